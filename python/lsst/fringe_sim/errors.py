@@ -1,0 +1,111 @@
+"""Every exception of the package, and when to raise which.
+
+All derive from `FringeSimError`. Whatever a user can mend by changing an input is an `InputError`; the
+command line turns it into one line and exit status 1. Raise before long work starts; say the field, the
+value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+__all__ = [
+    "ConvergenceError",
+    "FrameFormatError",
+    "FringeSimError",
+    "InputError",
+    "OutOfRangeError",
+    "ResourceError",
+    "StackError",
+    "UnknownNameError",
+]
+
+
+class FringeSimError(Exception):
+    """Base of all exceptions that this package raises on purpose."""
+
+
+class InputError(FringeSimError, ValueError):
+    """Something given by the user cannot be used.
+
+    Parameters
+    ----------
+    field : `str`
+        What was given: a parameter, a keyword, a column.
+    value : `object`
+        The value found.
+    allowed : `str`
+        What would be accepted.
+    source : `str`, optional
+        File (or data id) in which the value stands.
+    """
+
+    def __init__(self, field: str, value: object, allowed: str, *, source: str | None = None) -> None:
+        self.field = field
+        self.value = value
+        self.allowed = allowed
+        self.source = source
+        super().__init__(field, value, allowed)
+
+    def __str__(self) -> str:
+        where = f"{self.source}: " if self.source else ""
+        return f"{where}{self.field} is {self.value!r}; allowed: {self.allowed}"
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Keyword arguments survive the trip between processes.
+        return (_rebuild_input_error, (type(self), self.field, self.value, self.allowed, self.source))
+
+    def in_source(self, source: str) -> InputError:
+        """Return the same error with ``source`` as the file in which it stands."""
+        return _rebuild_input_error(type(self), self.field, self.value, self.allowed, source)
+
+
+def _rebuild_input_error(
+    kind: type[InputError], field: str, value: object, allowed: str, source: str | None
+) -> InputError:
+    error = kind.__new__(kind)
+    InputError.__init__(error, field, value, allowed, source=source)
+    return error
+
+
+class OutOfRangeError(InputError):
+    """A number lies outside the interval in which it is meaningful or tabulated."""
+
+
+class StackError(InputError):
+    """A layer stack is not physical: a finite end, a negative thickness, too few layers."""
+
+
+class FrameFormatError(InputError):
+    """A raw frame, a cube or a map is not laid out as it must be."""
+
+
+class UnknownNameError(InputError):
+    """A name (set-up, detector, raft, medium, effect) is not known; near misses are offered."""
+
+    def __init__(
+        self, field: str, value: object, known: Iterable[object], *, source: str | None = None
+    ) -> None:
+        names = sorted({str(name) for name in known})
+        near = difflib.get_close_matches(str(value), names, n=3, cutoff=0.5)
+        if near:
+            allowed = f"did you mean {' or '.join(near)}? ({_shorten(names)})"
+        else:
+            allowed = _shorten(names)
+        super().__init__(field, value, allowed, source=source)
+
+
+class ResourceError(FringeSimError):
+    """A table shipped with the package is missing, malformed or lacks its provenance."""
+
+
+class ConvergenceError(FringeSimError):
+    """A quadrature or an iteration did not reach the tolerance that was asked for."""
+
+
+def _shorten(names: list[str], most: int = 24) -> str:
+    if not names:
+        return "nothing is registered"
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown}, … ({len(names)} in all)"
