@@ -1,0 +1,425 @@
+"""Exact response of a stack as a function of the thickness of one layer.
+
+Only one layer varies over a sensor; what lies above and below it is fixed. With the round-trip phase factor
+``z = exp(i kappa d)`` of the varying layer every field above it is ``(u + v z) / (1 + g z)`` and every field in or
+below it is proportional to ``sqrt(z) / (1 + g z)``. The fraction of the light that any layer absorbs is therefore
+
+    A(d) = (a + b |z|² + e |z| + 2 Re(c z)) / |1 + g z|²
+
+with six numbers per wavelength, angle and polarisation, however many layers there are. Nothing is approximated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError, OutOfRangeError
+from .transfer_matrix import (
+    ComplexArray,
+    FloatArray,
+    InterfaceCoefficients,
+    WaveFields,
+    backward_sweep,
+    forward_sweep,
+    interface_coefficients,
+    layer_admittance,
+)
+
+__all__ = ["PhaseResponse", "reduce_to_phase"]
+
+_ANCHOR = 64
+"""Steps of the phase recurrence between two exact evaluations; keeps its rounding error below 1e-14."""
+
+
+@dataclass(frozen=True)
+class PhaseResponse:
+    """Coefficients of the closed form, one set per node (wavelength, angle, polarisation).
+
+    Attributes
+    ----------
+    a, b, e : `numpy.ndarray`, shape ``(P, ...)``
+        Real coefficients; the first axis is the polarisation (1 or 2 entries, averaged).
+    c, g, kappa : `numpy.ndarray`, complex, shape ``(P, ...)``
+        Complex coefficients; ``kappa`` is the round-trip phase per thickness [rad/µm].
+    """
+
+    a: FloatArray
+    b: FloatArray
+    e: FloatArray
+    c: ComplexArray
+    g: ComplexArray
+    kappa: ComplexArray
+
+    @property
+    def node_shape(self) -> tuple[int, ...]:
+        """Shape of the nodes, without the polarisation axis."""
+        return self.a.shape[1:]
+
+    def evaluate(self, thickness_um: ArrayLike) -> FloatArray:
+        """Response at every node.
+
+        Parameters
+        ----------
+        thickness_um : array_like
+            Thickness of the varying layer [µm]; broadcasts against the nodes.
+
+        Returns
+        -------
+        response : `numpy.ndarray`
+            Absorbed fraction, mean over polarisations; shape of ``thickness_um`` broadcast with the nodes.
+        """
+        thickness = _checked_thickness(thickness_um)
+        z = np.exp(1j * self.kappa * thickness)
+        size = np.abs(z)
+        top = self.a + self.b * size**2 + self.e * size + 2.0 * (self.c * z).real
+        return (top / np.abs(1.0 + self.g * z) ** 2).mean(axis=0)
+
+    def thickness_derivative(self, thickness_um: ArrayLike) -> FloatArray:
+        """Exact derivative of `evaluate` with respect to thickness [1/µm]; same shape."""
+        thickness = _checked_thickness(thickness_um)
+        z = np.exp(1j * self.kappa * thickness)
+        dz = 1j * self.kappa * z
+        size = np.abs(z)
+        dsize = -self.kappa.imag * size
+        top = self.a + self.b * size**2 + self.e * size + 2.0 * (self.c * z).real
+        dtop = 2.0 * self.b * size * dsize + self.e * dsize + 2.0 * (self.c * dz).real
+        bottom_field = 1.0 + self.g * z
+        bottom = np.abs(bottom_field) ** 2
+        dbottom = 2.0 * (np.conj(bottom_field) * self.g * dz).real
+        return ((dtop * bottom - top * dbottom) / bottom**2).mean(axis=0)
+
+    def averaged(self, weight: ArrayLike, thickness_um: ArrayLike) -> FloatArray:
+        """Weighted sum over the last node axis.
+
+        Parameters
+        ----------
+        weight : array_like, shape ``(W, Q)`` (or ``(Q,)``)
+            Weights of the nodes; `node_shape` must be ``(W, Q)`` (or ``(Q,)``).
+        thickness_um : array_like
+            Thickness [µm], any shape.
+
+        Returns
+        -------
+        response : `numpy.ndarray`, shape ``(W, *thickness.shape)`` (or ``thickness.shape``)
+        """
+        thickness = _checked_thickness(thickness_um)
+        arrays, weights, squeeze = self._grouped(weight)
+        out = _average_kernel(*arrays, weights, np.ascontiguousarray(thickness).ravel())
+        return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
+
+    def averaged_on_grid(self, weight: ArrayLike, start_um: float, step_um: float, count: int) -> FloatArray:
+        """Like `averaged` on ``start + step * arange(count)``, several times faster.
+
+        The phase advances by multiplication and is set anew every 64 steps.
+        """
+        if count < 1 or not math.isfinite(start_um + step_um * count):
+            raise InputError("thickness grid", (start_um, step_um, count), "finite, one point or more")
+        _checked_thickness([start_um, start_um + step_um * (count - 1)])
+        arrays, weights, squeeze = self._grouped(weight)
+        out = _grid_kernel(*arrays, weights, float(start_um), float(step_um), int(count))
+        return out[0] if squeeze else out
+
+    def averaged_derivative(self, weight: ArrayLike, thickness_um: ArrayLike) -> FloatArray:
+        """Thickness derivative of `averaged` [1/µm]; same shape."""
+        thickness = _checked_thickness(thickness_um)
+        arrays, weights, squeeze = self._grouped(weight)
+        out = _derivative_kernel(*arrays, weights, np.ascontiguousarray(thickness).ravel())
+        return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
+
+    def _grouped(self, weight: ArrayLike) -> tuple[tuple[np.ndarray, ...], FloatArray, bool]:
+        """Coefficients as ``(W, P * Q)`` and weights to match."""
+        weights = np.asarray(weight, dtype=float)
+        if weights.shape != self.node_shape or weights.ndim not in (1, 2):
+            raise InputError("shape of the weights", weights.shape, f"{self.node_shape}")
+        squeeze = weights.ndim == 1
+        groups = 1 if squeeze else weights.shape[0]
+        polarizations = len(self.a)
+
+        def group(array: np.ndarray) -> np.ndarray:
+            split = array.reshape(polarizations, groups, -1)
+            return np.ascontiguousarray(np.moveaxis(split, 0, 1).reshape(groups, -1))
+
+        spread = np.tile(weights.reshape(groups, -1) / polarizations, (1, polarizations))
+        return tuple(group(getattr(self, item.name)) for item in fields(self)), spread, squeeze
+
+
+def reduce_to_phase(
+    n: ArrayLike,
+    d: ArrayLike,
+    wavelength: ArrayLike,
+    theta: ArrayLike = 0.0,
+    polarization: str = "mixed",
+    *,
+    varying: int,
+    layers: Sequence[int],
+    roughness: ArrayLike | None = None,
+) -> PhaseResponse:
+    """Reduce a stack to its closed form in the phase of one layer.
+
+    Parameters
+    ----------
+    n : array_like, complex, shape ``(L, ...)``
+        Index of every layer.
+    d : array_like, shape ``(L,)``
+        Thickness of every layer [µm]; that of the varying layer is ignored.
+    wavelength, theta : array_like
+        Wavelength in vacuum [µm] and angle of incidence [rad]; broadcast with the trailing axes of ``n``.
+    polarization : {"mixed", "s", "p"}, optional
+        ``mixed`` keeps both and averages them.
+    varying : `int`
+        Position of the layer whose thickness varies; an inner layer.
+    layers : sequence of `int`
+        Inner layers whose absorption is summed: the detection layer, or all of them for ``1 - R - T``.
+    roughness : array_like, shape ``(L-1,)``, optional
+        Rms roughness of the interfaces [µm].
+
+    Returns
+    -------
+    response : `PhaseResponse`
+
+    Raises
+    ------
+    InputError
+        ``varying`` or an entry of ``layers`` is not an inner layer, or the polarisation is unknown.
+
+    Notes
+    -----
+    The tangential fields above the varying layer are those for light from above, ``u``, plus those for light from
+    below, ``x``, times the upward amplitude ``tau rho z / (1 + g z)`` at the top of the varying layer, with ``tau``
+    the transmission into it, ``rho`` the reflection at its lower face and ``g = -rho r_up``.
+    """
+    index = np.asarray(n, dtype=complex)
+    count = len(index)
+    thickness = np.asarray(d, dtype=float)
+    wave, angle = np.asarray(wavelength, dtype=float), np.asarray(theta, dtype=float)
+    for field, value in (("varying layer", varying), *(("absorbing layer", layer) for layer in layers)):
+        if not 0 < value < count - 1:
+            raise InputError(field, value, f"an inner layer, 1 to {count - 2}")
+    if polarization not in ("mixed", "s", "p"):
+        raise InputError("polarization", polarization, "mixed, s or p")
+    trailing = np.broadcast_shapes(index.shape[1:], wave.shape, angle.shape)
+    pad = (count,) + (1,) * (len(trailing) - index.ndim + 1) + index.shape[1:]
+    index = np.broadcast_to(index.reshape(pad), (count, *trailing))
+    wave, angle = np.broadcast_to(wave, trailing), np.broadcast_to(angle, trailing)
+    heights = None if roughness is None else np.asarray(roughness, dtype=float)
+    if heights is not None and not np.any(heights):
+        heights = None
+    parts = [
+        _reduce_polarization(index, thickness, wave, angle, each, varying, layers, heights)
+        for each in (("s", "p") if polarization == "mixed" else (polarization,))
+    ]
+    return PhaseResponse(*(np.stack(column) for column in zip(*parts, strict=True)))
+
+
+def _reduce_polarization(
+    index: ComplexArray,
+    thickness: FloatArray,
+    wavelength: FloatArray,
+    theta: FloatArray,
+    polarization: str,
+    varying: int,
+    layers: Sequence[int],
+    roughness: FloatArray | None,
+) -> tuple[np.ndarray, ...]:
+    normal, admittance = layer_admittance(index, theta, polarization)
+    column = (-1,) + (1,) * wavelength.ndim
+    heights = None if roughness is None else roughness.reshape(column) / wavelength
+    coefficients = interface_coefficients(admittance, normal, heights)
+    inner = np.where(np.arange(len(thickness)) == varying, 0.0, thickness)[1:-1].reshape(column)
+    propagation = np.exp(1j * (2.0 * np.pi * normal[1:-1] / wavelength) * inner)
+
+    above = _slice(coefficients, slice(None, varying))
+    from_above, _ = _solve(above, propagation[: varying - 1])
+    from_below, reflect_up = _solve(_upside_down(above), propagation[: varying - 1][::-1])
+    below, reflect_low = _solve(_slice(coefficients, slice(varying, None)), propagation[varying:])
+
+    entering = from_above.forward_top[varying]
+    g = -reflect_up * reflect_low
+    coupling = entering * reflect_low
+    incident = admittance[0].real
+    a, b, e = (np.zeros(wavelength.shape) for _ in range(3))
+    c = np.zeros(wavelength.shape, dtype=complex)
+    for layer in layers:
+        eta = admittance[layer]
+        if layer > varying:
+            under = layer - varying
+            flux = (
+                below.flux_top(admittance[varying:])[under] - below.flux_bottom(admittance[varying:])[under]
+            )
+            e += np.abs(entering) ** 2 * flux / incident
+            continue
+        if layer == varying:
+            faces = [((entering, np.zeros_like(entering)), (np.zeros_like(entering), coupling), 1.0)]
+            sum_, difference = 1.0 + reflect_low, eta * (1.0 - reflect_low)
+            e -= np.abs(entering) ** 2 * (sum_ * np.conj(difference)).real / incident
+        else:
+            mirrored = varying - layer
+            lit, back = from_above, from_below
+            faces = [
+                (
+                    (lit.forward_top[layer], lit.backward_top[layer]),
+                    (
+                        g * lit.forward_top[layer] + coupling * back.backward_bottom[mirrored],
+                        g * lit.backward_top[layer] + coupling * back.forward_bottom[mirrored],
+                    ),
+                    1.0,
+                ),
+                (
+                    (lit.forward_bottom[layer], lit.backward_bottom[layer]),
+                    (
+                        g * lit.forward_bottom[layer] + coupling * back.backward_top[mirrored],
+                        g * lit.backward_bottom[layer] + coupling * back.forward_top[mirrored],
+                    ),
+                    -1.0,
+                ),
+            ]
+        for (u_forward, u_backward), (v_forward, v_backward), sign in faces:
+            u_sum, u_diff = u_forward + u_backward, eta * (u_forward - u_backward)
+            v_sum, v_diff = v_forward + v_backward, eta * (v_forward - v_backward)
+            a += sign * (u_sum * np.conj(u_diff)).real / incident
+            b += sign * (v_sum * np.conj(v_diff)).real / incident
+            c += sign * 0.5 * (np.conj(u_sum) * v_diff + v_sum * np.conj(u_diff)) / incident
+    kappa = 2.0 * (2.0 * np.pi * normal[varying] / wavelength)
+    return a, b, e, c, g, kappa
+
+
+def _solve(coefficients: InterfaceCoefficients, propagation: ComplexArray) -> tuple[WaveFields, ComplexArray]:
+    reflection = backward_sweep(coefficients, propagation)
+    return forward_sweep(coefficients, propagation, reflection), reflection[0]
+
+
+def _slice(coefficients: InterfaceCoefficients, part: slice) -> InterfaceCoefficients:
+    return InterfaceCoefficients(
+        coefficients.reflect_down[part],
+        coefficients.transmit_down[part],
+        coefficients.reflect_up[part],
+        coefficients.transmit_up[part],
+    )
+
+
+def _upside_down(coefficients: InterfaceCoefficients) -> InterfaceCoefficients:
+    return InterfaceCoefficients(
+        coefficients.reflect_up[::-1],
+        coefficients.transmit_up[::-1],
+        coefficients.reflect_down[::-1],
+        coefficients.transmit_down[::-1],
+    )
+
+
+def _checked_thickness(thickness_um: ArrayLike) -> FloatArray:
+    thickness = np.asarray(thickness_um, dtype=float)
+    good = np.isfinite(thickness) & (thickness >= 0.0)
+    if not np.all(good):
+        wrong = np.atleast_1d(thickness)[~np.atleast_1d(good)]
+        raise OutOfRangeError("thickness [um]", float(wrong[0]), "finite and not negative")
+    return thickness
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True)
+def _average_kernel(
+    a: NDArray, b: NDArray, e: NDArray, c: NDArray, g: NDArray, kappa: NDArray, w: NDArray, d: NDArray
+) -> NDArray:  # pragma: no cover - compiled
+    groups, nodes = w.shape
+    out = np.zeros((groups, d.size))
+    for m in range(groups):
+        for i in numba.prange(d.size):
+            total = 0.0
+            for q in range(nodes):
+                size = math.exp(-kappa[m, q].imag * d[i])
+                angle = kappa[m, q].real * d[i]
+                x, y = size * math.cos(angle), size * math.sin(angle)
+                top = a[m, q] + (b[m, q] * size + e[m, q]) * size
+                top += 2.0 * (c[m, q].real * x - c[m, q].imag * y)
+                u = 1.0 + g[m, q].real * x - g[m, q].imag * y
+                v = g[m, q].real * y + g[m, q].imag * x
+                total += w[m, q] * top / (u * u + v * v)
+            out[m, i] = total
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True)
+def _derivative_kernel(
+    a: NDArray, b: NDArray, e: NDArray, c: NDArray, g: NDArray, kappa: NDArray, w: NDArray, d: NDArray
+) -> NDArray:  # pragma: no cover - compiled
+    groups, nodes = w.shape
+    out = np.zeros((groups, d.size))
+    for m in range(groups):
+        for i in numba.prange(d.size):
+            total = 0.0
+            for q in range(nodes):
+                size = math.exp(-kappa[m, q].imag * d[i])
+                angle = kappa[m, q].real * d[i]
+                z = complex(size * math.cos(angle), size * math.sin(angle))
+                dz = 1j * kappa[m, q] * z
+                dsize = -kappa[m, q].imag * size
+                top = a[m, q] + (b[m, q] * size + e[m, q]) * size + 2.0 * (c[m, q] * z).real
+                dtop = (2.0 * b[m, q] * size + e[m, q]) * dsize + 2.0 * (c[m, q] * dz).real
+                field = 1.0 + g[m, q] * z
+                bottom = field.real * field.real + field.imag * field.imag
+                dbottom = 2.0 * (field.conjugate() * g[m, q] * dz).real
+                total += w[m, q] * (dtop * bottom - top * dbottom) / (bottom * bottom)
+            out[m, i] = total
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract", "arcp", "reassoc"})
+def _grid_kernel(
+    a: NDArray,
+    b: NDArray,
+    e: NDArray,
+    c: NDArray,
+    g: NDArray,
+    kappa: NDArray,
+    w: NDArray,
+    start: float,
+    step: float,
+    count: int,
+) -> NDArray:  # pragma: no cover - compiled
+    groups, nodes = w.shape
+    out = np.zeros((groups, count))
+    blocks = (count + _ANCHOR - 1) // _ANCHOR
+    for task in numba.prange(groups * blocks):
+        m = task // blocks
+        first = (task % blocks) * _ANCHOR
+        many = min(_ANCHOR, count - first)
+        x, y = np.empty(_ANCHOR), np.empty(_ANCHOR)
+        total = np.zeros(_ANCHOR)
+        for q in range(nodes):
+            kr, ki = kappa[m, q].real, kappa[m, q].imag
+            # Powers of the one-step factor by doubling: log2(64) roundings, and a loop that vectorises.
+            angle, size = kr * (start + first * step), math.exp(-ki * (start + first * step))
+            x[0], y[0] = size * math.cos(angle), size * math.sin(angle)
+            filled = 1
+            while filled < _ANCHOR:
+                shift, decay = kr * step * filled, math.exp(-ki * step * filled)
+                fx, fy = decay * math.cos(shift), decay * math.sin(shift)
+                for i in range(filled):
+                    x[filled + i] = x[i] * fx - y[i] * fy
+                    y[filled + i] = x[i] * fy + y[i] * fx
+                filled *= 2
+            aq, bq, eq, wq = a[m, q], b[m, q], e[m, q], w[m, q]
+            cr, ci = 2.0 * c[m, q].real, 2.0 * c[m, q].imag
+            gr, gi = g[m, q].real, g[m, q].imag
+            if ki == 0.0:
+                flat = aq + bq + eq
+                for i in range(_ANCHOR):
+                    top = flat + cr * x[i] - ci * y[i]
+                    u = 1.0 + gr * x[i] - gi * y[i]
+                    v = gr * y[i] + gi * x[i]
+                    total[i] += wq * top / (u * u + v * v)
+            else:
+                for i in range(_ANCHOR):
+                    power = x[i] * x[i] + y[i] * y[i]
+                    top = aq + bq * power + eq * math.sqrt(power) + cr * x[i] - ci * y[i]
+                    u = 1.0 + gr * x[i] - gi * y[i]
+                    v = gr * y[i] + gi * x[i]
+                    total[i] += wq * top / (u * u + v * v)
+        for i in range(many):
+            out[m, first + i] = total[i]
+    return out

@@ -1,0 +1,179 @@
+"""A sensor as a stack of plane layers between two half spaces."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError, ResourceError, StackError, UnknownNameError
+from ..resources import list_resources, read_yaml
+from .media import Medium, get_medium
+
+__all__ = ["Layer", "LayerStack"]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One plane-parallel layer.
+
+    Attributes
+    ----------
+    name : `str`
+        What the layer is for: ``detection``, ``adhesive``, ``support``...
+    medium : `Medium`
+        What it is made of.
+    thickness_um : `float`
+        Thickness [µm]; infinite for the first and the last layer of a stack.
+    roughness_nm : `float`
+        Rms roughness of the interface on the side of the light [nm]; dephases the reflected and the
+        transmitted wave there.
+    """
+
+    name: str
+    medium: Medium
+    thickness_um: float
+    roughness_nm: float = 0.0
+
+
+@dataclass(frozen=True)
+class LayerStack:
+    """Layers in the order in which the light meets them.
+
+    Attributes
+    ----------
+    layers : `tuple` [`Layer`, ...]
+        From the ambient medium to the substrate; the two ends are infinite, all others finite.
+    name : `str`
+        Name of the stack.
+
+    Raises
+    ------
+    StackError
+        A finite end, an infinite, negative or NaN thickness inside, fewer than two layers, or a name twice.
+    """
+
+    layers: tuple[Layer, ...]
+    name: str = "stack"
+
+    def __post_init__(self) -> None:
+        if len(self.layers) < 2:
+            raise StackError("number of layers", len(self.layers), "two or more", source=self.name)
+        names = [layer.name for layer in self.layers]
+        for name in names:
+            if names.count(name) > 1:
+                raise StackError("layer name", name, "every name once", source=self.name)
+        for end in (self.layers[0], self.layers[-1]):
+            if end.thickness_um != math.inf:
+                raise StackError(
+                    f"thickness [um] of end layer {end.name}", end.thickness_um, "infinite", source=self.name
+                )
+        for layer in self.layers[1:-1]:
+            if not (0.0 <= layer.thickness_um < math.inf):
+                raise StackError(
+                    f"thickness [um] of layer {layer.name}",
+                    layer.thickness_um,
+                    "finite and not negative",
+                    source=self.name,
+                )
+        for layer in self.layers:
+            if not (0.0 <= layer.roughness_nm < math.inf):
+                raise StackError(
+                    f"roughness [nm] of layer {layer.name}",
+                    layer.roughness_nm,
+                    "finite and not negative",
+                    source=self.name,
+                )
+
+    @classmethod
+    def from_resource(cls, name: str) -> LayerStack:
+        """Stack shipped as ``data/stacks/<name>.yaml``.
+
+        Raises
+        ------
+        UnknownNameError
+            There is no such stack, or it names an unknown medium.
+        """
+        if f"{name}.yaml" not in list_resources("stacks"):
+            known = [entry.removesuffix(".yaml") for entry in list_resources("stacks")]
+            raise UnknownNameError("stack", name, known)
+        content = read_yaml("stacks", f"{name}.yaml")
+        for key in ("source", "doi", "licence", "layers"):
+            if key not in content:
+                raise ResourceError(f"data/stacks/{name}.yaml does not state its {key}")
+        layers = [
+            Layer(
+                str(entry["name"]),
+                get_medium(str(entry["medium"])),
+                float(entry["thickness_um"]),
+                float(entry.get("roughness_nm", 0.0)),
+            )
+            for entry in content["layers"]
+        ]
+        return cls(tuple(layers), name)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Layer names, from the light inwards."""
+        return tuple(layer.name for layer in self.layers)
+
+    @property
+    def thickness_um(self) -> NDArray[np.float64]:
+        """Thickness of every layer [µm], shape ``(L,)``; the ends are infinite."""
+        return np.array([layer.thickness_um for layer in self.layers])
+
+    @property
+    def roughness_nm(self) -> NDArray[np.float64]:
+        """Rms roughness of the upper interface of layers 1…L-1 [nm], shape ``(L-1,)``."""
+        return np.array([layer.roughness_nm for layer in self.layers[1:]])
+
+    def position(self, name: str) -> int:
+        """Index of the layer called ``name``.
+
+        Raises
+        ------
+        UnknownNameError
+            There is no such layer.
+        """
+        if name not in self.names:
+            raise UnknownNameError("layer", name, self.names, source=self.name)
+        return self.names.index(name)
+
+    def indices(self, wavelength_nm: ArrayLike, temperature_k: ArrayLike = 300.0) -> NDArray[np.complex128]:
+        """Complex index of every layer, shape ``(L, ...)`` with the broadcast shape of the arguments."""
+        by_medium: dict[int, NDArray[np.complex128]] = {}
+        for layer in self.layers:
+            if id(layer.medium) not in by_medium:
+                by_medium[id(layer.medium)] = layer.medium.index(wavelength_nm, temperature_k)
+        return np.stack([by_medium[id(layer.medium)] for layer in self.layers])
+
+    def replace_layer(self, name: str, **changes: object) -> LayerStack:
+        """Stack in which some attributes of one layer are changed."""
+        position = self.position(name)
+        layers = list(self.layers)
+        layers[position] = replace(layers[position], **changes)  # type: ignore[arg-type]
+        return replace(self, layers=tuple(layers))
+
+    def with_thickness(self, name: str, thickness_um: float) -> LayerStack:
+        """Stack in which the layer ``name`` has another thickness [µm]."""
+        return self.replace_layer(name, thickness_um=float(thickness_um))
+
+    def with_medium(self, name: str, medium: Medium) -> LayerStack:
+        """Stack in which the layer ``name`` is made of something else."""
+        return self.replace_layer(name, medium=medium)
+
+    def with_inserted(self, layer: Layer, *, before: str) -> LayerStack:
+        """Stack with one more layer on the light's side of the layer called ``before``."""
+        position = self.position(before)
+        if position == 0:
+            raise InputError("layer to insert before", before, "any layer but the ambient", source=self.name)
+        return replace(self, layers=(*self.layers[:position], layer, *self.layers[position:]))
+
+
+def ensure_layers(stack: LayerStack, names: Sequence[str]) -> None:
+    """Raise `UnknownNameError` unless every name is a layer of the stack."""
+    for name in names:
+        stack.position(name)

@@ -1,0 +1,99 @@
+"""Everything optical that decides how a pixel responds, in one frozen object that effects may change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from .illumination import DEFAULT_STEP_NM, Beam, Illumination, SpectralProfile
+from .phase_response import PhaseResponse, reduce_to_phase
+from .stack import LayerStack
+
+__all__ = ["OBSERVABLES", "OpticalSystem"]
+
+OBSERVABLES = ("detection", "total")
+"""``detection``: absorbed in the detection layer. ``total``: 1 - R - T of the stack, as the paper's fit used."""
+
+
+@dataclass(frozen=True)
+class OpticalSystem:
+    """Stack, illumination and observable.
+
+    Attributes
+    ----------
+    stack : `LayerStack`
+        The sensor.
+    temperature_k : `float`
+        Temperature of the sensor [K].
+    profile : `SpectralProfile`
+        Shape of the monochromator line.
+    beam : `Beam`
+        Angles of incidence.
+    varying, detection : `str`
+        Names of the layer whose thickness varies and of the one whose absorption is detected.
+    observable : {"detection", "total"}
+        What a pixel responds to.
+    polarization : {"mixed", "s", "p"}
+        Polarisation of the light.
+    wavelength_offset_nm : `float`
+        True minus nominal wavelength of every exposure [nm].
+    wavelength_stretch : `float`
+        Relative error of the wavelength scale, zero at `stretch_pivot_nm`.
+    stretch_pivot_nm : `float`
+        Wavelength at which the scale error vanishes [nm].
+    """
+
+    stack: LayerStack
+    temperature_k: float
+    profile: SpectralProfile
+    beam: Beam
+    varying: str = "adhesive"
+    detection: str = "detection"
+    observable: str = "detection"
+    polarization: str = "mixed"
+    wavelength_offset_nm: float = 0.0
+    wavelength_stretch: float = 0.0
+    stretch_pivot_nm: float = 935.0
+
+    def __post_init__(self) -> None:
+        self.stack.position(self.varying)
+        self.stack.position(self.detection)
+        if self.observable not in OBSERVABLES:
+            raise InputError("observable", self.observable, " or ".join(OBSERVABLES))
+
+    def with_layer(self, layer: str, **changes: object) -> OpticalSystem:
+        """System in which some attributes of one layer of the stack are changed."""
+        return replace(self, stack=self.stack.replace_layer(layer, **changes))
+
+    def true_wavelength(self, nominal_nm: ArrayLike) -> np.ndarray:
+        """Wavelength that the monochromator really delivers [nm]."""
+        nominal = np.asarray(nominal_nm, dtype=float)
+        return (
+            nominal + self.wavelength_offset_nm + self.wavelength_stretch * (nominal - self.stretch_pivot_nm)
+        )
+
+    def flat_fields(self, wavelength_nm: ArrayLike, step_nm: float = DEFAULT_STEP_NM) -> Illumination:
+        """Illumination of monochromator flats at nominal wavelengths [nm]."""
+        return Illumination.flat_fields(self.true_wavelength(wavelength_nm), self.profile, self.beam, step_nm)
+
+    def reduce(self, illumination: Illumination) -> PhaseResponse:
+        """Closed form of the response in the thickness of the varying layer, one set per node."""
+        index = self.stack.indices(illumination.wavelength_nm, self.temperature_k)
+        thickness = np.where(np.isinf(self.stack.thickness_um), 0.0, self.stack.thickness_um)
+        if self.observable == "detection":
+            layers = [self.stack.position(self.detection)]
+        else:
+            layers = list(range(1, len(self.stack.layers) - 1))
+        return reduce_to_phase(
+            index,
+            thickness,
+            1e-3 * illumination.wavelength_nm,
+            illumination.theta,
+            self.polarization,
+            varying=self.stack.position(self.varying),
+            layers=layers,
+            roughness=1e-3 * self.stack.roughness_nm,
+        )
