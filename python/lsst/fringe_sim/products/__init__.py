@@ -1,1 +1,28 @@
-"""products."""
+"""What travels between stages: frozen, validated on construction, and the same after a trip to disk.
+
+Each product has ``write_fits(path, metadata=None)`` and ``read_fits(path)``. Files are written whole or not
+at all, carry checksums, and two writes of one product agree to the byte.
+"""
+
+from .fringe_components import FringeComponents
+from .fringe_cube import CUBE_UNITS, FlatExposures, FringeCube
+from .fringe_flat import FringeFlat
+from .fringe_frame import FringeFrame
+from .mask import MASK_PLANES, describe_mask, mask_bits
+from .sky_frame import SKY_UNITS, SkyFringe
+from .thickness_map import ThicknessMap
+
+__all__ = [
+    "CUBE_UNITS",
+    "MASK_PLANES",
+    "SKY_UNITS",
+    "FlatExposures",
+    "FringeComponents",
+    "FringeCube",
+    "FringeFlat",
+    "FringeFrame",
+    "SkyFringe",
+    "ThicknessMap",
+    "describe_mask",
+    "mask_bits",
+]

@@ -1,0 +1,148 @@
+"""Checks shared by the products, each ending in one typed error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import FrameFormatError, InputError, OutOfRangeError
+from .mask import ALL_BITS
+
+__all__ = [
+    "as_float_array",
+    "as_mask",
+    "check_good_pixels",
+    "check_mapping",
+    "check_name",
+    "check_number",
+    "check_shape",
+    "read_only",
+]
+
+
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """View of ``array`` that cannot be written through; the caller's own array keeps its flags."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def as_float_array(
+    field: str, values: ArrayLike, ndim: int, dtype: type[np.floating] = np.float32
+) -> NDArray[Any]:
+    """Read-only real array of ``ndim`` axes; one that has the type already, in any byte order, is shared.
+
+    Raises
+    ------
+    FrameFormatError
+        Not real numbers, or the wrong number of axes, or no pixels.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise FrameFormatError(field, "ragged nested sequences", f"a real array of {ndim} axes") from None
+    if array.dtype.kind not in "fiu":
+        raise FrameFormatError(field, f"dtype {array.dtype}", "real numbers")
+    if array.ndim != ndim or array.size == 0:
+        raise FrameFormatError(field, f"shape {array.shape}", f"{ndim} axes, none of them empty")
+    if array.dtype.newbyteorder("=") != np.dtype(dtype):
+        with np.errstate(over="ignore"):
+            array = array.astype(dtype)
+    return read_only(array)
+
+
+def as_mask(field: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """Read-only int32 mask of the given shape.
+
+    Raises
+    ------
+    FrameFormatError
+        Not integers, another shape, or a bit that names no plane.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind not in "iub":
+        raise FrameFormatError(field, f"dtype {array.dtype}", "integers, one bit for each mask plane")
+    check_shape(field, array, shape)
+    used = int(np.bitwise_or.reduce(array, axis=None))
+    if used & ~ALL_BITS:
+        raise FrameFormatError(field, f"bits {used & ~ALL_BITS:#x}", "the bits of MASK_PLANES")
+    if array.dtype.newbyteorder("=") != np.dtype(np.int32):
+        array = array.astype(np.int32)
+    return read_only(array)
+
+
+def check_shape(field: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Refuse an array of another shape."""
+    if array.shape != shape:
+        raise FrameFormatError(field, f"shape {array.shape}", f"shape {shape}, that of the image")
+
+
+def check_good_pixels(
+    field: str, values: NDArray[Any], mask: NDArray[Any] | None = None, *, nonnegative: bool = False
+) -> None:
+    """Refuse a pixel that the mask calls good and that holds no usable number.
+
+    One leading plane is looked at at a time, so a memory-mapped cube is never in memory as a whole.
+    """
+    planes = range(values.shape[0]) if values.ndim == 3 else (slice(None),)
+    bad = 0
+    for plane in planes:
+        part = values[plane]
+        wrong = ~(np.isfinite(part) & (part >= 0)) if nonnegative else ~np.isfinite(part)
+        if mask is not None:
+            wrong &= mask[plane] == 0
+        bad += int(np.count_nonzero(wrong))
+    if bad:
+        kind = "negative or not finite" if nonnegative else "not finite"
+        where = "are good in MASK" if mask is not None else "are part of the frame"
+        raise FrameFormatError(field, f"{bad} pixels that are {kind} and {where}", "finite good pixels")
+
+
+def check_number(
+    field: str,
+    value: object,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    open_low: bool = False,
+    allow_inf: bool = False,
+) -> float:
+    """Return ``value`` as a float inside ``[low, high]`` (or ``(low, high]``).
+
+    Raises
+    ------
+    InputError
+        Not a number.
+    OutOfRangeError
+        Outside the interval.
+    """
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
+        raise InputError(field, value, "a number")
+    number = float(value)
+    inside = (number > low if open_low else number >= low) and number <= high
+    if not inside or (math.isinf(number) and not allow_inf):
+        bracket = "(" if open_low else "["
+        raise OutOfRangeError(field, number, f"a number in {bracket}{low:g}, {high:g}]")
+    return number
+
+
+def check_name(field: str, value: object, *, empty: bool = True) -> str:
+    """Return ``value`` as a printable ASCII name without blanks at its ends."""
+    if not isinstance(value, str) or not value.isascii() or not value.isprintable() or value != value.strip():
+        raise InputError(field, value, "printable ASCII text without blanks at its ends")
+    if not value and not empty:
+        raise InputError(field, value, "a name")
+    if len(value) > 60:
+        raise InputError(field, value, "at most 60 characters")
+    return value
+
+
+def check_mapping(field: str, value: object) -> Mapping[str, Any]:
+    """Return ``value`` if it is a mapping."""
+    if not isinstance(value, Mapping):
+        raise InputError(field, type(value).__name__, "a mapping of header keywords to values")
+    return value

@@ -1,0 +1,321 @@
+"""How products meet the disk: headers that come back bit for bit, and files that are whole or absent.
+
+A file is written under a temporary name in its own folder and then renamed, so that a reader never sees half
+of one. Two writes of the same product give the same bytes: nothing in them comes from the clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import uuid
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from ..errors import FrameFormatError, InputError
+from ._check import check_mapping
+from .mask import mask_plane_cards, planes_from_header, remap_mask
+
+__all__ = [
+    "Scalar",
+    "bintable_hdu",
+    "image_hdu",
+    "mask_hdu",
+    "merge_metadata",
+    "normalise_metadata",
+    "open_fits",
+    "primary_hdu",
+    "read_image",
+    "read_keyword",
+    "read_mask",
+    "read_metadata",
+    "write_hdus",
+]
+
+Scalar = bool | int | float | str | None
+
+PRODUCT_KEY = "PRODUCT"
+VERSION_KEY = "PRODVER"
+PRODUCT_VERSION = 1
+
+# Keywords that describe the bytes of the file rather than the product.
+_STRUCTURAL = re.compile(
+    r"SIMPLE|XTENSION|BITPIX|NAXIS\d*|EXTEND|PCOUNT|GCOUNT|GROUPS|BSCALE|BZERO|BLANK|TFIELDS|THEAP"
+    r"|T(FORM|TYPE|UNIT|NULL|SCAL|ZERO|DIM|DISP)\d+|CHECKSUM|DATASUM|END|CONTINUE|COMMENT|HISTORY|LONGSTRN"
+    r"|EXTNAME|EXTVER|EXTLEVEL|EXTTYPE|INHERIT|HIERARCH.*|Z(IMAGE|CMPTYPE|BITPIX|NAXIS\d*|TILE\d+)|MP_.*"
+    rf"|{PRODUCT_KEY}|{VERSION_KEY}|"
+)
+_KEYWORD = re.compile(r"[A-Z0-9_\-]+( [A-Z0-9_\-]+)*")
+_LONGEST_KEYWORD = 50
+
+
+def normalise_metadata(metadata: Mapping[str, Any] | None) -> Mapping[str, Scalar]:
+    """Freeze a mapping of header keywords, and make sure that a FITS header can hold it.
+
+    Keywords are upper-cased; numpy scalars become Python ones; blanks at the end of a text are dropped, as
+    FITS does.
+
+    Returns
+    -------
+    metadata : `Mapping` [`str`, `bool` | `int` | `float` | `str` | `None`]
+        Read-only copy.
+
+    Raises
+    ------
+    InputError
+        A keyword or a value that a FITS header cannot give back, or a keyword that describes the file itself.
+    """
+    result: dict[str, Scalar] = {}
+    for key, value in check_mapping("metadata", {} if metadata is None else metadata).items():
+        keyword = _normalise_keyword(key)
+        result[keyword] = _normalise_value(keyword, value)
+    return MappingProxyType(result)
+
+
+def merge_metadata(*parts: Mapping[str, Any] | None) -> Mapping[str, Scalar]:
+    """Join mappings, later ones winning."""
+    joined: dict[str, Scalar] = {}
+    for part in parts:
+        joined.update(normalise_metadata(part))
+    return MappingProxyType(joined)
+
+
+def _normalise_keyword(key: object) -> str:
+    keyword = key.strip().upper() if isinstance(key, str) else ""
+    if not _KEYWORD.fullmatch(keyword) or len(keyword) > _LONGEST_KEYWORD:
+        raise InputError(
+            "metadata keyword", key, f"words of A-Z 0-9 _ -, at most {_LONGEST_KEYWORD} characters"
+        )
+    if _STRUCTURAL.fullmatch(keyword):
+        raise InputError("metadata keyword", key, "a keyword that does not describe the file itself")
+    return keyword
+
+
+def _normalise_value(keyword: str, value: object) -> Scalar:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"metadata[{keyword}]", value, "a finite number (FITS has no other)")
+    if isinstance(value, str):
+        value = value.rstrip(" ")
+    if value is not None and not isinstance(value, bool | int | float | str):
+        raise InputError(f"metadata[{keyword}]", value, "text, a number, a truth value or None")
+    try:
+        returned = fits.Card.fromstring(_card(keyword, value).image).value
+    except (ValueError, fits.VerifyError) as error:
+        raise InputError(f"metadata[{keyword}]", value, f"what a FITS header can hold ({error})") from None
+    returned = None if isinstance(returned, fits.card.Undefined) else returned
+    if type(returned) is not type(value) or returned != value:
+        raise InputError(f"metadata[{keyword}]", value, "what a FITS header can hold and give back")
+    return value
+
+
+def _card(keyword: str, value: Scalar, comment: str = "") -> fits.Card:
+    """Header card whose value is read back exactly.
+
+    astropy cuts a float at twenty characters; those that need more are written in FITS free format.
+    """
+    plain = len(keyword) <= 8 and " " not in keyword
+    if isinstance(value, float):
+        text = repr(value).upper()
+        if len(text) > 20:
+            head = f"{keyword:<8}= " if plain else f"HIERARCH {keyword} = "
+            return fits.Card.fromstring(f"{head}{text}".ljust(80))
+    return fits.Card(keyword if plain else f"HIERARCH {keyword}", value, comment)
+
+
+def primary_hdu(
+    product: str, own: Sequence[tuple[str, Scalar, str]], metadata: Mapping[str, Scalar]
+) -> fits.PrimaryHDU:
+    """Empty primary HDU: what the product is, its own scalars, then the metadata.
+
+    Raises
+    ------
+    InputError
+        The metadata hold a keyword that the product writes itself.
+    """
+    hdu = fits.PrimaryHDU()
+    hdu.header.append(fits.Card(PRODUCT_KEY, product, "class of lsst.fringe_sim.products"))
+    hdu.header.append(fits.Card(VERSION_KEY, PRODUCT_VERSION, "layout of that class"))
+    for keyword, value, comment in own:
+        if keyword in metadata:
+            raise InputError("metadata keyword", keyword, f"a keyword that {product} does not write itself")
+        hdu.header.append(_card(keyword, value, comment))
+    for keyword, value in metadata.items():
+        hdu.header.append(_card(keyword, value))
+    return hdu
+
+
+def image_hdu(
+    name: str, data: NDArray[Any], *, unit: str | None = None, cards: Sequence[tuple[str, Any, str]] = ()
+) -> fits.ImageHDU:
+    """Image extension; ``data`` is not copied and not changed."""
+    view = data.view()
+    view.flags.writeable = False  # astropy swaps the bytes of writeable arrays in place
+    hdu = fits.ImageHDU(view, name=name)
+    if unit is not None:
+        hdu.header["BUNIT"] = unit
+    for card in cards:
+        hdu.header.append(fits.Card(*card))
+    return hdu
+
+
+def mask_hdu(
+    data: NDArray[Any], name: str = "MASK", *, cards: Sequence[tuple[str, Any, str]] = ()
+) -> fits.ImageHDU:
+    """Mask extension whose header names the planes."""
+    return image_hdu(name, data, cards=[*cards, *mask_plane_cards()])
+
+
+def bintable_hdu(name: str, columns: Sequence[tuple[str, NDArray[Any], str | None]]) -> fits.BinTableHDU:
+    """Binary table of float64 columns: (name, values, unit)."""
+    return fits.BinTableHDU.from_columns(
+        [
+            fits.Column(name=label, array=np.asarray(values, dtype=np.float64), format="D", unit=unit)
+            for label, values, unit in columns
+        ],
+        name=name,
+    )
+
+
+def write_hdus(path: str | os.PathLike[str], hdus: Sequence[Any]) -> None:
+    """Write HDUs to ``path``: checksummed, repeatable to the byte, and all or nothing.
+
+    Raises
+    ------
+    InputError
+        The folder does not exist.
+    """
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise InputError("folder", str(target.parent), "an existing folder", source=str(target))
+    for hdu in hdus:
+        hdu.add_datasum(when="data unit checksum")
+        hdu.add_checksum(when="HDU checksum", override_datasum=True)
+    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}.part")
+    try:
+        with open(temporary, "wb") as stream:
+            fits.HDUList(list(hdus)).writeto(stream, output_verify="exception")
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def open_fits(
+    path: str | os.PathLike[str], product: str, *, memmap: bool = False, verify: bool = True
+) -> Iterator[fits.HDUList]:
+    """Open a product for reading.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    product : `str`
+        Class the file must hold; a file that does not say what it is is accepted.
+    memmap : `bool`, optional
+        Leave the data on disk until touched.
+    verify : `bool`, optional
+        Compare the checksums, which reads the whole file.
+
+    Raises
+    ------
+    InputError
+        There is no such file.
+    FrameFormatError
+        Not FITS, truncated, damaged, or another product.
+    """
+    source = str(path)
+    if not Path(path).is_file():
+        raise InputError("file", source, "an existing FITS file")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            with fits.open(path, memmap=memmap, checksum=verify, lazy_load_hdus=False) as hdus:
+                _check_product(hdus[0].header, product, source)
+                yield hdus
+    except InputError as error:
+        raise (error if error.source else error.in_source(source)) from None
+    except (OSError, ValueError, TypeError, IndexError, KeyError, UserWarning) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise FrameFormatError("FITS file", reason, "an undamaged FITS file", source=source) from error
+
+
+def _check_product(header: fits.Header, product: str, source: str) -> None:
+    found = header.get(PRODUCT_KEY, product)
+    if found != product:
+        raise FrameFormatError(PRODUCT_KEY, found, product, source=source)
+    version = header.get(VERSION_KEY, PRODUCT_VERSION)
+    if version != PRODUCT_VERSION:
+        raise FrameFormatError(VERSION_KEY, version, str(PRODUCT_VERSION), source=source)
+
+
+def read_metadata(header: fits.Header, own: Sequence[str]) -> dict[str, Scalar]:
+    """Metadata of a primary header: everything but the structure and the product's ``own`` keywords."""
+    return {
+        keyword: header[keyword]
+        for keyword in header
+        if keyword not in own and not _STRUCTURAL.fullmatch(keyword)
+    }
+
+
+def read_keyword(header: fits.Header, keyword: str, *, source: str) -> Any:
+    """Value of a keyword that must be there.
+
+    Raises
+    ------
+    FrameFormatError
+        It is not.
+    """
+    if keyword not in header:
+        raise FrameFormatError(keyword, "missing", "a value in the header", source=source)
+    return header[keyword]
+
+
+def read_image(hdus: fits.HDUList, name: str, *, source: str, native: bool = True) -> NDArray[Any]:
+    """Data of an image extension.
+
+    Parameters
+    ----------
+    native : `bool`, optional
+        Copy into memory in the byte order of the machine; otherwise leave it as it lies in the file.
+
+    Raises
+    ------
+    FrameFormatError
+        There is no such extension, or it holds no image.
+    """
+    if name not in hdus:
+        raise FrameFormatError("extension", f"no {name}", f"an image extension named {name}", source=source)
+    data = hdus[name].data
+    if not isinstance(data, np.ndarray) or data.dtype.names is not None:
+        raise FrameFormatError(name, "no image", "an image extension", source=source)
+    return np.array(data, dtype=data.dtype.newbyteorder("=")) if native else data
+
+
+def read_mask(
+    hdus: fits.HDUList, name: str = "MASK", *, source: str, native: bool = True
+) -> NDArray[np.int32]:
+    """Mask of an extension, its bits moved to the numbering of `MASK_PLANES`.
+
+    Raises
+    ------
+    FrameFormatError
+        No such extension, not integers, or bits without a name.
+    UnknownNameError
+        A plane that is not known here.
+    """
+    data = read_image(hdus, name, source=source, native=native)
+    if data.dtype.kind not in "iu":
+        raise FrameFormatError(name, f"dtype {data.dtype}", "integers", source=source)
+    planes = planes_from_header(hdus[name].header, source=source)
+    return remap_mask(data, planes, source=source)

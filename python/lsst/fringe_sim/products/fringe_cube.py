@@ -1,0 +1,389 @@
+"""Flats of one sensor at many wavelengths: what a thickness fit and a search for effects work on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError
+from . import _check as check
+from . import _fits as io
+from .fringe_flat import FringeFlat
+from .mask import mask_bits
+
+__all__ = ["CUBE_UNITS", "FlatExposures", "FringeCube"]
+
+CUBE_UNITS = ("electron", "relative")
+"""Units of a cube: counts in electrons, or counts divided by their mean over the sensor (so near 1)."""
+
+_OWN = ("DETNAME", "LAYER")
+
+
+@dataclass(frozen=True, eq=False)
+class FlatExposures:
+    """How each plane of a cube was illuminated.
+
+    Parameters
+    ----------
+    wavelength_nm, bandwidth_fwhm_nm, temperature_k : array-like, shape ``(n_wavelengths,)``
+        Wavelength, full width at half maximum, and temperature of the sensor. One number for all wavelengths
+        is enough, except for the wavelength itself.
+    f_number : array-like, shape ``(n_wavelengths,)``, optional
+        Focal ratio; infinite (the default) for a collimated beam.
+    level_e : array-like, shape ``(n_wavelengths,)``, optional
+        Mean level in electrons; 0 (the default) where it is not known.
+    """
+
+    wavelength_nm: NDArray[np.float64]
+    bandwidth_fwhm_nm: NDArray[np.float64]
+    temperature_k: NDArray[np.float64]
+    f_number: NDArray[np.float64] = field(default_factory=lambda: np.array(np.inf))
+    level_e: NDArray[np.float64] = field(default_factory=lambda: np.array(0.0))
+
+    def __post_init__(self) -> None:
+        wavelength = check.as_float_array("wavelength", self.wavelength_nm, 1, np.float64)
+        number = wavelength.size
+        values = {
+            "wavelength_nm": _positive("wavelength", wavelength, number),
+            "bandwidth_fwhm_nm": _positive("bandwidth_fwhm", self.bandwidth_fwhm_nm, number, zero=True),
+            "temperature_k": _positive("temperature", self.temperature_k, number),
+            "f_number": _positive("f_number", self.f_number, number, infinite=True),
+            "level_e": _positive("level", self.level_e, number, zero=True),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return int(self.wavelength_nm.size)
+
+    def take(self, index: ArrayLike) -> FlatExposures:
+        """Exposures at the given positions, in the given order."""
+        at = np.asarray(index)
+        return FlatExposures(
+            self.wavelength_nm[at],
+            self.bandwidth_fwhm_nm[at],
+            self.temperature_k[at],
+            self.f_number[at],
+            self.level_e[at],
+        )
+
+
+def _positive(
+    name: str, values: ArrayLike, number: int, *, zero: bool = False, infinite: bool = False
+) -> NDArray[np.float64]:
+    if np.ndim(values) == 0:
+        values = np.full(number, values)
+    array = check.as_float_array(name, values, 1, np.float64)
+    if array.size != number:
+        raise FrameFormatError(name, f"{array.size} values", f"{number}, one for each wavelength")
+    good = (array >= 0 if zero else array > 0) & (np.isfinite(array) | (infinite & ~np.isnan(array)))
+    if not good.all():
+        sign = "not negative" if zero else "positive"
+        raise OutOfRangeError(name, float(array[~good][0]), f"{sign}{'' if infinite else ' and finite'}")
+    return check.read_only(array.astype(np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class FringeCube:
+    """Flats of one sensor, one plane for each wavelength, in the order given.
+
+    Parameters
+    ----------
+    image : `numpy.ndarray`, float32, shape ``(n_wavelengths, ny, nx)``
+        Counts, in ``unit``. May be memory-mapped and big-endian: convert what you take out of it.
+    variance : `numpy.ndarray`, float32, shape of ``image``
+        Variance, in the square of ``unit``.
+    mask : `numpy.ndarray`, int32, shape of ``image``
+        Planes of `MASK_PLANES`; 0 is good.
+    exposures : `FlatExposures`
+        Illumination of each plane.
+    unit : `str`
+        ``electron``, or ``relative``: counts over their mean, so near 1.
+    thickness, thickness_sigma : `numpy.ndarray`, float32, shape ``(ny, nx)``, optional
+        Known thickness of ``layer`` and its uncertainty, in µm; not a number where not known.
+    layer : `str`
+        Layer whose thickness that is, as ``epoxy``; needed when ``thickness`` is given.
+    detector : `str`
+        Name of the sensor; empty if not known.
+    metadata : `Mapping`
+        Further header keywords.
+
+    Raises
+    ------
+    FrameFormatError
+        Arrays of the wrong type or shape, or good pixels without a number.
+    InputError
+        An unknown unit, a thickness without the name of its layer, metadata that a header cannot hold.
+    """
+
+    image: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    mask: NDArray[np.int32]
+    exposures: FlatExposures
+    unit: str = "electron"
+    thickness: NDArray[np.float32] | None = None
+    thickness_sigma: NDArray[np.float32] | None = None
+    layer: str = ""
+    detector: str = ""
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.unit not in CUBE_UNITS:
+            raise UnknownNameError("BUNIT", self.unit, CUBE_UNITS)
+        if not isinstance(self.exposures, FlatExposures):
+            raise InputError("exposures", type(self.exposures).__name__, "FlatExposures")
+        image = check.as_float_array("IMAGE", self.image, 3)
+        variance = check.as_float_array("VARIANCE", self.variance, 3)
+        mask = check.as_mask("MASK", self.mask, image.shape)
+        check.check_shape("VARIANCE", variance, image.shape)
+        if len(self.exposures) != image.shape[0]:
+            raise FrameFormatError(
+                "EXPOSURES", f"{len(self.exposures)} rows", f"{image.shape[0]}, one for each plane of IMAGE"
+            )
+        check.check_good_pixels("IMAGE", image, mask)
+        check.check_good_pixels("VARIANCE", variance, mask, nonnegative=True)
+        if self.unit == "relative":
+            _refuse_amplitudes(image, mask)
+        values = {
+            "image": image,
+            "variance": variance,
+            "mask": mask,
+            "thickness": _map("THICKNESS", self.thickness, image.shape[1:]),
+            "thickness_sigma": _map("THICKNESS_SIGMA", self.thickness_sigma, image.shape[1:]),
+            "layer": check.check_name("LAYER", self.layer, empty=self.thickness is None),
+            "detector": check.check_name("detector", self.detector),
+            "metadata": io.normalise_metadata(self.metadata),
+        }
+        if self.thickness is None and self.thickness_sigma is not None:
+            raise FrameFormatError("THICKNESS", "missing", "a map beside THICKNESS_SIGMA")
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Wavelengths, rows, columns."""
+        return (self.image.shape[0], self.image.shape[1], self.image.shape[2])
+
+    @property
+    def wavelength_nm(self) -> NDArray[np.float64]:
+        """Wavelength of each plane, in nm."""
+        return self.exposures.wavelength_nm
+
+    def take(self, index: ArrayLike) -> FringeCube:
+        """Cube of the planes at the given positions, in the given order."""
+        at = np.asarray(index)
+        return FringeCube(
+            self.image[at],
+            self.variance[at],
+            self.mask[at],
+            self.exposures.take(at),
+            self.unit,
+            self.thickness,
+            self.thickness_sigma,
+            self.layer,
+            self.detector,
+            self.metadata,
+        )
+
+    @classmethod
+    def from_flats(cls, flats: Sequence[FringeFlat], metadata: Mapping[str, Any] | None = None) -> Self:
+        """Stack prepared flats into a relative cube, sorted by wavelength.
+
+        Equal wavelengths keep the order in which they are given. Masked pixels without a number become 1
+        with variance 0, and stay masked.
+
+        Raises
+        ------
+        InputError
+            No flats at all.
+        FrameFormatError
+            Flats of different shapes or different sensors.
+        """
+        if not flats:
+            raise InputError("flats", "none", "at least one flat")
+        ordered = sorted(flats, key=lambda flat: flat.wavelength_nm)
+        first = ordered[0]
+        for flat in ordered:
+            if flat.shape != first.shape:
+                raise FrameFormatError(
+                    f"flat at {flat.wavelength_nm:g} nm", f"shape {flat.shape}", f"shape {first.shape}"
+                )
+            if flat.detector != first.detector:
+                raise FrameFormatError(
+                    f"flat at {flat.wavelength_nm:g} nm",
+                    f"sensor {flat.detector or 'unnamed'}",
+                    f"sensor {first.detector or 'unnamed'}",
+                )
+        cube = (len(ordered), *first.shape)
+        image, variance = np.empty(cube, np.float32), np.empty(cube, np.float32)
+        mask = np.empty(cube, np.int32)
+        for plane, flat in enumerate(ordered):
+            image[plane] = np.nan_to_num(flat.image + np.float32(1), nan=1, posinf=1, neginf=1)
+            variance[plane] = np.nan_to_num(flat.variance, nan=0, posinf=0, neginf=0)
+            mask[plane] = flat.mask
+        exposures = FlatExposures(
+            np.array([flat.wavelength_nm for flat in ordered]),
+            np.array([flat.bandwidth_fwhm_nm for flat in ordered]),
+            np.array([flat.temperature_k for flat in ordered]),
+            np.array([flat.f_number for flat in ordered]),
+            np.array([flat.level_e for flat in ordered]),
+        )
+        return cls(
+            image,
+            variance,
+            mask,
+            exposures,
+            "relative",
+            detector=first.detector,
+            metadata={} if metadata is None else metadata,
+        )
+
+    def write_fits(self, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
+        """Write IMAGE, VARIANCE, MASK, EXPOSURES, and THICKNESS, THICKNESS_SIGMA if they are known.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write; an existing one is replaced when the new one is complete.
+        metadata : `Mapping`, optional
+            Further header keywords, which win over those of the product.
+        """
+        own: list[tuple[str, io.Scalar, str]] = [("DETNAME", self.detector, "sensor")]
+        if self.layer:
+            own.append(("LAYER", self.layer, "layer of THICKNESS"))
+        hdus = [
+            io.primary_hdu("FringeCube", own, io.merge_metadata(self.metadata, metadata)),
+            io.image_hdu("IMAGE", self.image, unit=self.unit),
+            io.image_hdu(
+                "VARIANCE", self.variance, unit="electron2" if self.unit == "electron" else "relative2"
+            ),
+            io.mask_hdu(self.mask),
+            self._exposures_hdu(),
+        ]
+        for name, data in (("THICKNESS", self.thickness), ("THICKNESS_SIGMA", self.thickness_sigma)):
+            if data is not None:
+                hdus.append(io.image_hdu(name, data, unit="um", cards=[("LAYER", self.layer, "layer")]))
+        io.write_hdus(path, hdus)
+
+    def _exposures_hdu(self) -> fits.BinTableHDU:
+        rows = self.exposures
+        return io.bintable_hdu(
+            "EXPOSURES",
+            [
+                ("wavelength", rows.wavelength_nm, "nm"),
+                ("bandwidth_fwhm", rows.bandwidth_fwhm_nm, "nm"),
+                ("temperature", rows.temperature_k, "K"),
+                ("f_number", rows.f_number, None),
+                ("level", rows.level_e, "electron"),
+            ],
+        )
+
+    @classmethod
+    def read_fits(cls, path: str | os.PathLike[str], *, memmap: bool = False) -> Self:
+        """Read a cube, from this package or from elsewhere.
+
+        Good pixels that hold no number (or no variance) are masked as NO_DATA. A mask ``[y, x]`` holds for
+        every wavelength.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        memmap : `bool`, optional
+            Leave images and masks on disk until touched; the checksums are then not compared.
+
+        Raises
+        ------
+        InputError
+            No such file, a missing extension or column, a wrong unit; the message names the file.
+        """
+        source = str(path)
+        with io.open_fits(path, "FringeCube", memmap=memmap, verify=not memmap) as hdus:
+            header = hdus[0].header
+            image = io.read_image(hdus, "IMAGE", source=source, native=not memmap)
+            variance = io.read_image(hdus, "VARIANCE", source=source, native=not memmap)
+            mask = io.read_mask(hdus, source=source, native=not memmap)
+            if mask.ndim == 2 and image.ndim == 3 and mask.shape == image.shape[1:]:
+                mask = np.broadcast_to(mask, image.shape)
+            maps = {
+                name: io.read_image(hdus, name, source=source) if name in hdus else None
+                for name in ("THICKNESS", "THICKNESS_SIGMA")
+            }
+            return cls(
+                image=image,
+                variance=variance,
+                mask=_mask_what_is_no_number(image, variance, mask),
+                exposures=_read_exposures(hdus, source),
+                unit=io.read_keyword(hdus["IMAGE"].header, "BUNIT", source=source),
+                thickness=maps["THICKNESS"],
+                thickness_sigma=maps["THICKNESS_SIGMA"],
+                layer=_read_layer(hdus),
+                detector=header.get("DETNAME", ""),
+                metadata=io.read_metadata(header, _OWN),
+            )
+
+
+def _map(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+    if values is None:
+        return None
+    array = check.as_float_array(name, values, 2)
+    check.check_shape(name, array, shape)
+    if bool(np.any(array < 0)):
+        raise OutOfRangeError(name, float(np.nanmin(array)), "0 or more, in um")
+    return array
+
+
+def _refuse_amplitudes(image: NDArray[Any], mask: NDArray[Any]) -> None:
+    """Refuse counts/mean - 1 where counts/mean belongs: a fit would run on either, and be wrong on one."""
+    plane = next((k for k in range(image.shape[0]) if (mask[k] == 0).any()), None)
+    if plane is None:
+        return
+    middle = float(np.median(image[plane][mask[plane] == 0]))
+    if not 0.5 < middle < 2:
+        raise OutOfRangeError("IMAGE (relative)", middle, "counts over their mean, with a median near 1")
+
+
+def _mask_what_is_no_number(
+    image: NDArray[Any], variance: NDArray[Any], mask: NDArray[Any]
+) -> NDArray[np.int32]:
+    if not image.shape == variance.shape == mask.shape or image.ndim != 3:
+        return mask  # the constructor says what is wrong
+    result = mask
+    for plane in range(image.shape[0]):
+        wrong = ~(np.isfinite(image[plane]) & np.isfinite(variance[plane])) & (mask[plane] == 0)
+        if wrong.any():
+            if result is mask:
+                result = np.array(mask, dtype=np.int32)
+            result[plane][wrong] |= mask_bits("NO_DATA")
+    return result
+
+
+def _read_exposures(hdus: fits.HDUList, source: str) -> FlatExposures:
+    if "EXPOSURES" not in hdus or not isinstance(hdus["EXPOSURES"], fits.BinTableHDU):
+        raise FrameFormatError("extension", "no EXPOSURES", "a binary table named EXPOSURES", source=source)
+    table = hdus["EXPOSURES"].data
+    names = {str(name).lower(): str(name) for name in table.names}
+    absent = {"f_number": np.inf, "level": 0.0}
+    columns: list[NDArray[Any]] = []
+    for name in ("wavelength", "bandwidth_fwhm", "temperature", "f_number", "level"):
+        if name in names:
+            columns.append(np.array(table[names[name]]))
+        elif name in absent:
+            columns.append(np.array(absent[name]))
+        else:
+            raise FrameFormatError("EXPOSURES", f"no column {name}", "a column of that name", source=source)
+    return FlatExposures(*columns)
+
+
+def _read_layer(hdus: fits.HDUList) -> str:
+    """Name of the layer: from the primary header, or from that of the map."""
+    for header in (hdus[0].header, *(hdus[name].header for name in ("THICKNESS",) if name in hdus)):
+        if "LAYER" in header:
+            return str(header["LAYER"])
+    return ""
