@@ -1,0 +1,231 @@
+"""What a physical effect is: a few parameters with null values, and one change to the model.
+
+An effect is one small file with one final subclass of `Effect` and one line in `EFFECTS`. At its null values it is
+exactly the identity: the object that it was given is returned unchanged.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..optics.system import OpticalSystem
+
+__all__ = [
+    "ActiveEffect",
+    "Effect",
+    "Parameter",
+    "ResponseContext",
+    "activate_effects",
+    "apply_to_response",
+    "apply_to_system",
+]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that says how strong an effect is.
+
+    Attributes
+    ----------
+    name, unit, description : `str`
+        ``unit`` is empty for pure numbers.
+    null : `float`
+        Value at which the effect is absent. NaN means "as the set-up says".
+    bounds : `tuple` [`float`, `float`]
+        Smallest and largest value in which the model is meaningful.
+    prior_scale : `float`
+        Typical departure from null in a real laboratory, in the same unit.
+    """
+
+    name: str
+    unit: str
+    null: float
+    bounds: tuple[float, float]
+    prior_scale: float
+    description: str
+
+
+@dataclass(frozen=True)
+class ResponseContext:
+    """What an effect on the response may know besides the response itself.
+
+    Attributes
+    ----------
+    wavelength_nm : `numpy.ndarray`, shape ``(W,)``
+        Nominal wavelengths [nm].
+    phase_mean : `numpy.ndarray`, shape ``(W,)``
+        Response averaged over the fringe phase.
+    """
+
+    wavelength_nm: FloatArray
+    phase_mean: FloatArray
+
+
+class Effect(ABC):
+    """A physical effect with named parameters.
+
+    Subclasses are final. They override `change_system`, or `change_response`, or both; each is only called when
+    some parameter differs from its null value.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    acts_on: ClassVar[str]
+    """``stack``, ``illumination`` or ``response``."""
+    parameters: ClassVar[tuple[Parameter, ...]]
+    reference: ClassVar[str]
+
+    def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
+        """Return the optical system with the effect in it."""
+        return system
+
+    def change_response(
+        self, response: FloatArray, values: Mapping[str, float], context: ResponseContext
+    ) -> FloatArray:
+        """Return the response ``[W, ...]`` with the effect in it; must not write into ``response``."""
+        return response
+
+    @abstractmethod
+    def null_values(self, system: OpticalSystem) -> dict[str, float]:
+        """Value of every parameter at which this effect leaves ``system`` as it is."""
+
+    def parameter(self, name: str) -> Parameter:
+        """Parameter called ``name``.
+
+        Raises
+        ------
+        UnknownNameError
+            The effect has no such parameter.
+        """
+        for candidate in self.parameters:
+            if candidate.name == name:
+                return candidate
+        raise UnknownNameError(
+            f"parameter of effect {self.name}", name, [parameter.name for parameter in self.parameters]
+        )
+
+
+class PlainNullEffect(Effect):
+    """An effect whose null values are the constants declared with its parameters."""
+
+    def null_values(self, system: OpticalSystem) -> dict[str, float]:
+        """The declared null values."""
+        return {parameter.name: parameter.null for parameter in self.parameters}
+
+
+@dataclass(frozen=True)
+class ActiveEffect:
+    """An effect with values for its parameters; those not given are at null.
+
+    Attributes
+    ----------
+    effect : `Effect`
+        Which effect.
+    values : `dict` [`str`, `float`]
+        Values by parameter name, validated.
+    """
+
+    effect: Effect
+    values: dict[str, float]
+
+    def __post_init__(self) -> None:
+        for name, value in self.values.items():
+            parameter = self.effect.parameter(name)
+            low, high = parameter.bounds
+            if not low <= value <= high:
+                raise OutOfRangeError(
+                    f"{self.effect.name}.{name} [{parameter.unit or '1'}]", value, f"{low:g} to {high:g}"
+                )
+
+    def complete_values(self, system: OpticalSystem) -> dict[str, float]:
+        """Values of all parameters, null where none is given."""
+        return {**self.effect.null_values(system), **self.values}
+
+    def is_null(self, system: OpticalSystem) -> bool:
+        """Whether every value equals its null."""
+        return self.complete_values(system) == self.effect.null_values(system)
+
+
+def activate_effects(settings: Mapping[str, Any], effects: Sequence[Effect]) -> tuple[ActiveEffect, ...]:
+    """Turn settings into active effects, in the order of the catalogue.
+
+    Parameters
+    ----------
+    settings : mapping
+        Either ``{"bandwidth.fwhm": 2.4}`` or ``{"bandwidth": {"fwhm": 2.4}}``, or both mixed.
+    effects : sequence of `Effect`
+        The catalogue.
+
+    Raises
+    ------
+    UnknownNameError
+        An effect or a parameter that is not in the catalogue.
+    OutOfRangeError
+        A value outside the bounds of its parameter.
+    InputError
+        A value that is not a number, or a setting without a parameter.
+    """
+    by_name = {effect.name: effect for effect in effects}
+    chosen: dict[str, dict[str, float]] = {}
+    for effect_name, parameter_name, value in _flatten(settings):
+        if effect_name not in by_name:
+            raise UnknownNameError("effect", effect_name, by_name)
+        by_name[effect_name].parameter(parameter_name)
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            raise InputError(f"{effect_name}.{parameter_name}", value, "a number") from None
+        chosen.setdefault(effect_name, {})[parameter_name] = number
+    return tuple(ActiveEffect(effect, chosen[effect.name]) for effect in effects if effect.name in chosen)
+
+
+def apply_to_system(active: Iterable[ActiveEffect], system: OpticalSystem) -> OpticalSystem:
+    """Optical system with all effects in it."""
+    changed = system
+    for item in active:
+        if not item.is_null(system):
+            changed = item.effect.change_system(changed, item.complete_values(system))
+    return changed
+
+
+def apply_to_response(
+    active: Iterable[ActiveEffect], system: OpticalSystem, response: FloatArray, context: ResponseContext
+) -> FloatArray:
+    """Response ``[W, ...]`` with all effects in it; ``response`` itself is left alone.
+
+    Parameters
+    ----------
+    active : iterable of `ActiveEffect`
+        The effects.
+    system : `OpticalSystem`
+        The system before any effect, by which null values are judged.
+    response : `numpy.ndarray`, shape ``(W, ...)``
+        Response of the optics.
+    context : `ResponseContext`
+        Wavelengths and phase-averaged response.
+    """
+    for item in active:
+        if not item.is_null(system):
+            response = item.effect.change_response(response, item.complete_values(system), context)
+    return response
+
+
+def _flatten(settings: Mapping[str, Any]) -> Iterable[tuple[str, str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            for parameter, number in value.items():
+                yield str(key), str(parameter), number
+            continue
+        effect, dot, parameter = str(key).partition(".")
+        if not dot or not effect or not parameter:
+            raise InputError("effect setting", key, "name.parameter=value")
+        yield effect, parameter, value

@@ -1,0 +1,31 @@
+"""Light that converges instead of arriving parallel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from ..errors import InputError
+from ..optics.illumination import Beam
+from ..optics.system import OpticalSystem
+from .base import Parameter, PlainNullEffect
+
+__all__ = ["ConvergingBeam"]
+
+
+class ConvergingBeam(PlainNullEffect):
+    """A uniform cone of light in place of the parallel beam of the laboratory."""
+
+    name = "converging_beam"
+    title = "converging beam or extended source"
+    acts_on = "illumination"
+    reference = "Groom 2017; Guo, Walter, Lage & Lupton 2022, section 2.2 (4 inch sphere at 1 m: 2.9 deg)"
+    parameters = (
+        Parameter("numerical_aperture", "", 0.0, (0.0, 0.7), 0.05, "sine of the largest angle of incidence"),
+    )
+
+    def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
+        """Replace the beam by a cone."""
+        if system.beam.theta.size > 1:
+            raise InputError("effect converging_beam", "a beam of many angles", "set-ups with parallel light")
+        return replace(system, beam=Beam.cone(0.5 / values["numerical_aperture"], nodes=32))

@@ -1,0 +1,207 @@
+"""The one model that every stage uses: response of a pixel as a function of layer thickness."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..effects import (
+    EFFECTS,
+    ActiveEffect,
+    Effect,
+    ResponseContext,
+    activate_effects,
+    apply_to_response,
+    apply_to_system,
+)
+from ..errors import InputError
+from ..optics.illumination import DEFAULT_STEP_NM, Illumination
+from ..optics.phase_response import PhaseResponse
+from ..optics.system import OpticalSystem
+from .setup import Setup
+
+__all__ = ["FringeModel"]
+
+FloatArray = NDArray[np.float64]
+
+PHASE_MEAN_SAMPLES = 256
+"""Thicknesses over which the phase average is taken; the fringe harmonics are below 1e-12 beyond the 20th."""
+
+
+@dataclass(frozen=True)
+class FringeModel:
+    """Response of a sensor, with effects.
+
+    Attributes
+    ----------
+    setup : `Setup`
+        Where the numbers come from.
+    base_system : `OpticalSystem`
+        Stack and light before any effect.
+    effects : `tuple` [`ActiveEffect`, ...]
+        Effects with their values, in the order of the catalogue.
+    system : `OpticalSystem`
+        Stack and light with the effects in them.
+    """
+
+    setup: Setup
+    base_system: OpticalSystem
+    effects: tuple[ActiveEffect, ...] = ()
+    system: OpticalSystem = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "system", apply_to_system(self.effects, self.base_system))
+
+    @classmethod
+    def from_setup(
+        cls,
+        setup: str | Setup,
+        effects: Mapping[str, Any] | None = None,
+        *,
+        field_x_deg: float = 0.0,
+        field_y_deg: float = 0.0,
+        observable: str = "detection",
+        catalogue: Sequence[Effect] = EFFECTS,
+    ) -> FringeModel:
+        """Model of a set-up.
+
+        Parameters
+        ----------
+        setup : `str` or `Setup`
+            Set-up, by name or as an object.
+        effects : mapping, optional
+            ``{"bandwidth.fwhm": 2.4}`` or ``{"bandwidth": {"fwhm": 2.4}}``.
+        field_x_deg, field_y_deg : `float`, optional
+            Field position [deg]; decides the beam behind a telescope.
+        observable : {"detection", "total"}, optional
+            Absorption in the detection layer, or 1 - R - T of the stack as the paper's fit used.
+        catalogue : sequence of `Effect`, optional
+            The effects that may be named.
+
+        Raises
+        ------
+        UnknownNameError
+            An unknown set-up, effect or parameter.
+        OutOfRangeError
+            A value outside the bounds of its parameter.
+        """
+        chosen = Setup.from_name(setup) if isinstance(setup, str) else setup
+        system = chosen.optical_system(
+            field_x_deg=field_x_deg, field_y_deg=field_y_deg, observable=observable
+        )
+        return cls(chosen, system, activate_effects(effects or {}, catalogue))
+
+    def with_effects(self, effects: Mapping[str, Any], catalogue: Sequence[Effect] = EFFECTS) -> FringeModel:
+        """Same set-up and light with other effects in place of the present ones."""
+        return replace(self, effects=activate_effects(effects, catalogue))
+
+    @property
+    def effect_settings(self) -> dict[str, float]:
+        """Values of all effects by ``name.parameter``; what a header or an override file holds."""
+        return {
+            f"{item.effect.name}.{parameter}": value
+            for item in self.effects
+            for parameter, value in item.values.items()
+        }
+
+    def response(self, thickness_um: ArrayLike, wavelength_nm: ArrayLike) -> FloatArray:
+        """Response to monochromator flats.
+
+        Parameters
+        ----------
+        thickness_um : array_like
+            Thickness of the varying layer [µm], any shape.
+        wavelength_nm : array_like, shape ``(W,)``
+            Nominal wavelengths [nm].
+
+        Returns
+        -------
+        response : `numpy.ndarray`, shape ``(W, *thickness.shape)``
+            Detected electrons per incident photon.
+
+        Raises
+        ------
+        OutOfRangeError
+            A wavelength outside the range of a medium, or a thickness that is negative or not finite.
+        """
+        wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
+        illumination = self.system.flat_fields(wavelength)
+        return self.respond(illumination, thickness_um, wavelength)
+
+    def respond(
+        self, illumination: Illumination, thickness_um: ArrayLike, wavelength_nm: ArrayLike | None = None
+    ) -> FloatArray:
+        """Response to any illumination, effects included; shape ``(W, *thickness.shape)``."""
+        reduced = self.system.reduce(illumination)
+        response = reduced.averaged(illumination.weight, thickness_um)
+        return self.finish(reduced, illumination, response, wavelength_nm)
+
+    def respond_on_grid(
+        self,
+        illumination: Illumination,
+        start_um: float,
+        step_um: float,
+        count: int,
+        wavelength_nm: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Like `respond` on ``start + step * arange(count)``, several times faster; shape ``(W, count)``."""
+        reduced = self.system.reduce(illumination)
+        response = reduced.averaged_on_grid(illumination.weight, start_um, step_um, count)
+        return self.finish(reduced, illumination, response, wavelength_nm)
+
+    def response_on_grid(
+        self, wavelength_nm: ArrayLike, start_um: float, step_um: float, count: int
+    ) -> FloatArray:
+        """Like `response` on a uniform grid of thickness; shape ``(W, count)``."""
+        wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
+        illumination = self.system.flat_fields(wavelength)
+        return self.respond_on_grid(illumination, start_um, step_um, count, wavelength)
+
+    def thickness_derivative(self, thickness_um: ArrayLike, wavelength_nm: ArrayLike) -> FloatArray:
+        """Exact derivative of `response` with respect to thickness [1/µm].
+
+        Raises
+        ------
+        InputError
+            An effect acts on the response after the optics; its derivative is not known here.
+        """
+        late = [item.effect.name for item in self.effects if item.effect.acts_on == "response"]
+        if late:
+            raise InputError("effects", late, "effects of the stack or of the illumination")
+        illumination = self.system.flat_fields(wavelength_nm)
+        return self.system.reduce(illumination).averaged_derivative(illumination.weight, thickness_um)
+
+    def quadrature_error(self, wavelength_nm: ArrayLike, thickness_um: ArrayLike) -> float:
+        """Largest change of the response when the wavelength nodes are twice as dense."""
+        coarse = self.system.flat_fields(wavelength_nm)
+        fine = self.system.flat_fields(wavelength_nm, DEFAULT_STEP_NM / 2.0)
+        difference = self.respond(coarse, thickness_um) - self.respond(fine, thickness_um)
+        return float(np.abs(difference).max())
+
+    def finish(
+        self,
+        reduced: PhaseResponse,
+        illumination: Illumination,
+        response: FloatArray,
+        wavelength_nm: ArrayLike | None,
+    ) -> FloatArray:
+        """Apply the effects that act after the optics."""
+        if not any(item.effect.acts_on == "response" for item in self.effects):
+            return response
+        nominal = (
+            (illumination.weight * illumination.wavelength_nm).sum(axis=1)
+            if wavelength_nm is None
+            else np.asarray(wavelength_nm, dtype=float)
+        )
+        context = ResponseContext(nominal, self._phase_mean(reduced, illumination))
+        return apply_to_response(self.effects, self.base_system, response, context)
+
+    def _phase_mean(self, reduced: PhaseResponse, illumination: Illumination) -> FloatArray:
+        low, high = self.setup.thickness_range_um
+        step = (high - low) / PHASE_MEAN_SAMPLES
+        grid = reduced.averaged_on_grid(illumination.weight, low + 0.5 * step, step, PHASE_MEAN_SAMPLES)
+        return grid.mean(axis=1)

@@ -1,0 +1,253 @@
+"""Set-ups: which sensor, at which temperature, under which light. Each is one YAML file in ``data/setups``."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..errors import InputError, UnknownNameError
+from ..optics.illumination import (
+    Beam,
+    GaussianProfile,
+    MonochromaticProfile,
+    SpectralProfile,
+    TriangularProfile,
+)
+from ..optics.stack import LayerStack
+from ..optics.system import OpticalSystem
+from ..resources import list_resources, read_yaml
+
+__all__ = ["Setup", "setup_names"]
+
+_PROFILES = {"gaussian": GaussianProfile, "triangular": TriangularProfile}
+_BEAM_KEYS = {
+    "collimated": set[str](),
+    "cone": {"f_number", "obscuration"},
+    "telescope": {"telescope"},
+}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Sensor, temperature and light of one instrument or test stand.
+
+    Attributes
+    ----------
+    name, title, source : `str`
+        Name, one line of description, and where the numbers come from.
+    camera, detector : `str`
+        Camera and default detector.
+    stack : `LayerStack`
+        The sensor.
+    varying : `str`
+        Layer whose thickness varies over the sensor.
+    thickness_range_um : `tuple` [`float`, `float`]
+        Thicknesses of that layer that are searched [µm].
+    temperature_k : `float`
+        Temperature of the sensor [K].
+    kind : {"monochromator", "sky"}
+        What illuminates the sensor.
+    bandwidth_fwhm_nm : `float`
+        Width of the monochromator line [nm]; 0 on the sky, whose lines are listed.
+    profile_name : `str`
+        Shape of the line.
+    wavelengths_nm : `tuple` [`float`, ...]
+        Usual wavelengths of the flats [nm]; empty on the sky.
+    beam_kind, f_number, obscuration, telescope
+        The beam: parallel, a cone, or that of a telescope traced with batoid.
+    bandpass : `str`
+        Bandpass of the sky ("" in the laboratory).
+    effective_area_m2, pixel_scale_arcsec, exposure_s, airmass : `float`
+        Of a sky exposure; zero in the laboratory.
+    """
+
+    name: str
+    title: str
+    source: str
+    camera: str
+    detector: str
+    stack: LayerStack
+    varying: str
+    thickness_range_um: tuple[float, float]
+    temperature_k: float
+    kind: str
+    bandwidth_fwhm_nm: float
+    profile_name: str
+    wavelengths_nm: tuple[float, ...]
+    beam_kind: str
+    f_number: float
+    obscuration: float
+    telescope: str
+    bandpass: str
+    effective_area_m2: float
+    pixel_scale_arcsec: float
+    exposure_s: float
+    airmass: float
+
+    @classmethod
+    def from_name(cls, name: str) -> Setup:
+        """Set-up shipped with the package.
+
+        Raises
+        ------
+        UnknownNameError
+            There is no such set-up; near misses are offered.
+        """
+        if name not in setup_names():
+            raise UnknownNameError("set-up", name, setup_names())
+        return _shipped(name)
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Setup:
+        """Set-up described by a YAML file of the user, laid out like the shipped ones.
+
+        Raises
+        ------
+        InputError
+            The file is not such a description; the key at fault is named.
+        """
+        path = Path(path)
+        try:
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise InputError("set-up file", str(error).split("\n")[0], "YAML", source=str(path)) from None
+        return cls.from_mapping(path.stem, content, source_file=str(path))
+
+    @classmethod
+    def from_mapping(cls, name: str, content: Any, *, source_file: str | None = None) -> Setup:
+        """Set-up from the parsed content of a YAML file; errors as for `from_file`."""
+        reader = _Reader(content, source_file or name)
+        light = reader.section("illumination")
+        kind = light.choice("kind", ("monochromator", "sky"))
+        beam = light.section("beam")
+        beam_kind = beam.choice("kind", tuple(_BEAM_KEYS))
+        low, high = reader.numbers("thickness_range_um", count=2)
+        if not 0.0 <= low < high:
+            raise InputError(
+                "thickness_range_um", [low, high], "two increasing numbers", source=reader.source
+            )
+        laboratory = kind == "monochromator"
+        bandwidth = light.number("bandwidth_fwhm_nm", low=0.0, high=200.0) if laboratory else 0.0
+        setup = cls(
+            name=name,
+            title=reader.text("title"),
+            source=reader.text("source"),
+            camera=reader.text("camera"),
+            detector=reader.text("detector"),
+            stack=LayerStack.from_resource(reader.text("stack")),
+            varying=reader.text("varying"),
+            thickness_range_um=(low, high),
+            temperature_k=reader.number("temperature_k", low=100.0, high=400.0),
+            kind=kind,
+            bandwidth_fwhm_nm=bandwidth,
+            profile_name=light.choice("profile", tuple(_PROFILES)) if laboratory else "",
+            wavelengths_nm=tuple(light.numbers("wavelengths_nm")) if laboratory else (),
+            beam_kind=beam_kind,
+            f_number=beam.number("f_number", low=0.5, high=1e6) if beam_kind == "cone" else float("inf"),
+            obscuration=(
+                beam.number("obscuration", low=0.0, high=0.999, default=0.0) if beam_kind == "cone" else 0.0
+            ),
+            telescope=beam.text("telescope") if beam_kind == "telescope" else "",
+            bandpass="" if laboratory else light.text("bandpass"),
+            effective_area_m2=0.0 if laboratory else light.number("effective_area_m2", low=1e-6, high=1e6),
+            pixel_scale_arcsec=0.0 if laboratory else light.number("pixel_scale_arcsec", low=1e-6, high=1e4),
+            exposure_s=0.0 if laboratory else light.number("exposure_s", low=0.0, high=1e6),
+            airmass=0.0 if laboratory else light.number("airmass", low=1.0, high=10.0),
+        )
+        setup.stack.position(setup.varying)
+        return setup
+
+    @property
+    def profile(self) -> SpectralProfile:
+        """Shape of the monochromator line; a single wavelength on the sky."""
+        if self.kind == "sky" or self.bandwidth_fwhm_nm == 0.0:
+            return MonochromaticProfile()
+        return _PROFILES[self.profile_name](self.bandwidth_fwhm_nm)
+
+    def beam(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0) -> Beam:
+        """Angles of incidence at a field position [deg]; the position matters only behind a telescope."""
+        if self.beam_kind == "collimated":
+            return Beam.collimated()
+        if self.beam_kind == "cone":
+            return Beam.cone(self.f_number, self.obscuration)
+        from ..instrument.telescope import telescope_beam
+
+        return telescope_beam(self.telescope, field_x_deg, field_y_deg)
+
+    def optical_system(
+        self, *, field_x_deg: float = 0.0, field_y_deg: float = 0.0, observable: str = "detection"
+    ) -> OpticalSystem:
+        """Stack and light of this set-up without any further effect."""
+        return OpticalSystem(
+            stack=self.stack,
+            temperature_k=self.temperature_k,
+            profile=self.profile,
+            beam=self.beam(field_x_deg, field_y_deg),
+            varying=self.varying,
+            observable=observable,
+        )
+
+
+def setup_names() -> tuple[str, ...]:
+    """Names of the set-ups shipped with the package."""
+    return tuple(name.removesuffix(".yaml") for name in list_resources("setups"))
+
+
+@functools.lru_cache(maxsize=32)
+def _shipped(name: str) -> Setup:
+    return Setup.from_mapping(name, read_yaml("setups", f"{name}.yaml"), source_file=f"set-up {name}")
+
+
+class _Reader:
+    """Reads typed values from a mapping; every complaint names the key."""
+
+    def __init__(self, content: Any, source: str, prefix: str = "") -> None:
+        if not isinstance(content, Mapping):
+            raise InputError(prefix or "content", content, "a mapping", source=source)
+        self._content = content
+        self._prefix = f"{prefix}." if prefix else ""
+        self.source = source
+
+    def _get(self, key: str) -> Any:
+        if key not in self._content:
+            raise InputError(f"{self._prefix}{key}", None, "a value (the key is missing)", source=self.source)
+        return self._content[key]
+
+    def section(self, key: str) -> _Reader:
+        return _Reader(self._get(key), self.source, f"{self._prefix}{key}")
+
+    def text(self, key: str) -> str:
+        value = self._get(key)
+        if not isinstance(value, str) or not value.strip():
+            raise InputError(f"{self._prefix}{key}", value, "text", source=self.source)
+        return value
+
+    def choice(self, key: str, allowed: tuple[str, ...]) -> str:
+        value = self._get(key)
+        if value not in allowed:
+            raise UnknownNameError(f"{self._prefix}{key}", value, allowed, source=self.source)
+        return str(value)
+
+    def number(self, key: str, *, low: float, high: float, default: float | None = None) -> float:
+        if default is not None and key not in self._content:
+            return default
+        value = self._get(key)
+        good = isinstance(value, int | float) and not isinstance(value, bool)
+        if not good or not low <= value <= high:
+            raise InputError(f"{self._prefix}{key}", value, f"{low:g} to {high:g}", source=self.source)
+        return float(value)
+
+    def numbers(self, key: str, count: int | None = None) -> list[float]:
+        value = self._get(key)
+        good = isinstance(value, list) and all(
+            isinstance(item, int | float) and not isinstance(item, bool) for item in value
+        )
+        if not good or not value or (count is not None and len(value) != count):
+            wanted = f"a list of {count} numbers" if count else "a list of numbers"
+            raise InputError(f"{self._prefix}{key}", value, wanted, source=self.source)
+        return [float(item) for item in value]
