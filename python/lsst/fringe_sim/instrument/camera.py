@@ -1,0 +1,576 @@
+"""Cameras as data: detectors, their place in the focal plane, their amplifiers.
+
+Every number comes from a table or a YAML file in ``data/instrument``; a further camera of few sensors is one more
+YAML file there (``monocam.yaml`` shows the form).
+
+Coordinates are those of the assembled, trimmed CCD: ``[0, 0]`` is the lower-left pixel, ``y`` up.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, OutOfRangeError, ResourceError, UnknownNameError
+from ..resources import read_table, read_yaml
+
+__all__ = ["Amplifier", "Camera", "Detector", "RawSegment"]
+
+VENDORS = {"E2V": "e2v", "ITL": "ITL", "HAMAMATSU": "Hamamatsu"}
+"""Vendor as spelled here, by its upper-case spelling."""
+
+READOUT_FROM_LSSTCAM = "median of LSSTCam"
+"""Value of ``readout`` in a camera's YAML file for sensors whose own readout is not published."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RawSegment:
+    """Where the pixels of one amplifier stand in its raw image, read-out order.
+
+    Attributes
+    ----------
+    hdu : `int`
+        Number of the FITS HDU; 0 is the primary header.
+    extname : `str`
+        Name of the HDU, ``Segment10``.
+    shape : `tuple` [`int`, `int`]
+        Rows and columns of the raw image.
+    data_y0, data_x0 : `int`
+        First imaging row and column, counted from 0. Columns before ``data_x0`` are serial prescan; columns
+        right of the imaging section are serial overscan, rows above it parallel overscan.
+    """
+
+    hdu: int
+    extname: str
+    shape: tuple[int, int]
+    data_y0: int
+    data_x0: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Amplifier:
+    """One output of a CCD.
+
+    Attributes
+    ----------
+    name : `str`
+        Name, ``C00`` … ``C17`` for LSST sensors.
+    channel : `int`
+        Number, from 1, in the order of the raw file.
+    y0, x0 : `int`
+        Lower-left pixel of the amplifier in the assembled, trimmed CCD.
+    height, width : `int`
+        Imaging rows and columns.
+    flip_y, flip_x : `bool`
+        Whether the raw image is reversed along that axis when the CCD is assembled.
+    gain : `float`
+        Gain, electrons per ADU.
+    read_noise : `float`
+        Read noise, electrons rms.
+    saturation : `float`
+        Saturation level, ADU above bias.
+    raw : `RawSegment` or `None`
+        Layout of the raw image; `None` for cameras whose raw files are not in the LSST layout.
+    """
+
+    name: str
+    channel: int
+    y0: int
+    x0: int
+    height: int
+    width: int
+    flip_y: bool
+    flip_x: bool
+    gain: float
+    read_noise: float
+    saturation: float
+    raw: RawSegment | None = None
+
+    @property
+    def section(self) -> tuple[slice, slice]:
+        """The amplifier's pixels in the assembled CCD, as ``[y, x]`` slices."""
+        return slice(self.y0, self.y0 + self.height), slice(self.x0, self.x0 + self.width)
+
+
+@dataclasses.dataclass(frozen=True)
+class Detector:
+    """One sensor.
+
+    Attributes
+    ----------
+    id : `int`
+        Number within the camera.
+    name : `str`
+        ``R11_S01`` in LSSTCam, ``RTM-020_S01`` on TS8.
+    raft, slot : `str`
+        The two parts of the name.
+    vendor : `str`
+        ``e2v``, ``ITL`` or ``Hamamatsu``.
+    kind : `str`
+        ``science``, ``guider`` or ``wavefront``.
+    serial, raft_serial : `str`
+        Serial numbers of the sensor and of its raft; empty where not known.
+    x_mm, y_mm : `float`
+        Centre of the sensor in the focal plane, mm.
+    field_x_deg, field_y_deg : `float`
+        Field angle of the centre, degrees; nan on a test stand, which has no telescope.
+    yaw_deg : `float`
+        Rotation of the sensor in the focal plane, degrees.
+    pixel_um : `float`
+        Pixel pitch, µm.
+    amplifiers : `tuple` [`Amplifier`, ...]
+        Outputs, in the order of the raw file.
+    readout_source : `str`
+        Where gains and read noises come from.
+    """
+
+    id: int
+    name: str
+    raft: str
+    slot: str
+    vendor: str
+    kind: str
+    serial: str
+    raft_serial: str
+    x_mm: float
+    y_mm: float
+    field_x_deg: float
+    field_y_deg: float
+    yaw_deg: float
+    pixel_um: float
+    amplifiers: tuple[Amplifier, ...]
+    readout_source: str
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the assembled, trimmed CCD."""
+        return (
+            max(amp.y0 + amp.height for amp in self.amplifiers),
+            max(amp.x0 + amp.width for amp in self.amplifiers),
+        )
+
+    @property
+    def gain(self) -> float:
+        """Mean gain of the amplifiers, electrons per ADU."""
+        return float(np.mean([amp.gain for amp in self.amplifiers]))
+
+    @property
+    def read_noise(self) -> float:
+        """Mean read noise of the amplifiers, electrons rms."""
+        return float(np.mean([amp.read_noise for amp in self.amplifiers]))
+
+    @property
+    def field_radius_deg(self) -> float:
+        """Distance of the centre from the optical axis, degrees; nan on a test stand."""
+        return math.hypot(self.field_x_deg, self.field_y_deg)
+
+    def amplifier(self, name: str) -> Amplifier:
+        """Return one amplifier by name.
+
+        Raises
+        ------
+        UnknownNameError
+            The sensor has no such amplifier.
+        """
+        for amp in self.amplifiers:
+            if amp.name == name:
+                return amp
+        raise UnknownNameError("amplifier", name, (amp.name for amp in self.amplifiers), source=self.name)
+
+    def cut_down(self, shape: tuple[int, int]) -> Detector:
+        """Return the same sensor with fewer (or more) pixels per amplifier.
+
+        Names, order, gains, flips and the widths of prescan and overscan stay; what changes is the number of
+        imaging rows and columns.
+
+        Parameters
+        ----------
+        shape : `tuple` [`int`, `int`]
+            Rows and columns of the assembled CCD; divisible by the rows and columns of amplifiers.
+
+        Raises
+        ------
+        InputError
+            The size cannot be divided evenly among the amplifiers.
+        """
+        n_columns = len({amp.x0 for amp in self.amplifiers})
+        n_rows = len({amp.y0 for amp in self.amplifiers})
+        height, rest_y = divmod(shape[0], n_rows)
+        width, rest_x = divmod(shape[1], n_columns)
+        if rest_y or rest_x or height < 1 or width < 1:
+            raise InputError(
+                "detector shape (rows, columns)",
+                shape,
+                f"positive multiples of {n_rows} rows and {n_columns} columns",
+                source=self.name,
+            )
+        return dataclasses.replace(
+            self, amplifiers=tuple(_resized(amp, height, width) for amp in self.amplifiers)
+        )
+
+
+def _resized(amp: Amplifier, height: int, width: int) -> Amplifier:
+    raw = amp.raw
+    if raw is not None:
+        shape = (raw.shape[0] + height - amp.height, raw.shape[1] + width - amp.width)
+        raw = dataclasses.replace(raw, shape=shape)
+    return dataclasses.replace(
+        amp,
+        y0=amp.y0 // amp.height * height,
+        x0=amp.x0 // amp.width * width,
+        height=height,
+        width=width,
+        raw=raw,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A set of detectors under one name.
+
+    Attributes
+    ----------
+    name : `str`
+        ``lsstCam``, ``ts8``, ``monocam`` or ``hsc``.
+    title : `str`
+        One line for people.
+    detectors : `tuple` [`Detector`, ...]
+        Every detector, by number.
+    """
+
+    name: str
+    title: str
+    detectors: tuple[Detector, ...]
+
+    @classmethod
+    def from_name(cls, name: str) -> Camera:
+        """Return one of the cameras shipped with the package.
+
+        Raises
+        ------
+        UnknownNameError
+            There is no such camera; near misses are offered.
+        """
+        return _load_camera(name)
+
+    @property
+    def science(self) -> tuple[Detector, ...]:
+        """Detectors that take science images."""
+        return tuple(detector for detector in self.detectors if detector.kind == "science")
+
+    @property
+    def rafts(self) -> tuple[str, ...]:
+        """Names of the rafts, sorted."""
+        return tuple(sorted({detector.raft for detector in self.detectors}))
+
+    def detector(self, key: int | str) -> Detector:
+        """Return one detector.
+
+        Parameters
+        ----------
+        key : `int` or `str`
+            Its number (``37`` or ``"37"``), its name (``"R11_S01"``) or its serial number
+            (``"E2V-CCD250-321"``, also with the suffix ``-Dev`` of the older files). On TS8 the name of the
+            place in LSSTCam that a sensor has today is understood too.
+
+        Raises
+        ------
+        UnknownNameError
+            The camera has no such detector; near misses are offered.
+        """
+        found = self._index.get(str(key).strip().removesuffix("-Dev"))
+        if found is None:
+            raise UnknownNameError("detector", key, self._names_like(str(key)), source=self.title)
+        return self.detectors[found]
+
+    def raft(self, name: str) -> tuple[Detector, ...]:
+        """Return the detectors of one raft, by slot.
+
+        Parameters
+        ----------
+        name : `str`
+            Name of the raft (``"R11"``), or the serial number of its module (``"RTM-020"`` or
+            ``"LCA-11021_RTM-020"``).
+
+        Raises
+        ------
+        UnknownNameError
+            The camera has no such raft; near misses are offered.
+        """
+        key = name.strip().removesuffix("-Dev")
+        members = [d for d in self.detectors if key in _raft_names(d)]
+        if not members and self.name != "lsstCam":
+            members = self._of_lsstcam_raft(key)
+        if not members:
+            known = {known for d in self.detectors for known in _raft_names(d) if known}
+            raise UnknownNameError("raft", name, known, source=self.title)
+        return tuple(sorted(members, key=lambda detector: detector.slot))
+
+    def _of_lsstcam_raft(self, name: str) -> list[Detector]:
+        serials = {d.serial for d in _load_camera("lsstCam").detectors if d.raft == name}
+        return [d for d in self.detectors if d.serial and d.serial in serials]
+
+    def _names_like(self, key: str) -> list[str]:
+        """Names to offer for a key that is not known: serial numbers if it looks like one."""
+        looks_like_serial = key.upper().startswith(("E2V", "ITL"))
+        return [d.serial if looks_like_serial else d.name for d in self.detectors]
+
+    @functools.cached_property
+    def _index(self) -> dict[str, int]:
+        index: dict[str, int] = {}
+        for position, detector in enumerate(self.detectors):
+            for key in (str(detector.id), detector.name, detector.serial):
+                if key:
+                    index[key] = position
+        if self.name == "ts8":
+            for detector in _load_camera("lsstCam").science:
+                if detector.serial in index:
+                    index.setdefault(detector.name, index[detector.serial])
+        return index
+
+
+def _raft_names(detector: Detector) -> tuple[str, str, str]:
+    module = detector.raft_serial.removesuffix("-Dev")
+    return detector.raft, module, module.rpartition("_")[2]
+
+
+@functools.cache
+def _load_camera(name: str) -> Camera:
+    loaders: dict[str, Callable[[], Camera]] = {
+        "lsstCam": _load_lsstcam,
+        "ts8": _load_ts8,
+        "monocam": functools.partial(_load_from_yaml, "monocam"),
+        "hsc": functools.partial(_load_from_yaml, "hsc"),
+    }
+    if name not in loaders:
+        raise UnknownNameError("camera", name, loaders)
+    return loaders[name]()
+
+
+def _vendor(spelling: str) -> str:
+    try:
+        return VENDORS[spelling.upper()]
+    except KeyError:
+        raise UnknownNameError("vendor", spelling, VENDORS.values()) from None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Readout:
+    """Gain, read noise and saturation level of one amplifier, and where they come from."""
+
+    gain: float
+    read_noise: float
+    saturation: float
+
+
+@functools.cache
+def _lsst_layout(vendor: str) -> tuple[dict[str, Any], ...]:
+    """Rows of the raw layout of one vendor, in the order of the HDUs."""
+    table = read_table("instrument", "lsst_raw_amp_layout.ecsv")
+    rows = [dict(zip(table.colnames, row, strict=True)) for row in table if row["vendor"] == vendor]
+    if not rows:
+        raise UnknownNameError("vendor", vendor, table["vendor"])
+    return tuple(sorted(rows, key=lambda row: row["hdu"]))
+
+
+def _lsst_amplifiers(vendor: str, readout: Mapping[str, _Readout]) -> tuple[Amplifier, ...]:
+    """Amplifiers of an LSST sensor; those without readout (half of a wavefront sensor) are left out."""
+    rows = [row for row in _lsst_layout(vendor) if row["amp"] in readout]
+    bottom = min(int(row["ccd_y0"]) for row in rows)
+    return tuple(
+        Amplifier(
+            name=str(row["amp"]),
+            channel=int(row["channel"]),
+            y0=int(row["ccd_y0"]) - bottom,
+            x0=int(row["ccd_x0"]),
+            height=int(row["data_h"]),
+            width=int(row["data_w"]),
+            flip_y=bool(row["flip_y"]),
+            flip_x=bool(row["flip_x"]),
+            gain=readout[str(row["amp"])].gain,
+            read_noise=readout[str(row["amp"])].read_noise,
+            saturation=readout[str(row["amp"])].saturation,
+            raw=RawSegment(
+                hdu=int(row["hdu"]),
+                extname=str(row["extname"]),
+                shape=(int(row["naxis2"]), int(row["naxis1"])),
+                data_y0=int(row["data_y0"]),
+                data_x0=int(row["data_x0"]),
+            ),
+        )
+        for row in rows
+    )
+
+
+@functools.cache
+def _lsstcam_readout() -> dict[int, dict[str, _Readout]]:
+    table = read_table("instrument", "lsstcam_amps.ecsv")
+    readout: dict[int, dict[str, _Readout]] = {}
+    for row in table:
+        readout.setdefault(int(row["detector"]), {})[str(row["amp"])] = _Readout(
+            float(row["gain"]), float(row["read_noise"]), float(row["saturation"])
+        )
+    return readout
+
+
+@functools.cache
+def _median_readout(vendor: str) -> dict[str, _Readout]:
+    """Median over the LSSTCam science sensors of one vendor, amplifier by amplifier."""
+    sensors = [{amp.name: amp for amp in d.amplifiers} for d in _load_lsstcam().science if d.vendor == vendor]
+    return {
+        name: _Readout(
+            float(np.median([amps[name].gain for amps in sensors])),
+            float(np.median([amps[name].read_noise for amps in sensors])),
+            float(np.median([amps[name].saturation for amps in sensors])),
+        )
+        for name in sensors[0]
+    }
+
+
+@functools.cache
+def _load_lsstcam() -> Camera:
+    table = read_table("instrument", "lsstcam_detectors.ecsv")
+    readout = _lsstcam_readout()
+    detectors = tuple(
+        Detector(
+            id=int(row["detector"]),
+            name=str(row["name"]),
+            raft=str(row["raft"]),
+            slot=str(row["slot"]),
+            vendor=_vendor(str(row["vendor"])),
+            kind=str(row["kind"]),
+            serial=str(row["ccd_serial"]),
+            raft_serial=str(row["raft_serial"]),
+            x_mm=float(row["x"]),
+            y_mm=float(row["y"]),
+            field_x_deg=float(row["field_x"]),
+            field_y_deg=float(row["field_y"]),
+            yaw_deg=float(row["yaw"]),
+            pixel_um=10.0,
+            amplifiers=_lsst_amplifiers(_vendor(str(row["vendor"])), readout[int(row["detector"])]),
+            readout_source="LSSTCam electro-optical tests (data/instrument/lsstcam_amps.ecsv)",
+        )
+        for row in table
+    )
+    return Camera("lsstCam", "LSST Camera", detectors)
+
+
+SENSOR_PITCH_MM = 42.25
+"""Distance between neighbouring sensors of a raft (data/instrument/lsstcam_detectors.ecsv)."""
+
+
+def _load_ts8() -> Camera:
+    by_serial = {d.serial: d for d in _load_lsstcam().science}
+    detectors = tuple(_ts8_detector(row, by_serial) for row in read_table("instrument", "ts8_detectors.ecsv"))
+    return Camera("ts8", "LSST raft test stand TS8 (SLAC and BNL)", detectors)
+
+
+def _ts8_detector(row: Mapping[str, Any], by_serial: Mapping[str, Detector]) -> Detector:
+    """One sensor on the test stand: alone with its raft, on no telescope."""
+    raft, slot, serial = str(row["raft"]), str(row["slot"]), str(row["ccd_serial"])
+    vendor = _vendor(str(row["vendor"]))
+    in_camera = by_serial.get(serial)
+    if in_camera is not None:
+        amplifiers = in_camera.amplifiers
+        source = f"LSSTCam electro-optical tests of {in_camera.name}, the same sensor"
+    else:
+        amplifiers = _lsst_amplifiers(vendor, _median_readout(vendor))
+        source = f"median of the {vendor} science sensors of LSSTCam"
+    return Detector(
+        id=int(row["detector"]),
+        name=f"{raft}_{slot}",
+        raft=raft,
+        slot=slot,
+        vendor=vendor,
+        kind="science",
+        serial=serial,
+        raft_serial=str(row["raft_serial"]),
+        x_mm=(int(slot[2]) - 1) * SENSOR_PITCH_MM,
+        y_mm=(int(slot[1]) - 1) * SENSOR_PITCH_MM,
+        field_x_deg=math.nan,
+        field_y_deg=math.nan,
+        yaw_deg=0.0,
+        pixel_um=10.0,
+        amplifiers=amplifiers,
+        readout_source=source,
+    )
+
+
+def _load_from_yaml(name: str) -> Camera:
+    """Camera of few sensors, described by ``data/instrument/<name>.yaml``."""
+    content = read_yaml("instrument", f"{name}.yaml")
+    try:
+        amplifiers, source = _yaml_amplifiers(content)
+        detectors = tuple(
+            _yaml_detector(content, entry, amplifiers, source) for entry in content["detectors"]
+        )
+        title = str(content["title"])
+    except KeyError as missing:
+        raise ResourceError(f"data/instrument/{name}.yaml lacks the entry {missing}") from None
+    _refuse_twins(name, (detector.id for detector in detectors))
+    return Camera(name, title, detectors)
+
+
+def _yaml_amplifiers(content: Mapping[str, Any]) -> tuple[tuple[Amplifier, ...], str]:
+    vendor = _vendor(str(content["vendor"]))
+    if content.get("readout") == READOUT_FROM_LSSTCAM:
+        source = f"median of the {vendor} science sensors of LSSTCam"
+        return _lsst_amplifiers(str(content["layout"]), _median_readout(vendor)), source
+    amplifiers = tuple(
+        Amplifier(
+            name=str(amp["name"]),
+            channel=channel,
+            y0=int(amp["y0"]),
+            x0=int(amp["x0"]),
+            height=int(amp["height"]),
+            width=int(amp["width"]),
+            flip_y=False,
+            flip_x=False,
+            gain=_positive("gain", amp["gain"]),
+            read_noise=_positive("read_noise", amp["read_noise"]),
+            saturation=_positive("saturation", amp["saturation"]),
+        )
+        for channel, amp in enumerate(content["amplifiers"], start=1)
+    )
+    return amplifiers, str(content["source"])
+
+
+def _yaml_detector(
+    content: Mapping[str, Any], entry: Mapping[str, Any], amplifiers: tuple[Amplifier, ...], source: str
+) -> Detector:
+    return Detector(
+        id=int(entry["id"]),
+        name=str(entry["name"]),
+        raft=str(entry["raft"]),
+        slot=str(entry["slot"]),
+        vendor=_vendor(str(content["vendor"])),
+        kind="science",
+        serial=str(entry["serial"]),
+        raft_serial=str(entry["raft_serial"]),
+        x_mm=float(entry["x_mm"]),
+        y_mm=float(entry["y_mm"]),
+        field_x_deg=float(entry["field_x_deg"]),
+        field_y_deg=float(entry["field_y_deg"]),
+        yaw_deg=0.0,
+        pixel_um=_positive("pixel_um", content["pixel_um"]),
+        amplifiers=amplifiers,
+        readout_source=source,
+    )
+
+
+def _positive(field: str, value: Any) -> float:
+    number = float(value)
+    if not (math.isfinite(number) and number > 0):
+        raise OutOfRangeError(field, value, "a positive number")
+    return number
+
+
+def _refuse_twins(name: str, ids: Iterable[int]) -> None:
+    numbers = list(ids)
+    if len(set(numbers)) != len(numbers):
+        raise ResourceError(f"data/instrument/{name}.yaml gives one detector number to two detectors")
