@@ -1,0 +1,133 @@
+"""One contract for all effects of the catalogue."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.effects import EFFECTS, Effect, activate_effects
+from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
+from lsst.fringe_sim.model import FringeModel
+
+WAVELENGTHS = np.array([900.0, 960.0, 985.0])
+CASES = [(effect, parameter) for effect in EFFECTS for parameter in effect.parameters]
+IDS = [f"{effect.name}.{parameter.name}" for effect, parameter in CASES]
+
+
+@pytest.fixture(scope="module")
+def base() -> FringeModel:
+    return FringeModel.from_setup("ts8_e2v")
+
+
+@pytest.fixture(scope="module")
+def thickness() -> np.ndarray:
+    return np.linspace(14.0, 15.2, 40)
+
+
+def null_of(effect: Effect, name: str, base: FringeModel) -> float:
+    return effect.null_values(base.base_system)[name]
+
+
+def test_names_are_unique() -> None:
+    names = [effect.name for effect in EFFECTS]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
+def test_every_effect_is_described(effect: Effect) -> None:
+    assert effect.title
+    assert effect.reference
+    assert effect.acts_on in {"stack", "illumination", "response"}
+    for parameter in effect.parameters:
+        assert parameter.description
+        assert parameter.bounds[0] < parameter.bounds[1]
+        assert parameter.prior_scale > 0.0
+        assert math.isnan(parameter.null) or parameter.bounds[0] <= parameter.null <= parameter.bounds[1]
+
+
+@pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
+def test_null_is_exactly_the_identity(effect, parameter, base, thickness) -> None:
+    null = null_of(effect, parameter.name, base)
+    changed = base.with_effects({effect.name: {parameter.name: null}})
+    assert changed.system is base.base_system
+    np.testing.assert_array_equal(
+        changed.response(thickness, WAVELENGTHS), base.response(thickness, WAVELENGTHS)
+    )
+
+
+@pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
+def test_onset_is_monotone_and_smooth(effect, parameter, base, thickness) -> None:
+    """Small departures from null change the response, and more the larger they are."""
+    null = null_of(effect, parameter.name, base)
+    low, high = parameter.bounds
+    direction = 1.0 if null < high else -1.0
+    reference = base.response(thickness, WAVELENGTHS)
+    changes = []
+    for size in (0.05, 0.1, 0.2):
+        value = float(np.clip(null + direction * size * parameter.prior_scale, low, high))
+        response = base.with_effects({effect.name: {parameter.name: value}}).response(thickness, WAVELENGTHS)
+        changes.append(np.abs(response - reference).max())
+    assert 0.0 < changes[0] < changes[1] < changes[2]
+
+
+@pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
+def test_finite_everywhere_in_bounds(effect, parameter, base, thickness) -> None:
+    for value in np.linspace(*parameter.bounds, 5):
+        response = base.with_effects({effect.name: {parameter.name: value}}).response(thickness, WAVELENGTHS)
+        assert np.all(np.isfinite(response))
+        assert np.all(response >= 0.0)
+
+
+@pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
+def test_nothing_is_mutated(effect, parameter, base, thickness) -> None:
+    before = dataclasses.replace(base.base_system)
+    reference = base.response(thickness, WAVELENGTHS)
+    null = null_of(effect, parameter.name, base)
+    value = float(np.clip(null + parameter.prior_scale, *parameter.bounds))
+    base.with_effects({effect.name: {parameter.name: value}}).response(thickness, WAVELENGTHS)
+    assert base.base_system == before
+    np.testing.assert_array_equal(base.response(thickness, WAVELENGTHS), reference)
+
+
+def test_both_spellings_agree() -> None:
+    dotted = activate_effects({"bandwidth.fwhm": 2.4}, EFFECTS)
+    nested = activate_effects({"bandwidth": {"fwhm": 2.4}}, EFFECTS)
+    assert dotted == nested
+
+
+def test_order_is_that_of_the_catalogue() -> None:
+    given = {"ghost_pedestal.fraction": 0.1, "epoxy_index.offset": 0.01, "bandwidth.fwhm": 3.0}
+    names = [item.effect.name for item in activate_effects(given, EFFECTS)]
+    assert names == ["epoxy_index", "bandwidth", "ghost_pedestal"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        ({"bandwith.fwhm": 2.0}, UnknownNameError, "did you mean bandwidth"),
+        ({"bandwidth.width": 2.0}, UnknownNameError, "fwhm"),
+        ({"bandwidth.fwhm": -1.0}, OutOfRangeError, "0.05 to 20"),
+        ({"bandwidth.fwhm": float("nan")}, OutOfRangeError, "0.05 to 20"),
+        ({"bandwidth.fwhm": "wide"}, InputError, "a number"),
+        ({"bandwidth": 2.0}, InputError, "name.parameter=value"),
+    ],
+)
+def test_bad_settings_are_refused(settings, error, words) -> None:
+    with pytest.raises(error, match=words):
+        activate_effects(settings, EFFECTS)
+
+
+def test_wider_bandpass_lowers_the_contrast(base, thickness) -> None:
+    narrow = base.response(thickness, WAVELENGTHS)
+    wide = base.with_effects({"bandwidth.fwhm": 6.0}).response(thickness, WAVELENGTHS)
+    assert np.all(wide.std(axis=1) < narrow.std(axis=1))
+
+
+def test_contrast_loss_scales_the_fringe_about_its_mean(base) -> None:
+    phase = np.linspace(14.0, 14.0 + 3.0, 400)
+    full = base.response(phase, WAVELENGTHS)
+    damped = base.with_effects({"contrast_loss.factor": 0.25}).response(phase, WAVELENGTHS)
+    np.testing.assert_allclose(np.ptp(damped, axis=1), 0.25 * np.ptp(full, axis=1), rtol=1e-12)
