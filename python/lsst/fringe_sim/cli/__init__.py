@@ -1,1 +1,5 @@
-"""cli."""
+"""The command line: ``fringe-sim``."""
+
+from .main import main
+
+__all__ = ["main"]

@@ -1,0 +1,101 @@
+"""``fringe-sim setups`` and ``fringe-sim effects``."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import click
+
+from ..effects import EFFECTS, Parameter
+from ..model import Setup, setup_names
+
+__all__ = ["effects", "setups"]
+
+
+@click.command()
+@click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
+def setups(as_json: bool) -> None:
+    """List the set-ups: sensors, telescopes and test stands.
+
+    \b
+    Example:
+      fringe-sim setups
+    """
+    found = [Setup.from_name(name) for name in setup_names()]
+    if as_json:
+        rows = [
+            {
+                "name": setup.name,
+                "title": setup.title,
+                "camera": setup.camera,
+                "detector": setup.detector,
+                "stack": setup.stack.name,
+                "varying": setup.varying,
+                "temperature_k": setup.temperature_k,
+                "light": setup.kind,
+                "source": setup.source,
+            }
+            for setup in found
+        ]
+        click.echo(json.dumps(rows, indent=2))
+        return
+    width = max(len(setup.name) for setup in found)
+    for setup in found:
+        click.echo(f"{setup.name:<{width}}  {setup.title}")
+        layers = f"{setup.stack.name}, {setup.varying} {setup.thickness_range_um[0]:g}"
+        light = (
+            f"{setup.bandwidth_fwhm_nm:g} nm {setup.profile_name} line"
+            if setup.kind == "monochromator"
+            else f"night sky through {setup.bandpass}"
+        )
+        click.echo(
+            f"{'':<{width}}  {layers}–{setup.thickness_range_um[1]:g} µm, {setup.temperature_k:g} K, {light}"
+        )
+
+
+@click.command()
+@click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
+def effects(as_json: bool) -> None:
+    """List the physical effects that the model knows, with parameters, units and null values.
+
+    \b
+    Example, with one of them switched on:
+      fringe-sim effects
+      fringe-sim mock-flats raws --setup ts8_e2v --effect bandwidth.fwhm=2.6 --seed 1
+    """
+    if as_json:
+        rows = [
+            {
+                "name": effect.name,
+                "title": effect.title,
+                "acts_on": effect.acts_on,
+                "reference": effect.reference,
+                "parameters": [
+                    {
+                        "name": parameter.name,
+                        "unit": parameter.unit,
+                        "null": None if math.isnan(parameter.null) else parameter.null,
+                        "bounds": list(parameter.bounds),
+                        "prior_scale": parameter.prior_scale,
+                        "description": parameter.description,
+                    }
+                    for parameter in effect.parameters
+                ],
+            }
+            for effect in EFFECTS
+        ]
+        click.echo(json.dumps(rows, indent=2))
+        return
+    for effect in EFFECTS:
+        click.echo(f"{effect.name}  ({effect.acts_on}: {effect.title})")
+        for parameter in effect.parameters:
+            click.echo(f"    {_describe(parameter)}")
+        click.echo(f"    {effect.reference}")
+
+
+def _describe(parameter: Parameter) -> str:
+    null = "as the set-up says" if math.isnan(parameter.null) else f"{parameter.null:g}"
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    low, high = parameter.bounds
+    return f".{parameter.name}: {parameter.description}; {low:g} to {high:g}{unit}, absent at {null}"

@@ -1,0 +1,121 @@
+"""``fringe-sim``: the group of commands, and what an exception becomes.
+
+Exit status: 0 done, 1 bad input, 2 usage, 3 internal failure.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import sys
+import traceback
+from collections.abc import Sequence
+
+import click
+
+from .. import __version__
+from ..errors import FringeSimError
+
+__all__ = ["cli", "main"]
+
+EXIT_BAD_INPUT = 1
+EXIT_USAGE = 2
+EXIT_INTERNAL = 3
+
+# Name of the command, module in which it is written, and its line in the overview.
+_COMMANDS = {
+    "demo": ("demo", "Run the whole chain on the built-in sensor."),
+    "setups": ("catalogue", "List the set-ups: sensors, telescopes, test stands."),
+    "effects": ("catalogue", "List the physical effects and their parameters."),
+    "mock-flats": ("mock_flats", "Write raw laboratory frames of a simulated sensor."),
+    "fit": ("fit", "Fit the layer thickness to raw flats."),
+    "sky": ("sky", "Simulate the fringes of the night sky."),
+}
+
+
+class _LazyGroup(click.Group):
+    """Imports a command when it is asked for, so that ``--help`` is quick."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in _COMMANDS:
+            return None
+        module = importlib.import_module(f".{_COMMANDS[name][0]}", __package__)
+        command: click.Command = getattr(module, name.replace("-", "_"))
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
+            import difflib
+
+            near = difflib.get_close_matches(args[0], _COMMANDS, n=2, cutoff=0.5)
+            hint = f" Did you mean {' or '.join(near)}?" if near else ""
+            ctx.fail(f"There is no command {args[0]!r}.{hint}")
+        return super().resolve_command(ctx, args)
+
+
+@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="fringe-sim")
+@click.option(
+    "--log-level",
+    type=click.Choice(["debug", "info", "warning", "error"], case_sensitive=False),
+    default="info",
+    show_default=True,
+    help="How much to say.",
+)
+def cli(log_level: str) -> None:
+    """CCD fringing: simulate, fit, forecast.
+
+    Lengths are in µm for layers and nm for wavelengths; temperatures in kelvin unless a unit is given.
+    """
+    logging.basicConfig(
+        level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr, force=True
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and exit with its status.
+
+    Parameters
+    ----------
+    arguments : sequence of `str`, optional
+        In place of ``sys.argv[1:]``.
+    """
+    sys.exit(run(arguments))
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status."""
+    try:
+        result = cli.main(args=arguments, prog_name="fringe-sim", standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        return int(stop.exit_code)
+    except click.Abort:
+        click.echo("Stopped.", err=True)
+        return EXIT_BAD_INPUT
+    except click.UsageError as error:
+        error.show()
+        return EXIT_USAGE
+    except click.ClickException as error:
+        error.show()
+        return EXIT_BAD_INPUT
+    except FringeSimError as error:
+        click.echo(f"fringe-sim: {error}", err=True)
+        return EXIT_BAD_INPUT
+    except OSError as error:
+        named = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        click.echo(f"fringe-sim: {named}", err=True)
+        return EXIT_BAD_INPUT
+    except Exception:
+        click.echo("fringe-sim: internal failure; this is a bug of the program.", err=True)
+        click.echo(traceback.format_exc(), err=True)
+        return EXIT_INTERNAL
+    return result if isinstance(result, int) else 0

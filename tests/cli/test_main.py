@@ -1,0 +1,99 @@
+"""The command line: exit status, help, near misses, types of arguments."""
+
+from __future__ import annotations
+
+import json
+
+import click
+import pytest
+
+from lsst.fringe_sim.cli.main import _COMMANDS, cli, run
+from lsst.fringe_sim.cli.parameters import EFFECT, SIZE, WAVELENGTHS, Quantity
+
+
+@pytest.mark.parametrize("name", sorted(_COMMANDS))
+def test_every_command_explains_itself(name, capsys) -> None:
+    assert run([name, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "Usage: fringe-sim" in text
+    assert "xample" in text, "every command shows an example"
+
+
+def test_overview_lists_every_command(capsys) -> None:
+    assert run(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in _COMMANDS)
+    assert cli.list_commands(click.Context(cli)) == list(_COMMANDS)
+
+
+def test_unknown_command_is_a_usage_error_with_a_hint(capsys) -> None:
+    assert run(["efects"]) == 2
+    assert "Did you mean effects?" in capsys.readouterr().err
+
+
+def test_unknown_option_is_a_usage_error() -> None:
+    assert run(["setups", "--nonsense"]) == 2
+
+
+def test_setups_as_json(capsys) -> None:
+    assert run(["setups", "--json"]) == 0
+    names = {row["name"] for row in json.loads(capsys.readouterr().out)}
+    assert {"ts8_e2v", "bnl_ts8_e2v", "ts8_itl", "monocam", "hsc", "lsst_e2v", "lsst_itl"} <= names
+
+
+def test_effects_as_json(capsys) -> None:
+    assert run(["effects", "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["bandwidth"]["parameters"][0]["unit"] == "nm"
+    assert rows["bandwidth"]["parameters"][0]["null"] is None
+
+
+def test_internal_failures_have_their_own_status(monkeypatch, capsys) -> None:
+    def broken(*args: object, **kwargs: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(cli, "main", broken)
+    assert run(["setups"]) == 3
+    assert "a bug" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("unit", "text", "value"),
+    [
+        ("nm", "960", 960.0),
+        ("nm", "0.96um", 960.0),
+        ("um", "14 µm", 14.0),
+        ("um", "14000nm", 14.0),
+        ("K", "-90degC", 183.15),
+        ("K", "183.15", 183.15),
+        ("s", "0.5min", 30.0),
+    ],
+)
+def test_quantities_take_units(unit, text, value) -> None:
+    assert Quantity(unit).convert(text, None, None) == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize("text", ["wide", "960 furlong", "12 s", "1e", ""])
+def test_bad_quantities_are_usage_errors(text) -> None:
+    with pytest.raises(click.BadParameter):
+        Quantity("nm").convert(text, None, None)
+
+
+def test_wavelength_ranges_include_the_end() -> None:
+    assert WAVELENGTHS.convert("880:990:10", None, None) == tuple(float(w) for w in range(880, 991, 10))
+    assert WAVELENGTHS.convert("880,0.9um", None, None) == (880.0, 900.0)
+
+
+@pytest.mark.parametrize("text", ["880:990", "990:880:10", "880:990:0", "1:100000:0.1"])
+def test_bad_wavelength_ranges_are_usage_errors(text) -> None:
+    with pytest.raises(click.BadParameter):
+        WAVELENGTHS.convert(text, None, None)
+
+
+def test_sizes_and_effects() -> None:
+    assert SIZE.convert("512x256", None, None) == (512, 256)
+    assert EFFECT.convert("bandwidth.fwhm=2.4", None, None) == ("bandwidth.fwhm", 2.4)
+    with pytest.raises(click.BadParameter):
+        SIZE.convert("512", None, None)
+    with pytest.raises(click.BadParameter):
+        EFFECT.convert("bandwidth=2.4", None, None)
