@@ -20,6 +20,7 @@ __all__ = [
     "check_name",
     "check_number",
     "check_shape",
+    "check_whole_number",
     "read_only",
 ]
 
@@ -128,6 +129,23 @@ def check_number(
         bracket = "(" if open_low else "["
         raise OutOfRangeError(field, number, f"a number in {bracket}{low:g}, {high:g}]")
     return number
+
+
+def check_whole_number(field: str, value: object, *, low: int, high: int) -> int:
+    """Return ``value`` as an integer inside ``[low, high]``.
+
+    Raises
+    ------
+    InputError
+        Not a whole number.
+    OutOfRangeError
+        Outside the interval.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise InputError(field, value, "a whole number")
+    if not low <= value <= high:
+        raise OutOfRangeError(field, int(value), f"a whole number in [{low}, {high}]")
+    return int(value)
 
 
 def check_name(field: str, value: object, *, empty: bool = True) -> str:

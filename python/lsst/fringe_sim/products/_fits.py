@@ -46,23 +46,31 @@ Scalar = bool | int | float | str | None
 PRODUCT_KEY = "PRODUCT"
 VERSION_KEY = "PRODVER"
 PRODUCT_VERSION = 1
+EXTENSIONS_KEY = "NEXTEND"
 
 # Keywords that describe the bytes of the file rather than the product.
 _STRUCTURAL = re.compile(
     r"SIMPLE|XTENSION|BITPIX|NAXIS\d*|EXTEND|PCOUNT|GCOUNT|GROUPS|BSCALE|BZERO|BLANK|TFIELDS|THEAP"
     r"|T(FORM|TYPE|UNIT|NULL|SCAL|ZERO|DIM|DISP)\d+|CHECKSUM|DATASUM|END|CONTINUE|COMMENT|HISTORY|LONGSTRN"
     r"|EXTNAME|EXTVER|EXTLEVEL|EXTTYPE|INHERIT|HIERARCH.*|Z(IMAGE|CMPTYPE|BITPIX|NAXIS\d*|TILE\d+)|MP_.*"
-    rf"|{PRODUCT_KEY}|{VERSION_KEY}|"
+    rf"|{PRODUCT_KEY}|{VERSION_KEY}|{EXTENSIONS_KEY}|"
 )
 _KEYWORD = re.compile(r"[A-Z0-9_\-]+( [A-Z0-9_\-]+)*")
 _LONGEST_KEYWORD = 50
 
 
-def normalise_metadata(metadata: Mapping[str, Any] | None) -> Mapping[str, Scalar]:
+def normalise_metadata(metadata: Mapping[str, Any] | None, own: Sequence[str] = ()) -> Mapping[str, Scalar]:
     """Freeze a mapping of header keywords, and make sure that a FITS header can hold it.
 
     Keywords are upper-cased; numpy scalars become Python ones; blanks at the end of a text are dropped, as
     FITS does.
+
+    Parameters
+    ----------
+    metadata : `Mapping` or `None`
+        Keywords and their values.
+    own : `~collections.abc.Sequence` [`str`], optional
+        Keywords that the product writes itself.
 
     Returns
     -------
@@ -72,21 +80,23 @@ def normalise_metadata(metadata: Mapping[str, Any] | None) -> Mapping[str, Scala
     Raises
     ------
     InputError
-        A keyword or a value that a FITS header cannot give back, or a keyword that describes the file itself.
+        A keyword or a value that a FITS header cannot give back, or a keyword that the file or the product
+        writes itself.
     """
     result: dict[str, Scalar] = {}
     for key, value in check_mapping("metadata", {} if metadata is None else metadata).items():
         keyword = _normalise_keyword(key)
+        if keyword in own:
+            raise InputError("metadata keyword", key, "a keyword that the product does not write itself")
         result[keyword] = _normalise_value(keyword, value)
     return MappingProxyType(result)
 
 
-def merge_metadata(*parts: Mapping[str, Any] | None) -> Mapping[str, Scalar]:
-    """Join mappings, later ones winning."""
-    joined: dict[str, Scalar] = {}
-    for part in parts:
-        joined.update(normalise_metadata(part))
-    return MappingProxyType(joined)
+def merge_metadata(
+    first: Mapping[str, Any], second: Mapping[str, Any] | None, own: Sequence[str]
+) -> Mapping[str, Scalar]:
+    """Join two mappings, the second winning."""
+    return MappingProxyType({**normalise_metadata(first, own), **normalise_metadata(second, own)})
 
 
 def _normalise_keyword(key: object) -> str:
@@ -109,6 +119,8 @@ def _normalise_value(keyword: str, value: object) -> Scalar:
         value = value.rstrip(" ")
     if value is not None and not isinstance(value, bool | int | float | str):
         raise InputError(f"metadata[{keyword}]", value, "text, a number, a truth value or None")
+    if isinstance(value, int) and abs(value) >= 2**63:
+        raise InputError(f"metadata[{keyword}]", value, "a whole number of at most 63 bits")
     try:
         returned = fits.Card.fromstring(_card(keyword, value).image).value
     except (ValueError, fits.VerifyError) as error:
@@ -136,19 +148,11 @@ def _card(keyword: str, value: Scalar, comment: str = "") -> fits.Card:
 def primary_hdu(
     product: str, own: Sequence[tuple[str, Scalar, str]], metadata: Mapping[str, Scalar]
 ) -> fits.PrimaryHDU:
-    """Empty primary HDU: what the product is, its own scalars, then the metadata.
-
-    Raises
-    ------
-    InputError
-        The metadata hold a keyword that the product writes itself.
-    """
+    """Empty primary HDU: what the product is, its own scalars, then the metadata."""
     hdu = fits.PrimaryHDU()
     hdu.header.append(fits.Card(PRODUCT_KEY, product, "class of lsst.fringe_sim.products"))
     hdu.header.append(fits.Card(VERSION_KEY, PRODUCT_VERSION, "layout of that class"))
     for keyword, value, comment in own:
-        if keyword in metadata:
-            raise InputError("metadata keyword", keyword, f"a keyword that {product} does not write itself")
         hdu.header.append(_card(keyword, value, comment))
     for keyword, value in metadata.items():
         hdu.header.append(_card(keyword, value))
@@ -198,6 +202,7 @@ def write_hdus(path: str | os.PathLike[str], hdus: Sequence[Any]) -> None:
     target = Path(path)
     if not target.parent.is_dir():
         raise InputError("folder", str(target.parent), "an existing folder", source=str(target))
+    hdus[0].header[EXTENSIONS_KEY] = (len(hdus) - 1, "number of extensions")
     for hdu in hdus:
         hdu.add_datasum(when="data unit checksum")
         hdu.add_checksum(when="HDU checksum", override_datasum=True)
@@ -238,10 +243,12 @@ def open_fits(
     if not Path(path).is_file():
         raise InputError("file", source, "an existing FITS file")
     try:
-        with warnings.catch_warnings():
+        # The stream is opened here because astropy leaves its own open when it stumbles.
+        with warnings.catch_warnings(), open(path, "rb") as stream:
             warnings.simplefilter("error")
-            with fits.open(path, memmap=memmap, checksum=verify, lazy_load_hdus=False) as hdus:
+            with fits.open(stream, memmap=memmap, checksum=verify, lazy_load_hdus=False) as hdus:
                 _check_product(hdus[0].header, product, source)
+                _check_complete(hdus, source)
                 yield hdus
     except InputError as error:
         raise (error if error.source else error.in_source(source)) from None
@@ -257,6 +264,21 @@ def _check_product(header: fits.Header, product: str, source: str) -> None:
     version = header.get(VERSION_KEY, PRODUCT_VERSION)
     if version != PRODUCT_VERSION:
         raise FrameFormatError(VERSION_KEY, version, str(PRODUCT_VERSION), source=source)
+
+
+def _check_complete(hdus: fits.HDUList, source: str) -> None:
+    """Refuse a file of ours that lost an extension, or a checksum and with it what would show damage."""
+    header = hdus[0].header
+    if PRODUCT_KEY not in header:
+        return
+    found = len(hdus) - 1
+    if header.get(EXTENSIONS_KEY) != found:
+        allowed = f"{header.get(EXTENSIONS_KEY)}, as {EXTENSIONS_KEY} says"
+        raise FrameFormatError("number of extensions", found, allowed, source=source)
+    for hdu in hdus:
+        for keyword in ("CHECKSUM", "DATASUM"):
+            if keyword not in hdu.header:
+                raise FrameFormatError(f"{keyword} of {hdu.name}", "missing", "a checksum", source=source)
 
 
 def read_metadata(header: fits.Header, own: Sequence[str]) -> dict[str, Scalar]:

@@ -87,7 +87,7 @@ class FringeComponents:
             "explained_variance_ratio": ratio,
             "scores": scores,
             "mask": check.as_mask("MASK", self.mask, mean.shape),
-            "metadata": io.normalise_metadata(self.metadata),
+            "metadata": io.normalise_metadata(self.metadata, _OWN),
             "detector": check.check_name("detector", self.detector),
             "physical_filter": check.check_name("physical_filter", self.physical_filter),
         }
@@ -118,7 +118,7 @@ class FringeComponents:
             ("explained_variance_ratio", self.explained_variance_ratio, None),
         ]
         hdus = [
-            io.primary_hdu("FringeComponents", own, io.merge_metadata(self.metadata, metadata)),
+            io.primary_hdu("FringeComponents", own, io.merge_metadata(self.metadata, metadata, _OWN)),
             io.image_hdu("MEAN", self.mean, unit=""),
             io.image_hdu("COMPONENTS", self.components, unit=""),
             io.mask_hdu(self.mask),

@@ -158,7 +158,7 @@ class FringeCube:
             "thickness_sigma": _map("THICKNESS_SIGMA", self.thickness_sigma, image.shape[1:]),
             "layer": check.check_name("LAYER", self.layer, empty=self.thickness is None),
             "detector": check.check_name("detector", self.detector),
-            "metadata": io.normalise_metadata(self.metadata),
+            "metadata": io.normalise_metadata(self.metadata, _OWN),
         }
         if self.thickness is None and self.thickness_sigma is not None:
             raise FrameFormatError("THICKNESS", "missing", "a map beside THICKNESS_SIGMA")
@@ -258,7 +258,7 @@ class FringeCube:
         if self.layer:
             own.append(("LAYER", self.layer, "layer of THICKNESS"))
         hdus = [
-            io.primary_hdu("FringeCube", own, io.merge_metadata(self.metadata, metadata)),
+            io.primary_hdu("FringeCube", own, io.merge_metadata(self.metadata, metadata, _OWN)),
             io.image_hdu("IMAGE", self.image, unit=self.unit),
             io.image_hdu(
                 "VARIANCE", self.variance, unit="electron2" if self.unit == "electron" else "relative2"

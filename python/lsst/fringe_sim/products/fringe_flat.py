@@ -82,7 +82,7 @@ class FringeFlat:
             "level_e": check.check_number("level_e", self.level_e, low=0, open_low=True),
             "f_number": check.check_number("f_number", self.f_number, low=0, open_low=True, allow_inf=True),
             "detector": check.check_name("detector", self.detector),
-            "metadata": io.normalise_metadata(self.metadata),
+            "metadata": io.normalise_metadata(self.metadata, _OWN),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -112,7 +112,7 @@ class FringeFlat:
         if math.isfinite(self.f_number):
             own.append(("FNUMBER", self.f_number, "focal ratio; absent: collimated"))
         hdus = [
-            io.primary_hdu("FringeFlat", own, io.merge_metadata(self.metadata, metadata)),
+            io.primary_hdu("FringeFlat", own, io.merge_metadata(self.metadata, metadata, _OWN)),
             io.image_hdu("IMAGE", self.image, unit=""),
             io.mask_hdu(self.mask),
             io.image_hdu("VARIANCE", self.variance, unit=""),

@@ -87,7 +87,7 @@ class FringeFrame:
             "physical_filter": check.check_name("physical_filter", self.physical_filter, empty=False),
             "detector": check.check_name("detector", self.detector),
             "xy0": (int(self.xy0[0]), int(self.xy0[1])),
-            "metadata": io.normalise_metadata(self.metadata),
+            "metadata": io.normalise_metadata(self.metadata, _OWN),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -108,7 +108,7 @@ class FringeFrame:
             Further header keywords, which win over those of the product.
         """
         hdus = [
-            self._primary_hdu(io.merge_metadata(self.metadata, metadata)),
+            self._primary_hdu(io.merge_metadata(self.metadata, metadata, _OWN)),
             io.image_hdu("IMAGE", self.image, cards=self._extension_cards("IMAGE")),
             io.mask_hdu(self.mask, cards=self._extension_cards("MASK")),
             io.image_hdu("VARIANCE", self.variance, cards=self._extension_cards("VARIANCE")),

@@ -86,12 +86,12 @@ class SkyFringe:
             "airmass": check.check_number("airmass", self.airmass, low=1, high=40),
             "hour": check.check_number("hour", self.hour, low=0, high=24),
             "quadrature_error": check.check_number("quadrature_error", self.quadrature_error, low=0),
-            "metadata": io.normalise_metadata(self.metadata),
+            "metadata": io.normalise_metadata(self.metadata, _OWN),
             "detector": check.check_name("detector", self.detector),
             "physical_filter": check.check_name("physical_filter", self.physical_filter),
         }
         if self.seed is not None:
-            values["seed"] = int(check.check_number("seed", self.seed, low=0, high=2**53))
+            values["seed"] = check.check_whole_number("seed", self.seed, low=0, high=2**63 - 1)
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -128,7 +128,7 @@ class SkyFringe:
         if self.seed is not None:
             own.append(("SEED", self.seed, "seed of the noise; absent: no noise"))
         hdus = [
-            io.primary_hdu("SkyFringe", own, io.merge_metadata(self.metadata, metadata)),
+            io.primary_hdu("SkyFringe", own, io.merge_metadata(self.metadata, metadata, _OWN)),
             io.image_hdu("IMAGE", self.image, unit=self.unit),
             io.mask_hdu(self.mask),
         ]

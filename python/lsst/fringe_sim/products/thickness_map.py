@@ -76,7 +76,7 @@ class ThicknessMap:
             "mask": mask,
             "layer": check.check_name("layer", self.layer, empty=False),
             "detector": check.check_name("detector", self.detector),
-            "metadata": io.normalise_metadata(self.metadata),
+            "metadata": io.normalise_metadata(self.metadata, _OWN),
             "n_wavelengths": _counts(self.n_wavelengths, value.shape),
         }
         for name in ("sigma", "chi2", "slip_probability"):
@@ -110,7 +110,7 @@ class ThicknessMap:
             ("LAYER", self.layer, "layer"),
         ]
         hdus = [
-            io.primary_hdu("ThicknessMap", own, io.merge_metadata(self.metadata, metadata)),
+            io.primary_hdu("ThicknessMap", own, io.merge_metadata(self.metadata, metadata, _OWN)),
             io.image_hdu("VALUE", self.value, unit="um"),
             io.image_hdu("SIGMA", self.sigma, unit="um"),
             io.image_hdu("CHI2", self.chi2, unit=""),

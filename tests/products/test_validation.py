@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from product_makers import MAKERS, components, cube, flat, frame, pixels, sky, thickness
+
+from lsst.fringe_sim.errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError
+from lsst.fringe_sim.products import FlatExposures, FringeCube
+
+GOOD = np.zeros((3, 4), dtype=int)
+
+
+def nan_at(shape: tuple[int, ...], at: tuple[int, ...], value: float = np.nan) -> np.ndarray:
+    values = np.abs(pixels(shape, 3)) + 1
+    values[at] = value
+    return values
+
+
+BAD: list[tuple[str, dict[str, Any], type[InputError], str]] = [
+    (
+        "FringeFlat",
+        {"image": nan_at((3, 4), (1, 2)), "mask": GOOD},
+        FrameFormatError,
+        "1 pixels .* not finite",
+    ),
+    ("FringeFlat", {"variance": nan_at((3, 4), (1, 2), -1), "mask": GOOD}, FrameFormatError, "VARIANCE"),
+    ("FringeFlat", {"variance": np.zeros((4, 3))}, FrameFormatError, r"VARIANCE is 'shape \(4, 3\)'"),
+    ("FringeFlat", {"mask": np.zeros((3, 4), float)}, FrameFormatError, "MASK is 'dtype float64'"),
+    ("FringeFlat", {"mask": np.full((3, 4), 1 << 29)}, FrameFormatError, "bits 0x20000000"),
+    ("FringeFlat", {"image": np.zeros((2, 3, 4))}, FrameFormatError, "2 axes"),
+    ("FringeFlat", {"image": np.zeros((0, 4))}, FrameFormatError, "none of them empty"),
+    ("FringeFlat", {"image": np.zeros((3, 4), complex)}, FrameFormatError, "real numbers"),
+    ("FringeFlat", {"image": [[1, 2], [3]]}, FrameFormatError, "ragged"),
+    ("FringeFlat", {"wavelength_nm": 0.0}, OutOfRangeError, "wavelength_nm is 0.0"),
+    ("FringeFlat", {"wavelength_nm": "960"}, InputError, "wavelength_nm is '960'; allowed: a number"),
+    ("FringeFlat", {"wavelength_nm": True}, InputError, "a number"),
+    ("FringeFlat", {"bandwidth_fwhm_nm": -1.0}, OutOfRangeError, "bandwidth_fwhm_nm"),
+    ("FringeFlat", {"temperature_k": float("nan")}, OutOfRangeError, "temperature_k"),
+    ("FringeFlat", {"level_e": float("inf")}, OutOfRangeError, "level_e"),
+    ("FringeFlat", {"detector": " R11"}, InputError, "detector"),
+    ("FringeFlat", {"detector": "é"}, InputError, "ASCII"),
+    ("FringeFlat", {"detector": "x" * 61}, InputError, "60"),
+    ("FringeCube", {"unit": "adu"}, UnknownNameError, "BUNIT is 'adu'; allowed: electron, relative"),
+    ("FringeCube", {"layer": ""}, InputError, "LAYER"),
+    ("FringeCube", {"thickness": None}, FrameFormatError, "THICKNESS is 'missing'"),
+    ("FringeCube", {"thickness": np.zeros((4, 4))}, FrameFormatError, "THICKNESS"),
+    ("FringeCube", {"thickness_sigma": np.full((3, 4), -1.0)}, OutOfRangeError, "THICKNESS_SIGMA"),
+    (
+        "FringeCube",
+        {"image": nan_at((2, 3, 4), (1, 0, 0)), "mask": np.zeros((2, 3, 4), int)},
+        FrameFormatError,
+        "IMAGE is '1 pixels",
+    ),
+    ("FringeCube", {"exposures": [960.0]}, InputError, "FlatExposures"),
+    ("FringeCube", {"exposures": FlatExposures([960.0], 2.0, 183.0)}, FrameFormatError, "1 rows"),
+    ("ThicknessMap", {"value": np.zeros((3, 4)), "mask": GOOD}, OutOfRangeError, "a positive thickness"),
+    ("ThicknessMap", {"sigma": nan_at((3, 4), (0, 0)), "mask": GOOD}, FrameFormatError, "SIGMA"),
+    ("ThicknessMap", {"chi2": nan_at((3, 4), (0, 0), -2), "mask": GOOD}, FrameFormatError, "CHI2"),
+    ("ThicknessMap", {"slip_probability": np.full((3, 4), 1.1), "mask": GOOD}, OutOfRangeError, "0 to 1"),
+    ("ThicknessMap", {"n_wavelengths": np.full((3, 4), -1)}, OutOfRangeError, "N_WAVELENGTHS"),
+    ("ThicknessMap", {"n_wavelengths": np.full((3, 4), 1.5)}, FrameFormatError, "integers"),
+    ("ThicknessMap", {"layer": ""}, InputError, "layer"),
+    ("FringeFrame", {"image": nan_at((3, 4), (0, 0)), "mask": GOOD + 1}, FrameFormatError, "IMAGE"),
+    ("FringeFrame", {"variance": nan_at((3, 4), (0, 0)), "mask": GOOD + 1}, FrameFormatError, "VARIANCE"),
+    ("FringeFrame", {"image": np.full((3, 4), 0.01), "mask": GOOD}, OutOfRangeError, "mean of IMAGE"),
+    ("FringeFrame", {"creation_datetime": "yesterday"}, InputError, "YYYY"),
+    ("FringeFrame", {"physical_filter": ""}, InputError, "physical_filter"),
+    ("FringeFrame", {"xy0": (1.5, 2)}, InputError, "xy0"),
+    ("FringeFrame", {"metadata": {"OBSTYPE": "flat"}}, InputError, "OBSTYPE"),
+    ("FringeComponents", {"components": np.zeros((2, 4, 4))}, FrameFormatError, "COMPONENTS"),
+    ("FringeComponents", {"mean": nan_at((3, 4), (0, 0))}, FrameFormatError, "MEAN"),
+    ("FringeComponents", {"scores": np.zeros((5, 3))}, FrameFormatError, "SCORES"),
+    ("FringeComponents", {"explained_variance": np.array([1.0, 2.0])}, OutOfRangeError, "largest first"),
+    ("FringeComponents", {"explained_variance_ratio": np.array([0.9, 0.2])}, OutOfRangeError, "at most 1"),
+    ("FringeComponents", {"explained_variance": np.ones(3)}, FrameFormatError, "3 values"),
+    ("SkyFringe", {"unit": "adu"}, UnknownNameError, "unit"),
+    ("SkyFringe", {"airmass": 0.9}, OutOfRangeError, "airmass"),
+    ("SkyFringe", {"hour": 25.0}, OutOfRangeError, "hour"),
+    ("SkyFringe", {"seed": -1}, OutOfRangeError, "seed"),
+    ("SkyFringe", {"seed": 1.5}, InputError, "seed"),
+    ("SkyFringe", {"quadrature_error": -1e-9}, OutOfRangeError, "quadrature_error"),
+    ("SkyFringe", {"mean_electrons": 0.0}, OutOfRangeError, "mean_electrons"),
+]
+
+
+@pytest.mark.parametrize(("kind", "changes", "error", "message"), BAD)
+def test_one_typed_error(kind: str, changes: dict[str, Any], error: type[InputError], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        MAKERS[kind](**changes)
+    assert type(caught.value) is error
+
+
+METADATA_REFUSED: list[dict[Any, Any]] = [
+    {"NAXIS1": 3},
+    {"CHECKSUM": "x"},
+    {"EXTNAME": "x"},
+    {"MP_BAD": 3},
+    {"PRODUCT": "x"},
+    {"": 1},
+    {5: 1},
+    {"WHAT?": 1},
+    {"K" * 51: 1},
+    {"A": float("nan")},
+    {"A": float("inf")},
+    {"A": "µm"},
+    {"A": "two\nlines"},
+    {"A": [1, 2]},
+    {"A": 1 + 2j},
+    {"A": 10**400},
+]
+
+
+@pytest.mark.parametrize("kind", sorted(MAKERS))
+@pytest.mark.parametrize("metadata", METADATA_REFUSED)
+def test_metadata_that_a_header_cannot_hold(kind: str, metadata: dict[Any, Any]) -> None:
+    with pytest.raises(InputError, match="metadata"):
+        MAKERS[kind](metadata=metadata)
+
+
+@given(st.sampled_from(sorted(MAKERS)), st.text(max_size=12), st.text(max_size=90))
+def test_any_text_is_kept_or_refused(kind: str, key: str, value: str) -> None:
+    try:
+        product = MAKERS[kind](metadata={key: value})
+    except InputError:
+        return
+    assert dict(product.metadata) == {key.strip().upper(): value.rstrip(" ")}
+
+
+@given(
+    st.sampled_from(["wavelength_nm", "bandwidth_fwhm_nm", "temperature_k", "level_e", "f_number"]),
+    st.one_of(st.floats(), st.text(max_size=3), st.none(), st.booleans(), st.complex_numbers()),
+)
+def test_a_scalar_is_kept_or_refused(name: str, value: Any) -> None:
+    real = isinstance(value, float) and value >= 0
+    try:
+        product = flat(**{name: value})
+    except InputError as error:
+        field = error.field
+        refused = not real or value == 0 or not np.isfinite(value)
+        kept = False
+    else:
+        field, refused, kept = name, False, getattr(product, name) == value
+    assert field == name
+    assert refused or (real and kept)
+
+
+@pytest.mark.parametrize(
+    ("columns", "field"),
+    [
+        ({"wavelength_nm": [960.0, -1.0]}, "wavelength"),
+        ({"wavelength_nm": []}, "wavelength"),
+        ({"bandwidth_fwhm_nm": np.nan}, "bandwidth_fwhm"),
+        ({"temperature_k": [183.0] * 3}, "temperature"),
+        ({"temperature_k": np.inf}, "temperature"),
+        ({"f_number": [np.inf, np.nan]}, "f_number"),
+        ({"f_number": 0.0}, "f_number"),
+        ({"level_e": -5.0}, "level"),
+    ],
+)
+def test_exposures_name_the_column(columns: dict[str, Any], field: str) -> None:
+    good = {"wavelength_nm": [960.0, 970.0], "bandwidth_fwhm_nm": 2.0, "temperature_k": 183.0}
+    with pytest.raises(InputError) as caught:
+        FlatExposures(**(good | columns))
+    assert caught.value.field == field
+
+
+def test_amplitudes_are_not_taken_for_relative_counts() -> None:
+    with pytest.raises(OutOfRangeError, match="counts over their mean"):
+        cube(unit="relative", image=pixels((2, 3, 4), 1))
+
+
+def test_flats_are_sorted_by_wavelength_and_shifted_to_relative_counts() -> None:
+    flats = [flat(number=k, wavelength_nm=w, level_e=w) for k, w in enumerate([990.0, 880.0, 930.0])]
+    stacked = FringeCube.from_flats(flats)
+    np.testing.assert_array_equal(stacked.wavelength_nm, [880, 930, 990])
+    np.testing.assert_array_equal(stacked.exposures.level_e, [880, 930, 990])
+    assert stacked.unit == "relative"
+    assert stacked.detector == "R11_S01"
+    good = stacked.mask[2] == 0
+    np.testing.assert_array_equal(stacked.image[2][good], (flats[0].image + np.float32(1))[good])
+    np.testing.assert_array_equal(stacked.variance[2][good], flats[0].variance[good])
+    assert np.isfinite(stacked.image).all()
+
+
+def test_flats_that_do_not_belong_together() -> None:
+    with pytest.raises(InputError, match="at least one flat"):
+        FringeCube.from_flats([])
+    with pytest.raises(FrameFormatError, match="flat at 970 nm is 'shape"):
+        FringeCube.from_flats([flat(), flat((4, 4), wavelength_nm=970.0)])
+    with pytest.raises(FrameFormatError, match="sensor R11_S02"):
+        FringeCube.from_flats([flat(), flat(detector="R11_S02", wavelength_nm=970.0)])
+
+
+def test_take_keeps_planes_and_exposures_together() -> None:
+    whole = cube()
+    part = whole.take([1])
+    np.testing.assert_array_equal(part.image[0], whole.image[1])
+    np.testing.assert_array_equal(part.wavelength_nm, whole.wavelength_nm[[1]])
+    assert part.shape == (1, 3, 4)
+
+
+def test_sky_fraction_is_the_same_from_either_unit() -> None:
+    electrons = sky(mask=GOOD, image=2717.1 * (1 + pixels((3, 4), 1)))
+    fraction = sky(mask=GOOD, image=pixels((3, 4), 1), unit="fraction")
+    np.testing.assert_allclose(electrons.fraction(), fraction.fraction(), rtol=0, atol=3e-7)
+
+
+def test_every_maker_makes_a_good_product() -> None:
+    for maker in (flat, cube, thickness, frame, components, sky):
+        maker((2, 2), 7)
