@@ -1,1 +1,28 @@
-"""algorithms."""
+"""Fit, simulate, decompose and criticise: arrays in, arrays out.
+
+The public functions are imported on first use, because some of them bring heavy libraries along.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+_LAZY = {
+    "coadd_correlation": ".coadd_correlation",
+    "combine_biases": ".flat_prep",
+    "discover": ".discovery",
+    "fit_pca": ".pca",
+    "fit_single_pixel": ".single_pixel",
+    "fit_thickness": ".thickness_fit",
+    "prepare_flat": ".flat_prep",
+    "simulate_sky_frame": ".sky_frame",
+}
+
+__all__ = sorted(_LAZY)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name], __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
