@@ -37,6 +37,7 @@ __all__ = [
     "RawFrame",
     "RawMetadata",
     "Section",
+    "read_raw_header",
     "read_raw_metadata",
 ]
 
@@ -298,17 +299,13 @@ class RawMetadata:
         return self.temperature_k
 
     @classmethod
-    def from_headers(
-        cls, primary: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]] | None = None, *, source: str
-    ) -> RawMetadata:
-        """Interpret the headers of a raw frame.
+    def from_header(cls, header: Mapping[str, Any], *, source: str) -> RawMetadata:
+        """Interpret the header of a raw frame.
 
         Parameters
         ----------
-        primary : `~collections.abc.Mapping`
-            Primary header.
-        others : `~collections.abc.Mapping`, optional
-            Headers of the HDUs with test conditions (``TEST_COND``, ``REB_COND``) by name.
+        header : `~collections.abc.Mapping`
+            Primary header, with what it lacks of the test conditions (`read_raw_header`).
         source : `str`
             Name of the file, for messages.
 
@@ -319,7 +316,7 @@ class RawMetadata:
         UnknownNameError
             The sensor that the header names is not in the camera.
         """
-        return _interpret(_Headers(primary, others or {}, source))
+        return _interpret(_Header(header, source))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -333,7 +330,7 @@ class RawFrame:
     detector_shape : `tuple` [`int`, `int`]
         Rows and columns of the assembled, trimmed CCD.
     header : `astropy.io.fits.Header`
-        Primary header.
+        Primary header; temperature and wavelength that it lacks are added from the test conditions.
     metadata : `RawMetadata`
         What the headers say about the exposure.
     """
@@ -356,13 +353,14 @@ class RawFrame:
         """
         source = str(path)
         with _open_fits(source) as hdus:
-            metadata = _metadata(hdus, source)
+            header = _merged_header(hdus)
+            metadata = RawMetadata.from_header(header, source=source)
             layouts, shape = _amplifier_layouts(hdus, source)
             amplifiers = tuple(
                 RawAmplifier(data=_integer_pixels(hdus[layout.hdu], source), **vars(layout))
                 for layout in layouts
             )
-            return cls(amplifiers, shape, hdus[0].header.copy(), metadata)
+            return cls(amplifiers, shape, header, metadata)
 
     def amplifier(self, name: str) -> RawAmplifier:
         """Return one amplifier by name.
@@ -380,11 +378,30 @@ class RawFrame:
         )
 
 
+def read_raw_header(path: str | Path) -> fits.Header:
+    """Check a raw frame and read its header, but not its pixels.
+
+    Everything that `RawFrame.read` refuses about the layout is refused here too, as far as headers and the
+    length of the file show it.
+
+    Returns
+    -------
+    header : `astropy.io.fits.Header`
+        Primary header; temperature and wavelength that it lacks are added from the test conditions.
+
+    Raises
+    ------
+    FrameFormatError
+        The file is not a complete raw frame in the LSST layout.
+    """
+    source = str(path)
+    with _open_fits(source) as hdus:
+        _amplifier_layouts(hdus, source)
+        return _merged_header(hdus)
+
+
 def read_raw_metadata(path: str | Path) -> RawMetadata:
     """Check a raw frame and read its metadata, but not its pixels.
-
-    Everything that `RawFrame.read` refuses is refused here too, as far as headers and the length of the file
-    show it.
 
     Raises
     ------
@@ -393,11 +410,7 @@ def read_raw_metadata(path: str | Path) -> RawMetadata:
     UnknownNameError
         The sensor that the header names is not in the camera.
     """
-    source = str(path)
-    with _open_fits(source) as hdus:
-        metadata = _metadata(hdus, source)
-        _amplifier_layouts(hdus, source)
-        return metadata
+    return RawMetadata.from_header(read_raw_header(path), source=str(path))
 
 
 # Reading the file -----------------------------------------------------------------------------------------
@@ -433,12 +446,19 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
         ) from error
 
 
-def _metadata(hdus: fits.HDUList, source: str) -> RawMetadata:
-    conditions = {hdu.name: hdu.header for hdu in hdus[1:] if hdu.name in _CONDITION_HDUS}
-    return RawMetadata.from_headers(hdus[0].header, conditions, source=source)
-
-
 _CONDITION_HDUS = ("TEST_COND", "REB_COND")
+_CONDITIONS = ("MONOWL", "CCDTEMP", "SENSTEMP", "TEMP_SET")
+
+
+def _merged_header(hdus: Sequence[Any]) -> fits.Header:
+    """Primary header, and from the test conditions what it lacks."""
+    header = hdus[0].header.copy()
+    for hdu in hdus[1:]:
+        if hdu.name in _CONDITION_HDUS:
+            for keyword in _CONDITIONS:
+                if _value(header, keyword) is None and _value(hdu.header, keyword) is not None:
+                    header[keyword] = (hdu.header[keyword], f"from {hdu.name}")
+    return header
 
 
 def _integer_pixels(hdu: Any, source: str) -> npt.NDArray[np.integer[Any]]:
@@ -666,23 +686,14 @@ def _value(header: Mapping[str, Any], keyword: str) -> Any:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Headers:
-    """Headers of a frame, asked for values of a certain kind."""
+class _Header:
+    """Header of a frame, asked for values of a certain kind."""
 
-    primary: Mapping[str, Any]
-    others: Mapping[str, Mapping[str, Any]]
+    cards: Mapping[str, Any]
     source: str
 
     def value(self, keyword: str) -> Any:
-        return _value(self.primary, keyword)
-
-    def anywhere(self, keyword: str) -> Any:
-        """Value in the primary header, else in the headers of the test conditions."""
-        for header in (self.primary, *self.others.values()):
-            value = _value(header, keyword)
-            if value is not None:
-                return value
-        return None
+        return _value(self.cards, keyword)
 
     def text(self, keyword: str) -> str:
         value = self.value(keyword)
@@ -702,35 +713,35 @@ class _Headers:
         return FrameFormatError(keyword, value, allowed, source=self.source)
 
 
-def _interpret(headers: _Headers) -> RawMetadata:
-    camera = _camera(headers)
-    observation_type = _observation_type(headers)
-    exposure_time, dark_time = _times(headers, observation_type)
-    temperature, temperature_source = _temperature(headers)
-    detector = _detector(headers, camera)
-    start = _date_obs(headers)
-    day_obs, seq_num = _day_and_sequence(headers, camera, start)
+def _interpret(header: _Header) -> RawMetadata:
+    camera = _camera(header)
+    observation_type = _observation_type(header)
+    exposure_time, dark_time = _times(header, observation_type)
+    temperature, temperature_source = _temperature(header)
+    detector = _detector(header, camera)
+    start = _date_obs(header)
+    day_obs, seq_num = _day_and_sequence(header, camera, start)
     return RawMetadata(
-        source=headers.source,
+        source=header.source,
         camera=camera,
         observation_type=observation_type,
-        test_type=headers.text("TESTTYPE").lower(),
-        wavelength_nm=_wavelength(headers, observation_type),
-        bandpass_nm=_bandpass(headers),
+        test_type=header.text("TESTTYPE").lower(),
+        wavelength_nm=_wavelength(header, observation_type),
+        bandpass_nm=_bandpass(header),
         exposure_time_s=exposure_time,
         dark_time_s=dark_time,
         temperature_k=temperature,
         temperature_source=temperature_source,
         raft=detector.raft,
         slot=detector.slot,
-        serial=headers.text("LSST_NUM").removesuffix("-Dev"),
+        serial=header.text("LSST_NUM").removesuffix("-Dev"),
         detector=detector.id,
-        filter_name=_filter_name(headers),
-        run=headers.text("RUNNUM"),
+        filter_name=_filter_name(header),
+        run=header.text("RUNNUM"),
         date_obs=start,
         day_obs=day_obs,
         seq_num=seq_num,
-        exposure_id=_exposure_id(headers, camera, start, day_obs, seq_num),
+        exposure_id=_exposure_id(header, camera, start, day_obs, seq_num),
     )
 
 
@@ -743,128 +754,128 @@ _CAMERAS = {
 }
 
 
-def _camera(headers: _Headers) -> str:
+def _camera(header: _Header) -> str:
     """Camera or test stand that took the frame; the place of the sensor tells where nothing says it outright."""
-    if headers.value("INSTRUME") is not None:
-        instrument = headers.text("INSTRUME").upper()
+    if header.value("INSTRUME") is not None:
+        instrument = header.text("INSTRUME").upper()
         if instrument not in _CAMERAS:
-            raise headers.refuse("INSTRUME", headers.value("INSTRUME"), ", ".join(_CAMERAS))
+            raise header.refuse("INSTRUME", header.value("INSTRUME"), ", ".join(_CAMERAS))
         return _CAMERAS[instrument]
-    if "TS8" in headers.text("TSTAND").upper():
+    if "TS8" in header.text("TSTAND").upper():
         return "ts8"
-    if _bay(headers) is not None:
+    if _bay(header) is not None:
         return "lsstCam"
-    if _module(headers) is not None or headers.value("LSST_NUM") is not None:
+    if _module(header) is not None or header.value("LSST_NUM") is not None:
         return "ts8"
-    raise headers.refuse(
+    raise header.refuse(
         "INSTRUME",
         None,
         "lsstCam or MonoCam; or TSTAND = TS8; or RAFTBAY, RAFTNAME or LSST_NUM, which tell it",
     )
 
 
-def _bay(headers: _Headers) -> str | None:
+def _bay(header: _Header) -> str | None:
     """Raft bay of the LSST Camera, from either keyword that holds it."""
     for keyword in ("RAFTBAY", "RAFTNAME"):
-        if re.fullmatch(r"R\d\d", headers.text(keyword)):
-            return headers.text(keyword)
+        if re.fullmatch(r"R\d\d", header.text(keyword)):
+            return header.text(keyword)
     return None
 
 
-def _module(headers: _Headers) -> str | None:
+def _module(header: _Header) -> str | None:
     """Raft module, ``RTM-020``."""
-    match = re.search(r"RTM-\d{3}", headers.text("RAFTNAME"))
+    match = re.search(r"RTM-\d{3}", header.text("RAFTNAME"))
     return match.group(0) if match else None
 
 
-def _detector(headers: _Headers, camera: str) -> Detector:
+def _detector(header: _Header, camera: str) -> Detector:
     """The sensor. In a camera its place decides; on the test stand its serial number, for rafts were rebuilt."""
     table = Camera.from_name(camera)
     if len(table.detectors) == 1:
         return table.detectors[0]
-    slot = headers.text("SLOTNAME") or headers.text("CCDSLOT")
-    raft = _bay(headers) if camera == "lsstCam" else _module(headers) or _bay(headers)
+    slot = header.text("SLOTNAME") or header.text("CCDSLOT")
+    raft = _bay(header) if camera == "lsstCam" else _module(header) or _bay(header)
     place = f"{raft}_{slot}" if raft and slot else ""
-    serial = headers.text("LSST_NUM")
+    serial = header.text("LSST_NUM")
     keys = [key for key in ((place, serial) if camera == "lsstCam" else (serial, place)) if key]
     if not keys:
-        raise headers.refuse("LSST_NUM", None, "the serial number of the sensor, or RAFTBAY and CCDSLOT")
+        raise header.refuse("LSST_NUM", None, "the serial number of the sensor, or RAFTBAY and CCDSLOT")
     for key in keys:
         try:
             return table.detector(key)
         except UnknownNameError as error:
             unknown = error
-    raise unknown.in_source(headers.source)
+    raise unknown.in_source(header.source)
 
 
-def _observation_type(headers: _Headers) -> str:
+def _observation_type(header: _Header) -> str:
     """From ``IMGTYPE``; where it is absent, from ``TESTTYPE``."""
-    keyword = "IMGTYPE" if headers.value("IMGTYPE") is not None else "TESTTYPE"
-    spelled = headers.text(keyword).upper()
+    keyword = "IMGTYPE" if header.value("IMGTYPE") is not None else "TESTTYPE"
+    spelled = header.text(keyword).upper()
     # TESTTYPE carries a suffix with the wavelength: SFLAT_500.
     known = spelled if keyword == "IMGTYPE" else spelled.partition("_")[0]
     if known not in OBSERVATION_TYPES:
-        raise headers.refuse("IMGTYPE", headers.value(keyword), ", ".join(OBSERVATION_TYPES))
+        raise header.refuse("IMGTYPE", header.value(keyword), ", ".join(OBSERVATION_TYPES))
     return OBSERVATION_TYPES[known]
 
 
-def _wavelength(headers: _Headers, observation_type: str) -> float | None:
+def _wavelength(header: _Header, observation_type: str) -> float | None:
     """``MONOWL``. ``MONOCH-WAVELENG`` is not used: it can still hold the value of an earlier exposure."""
     if observation_type in WITHOUT_LIGHT:
         return None
-    value = headers.anywhere("MONOWL")
-    lambda_flat = observation_type == "flat" and headers.text("TESTTYPE").upper() == "LAMBDA"
+    value = header.value("MONOWL")
+    lambda_flat = observation_type == "flat" and header.text("TESTTYPE").upper() == "LAMBDA"
     not_set = value is None or (isinstance(value, int | float) and value <= 0)
     if not_set and not lambda_flat:
         return None
     low, high = WAVELENGTH_RANGE_NM
-    return headers.number(
+    return header.number(
         "MONOWL", value, f"a wavelength from {low:g} to {high:g} nm", lambda nm: low <= nm <= high
     )
 
 
-def _bandpass(headers: _Headers) -> float | None:
-    value = headers.value("MONOCH-BANDPASS")
+def _bandpass(header: _Header) -> float | None:
+    value = header.value("MONOCH-BANDPASS")
     if value is None:
         return None
     # 0 means that the slits were not set to a width in nm.
-    return headers.number("MONOCH-BANDPASS", value, "0 or a width in nm", lambda nm: 0 <= nm < 1000) or None
+    return header.number("MONOCH-BANDPASS", value, "0 or a width in nm", lambda nm: 0 <= nm < 1000) or None
 
 
-def _times(headers: _Headers, observation_type: str) -> tuple[float, float]:
+def _times(header: _Header, observation_type: str) -> tuple[float, float]:
     """Exposure time and dark time, seconds; a bias without ``EXPTIME`` has none."""
-    value = headers.value("EXPTIME")
+    value = header.value("EXPTIME")
     if value is None and observation_type == "bias":
         value = 0.0
-    exposure = headers.number("EXPTIME", value, "seconds, 0 or more", lambda s: s >= 0)
-    dark = headers.value("DARKTIME")
+    exposure = header.number("EXPTIME", value, "seconds, 0 or more", lambda s: s >= 0)
+    dark = header.value("DARKTIME")
     if dark is None:
         return exposure, exposure
-    return exposure, headers.number("DARKTIME", dark, "seconds, 0 or more", lambda s: s >= 0)
+    return exposure, header.number("DARKTIME", dark, "seconds, 0 or more", lambda s: s >= 0)
 
 
-def _temperature(headers: _Headers) -> tuple[float | None, str]:
+def _temperature(header: _Header) -> tuple[float | None, str]:
     low, high = TEMPERATURE_RANGE_C
     for keyword in ("CCDTEMP", "SENSTEMP", "TEMP_SET"):
-        value = headers.anywhere(keyword)
+        value = header.value(keyword)
         if value is not None:
-            celsius = headers.number(
+            celsius = header.number(
                 keyword, value, f"°C from {low:g} to {high:g}", lambda c: low <= c <= high
             )
             return celsius + ZERO_CELSIUS_K, keyword
     return None, ""
 
 
-def _filter_name(headers: _Headers) -> str:
+def _filter_name(header: _Header) -> str:
     """Filter of the LSST Camera: its parts joined by ``~``, empty places left out."""
-    parts = [headers.text(keyword) for keyword in ("FILTER", "FILTER1", "FILTER2")]
+    parts = [header.text(keyword) for keyword in ("FILTER", "FILTER1", "FILTER2")]
     named = [part for part in parts if part and part.lower() not in {"empty", "none"}]
     return "~".join(dict.fromkeys(named))
 
 
-def _date_obs(headers: _Headers) -> datetime.datetime:
+def _date_obs(header: _Header) -> datetime.datetime:
     for keyword, scale in (("DATE-OBS", "isot"), ("MJD-OBS", "mjd"), ("MJD", "mjd")):
-        value = headers.value(keyword)
+        value = header.value(keyword)
         if value is None:
             continue
         try:
@@ -874,35 +885,35 @@ def _date_obs(headers: _Headers) -> datetime.datetime:
                 return Time(text, format=scale, scale="utc").to_datetime()
         except (TypeError, ValueError):
             allowed = "YYYY-MM-DDThh:mm:ss.sss" if scale == "isot" else "a modified Julian date"
-            raise headers.refuse(keyword, value, allowed) from None
-    raise headers.refuse("DATE-OBS", None, "YYYY-MM-DDThh:mm:ss.sss, or MJD-OBS")
+            raise header.refuse(keyword, value, allowed) from None
+    raise header.refuse("DATE-OBS", None, "YYYY-MM-DDThh:mm:ss.sss, or MJD-OBS")
 
 
-def _day_and_sequence(headers: _Headers, camera: str, start: datetime.datetime) -> tuple[int, int]:
+def _day_and_sequence(header: _Header, camera: str, start: datetime.datetime) -> tuple[int, int]:
     """``DAYOBS`` and ``SEQNUM``; where absent, the day on which the night began and the seconds since then."""
     day_start = start - datetime.timedelta(hours=DAY_ROLLOVER_H[camera])
-    stated = headers.value("DAYOBS")
-    day = int(day_start.strftime("%Y%m%d")) if stated is None else _day(headers, stated)
-    value = headers.value("SEQNUM")
+    stated = header.value("DAYOBS")
+    day = int(day_start.strftime("%Y%m%d")) if stated is None else _day(header, stated)
+    value = header.value("SEQNUM")
     if value is None:
         midnight = day_start.replace(hour=0, minute=0, second=0, microsecond=0)
         return day, int((day_start - midnight).total_seconds())
-    number = headers.number("SEQNUM", value, "an integer from 0 to 99999", lambda n: 0 <= n < 100000)
+    number = header.number("SEQNUM", value, "an integer from 0 to 99999", lambda n: 0 <= n < 100000)
     if number != int(number):
-        raise headers.refuse("SEQNUM", value, "an integer from 0 to 99999")
+        raise header.refuse("SEQNUM", value, "an integer from 0 to 99999")
     return day, int(number)
 
 
-def _day(headers: _Headers, value: Any) -> int:
+def _day(header: _Header, value: Any) -> int:
     digits = str(value).replace("-", "")
     try:
         datetime.datetime.strptime(digits, "%Y%m%d")
     except ValueError:
-        raise headers.refuse("DAYOBS", value, "a date YYYYMMDD") from None
+        raise header.refuse("DAYOBS", value, "a date YYYYMMDD") from None
     return int(digits)
 
 
-def _exposure_id(headers: _Headers, camera: str, start: datetime.datetime, day_obs: int, seq_num: int) -> int:
+def _exposure_id(header: _Header, camera: str, start: datetime.datetime, day_obs: int, seq_num: int) -> int:
     """Number of the exposure, as obs_lsst has it.
 
     On TS8 the digits of ``DATE-OBS`` down to tenths of a second: ``SEQNUM`` repeats within a day there. In the
@@ -910,7 +921,7 @@ def _exposure_id(headers: _Headers, camera: str, start: datetime.datetime, day_o
     """
     if camera == "ts8":
         return int(start.strftime("%Y%m%d%H%M%S")) * 10 + start.microsecond // 100_000
-    controller = headers.text("CONTRLLR").upper() or "O"
+    controller = header.text("CONTRLLR").upper() or "O"
     if controller not in CONTROLLERS:
-        raise headers.refuse("CONTRLLR", controller, f"one of {', '.join(CONTROLLERS)}")
+        raise header.refuse("CONTRLLR", controller, f"one of {', '.join(CONTROLLERS)}")
     return (day_obs + CONTROLLERS.index(controller) * 10_000_000) * 100_000 + seq_num
