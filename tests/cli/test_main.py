@@ -81,7 +81,7 @@ def test_bad_quantities_are_usage_errors(text) -> None:
 
 def test_wavelength_ranges_include_the_end() -> None:
     assert WAVELENGTHS.convert("880:990:10", None, None) == tuple(float(w) for w in range(880, 991, 10))
-    assert WAVELENGTHS.convert("880,0.9um", None, None) == (880.0, 900.0)
+    assert WAVELENGTHS.convert("880,0.9um", None, None) == pytest.approx((880.0, 900.0), rel=1e-12)
 
 
 @pytest.mark.parametrize("text", ["880:990", "990:880:10", "880:990:0", "1:100000:0.1"])

@@ -1,1 +1,5 @@
-"""report."""
+"""Figures and the HTML report."""
+
+from .page import Report
+
+__all__ = ["Report"]

@@ -1,0 +1,259 @@
+"""Figures of what a run leaves: thickness maps, flats, residuals, sky frames, components, one pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ..algorithms.single_pixel import SinglePixelFit
+from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
+from .style import LINES, figure, finite_range, show_image
+
+__all__ = [
+    "components_figure",
+    "flats_figure",
+    "phase_figure",
+    "single_pixel_figure",
+    "sky_figure",
+    "template_figure",
+    "thickness_figure",
+]
+
+PERCENT = 100.0
+
+
+def thickness_figure(thickness: ThicknessMap, order_um: float) -> Figure:
+    """Thickness with a contour per fringe order, its uncertainty, and the probability of a slipped order.
+
+    Parameters
+    ----------
+    thickness : `ThicknessMap`
+        The map.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    """
+    with figure(13.0, 3.9) as made:
+        left, middle, right = made.subplots(1, 3)
+        show_image(
+            left,
+            thickness.value,
+            mask=thickness.mask,
+            label=f"{thickness.layer} thickness [µm]",
+            title=f"{thickness.detector or 'sensor'}: one contour per fringe order",
+        )
+        good = np.where(thickness.mask == 0, thickness.value, np.nan)
+        step = max(1, min(good.shape) // 300)
+        low, high = np.nanmin(good), np.nanmax(good)
+        levels = np.arange(np.ceil(low / order_um), np.floor(high / order_um) + 1) * order_um
+        if 0 < len(levels) <= 80:
+            left.contour(
+                np.arange(0, good.shape[1], step),
+                np.arange(0, good.shape[0], step),
+                good[::step, ::step],
+                levels=levels,
+                colors="white",
+                linewidths=0.4,
+                alpha=0.7,
+            )
+        show_image(middle, 1e3 * thickness.sigma, mask=thickness.mask, label="σ [nm]", title="uncertainty")
+        chance = np.log10(np.clip(thickness.slip_probability, 1e-12, 1.0))
+        show_image(
+            right,
+            chance,
+            mask=thickness.mask,
+            label="log₁₀ probability",
+            title="chance that the order is wrong",
+            limits=(-12.0, 0.0),
+        )
+        return made
+
+
+def flats_figure(
+    amplitude: NDArray[np.floating],
+    mask: NDArray[np.integer],
+    wavelength_nm: Sequence[float],
+    *,
+    title: str,
+    unit: str = "fringe amplitude [%]",
+) -> Figure:
+    """Gallery of frames ``[wavelength, y, x]`` on one colour scale."""
+    count = len(wavelength_nm)
+    columns = min(6, count)
+    rows = -(-count // columns)
+    with figure(2.1 * columns + 0.6, 2.15 * rows + 0.5) as made:
+        panels = np.atleast_1d(made.subplots(rows, columns, sharex=True, sharey=True)).ravel()
+        values = PERCENT * np.where(np.asarray(mask) == 0, amplitude, np.nan)
+        limits = finite_range(values[:, ::7, ::7], symmetric=True)
+        for panel, image, wavelength in zip(panels, values, wavelength_nm, strict=False):
+            drawn = show_image(
+                panel,
+                image,
+                label="",
+                title=f"{wavelength:g} nm",
+                diverging=True,
+                limits=limits,
+                colorbar=False,
+            )
+            panel.set_xlabel("")
+            panel.set_ylabel("")
+            panel.tick_params(labelsize=6)
+        for panel in panels[count:]:
+            panel.set_visible(False)
+        made.colorbar(drawn, ax=list(panels), label=unit, shrink=0.8)
+        made.suptitle(title)
+        return made
+
+
+def phase_figure(
+    phase: NDArray[np.floating],
+    data: NDArray[np.floating],
+    model: NDArray[np.floating],
+    wavelength_nm: Sequence[float],
+) -> Figure:
+    """Data and model folded on fringe phase, one panel per wavelength.
+
+    Parameters
+    ----------
+    phase : `numpy.ndarray`, shape ``(B,)``
+        Centres of the phase bins, in fringe orders.
+    data, model : `numpy.ndarray`, shape ``(W, B)``
+        Mean amplitude in each bin.
+    wavelength_nm : sequence of `float`
+        Wavelengths [nm].
+    """
+    count = len(wavelength_nm)
+    columns = min(4, count)
+    rows = -(-count // columns)
+    with figure(2.9 * columns, 1.9 * rows + 0.3) as made:
+        panels = np.atleast_1d(made.subplots(rows, columns, sharex=True, sharey=True)).ravel()
+        for panel, measured, modelled, wavelength in zip(panels, data, model, wavelength_nm, strict=False):
+            panel.plot(phase, PERCENT * measured, ".", ms=3, color=LINES[0], label="flats")
+            panel.plot(
+                phase, PERCENT * modelled, "-", lw=1, color=LINES[1], label="model at the fitted thickness"
+            )
+            panel.set_title(f"{wavelength:g} nm")
+        panels[0].legend(fontsize=7)
+        for panel in panels[count:]:
+            panel.set_visible(False)
+        made.supxlabel("thickness over one fringe order")
+        made.supylabel("fringe amplitude [%]")
+        return made
+
+
+def sky_figure(frames: Sequence[SkyFringe]) -> Figure:
+    """First frame of a night, its histogram, and the fringe strength through the night."""
+    with figure(13.0, 3.9) as made:
+        left, middle, right = made.subplots(1, 3)
+        first = frames[0]
+        show_image(
+            left,
+            PERCENT * _fraction(first),
+            mask=first.mask,
+            diverging=True,
+            label="sky / mean - 1 [%]",
+            title=f"{first.detector} {first.physical_filter}, {first.hour:g} h, {first.exposure_s:g} s",
+        )
+        for frame in (frames[0], frames[len(frames) // 2], frames[-1]):
+            values = PERCENT * _fraction(frame)[frame.mask == 0]
+            middle.hist(values, bins=120, histtype="step", density=True, label=f"{frame.hour:g} h")
+        middle.set_xlabel("sky / mean - 1 [%]")
+        middle.set_ylabel("density")
+        middle.set_title("distribution over pixels")
+        middle.legend()
+        hours = np.arange(len(frames))
+        rms = [PERCENT * _fraction(frame)[frame.mask == 0].std() for frame in frames]
+        right.plot(hours, rms, "o-")
+        right.set_xticks(hours, [f"{frame.hour:g}" for frame in frames])
+        right.set_xlabel("local time [h]")
+        right.set_ylabel("rms over pixels [%]")
+        right.set_title("through the night")
+        return made
+
+
+def components_figure(components: FringeComponents) -> Figure:
+    """Mean frame, first two components, and the variance that each component explains."""
+    with figure(14.0, 3.6) as made:
+        panels = made.subplots(1, 4)
+        images = [("mean frame", components.mean)]
+        images += [
+            (f"component {k + 1}: {PERCENT * components.explained_variance_ratio[k]:.3g} %", image)
+            for k, image in enumerate(components.components[:2])
+        ]
+        for panel, (title, image) in zip(panels, images, strict=False):
+            show_image(
+                panel,
+                PERCENT * image if title == "mean frame" else image,
+                mask=components.mask,
+                diverging=True,
+                label="sky / mean - 1 [%]" if title == "mean frame" else "component [1]",
+                title=title,
+            )
+        scree = panels[-1]
+        ratio = np.maximum(components.explained_variance_ratio, 1e-16)
+        scree.semilogy(np.arange(1, len(ratio) + 1), ratio, "o-")
+        scree.set_xlabel("component")
+        scree.set_ylabel("share of the variance")
+        scree.set_title("scree")
+        for panel in panels[len(images) : -1]:
+            panel.set_visible(False)
+        return made
+
+
+def template_figure(template: FringeFrame) -> Figure:
+    """The fringe template as calibration users read it."""
+    with figure(9.0, 3.9) as made:
+        left, right = made.subplots(1, 2)
+        show_image(
+            left,
+            PERCENT * template.image,
+            mask=template.mask,
+            diverging=True,
+            label="(sky - mean) / mean [%]",
+            title="fringe template",
+        )
+        row = template.image.shape[0] // 2
+        right.plot(PERCENT * template.image[row], lw=0.8)
+        right.set_xlabel("column [px]")
+        right.set_ylabel("(sky - mean) / mean [%]")
+        right.set_title(f"row {row}")
+        return made
+
+
+def single_pixel_figure(
+    wavelength_nm: NDArray[np.floating],
+    amplitude: NDArray[np.floating],
+    fits: Sequence[tuple[str, SinglePixelFit]],
+) -> Figure:
+    """Measured points of one pixel with several fits, and the misfit against thickness."""
+    with figure(11.5, 3.9) as made:
+        left, right = made.subplots(1, 2)
+        left.plot(wavelength_nm, PERCENT * amplitude, "o", color="black", label="measured", zorder=3)
+        for k, (name, fit) in enumerate(fits):
+            color = LINES[k % len(LINES)]
+            left.plot(
+                wavelength_nm,
+                PERCENT * fit.predicted,
+                "s--",
+                ms=3,
+                lw=1,
+                color=color,
+                label=f"{name}: {fit.thickness_um:.2f} µm, rms {PERCENT * fit.rms:.2f} %",
+            )
+            right.plot(fit.searched_um, PERCENT * fit.searched_rms, lw=0.7, color=color)
+        left.set_xlabel("wavelength [nm]")
+        left.set_ylabel("fringe amplitude [%]")
+        left.legend(fontsize=7)
+        left.set_title("pixel (2100, 2100) of E2V-CCD250-321")
+        right.set_xlabel("adhesive thickness [µm]")
+        right.set_ylabel("rms misfit [%]")
+        right.set_yscale("log")
+        right.set_title("misfit at every thickness")
+        return made
+
+
+def _fraction(frame: SkyFringe) -> NDArray[np.float64]:
+    image = np.asarray(frame.image, dtype=float)
+    return image if frame.unit == "fraction" else image / frame.mean_electrons - 1.0

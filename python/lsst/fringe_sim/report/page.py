@@ -1,0 +1,124 @@
+"""One self-contained HTML page: opens from disk, needs no network and no script."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from astropy.table import Table
+from matplotlib.figure import Figure
+
+from .style import to_png
+
+__all__ = ["Report"]
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 0 auto; padding: 1rem; color: #1b1b1b; }
+h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
+.lead { color: #444; margin-top: 0; } nav a { margin-right: 1rem; }
+figure { margin: 1rem 0; } figcaption { color: #444; font-size: .92rem; }
+img { max-width: 100%; height: auto; border: 1px solid #ddd; }
+.zoom input { position: absolute; opacity: 0; } .zoom { display: block; overflow-x: auto; cursor: zoom-in; }
+.zoom input:checked + img { max-width: none; cursor: zoom-out; }
+.zoom input:focus-visible + img { outline: 3px solid #0072b2; }
+.tables { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .92rem; }
+th, td { padding: .25rem .7rem; border-bottom: 1px solid #ddd; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+"""
+
+
+@dataclass
+class Report:
+    """A page that grows section by section.
+
+    Parameters
+    ----------
+    title : `str`
+        Heading of the page.
+    lead : `str`
+        One sentence under it.
+    """
+
+    title: str
+    lead: str = ""
+    _body: list[str] = field(default_factory=list, repr=False)
+    _sections: list[tuple[str, str]] = field(default_factory=list, repr=False)
+
+    def section(self, title: str, text: str = "") -> None:
+        """Begin a section with a paragraph of plain text."""
+        anchor = f"s{len(self._sections) + 1}"
+        self._sections.append((anchor, title))
+        self._body.append(f'<h2 id="{anchor}">{html.escape(title)}</h2>')
+        if text:
+            self.paragraph(text)
+
+    def paragraph(self, text: str) -> None:
+        """Add a paragraph of plain text."""
+        self._body.append(f"<p>{html.escape(text)}</p>")
+
+    def figure(self, made: Figure, caption: str) -> None:
+        """Add a figure; a click enlarges it."""
+        data = base64.b64encode(to_png(made)).decode("ascii")
+        text = html.escape(caption, quote=True)
+        self._body.append(
+            f'<figure><label class="zoom"><input type="checkbox"><img alt="{text}" '
+            f'src="data:image/png;base64,{data}"></label><figcaption>{text}</figcaption></figure>'
+        )
+
+    def table(self, table: Table, name: str) -> None:
+        """Add a table with its units, and a link that saves it as ECSV.
+
+        Parameters
+        ----------
+        table : `astropy.table.Table`
+            Few rows; numbers are shown as astropy formats them.
+        name : `str`
+            File name of the download, without its ending.
+        """
+        heads = "".join(
+            f"<th>{html.escape(column.name)}{f' [{column.unit}]' if column.unit else ''}</th>"
+            for column in table.itercols()
+        )
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in cells) + "</tr>"
+            for cells in zip(
+                *(
+                    column.pformat(show_name=False, show_unit=False, max_lines=-1)
+                    for column in table.itercols()
+                ),
+                strict=True,
+            )
+        )
+        text = io.StringIO()
+        table.write(text, format="ascii.ecsv")
+        data = base64.b64encode(text.getvalue().encode()).decode("ascii")
+        self._body.append(
+            f'<div class="tables"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
+            f'<p><a download="{html.escape(name, quote=True)}.ecsv" '
+            f'href="data:text/plain;base64,{data}">{html.escape(name)}.ecsv</a></p>'
+        )
+
+    def to_html(self) -> str:
+        """The page as text."""
+        links = "".join(f'<a href="#{anchor}">{html.escape(title)}</a>' for anchor, title in self._sections)
+        return (
+            '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"<title>{html.escape(self.title)}</title><style>{_STYLE}</style></head><body>"
+            f'<h1>{html.escape(self.title)}</h1><p class="lead">{html.escape(self.lead)}</p>'
+            f"<nav>{links}</nav>{''.join(self._body)}</body></html>\n"
+        )
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write the page; an existing file is replaced when the new one is complete."""
+        target = Path(path)
+        temporary = target.with_name(f".{target.name}.{os.getpid()}")
+        temporary.write_text(self.to_html(), encoding="utf-8")
+        os.replace(temporary, target)
+        return target

@@ -1,0 +1,130 @@
+"""Look of all figures: sizes, colour maps that everyone can read, thinning of large images."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from numpy.typing import NDArray
+
+__all__ = [
+    "DIVERGING",
+    "LINES",
+    "SEQUENTIAL",
+    "figure",
+    "finite_range",
+    "save_figure",
+    "show_image",
+    "to_png",
+]
+
+SEQUENTIAL = "cividis"
+DIVERGING = "PuOr_r"
+LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+"""Okabe & Ito 2008: distinct for all common kinds of colour vision."""
+
+MOST_PIXELS = 600
+"""Images are averaged down to about this many pixels a side before drawing."""
+
+_RC = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.prop_cycle": matplotlib.cycler(color=LINES),
+    "image.origin": "lower",
+    "image.interpolation": "nearest",
+    "legend.frameon": False,
+    "figure.dpi": 110,
+}
+
+
+@contextmanager
+def figure(width: float, height: float) -> Iterator[Figure]:
+    """A figure in the common style, in inches, that is not known to pyplot."""
+    with matplotlib.rc_context(_RC):
+        made = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(made)
+        yield made
+
+
+def finite_range(
+    values: NDArray[np.floating], percent: float = 0.5, *, symmetric: bool = False
+) -> tuple[float, float]:
+    """Colour range that leaves out ``percent`` at either end."""
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return -1.0, 1.0
+    low, high = (float(edge) for edge in np.percentile(finite, [percent, 100.0 - percent]))
+    if symmetric:
+        reach = max(abs(low), abs(high)) or 1e-12
+        return -reach, reach
+    return (low, high) if high > low else (low - 1e-12, high + 1e-12)
+
+
+def show_image(
+    axes: Axes,
+    image: NDArray[Any],
+    *,
+    label: str,
+    title: str = "",
+    mask: NDArray[Any] | None = None,
+    diverging: bool = False,
+    limits: tuple[float, float] | None = None,
+    colorbar: bool = True,
+) -> AxesImage:
+    """Draw an image in detector coordinates, thinned if it is large; masked pixels are grey."""
+    values = np.asarray(image, dtype=float)
+    if mask is not None:
+        values = np.where(np.asarray(mask) == 0, values, np.nan)
+    thin = _thin(values)
+    low, high = limits or finite_range(thin, symmetric=diverging)
+    cmap = matplotlib.colormaps[DIVERGING if diverging else SEQUENTIAL].with_extremes(bad="0.75")
+    ny, nx = values.shape
+    drawn = axes.imshow(
+        thin, cmap=cmap, vmin=low, vmax=high, extent=(-0.5, nx - 0.5, -0.5, ny - 0.5), aspect="equal"
+    )
+    axes.set_title(title)
+    axes.set_xlabel("column [px]")
+    axes.set_ylabel("row [px]")
+    if colorbar:
+        axes.figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
+    return drawn
+
+
+def to_png(made: Figure) -> bytes:
+    """The figure as PNG without time stamps."""
+    buffer = io.BytesIO()
+    made.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def save_figure(made: Figure, path: str | os.PathLike[str]) -> Path:
+    """Write the figure as PNG; an existing file is replaced when the new one is complete."""
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}")
+    temporary.write_bytes(to_png(made))
+    os.replace(temporary, target)
+    return target
+
+
+def _thin(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean over square blocks, so that fringes do not alias when a large image is drawn small."""
+    block = max(1, min(values.shape) // MOST_PIXELS)
+    if block == 1:
+        return values
+    ny, nx = (size // block * block for size in values.shape)
+    blocks = values[:ny, :nx].reshape(ny // block, block, nx // block, block)
+    count = np.isfinite(blocks).sum(axis=(1, 3))
+    total = np.nansum(blocks, axis=(1, 3))
+    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
