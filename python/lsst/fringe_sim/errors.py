@@ -18,6 +18,7 @@ __all__ = [
     "OutOfRangeError",
     "ResourceError",
     "StackError",
+    "TableCacheWarning",
     "UnknownNameError",
 ]
 
@@ -102,6 +103,10 @@ class ResourceError(FringeSimError):
 
 class ConvergenceError(FringeSimError):
     """A quadrature or an iteration did not reach the tolerance that was asked for."""
+
+
+class TableCacheWarning(UserWarning):
+    """A cached table is damaged or cannot be stored; the result is right, only slower to get."""
 
 
 def _shorten(names: list[str], most: int = 24) -> str:

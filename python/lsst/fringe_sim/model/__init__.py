@@ -1,6 +1,8 @@
 """Set-ups and the fringe model."""
 
 from .fringe_model import FringeModel
+from .response_table import ResponseTable, response_table, tabulate
 from .setup import Setup, setup_names
+from .table_cache import TableCache
 
-__all__ = ["FringeModel", "Setup", "setup_names"]
+__all__ = ["FringeModel", "ResponseTable", "Setup", "TableCache", "response_table", "setup_names", "tabulate"]

@@ -22,7 +22,9 @@ from ..errors import InputError
 from ..optics.illumination import DEFAULT_STEP_NM, Illumination
 from ..optics.phase_response import PhaseResponse
 from ..optics.system import OpticalSystem
+from .response_table import DEFAULT_TOLERANCE, ResponseTable, response_table, tabulate
 from .setup import Setup
+from .table_cache import TableCache
 
 __all__ = ["FringeModel"]
 
@@ -161,6 +163,61 @@ class FringeModel:
         illumination = self.system.flat_fields(wavelength)
         return self.respond_on_grid(illumination, start_um, step_um, count, wavelength)
 
+    def table(
+        self,
+        thickness_range_um: tuple[float, float],
+        wavelength_nm: ArrayLike,
+        *,
+        tolerance: float = DEFAULT_TOLERANCE,
+        cache: TableCache | None = None,
+    ) -> ResponseTable:
+        """Response to monochromator flats as a table.
+
+        Parameters
+        ----------
+        thickness_range_um : `tuple` [`float`, `float`]
+            Thicknesses that the table must cover [µm].
+        wavelength_nm : array_like, shape ``(W,)``
+            Nominal wavelengths [nm].
+        tolerance : `float`, optional
+            Largest interpolation error.
+        cache : `TableCache`, optional
+            Where finished tables are kept. Tables with an effect on the response are not kept.
+        """
+        wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
+        illumination = self.system.flat_fields(wavelength)
+        return self.table_of(
+            illumination, thickness_range_um, wavelength_nm=wavelength, tolerance=tolerance, cache=cache
+        )
+
+    def table_of(
+        self,
+        illumination: Illumination,
+        thickness_range_um: tuple[float, float],
+        *,
+        wavelength_nm: ArrayLike | None = None,
+        tolerance: float = DEFAULT_TOLERANCE,
+        cache: TableCache | None = None,
+    ) -> ResponseTable:
+        """Response to any illumination as a table; parameters as for `table`."""
+        if not any(item.effect.acts_on == "response" for item in self.effects):
+            return response_table(
+                self.system,
+                illumination,
+                thickness_range_um,
+                wavelength_nm=wavelength_nm,
+                tolerance=tolerance,
+                cache=cache,
+            )
+        reduced = self.system.reduce(illumination)
+
+        def sample(start_um: float, step_um: float, count: int) -> FloatArray:
+            response = reduced.averaged_on_grid(illumination.weight, start_um, step_um, count)
+            return self.finish(reduced, illumination, response, wavelength_nm)
+
+        labels = illumination.mean_wavelength_nm if wavelength_nm is None else wavelength_nm
+        return tabulate(sample, thickness_range_um, labels, tolerance=tolerance)
+
     def thickness_derivative(self, thickness_um: ArrayLike, wavelength_nm: ArrayLike) -> FloatArray:
         """Exact derivative of `response` with respect to thickness [1/µm].
 
@@ -193,7 +250,7 @@ class FringeModel:
         if not any(item.effect.acts_on == "response" for item in self.effects):
             return response
         nominal = (
-            (illumination.weight * illumination.wavelength_nm).sum(axis=1)
+            illumination.mean_wavelength_nm
             if wavelength_nm is None
             else np.asarray(wavelength_nm, dtype=float)
         )

@@ -199,6 +199,12 @@ class Illumination:
         if not np.allclose(self.weight.sum(axis=1), 1.0, rtol=0.0, atol=1e-9):
             raise InputError("sum of the weights", self.weight.sum(axis=1).tolist(), "1 for every exposure")
 
+    @property
+    def mean_wavelength_nm(self) -> FloatArray:
+        """Mean wavelength of every exposure [nm], shape ``(W,)``."""
+        mean: FloatArray = (self.weight * self.wavelength_nm).sum(axis=1)
+        return mean
+
     @classmethod
     def flat_fields(
         cls,

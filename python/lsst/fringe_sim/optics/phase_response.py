@@ -132,6 +132,33 @@ class PhaseResponse:
         out = _derivative_kernel(*arrays, weights, np.ascontiguousarray(thickness).ravel())
         return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
 
+    def derivative_bound(self, weight: ArrayLike, order: int, from_um: float = 0.0) -> FloatArray:
+        """Upper bound of the magnitude of a thickness derivative of `averaged`.
+
+        Parameters
+        ----------
+        weight : array_like, shape ``(W, Q)`` (or ``(Q,)``)
+            Weights of the nodes.
+        order : `int`
+            Order of the derivative, 1 or more.
+        from_um : `float`, optional
+            The bound holds from this thickness upwards [µm].
+
+        Returns
+        -------
+        bound : `numpy.ndarray`, shape ``(W,)`` (or ``(1,)``)
+            In 1/µm to the power ``order``.
+
+        Notes
+        -----
+        With ``h = -g`` the closed form is the power series ``sum C_jk z^j conj(z)^k``, and the derivative of a term
+        is at most ``(|j-k| Re kappa + (j+k) Im kappa)^order |C_jk| |z|^(j+k)``.
+        """
+        if order < 1:
+            raise InputError("order of the derivative", order, "1 or more")
+        arrays, weights, _ = self._grouped(weight)
+        return _bound_kernel(*arrays, np.abs(weights), int(order), float(from_um))
+
     def _grouped(self, weight: ArrayLike) -> tuple[tuple[np.ndarray, ...], FloatArray, bool]:
         """Coefficients as ``(W, P * Q)`` and weights to match."""
         weights = np.asarray(weight, dtype=float)
@@ -365,6 +392,53 @@ def _derivative_kernel(
                 dbottom = 2.0 * (field.conjugate() * g[m, q] * dz).real
                 total += w[m, q] * (dtop * bottom - top * dbottom) / (bottom * bottom)
             out[m, i] = total
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _bound_kernel(
+    a: NDArray,
+    b: NDArray,
+    e: NDArray,
+    c: NDArray,
+    g: NDArray,
+    kappa: NDArray,
+    w: NDArray,
+    order: int,
+    start: float,
+) -> NDArray:  # pragma: no cover - compiled
+    groups, nodes = w.shape
+    out = np.zeros(groups)
+    for m in range(groups):
+        for q in range(nodes):
+            h, kr, ki = -g[m, q], abs(kappa[m, q].real), kappa[m, q].imag
+            r = math.exp(-ki * start)
+            total = 0.0
+            if ki == 0.0:
+                first = (a[m, q] + b[m, q] + e[m, q]) * h + c[m, q] + c[m, q].conjugate() * h * h
+                size, term, j = abs(first) / (1.0 - abs(h) ** 2), 1.0, 1
+                while term > 1e-20 * total:
+                    term = size * (j * kr) ** order
+                    total += 2.0 * term
+                    size *= abs(h)
+                    j += 1
+                out[m] += w[m, q] * total
+                continue
+            reach = max(order, min(400, 2 + int(math.log(1e-18) / math.log(max(abs(h) * r, 1e-9)))))
+            for j in range(reach + 1):
+                for k in range(j + 1):
+                    term = a[m, q] * h**j * h.conjugate() ** k
+                    if k > 0:
+                        term += b[m, q] * h ** (j - 1) * h.conjugate() ** (k - 1)
+                        term += c[m, q].conjugate() * h**j * h.conjugate() ** (k - 1)
+                    if j > 0:
+                        term += c[m, q] * h ** (j - 1) * h.conjugate() ** k
+                    twice = 1.0 if j == k else 2.0
+                    rate = ((j - k) * kr + (j + k) * ki) ** order
+                    total += twice * rate * abs(term) * r ** (j + k)
+                    rate = ((j - k) * kr + (j + k + 1) * ki) ** order
+                    total += twice * rate * abs(e[m, q]) * abs(h) ** (j + k) * r ** (j + k + 1)
+            out[m] += w[m, q] * total
     return out
 
 

@@ -1,0 +1,423 @@
+"""Response as a table over thickness, with a stated interpolation error, and whole frames made from it."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from importlib import resources
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+
+from ..errors import ConvergenceError, InputError, OutOfRangeError
+from ..optics.illumination import Illumination
+from ..optics.system import OpticalSystem
+from .table_cache import TableCache
+
+__all__ = ["DEFAULT_TOLERANCE", "ResponseTable", "content_key", "response_table", "tabulate"]
+
+FloatArray = NDArray[np.float64]
+Sampler = Callable[[float, float, int], FloatArray]
+"""``(start_um, step_um, count) -> response [W, count]`` on a uniform grid of thickness."""
+
+DEFAULT_TOLERANCE = 1e-7
+"""Interpolation error that is asked for by default: about the rounding of the float32 frames."""
+
+MOST_POINTS = 4_000_000
+"""Points of one row; a table that wants more is refused."""
+
+_REFINEMENTS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseTable:
+    """Response on a uniform grid of thickness, interpolated by a cubic spline.
+
+    Attributes
+    ----------
+    start_um, step_um : `float`
+        First thickness and spacing of the grid [µm].
+    values : `numpy.ndarray`, shape ``(W, N)``
+        Response of W exposures at N thicknesses.
+    wavelength_nm : `numpy.ndarray`, shape ``(W,)``
+        Nominal (or mean) wavelength of every exposure [nm].
+    interpolation_error : `float`
+        Largest absolute difference between the interpolated and the tabulated function.
+    quadrature_error : `float`
+        Error estimate of the illumination quadrature behind the values; NaN if it was not estimated.
+    key : `str`
+        Hash of everything that enters; empty for a table that cannot be cached.
+
+    Raises
+    ------
+    InputError
+        Fewer than four points, shapes that do not belong together, or a grid that is not increasing.
+    """
+
+    start_um: float
+    step_um: float
+    values: FloatArray
+    wavelength_nm: FloatArray
+    interpolation_error: float
+    quadrature_error: float = math.nan
+    key: str = ""
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or self.values.shape[1] < 4:
+            raise InputError("shape of the table", self.values.shape, "(exposures, four or more thicknesses)")
+        if self.wavelength_nm.shape != self.values.shape[:1]:
+            raise InputError("wavelengths of the table", self.wavelength_nm.shape, f"{self.values.shape[:1]}")
+        if not (math.isfinite(self.start_um) and 0.0 < self.step_um < math.inf):
+            raise InputError("grid of the table [um]", (self.start_um, self.step_um), "finite, increasing")
+
+    @property
+    def stop_um(self) -> float:
+        """Last thickness of the grid [µm]."""
+        return self.start_um + self.step_um * (self.values.shape[1] - 1)
+
+    @property
+    def thickness_um(self) -> FloatArray:
+        """Thicknesses of the grid [µm], shape ``(N,)``."""
+        return self.start_um + self.step_um * np.arange(self.values.shape[1])
+
+    @functools.cached_property
+    def polynomials(self) -> FloatArray:
+        """Coefficients ``(W, N-1, 4)`` of ``c0 + c1 t + c2 t² + c3 t³``, ``t`` from 0 to 1 in every cell."""
+        spline = CubicSpline(np.arange(self.values.shape[1]), self.values, axis=1)
+        return np.ascontiguousarray(np.moveaxis(spline.c[::-1], 0, -1).swapaxes(0, 1))
+
+    @functools.cached_property
+    def _packed(self) -> NDArray[np.float32]:
+        return self.polynomials.astype(np.float32)
+
+    def lookup(self, thickness_um: ArrayLike) -> FloatArray:
+        """Interpolated response.
+
+        Parameters
+        ----------
+        thickness_um : array_like
+            Thickness [µm], any shape; NaN gives NaN.
+
+        Returns
+        -------
+        response : `numpy.ndarray`, float64, shape ``(W, *thickness.shape)``
+
+        Raises
+        ------
+        OutOfRangeError
+            A thickness outside the grid.
+        """
+        thickness = np.asarray(thickness_um, dtype=float)
+        flat = np.ascontiguousarray(thickness).ravel()
+        self._demand_inside(flat)
+        out = _lookup_kernel(self.polynomials, self.start_um, 1.0 / self.step_um, flat, 0)
+        return out.reshape(len(out), *thickness.shape)
+
+    def thickness_derivative(self, thickness_um: ArrayLike) -> FloatArray:
+        """Derivative of `lookup` [1/µm]; same shape and errors."""
+        thickness = np.asarray(thickness_um, dtype=float)
+        flat = np.ascontiguousarray(thickness).ravel()
+        self._demand_inside(flat)
+        out = _lookup_kernel(self.polynomials, self.start_um, 1.0 / self.step_um, flat, 1)
+        return (out / self.step_um).reshape(len(out), *thickness.shape)
+
+    def frame(
+        self, thickness_um: ArrayLike, row: int = 0, out: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """Image of one exposure, in one pass over the thickness map with all processor cores.
+
+        Parameters
+        ----------
+        thickness_um : array_like, shape ``(ny, nx)``
+            Thickness [µm], float32 or float64; NaN gives NaN.
+        row : `int`, optional
+            Which exposure.
+        out : `numpy.ndarray`, float32, optional
+            Where to write; allocated if not given.
+
+        Returns
+        -------
+        image : `numpy.ndarray`, float32, shape ``(ny, nx)``
+            The same bits whatever the number of threads.
+
+        Raises
+        ------
+        OutOfRangeError
+            A thickness outside the grid, or a row that does not exist.
+        InputError
+            A map that is not two-dimensional, or ``out`` of another shape or type.
+        """
+        image = np.asarray(thickness_um)
+        if image.dtype not in (np.float32, np.float64):
+            image = image.astype(np.float64)
+        if image.ndim != 2:
+            raise InputError("shape of the thickness map", image.shape, "two axes (y, x)")
+        if not 0 <= row < len(self.values):
+            raise OutOfRangeError("row of the table", row, f"0 to {len(self.values) - 1}")
+        if out is None:
+            out = np.empty(image.shape, dtype=np.float32)
+        elif out.shape != image.shape or out.dtype != np.float32:
+            raise InputError("output image", (out.shape, str(out.dtype)), f"{image.shape}, float32")
+        outside = _frame_kernel(self._packed[row], self.start_um, 1.0 / self.step_um, image, out)
+        if np.any(outside):
+            self._demand_inside(np.asarray(image[int(np.argmax(outside))], dtype=float))
+        return out
+
+    def _demand_inside(self, thickness: FloatArray) -> None:
+        # Written so that NaN passes. The margin is the rounding of (d - start) / step.
+        margin = 1e-9 * self.step_um
+        wrong = (thickness < self.start_um - margin) | (thickness > self.stop_um + margin)
+        if np.any(wrong):
+            allowed = f"{self.start_um:.6g} to {self.stop_um:.6g} (range of the table)"
+            raise OutOfRangeError("thickness [um]", float(thickness[wrong][0]), allowed)
+
+
+def response_table(
+    system: OpticalSystem,
+    illumination: Illumination,
+    thickness_range_um: tuple[float, float],
+    *,
+    wavelength_nm: ArrayLike | None = None,
+    tolerance: float = DEFAULT_TOLERANCE,
+    quadrature_error: float = math.nan,
+    cache: TableCache | None = None,
+) -> ResponseTable:
+    """Tabulate the response of an optical system.
+
+    Parameters
+    ----------
+    system : `OpticalSystem`
+        The sensor.
+    illumination : `Illumination`
+        The light of W exposures.
+    thickness_range_um : `tuple` [`float`, `float`]
+        Thicknesses that the table must cover [µm].
+    wavelength_nm : array_like, shape ``(W,)``, optional
+        Nominal wavelengths [nm], as labels; the mean wavelength if not given.
+    tolerance : `float`, optional
+        Largest interpolation error; bounded from the closed form, not only sampled.
+    quadrature_error : `float`, optional
+        Error estimate of the illumination, to be carried along.
+    cache : `TableCache`, optional
+        Where finished tables are kept; nothing is stored if not given.
+
+    Returns
+    -------
+    table : `ResponseTable`
+
+    Raises
+    ------
+    OutOfRangeError
+        A negative, empty or infinite range.
+    ConvergenceError
+        The tolerance cannot be reached.
+    """
+    low, high = _checked_range(thickness_range_um)
+    if wavelength_nm is None:
+        wavelength = illumination.mean_wavelength_nm
+    else:
+        wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
+    key = content_key(system, illumination, (low, high), tolerance, wavelength, quadrature_error)
+
+    def build() -> ResponseTable:
+        reduced = system.reduce(illumination)
+        weight = illumination.weight
+        return tabulate(
+            functools.partial(reduced.averaged_on_grid, weight),
+            (low, high),
+            wavelength,
+            fourth_derivative=float(reduced.derivative_bound(weight, 4, low).max()),
+            tolerance=tolerance,
+            quadrature_error=quadrature_error,
+            key=key,
+        )
+
+    return build() if cache is None else cache.get(key, ResponseTable, build)
+
+
+def tabulate(
+    sample: Sampler,
+    thickness_range_um: tuple[float, float],
+    wavelength_nm: ArrayLike,
+    *,
+    fourth_derivative: float | None = None,
+    tolerance: float = DEFAULT_TOLERANCE,
+    quadrature_error: float = math.nan,
+    key: str = "",
+) -> ResponseTable:
+    """Tabulate any response that can be sampled on a uniform grid.
+
+    Parameters
+    ----------
+    sample : callable
+        ``(start_um, step_um, count) -> response [W, count]``.
+    thickness_range_um : `tuple` [`float`, `float`]
+        Thicknesses to cover [µm].
+    wavelength_nm : array_like, shape ``(W,)``
+        Labels of the exposures [nm].
+    fourth_derivative : `float`, optional
+        Upper bound of the fourth derivative with respect to thickness [1/µm⁴]. Without one it is taken from
+        differences of the samples, and the stated error is an estimate.
+    tolerance, quadrature_error, key
+        See `response_table`.
+
+    Notes
+    -----
+    In every cell the error vanishes at both ends, is measured at 1/3 and 2/3 (``e``), and its fourth derivative is
+    that of the function, so that it cannot exceed ``9/8 max|e| + h⁴ max|f''''| / 1944``.
+    """
+    low, high = _checked_range(thickness_range_um)
+    wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
+    if fourth_derivative is None:
+        fourth_derivative = _estimated_fourth_derivative(sample, low, high)
+    # A spline far from its ends errs by h⁴ f''''/384.
+    step = (384.0 * 0.5 * tolerance / max(fourth_derivative, 1e-300)) ** 0.25
+    error = math.inf
+    for _ in range(_REFINEMENTS):
+        cells = max(8, math.ceil((high - low) / step))
+        if cells > MOST_POINTS:
+            break
+        step = (high - low) / cells
+        fine = sample(low, step / 3.0, 3 * cells + 1)
+        table = ResponseTable(low, step, np.ascontiguousarray(fine[:, ::3]), wavelength, math.inf)
+        measured = _third_point_error(table.polynomials, fine)
+        error = 1.125 * measured + step**4 * fourth_derivative / 1944.0
+        # Near 1e-14 only rounding is left, and a finer grid does not reduce it.
+        if error <= max(tolerance, 1e-14):
+            return ResponseTable(low, step, table.values, wavelength, error, quadrature_error, key)
+        step *= max(0.3, min(0.8, 0.9 * (tolerance / error) ** 0.25))
+    raise ConvergenceError(
+        f"response table over {low:g} to {high:g} um: interpolation error {error:.2g} at a step of "
+        f"{step:.2g} um; asked for {tolerance:.2g}"
+    )
+
+
+def content_key(
+    system: OpticalSystem,
+    illumination: Illumination,
+    thickness_range_um: tuple[float, float],
+    tolerance: float,
+    wavelength_nm: FloatArray,
+    quadrature_error: float,
+) -> str:
+    """SHA-256 of everything that decides the content of a table, the source code included."""
+    digest = hashlib.sha256()
+
+    def add(name: str, value: object) -> None:
+        array = np.ascontiguousarray(value)
+        if array.dtype.kind == "f":
+            array = array + 0.0  # one representation of zero
+        digest.update(f"{name}:{array.dtype.str}:{array.shape}:".encode())
+        digest.update(array.tobytes())
+
+    add("code", code_version())
+    add("range", [*thickness_range_um, tolerance, quadrature_error])
+    add("labels", wavelength_nm)
+    for item in fields(Illumination):
+        value = getattr(illumination, item.name)
+        if value is not None:
+            add(f"illumination.{item.name}", value)
+    index = system.stack.indices(illumination.wavelength_nm, system.temperature_k)
+    add("index.real", index.real)
+    add("index.imag", index.imag)
+    add("thickness", system.stack.thickness_um)
+    add("roughness", system.stack.roughness_nm)
+    add("layers", " ".join(system.stack.names))
+    for item in fields(OpticalSystem):
+        # The illumination stands for the light; what is left are plain numbers and names.
+        if item.name not in ("stack", "profile", "beam"):
+            add(f"system.{item.name}", repr(getattr(system, item.name)))
+    return digest.hexdigest()
+
+
+@functools.lru_cache(maxsize=1)
+def code_version() -> str:
+    """Hash of the source of the optics and of this module."""
+    digest = hashlib.sha256()
+    base = resources.files("lsst.fringe_sim")
+    sources = [entry for entry in (base / "optics").iterdir() if entry.name.endswith(".py")]
+    for entry in [*sorted(sources, key=lambda item: item.name), base / "model" / "response_table.py"]:
+        digest.update(entry.read_bytes())
+    return digest.hexdigest()
+
+
+def _checked_range(thickness_range_um: tuple[float, float]) -> tuple[float, float]:
+    low, high = (float(value) for value in thickness_range_um)
+    if not 0.0 <= low < high < math.inf:
+        raise OutOfRangeError("thickness range [um]", (low, high), "two increasing, not negative numbers")
+    return low, high
+
+
+def _third_point_error(polynomials: FloatArray, fine: FloatArray) -> float:
+    worst = 0.0
+    for part in (1, 2):
+        t = part / 3.0
+        value = polynomials @ np.array([1.0, t, t**2, t**3])
+        worst = max(worst, float(np.abs(value - fine[:, part::3]).max()))
+    return worst
+
+
+def _estimated_fourth_derivative(sample: Sampler, low: float, high: float) -> float:
+    """Largest fourth difference over the fourth power of the step, at a step that resolves it."""
+    count = 1024
+    estimate = 0.0
+    for _ in range(8):
+        step = (high - low) / count
+        previous, estimate = estimate, float(np.abs(np.diff(sample(low, step, count + 1), 4)).max()) / step**4
+        if abs(estimate - previous) < 0.1 * estimate:
+            break
+        count *= 2
+    return 1.2 * estimate
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True)
+def _lookup_kernel(
+    polynomials: NDArray, start: float, per_step: float, thickness: NDArray, order: int
+) -> NDArray:  # pragma: no cover - compiled
+    rows, cells, _ = polynomials.shape
+    out = np.empty((rows, thickness.size))
+    for i in numba.prange(thickness.size):
+        position = (thickness[i] - start) * per_step
+        if position != position:  # NaN
+            for row in range(rows):
+                out[row, i] = np.nan
+            continue
+        cell = min(max(int(position), 0), cells - 1)
+        t = position - cell
+        for row in range(rows):
+            c = polynomials[row, cell]
+            if order == 0:
+                out[row, i] = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
+            else:
+                out[row, i] = c[1] + t * (2.0 * c[2] + t * 3.0 * c[3])
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True)
+def _frame_kernel(
+    polynomials: NDArray, start: float, per_step: float, thickness: NDArray, out: NDArray
+) -> NDArray:  # pragma: no cover - compiled
+    cells = len(polynomials)
+    height, width = thickness.shape
+    outside = np.zeros(height, dtype=np.bool_)
+    last = float(cells)
+    for y in numba.prange(height):
+        wrong = 0
+        for x in range(width):
+            position = (float(thickness[y, x]) - start) * per_step
+            # NaN fails both comparisons and is not "outside".
+            wrong += (position < -1e-9) | (position > last + 1e-9)
+            clipped = min(max(position, 0.0), last) if position == position else 0.0
+            cell = min(int(clipped), cells - 1)
+            t = np.float32(clipped - cell)
+            c0, c1 = polynomials[cell, 0], polynomials[cell, 1]
+            c2, c3 = polynomials[cell, 2], polynomials[cell, 3]
+            value = c0 + t * (c1 + t * (c2 + t * c3))
+            out[y, x] = value if position == position else np.float32(np.nan)
+        outside[y] = wrong > 0
+    return outside
