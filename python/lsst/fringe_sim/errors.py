@@ -90,6 +90,7 @@ class UnknownNameError(InputError):
     ) -> None:
         names = sorted({str(name) for name in known})
         near = difflib.get_close_matches(str(value), names, n=3, cutoff=0.5)
+        near += [name for name in names if value and str(value) in name and name not in near][: 3 - len(near)]
         if near:
             allowed = f"did you mean {' or '.join(near)}? ({_shorten(names)})"
         else:
