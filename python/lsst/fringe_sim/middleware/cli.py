@@ -1,0 +1,142 @@
+"""Subcommands that this package adds to ``butler``."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from lsst.daf.butler.cli.opt import options_file_option, repo_argument, transfer_option
+from lsst.daf.butler.cli.utils import ButlerCommand
+
+from ..errors import FringeSimError
+
+__all__ = ["define_fringe_night", "get_cli_subcommands", "ingest_fringe_raws"]
+
+
+def get_cli_subcommands() -> list[click.Command]:
+    """Return the subcommands; the entry point ``butler.cli`` leads here."""
+    return [ingest_fringe_raws, define_fringe_night]
+
+
+def _one_clear_message(command: Callable[..., None]) -> Callable[..., None]:
+    """Turn an error that the user can mend into one line and exit status 1."""
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+        except FringeSimError as error:
+            raise click.ClickException(str(error)) from error
+
+    return wrapped
+
+
+@click.command(short_help="Ingest raw frames in the LSST layout.", cls=ButlerCommand)
+@repo_argument(required=True)
+@click.argument("paths", metavar="PATH ...", nargs=-1, required=True)
+@click.option("--output-run", metavar="RUN", help="Run for the frames; by default INSTRUMENT/raw/all.")
+@transfer_option()
+@click.option("-n", "--dry-run", is_flag=True, help="Look at every file and report, but store nothing.")
+@options_file_option()
+@_one_clear_message
+def ingest_fringe_raws(
+    repo: str, paths: tuple[str, ...], output_run: str | None, transfer: str, dry_run: bool
+) -> None:
+    """Ingest raw frames: exposure records from their headers, and the files.
+
+    PATH is a file, a directory that is searched with all below it, or a quoted pattern. Frames that the
+    repository has already are left alone. A file that cannot be used is reported in one line; the others go in,
+    and the exit status is 1.
+    """
+    from lsst.daf.butler import Butler
+
+    from .raw_ingest import ingest_raws
+
+    with Butler.from_config(repo, writeable=not dry_run) as butler:
+        report = ingest_raws(butler, paths, transfer=transfer, run=output_run, dry_run=dry_run)
+    for message in report.refused:
+        click.echo(f"refused: {message}", err=True)
+    if dry_run:
+        for exposure in report.ingested:
+            info = exposure.info
+            click.echo(
+                f"{exposure.path}: {exposure.instrument} {info.detector_unique_name} exposure "
+                f"{info.exposure_id} {info.observation_type} {info.physical_filter} {info.object}"
+            )
+    runs = ", ".join(report.run.values()) or "no run"
+    verb = "would be ingested" if dry_run else "ingested"
+    click.echo(
+        f"{len(report.ingested)} raw frames {verb} into {runs}; {len(report.present)} were there already; "
+        f"{len(report.refused)} refused"
+    )
+    if report.refused:
+        sys.exit(1)
+
+
+@click.command(short_help="Register the sky exposures of a night.", cls=ButlerCommand)
+@repo_argument(required=True)
+@click.argument("instrument")
+@click.option(
+    "--date",
+    "dates",
+    metavar="YYYYMMDD",
+    required=True,
+    multiple=True,
+    type=click.DateTime(["%Y%m%d", "%Y-%m-%d"]),
+    help="Evening on which the night begins; may be given several times.",
+)
+@click.option(
+    "--hours",
+    metavar="FIRST:LAST[:STEP]",
+    default="19:29",
+    show_default=True,
+    help="Local hours of the exposures, the last one included; 25 is 1 h after midnight.",
+)
+@click.option("--exposure-time", type=float, default=30.0, show_default=True, help="Exposure time, seconds.")
+@click.option("--airmass", type=float, default=1.2, show_default=True, help="Airmass of the exposures.")
+@click.option("--filter", "physical_filter", help="Physical filter; by default the y filter.")
+@click.option("-n", "--dry-run", is_flag=True, help="Show the exposures, but store nothing.")
+@options_file_option()
+@_one_clear_message
+def define_fringe_night(
+    repo: str,
+    instrument: str,
+    dates: tuple[datetime.datetime, ...],
+    hours: str,
+    exposure_time: float,
+    airmass: float,
+    physical_filter: str | None,
+    dry_run: bool,
+) -> None:
+    """Register a night of sky exposures, for which sky fringes are to be simulated.
+
+    INSTRUMENT is the name of an instrument that the repository knows, as LSSTCam. Only records are made, no
+    images. Registering the same night again changes nothing.
+    """
+    from lsst.daf.butler import Butler
+
+    from .night import NightPlan, define_night, parse_hours
+
+    plans = [
+        NightPlan(
+            date=date.date(),
+            hours=parse_hours(hours),
+            exposure_time_s=exposure_time,
+            airmass=airmass,
+            physical_filter=physical_filter,
+        )
+        for date in dates
+    ]
+    with Butler.from_config(repo, writeable=not dry_run) as butler:
+        records = define_night(butler, instrument, plans, dry_run=dry_run)
+    for record in records:
+        click.echo(
+            f"exposure {record['id']}  {record['target_name']}  {record['physical_filter']}  "
+            f"{record['exposure_time']:g} s"
+        )
+    click.echo(f"{len(records)} exposures {'would be registered' if dry_run else 'registered'}")

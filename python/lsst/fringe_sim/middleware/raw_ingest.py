@@ -1,0 +1,392 @@
+"""Raw frames into a repository: exposure records from the headers, files by `Butler.ingest`.
+
+Every file is looked at before anything is stored. A file that cannot be used is set aside with one message; the
+others go in. What is already there stays as it is, so that ingesting again changes nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import glob
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import astropy.units as u
+from astro_metadata_translator import ObservationInfo
+
+from lsst.daf.butler import (
+    Butler,
+    CollectionType,
+    DataCoordinate,
+    DatasetRef,
+    DatasetType,
+    FileDataset,
+    Timespan,
+)
+from lsst.daf.butler.registry import ConflictingDefinitionError
+
+from ..errors import FrameFormatError, InputError
+from ..instrument.raw_frame import RawMetadata, read_raw_header
+from .formatters import RawFrameFormatter
+from .instruments import INSTRUMENTS, FringeInstrument
+from .translators import TRANSLATORS
+
+__all__ = ["RAW", "IngestReport", "RawExposure", "find_raw_files", "ingest_raws", "raw_dataset_type"]
+
+RAW = "raw"
+"""Dataset type of raw frames."""
+
+SUFFIXES = (".fits", ".fits.fz", ".fits.gz", ".fz")
+"""Endings of the files that are taken from a directory."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RawExposure:
+    """One raw file that can be ingested.
+
+    Attributes
+    ----------
+    path : `str`
+        The file.
+    info : `astro_metadata_translator.ObservationInfo`
+        What its header says.
+    instrument : `str`
+        Name of the instrument.
+    data_id : `dict`
+        Its instrument, exposure and detector.
+    """
+
+    path: str
+    info: ObservationInfo
+    instrument: str
+
+    @property
+    def data_id(self) -> dict[str, Any]:
+        """Instrument, exposure and detector."""
+        return {
+            "instrument": self.instrument,
+            "exposure": self.info.exposure_id,
+            "detector": self.info.detector_num,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class IngestReport:
+    """What became of the files.
+
+    Attributes
+    ----------
+    ingested, present : `tuple` [`RawExposure`, ...]
+        Files that are new in the repository (or would be), and files whose data id was there before.
+    refused : `tuple` [`str`, ...]
+        One message for each file that could not be used.
+    run : `dict` [`str`, `str`]
+        Run into which the files of each instrument went.
+    """
+
+    ingested: tuple[RawExposure, ...]
+    present: tuple[RawExposure, ...]
+    refused: tuple[str, ...]
+    run: Mapping[str, str]
+
+
+def raw_dataset_type(butler: Butler) -> DatasetType:
+    """Return the dataset type of raw frames."""
+    return DatasetType(
+        RAW,
+        ("instrument", "exposure", "detector"),
+        "RawFrame",
+        universe=butler.dimensions,
+        isCalibration=False,
+    )
+
+
+def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Find the files that are meant.
+
+    Parameters
+    ----------
+    paths : iterable of `str`
+        Files, directories (searched with everything below them) and patterns with ``*``, ``?`` and ``[]``.
+
+    Returns
+    -------
+    files : `list` [`str`]
+        Absolute paths, sorted, each once.
+    refused : `list` [`str`]
+        One message for each path that leads to no file.
+    """
+    files: set[str] = set()
+    refused = []
+    for path in paths:
+        found = list(_expand(path))
+        if not found:
+            allowed = (
+                f"a file, a directory that holds {'/'.join(SUFFIXES)} files, or a pattern that matches some"
+            )
+            refused.append(str(InputError("path", path, allowed)))
+        files.update(str(file.absolute()) for file in found)
+    return sorted(files), refused
+
+
+def _expand(path: str) -> Iterator[Path]:
+    entry = Path(path)
+    if entry.is_dir():
+        yield from (file for file in entry.rglob("*") if file.is_file() and file.name.endswith(SUFFIXES))
+    elif entry.is_file():
+        yield entry
+    else:
+        for name in glob.iglob(path, recursive=True):
+            yield from _expand(name)
+
+
+def ingest_raws(
+    butler: Butler,
+    paths: Iterable[str],
+    *,
+    transfer: str | None = "auto",
+    run: str | None = None,
+    dry_run: bool = False,
+) -> IngestReport:
+    """Ingest raw frames.
+
+    Parameters
+    ----------
+    butler : `lsst.daf.butler.Butler`
+        The repository, writeable unless ``dry_run``.
+    paths : iterable of `str`
+        Files, directories and patterns.
+    transfer : `str` or `None`, optional
+        How the files come into the repository (``copy``, ``link``, ``direct`` to leave them where they are, …).
+    run : `str`, optional
+        Run for the files; by default ``<instrument>/raw/all``.
+    dry_run : `bool`, optional
+        Look at the files and report, but store nothing.
+
+    Returns
+    -------
+    report : `IngestReport`
+        What became of each file.
+    """
+    files, refused = find_raw_files(paths)
+    registered = _registered_instruments(butler)
+    usable: list[RawExposure] = []
+    for file in files:
+        try:
+            usable.append(_examine(file, registered))
+        except InputError as error:
+            refused.append(_one_line(error))
+    usable, contradicting = _agreeing(usable)
+    refused += contradicting
+    runs = {name: run or cls().makeDefaultRawIngestRunName() for name, cls in registered.items()}
+    new, present = _split_by_presence(butler, usable, runs)
+    if not dry_run:
+        new, conflicting = _store(butler, new, registered, runs, transfer)
+        refused += conflicting
+    used = {exposure.instrument for exposure in (*new, *present)}
+    return IngestReport(
+        tuple(new), tuple(present), tuple(refused), {name: runs[name] for name in sorted(used)}
+    )
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _registered_instruments(butler: Butler) -> dict[str, type[FringeInstrument]]:
+    """Instruments of this package that the repository knows, by name."""
+    names = {record.name for record in butler.query_dimension_records("instrument", explain=False)}
+    return {cls.getName(): cls for cls in INSTRUMENTS.values() if cls.getName() in names}
+
+
+def _examine(path: str, registered: Mapping[str, type[FringeInstrument]]) -> RawExposure:
+    """Read the header of one file.
+
+    Raises
+    ------
+    InputError
+        The file is no raw frame, or the repository does not know its instrument or its filter.
+    """
+    header = read_raw_header(path)
+    camera = RawMetadata.from_header(header, source=path).camera
+    instrument = INSTRUMENTS[camera]
+    if instrument.getName() not in registered:
+        raise InputError(
+            "instrument",
+            instrument.getName(),
+            f"one that the repository knows ({', '.join(sorted(registered)) or 'there is none'}); "
+            f"butler register-instrument REPO lsst.fringe_sim.{instrument.__name__} adds it",
+            source=path,
+        )
+    info = ObservationInfo(header, filename=path, translator_class=TRANSLATORS[camera], pedantic=True)
+    try:
+        instrument.band_of(str(info.physical_filter))
+    except InputError as error:
+        raise error.in_source(path) from None
+    return RawExposure(path, info, instrument.getName())
+
+
+def _agreeing(exposures: Sequence[RawExposure]) -> tuple[list[RawExposure], list[str]]:
+    """Set aside files that contradict an earlier one: the same data id twice, or one exposure told differently."""
+    kept: list[RawExposure] = []
+    refused = []
+    first_of: dict[tuple[str, int], RawExposure] = {}
+    by_data_id: dict[tuple[Any, ...], RawExposure] = {}
+    for exposure in exposures:
+        data_id = tuple(exposure.data_id.values())
+        first = first_of.setdefault((exposure.instrument, exposure.data_id["exposure"]), exposure)
+        try:
+            if data_id in by_data_id:
+                raise FrameFormatError(
+                    "exposure and detector",
+                    exposure.data_id,
+                    f"those of no other file; {by_data_id[data_id].path} has the same",
+                    source=exposure.path,
+                )
+            _refuse_contradiction(exposure, first)
+        except InputError as error:
+            refused.append(_one_line(error))
+            continue
+        by_data_id[data_id] = exposure
+        kept.append(exposure)
+    return kept, refused
+
+
+def _refuse_contradiction(exposure: RawExposure, first: RawExposure) -> None:
+    """Sensors that were read together must tell the same of their exposure."""
+    record, other = _exposure_record(exposure.info), _exposure_record(first.info)
+    for field, value in record.items():
+        if value != other[field]:
+            raise FrameFormatError(
+                f"{field} of exposure {record['id']}",
+                str(value),
+                f"{other[field]}, as {first.path} has it; a frame of another exposure needs a DATE-OBS or SEQNUM "
+                "of its own",
+                source=exposure.path,
+            )
+
+
+def _exposure_record(info: ObservationInfo) -> dict[str, Any]:
+    """Record of the exposure dimension."""
+    exposure_time, dark_time = _seconds(info.exposure_time), _seconds(info.dark_time)
+    return {
+        "instrument": info.instrument,
+        "id": info.exposure_id,
+        "obs_id": info.observation_id,
+        "group": info.exposure_group,
+        "day_obs": info.observing_day,
+        "physical_filter": info.physical_filter,
+        "exposure_time": exposure_time,
+        "dark_time": dark_time,
+        "observation_type": info.observation_type,
+        "observation_reason": info.observation_reason,
+        "seq_num": info.observation_counter,
+        "seq_start": info.group_counter_start,
+        "seq_end": info.group_counter_end,
+        "target_name": info.object,
+        "science_program": info.science_program,
+        "has_simulated": info.has_simulated_content,
+        "can_see_sky": info.can_see_sky,
+        "timespan": Timespan(info.datetime_begin, info.datetime_end),
+    }
+
+
+def _seconds(duration: u.Quantity | None) -> float | None:
+    return None if duration is None else float(duration.to_value(u.s))
+
+
+def _split_by_presence(
+    butler: Butler, exposures: Sequence[RawExposure], runs: Mapping[str, str]
+) -> tuple[list[RawExposure], list[RawExposure]]:
+    """Files that are new, and files whose data id the run has already."""
+    there: set[tuple[Any, ...]] = set()
+    for instrument in {exposure.instrument for exposure in exposures}:
+        if _has_run(butler, runs[instrument]):
+            refs = butler.query_datasets(
+                RAW, collections=runs[instrument], instrument=instrument, explain=False, limit=None
+            )
+            there |= {
+                tuple(ref.dataId[name] for name in ("instrument", "exposure", "detector")) for ref in refs
+            }
+    new = [exposure for exposure in exposures if tuple(exposure.data_id.values()) not in there]
+    present = [exposure for exposure in exposures if tuple(exposure.data_id.values()) in there]
+    return new, present
+
+
+def _has_run(butler: Butler, run: str) -> bool:
+    known_type = bool(list(butler.registry.queryDatasetTypes(RAW)))
+    return known_type and run in butler.collections.query("*", collection_types=CollectionType.RUN)
+
+
+def _store(
+    butler: Butler,
+    exposures: Sequence[RawExposure],
+    registered: Mapping[str, type[FringeInstrument]],
+    runs: Mapping[str, str],
+    transfer: str | None,
+) -> tuple[list[RawExposure], list[str]]:
+    """Write records and files; exposures that contradict the repository are set aside."""
+    dataset_type = raw_dataset_type(butler)
+    butler.registry.registerDatasetType(dataset_type)
+    refused = _sync_exposures(butler, exposures, registered)
+    stored = [exposure for exposure in exposures if _exposure_key(exposure) not in refused]
+    for run in {runs[exposure.instrument] for exposure in stored}:
+        butler.collections.register(run)
+    datasets = [
+        FileDataset(
+            path=exposure.path,
+            refs=[
+                DatasetRef(
+                    dataset_type,
+                    DataCoordinate.standardize(exposure.data_id, universe=butler.dimensions),
+                    run=runs[exposure.instrument],
+                )
+            ],
+            formatter=RawFrameFormatter,
+        )
+        for exposure in stored
+    ]
+    if datasets:
+        butler.ingest(*datasets, transfer=transfer)
+    messages = [
+        f"{exposure.path}: {refused[_exposure_key(exposure)]}"
+        for exposure in exposures
+        if _exposure_key(exposure) in refused
+    ]
+    return stored, messages
+
+
+def _exposure_key(exposure: RawExposure) -> tuple[str, int]:
+    return exposure.instrument, exposure.data_id["exposure"]
+
+
+def _sync_exposures(
+    butler: Butler, exposures: Sequence[RawExposure], registered: Mapping[str, type[FringeInstrument]]
+) -> dict[tuple[str, int], str]:
+    """Make the records of every exposure; return a message for each that the repository tells differently."""
+    refused: dict[tuple[str, int], str] = {}
+    for key, info in {_exposure_key(exposure): exposure.info for exposure in exposures}.items():
+        try:
+            with butler.transaction():
+                _sync_exposure(butler, info, registered[key[0]])
+        except ConflictingDefinitionError as error:
+            refused[key] = (
+                f"exposure {key[1]} of {key[0]} is in the repository with other properties "
+                f"({_one_line(error)}); allowed: a DATE-OBS or SEQNUM of its own"
+            )
+    return refused
+
+
+def _sync_exposure(butler: Butler, info: ObservationInfo, instrument: type[FringeInstrument]) -> None:
+    record = _exposure_record(info)
+    name = str(record["physical_filter"])
+    instrument().register_filter(butler.registry, name, instrument.band_of(name))
+    registry = butler.registry
+    registry.syncDimensionData("day_obs", _day_obs_record(info))
+    registry.syncDimensionData("group", {"instrument": info.instrument, "name": info.exposure_group})
+    registry.syncDimensionData("exposure", record)
+
+
+def _day_obs_record(info: ObservationInfo) -> dict[str, Any]:
+    return {"instrument": info.instrument, "id": info.observing_day}
