@@ -1,0 +1,140 @@
+"""``fringe-sim mock-flats``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..instrument.camera import Camera
+from ..mock.hidden_effects import validate_effects
+from ..mock.raw_frames import Defects, write_mock_flats
+from ..mock.thickness import e2v_321, fit_to_sensor, random_field
+from ..model import Setup
+from .inputs import prepare_folder, read_settings, read_thickness
+from .parameters import EFFECT, SIZE, WAVELENGTHS, Quantity, effect_settings
+from .progress import progress
+
+__all__ = ["mock_flats"]
+
+BLEMISHES = Defects(bad_columns=6, hot_pixels=200, prnu_rms=0.003)
+"""What ``--blemishes`` puts on the sensor: about what a science-grade sensor shows."""
+
+
+@click.command("mock-flats")
+@click.argument("outdir", type=click.Path(path_type=Path))
+@click.option("--setup", default="ts8_e2v", show_default=True, help="Laboratory set-up.")
+@click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
+@click.option(
+    "--thickness",
+    default="e2v_321",
+    show_default=True,
+    help="Map of the varying layer: a FITS file [µm], 'random', or 'e2v_321' (model of a measured sensor).",
+)
+@click.option("--wavelengths", type=WAVELENGTHS, default=None, help="first:last:step or a list [nm].")
+@click.option("--effect", "effects", type=EFFECT, multiple=True, help="Hidden effect; may be repeated.")
+@click.option(
+    "--effects-file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="YAML with hidden effects.",
+)
+@click.option(
+    "--size", type=SIZE, default=None, help="Cut-down sensor, columns x rows; full size if not given."
+)
+@click.option("--bias-frames", type=click.IntRange(1, 200), default=5, show_default=True)
+@click.option(
+    "--level", type=click.FloatRange(10.0, 1e5), default=20000.0, show_default=True, help="Electrons."
+)
+@click.option(
+    "--temperature", type=Quantity("K"), default=None, help="Sensor temperature, as 183.15 or -90degC."
+)
+@click.option("--blemishes/--no-blemishes", default=False, help="Bad columns and hot pixels.")
+@click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all randomness.")
+@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+def mock_flats(
+    outdir: Path,
+    setup: str,
+    detector: str | None,
+    thickness: str,
+    wavelengths: tuple[float, ...] | None,
+    effects: tuple[tuple[str, float], ...],
+    effects_file: Path | None,
+    size: tuple[int, int] | None,
+    bias_frames: int,
+    level: float,
+    temperature: float | None,
+    blemishes: bool,
+    seed: int,
+    dry_run: bool,
+) -> None:
+    """Write raw bias frames and flats of a simulated sensor in the LSST raw layout.
+
+    Nothing in the files tells the thickness, the effects or the seed.
+
+    \b
+    Examples:
+      fringe-sim mock-flats raws --setup ts8_e2v --detector R11_S01 --seed 1 --size 512x500
+      fringe-sim mock-flats raws --thickness random --effect bandwidth.fwhm=2.6 --seed 2 --size 512x500
+    """
+    chosen = Setup.from_name(setup)
+    if chosen.kind != "monochromator":
+        raise InputError("set-up", setup, "a laboratory set-up with a monochromator")
+    camera = Camera.from_name(chosen.camera)
+    sensor = camera.detector(detector or chosen.detector)
+    shape = (size[1], size[0]) if size else sensor.shape
+    rng = np.random.default_rng(seed)
+    settings = dict(read_settings(effects_file)) if effects_file else {}
+    settings.update(effect_settings(effects))
+    if temperature is not None:
+        settings["temperature.kelvin"] = temperature
+    validate_effects(settings)
+    nominal = wavelengths or chosen.wavelengths_nm
+    layer = thickness_map(thickness, chosen, shape, rng)
+    frames = bias_frames + len(nominal)
+    if dry_run:
+        click.echo(
+            f"would write {frames} frames of {sensor.name}, {shape[1]} x {shape[0]} pixels, to {outdir}"
+        )
+        return
+    folder = prepare_folder(outdir)
+    with progress("writing raw frames", frames) as advance:
+        run = write_mock_flats(
+            folder,
+            setup=setup,
+            detector=detector or chosen.detector,
+            thickness_um=layer,
+            wavelengths_nm=nominal,
+            rng=rng,
+            effects=settings,
+            size=f"{shape[1]}x{shape[0]}" if size else None,
+            n_bias=bias_frames,
+            level_e=level,
+            defects=BLEMISHES if blemishes else None,
+            progress=lambda path: advance(),
+        )
+    click.echo(f"{len(run.paths)} raw frames in {folder}")
+
+
+def thickness_map(
+    text: str, setup: Setup, shape: tuple[int, int], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Thickness map of a sensor from the argument of ``--thickness``."""
+    if text == "random":
+        low, high = setup.thickness_range_um
+        if setup.varying == "adhesive":
+            # What the nine sensors of RTM-020 show: 7 to 14 um of range on a mean between 13 and 22 um.
+            span = float(rng.uniform(6.0, 10.0))
+            mean = float(rng.uniform(max(low, 10.0) + span / 2, min(high, 26.0) - span / 2))
+        else:
+            span = 0.2 * (high - low)
+            mean = 0.5 * (low + high)
+        return random_field(shape, rng, mean=mean, span=span, scale=0.35 * min(shape))
+    if text == "e2v_321":
+        if setup.varying != "adhesive":
+            raise InputError("--thickness", text, f"'random' or a file for the layer {setup.varying}")
+        return e2v_321(shape)
+    layer = read_thickness(text)
+    return layer if layer.shape == shape else fit_to_sensor(layer, shape)
