@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.effects import EFFECTS, Effect, activate_effects
+from lsst.fringe_sim.effects import EFFECTS, Effect, ImageGeometry, activate_effects
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.model import FringeModel
 
@@ -24,7 +24,14 @@ def base() -> FringeModel:
 
 @pytest.fixture(scope="module")
 def thickness() -> np.ndarray:
-    return np.linspace(14.0, 15.2, 40)
+    """A small sensor: one thickness in every pixel, all fringe phases, all amplifiers."""
+    return np.linspace(14.0, 15.2, 4 * 16).reshape(16, 4).T.copy()
+
+
+def observe(model: FringeModel, thickness: np.ndarray) -> np.ndarray:
+    """Response, followed by the image of a flat of 20 000 electrons; a change of either is a change."""
+    geometry = ImageGeometry.of_pixels(thickness.shape, WAVELENGTHS, 20_000.0)
+    return np.concatenate([model.response(thickness, WAVELENGTHS), model.flat_image(thickness, geometry)])
 
 
 def null_of(effect: Effect, name: str, base: FringeModel) -> float:
@@ -40,7 +47,7 @@ def test_names_are_unique() -> None:
 def test_every_effect_is_described(effect: Effect) -> None:
     assert effect.title
     assert effect.reference
-    assert effect.acts_on in {"stack", "illumination", "response"}
+    assert effect.acts_on in {"stack", "illumination", "response", "image"}
     for parameter in effect.parameters:
         assert parameter.description
         assert parameter.bounds[0] < parameter.bounds[1]
@@ -53,9 +60,7 @@ def test_null_is_exactly_the_identity(effect, parameter, base, thickness) -> Non
     null = null_of(effect, parameter.name, base)
     changed = base.with_effects({effect.name: {parameter.name: null}})
     assert changed.system is base.base_system
-    np.testing.assert_array_equal(
-        changed.response(thickness, WAVELENGTHS), base.response(thickness, WAVELENGTHS)
-    )
+    np.testing.assert_array_equal(observe(changed, thickness), observe(base, thickness))
 
 
 @pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
@@ -64,11 +69,11 @@ def test_onset_is_monotone_and_smooth(effect, parameter, base, thickness) -> Non
     null = null_of(effect, parameter.name, base)
     low, high = parameter.bounds
     direction = 1.0 if null < high else -1.0
-    reference = base.response(thickness, WAVELENGTHS)
+    reference = observe(base, thickness)
     changes = []
-    for size in (0.05, 0.1, 0.2):
+    for size in (0.01, 0.02, 0.04):
         value = float(np.clip(null + direction * size * parameter.prior_scale, low, high))
-        response = base.with_effects({effect.name: {parameter.name: value}}).response(thickness, WAVELENGTHS)
+        response = observe(base.with_effects({effect.name: {parameter.name: value}}), thickness)
         changes.append(np.abs(response - reference).max())
     assert 0.0 < changes[0] < changes[1] < changes[2]
 
@@ -76,7 +81,7 @@ def test_onset_is_monotone_and_smooth(effect, parameter, base, thickness) -> Non
 @pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
 def test_finite_everywhere_in_bounds(effect, parameter, base, thickness) -> None:
     for value in np.linspace(*parameter.bounds, 5):
-        response = base.with_effects({effect.name: {parameter.name: value}}).response(thickness, WAVELENGTHS)
+        response = observe(base.with_effects({effect.name: {parameter.name: value}}), thickness)
         assert np.all(np.isfinite(response))
         assert np.all(response >= 0.0)
 
@@ -84,12 +89,12 @@ def test_finite_everywhere_in_bounds(effect, parameter, base, thickness) -> None
 @pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
 def test_nothing_is_mutated(effect, parameter, base, thickness) -> None:
     before = dataclasses.replace(base.base_system)
-    reference = base.response(thickness, WAVELENGTHS)
+    reference = observe(base, thickness)
     null = null_of(effect, parameter.name, base)
     value = float(np.clip(null + parameter.prior_scale, *parameter.bounds))
-    base.with_effects({effect.name: {parameter.name: value}}).response(thickness, WAVELENGTHS)
+    observe(base.with_effects({effect.name: {parameter.name: value}}), thickness)
     assert base.base_system == before
-    np.testing.assert_array_equal(base.response(thickness, WAVELENGTHS), reference)
+    np.testing.assert_array_equal(observe(base, thickness), reference)
 
 
 def test_both_spellings_agree() -> None:
@@ -123,7 +128,7 @@ def test_bad_settings_are_refused(settings, error, words) -> None:
 def test_wider_bandpass_lowers_the_contrast(base, thickness) -> None:
     narrow = base.response(thickness, WAVELENGTHS)
     wide = base.with_effects({"bandwidth.fwhm": 6.0}).response(thickness, WAVELENGTHS)
-    assert np.all(wide.std(axis=1) < narrow.std(axis=1))
+    assert np.all(wide.std(axis=(1, 2)) < narrow.std(axis=(1, 2)))
 
 
 def test_contrast_loss_scales_the_fringe_about_its_mean(base) -> None:

@@ -1,5 +1,7 @@
 """The catalogue of physical effects: one file each, one line in `EFFECTS`."""
 
+from .amplifier_gain import AmplifierGain
+from .amplifier_offset import AmplifierOffset
 from .ar_coating import ArCoating
 from .bandwidth import Bandwidth
 from .base import (
@@ -8,28 +10,45 @@ from .base import (
     Parameter,
     ResponseContext,
     activate_effects,
+    apply_to_image,
     apply_to_response,
     apply_to_system,
 )
+from .black_coating import BlackCoating
+from .charge_diffusion import ChargeDiffusion
+from .chromatic_illumination import ChromaticIllumination
 from .contrast_loss import ContrastLoss
 from .converging_beam import ConvergingBeam
+from .dark_pedestal import DarkPedestal
 from .epoxy_absorption import EpoxyAbsorption
 from .epoxy_index import EpoxyIndex
+from .gate_oxide import GateOxide
+from .gate_thickness import GateThickness
 from .ghost_pedestal import GhostPedestal
+from .illumination import Illumination
+from .image_geometry import AMPLIFIERS, ImageGeometry
 from .interface_roughness import InterfaceRoughness
+from .midline_step import MidlineStep
+from .non_linearity import NonLinearity
 from .silicon_absorption import SiliconAbsorption
 from .silicon_thickness import SiliconThickness
+from .support_index import SupportIndex
 from .temperature import Temperature
+from .tilt import Tilt
+from .vignetting import Vignetting
 from .wavelength_offset import WavelengthOffset
 from .wavelength_scale import WavelengthScale
 
 __all__ = [
+    "AMPLIFIERS",
     "EFFECTS",
     "ActiveEffect",
     "Effect",
+    "ImageGeometry",
     "Parameter",
     "ResponseContext",
     "activate_effects",
+    "apply_to_image",
     "apply_to_response",
     "apply_to_system",
 ]
@@ -43,13 +62,28 @@ EFFECTS: tuple[Effect, ...] = (
     Temperature(),
     ArCoating(),
     InterfaceRoughness(),
+    SupportIndex(),
+    GateOxide(),
+    GateThickness(),
+    BlackCoating(),
     # illumination
     Bandwidth(),
     WavelengthOffset(),
     WavelengthScale(),
     ConvergingBeam(),
+    Tilt(),
     # response
     GhostPedestal(),
     ContrastLoss(),
+    # image, from the light to the file
+    Illumination(),
+    ChromaticIllumination(),
+    Vignetting(),
+    MidlineStep(),
+    DarkPedestal(),
+    ChargeDiffusion(),
+    NonLinearity(),
+    AmplifierGain(),
+    AmplifierOffset(),
 )
 """Every effect that the model knows, in the order in which they are applied."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..optics.system import OpticalSystem
+from .image_geometry import ImageGeometry
 
 __all__ = [
     "ActiveEffect",
@@ -23,6 +24,7 @@ __all__ = [
     "Parameter",
     "ResponseContext",
     "activate_effects",
+    "apply_to_image",
     "apply_to_response",
     "apply_to_system",
 ]
@@ -73,14 +75,14 @@ class ResponseContext:
 class Effect(ABC):
     """A physical effect with named parameters.
 
-    Subclasses are final. They override `change_system`, or `change_response`, or both; each is only called when
-    some parameter differs from its null value.
+    Subclasses are final. They override `change_system`, `change_response` or `change_image`, or several of them; each
+    is only called when some parameter differs from its null value.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
     acts_on: ClassVar[str]
-    """``stack``, ``illumination`` or ``response``."""
+    """``stack``, ``illumination``, ``response`` or ``image``."""
     parameters: ClassVar[tuple[Parameter, ...]]
     reference: ClassVar[str]
 
@@ -93,6 +95,15 @@ class Effect(ABC):
     ) -> FloatArray:
         """Return the response ``[W, ...]`` with the effect in it; must not write into ``response``."""
         return response
+
+    def change_image(
+        self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
+    ) -> FloatArray:
+        """Return the image cube ``[W, y, x]`` with the effect in it; must not write into ``image``.
+
+        The image is in units of its mean level; what is added to it in electrons is divided by the level.
+        """
+        return image
 
     @abstractmethod
     def null_values(self, system: OpticalSystem) -> dict[str, float]:
@@ -217,6 +228,28 @@ def apply_to_response(
         if not item.is_null(system):
             response = item.effect.change_response(response, item.complete_values(system), context)
     return response
+
+
+def apply_to_image(
+    active: Iterable[ActiveEffect], system: OpticalSystem, image: FloatArray, geometry: ImageGeometry
+) -> FloatArray:
+    """Image cube with all effects in it; ``image`` itself is left alone.
+
+    Parameters
+    ----------
+    active : iterable of `ActiveEffect`
+        The effects.
+    system : `OpticalSystem`
+        The system before any effect, by which null values are judged.
+    image : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Signal of each plane in units of its mean level.
+    geometry : `ImageGeometry`
+        Where the samples lie.
+    """
+    for item in active:
+        if not item.is_null(system):
+            image = item.effect.change_image(image, item.complete_values(system), geometry)
+    return image
 
 
 def _flatten(settings: Mapping[str, Any]) -> Iterable[tuple[str, str, Any]]:

@@ -13,8 +13,10 @@ from ..effects import (
     EFFECTS,
     ActiveEffect,
     Effect,
+    ImageGeometry,
     ResponseContext,
     activate_effects,
+    apply_to_image,
     apply_to_response,
     apply_to_system,
 )
@@ -133,6 +135,32 @@ class FringeModel:
         wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
         illumination = self.system.flat_fields(wavelength)
         return self.respond(illumination, thickness_um, wavelength)
+
+    def flat_image(self, thickness_um: ArrayLike, geometry: ImageGeometry) -> FloatArray:
+        """Images of monochromator flats, each over its mean, with the effects of light, sensor and read-out.
+
+        Parameters
+        ----------
+        thickness_um : array_like, shape ``(ny, nx)``
+            Thickness of the varying layer at the samples of ``geometry`` [µm].
+        geometry : `ImageGeometry`
+            Positions of the samples, wavelengths and levels.
+
+        Returns
+        -------
+        image : `numpy.ndarray`, shape ``(W, ny, nx)``
+
+        Raises
+        ------
+        InputError
+            The map does not fit the geometry, or an effect in electrons meets a level that is not known.
+        """
+        thickness = np.asarray(thickness_um, dtype=float)
+        if thickness.shape != geometry.sample_shape:
+            raise InputError("shape of the thickness map", thickness.shape, f"{geometry.sample_shape}")
+        image = self.response(thickness, geometry.wavelength_nm)
+        image /= image.mean(axis=(1, 2), keepdims=True)
+        return apply_to_image(self.effects, self.base_system, image, geometry)
 
     def respond(
         self, illumination: Illumination, thickness_um: ArrayLike, wavelength_nm: ArrayLike | None = None

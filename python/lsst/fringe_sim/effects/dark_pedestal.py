@@ -1,0 +1,28 @@
+"""Dark signal or light leak."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from .base import FloatArray, Parameter, PlainNullEffect
+from .image_geometry import ImageGeometry
+
+__all__ = ["DarkPedestal"]
+
+
+class DarkPedestal(PlainNullEffect):
+    """Every exposure holds the same number of electrons that are not from the monochromator."""
+
+    name = "dark_pedestal"
+    title = "dark signal or light leak"
+    acts_on = "image"
+    reference = "EMVA standard 1288, release 4 (dark signal of a camera)"
+    parameters = (
+        Parameter("electrons", "electron", 0.0, (-5000.0, 100000.0), 200.0, "level in every exposure"),
+    )
+
+    def change_image(
+        self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
+    ) -> FloatArray:
+        """Add the level."""
+        return image + values["electrons"] / geometry.require_levels(self.name)
