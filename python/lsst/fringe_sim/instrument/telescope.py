@@ -1,0 +1,526 @@
+"""Telescopes: which directions of light arrive at a place of the focal plane.
+
+A telescope is a YAML file in ``data/telescopes``. Its beams come from a ray trace with batoid, or from a cone of
+given focal ratio. What the thin-film model needs of some 10⁵ rays is the distribution of ``sin²θ``; a Gauss rule
+with respect to that distribution represents it by a few dozen angles (paper, section 4.2 and Eq. 5).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import batoid
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
+
+from ..errors import InputError, OutOfRangeError, ResourceError, UnknownNameError
+from ..optics import Beam
+from ..resources import list_resources, read_yaml
+
+__all__ = [
+    "BeamField",
+    "ConeOptics",
+    "RayBundle",
+    "Telescope",
+    "TracedOptics",
+    "beam_error",
+    "gauss_rule",
+    "telescope_beam",
+]
+
+FloatArray = NDArray[np.float64]
+
+BEAM_NODES = 64
+"""Angles in a beam. Resolves 100 µm of detection plus 165 µm of support silicon, twice over (second harmonic)."""
+
+QUANTILES = 4096
+"""Groups of equal light into which the rays are gathered before the Gauss rule is formed."""
+
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RayBundle:
+    """Rays that reach one place of the focal plane; every ray carries the same light.
+
+    Attributes
+    ----------
+    slope_x, slope_y : `numpy.ndarray`, shape ``(N,)``
+        Slopes dx/dz and dy/dz against the normal of the sensor, z pointing into it.
+    kept_fraction : `float`
+        Share of the rays launched over the entrance pupil that was not vignetted.
+    """
+
+    slope_x: FloatArray
+    slope_y: FloatArray
+    kept_fraction: float
+
+    @property
+    def sin_squared(self) -> FloatArray:
+        """Squared sine of the angle of incidence, shape ``(N,)``."""
+        tangent = self.slope_x**2 + self.slope_y**2
+        return tangent / (1.0 + tangent)
+
+    @property
+    def theta(self) -> FloatArray:
+        """Angle of incidence ``arccos(|v_z| / |v|)`` [rad], shape ``(N,)``."""
+        return np.arctan(np.hypot(self.slope_x, self.slope_y))
+
+    def quantiles(self, groups: int = QUANTILES) -> FloatArray:
+        """Mean of ``sin²θ`` in groups of equal light, ascending, shape ``(groups,)``."""
+        ordered = np.sort(self.sin_squared)
+        edges = np.linspace(0.0, ordered.size, groups + 1)
+        # Integrating the step function of the sorted rays keeps the groups equal whatever their number.
+        cumulative = np.concatenate([[0.0], np.cumsum(ordered)])
+        integral = np.interp(edges, np.arange(ordered.size + 1), cumulative)
+        return np.diff(integral) / np.diff(edges)
+
+    def beam(self, nodes: int = BEAM_NODES) -> Beam:
+        """Gauss rule of the bundle."""
+        return _beam_of_quantiles(self.quantiles(), nodes)
+
+
+@dataclass(frozen=True)
+class TracedOptics:
+    """Optics traced with batoid.
+
+    Attributes
+    ----------
+    prescription : `str`
+        Name of a prescription that ships with batoid, e.g. ``LSST_y.yaml``.
+    wavelength_nm : `float`
+        Wavelength of the traced rays [nm]; the angles depend on it only through the refracting elements.
+    axisymmetric : `bool`
+        Whether the beam depends on the distance from the axis alone (no spiders, no tilted elements).
+    rings, spokes : `int`
+        Rays over the entrance pupil: midpoints of equal areas.
+    field_nodes_deg : `tuple` [`float`, ...]
+        Field radii between which beams are interpolated [deg]; dense where vignetting sets in.
+    """
+
+    prescription: str
+    wavelength_nm: float
+    axisymmetric: bool
+    rings: int = 400
+    spokes: int = 1200
+    field_nodes_deg: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "field_nodes_deg", tuple(float(node) for node in self.field_nodes_deg))
+
+    def trace(self, field_x_deg: float, field_y_deg: float) -> RayBundle:
+        """Trace the light of one field position down to the sensor.
+
+        Raises
+        ------
+        OutOfRangeError
+            No ray arrives.
+        """
+        if not self.axisymmetric:
+            return self._trace_pupil(field_x_deg, field_y_deg, self.spokes, 2.0 * np.pi)
+        # Mirror and rotation of one half of the pupil give the rest; no ray is left out.
+        half = self._trace_pupil(math.hypot(field_x_deg, field_y_deg), 0.0, self.spokes // 2, np.pi)
+        along = np.concatenate([half.slope_x, half.slope_x])
+        across = np.concatenate([half.slope_y, -half.slope_y])
+        azimuth = math.atan2(field_y_deg, field_x_deg)
+        cosine, sine = math.cos(azimuth), math.sin(azimuth)
+        return RayBundle(cosine * along - sine * across, sine * along + cosine * across, half.kept_fraction)
+
+    def _trace_pupil(self, field_x_deg: float, field_y_deg: float, spokes: int, reach: float) -> RayBundle:
+        """Trace midpoints of equal areas of the pupil between azimuth 0 and ``reach`` [rad]."""
+        optic = _batoid_optic(self.prescription)
+        outer = 0.5 * optic.pupilSize
+        inner = outer * optic.pupilObscuration
+        ring = np.arange(self.rings)
+        radius = np.sqrt(inner**2 + (outer**2 - inner**2) * (ring + 0.5) / self.rings)
+        # Every ring starts at another azimuth, so that vignetting edges do not cut all rings alike.
+        start = np.mod(ring * _GOLDEN, 1.0)
+        azimuth = reach * (np.arange(spokes) + start[:, None]) / spokes
+        rays = batoid.RayVector.fromStop(
+            (radius[:, None] * np.cos(azimuth)).ravel(),
+            (radius[:, None] * np.sin(azimuth)).ravel(),
+            optic=optic,
+            wavelength=1e-9 * self.wavelength_nm,
+            theta_x=math.radians(field_x_deg),
+            theta_y=math.radians(field_y_deg),
+        )
+        optic.trace(rays)  # leaves the rays in the coordinates of the last surface, the sensor
+        kept = ~(rays.vignetted | rays.failed)
+        if not kept.any():
+            raise OutOfRangeError(
+                "field angle [deg]",
+                (field_x_deg, field_y_deg),
+                "a place that light reaches",
+                source=self.prescription,
+            )
+        velocity = rays.v[kept]
+        # Slopes along the direction of travel, with z into the sensor whatever the sense of batoid's axis.
+        depth = np.abs(velocity[:, 2])
+        return RayBundle(velocity[:, 0] / depth, velocity[:, 1] / depth, float(kept.mean()))
+
+
+@dataclass(frozen=True)
+class ConeOptics:
+    """An aplanatic cone: the pupil is uniform in the direction sines (Abbe sine condition).
+
+    Attributes
+    ----------
+    f_number : `float`
+        Focal ratio N; the marginal ray arrives at ``arcsin(1 / 2N)``.
+    obscuration : `float`
+        Linear central obscuration, 0 to below 1.
+    rings, spokes : `int`
+        Rays over the pupil, where rays are asked for.
+    """
+
+    f_number: float
+    obscuration: float = 0.0
+    rings: int = 400
+    spokes: int = 1200
+
+    axisymmetric = True
+
+    def trace(self, field_x_deg: float, field_y_deg: float) -> RayBundle:
+        """Rays of the cone; the same at every field position."""
+        share = (np.arange(self.rings) + 0.5) / self.rings
+        outer = (0.5 / self.f_number) ** 2
+        sine = np.sqrt(outer * (self.obscuration**2 + (1.0 - self.obscuration**2) * share))
+        tangent = sine / np.sqrt(1.0 - sine**2)
+        azimuth = 2.0 * np.pi * (np.arange(self.spokes) + 0.5) / self.spokes
+        return RayBundle(
+            np.outer(tangent, np.cos(azimuth)).ravel(), np.outer(tangent, np.sin(azimuth)).ravel(), 1.0
+        )
+
+
+@dataclass(frozen=True)
+class Telescope:
+    """A telescope with its camera.
+
+    Attributes
+    ----------
+    name : `str`
+        Name of the file in ``data/telescopes``.
+    optics : `TracedOptics` or `ConeOptics`
+        What shapes the beam.
+    collecting_area_m2 : `float`
+        Effective collecting area on axis [m²].
+    pixel_um, pixel_scale_arcsec : `float`
+        Pixel pitch [µm] and the angle that it covers [arcsec].
+    field_radius_deg : `float`
+        Largest field angle at which beams are given [deg].
+    """
+
+    name: str
+    optics: TracedOptics | ConeOptics
+    collecting_area_m2: float
+    pixel_um: float
+    pixel_scale_arcsec: float
+    field_radius_deg: float
+
+    @classmethod
+    def from_name(cls, name: str) -> Telescope:
+        """Telescope of ``data/telescopes/<name>.yaml``; capitals do not matter.
+
+        Raises
+        ------
+        UnknownNameError
+            There is no such telescope.
+        ResourceError
+            The file is incomplete.
+        """
+        known = [entry.removesuffix(".yaml") for entry in list_resources("telescopes")]
+        stem = name.casefold()
+        if stem not in known:
+            raise UnknownNameError("telescope", name, known)
+        return cls.from_mapping(stem, read_yaml("telescopes", f"{stem}.yaml"))
+
+    @classmethod
+    def from_mapping(cls, name: str, content: Mapping[str, Any]) -> Telescope:
+        """Telescope described by the mapping of a YAML file.
+
+        Raises
+        ------
+        ResourceError
+            A key is missing, or the kind of optics is unknown.
+        """
+        try:
+            for key in ("source", "doi", "licence"):
+                content[key]
+            optics = dict(content["optics"])
+            kind = optics.pop("kind")
+            builders: dict[str, type[TracedOptics] | type[ConeOptics]] = {
+                "traced": TracedOptics,
+                "cone": ConeOptics,
+            }
+            return cls(
+                name,
+                builders[kind](**optics),
+                *(
+                    float(content[key])
+                    for key in ("collecting_area_m2", "pixel_um", "pixel_scale_arcsec", "field_radius_deg")
+                ),
+            )
+        except (KeyError, TypeError) as error:
+            raise ResourceError(f"telescope {name}: wrong or missing entry {error}") from error
+
+    @property
+    def pixel_solid_angle_arcsec2(self) -> float:
+        """Sky area of a pixel [arcsec²]."""
+        return self.pixel_scale_arcsec**2
+
+    def trace(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0) -> RayBundle:
+        """Rays that arrive at one field position.
+
+        Raises
+        ------
+        OutOfRangeError
+            The position lies outside the field.
+        """
+        self._check_field(field_x_deg, field_y_deg)
+        return self.optics.trace(field_x_deg, field_y_deg)
+
+    def beam(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0, nodes: int = BEAM_NODES) -> Beam:
+        """Angles of incidence at one field position, as a Gauss rule.
+
+        Raises
+        ------
+        OutOfRangeError
+            The position lies outside the field.
+        """
+        self._check_field(field_x_deg, field_y_deg)
+        if isinstance(self.optics, ConeOptics):
+            return Beam.cone(self.optics.f_number, self.optics.obscuration, nodes)
+        if self.optics.axisymmetric:
+            field_x_deg, field_y_deg = math.hypot(field_x_deg, field_y_deg), 0.0
+        return _beam_of_quantiles(_traced_quantiles(self.optics, field_x_deg, field_y_deg)[0], nodes)
+
+    def kept_fraction(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0) -> float:
+        """Share of the pupil that light from one field position passes; vignetting is its fall off axis."""
+        self._check_field(field_x_deg, field_y_deg)
+        if isinstance(self.optics, ConeOptics):
+            return 1.0
+        return _traced_quantiles(self.optics, field_x_deg, field_y_deg)[1]
+
+    def _check_field(self, field_x_deg: float, field_y_deg: float) -> None:
+        if not math.hypot(field_x_deg, field_y_deg) <= self.field_radius_deg:
+            raise OutOfRangeError(
+                "field angle [deg]",
+                (field_x_deg, field_y_deg),
+                f"within {self.field_radius_deg} deg of the axis",
+                source=f"telescope {self.name}",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class BeamField:
+    """Beams at any distance from the axis, interpolated between traced radii.
+
+    What is interpolated is the quantile function of ``sin²θ``, so that edges of the distribution move as they do in
+    the telescope instead of fading from one place to another.
+
+    Attributes
+    ----------
+    radius_deg : `numpy.ndarray`, shape ``(K,)``
+        Traced field radii [deg].
+    quantile : `numpy.ndarray`, shape ``(K, G)``
+        Mean of ``sin²θ`` in G groups of equal light.
+    kept : `numpy.ndarray`, shape ``(K,)``
+        Unvignetted share of the pupil.
+    """
+
+    radius_deg: FloatArray
+    quantile: FloatArray
+    kept: FloatArray
+
+    @classmethod
+    def trace(
+        cls, telescope: Telescope, radius_deg: ArrayLike | None = None, groups: int = QUANTILES
+    ) -> BeamField:
+        """Trace a telescope along one radius of its field.
+
+        Parameters
+        ----------
+        telescope : `Telescope`
+            An axisymmetric telescope.
+        radius_deg : array_like, shape ``(K,)``, optional
+            Radii to trace [deg]; by default those that the telescope's file names, else 40 over the field.
+        groups : `int`, optional
+            Groups of equal light kept per radius.
+
+        Raises
+        ------
+        InputError
+            The telescope is not axisymmetric; trace each position instead.
+        """
+        if not telescope.optics.axisymmetric:
+            raise InputError("telescope", telescope.name, "an axisymmetric one; trace every position instead")
+        if radius_deg is None:
+            named = telescope.optics.field_nodes_deg if isinstance(telescope.optics, TracedOptics) else ()
+            radius_deg = named or np.linspace(0.0, telescope.field_radius_deg, 40)
+        radii = np.sort(np.asarray(radius_deg, dtype=float))
+        bundles = [telescope.trace(float(radius)) for radius in radii]
+        return cls(
+            radii,
+            np.stack([bundle.quantiles(groups) for bundle in bundles]),
+            np.array([bundle.kept_fraction for bundle in bundles]),
+        )
+
+    def beam(self, field_x_deg: float, field_y_deg: float = 0.0, nodes: int = BEAM_NODES) -> Beam:
+        """Angles of incidence at one field position.
+
+        Raises
+        ------
+        OutOfRangeError
+            The position lies outside the traced radii.
+        """
+        radius = self._radius(field_x_deg, field_y_deg)
+        quantile = np.clip(self._quantile_of_radius(radius), 0.0, None)
+        return _beam_of_quantiles(np.sort(quantile), nodes)
+
+    def kept_fraction(self, field_x_deg: float, field_y_deg: float = 0.0) -> float:
+        """Unvignetted share of the pupil at one field position."""
+        return float(PchipInterpolator(self.radius_deg, self.kept)(self._radius(field_x_deg, field_y_deg)))
+
+    @functools.cached_property
+    def _quantile_of_radius(self) -> PchipInterpolator:
+        return PchipInterpolator(self.radius_deg, self.quantile, axis=0)
+
+    def _radius(self, field_x_deg: float, field_y_deg: float) -> float:
+        radius = math.hypot(field_x_deg, field_y_deg)
+        if not self.radius_deg[0] <= radius <= self.radius_deg[-1]:
+            raise OutOfRangeError(
+                "field angle [deg]", radius, f"{self.radius_deg[0]:.3f} to {self.radius_deg[-1]:.3f}"
+            )
+        return radius
+
+
+def telescope_beam(
+    telescope: str | Telescope, field_x_deg: float = 0.0, field_y_deg: float = 0.0, nodes: int = BEAM_NODES
+) -> Beam:
+    """Angles of incidence of a telescope at one field position.
+
+    Parameters
+    ----------
+    telescope : `str` or `Telescope`
+        A telescope or its name (``lsst``, ``hsc``, ``monocam``).
+    field_x_deg, field_y_deg : `float`, optional
+        Field angle [deg]; the axis by default.
+    nodes : `int`, optional
+        Number of angles.
+
+    Returns
+    -------
+    beam : `Beam`
+
+    Raises
+    ------
+    UnknownNameError
+        The telescope is unknown.
+    OutOfRangeError
+        The position lies outside the field.
+    """
+    found = Telescope.from_name(telescope) if isinstance(telescope, str) else telescope
+    return found.beam(field_x_deg, field_y_deg, nodes)
+
+
+def gauss_rule(value: ArrayLike, weight: ArrayLike, nodes: int) -> tuple[FloatArray, FloatArray]:
+    """Gauss quadrature with respect to a discrete measure.
+
+    The rule integrates polynomials up to degree ``2 nodes - 1`` over the measure exactly (Lanczos process with full
+    reorthogonalisation, Golub & Welsch 1969). Where the measure has no more points than that, it is returned as is.
+
+    Parameters
+    ----------
+    value, weight : array_like, shape ``(N,)``
+        Points of the measure and their weights.
+    nodes : `int`
+        Number of nodes wanted.
+
+    Returns
+    -------
+    node, node_weight : `numpy.ndarray`
+        Ascending nodes inside the range of ``value``, and weights that sum to the sum of ``weight``.
+    """
+    if nodes < 1:
+        raise OutOfRangeError("number of beam angles", nodes, "1 or more")
+    points, mass = np.asarray(value, dtype=float), np.asarray(weight, dtype=float)
+    order = np.argsort(points)
+    points, mass = points[order], mass[order]
+    centre, half = 0.5 * (points[0] + points[-1]), 0.5 * (points[-1] - points[0])
+    if points.size <= nodes or half <= 1e-14 * max(1.0, abs(centre)):
+        return (points, mass) if half > 0.0 else (points[:1], np.array([mass.sum()]))
+    scaled = (points - centre) / half
+    total = float(mass.sum())
+    basis = np.zeros((nodes, points.size))
+    diagonal, off_diagonal = np.zeros(nodes), np.zeros(nodes)
+    basis[0] = np.sqrt(mass / total)
+    for step in range(nodes):
+        vector = scaled * basis[step]
+        diagonal[step] = basis[step] @ vector
+        for _ in range(2):  # twice is enough
+            vector -= basis[: step + 1].T @ (basis[: step + 1] @ vector)
+        if step + 1 < nodes:
+            off_diagonal[step] = np.linalg.norm(vector)
+            basis[step + 1] = vector / off_diagonal[step]
+    eigenvalues, eigenvectors = scipy.linalg.eigh_tridiagonal(diagonal, off_diagonal[: nodes - 1])
+    return centre + half * eigenvalues, total * eigenvectors[0] ** 2
+
+
+def beam_error(
+    beam: Beam, sin_squared: ArrayLike, index: float, thickness_um: float, wavelength_nm: float
+) -> float:
+    """Error of a beam in the coherence of one layer.
+
+    Parameters
+    ----------
+    beam : `Beam`
+        The quadrature.
+    sin_squared : array_like, shape ``(N,)``
+        ``sin²θ`` of the rays that it stands for.
+    index, thickness_um : `float`
+        Refractive index and thickness [µm] of the layer.
+    wavelength_nm : `float`
+        Wavelength [nm].
+
+    Returns
+    -------
+    error : `float`
+        ``|<exp(i phi)>_beam - <exp(i phi)>_rays|`` with the round-trip phase phi of the layer; fringe contrast is
+        proportional to the coherence, so this is the error relative to the contrast in parallel light.
+    """
+    rate = 4.0 * np.pi * thickness_um / (1e-3 * wavelength_nm)
+
+    def factor(sine: FloatArray) -> NDArray[np.complex128]:
+        return np.exp(1j * rate * np.sqrt(index**2 - sine))
+
+    rays = factor(np.asarray(sin_squared, dtype=float)).mean()
+    return float(abs(beam.weight @ factor(np.sin(beam.theta) ** 2) - rays))
+
+
+def _beam_of_quantiles(quantile: FloatArray, nodes: int) -> Beam:
+    sine, weight = gauss_rule(quantile, np.full(quantile.size, 1.0 / quantile.size), nodes)
+    return Beam(np.arcsin(np.sqrt(np.clip(sine, 0.0, 1.0))), weight / weight.sum())
+
+
+@functools.lru_cache(maxsize=8)
+def _batoid_optic(prescription: str) -> batoid.Optic:
+    try:
+        return batoid.Optic.fromYaml(prescription)
+    except FileNotFoundError as error:
+        raise ResourceError(f"batoid has no prescription {prescription}") from error
+
+
+@functools.lru_cache(maxsize=64)
+def _traced_quantiles(
+    optics: TracedOptics, field_x_deg: float, field_y_deg: float
+) -> tuple[FloatArray, float]:
+    bundle = optics.trace(field_x_deg, field_y_deg)
+    quantile = bundle.quantiles()
+    quantile.flags.writeable = False
+    return quantile, bundle.kept_fraction

@@ -1,0 +1,208 @@
+"""Beams against the law of the cone, batoid itself, and symmetry."""
+
+from __future__ import annotations
+
+import math
+
+import batoid
+import numpy as np
+import pytest
+from astropy.table import Table
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lsst.fringe_sim.errors import InputError, OutOfRangeError, ResourceError, UnknownNameError
+from lsst.fringe_sim.instrument.telescope import (
+    BeamField,
+    ConeOptics,
+    Telescope,
+    TracedOptics,
+    beam_error,
+    gauss_rule,
+    telescope_beam,
+)
+from lsst.fringe_sim.optics import Beam
+
+COARSE = TracedOptics("LSST_y.yaml", 1000.0, axisymmetric=True, rings=60, spokes=180)
+
+
+@pytest.fixture(scope="module")
+def lsst() -> Telescope:
+    return Telescope.from_name("lsst")
+
+
+@pytest.mark.parametrize(
+    ("name", "field_deg", "smallest", "largest", "mean"),
+    [
+        ("lsst", 0.0, 14.36, 23.91, 19.46),
+        ("lsst", 1.44, 10.04, 29.26, 20.05),
+        ("hsc", 0.0, 3.02, 12.92, 9.08),
+    ],
+)
+def test_angles_of_the_published_ray_traces(name, field_deg, smallest, largest, mean):
+    angle = np.degrees(Telescope.from_name(name).trace(field_deg).theta)
+    assert angle.min() == pytest.approx(smallest, abs=0.05)
+    assert angle.max() == pytest.approx(largest, abs=0.05)
+    assert angle.mean() == pytest.approx(mean, abs=0.05)
+
+
+@pytest.mark.shared
+def test_every_traced_radius_of_the_summary(shared_dir):
+    summary = Table.read(shared_dir / "data" / "beam_angles_summary.ecsv")
+    for row in summary[(summary["beam"] == "LSST") & (summary["field_r"] < 1.74)]:
+        bundle = Telescope.from_name("lsst").trace(float(row["field_r"]))
+        angle = np.degrees(bundle.theta)
+        assert angle.min() == pytest.approx(row["theta_min"], abs=0.05)
+        assert angle.max() == pytest.approx(row["theta_max"], abs=0.05)
+        assert angle.mean() == pytest.approx(row["theta_mean"], abs=0.03)
+        assert angle.std() == pytest.approx(row["theta_std"], abs=0.03)
+        # the summary launches rays on the rims of the pupil, which are vignetted
+        assert bundle.kept_fraction == pytest.approx(row["kept_fraction"], abs=0.006)
+
+
+def test_angle_is_that_of_batoid():
+    optic = batoid.Optic.fromYaml("LSST_y.yaml")
+    rays = batoid.RayVector.fromStop(
+        np.array([3.0, 0.0, -2.0]),
+        np.array([0.0, 3.5, 3.0]),
+        optic=optic,
+        wavelength=1e-6,
+        theta_x=math.radians(0.7),
+        theta_y=math.radians(-0.4),
+    )
+    optic.trace(rays)
+    expected = np.arccos(np.abs(rays.v[:, 2]) / np.linalg.norm(rays.v, axis=1))
+    bundle = Telescope.from_name("lsst").trace(0.7, -0.4)
+    # the three rays lie among those of the bundle: nearest neighbour in slope
+    for ray, angle in zip(rays.v, expected, strict=True):
+        slope = ray[:2] / abs(ray[2])
+        near = np.argmin((bundle.slope_x - slope[0]) ** 2 + (bundle.slope_y - slope[1]) ** 2)
+        assert math.hypot(bundle.slope_x[near] - slope[0], bundle.slope_y[near] - slope[1]) < 2e-3
+        assert bundle.theta[near] == pytest.approx(angle, abs=2e-3)
+
+
+def test_mirror_and_rotation_stand_for_a_full_trace():
+    fold = COARSE.trace(0.5, 0.9)
+    full = TracedOptics("LSST_y.yaml", 1000.0, axisymmetric=False, rings=60, spokes=180).trace(0.5, 0.9)
+    assert fold.slope_x.mean() == pytest.approx(full.slope_x.mean(), abs=2e-4)
+    assert fold.slope_y.mean() == pytest.approx(full.slope_y.mean(), abs=2e-4)
+    assert np.cov(fold.slope_x, fold.slope_y) == pytest.approx(np.cov(full.slope_x, full.slope_y), abs=3e-4)
+    assert fold.kept_fraction == pytest.approx(full.kept_fraction, abs=2e-3)
+
+
+@pytest.mark.parametrize("field_deg", [0.0, 0.9, 1.44, 1.75])
+@pytest.mark.parametrize(("index", "thickness_um"), [(1.6, 14.0), (1.6, 30.0), (3.6, 100.0), (3.6, 265.0)])
+def test_sixty_four_angles_stand_for_all_rays(lsst, field_deg, index, thickness_um):
+    rays = lsst.trace(field_deg)
+    assert beam_error(rays.beam(), rays.sin_squared, index, thickness_um, 1000.0) < 2e-5
+
+
+def test_beam_is_a_distribution(lsst):
+    beam = lsst.beam(1.0, 0.3)
+    rays = lsst.trace(1.0, 0.3)
+    assert beam.weight.sum() == pytest.approx(1.0, abs=1e-12)
+    assert np.all(np.diff(beam.theta) > 0)
+    assert beam.theta.min() >= rays.theta.min()
+    assert beam.theta.max() <= rays.theta.max()
+    assert beam.mean_angle == pytest.approx(rays.theta.mean(), abs=1e-5)
+
+
+def test_cone_of_rays_obeys_the_sine_condition():
+    cone = ConeOptics(1.2, obscuration=0.6, rings=800, spokes=32)
+    analytic = Beam.cone(1.2, 0.6, nodes=64)
+    sine = cone.trace(0.0, 0.0).sin_squared
+    for power in (1, 2, 3):
+        assert np.mean(sine**power) == pytest.approx(
+            analytic.weight @ np.sin(analytic.theta) ** (2 * power), rel=1e-6
+        )
+    monocam = telescope_beam("monocam", 0.2, 0.1)
+    assert monocam.theta.max() < math.asin(1 / 8) < monocam.theta.max() + 1e-3
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(2, 12),
+    st.integers(30, 300),
+    st.integers(0, 2**32 - 1),
+)
+def test_gauss_rule_integrates_polynomials(nodes, points, seed):
+    rng = np.random.default_rng(seed)
+    value, weight = rng.uniform(0.05, 0.25, points), rng.uniform(0.1, 1.0, points)
+    node, mass = gauss_rule(value, weight, nodes)
+    scaled, expected = (node - 0.15) / 0.1, (value - 0.15) / 0.1
+    assert mass.min() > 0
+    assert value.min() < node.min() < node.max() < value.max()
+    for degree in range(2 * nodes):
+        assert mass @ scaled**degree == pytest.approx(weight @ expected**degree, abs=1e-9 * weight.sum())
+
+
+def test_gauss_rule_is_gauss_legendre_for_a_uniform_measure():
+    value = (np.arange(400_000) + 0.5) / 200_000 - 1.0
+    node, mass = gauss_rule(value, np.full(value.size, 1 / 200_000), 8)
+    expected_node, expected_mass = np.polynomial.legendre.leggauss(8)
+    np.testing.assert_allclose(node, expected_node, atol=1e-9)
+    np.testing.assert_allclose(mass, expected_mass, atol=1e-9)
+
+
+def test_gauss_rule_of_few_points_is_those_points():
+    node, mass = gauss_rule([0.3, 0.1], [1.0, 2.0], 64)
+    np.testing.assert_array_equal(node, [0.1, 0.3])
+    np.testing.assert_array_equal(mass, [2.0, 1.0])
+    node, mass = gauss_rule(np.full(9, 0.2), np.full(9, 1 / 9), 4)
+    assert node.size == 1
+    assert mass.sum() == pytest.approx(1.0)
+
+
+def test_quantiles_keep_the_mean_whatever_the_number_of_groups():
+    bundle = COARSE.trace(1.0, 0.0)
+    for groups in (7, 64, 1000):
+        quantile = bundle.quantiles(groups)
+        assert np.all(np.diff(quantile) >= 0)
+        assert quantile.mean() == pytest.approx(bundle.sin_squared.mean(), rel=1e-12)
+
+
+def coherence(beam: Beam, index: float, thickness_um: float) -> complex:
+    phase = 4 * np.pi * thickness_um * (np.sqrt(index**2 - np.sin(beam.theta) ** 2) - index)
+    return complex(beam.weight @ np.exp(1j * phase))
+
+
+# Sensors between traced radii: near the axis, at both onsets of vignetting, and in a corner of the field.
+@pytest.mark.parametrize("radius", [0.2348, 0.666, 1.711, 1.8942])
+def test_interpolated_beams_equal_traced_ones(lsst, radius):
+    nodes = np.array(lsst.optics.field_nodes_deg)
+    # the interpolation is local: two radii on each side decide
+    place = np.searchsorted(nodes, radius)
+    field = BeamField.trace(lsst, nodes[place - 2 : place + 2])
+    traced, interpolated = lsst.beam(radius), field.beam(radius)
+    thickness = np.arange(14.0, 22.0, 0.5)
+    before = np.array([coherence(traced, 1.6, each) for each in thickness])
+    after = np.array([coherence(interpolated, 1.6, each) for each in thickness])
+    assert np.abs(after - before).max() < 0.005 * np.abs(before).max()
+    assert field.kept_fraction(radius) == pytest.approx(lsst.kept_fraction(radius), abs=5e-3)
+
+
+def test_beam_field_needs_symmetry_and_stays_inside():
+    with pytest.raises(InputError, match="axisymmetric"):
+        BeamField.trace(Telescope.from_name("hsc"))
+    field = BeamField.trace(Telescope("coarse", COARSE, 32.4, 10.0, 0.2, 2.0), [0.0, 0.5, 1.0])
+    with pytest.raises(OutOfRangeError, match=r"0\.000 to 1\.000"):
+        field.beam(1.2)
+    assert field.beam(0.3, 0.4).mean_angle == pytest.approx(COARSE.trace(0.5, 0.0).theta.mean(), abs=1e-6)
+
+
+def test_bad_input_is_named(lsst):
+    assert Telescope.from_name("LSST") == lsst
+    with pytest.raises(UnknownNameError, match="did you mean lsst"):
+        telescope_beam("lsst2")
+    with pytest.raises(OutOfRangeError, match="field angle"):
+        lsst.beam(2.0, 1.0)
+    with pytest.raises(OutOfRangeError, match="field angle"):
+        lsst.beam(math.nan)
+    with pytest.raises(OutOfRangeError, match="number of beam angles"):
+        lsst.beam(0.0, nodes=0)
+    with pytest.raises(ResourceError, match="wrong or missing entry"):
+        Telescope.from_mapping("mine", {"optics": {"kind": "cone", "f_number": 4.0}})
+    with pytest.raises(ResourceError, match="no prescription"):
+        TracedOptics("NoSuch.yaml", 1000.0, axisymmetric=True).trace(0.0, 0.0)
+    with pytest.raises(OutOfRangeError, match="a place that light reaches"):
+        COARSE.trace(2.5, 0.0)
