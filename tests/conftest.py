@@ -7,6 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
+
+# A busy machine is no failure: examples are bounded in number, not in time.
+settings.register_profile("fringe_sim", deadline=None)
+settings.load_profile("fringe_sim")
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 

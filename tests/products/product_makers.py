@@ -146,6 +146,18 @@ def sky(shape: tuple[int, int] = (3, 4), number: int = 1, **changes: Any) -> p.S
     return p.SkyFringe(**(values | changes))
 
 
+def bias(shape: tuple[int, int] = (3, 4), number: int = 1, **changes: Any) -> p.CombinedBias:
+    values: dict[str, Any] = {
+        "image": pixels(shape, number),
+        "mask": masks(shape, number),
+        "noise_adu": {"C00": 5.5, "C17": 1 / 3},
+        "n_frames": 5,
+        "serial": "E2V-CCD250-321",
+        "detector": "R11_S01",
+    }
+    return p.CombinedBias(**(values | changes))
+
+
 MAKERS: dict[str, Callable[..., Any]] = {
     "FringeFlat": flat,
     "FringeCube": cube,
@@ -153,4 +165,5 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "FringeFrame": frame,
     "FringeComponents": components,
     "SkyFringe": sky,
+    "CombinedBias": bias,
 }

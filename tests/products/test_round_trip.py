@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ def assert_identical(left: Any, right: Any) -> None:
             native = second.astype(second.dtype.newbyteorder("="))
             assert first.dtype == native.dtype
             assert first.tobytes() == native.tobytes()
-        elif item.name == "metadata":
+        elif isinstance(first, Mapping):
             assert {key: (type(value), value) for key, value in first.items()} == {
                 key: (type(value), value) for key, value in second.items()
             }

@@ -79,10 +79,15 @@ BAD: list[tuple[str, dict[str, Any], type[InputError], str]] = [
     ("FringeComponents", {"explained_variance": np.ones(3)}, FrameFormatError, "3 values"),
     ("SkyFringe", {"unit": "adu"}, UnknownNameError, "unit"),
     ("SkyFringe", {"airmass": 0.9}, OutOfRangeError, "airmass"),
-    ("SkyFringe", {"hour": 25.0}, OutOfRangeError, "hour"),
+    ("SkyFringe", {"hour": 37.0}, OutOfRangeError, "hour"),
     ("SkyFringe", {"seed": -1}, OutOfRangeError, "seed"),
     ("SkyFringe", {"seed": 1.5}, InputError, "seed"),
     ("SkyFringe", {"quadrature_error": -1e-9}, OutOfRangeError, "quadrature_error"),
+    ("CombinedBias", {"image": nan_at((3, 4), (0, 0))}, FrameFormatError, "IMAGE"),
+    ("CombinedBias", {"noise_adu": {"C00": -1.0}}, OutOfRangeError, "noise of C00"),
+    ("CombinedBias", {"noise_adu": {}}, InputError, "noise_adu"),
+    ("CombinedBias", {"noise_adu": [1.0]}, InputError, "noise_adu"),
+    ("CombinedBias", {"n_frames": 0}, OutOfRangeError, "n_frames"),
     ("SkyFringe", {"mean_electrons": 0.0}, OutOfRangeError, "mean_electrons"),
 ]
 

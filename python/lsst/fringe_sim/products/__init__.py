@@ -4,6 +4,7 @@ Each product has ``write_fits(path, metadata=None)`` and ``read_fits(path)``. Fi
 at all, carry checksums, and two writes of one product agree to the byte.
 """
 
+from .combined_bias import CombinedBias
 from .fringe_components import FringeComponents
 from .fringe_cube import CUBE_UNITS, FlatExposures, FringeCube
 from .fringe_flat import FringeFlat
@@ -16,6 +17,7 @@ __all__ = [
     "CUBE_UNITS",
     "MASK_PLANES",
     "SKY_UNITS",
+    "CombinedBias",
     "FlatExposures",
     "FringeComponents",
     "FringeCube",

@@ -41,7 +41,7 @@ class SkyFringe:
     airmass : `float`
         Airmass, 1 or more.
     hour : `float`
-        Local time, in hours from 0 to 24.
+        Local time, in hours since the midnight before the evening: 25 is one hour after midnight.
     seed : `int` or `None`
         Seed of the photon and read noise; `None` for a frame without noise.
     quadrature_error : `float`
@@ -84,7 +84,7 @@ class SkyFringe:
             "mean_electrons": check.check_number("mean_electrons", self.mean_electrons, low=0, open_low=True),
             "exposure_s": check.check_number("exposure_s", self.exposure_s, low=0, open_low=True),
             "airmass": check.check_number("airmass", self.airmass, low=1, high=40),
-            "hour": check.check_number("hour", self.hour, low=0, high=24),
+            "hour": check.check_number("hour", self.hour, low=0, high=36),
             "quadrature_error": check.check_number("quadrature_error", self.quadrature_error, low=0),
             "metadata": io.normalise_metadata(self.metadata, _OWN),
             "detector": check.check_name("detector", self.detector),
@@ -122,7 +122,7 @@ class SkyFringe:
             ("MEANE", self.mean_electrons, "[electron] mean sky"),
             ("EXPTIME", self.exposure_s, "[s] exposure time"),
             ("AIRMASS", self.airmass, "airmass"),
-            ("HOUR", self.hour, "[h] local time"),
+            ("HOUR", self.hour, "[h] local time; 25 is 1 h after midnight"),
             ("QUADERR", self.quadrature_error, "quadrature error, fraction of the sky"),
         ]
         if self.seed is not None:
