@@ -1,0 +1,48 @@
+"""A piece of the chain, run from an installed wheel outside the checkout."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import lsst.fringe_sim
+from lsst.fringe_sim.model import FringeModel, setup_names
+
+BIN = Path(sys.executable).parent
+
+
+def run(*command: str) -> str:
+    """Run a program of this environment and return what it prints."""
+    done = subprocess.run([str(BIN / command[0]), *command[1:]], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        sys.exit(f"{' '.join(command)} failed with {done.returncode}:\n{done.stdout}\n{done.stderr}")
+    return done.stdout
+
+
+def main() -> None:
+    """Raise or exit with a message if anything that the wheel must carry is missing."""
+    assert "site-packages" in lsst.fringe_sim.__file__, lsst.fringe_sim.__file__
+    for name in setup_names():
+        FringeModel.from_setup(name)
+    response = FringeModel.from_setup("ts8_e2v").response(np.linspace(14.0, 15.0, 50), [960.0])
+    assert response.shape == (1, 50)
+    assert "ts8_e2v" in run("fringe-sim", "setups")
+    run("fringe-sim", "mock-flats", "raws", "--size", "256x200", "--seed", "1")
+    run("butler", "create", "repo", "--seed-config", "resource://lsst.fringe_sim/configs/butler.yaml")
+    run("butler", "register-instrument", "repo", "lsst.fringe_sim.Ts8Fringe")
+    run("butler", "ingest-fringe-raws", "repo", "raws")
+    found = run("butler", "query-datasets", "repo", "raw")
+    assert found.count("raw") > 12, found
+    pipelines = sorted((Path(lsst.fringe_sim.__file__).parent / "pipelines").rglob("*.yaml"))
+    assert pipelines, "the wheel carries no pipelines"
+    for pipeline in pipelines:
+        if "_ingredients" not in pipeline.parts:
+            run("pipetask", "build", "-p", str(pipeline), "--show", "tasks")
+    print("The wheel runs.")
+
+
+if __name__ == "__main__":
+    main()
