@@ -14,7 +14,7 @@ from astro_metadata_translator import FitsTranslator, PropertyDefinition, cache_
 from astropy.time import Time, TimeDelta
 
 from ..errors import InputError
-from ..instrument.raw_frame import DAY_ROLLOVER_H, RawMetadata
+from ..instrument.raw_metadata import DAY_ROLLOVER_H, RawMetadata
 from .instruments import INSTRUMENTS, MONOCHROMATOR, NO_FILTER
 
 __all__ = [
