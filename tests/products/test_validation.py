@@ -191,6 +191,19 @@ def test_flats_are_sorted_by_wavelength_and_shifted_to_relative_counts() -> None
     assert np.isfinite(stacked.image).all()
 
 
+def test_flats_may_come_one_by_one_and_pass_on_what_they_share() -> None:
+    flats = [
+        flat(number=k, wavelength_nm=w, metadata={"SMOOTHPX": 3.0, "EXPID": k, f"ONLY{k}": 1})
+        for k, w in enumerate([880.0, 890.0])
+    ]
+    streamed = FringeCube.from_flats(iter(flats), {"NOTE": "x"}, number=2)
+    assert dict(streamed.metadata) == {"SMOOTHPX": 3.0, "NOTE": "x"}
+    np.testing.assert_array_equal(streamed.image, FringeCube.from_flats(flats).image)
+    for number, message in ((None, "without length"), (1, "more than 1"), (3, "3, as announced")):
+        with pytest.raises(InputError, match=message):
+            FringeCube.from_flats(iter(flats), number=number)
+
+
 def test_flats_that_do_not_belong_together() -> None:
     with pytest.raises(InputError, match="at least one flat"):
         FringeCube.from_flats([])

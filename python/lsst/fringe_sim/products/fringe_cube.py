@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sized
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -192,56 +192,46 @@ class FringeCube:
         )
 
     @classmethod
-    def from_flats(cls, flats: Sequence[FringeFlat], metadata: Mapping[str, Any] | None = None) -> Self:
+    def from_flats(
+        cls,
+        flats: Iterable[FringeFlat],
+        metadata: Mapping[str, Any] | None = None,
+        *,
+        number: int | None = None,
+    ) -> Self:
         """Stack prepared flats into a relative cube, sorted by wavelength.
 
         Equal wavelengths keep the order in which they are given. Masked pixels without a number become 1
-        with variance 0, and stay masked.
+        with variance 0, and stay masked. Metadata that all flats share become those of the cube.
+
+        Parameters
+        ----------
+        flats : iterable of `FringeFlat`
+            Flats of one sensor. Only one is held at a time if they come from a generator.
+        metadata : `Mapping`, optional
+            Further header keywords, which win over those of the flats.
+        number : `int`, optional
+            How many flats there are; needed if ``flats`` cannot tell.
 
         Raises
         ------
         InputError
-            No flats at all.
+            No flats at all, or not as many as announced.
         FrameFormatError
             Flats of different shapes or different sensors.
         """
-        if not flats:
-            raise InputError("flats", "none", "at least one flat")
-        ordered = sorted(flats, key=lambda flat: flat.wavelength_nm)
-        first = ordered[0]
-        for flat in ordered:
-            if flat.shape != first.shape:
-                raise FrameFormatError(
-                    f"flat at {flat.wavelength_nm:g} nm", f"shape {flat.shape}", f"shape {first.shape}"
-                )
-            if flat.detector != first.detector:
-                raise FrameFormatError(
-                    f"flat at {flat.wavelength_nm:g} nm",
-                    f"sensor {flat.detector or 'unnamed'}",
-                    f"sensor {first.detector or 'unnamed'}",
-                )
-        cube = (len(ordered), *first.shape)
-        image, variance = np.empty(cube, np.float32), np.empty(cube, np.float32)
-        mask = np.empty(cube, np.int32)
-        for plane, flat in enumerate(ordered):
-            image[plane] = np.nan_to_num(flat.image + np.float32(1), nan=1, posinf=1, neginf=1)
-            variance[plane] = np.nan_to_num(flat.variance, nan=0, posinf=0, neginf=0)
-            mask[plane] = flat.mask
-        exposures = FlatExposures(
-            np.array([flat.wavelength_nm for flat in ordered]),
-            np.array([flat.bandwidth_fwhm_nm for flat in ordered]),
-            np.array([flat.temperature_k for flat in ordered]),
-            np.array([flat.f_number for flat in ordered]),
-            np.array([flat.level_e for flat in ordered]),
-        )
+        stack = _Stack.of(flats, len(flats) if isinstance(flats, Sized) else number)
+        order = np.argsort(stack.wavelength_nm, kind="stable")
+        in_order = bool(np.all(np.diff(order) == 1))
+        planes: Any = slice(None) if in_order else order
         return cls(
-            image,
-            variance,
-            mask,
-            exposures,
+            stack.image[planes],
+            stack.variance[planes],
+            stack.mask[planes],
+            FlatExposures(*np.array(stack.rows)[order].T),
             "relative",
-            detector=first.detector,
-            metadata={} if metadata is None else metadata,
+            detector=stack.detector,
+            metadata={**stack.metadata, **({} if metadata is None else metadata)},
         )
 
     def write_fits(self, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
@@ -327,6 +317,63 @@ class FringeCube:
                 detector=header.get("DETNAME", ""),
                 metadata=io.read_metadata(header, _OWN),
             )
+
+
+@dataclass
+class _Stack:
+    """Planes of a cube while they come in."""
+
+    image: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    mask: NDArray[np.int32]
+    detector: str
+    metadata: dict[str, Any]
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, flats: Iterable[FringeFlat], number: int | None) -> _Stack:
+        stack: _Stack | None = None
+        for flat in flats:
+            if stack is None:
+                if number is None:
+                    raise InputError("number", None, "the number of flats, for an iterable without length")
+                cube = (number, *flat.shape)
+                image, variance = np.empty(cube, np.float32), np.empty(cube, np.float32)
+                mask = np.empty(cube, np.int32)
+                stack = cls(image, variance, mask, flat.detector, dict(flat.metadata))
+            stack.add(flat)
+        if stack is None:
+            raise InputError("flats", "none", "at least one flat")
+        if len(stack.rows) != number:
+            raise InputError("flats", len(stack.rows), f"{number}, as announced")
+        return stack
+
+    @property
+    def wavelength_nm(self) -> NDArray[np.float64]:
+        return np.array([row[0] for row in self.rows])
+
+    def add(self, flat: FringeFlat) -> None:
+        name, shape = f"flat at {flat.wavelength_nm:g} nm", self.image.shape[1:]
+        if flat.shape != shape:
+            raise FrameFormatError(name, f"shape {flat.shape}", f"shape {shape}")
+        if flat.detector != self.detector:
+            raise FrameFormatError(
+                name, f"sensor {flat.detector or 'unnamed'}", f"sensor {self.detector or 'unnamed'}"
+            )
+        plane = len(self.rows)
+        if plane == len(self.image):
+            raise InputError("flats", f"more than {plane}", f"{plane}, as announced")
+        self.image[plane] = np.nan_to_num(flat.image + np.float32(1), nan=1, posinf=1, neginf=1)
+        self.variance[plane] = np.nan_to_num(flat.variance, nan=0, posinf=0, neginf=0)
+        self.mask[plane] = flat.mask
+        self.metadata = {
+            keyword: value
+            for keyword, value in self.metadata.items()
+            if keyword in flat.metadata and flat.metadata[keyword] == value
+        }
+        self.rows.append(
+            (flat.wavelength_nm, flat.bandwidth_fwhm_nm, flat.temperature_k, flat.f_number, flat.level_e)
+        )
 
 
 def _map(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
