@@ -1,0 +1,606 @@
+"""The night sky: OH lines from molecular constants, continua, and what of them reaches the sensor.
+
+Radiances are in photons s⁻¹ m⁻² arcsec⁻² (per nm for continua), at the zenith and above the lower atmosphere unless
+a term says otherwise. References: Noll et al. 2025 (PALACE, lines and populations), Noll et al. 2012 (continuum,
+variability), Leinert et al. 1998 (zodiacal light), Krisciunas & Schaefer 1991 (moonlight).
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..resources import read_table
+from .bandpass import Bandpass
+
+__all__ = [
+    "ContinuumTerm",
+    "EmissionLines",
+    "SkySpectrum",
+    "SpectralComponent",
+    "airglow_continuum",
+    "blend_components",
+    "moonlight",
+    "van_rhijn_factor",
+    "zodiacal_light",
+]
+
+FloatArray = NDArray[np.float64]
+
+SECOND_RADIATION_CM_K = 1.4387769
+"""hc/k [cm K]."""
+
+AIRGLOW_HEIGHT_KM = 90.0
+EARTH_RADIUS_KM = 6371.0
+
+CONTINUUM_STEP_NM = 0.1
+"""Spacing of continuum nodes [nm]: the fringe of 365 µm of silicon (HSC and its support) has 0.35 nm."""
+
+_ARCSEC2_PER_SR = (180.0 * 3600.0 / math.pi) ** 2
+_PHOTON_ENERGY_NM_J = 1.98644586e-16
+"""Energy of a photon times its wavelength [J nm]."""
+
+_V_BAND_NM = 551.0
+
+_SOLAR_TEMPERATURE_K = 5900.0
+"""Colour temperature of the Sun between 500 and 1000 nm, where its flux falls by a factor 0.39 (ASTM E-490)."""
+
+
+@dataclass(frozen=True, eq=False)
+class EmissionLines:
+    """Airglow lines.
+
+    Attributes
+    ----------
+    wavelength_nm : `numpy.ndarray`, shape ``(N,)``
+        Wavelength in vacuum [nm], ascending.
+    photon_radiance : `numpy.ndarray`, shape ``(N,)``
+        Zenith radiance above the lower atmosphere [ph s⁻¹ m⁻² arcsec⁻²].
+    transmission : `numpy.ndarray`, shape ``(N,)``
+        Molecular transmission of the air at the wavelength of the line, zenith.
+    band : `numpy.ndarray` of `str`, shape ``(N,)``
+        Vibrational band, e.g. ``8-4``.
+    """
+
+    wavelength_nm: FloatArray
+    photon_radiance: FloatArray
+    transmission: FloatArray
+    band: NDArray[np.str_]
+
+    def __post_init__(self) -> None:
+        shapes = {
+            np.shape(array)
+            for array in (self.wavelength_nm, self.photon_radiance, self.transmission, self.band)
+        }
+        if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+            raise InputError("shapes of the line list", shapes, "one common shape (lines,)")
+        if not np.all(self.photon_radiance >= 0.0):
+            raise InputError("photon radiance", float(np.min(self.photon_radiance)), "not negative")
+        if not np.all(np.diff(self.wavelength_nm) >= 0.0):
+            raise InputError("wavelengths of the lines", "unordered", "ascending")
+
+    @classmethod
+    def oh(
+        cls,
+        rotational_temperature_k: float | None = None,
+        vibrational_temperature_k: float | None = None,
+        band_scale: Mapping[str, float] | None = None,
+        *,
+        hot_temperature_k: float | None = None,
+        hot_ratio: float = 0.0,
+    ) -> EmissionLines:
+        """OH lines between 880 and 1110 nm, recomputed from Einstein coefficients and populations.
+
+        Parameters
+        ----------
+        rotational_temperature_k : `float`, optional
+            Rotational temperature [K] of every vibrational level; by default the PALACE populations, which are
+            close to 190-200 K in the low levels and hotter in the high ones.
+        vibrational_temperature_k : `float`, optional
+            Vibrational temperature [K] between the lowest rotational levels; by default the PALACE populations,
+            which correspond to 10 970 K.
+        band_scale : mapping, optional
+            Factors on the radiance of bands, by name (``{"8-4": 1.3}``).
+        hot_temperature_k, hot_ratio : `float`, optional
+            A second, hot rotational population: its temperature [K] and its size relative to the cold one at zero
+            rotational energy. Needs ``rotational_temperature_k``.
+
+        Raises
+        ------
+        OutOfRangeError
+            A temperature that is not positive, or a negative ratio.
+        UnknownNameError
+            A band that is not in the list.
+        InputError
+            A hot population without a cold temperature.
+
+        Notes
+        -----
+        A rotational temperature redistributes each vibrational level and keeps its population; a vibrational
+        temperature redistributes the levels and keeps the photon radiance of the whole list.
+        """
+        table = read_table("sky", "oh_lines_palace_yband.ecsv")
+        level = _LevelPopulations.of_reference()
+        if hot_temperature_k is not None and rotational_temperature_k is None:
+            raise InputError("rotational_temperature_k", None, "a temperature of the cold population")
+        if rotational_temperature_k is not None:
+            level = level.thermal(rotational_temperature_k, hot_temperature_k, hot_ratio)
+        rate = np.asarray(table["A"], dtype=float) * np.asarray(table["g_up"], dtype=float)
+        radiance = rate * level.of_lines() * _photons_per_rayleigh()
+        if vibrational_temperature_k is not None:
+            total = radiance.sum()
+            radiance *= _vibrational_factor(np.asarray(table["v_up"]), vibrational_temperature_k)
+            radiance *= total / radiance.sum()
+        order = np.argsort(np.asarray(table["wavelength"]), kind="stable")
+        lines = cls(
+            np.asarray(table["wavelength"], dtype=float)[order],
+            radiance[order],
+            np.asarray(table["transmission"], dtype=float)[order],
+            np.asarray(table["band"], dtype=str)[order],
+        )
+        return lines.scaled(band_scale or {})
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Names of the bands, in the order of their first line."""
+        return tuple(dict.fromkeys(str(name) for name in self.band))
+
+    def scaled(self, band_scale: Mapping[str, float]) -> EmissionLines:
+        """Lines whose bands are multiplied by factors.
+
+        Raises
+        ------
+        UnknownNameError
+            A band that is not in the list.
+        OutOfRangeError
+            A factor that is negative or not finite.
+        """
+        factor = np.ones(len(self.wavelength_nm))
+        for name, scale in band_scale.items():
+            if name not in self.bands:
+                raise UnknownNameError("OH band", name, self.bands)
+            if not 0.0 <= scale < math.inf:
+                raise OutOfRangeError(f"scale of OH band {name}", scale, "finite and not negative")
+            factor[self.band == name] = scale
+        return replace(self, photon_radiance=self.photon_radiance * factor)
+
+    def of_band(self, name: str) -> EmissionLines:
+        """Lines of one band."""
+        if name not in self.bands:
+            raise UnknownNameError("OH band", name, self.bands)
+        chosen = self.band == name
+        return EmissionLines(
+            self.wavelength_nm[chosen],
+            self.photon_radiance[chosen],
+            self.transmission[chosen],
+            self.band[chosen],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuumTerm:
+    """Light without lines.
+
+    Attributes
+    ----------
+    name : `str`
+        What it is.
+    wavelength_nm, photon_radiance : `numpy.ndarray`, shape ``(K,)``
+        Nodes [nm] and radiance [ph s⁻¹ m⁻² arcsec⁻² nm⁻¹] between which it is linear.
+    origin : {"airglow", "celestial", "local"}
+        ``airglow`` grows towards the horizon and passes the air, ``celestial`` only passes it, ``local`` is light
+        scattered in the air, given as it arrives.
+    """
+
+    name: str
+    wavelength_nm: FloatArray
+    photon_radiance: FloatArray
+    origin: Literal["airglow", "celestial", "local"]
+
+    def radiance(self, wavelength_nm: ArrayLike) -> FloatArray:
+        """Photon radiance per nm.
+
+        Raises
+        ------
+        OutOfRangeError
+            A wavelength outside the nodes.
+        """
+        wavelength = np.asarray(wavelength_nm, dtype=float)
+        low, high = float(self.wavelength_nm[0]), float(self.wavelength_nm[-1])
+        if np.any(~((wavelength >= low) & (wavelength <= high))):
+            wrong = float(np.ravel(wavelength)[~np.ravel((wavelength >= low) & (wavelength <= high))][0])
+            raise OutOfRangeError(
+                "wavelength [nm]", wrong, f"{low} to {high}", source=f"continuum {self.name}"
+            )
+        return np.interp(wavelength, self.wavelength_nm, self.photon_radiance)
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralComponent:
+    """Light of one origin as it reaches the sensor; only its level changes during a night.
+
+    Attributes
+    ----------
+    name : `str`
+        OH band or continuum.
+    wavelength_nm : `numpy.ndarray`, shape ``(K,)``
+        Wavelengths [nm].
+    photons : `numpy.ndarray`, shape ``(K,)``
+        Photons behind air and optics [s⁻¹ m⁻² arcsec⁻²].
+    """
+
+    name: str
+    wavelength_nm: FloatArray
+    photons: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SkySpectrum:
+    """Lines and continua of one moment.
+
+    Attributes
+    ----------
+    lines : `EmissionLines`
+        Line emission.
+    continua : `tuple` [`ContinuumTerm`, ...]
+        Everything else, term by term.
+    airmass : `float`
+        Airmass of the pointing.
+    """
+
+    lines: EmissionLines
+    continua: tuple[ContinuumTerm, ...] = ()
+    airmass: float = 1.0
+
+    @classmethod
+    def dark(
+        cls,
+        lines: EmissionLines | None = None,
+        airmass: float = 1.0,
+        *,
+        solar_flux_sfu: float = 129.0,
+        helioecliptic_longitude_deg: float = 120.0,
+        ecliptic_latitude_deg: float = 60.0,
+    ) -> SkySpectrum:
+        """Moonless sky: OH lines, airglow continuum and zodiacal light."""
+        return cls(
+            EmissionLines.oh() if lines is None else lines,
+            (
+                airglow_continuum(solar_flux_sfu),
+                zodiacal_light(helioecliptic_longitude_deg, ecliptic_latitude_deg),
+            ),
+            airmass,
+        )
+
+    def with_band_scale(self, band_scale: Mapping[str, float]) -> SkySpectrum:
+        """Spectrum whose OH bands are multiplied by factors."""
+        return replace(self, lines=self.lines.scaled(band_scale))
+
+    def components(
+        self, bandpass: Bandpass, continuum_step_nm: float = CONTINUUM_STEP_NM
+    ) -> list[SpectralComponent]:
+        """What reaches the sensor, band by band and term by term.
+
+        Parameters
+        ----------
+        bandpass : `Bandpass`
+            Optics and air.
+        continuum_step_nm : `float`, optional
+            Spacing of the midpoints that stand for a continuum [nm].
+
+        Returns
+        -------
+        components : `list` [`SpectralComponent`]
+            OH bands first, then continua; those without any light are left out.
+        """
+        found = [self._band(name, bandpass) for name in self.lines.bands]
+        found += [self._continuum(term, bandpass, continuum_step_nm) for term in self.continua]
+        return [component for component in found if component.photons.sum() > 0.0]
+
+    def _band(self, name: str, bandpass: Bandpass) -> SpectralComponent:
+        lines = self.lines.of_band(name)
+        air = bandpass.air.scattering(lines.wavelength_nm, self.airmass) * lines.transmission**self.airmass
+        photons = lines.photon_radiance * van_rhijn_factor(self.airmass) * air
+        return SpectralComponent(
+            name, lines.wavelength_nm, photons * bandpass.transmission(lines.wavelength_nm)
+        )
+
+    def _continuum(self, term: ContinuumTerm, bandpass: Bandpass, step_nm: float) -> SpectralComponent:
+        low, high = bandpass.support()
+        count = math.ceil((high - low) / step_nm)
+        wave = low + (np.arange(count) + 0.5) * (high - low) / count
+        photons = term.radiance(wave) * bandpass.transmission(wave) * (high - low) / count
+        if term.origin != "local":
+            photons = photons * bandpass.air.total(wave, self.airmass)
+        if term.origin == "airglow":
+            photons = photons * van_rhijn_factor(self.airmass)
+        return SpectralComponent(term.name, wave, photons)
+
+
+def van_rhijn_factor(airmass: float, height_km: float = AIRGLOW_HEIGHT_KM) -> float:
+    """Path through an emitting shell relative to the zenith.
+
+    Parameters
+    ----------
+    airmass : `float`
+        Secant of the zenith distance.
+    height_km : `float`, optional
+        Height of the shell [km].
+
+    References
+    ----------
+    van Rhijn 1921; ``1 / sqrt(1 - (R sin z / (R + h))²)``.
+    """
+    if not airmass >= 1.0:
+        raise OutOfRangeError("airmass", airmass, "1 or more")
+    sine_squared = 1.0 - airmass**-2
+    return float((1.0 - (EARTH_RADIUS_KM / (EARTH_RADIUS_KM + height_km)) ** 2 * sine_squared) ** -0.5)
+
+
+def airglow_continuum(solar_flux_sfu: float = 129.0) -> ContinuumTerm:
+    """Residual continuum of the airglow (Noll et al. 2012), for a solar radio flux [sfu].
+
+    Its level beyond 900 nm is very uncertain, as its authors say.
+    """
+    if not 50.0 <= solar_flux_sfu <= 400.0:
+        raise OutOfRangeError("solar radio flux [sfu]", solar_flux_sfu, "50 to 400")
+    table = read_table("sky", "sky_airglow_continuum_eso_sm01.ecsv")
+    level = 0.2068 + 0.006139 * solar_flux_sfu
+    return ContinuumTerm(
+        "airglow continuum",
+        np.asarray(table["wavelength"], dtype=float),
+        1e-3 * level * np.asarray(table["photon_radiance"], dtype=float),
+        "airglow",
+    )
+
+
+def zodiacal_light(helioecliptic_longitude_deg: float, ecliptic_latitude_deg: float) -> ContinuumTerm:
+    """Zodiacal light of Leinert et al. 1998, Table 17, with the reddening given there.
+
+    Parameters
+    ----------
+    helioecliptic_longitude_deg, ecliptic_latitude_deg : `float`
+        Ecliptic longitude minus that of the Sun, and latitude [deg].
+
+    Raises
+    ------
+    OutOfRangeError
+        A place too close to the Sun for the table.
+    """
+    table = read_table("sky", "sky_zodiacal_leinert1998.ecsv")
+    longitude, latitude = (np.unique(np.asarray(table[name], dtype=float)) for name in ("dlon", "beta"))
+    brightness = np.full((longitude.size, latitude.size), np.nan)
+    rows = np.searchsorted(longitude, table["dlon"]), np.searchsorted(latitude, table["beta"])
+    brightness[rows] = np.asarray(table["brightness"], dtype=float)
+    place = (abs((helioecliptic_longitude_deg + 180.0) % 360.0 - 180.0), abs(ecliptic_latitude_deg))
+    if not place[1] <= 90.0:
+        raise OutOfRangeError("ecliptic latitude [deg]", ecliptic_latitude_deg, "-90 to 90")
+    value = float(np.asarray(RegularGridInterpolator((longitude, latitude), brightness)(place)).item())
+    if math.isnan(value):
+        raise OutOfRangeError("helioecliptic position [deg]", place, "15 deg or more from the Sun")
+    cosine = math.cos(math.radians(place[0])) * math.cos(math.radians(place[1]))
+    elongation = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+    reddening = 0.8 - 0.2 * min(max((elongation - 30.0) / 60.0, 0.0), 1.0)
+    wave = np.arange(500.0, 1201.0, 5.0)
+    energy = 1e-8 * 1e-3 * value * _solar_shape(wave, 500.0) * (1.0 + reddening * np.log10(wave / 500.0))
+    return ContinuumTerm(
+        "zodiacal light", wave, energy * wave / _PHOTON_ENERGY_NM_J / _ARCSEC2_PER_SR, "celestial"
+    )
+
+
+def moonlight(
+    phase_angle_deg: float, separation_deg: float, moon_zenith_deg: float, target_zenith_deg: float = 0.0
+) -> ContinuumTerm:
+    """Moonlight scattered in the air (Krisciunas & Schaefer 1991), carried from V to the near infrared.
+
+    Parameters
+    ----------
+    phase_angle_deg : `float`
+        Phase angle of the Moon [deg]; 0 when full.
+    separation_deg : `float`
+        Angle between Moon and target [deg], at least 5.
+    moon_zenith_deg, target_zenith_deg : `float`
+        Zenith distances [deg].
+
+    Returns
+    -------
+    term : `ContinuumTerm`
+        A ``local`` term; zero when the Moon is below the horizon.
+
+    Notes
+    -----
+    The Rayleigh part of the V-band model is taken to fall as the fourth power of the wavelength, its aerosol part as
+    the power 1.3; the sunlight is reddened by the reflectance of the Moon, which rises as the power 0.7 of the
+    wavelength between 550 and 1000 nm (Kieffer & Stone 2005). Good to some ten per cent.
+    """
+    for field, value, low, high in (
+        ("phase angle [deg]", phase_angle_deg, 0.0, 180.0),
+        ("separation [deg]", separation_deg, 5.0, 180.0),
+        ("moon zenith distance [deg]", moon_zenith_deg, 0.0, 180.0),
+        ("target zenith distance [deg]", target_zenith_deg, 0.0, 85.0),
+    ):
+        if not low <= value <= high:
+            raise OutOfRangeError(field, value, f"{low:g} to {high:g}")
+    wave = np.arange(500.0, 1201.0, 5.0)
+    if moon_zenith_deg >= 90.0:
+        return ContinuumTerm("moonlight", wave, np.zeros_like(wave), "local")
+    extinction = 0.172
+    moon = 10.0 ** (-0.4 * (3.84 + 0.026 * phase_angle_deg + 4e-9 * phase_angle_deg**4))
+    to_moon, to_target = (
+        (1.0 - 0.96 * math.sin(math.radians(angle)) ** 2) ** -0.5
+        for angle in (moon_zenith_deg, target_zenith_deg)
+    )
+    path = 10.0 ** (-0.4 * extinction * to_moon) * (1.0 - 10.0 ** (-0.4 * extinction * to_target))
+    rayleigh = 10.0**5.36 * (1.06 + math.cos(math.radians(separation_deg)) ** 2)
+    aerosol = 10.0 ** (6.15 - separation_deg / 40.0)
+    relative = wave / _V_BAND_NM
+    scattered = rayleigh * relative**-4.0 + aerosol * relative**-1.3
+    nanolambert = moon * path * scattered * relative**0.7 * _solar_shape(wave, _V_BAND_NM) * relative
+    return ContinuumTerm("moonlight", wave, nanolambert * _photons_per_nanolambert(), "local")
+
+
+def _photons_per_nanolambert() -> float:
+    """V-band photons s⁻¹ m⁻² arcsec⁻² nm⁻¹ of one nanolambert, through its magnitude per arcsec² (K&S, Eq. 1)."""
+    magnitude = (20.7233 - math.log(1.0 / 34.08)) / 0.92104
+    vega_photons = 3.63e-11 * _V_BAND_NM / _PHOTON_ENERGY_NM_J  # W m⁻² nm⁻¹ at V = 0
+    return float(10.0 ** (-0.4 * magnitude) * vega_photons)
+
+
+def _solar_shape(wavelength_nm: FloatArray, reference_nm: float) -> FloatArray:
+    """Energy flux per wavelength of the Sun relative to that at a reference wavelength."""
+
+    def planck(wave: FloatArray | float) -> FloatArray | float:
+        return np.power(wave, -5.0) / np.expm1(1e7 * SECOND_RADIATION_CM_K / (wave * _SOLAR_TEMPERATURE_K))
+
+    return np.asarray(planck(wavelength_nm) / planck(reference_nm))
+
+
+def _photons_per_rayleigh() -> float:
+    """Photons s⁻¹ m⁻² arcsec⁻² of one rayleigh."""
+    return 1e10 / (4.0 * math.pi) / _ARCSEC2_PER_SR
+
+
+@dataclass(frozen=True, eq=False)
+class _LevelPopulations:
+    """Populations per sublevel of the upper levels of the line list [rayleigh seconds]."""
+
+    vibration: NDArray[np.int64]
+    energy_cm: FloatArray
+    weight: FloatArray
+    population: FloatArray
+    line_level: NDArray[np.int64]
+
+    @classmethod
+    def of_reference(cls) -> _LevelPopulations:
+        table = read_table("sky", "oh_lines_palace_yband.ecsv")
+        names = ("v_up", "N_up", "F_up", "parity_up")
+        keys = list(zip(*(table[name].tolist() for name in names), strict=True))
+        levels = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+        first = [keys.index(key) for key in levels]
+
+        def column(name: str) -> FloatArray:
+            return np.asarray(table[name], dtype=float)[first]
+
+        return cls(
+            np.asarray(table["v_up"], dtype=np.int64)[first],
+            column("E_rot"),
+            column("g_up"),
+            np.exp(column("ln_pop")),
+            np.array([levels[key] for key in keys]),
+        )
+
+    def thermal(self, cold_k: float, hot_k: float | None, hot_ratio: float) -> _LevelPopulations:
+        """Boltzmann populations with the same total in every vibrational level."""
+        shape = _boltzmann(self.energy_cm, cold_k)
+        if hot_k is not None:
+            if not 0.0 <= hot_ratio < math.inf:
+                raise OutOfRangeError("ratio of the hot population", hot_ratio, "finite and not negative")
+            shape = shape + hot_ratio * _boltzmann(self.energy_cm, hot_k)
+        population = np.empty_like(shape)
+        for level in np.unique(self.vibration):
+            chosen = self.vibration == level
+            held = self.weight[chosen] @ self.population[chosen] / (self.weight[chosen] @ shape[chosen])
+            population[chosen] = held * shape[chosen]
+        return replace(self, population=population)
+
+    def of_lines(self) -> FloatArray:
+        """Population of the upper level of every line of the table."""
+        return self.population[self.line_level]
+
+
+def _boltzmann(energy_cm: FloatArray, temperature_k: float) -> FloatArray:
+    if not 0.0 < temperature_k < math.inf:
+        raise OutOfRangeError("temperature [K]", temperature_k, "positive")
+    return np.exp(-SECOND_RADIATION_CM_K * energy_cm / temperature_k)
+
+
+def _vibrational_factor(upper: NDArray[np.int64], temperature_k: float) -> FloatArray:
+    """Wanted over reference population of the lowest rotational level, per line."""
+    table = read_table("sky", "oh_levels_palace.ecsv")
+    level = np.asarray(table["v_up"], dtype=np.int64)
+    wanted = _boltzmann(np.asarray(table["E_v0"], dtype=float), temperature_k)
+    # Scaled to the middle of the range so that neither factor overflows.
+    ratio = np.log(wanted) - np.asarray(table["ln_pop_N1"], dtype=float)
+    factor = dict(zip(level.tolist(), np.exp(ratio - ratio[level == 6]), strict=True))
+    return np.array([factor[int(each)] for each in upper])
+
+
+def blend_components(components: Sequence[SpectralComponent], rms_shift_nm: float) -> list[SpectralComponent]:
+    """Fewer nodes with the same photons and the same mean wavelength in every component.
+
+    Neighbours of one component are merged, cheapest first (Ward), until the photon-weighted rms distance of all
+    nodes from those that stand for them reaches ``rms_shift_nm``. The fringe of a layer with period P in wavelength
+    then changes by less than ``(2 pi rms_shift / P)² / 2`` of its amplitude. Faint components are thinned most.
+
+    Parameters
+    ----------
+    components : sequence of `SpectralComponent`
+        Nodes of each component in ascending order.
+    rms_shift_nm : `float`
+        Rms distance allowed [nm]; 0 merges only coincident nodes.
+
+    Returns
+    -------
+    blended : `list` [`SpectralComponent`]
+        In the same order.
+    """
+    if not 0.0 <= rms_shift_nm < math.inf:
+        raise OutOfRangeError("rms shift [nm]", rms_shift_nm, "finite and not negative")
+    kept = [component.photons > 0.0 for component in components]
+    sizes = [int(keep.sum()) for keep in kept]
+    wave = np.concatenate([item.wavelength_nm[keep] for item, keep in zip(components, kept, strict=True)])
+    photons = np.concatenate([item.photons[keep] for item, keep in zip(components, kept, strict=True)])
+    owner = np.repeat(np.arange(len(components)), sizes)
+    alive, wave, photons = _merge_neighbours(wave, photons, owner, rms_shift_nm**2 * float(photons.sum()))
+    return [
+        SpectralComponent(item.name, wave[alive & (owner == number)], photons[alive & (owner == number)])
+        for number, item in enumerate(components)
+    ]
+
+
+def _merge_neighbours(
+    wavelength: FloatArray, weight: FloatArray, owner: NDArray[np.int64], budget: float
+) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+    """Agglomerate neighbours of one owner until the added variance would exceed the budget.
+
+    Returns which nodes survive, and the wavelengths and weights in which the survivors hold what they absorbed.
+    """
+    wave, mass = wavelength.tolist(), weight.tolist()
+    count = len(wave)
+    left = [n - 1 if n > 0 and owner[n - 1] == owner[n] else -1 for n in range(count)]
+    right = [n + 1 if n + 1 < count and owner[n + 1] == owner[n] else -1 for n in range(count)]
+    age, alive = [0] * count, [True] * count
+    heap: list[tuple[float, int, int, int, int]] = []
+
+    def offer(a: int, b: int) -> None:
+        price = mass[a] * mass[b] / (mass[a] + mass[b]) * (wave[a] - wave[b]) ** 2
+        heapq.heappush(heap, (price, a, b, age[a], age[b]))
+
+    for node in range(count):
+        if right[node] >= 0:
+            offer(node, right[node])
+    while heap:
+        price, a, b, age_a, age_b = heapq.heappop(heap)
+        if not (alive[a] and alive[b]) or (age[a], age[b]) != (age_a, age_b):
+            continue  # priced before one of the two changed
+        if price > budget:
+            break
+        budget -= price
+        total = mass[a] + mass[b]
+        wave[a], mass[a], alive[b] = (mass[a] * wave[a] + mass[b] * wave[b]) / total, total, False
+        age[a] += 1
+        right[a] = right[b]
+        if right[b] >= 0:
+            left[right[b]] = a
+            offer(a, right[b])
+        if left[a] >= 0:
+            offer(left[a], a)
+    return np.array(alive), np.array(wave), np.array(mass)
