@@ -1,0 +1,20 @@
+"""Thickness maps from flats at many wavelengths: a global fit, and the walk of the paper as its peer."""
+
+from .amplitudes import Amplitudes
+from .fit import FIT_METHODS, fit_thickness, make_templates
+from .global_fit import GlobalFit, global_fit
+from .guo2022 import walk_fit
+from .pixels import PixelFit
+from .templates import FringeTemplates
+
+__all__ = [
+    "FIT_METHODS",
+    "Amplitudes",
+    "FringeTemplates",
+    "GlobalFit",
+    "PixelFit",
+    "fit_thickness",
+    "global_fit",
+    "make_templates",
+    "walk_fit",
+]

@@ -1,0 +1,441 @@
+"""Averages over small cells of a sensor, safe against bad columns, bad rows and hot pixels.
+
+The fringe order is solved on cells, not on pixels: a cell has less noise and there are fewer of them. One bad
+column that nobody masked would spoil every cell it crosses, so each cell throws out the rows and columns that
+do not follow their neighbours before it is averaged.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...errors import InputError
+from .amplitudes import Amplitudes
+from .templates import LANES
+
+__all__ = ["Cells", "average_cells", "cell_edges", "effective_number", "sample_pixels"]
+
+_MATH = {"reassoc", "contract", "arcp", "nsz"}
+_SPIKE_SIGMA = 6.0
+"""A row or column of a cell this many standard deviations off its neighbours is thrown out."""
+_FINEST_PERIOD_PX = 24.0
+"""Shortest fringe whose curvature is not mistaken for a spike [px]."""
+_LEAST_FILLED = 0.2
+"""Smallest fraction of good pixels with which a cell counts at a wavelength."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Mean amplitude of every cell.
+
+    Attributes
+    ----------
+    value, weight : `numpy.ndarray`, float32, shape ``(ncy, ncx, padded wavelengths)``
+        Mean amplitude and its inverse variance; weight 0 where there is none.
+    rise_y, rise_x : `numpy.ndarray`, float32, shape of ``value``
+        Slope of the amplitude inside the cell along rows and columns [1/px], from its two halves.
+    y_edges, x_edges : `numpy.ndarray` of `int`
+        First row (column) of each cell, and the end of the last.
+    """
+
+    value: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    rise_y: NDArray[np.float32]
+    rise_x: NDArray[np.float32]
+    y_edges: NDArray[np.int64]
+    x_edges: NDArray[np.int64]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
+        return (self.value.shape[0], self.value.shape[1])
+
+    @property
+    def n_wavelengths(self) -> NDArray[np.int64]:
+        """Number of wavelengths of each cell, shape ``(ncy, ncx)``."""
+        return np.count_nonzero(self.weight > 0, axis=-1)
+
+    @property
+    def y_centre(self) -> NDArray[np.float64]:
+        """Row of the centre of each row of cells [px]."""
+        return np.asarray(0.5 * (self.y_edges[:-1] + self.y_edges[1:] - 1.0), dtype=float)
+
+    @property
+    def x_centre(self) -> NDArray[np.float64]:
+        """Column of the centre of each column of cells [px]."""
+        return np.asarray(0.5 * (self.x_edges[:-1] + self.x_edges[1:] - 1.0), dtype=float)
+
+
+def cell_edges(length: int, size: int, breaks: Sequence[int] = ()) -> NDArray[np.int64]:
+    """Edges of cells of about ``size`` pixels, none of which crosses a break.
+
+    Parameters
+    ----------
+    length : `int`
+        Number of pixels.
+    size : `int`
+        Wanted size of a cell; none is larger.
+    breaks : sequence of `int`, optional
+        Pixels at which a new zone of the sensor begins.
+
+    Raises
+    ------
+    InputError
+        A break outside the sensor.
+    """
+    for value in breaks:
+        if not 0 <= value <= length:
+            raise InputError("zone boundary [px]", value, f"0 to {length}")
+    borders = sorted({0, length, *(int(value) for value in breaks)})
+    edges = [0]
+    for low, high in itertools.pairwise(borders):
+        count = -(-(high - low) // size)
+        edges.extend(int(e) for e in np.rint(np.linspace(low, high, count + 1)).astype(int)[1:])
+    return np.array(edges, dtype=np.int64)
+
+
+def effective_number(rows: float, columns: float, correlation_px: float) -> float:
+    """Number of independent pixels in a block whose noise is white noise smoothed by a Gaussian kernel.
+
+    The correlation of two pixels a distance ``r`` apart is ``exp(-r² / 4 s²)``; the variance of the mean is
+    the mean of the correlation over all pairs, which factors into rows and columns.
+
+    Parameters
+    ----------
+    rows, columns : `float`
+        Size of the block [px].
+    correlation_px : `float`
+        Standard deviation ``s`` of the kernel [px]; 0 for independent pixels.
+    """
+    return (
+        rows * columns / (_pair_sum(round(rows), correlation_px) * _pair_sum(round(columns), correlation_px))
+    )
+
+
+def _pair_sum(count: int, correlation_px: float) -> float:
+    """Variance of the mean of a line of pixels, times their number."""
+    if correlation_px == 0.0 or count <= 1:
+        return 1.0
+    lag = np.arange(1, count)
+    rho = np.exp(-(lag**2) / (4.0 * correlation_px**2))
+    return float(1.0 + 2.0 * np.sum((1.0 - lag / count) * rho))
+
+
+def average_cells(
+    data: Amplitudes,
+    y_edges: NDArray[np.int64],
+    x_edges: NDArray[np.int64],
+    *,
+    largest_amplitude: ArrayLike,
+    threads: int = 2,
+) -> Cells:
+    """Average a cube over cells.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    y_edges, x_edges : `numpy.ndarray`
+        From `cell_edges`.
+    largest_amplitude : array_like, shape ``(n_wavelengths,)``
+        Largest fringe amplitude that the model can show: how much curvature is still a fringe.
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+
+    Returns
+    -------
+    cells : `Cells`
+    """
+    wavelengths = data.shape[0]
+    shape = (len(y_edges) - 1, len(x_edges) - 1)
+    padded = -(-wavelengths // LANES) * LANES
+    value, weight, rise_y, rise_x = (np.zeros((*shape, padded), np.float32) for _ in range(4))
+    wave = 2.0 * np.pi / _FINEST_PERIOD_PX
+    curvature = (0.5 * wave**2 * np.asarray(largest_amplitude, dtype=float)).astype(np.float32)
+    size = (float(np.diff(y_edges).max()), float(np.diff(x_edges).max()))
+    inflation = size[0] * size[1] / effective_number(*size, data.noise_correlation_px)
+    scale = data.scale.astype(np.float32)
+
+    def work(strip: int) -> None:
+        low, high = int(y_edges[strip]), int(y_edges[strip + 1])
+        image, variance, bad = data.rows(low, high)
+        _average_strip(
+            image, core(variance), core(bad), scale, curvature, x_edges,
+            inflation, data.noise_correlation_px > 0.0, value[strip], weight[strip],
+            rise_y[strip], rise_x[strip],
+        )  # fmt: skip
+
+    run_threaded(work, shape[0], threads)
+    return Cells(value, weight, rise_y, rise_x, y_edges, x_edges)
+
+
+def sample_pixels(data: Amplitudes, most: int = 200_000) -> Cells:
+    """Cells of one pixel each, on a regular grid over the sensor.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    most : `int`, optional
+        Bound on the number of pixels taken.
+    """
+    wavelengths, ny, nx = data.shape
+    stride = max(1, int(np.ceil(np.sqrt(ny * nx / most))))
+    rows, columns = np.arange(0, ny, stride), np.arange(0, nx, stride)
+    padded = -(-wavelengths // LANES) * LANES
+    value, weight, none = (np.zeros((len(rows), len(columns), padded), np.float32) for _ in range(3))
+    scale = data.scale.astype(np.float32)[:, None]
+    for number, row in enumerate(rows):
+        image, variance, bad = (part[:, 0, ::stride] for part in data.rows(int(row), int(row) + 1))
+        good = (bad == 0) & np.isfinite(image) & np.isfinite(variance) & (variance > 0)
+        value[number, :, :wavelengths] = np.where(good, image * scale - 1, 0).T
+        weight[number, :, :wavelengths] = np.where(good, 1 / np.where(good, variance * scale**2, 1), 0).T
+    return Cells(value, weight, none, none, np.append(rows, ny), np.append(columns, nx))
+
+
+def run_threaded(work: Any, count: int, threads: int) -> None:
+    """Call ``work(i)`` for every ``i < count``; each call writes to its own place, so order does not matter."""
+    if threads <= 1 or count <= 1:
+        for item in range(count):
+            work(item)
+        return
+    # Interleaved shares: neighbouring strips cost about the same.
+    with ThreadPoolExecutor(threads) as pool:
+        for job in [pool.submit(_share, work, first, count, threads) for first in range(threads)]:
+            job.result()
+
+
+def _share(work: Any, first: int, count: int, threads: int) -> None:
+    for item in range(first, count, threads):
+        work(item)
+
+
+def core(array: NDArray[Any]) -> NDArray[Any]:
+    """Contiguous array with broadcast axes shrunk to length 1, which is how kernels know them."""
+    part = array[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in array.strides)]
+    return np.ascontiguousarray(part)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
+def load_row(image, variance, bad, scale, value, spread):  # type: ignore[no-untyped-def]
+    """Amplitude and variance of one row; variance 0 marks what cannot be used.
+
+    ``variance`` and ``bad`` have one element when they are the same for the whole row.
+    """
+    columns = image.shape[0]
+    square = scale * scale
+    if variance.shape[0] == 1:
+        same = variance[0] * square
+        for x in range(columns):
+            spread[x] = same
+    else:
+        for x in range(columns):
+            spread[x] = variance[x] * square
+    if bad.shape[0] == 1:
+        if bad[0] != 0:
+            for x in range(columns):
+                spread[x] = np.float32(0.0)
+    else:
+        for x in range(columns):
+            spread[x] = spread[x] if bad[x] == 0 else np.float32(0.0)
+    for x in range(columns):
+        amplitude = image[x] * scale - np.float32(1.0)
+        # Differences of infinities and NaN are NaN, which is not 0.
+        good = (amplitude - amplitude == 0.0) and (spread[x] > 0.0) and (spread[x] < np.float32(1e30))
+        value[x] = amplitude if good else np.float32(0.0)
+        spread[x] = spread[x] if good else np.float32(0.0)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+def _average_strip(  # type: ignore[no-untyped-def]
+    image, variance, bad, scale, curvature, x_edges, inflation, correlated, out, out_weight, rise_y, rise_x
+):
+    bands, rows, columns = image.shape
+    cells = x_edges.shape[0] - 1
+    widest = 0
+    for c in range(cells):
+        widest = max(widest, x_edges[c + 1] - x_edges[c])
+    value = np.zeros((rows, columns), np.float32)
+    spread = np.zeros((rows, columns), np.float32)
+    column_sum = np.zeros(columns, np.float32)
+    column_var = np.zeros(columns, np.float32)
+    column_count = np.zeros(columns, np.float32)
+    keep_row, keep_column = np.ones(rows, np.bool_), np.ones(widest, np.bool_)
+    line, line_count = np.zeros(max(rows, widest), np.float32), np.zeros(max(rows, widest), np.float32)
+    for band in range(bands):
+        column_sum[:] = 0.0
+        column_var[:] = 0.0
+        column_count[:] = 0.0
+        for r in range(rows):
+            vr = r if variance.shape[1] > 1 else 0
+            br = r if bad.shape[1] > 1 else 0
+            vb = band if variance.shape[0] > 1 else 0
+            bb = band if bad.shape[0] > 1 else 0
+            load_row(image[band, r], variance[vb, vr], bad[bb, br], scale[band], value[r], spread[r])
+            for x in range(columns):
+                column_sum[x] += value[r, x]
+                column_var[x] += spread[r, x]
+                column_count[x] += np.float32(1.0) if spread[r, x] > 0.0 else np.float32(0.0)
+        for c in range(cells):
+            low, high = x_edges[c], x_edges[c + 1]
+            width = high - low
+            total, count, var = 0.0, 0.0, 0.0
+            for x in range(low, high):
+                total += column_sum[x]
+                count += column_count[x]
+                var += column_var[x]
+            if count < _LEAST_FILLED * rows * width:
+                continue
+            noise = np.sqrt(var / count)
+            # Rows: one pass over the cell, which is in cache.
+            for r in range(rows):
+                row_sum, row_count = np.float32(0.0), np.float32(0.0)
+                for x in range(low, high):
+                    row_sum += value[r, x]
+                    row_count += np.float32(1.0) if spread[r, x] > 0.0 else np.float32(0.0)
+                line[r], line_count[r] = row_sum, row_count
+            rejected = _reject(line, line_count, rows, noise, correlated, curvature[band], keep_row)
+            rise_y[c, band] = _slope(line, line_count, rows, keep_row)
+            for x in range(width):
+                line[x], line_count[x] = column_sum[low + x], column_count[low + x]
+            rejected += _reject(line, line_count, width, noise, correlated, curvature[band], keep_column)
+            rise_x[c, band] = _slope(line, line_count, width, keep_column)
+            if rejected > 0:
+                total, count, var = 0.0, 0.0, 0.0
+                for r in range(rows):
+                    if keep_row[r]:
+                        for x in range(width):
+                            if keep_column[x] and spread[r, low + x] > 0.0:
+                                total += value[r, low + x]
+                                var += spread[r, low + x]
+                                count += 1.0
+                if count < _LEAST_FILLED * rows * width:
+                    continue
+            out[c, band] = total / count
+            out_weight[c, band] = count * count / (var * inflation)
+
+
+@numba.njit(cache=True, nogil=True)
+def _reject(total, count, size, noise, correlated, curvature, keep):  # type: ignore[no-untyped-def]
+    """Mark lines whose mean does not lie between its neighbours; returns how many.
+
+    A line is compared with the mean of the nearest lines still kept on both sides, at an end with the line
+    through the nearest two. The worst goes first; of several about as bad, the one farthest from the median,
+    so that a pair of bad columns does not take its good neighbours with it.
+    """
+    for k in range(size):
+        keep[k] = count[k] > 0.0
+    if _is_smooth(total, count, size, noise, correlated, curvature):
+        return 0
+    rejected = 0
+    while rejected < size // 2:
+        worst, least_ratio = -1, 1.0
+        for k in range(size):
+            if keep[k]:
+                ratio = _miss_ratio(total, count, size, noise, correlated, curvature, keep, k)
+                if ratio > least_ratio:
+                    worst, least_ratio = k, ratio
+        if worst < 0:
+            break
+        middle = _median(total, count, size, keep)
+        farthest = abs(total[worst] / count[worst] - middle)
+        for k in range(size):
+            if keep[k] and k != worst:
+                distance = abs(total[k] / count[k] - middle)
+                if distance > farthest:
+                    ratio = _miss_ratio(total, count, size, noise, correlated, curvature, keep, k)
+                    if ratio > 0.6 * least_ratio and ratio > 1.0:
+                        worst, farthest = k, distance
+        keep[worst] = False
+        rejected += 1
+    return rejected
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_smooth(total, count, size, noise, correlated, curvature):  # type: ignore[no-untyped-def]
+    """Whether no line can be rejected, for the usual case of lines that are all filled alike.
+
+    Inside, a line that is tolerated bends by less than ``2 (6 sigma sqrt(3/2) + curvature)``; the two ends are
+    tested on the same second difference, with ``6 sigma sqrt(6) + 2 curvature``: the same number.
+    """
+    first = count[0]
+    if first <= 0.0:
+        return False
+    most = np.float32(0.0)
+    for k in range(1, size - 1):
+        if count[k] != first:
+            return False
+        most = max(most, abs(total[k - 1] - np.float32(2.0) * total[k] + total[k + 1]))
+    if size < 3 or count[size - 1] != first:
+        return False
+    sigma = noise if correlated else noise / np.sqrt(first)
+    return most <= first * (_SPIKE_SIGMA * sigma * np.sqrt(6.0) + 2.0 * curvature)
+
+
+@numba.njit(cache=True, nogil=True)
+def _miss_ratio(total, count, size, noise, correlated, curvature, keep, k):  # type: ignore[no-untyped-def]
+    """How far a line is from where its neighbours put it, in units of what is tolerated."""
+    before = k - 1
+    while before >= 0 and not keep[before]:
+        before -= 1
+    after = k + 1
+    while after < size and not keep[after]:
+        after += 1
+    if before < 0:
+        before = after
+        after += 1
+        while after < size and not keep[after]:
+            after += 1
+    elif after >= size:
+        after = before
+        before -= 1
+        while before >= 0 and not keep[before]:
+            before -= 1
+    if before < 0 or after >= size:
+        return 0.0
+    share = (k - before) / (after - before)
+    predicted = (1.0 - share) * total[before] / count[before] + share * total[after] / count[after]
+    variance = 1.0 / count[k] + (1.0 - share) ** 2 / count[before] + share**2 / count[after]
+    sigma = noise * np.sqrt(variance if not correlated else 1.0 + (1.0 - share) ** 2 + share**2)
+    bend = curvature * abs((k - before) * (after - k))
+    return abs(total[k] / count[k] - predicted) / (_SPIKE_SIGMA * sigma + bend)
+
+
+@numba.njit(cache=True, nogil=True)
+def _slope(total, count, size, keep):  # type: ignore[no-untyped-def]
+    """Slope of the line means: upper half less lower half, over the distance of the two halves [1/px]."""
+    middle = 0.5 * (size - 1.0)
+    low, low_n, low_at, high, high_n, high_at = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(size):
+        if keep[k] and count[k] > 0.0:
+            if k < middle:
+                low += total[k]
+                low_n += count[k]
+                low_at += count[k] * k
+            elif k > middle:
+                high += total[k]
+                high_n += count[k]
+                high_at += count[k] * k
+    if low_n == 0.0 or high_n == 0.0:
+        return 0.0
+    return (high / high_n - low / low_n) / (high_at / high_n - low_at / low_n)
+
+
+@numba.njit(cache=True, nogil=True)
+def _median(total, count, size, keep):  # type: ignore[no-untyped-def]
+    means = np.empty(size, np.float32)
+    number = 0
+    for k in range(size):
+        if keep[k]:
+            means[number] = total[k] / count[k]
+            number += 1
+    ordered = np.sort(means[:number])
+    return ordered[number // 2]

@@ -1,0 +1,232 @@
+"""From a cube of flats to a map of thickness."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_distribution
+
+from ...errors import InputError, OutOfRangeError, UnknownNameError
+from ...model import FringeModel
+from ...optics.system import OBSERVABLES
+from ...products import FringeCube, ThicknessMap, mask_bits
+from .amplitudes import Amplitudes
+from .cells import sample_pixels
+from .global_fit import global_fit, normalise_to_cells, spans_orders
+from .guo2022 import walk_fit
+from .pixels import PixelFit
+from .templates import FringeTemplates
+from .uncertainty import region_slip_probability
+
+__all__ = ["FIT_METHODS", "amplitudes_from_cube", "fit_thickness", "make_templates"]
+
+FIT_METHODS = ("global", "guo2022")
+
+STEPS_PER_ORDER = 300
+"""Template thicknesses in one fringe order: 1 nm of epoxy; linear interpolation is then good to 3e-5 of the swing."""
+FEWEST_WAVELENGTHS = 4
+"""With fewer wavelengths than this a pixel is flagged: phase, order and fit quality cannot all be told."""
+SUSPECT_PROBABILITY = 1e-7
+"""A pixel whose chi-square is that improbable is flagged as SUSPECT."""
+
+
+def fit_thickness(
+    cube: FringeCube,
+    model: FringeModel,
+    method: str = "global",
+    *,
+    range_um: tuple[float, float] | None = None,
+    observable: str | None = None,
+    start_pixel: tuple[int, int] | None = None,
+    cell_px: int | None = None,
+    noise_correlation_px: float | None = None,
+    slip_limit: float = 0.01,
+    threads: int | None = None,
+) -> ThicknessMap:
+    """Thickness of the varying layer at every pixel of a sensor.
+
+    Parameters
+    ----------
+    cube : `FringeCube`
+        Flats of one sensor, in any order of wavelengths.
+    model : `FringeModel`
+        Its response, divided by its mean over the sensor, is compared with the flats, divided by theirs.
+    method : {"global", "guo2022"}, optional
+        ``global`` solves the fringe order of the whole sensor at once. ``guo2022`` is the walk from pixel to
+        pixel of the paper, section 3.3.
+    range_um : `tuple` [`float`, `float`], optional
+        Thicknesses that are possible [µm]; those of the set-up if not given.
+    observable : {"detection", "total"}, optional
+        What a pixel responds to; that of ``model`` if not given. ``total`` is 1 - R - T of the whole stack,
+        as in the paper's code; its fringes are out of step with those of the detection layer by half an order.
+    start_pixel : `tuple` [`int`, `int`], optional
+        Row and column at which the walk of ``guo2022`` begins; the middle of the sensor if not given.
+    cell_px : `int`, optional
+        Size of the cells on which ``global`` solves the orders [px]; chosen from the data if not given.
+    noise_correlation_px : `float`, optional
+        Standard deviation of the Gaussian kernel with which the flats were smoothed [px]. If not given, the
+        keyword ``SMOOTHPX`` of the cube's metadata, else 0.
+    slip_limit : `float`, optional
+        Pixels whose order is wrong with a larger probability are flagged SLIP.
+    threads : `int`, optional
+        Number of threads; as many as there are processors if not given. Has no influence on the result.
+
+    Returns
+    -------
+    thickness : `ThicknessMap`
+        Masked pixels keep their value where there is one. Planes: NO_DATA (nothing to fit), LOW_SIGNAL (fewer
+        than four wavelengths), SLIP (the order may be wrong), SUSPECT (improbable chi-square).
+
+    Raises
+    ------
+    UnknownNameError
+        An unknown method or observable.
+    InputError, OutOfRangeError
+        No good pixel, a range that holds less than two orders, a start pixel outside the sensor.
+    """
+    if method not in FIT_METHODS:
+        raise UnknownNameError("method", method, FIT_METHODS)
+    if not 0.0 < slip_limit <= 1.0:
+        raise OutOfRangeError("slip limit", slip_limit, "above 0, at most 1")
+    workers = threads if threads is not None else len(os.sched_getaffinity(0))
+    data = amplitudes_from_cube(cube, noise_correlation_px)
+    low, high = range_um or model.setup.thickness_range_um
+    templates = make_templates(model, cube.wavelength_nm, (low, high), observable)
+    notes: dict[str, Any] = {"METHOD": method, "RANGELO": low, "RANGEHI": high}
+    notes["OBSERVAB"] = observable or model.base_system.observable
+    if method == "guo2022":
+        start = start_pixel or (data.shape[1] // 2, data.shape[2] // 2)
+        pixels = _repeated_walk(data, templates, start, (low, high), workers)
+        slip = np.zeros(data.shape[1:], np.float32)
+        notes |= {"STARTROW": start[0], "STARTCOL": start[1]}
+    else:
+        found = global_fit(data, templates, range_um=(low, high), cell_px=cell_px, threads=workers)
+        pixels = found.pixels
+        slip = region_slip_probability(found)
+        notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
+        notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
+    return _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes)
+
+
+def amplitudes_from_cube(cube: FringeCube, noise_correlation_px: float | None = None) -> Amplitudes:
+    """Fringe amplitudes of a cube: counts over their mean over the sensor, less one.
+
+    Parameters
+    ----------
+    cube : `FringeCube`
+        Flats; a cube in electrons is divided by the mean of its good pixels, a relative one is left as it is.
+    noise_correlation_px : `float`, optional
+        See `fit_thickness`.
+
+    Raises
+    ------
+    InputError
+        A wavelength without a good pixel, or with a mean that is not positive.
+    """
+    if noise_correlation_px is None:
+        noise_correlation_px = float(cube.metadata.get("SMOOTHPX") or 0.0)
+    scale = np.ones(len(cube.wavelength_nm))
+    if cube.unit == "electron":
+        for band, wavelength in enumerate(cube.wavelength_nm):
+            good = cube.mask[band] == 0
+            mean = float(np.mean(cube.image[band], where=good, dtype=float)) if good.any() else 0.0
+            if not mean > 0.0:
+                raise InputError(f"mean level at {wavelength:g} nm", mean, "a positive number of electrons")
+            scale[band] = 1.0 / mean
+    return Amplitudes(cube.image, cube.variance, cube.mask, scale, noise_correlation_px)
+
+
+def make_templates(
+    model: FringeModel,
+    wavelength_nm: NDArray[np.float64],
+    range_um: tuple[float, float],
+    observable: str | None = None,
+) -> FringeTemplates:
+    """Templates of a model over a range of thickness, with a margin of one order on both sides.
+
+    Parameters
+    ----------
+    model : `FringeModel`
+        The model.
+    wavelength_nm : `numpy.ndarray`, shape ``(n_wavelengths,)``
+        Nominal wavelengths [nm].
+    range_um : `tuple` [`float`, `float`]
+        Thicknesses that are possible [µm].
+    observable : {"detection", "total"}, optional
+        See `fit_thickness`.
+
+    Raises
+    ------
+    UnknownNameError
+        An unknown observable.
+    OutOfRangeError
+        A range that is not positive and increasing.
+    """
+    low, high = range_um
+    if not 0.0 < low < high < np.inf:
+        raise OutOfRangeError("thickness range [um]", (low, high), "two increasing, positive numbers")
+    if observable is not None:
+        if observable not in OBSERVABLES:
+            raise UnknownNameError("observable", observable, OBSERVABLES)
+        model = replace(model, base_system=replace(model.base_system, observable=observable))
+    system = model.system
+    index = system.stack.indices(wavelength_nm, system.temperature_k)[system.stack.position(system.varying)]
+    order = float(np.mean(1e-3 * wavelength_nm / (2.0 * index.real)))
+    step = order / STEPS_PER_ORDER
+    start = max(low - order, step)
+    count = int(np.ceil((high + order - start) / step)) + 1
+    response = model.response_on_grid(wavelength_nm, start, step, count)
+    return FringeTemplates(np.ascontiguousarray(response.T), start, step, wavelength_nm)
+
+
+def _repeated_walk(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    start: tuple[int, int],
+    range_um: tuple[float, float],
+    threads: int,
+) -> PixelFit:
+    """Walk twice: the mean response over the sensor is known after the first time."""
+    first = walk_fit(data, templates, start_pixel=start, range_um=range_um, threads=threads)
+    sample = sample_pixels(data)
+    seen = first.value[np.ix_(sample.y_edges[:-1], sample.x_edges[:-1])]
+    if not spans_orders(seen, templates.order_um()):
+        return first
+    _, fitted = normalise_to_cells(sample, templates, seen, threads)
+    return walk_fit(data, fitted, start_pixel=start, range_um=range_um, threads=threads)
+
+
+def _assemble(
+    pixels: PixelFit,
+    slip: NDArray[np.float32],
+    slip_limit: float,
+    cube: FringeCube,
+    layer: str,
+    notes: Mapping[str, Any],
+) -> ThicknessMap:
+    used = pixels.n_wavelengths
+    none = used == 0
+    if none.all():
+        raise InputError("pixels", "all masked", "at least one good pixel")
+    good_chi2 = pixels.chi2[used >= FEWEST_WAVELENGTHS]
+    scale = max(float(np.median(good_chi2)), 1.0) if good_chi2.size else 1.0
+    mask = np.where(none, mask_bits("NO_DATA"), 0).astype(np.int32)
+    mask[(used < FEWEST_WAVELENGTHS) | ~np.isfinite(pixels.sigma)] |= mask_bits("LOW_SIGNAL")
+    mask[slip > slip_limit] |= mask_bits("SLIP")
+    limit = _chi2_limits(int(used.max()))
+    mask[pixels.chi2 > scale * limit[used]] |= mask_bits("SUSPECT")
+    notes = dict(notes) | {"NWAVE": len(cube.wavelength_nm), "CHI2MED": round(scale, 4)}
+    return ThicknessMap(
+        pixels.value, pixels.sigma, pixels.chi2, slip, mask, layer, notes, used, cube.detector
+    )
+
+
+def _chi2_limits(most: int) -> NDArray[np.float32]:
+    """Reduced chi-square that is exceeded with `SUSPECT_PROBABILITY`, by number of wavelengths."""
+    degrees = np.maximum(np.arange(most + 1) - 1, 1)
+    return (chi2_distribution.isf(SUSPECT_PROBABILITY, degrees) / degrees).astype(np.float32)

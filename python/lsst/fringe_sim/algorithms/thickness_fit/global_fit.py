@@ -1,0 +1,262 @@
+"""Thickness of a whole sensor at once: orders on cells, then every pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from .amplitudes import Amplitudes
+from .cells import Cells, average_cells, cell_edges, effective_number
+from .orders import OrderEvidence, OrderSolution, order_evidence, refine_cells, solve_orders
+from .pixels import CellSurface, PixelFit, fit_pixels
+from .templates import FringeTemplates
+
+__all__ = ["GlobalFit", "choose_cell_size", "global_fit", "normalise_to_cells", "spans_orders"]
+
+LARGEST_CELL_PX = 8
+"""Cells beyond this would wash out the steep fringes of real sensors (9 nm per pixel)."""
+MOST_CELLS = 600_000
+"""Bound on the memory of the order evidence: about 84 orders of 4 bytes for each cell."""
+_STEEPEST_STRUCTURE = 0.6
+"""Largest ``1 - cos`` of the phase across a cell, in the steepest tenth of the sensor."""
+_MEAN_CHANGE = 0.15
+"""Change of the mean response, in rms fringe amplitudes, at which the orders are solved a second time."""
+_MEAN_TOLERANCE = 2e-6
+"""Relative change of the mean response that is left alone: far below the noise of a smoothed flat."""
+_MOST_ROUNDS = 20
+_SENSOR_ORDERS = 2.0
+"""Orders of thickness that a sensor must span before its own mean can be told from that of the range."""
+
+
+@dataclass(frozen=True, eq=False)
+class GlobalFit:
+    """What the global fit found.
+
+    Attributes
+    ----------
+    pixels : `PixelFit`
+        Value, uncertainty, chi-square of every pixel.
+    cells : `Cells`
+        Averages that the orders were solved on.
+    solution : `OrderSolution`
+        Order and region of every cell.
+    templates : `FringeTemplates`
+        The model as it was normalised in the end.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    normalisation : `str`
+        ``sensor`` or ``range``: over which thicknesses the mean response was taken.
+    """
+
+    pixels: PixelFit
+    cells: Cells
+    solution: OrderSolution
+    templates: FringeTemplates
+    order_um: float
+    normalisation: str
+
+
+def global_fit(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    *,
+    range_um: tuple[float, float],
+    cell_px: int | None = None,
+    y_breaks: Sequence[int] = (),
+    x_breaks: Sequence[int] = (),
+    threads: int = 2,
+) -> GlobalFit:
+    """Fit a sensor.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    templates : `FringeTemplates`
+        The model; its grid must contain the range and half an order on both sides.
+    range_um : `tuple` [`float`, `float`]
+        Thicknesses that are possible [µm].
+    cell_px : `int`, optional
+        Size of the cells [px]; chosen from the steepness of the fringes if not given.
+    y_breaks, x_breaks : sequence of `int`, optional
+        Rows and columns at which a new zone begins; no cell crosses them.
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+    """
+    _, ny, nx = data.shape
+    order = templates.order_um()
+    size = choose_cell_size(data) if cell_px is None else cell_px
+    cells = average_cells(
+        data,
+        cell_edges(ny, size, y_breaks),
+        cell_edges(nx, size, x_breaks),
+        largest_amplitude=np.abs(templates.amplitude()).max(axis=0),
+        threads=threads,
+    )
+    found, solution, fitted, normalisation = _solve(data, cells, templates, order, range_um, size, threads)
+    surface = _surface(cells, found, solution, order)
+    pixels = fit_pixels(data, fitted, surface, order, threads=threads)
+    return GlobalFit(pixels, cells, solution, fitted, order, normalisation)
+
+
+def _solve(
+    data: Amplitudes,
+    cells: Cells,
+    templates: FringeTemplates,
+    order: float,
+    range_um: tuple[float, float],
+    size: int,
+    threads: int,
+) -> tuple[OrderEvidence, OrderSolution, FringeTemplates, str]:
+    """Solve the orders, and once more if the sensor's own mean response turns out to be another."""
+    temper = _cell_independence(size, data.noise_correlation_px)
+    fitted, normalisation = templates, "range"
+    for _ in range(3):
+        found = order_evidence(cells, fitted, order, range_um=range_um, temper=temper, threads=threads)
+        solution = solve_orders(cells, found)
+        if not spans_orders(solution.thickness_um, order):
+            break
+        before, normalisation = fitted, "sensor"
+        thickness, fitted = normalise_to_cells(cells, fitted, solution.thickness_um, threads)
+        solution = replace(solution, thickness_um=thickness)
+        change = fitted.mean_response / before.mean_response - 1.0
+        if np.all(np.abs(change) < _MEAN_CHANGE * fitted.amplitude().std(axis=0)):
+            break
+    return found, solution, fitted, normalisation
+
+
+def spans_orders(thickness_um: NDArray[np.float32], order_um: float) -> bool:
+    """Whether a sensor holds enough orders for the mean response over it to be known from its map."""
+    values = thickness_um[np.isfinite(thickness_um)]
+    return values.size > 0 and float(np.ptp(np.percentile(values, (2.0, 98.0)))) > _SENSOR_ORDERS * order_um
+
+
+def normalise_to_cells(
+    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32], threads: int = 2
+) -> tuple[NDArray[np.float32], FringeTemplates]:
+    """Refit the cells and renormalise the templates in turn until neither changes.
+
+    A wrong mean response shifts each thickness by a little that depends on its phase, and so bends the very
+    distribution from which the mean response is taken; a few rounds straighten it.
+
+    Parameters
+    ----------
+    cells : `Cells`
+        Mean amplitudes.
+    templates : `FringeTemplates`
+        The model as it is normalised so far.
+    thickness_um : `numpy.ndarray`, shape ``(ncy, ncx)``
+        Thickness of the cells to within a fraction of an order [µm]; NaN where there is none.
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+
+    Returns
+    -------
+    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+    templates : `FringeTemplates`
+    """
+    thickness, fitted = thickness_um, templates.normalised_to(thickness_um)
+    for _ in range(_MOST_ROUNDS):
+        thickness = refine_cells(cells, fitted, thickness, threads)
+        before, fitted = fitted, fitted.normalised_to(thickness)
+        if np.abs(fitted.mean_response / before.mean_response - 1.0).max() < _MEAN_TOLERANCE:
+            break
+    return thickness, fitted
+
+
+def _cell_independence(size: int, correlation_px: float) -> float:
+    """Independent cells per cell: cells share noise where the kernel is wider than they are."""
+    if correlation_px == 0.0:
+        return 1.0
+    block = max(16, int(12.0 * correlation_px / size))
+    whole = effective_number(block * size, block * size, correlation_px)
+    return min(whole / (block**2 * effective_number(size, size, correlation_px)), 1.0)
+
+
+def _surface(cells: Cells, found: OrderEvidence, solution: OrderSolution, order: float) -> CellSurface:
+    """Surface on which the pixels begin; cells without data borrow from the nearest with data."""
+    thickness, slope_y, slope_x = solution.thickness_um, found.slope_y, found.slope_x
+    empty = ~np.isfinite(thickness)
+    if empty.any() and not empty.all():
+        near = distance_transform_edt(empty, return_distances=False, return_indices=True)
+        thickness = thickness[tuple(near)]
+        slope_y, slope_x = np.where(empty, 0.0, slope_y), np.where(empty, 0.0, slope_x)
+    return CellSurface.from_cells(thickness, slope_y, slope_x, cells.y_centre, cells.x_centre, order)
+
+
+def choose_cell_size(data: Amplitudes) -> int:
+    """Largest cell over which the steepest tenth of the sensor still shows its fringes.
+
+    The structure function ``<(a(x + s) - a(x))²> / 2 var(a)`` of a fringe is ``1 - cos`` of its phase over the
+    distance ``s``; it is taken in blocks, at the wavelength of largest contrast, with the noise subtracted.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+
+    Returns
+    -------
+    size : `int`
+        1, 2, 4 or 8 px, or what keeps the number of cells below `MOST_CELLS`.
+    """
+    _, ny, nx = data.shape
+    least = int(np.ceil(np.sqrt(ny * nx / MOST_CELLS)))
+    rows = np.unique(np.linspace(0, max(ny - 2 * LARGEST_CELL_PX, 0), 16).astype(int))
+    strips = [_strip(data, int(row), min(2 * LARGEST_CELL_PX, ny)) for row in rows]
+    image, variance = (np.concatenate(parts, axis=1) for parts in zip(*strips, strict=True))
+    seen = np.flatnonzero(np.isfinite(image).any(axis=(1, 2)))
+    if seen.size == 0:
+        return max(LARGEST_CELL_PX, least)
+    noise = np.array([np.nanmean(variance[k]) for k in seen])
+    excess = np.array([np.nanvar(image[k]) for k in seen]) - noise
+    best = int(np.argmax(excess))
+    band, signal = int(seen[best]), float(excess[best])
+    if not signal > 0.0:
+        return max(LARGEST_CELL_PX, least)
+    for size in (8, 4, 2):
+        if size <= least:
+            break
+        if (
+            size < max(ny, nx)
+            and _structure(strips, band, size, float(noise[best]), signal) < _STEEPEST_STRUCTURE
+        ):
+            return max(size, least)
+    return max(least, 1)
+
+
+def _strip(data: Amplitudes, row: int, height: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Amplitude and variance of some rows, NaN where not to be used."""
+    image, variance, bad = data.rows(row, row + height)
+    scale = data.scale.astype(np.float32)[:, None, None]
+    good = (bad == 0) & np.isfinite(image) & (variance > 0) & np.isfinite(variance)
+    return (
+        np.where(good, image * scale - np.float32(1), np.float32(np.nan)),
+        np.where(good, variance * scale**2, np.float32(np.nan)),
+    )
+
+
+def _structure(
+    strips: list[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    band: int,
+    lag: int,
+    noise: float,
+    signal: float,
+) -> float:
+    """Ninth decile over blocks of the structure function at one distance."""
+    values = []
+    for strip, _ in strips:
+        image = strip[band]
+        width = max(image.shape[1] // 16, 2 * lag)
+        for left in range(0, image.shape[1], width):
+            block = image[:, left : left + width]
+            for step in (block[lag:] - block[:-lag], block[:, lag:] - block[:, :-lag]):
+                good = step[np.isfinite(step)]
+                if good.size >= 16:
+                    # The median of a squared normal deviate is 0.455; spikes do not reach it.
+                    values.append((np.median(good**2) / 0.455 - 2.0 * noise) / (2.0 * signal))
+    return float(np.percentile(values, 90)) if values else np.inf

@@ -1,0 +1,248 @@
+"""Thickness of every pixel, starting from the solved cells.
+
+Where the cells around a pixel lie on one surface, the pixel starts from the surface and needs two Gauss-Newton
+steps. Near a step in the layer the pixel tries every surface that a cell in reach shows, and takes the one that
+its own amplitudes prefer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from .amplitudes import Amplitudes
+from .cells import core, load_row, run_threaded
+from .newton import gauss_newton
+from .templates import FringeTemplates
+
+__all__ = ["CellSurface", "PixelFit", "fit_pixels"]
+
+_MATH = {"reassoc", "contract", "arcp", "nsz"}
+_STEPS = 5
+"""Most Gauss-Newton steps; two are usual."""
+_LONGEST_STEP = 0.1
+"""Longest Gauss-Newton step, in fringe orders."""
+_SAME_SURFACE = 0.25
+"""Cells whose thickness agrees within this many orders, slopes allowed for, lie on one surface."""
+_LONE_CELL_PENALTY = 12.0
+"""Chi-square by which a surface shown by a single cell must be better than one that several show."""
+_BAND_ROWS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class PixelFit:
+    """Result for every pixel; NaN (and 0 wavelengths) where there was nothing to fit.
+
+    Attributes
+    ----------
+    value, sigma : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        Thickness and its standard uncertainty [µm].
+    chi2 : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        Reduced chi-square.
+    n_wavelengths : `numpy.ndarray`, int32, shape ``(ny, nx)``
+        Number of wavelengths used.
+    """
+
+    value: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    chi2: NDArray[np.float32]
+    n_wavelengths: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class CellSurface:
+    """Thickness and slope of every cell, and where cells lie on one surface.
+
+    Attributes
+    ----------
+    thickness_um, slope_y, slope_x : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Thickness at the centre [µm] and its slopes [µm/px]; finite everywhere.
+    y_centre, x_centre : `numpy.ndarray`
+        Centres of the cells [px].
+    smooth : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
+        Whether a cell and its eight neighbours lie on one surface.
+    """
+
+    thickness_um: NDArray[np.float32]
+    slope_y: NDArray[np.float32]
+    slope_x: NDArray[np.float32]
+    y_centre: NDArray[np.float64]
+    x_centre: NDArray[np.float64]
+    smooth: NDArray[np.bool_]
+
+    @classmethod
+    def from_cells(
+        cls,
+        thickness_um: NDArray[np.float32],
+        slope_y: NDArray[np.floating],
+        slope_x: NDArray[np.floating],
+        y_centre: NDArray[np.float64],
+        x_centre: NDArray[np.float64],
+        order_um: float,
+    ) -> CellSurface:
+        """Find out which cells lie on one surface."""
+        rise = np.diff(y_centre)[:, None] * 0.5 * (slope_y[1:] + slope_y[:-1])
+        run = np.diff(x_centre)[None, :] * 0.5 * (slope_x[:, 1:] + slope_x[:, :-1])
+        broken = np.zeros(thickness_um.shape, bool)
+        breaks = np.abs(np.diff(thickness_um, axis=0) - rise) > _SAME_SURFACE * order_um
+        broken[1:] |= breaks
+        broken[:-1] |= breaks
+        breaks = np.abs(np.diff(thickness_um, axis=1) - run) > _SAME_SURFACE * order_um
+        broken[:, 1:] |= breaks
+        broken[:, :-1] |= breaks
+        broken = binary_dilation(broken, np.ones((3, 3), bool))
+        return cls(
+            np.ascontiguousarray(thickness_um, np.float32),
+            np.ascontiguousarray(slope_y, np.float32),
+            np.ascontiguousarray(slope_x, np.float32),
+            y_centre,
+            x_centre,
+            ~broken,
+        )
+
+
+def fit_pixels(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    surface: CellSurface,
+    order_um: float,
+    *,
+    threads: int = 2,
+) -> PixelFit:
+    """Refine every pixel.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    templates : `FringeTemplates`
+        The model, normalised to the sensor.
+    surface : `CellSurface`
+        Where to begin.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+    """
+    _, ny, nx = data.shape
+    value, sigma, chi2 = (np.full((ny, nx), np.nan, np.float32) for _ in range(3))
+    used = np.zeros((ny, nx), np.int32)
+    table = templates.table()
+    scale = data.scale.astype(np.float32)
+    below_x, share_x = _bracket(surface.x_centre, nx)
+    below_y, share_y = _bracket(surface.y_centre, ny)
+
+    def work(band: int) -> None:
+        low, high = band * _BAND_ROWS, min((band + 1) * _BAND_ROWS, ny)
+        image, variance, bad = data.rows(low, high)
+        _fit_band(
+            image, core(variance), core(bad), scale, table, templates.start_um, templates.step_um, order_um,
+            surface.thickness_um, surface.slope_y, surface.slope_x, surface.y_centre, surface.x_centre,
+            surface.smooth, low, below_y, share_y, below_x, share_x,
+            value[low:high], sigma[low:high], chi2[low:high], used[low:high],
+        )  # fmt: skip
+
+    run_threaded(work, -(-ny // _BAND_ROWS), threads)
+    return PixelFit(value, sigma, chi2, used)
+
+
+def _bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """For each pixel the cell centre below it, and how far it is to the next (outside 0..1: beyond the ends)."""
+    if len(centre) == 1:
+        return np.zeros(length, np.int64), np.zeros(length, np.float32)
+    pixel = np.arange(length)
+    below = np.clip(np.searchsorted(centre, pixel, side="right") - 1, 0, len(centre) - 2)
+    share = (pixel - centre[below]) / (centre[below + 1] - centre[below])
+    return below.astype(np.int64), share.astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+def _fit_band(  # type: ignore[no-untyped-def]
+    image, variance, bad, scale, table, start, step, order,
+    thickness, slope_y, slope_x, y_centre, x_centre, smooth, first_row, below_y, share_y, below_x, share_x,
+    value, sigma, chi2_out, used_out,
+):  # fmt: skip
+    bands, rows, columns = image.shape
+    padded = table.shape[1]
+    ncy, ncx = thickness.shape
+    longest = _LONGEST_STEP * order / step
+    amplitude = np.zeros((bands, columns), np.float32)
+    spread = np.zeros((bands, columns), np.float32)
+    y, w = np.zeros(padded, np.float32), np.zeros(padded, np.float32)
+    for r in range(rows):
+        for band in range(bands):
+            vb = band if variance.shape[0] > 1 else 0
+            bb = band if bad.shape[0] > 1 else 0
+            vr = r if variance.shape[1] > 1 else 0
+            br = r if bad.shape[1] > 1 else 0
+            load_row(
+                image[band, r], variance[vb, vr], bad[bb, br], scale[band], amplitude[band], spread[band]
+            )
+        j = below_y[first_row + r]
+        v = share_y[first_row + r]
+        jj = min(j + 1, ncy - 1)
+        for x in range(columns):
+            count = 0
+            for band in range(bands):
+                y[band] = amplitude[band, x]
+                if spread[band, x] > 0.0:
+                    w[band] = np.float32(1.0) / spread[band, x]
+                    count += 1
+                else:
+                    w[band] = np.float32(0.0)
+            if count == 0:
+                continue
+            i, u = below_x[x], share_x[x]
+            ii = min(i + 1, ncx - 1)
+            own_y, own_x = (j if v < 0.5 else jj), (i if u < 0.5 else ii)
+            if smooth[own_y, own_x]:
+                left = thickness[j, i] + v * (thickness[jj, i] - thickness[j, i])
+                right = thickness[j, ii] + v * (thickness[jj, ii] - thickness[j, ii])
+                place = (left + u * (right - left) - start) / step
+                place = min(max(place, 0.0), table.shape[0] - 1.0)
+                place, information, chi2 = gauss_newton(table, place, y, w, _STEPS, longest)
+            else:
+                place, information, chi2 = _try_surfaces(
+                    table, start, step, order, y, w, thickness, slope_y, slope_x,
+                    y_centre, x_centre, first_row + r, x, own_y, own_x, longest,
+                )  # fmt: skip
+            value[r, x] = start + step * place
+            sigma[r, x] = step / np.sqrt(information) if information > 0.0 else np.inf
+            chi2_out[r, x] = max(chi2, np.float32(0.0)) / max(count - 1, 1)
+            used_out[r, x] = count
+
+
+@numba.njit(cache=True, nogil=True)
+def _try_surfaces(  # type: ignore[no-untyped-def]
+    table, start, step, order, y, w, thickness, slope_y, slope_x,
+    y_centre, x_centre, row, column, own_y, own_x, longest,
+):  # fmt: skip
+    """Best of the surfaces that the cells around a pixel show."""
+    guess, votes = np.empty(9, np.float64), np.zeros(9, np.int64)
+    number = 0
+    for a in range(max(own_y - 1, 0), min(own_y + 2, thickness.shape[0])):
+        for b in range(max(own_x - 1, 0), min(own_x + 2, thickness.shape[1])):
+            at = (
+                thickness[a, b] + slope_y[a, b] * (row - y_centre[a]) + slope_x[a, b] * (column - x_centre[b])
+            )
+            seen = False
+            for k in range(number):
+                if abs(guess[k] - at) < _SAME_SURFACE * order:
+                    votes[k] += 1
+                    seen = True
+                    break
+            if not seen:
+                guess[number], votes[number] = at, 1
+                number += 1
+    best, best_information, best_chi2, best_cost = 0.0, np.float32(0.0), np.float32(0.0), np.inf
+    for k in range(number):
+        place = min(max((guess[k] - start) / step, 0.0), table.shape[0] - 1.0)
+        place, information, chi2 = gauss_newton(table, place, y, w, 2 * _STEPS, longest)
+        cost = chi2 + (_LONE_CELL_PENALTY if votes[k] == 1 else 0.0)
+        if cost < best_cost:
+            best, best_information, best_chi2, best_cost = place, information, chi2, cost
+    return best, best_information, best_chi2

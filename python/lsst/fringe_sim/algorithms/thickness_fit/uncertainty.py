@@ -1,0 +1,30 @@
+"""How sure the fringe order of a pixel is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .global_fit import GlobalFit
+
+__all__ = ["region_slip_probability"]
+
+
+def region_slip_probability(found: GlobalFit) -> NDArray[np.float32]:
+    """Probability that the whole region in which a pixel lies has the wrong order.
+
+    Parameters
+    ----------
+    found : `GlobalFit`
+        Result of the global fit.
+
+    Returns
+    -------
+    probability : `numpy.ndarray`, float32, shape ``(ny, nx)``
+    """
+    evidence = found.solution.region_evidence.astype(float)
+    by_region = 1.0 - 1.0 / np.exp(-0.5 * evidence).sum(axis=1)
+    by_cell = np.append(by_region, 1.0)[found.solution.region]
+    rows = np.diff(found.cells.y_edges)
+    columns = np.diff(found.cells.x_edges)
+    return np.repeat(np.repeat(by_cell.astype(np.float32), rows, axis=0), columns, axis=1)
