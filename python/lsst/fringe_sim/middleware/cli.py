@@ -10,17 +10,17 @@ from typing import Any
 
 import click
 
-from lsst.daf.butler.cli.opt import options_file_option, repo_argument, transfer_option
+from lsst.daf.butler.cli.opt import options_file_option, repo_argument, transfer_option, where_option
 from lsst.daf.butler.cli.utils import ButlerCommand
 
 from ..errors import FringeSimError
 
-__all__ = ["define_fringe_night", "get_cli_subcommands", "ingest_fringe_raws"]
+__all__ = ["define_fringe_night", "get_cli_subcommands", "ingest_fringe_raws", "write_fringe_handoff"]
 
 
 def get_cli_subcommands() -> list[click.Command]:
     """Return the subcommands; the entry point ``butler.cli`` leads here."""
-    return [ingest_fringe_raws, define_fringe_night]
+    return [ingest_fringe_raws, define_fringe_night, write_fringe_handoff]
 
 
 def _one_clear_message(command: Callable[..., None]) -> Callable[..., None]:
@@ -140,3 +140,28 @@ def define_fringe_night(
             f"{record['exposure_time']:g} s"
         )
     click.echo(f"{len(records)} exposures {'would be registered' if dry_run else 'registered'}")
+
+
+@click.command(short_help="Write fringe frames for a repository of real images.", cls=ButlerCommand)
+@repo_argument(required=True)
+@click.argument("collection")
+@click.argument("directory")
+@where_option()
+@click.option("-n", "--dry-run", is_flag=True, help="Show the frames, but write nothing.")
+@options_file_option()
+@_one_clear_message
+def write_fringe_handoff(repo: str, collection: str, directory: str, where: str, dry_run: bool) -> None:
+    """Write fringe frames for a repository of real images, where this package is not installed.
+
+    The frames of COLLECTION go into DIRECTORY, which must be new or empty, with their validity ranges if it is a
+    calibration collection. There, "butler import OTHER_REPO DIRECTORY --transfer copy" takes them in as ExposureF.
+    """
+    from lsst.daf.butler import Butler
+
+    from .handoff import write_handoff
+
+    with Butler.from_config(repo, writeable=False) as butler:
+        refs = write_handoff(butler, collection, directory, where=where, dry_run=dry_run)
+    for ref in refs:
+        click.echo(str(ref.dataId))
+    click.echo(f"{len(refs)} fringe frames {'would be written' if dry_run else 'written'} to {directory}")

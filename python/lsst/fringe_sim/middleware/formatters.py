@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -12,11 +13,15 @@ from lsst.resources import ResourcePath
 from ..errors import InputError
 from ..instrument.raw_frame import RawFrame, read_raw_metadata
 from ..products import FringeFrame
+from .afw import read_exposure
 
 __all__ = ["FitsProductFormatter", "FringeFrameFormatter", "RawFrameFormatter", "StrictJsonFormatter"]
 
 PROVENANCE_PREFIX = "LSST BUTLER"
 """Start of the header keywords that say from which datasets a product was made, as in other Rubin images."""
+
+MOST_INPUTS_IN_HEADER = 1000
+"""With more inputs than this only their number is written."""
 
 LONGEST_RUN_IN_HEADER = 60
 """Names of runs beyond this length would need continued cards under long keywords, which not every reader takes."""
@@ -46,14 +51,20 @@ class FitsProductFormatter(FormatterV2):
     def add_provenance(
         self, in_memory_dataset: Any, /, *, provenance: DatasetProvenance | None = None
     ) -> Any:
-        """Keep the provenance until the file is written; the product itself stays as it is."""
+        """Keep the provenance until the file is written; that of an earlier file is taken out of the product."""
         self._provenance = _provenance_cards(provenance or DatasetProvenance(), self.dataset_ref)
-        return in_memory_dataset
+        metadata = in_memory_dataset.metadata
+        own = {key: value for key, value in metadata.items() if not key.startswith(PROVENANCE_PREFIX)}
+        if len(own) == len(metadata):
+            return in_memory_dataset
+        return dataclasses.replace(in_memory_dataset, metadata=own)
 
 
 def _provenance_cards(provenance: DatasetProvenance, ref: Any) -> dict[str, Any]:
     """Header cards that name the dataset, its quantum and its inputs."""
-    flat = provenance.to_flat_dict(ref, prefix=PROVENANCE_PREFIX, sep=" ", simple_types=True)
+    flat = provenance.to_flat_dict(
+        ref, prefix=PROVENANCE_PREFIX, sep=" ", simple_types=True, max_inputs=MOST_INPUTS_IN_HEADER
+    )
     return {
         keyword: str(value)[:LONGEST_RUN_IN_HEADER] if keyword.endswith(" RUN") else value
         for keyword, value in flat.items()
@@ -75,21 +86,8 @@ class FringeFrameFormatter(FitsProductFormatter):
         descriptor = self.file_descriptor
         wanted = descriptor.readStorageClass or descriptor.storageClass
         if wanted.name.startswith("Exposure"):
-            return _read_as_exposure(path)
+            return read_exposure(path)
         return FringeFrame.read_fits(path)
-
-
-def _read_as_exposure(path: str) -> Any:
-    try:
-        from lsst.afw.image import ExposureF
-    except ImportError:
-        raise InputError(
-            "storage class",
-            "ExposureF",
-            "FringeFrame; an exposure needs lsst.afw, which is not installed here",
-            source=path,
-        ) from None
-    return ExposureF.readFits(path)
 
 
 class RawFrameFormatter(FormatterV2):

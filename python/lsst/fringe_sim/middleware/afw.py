@@ -1,0 +1,72 @@
+"""Fringe frames as afw exposures, where afw is installed. It is not needed for anything else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..products import MASK_PLANES, FringeFrame
+
+__all__ = ["frame_from_exposure", "read_exposure"]
+
+
+def read_exposure(path: str) -> Any:
+    """Read the file of a fringe frame as an ``ExposureF``.
+
+    Raises
+    ------
+    InputError
+        afw is not installed.
+    """
+    try:
+        from lsst.afw.image import ExposureF
+    except ImportError:
+        raise InputError(
+            "storage class",
+            "ExposureF",
+            "FringeFrame; an exposure needs lsst.afw, which is not installed here",
+            source=path,
+        ) from None
+    return ExposureF.readFits(path)
+
+
+def frame_from_exposure(exposure: Any) -> FringeFrame:
+    """Return the fringe frame that an ``ExposureF`` holds.
+
+    Parameters
+    ----------
+    exposure : ``lsst.afw.image.ExposureF``
+        A fringe calibration: zero-mean fractions of the sky, with the time of its making in
+        ``CALIB_CREATION_DATETIME``.
+
+    Raises
+    ------
+    InputError
+        The exposure does not say when it was made, or is no fringe frame.
+    """
+    header = exposure.getMetadata()
+    if "CALIB_CREATION_DATETIME" not in header:
+        raise InputError("CALIB_CREATION_DATETIME", None, "YYYY-MM-DDThh:mm:ss in the exposure's metadata")
+    corner = exposure.getXY0()
+    detector = exposure.getDetector()
+    return FringeFrame(
+        image=np.array(exposure.image.array, dtype=np.float32),
+        mask=_known_planes(exposure.mask),
+        variance=np.array(exposure.variance.array, dtype=np.float32),
+        physical_filter=str(exposure.getFilter().physicalLabel),
+        creation_datetime=str(header["CALIB_CREATION_DATETIME"]),
+        detector="" if detector is None else str(detector.getName()),
+        xy0=(int(corner[0]), int(corner[1])),
+    )
+
+
+def _known_planes(mask: Any) -> np.ndarray:
+    """Mask with the planes that both sides know; a pixel masked for another reason becomes BAD."""
+    stored = np.asarray(mask.array)
+    result = np.zeros(stored.shape, dtype=np.int32)
+    for name, bit in mask.getMaskPlaneDict().items():
+        plane = MASK_PLANES.get(name, MASK_PLANES["BAD"])
+        result |= np.where(stored >> bit & 1, np.int32(1 << plane), np.int32(0))
+    return result

@@ -1,0 +1,95 @@
+"""Fringe frames for a repository of real images, where this package is not installed.
+
+The hand-off is a directory that ``butler import`` reads: the FITS files, which afw reads as they are, and an
+export file in which they are ``ExposureF`` with the formatter of Rubin's own packages.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lsst.daf.butler import Butler, CollectionType, DatasetRef, FileDataset, MissingDatasetTypeError
+
+from ..errors import InputError
+
+__all__ = ["EXPORT_FILE", "FRINGE", "write_handoff"]
+
+FRINGE = "fringe"
+"""Dataset type that Rubin's instrument signature removal reads."""
+
+EXPORT_FILE = "export.yaml"
+
+EXPOSURE_FORMATTER = "lsst.obs.base.formatters.fitsExposure.FitsExposureFormatter"
+
+
+def write_handoff(
+    butler: Butler, collection: str, directory: str | Path, *, where: str = "", dry_run: bool = False
+) -> list[DatasetRef]:
+    """Write the fringe frames of a collection for another repository.
+
+    Parameters
+    ----------
+    butler : `lsst.daf.butler.Butler`
+        The repository that has the frames.
+    collection : `str`
+        Calibration collection, whose validity ranges go along, or a run.
+    directory : `str` or `pathlib.Path`
+        Directory for the files; new or empty.
+    where : `str`, optional
+        Condition on the data ids, as ``instrument='LSSTCam' AND detector.raft='R11'``.
+    dry_run : `bool`, optional
+        Say what would be written, but write nothing.
+
+    Returns
+    -------
+    refs : `list` [`lsst.daf.butler.DatasetRef`]
+        The frames.
+
+    Raises
+    ------
+    InputError
+        There is no such collection, it has no fringe frames, or the directory is not empty.
+    """
+    target = Path(directory)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError("directory", str(target), "a new or an empty directory")
+    refs = _find(butler, collection, where)
+    if not dry_run:
+        target.mkdir(parents=True, exist_ok=True)
+        _export(butler, collection, refs, target)
+    return refs
+
+
+def _find(butler: Butler, collection: str, where: str) -> list[DatasetRef]:
+    if collection not in butler.collections.query("*"):
+        raise InputError("collection", collection, ", ".join(sorted(butler.collections.query("*"))) or "none")
+    try:
+        # The registry's query also looks into calibration collections without asking for a time.
+        refs = set(butler.registry.queryDatasets(FRINGE, collections=collection, where=where))
+    except MissingDatasetTypeError:
+        refs = set()
+    if not refs:
+        raise InputError(
+            "fringe frames", 0, f"at least one in collection {collection!r} where {where or 'all'}"
+        )
+    return sorted(refs)
+
+
+def _export(butler: Butler, collection: str, refs: list[DatasetRef], target: Path) -> None:
+    storage_class = refs[0].datasetType.storageClass_name
+    with butler.export(directory=str(target), filename=EXPORT_FILE, format="yaml", transfer="copy") as export:
+        # Instruments, detectors and filters are those of the other repository: no records go along.
+        expanded = [ref.expanded(butler.registry.expandDataId(ref.dataId)) for ref in refs]
+        export.saveDatasets(expanded, elements=(), rewrite=_for_other_readers)
+        if butler.collections.get_info(collection).type is CollectionType.CALIBRATION:
+            export.saveCollection(collection)
+    # The storage class can be changed in the file only: Python's type behind it need not be installed here.
+    file = target / EXPORT_FILE
+    text = file.read_text(encoding="utf-8")
+    file.write_text(
+        text.replace(f"storage_class: {storage_class}\n", "storage_class: ExposureF\n"), encoding="utf-8"
+    )
+
+
+def _for_other_readers(dataset: FileDataset) -> FileDataset:
+    return FileDataset(path=dataset.path, refs=dataset.refs, formatter=EXPOSURE_FORMATTER)
