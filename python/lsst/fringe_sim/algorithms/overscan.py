@@ -1,0 +1,126 @@
+"""The electronic level of an amplifier, measured in its overscan."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_lsq_spline
+
+from ..errors import FrameFormatError
+from ..instrument.raw_frame import RawAmplifier
+from .flat_prep_options import DEFAULT_OPTIONS, GAUSSIAN_MAD, FlatPrepOptions
+
+__all__ = ["OverscanCorrected", "correct_overscan"]
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class OverscanCorrected:
+    """One amplifier without its electronic level.
+
+    Attributes
+    ----------
+    image : `numpy.ndarray` [y, x], float32
+        Imaging section, read-out order [ADU].
+    level_adu : `float`
+        Median level that was taken off [ADU].
+    noise_adu : `float`
+        Robust standard deviation of the overscan pixels: the read noise [ADU].
+    """
+
+    image: Image
+    level_adu: float
+    noise_adu: float
+
+
+def correct_overscan(
+    amp: RawAmplifier, options: FlatPrepOptions = DEFAULT_OPTIONS
+) -> OverscanCorrected | None:
+    """Take the electronic level off one amplifier.
+
+    Row by row with the serial overscan, which follows the drift of the electronics, then column by column with
+    the parallel overscan. Outliers (cosmic rays, bleeding, deferred charge) are rejected.
+
+    Parameters
+    ----------
+    amp : `RawAmplifier`
+        Amplifier as read.
+    options : `FlatPrepOptions`, optional
+        Choices.
+
+    Returns
+    -------
+    corrected : `OverscanCorrected` or `None`
+        `None` for an amplifier that is switched off: one value in all pixels.
+
+    Raises
+    ------
+    FrameFormatError
+        The frame has too little serial overscan.
+    """
+    if amp.data.min() == amp.data.max():
+        return None
+    first_column = amp.serial_overscan[1].start + options.overscan_skip
+    if first_column + 3 > amp.data.shape[1]:
+        width = amp.data.shape[1] - amp.serial_overscan[1].start
+        raise FrameFormatError(
+            f"{amp.name} serial overscan", width, f"{options.overscan_skip + 3} columns or more"
+        )
+    rows, columns = amp.imaging
+    serial = amp.data[:, first_column:].astype(np.float32)
+    level, noise = _row_level(serial, rows, options)
+    image = amp.data[rows, columns].astype(np.float32)
+    image -= level[rows, np.newaxis]
+    first_row = amp.parallel_overscan[0].start + options.overscan_skip
+    if options.parallel_overscan and first_row + 3 <= amp.data.shape[0]:
+        parallel = amp.data[first_row:, columns].astype(np.float32)
+        parallel -= level[first_row:, np.newaxis]
+        image -= _column_level(parallel, noise, options)
+    return OverscanCorrected(image, float(np.median(level)), noise)
+
+
+def _row_level(serial: Image, imaging_rows: slice, options: FlatPrepOptions) -> tuple[Image, float]:
+    """Level of every row, and the noise of one pixel about it [ADU]."""
+    median = np.median(serial, axis=1)
+    departure = serial - median[:, np.newaxis]
+    noise = GAUSSIAN_MAD * float(np.median(np.abs(departure)))
+    noise = max(noise, 1.0 / math.sqrt(12.0))  # an integer is never known better than this
+    if options.overscan_method == "median":
+        return median, noise
+    clipped = np.clip(departure, -options.clip_sigma * noise, options.clip_sigma * noise)
+    mean = median + clipped.mean(axis=1)
+    return _robust_spline(mean.astype(float), options).astype(np.float32), noise
+
+
+def _robust_spline(values: NDArray[np.float64], options: FlatPrepOptions) -> NDArray[np.float64]:
+    """Cubic least-squares spline through equidistant values, refitted without outliers."""
+    position = np.arange(len(values), dtype=float)
+    intervals = min(options.overscan_knots, max(1, len(values) // 8))
+    inner = np.linspace(0.0, position[-1], intervals + 1)
+    knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
+    weight = np.ones(len(values))
+    for _ in range(5):
+        curve = make_lsq_spline(position, values, knots, 3, w=weight)(position)
+        residual = values - curve
+        scale = GAUSSIAN_MAD * np.median(np.abs(residual))
+        # Outliers keep a trace of weight, so that no interval of the spline is ever left without data.
+        updated = np.where(np.abs(residual) <= options.clip_sigma * max(scale, 1e-6), 1.0, 1e-3)
+        if np.array_equal(updated, weight):
+            break
+        weight = updated
+    return curve
+
+
+def _column_level(parallel: Image, noise: float, options: FlatPrepOptions) -> Image:
+    """Level of every column in the parallel overscan [ADU]; columns into which charge bled take the common one."""
+    median = np.median(parallel, axis=0)
+    common = float(np.median(median))
+    # The standard error of a median of n Gaussian values is 1.2533 sigma / sqrt(n).
+    error = 1.2533 * noise / math.sqrt(parallel.shape[0])
+    scatter = max(GAUSSIAN_MAD * float(np.median(np.abs(median - common))), error)
+    outlier = np.abs(median - common) > options.clip_sigma * scatter
+    return np.where(outlier, np.float32(common), median)

@@ -1,0 +1,487 @@
+"""Physical effects that a mock can hide in its frames, in the mock's own implementation.
+
+Each acts at the place where nature has it: in the optics of the sensor, on the light that arrives, on the charge
+that is collected, or in the electronics of an amplifier. At their null values they change nothing. Names and
+units agree with the catalogue of the model where both know an effect; no code is shared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from ..errors import InputError, OutOfRangeError, UnknownNameError
+from .optics import FlatFieldOptics
+
+__all__ = ["HIDDEN_EFFECTS", "AmplifierState", "HiddenEffect", "HiddenParameter", "validate_effects"]
+
+FloatArray = NDArray[np.float64]
+Values = Mapping[str, float]
+
+AMPLIFIER_NAMES = tuple(f"C{row}{column}" for row in (1, 0) for column in range(8))
+REFERENCE_CHARGE_E = 100_000.0
+"""Charge at which the coefficient of the non-linearity is stated [electrons]."""
+
+
+@dataclass(frozen=True)
+class HiddenParameter:
+    """One number of an effect; a null of NaN means "as the set-up says"."""
+
+    name: str
+    unit: str
+    null: float
+    bounds: tuple[float, float]
+    description: str
+
+
+@dataclass(frozen=True)
+class AmplifierState:
+    """What one amplifier really does, as opposed to what the tables say of it.
+
+    Attributes
+    ----------
+    name : `str`
+        ``C00`` … ``C17``.
+    gain : `float`
+        Gain [electrons per ADU].
+    read_noise_e : `float`
+        Read noise [electrons rms].
+    saturation_e : `float`
+        Full well [electrons].
+    dark_e : `float`
+        Charge that gathers in every imaging pixel of a flat without being light [electrons].
+    offset_e : `float`
+        Level that the imaging pixels of a flat have and its overscan has not, without noise of its own
+        [electrons].
+    """
+
+    name: str
+    gain: float
+    read_noise_e: float
+    saturation_e: float
+    dark_e: float = 0.0
+    offset_e: float = 0.0
+
+
+@dataclass(frozen=True)
+class HiddenEffect:
+    """An effect and the one or two places at which it acts.
+
+    Attributes
+    ----------
+    name, title : `str`
+        Key in the mapping of effects; one line for people.
+    parameters : `tuple` [`HiddenParameter`, ...]
+        Its numbers.
+    on_optics : callable, optional
+        ``(optics, values) -> optics``.
+    on_light : callable, optional
+        ``(light [y, x], values) -> light``; the light is relative to its mean over the sensor.
+    on_charge : callable, optional
+        ``(electrons [y, x], values) -> electrons``, after the photon noise.
+    on_amplifier : callable, optional
+        ``(state, values, standard_normal) -> state``, with one normal deviate for each amplifier.
+    """
+
+    name: str
+    title: str
+    parameters: tuple[HiddenParameter, ...]
+    on_optics: Callable[[FlatFieldOptics, Values], FlatFieldOptics] | None = None
+    on_light: Callable[[FloatArray, Values], FloatArray] | None = None
+    on_charge: Callable[[FloatArray, Values], FloatArray] | None = None
+    on_amplifier: Callable[[AmplifierState, Values, float], AmplifierState] | None = None
+
+    def parameter(self, name: str) -> HiddenParameter:
+        """Parameter called ``name``.
+
+        Raises
+        ------
+        UnknownNameError
+            The effect has no such parameter.
+        """
+        for candidate in self.parameters:
+            if candidate.name == name:
+                return candidate
+        known = [candidate.name for candidate in self.parameters]
+        raise UnknownNameError(f"parameter of effect {self.name}", name, known)
+
+    def complete(self, values: Values) -> dict[str, float]:
+        """Values of all parameters, null where none is given."""
+        return {p.name: values.get(p.name, p.null) for p in self.parameters}
+
+
+def validate_effects(
+    settings: Mapping[str, Any] | None, catalogue: tuple[HiddenEffect, ...] | None = None
+) -> tuple[tuple[HiddenEffect, dict[str, float]], ...]:
+    """Check settings and return the effects with their values, in the order of the catalogue.
+
+    Parameters
+    ----------
+    settings : mapping or `None`
+        ``{"bandwidth.fwhm": 2.4}`` or ``{"bandwidth": {"fwhm": 2.4}}``, or both mixed.
+    catalogue : `tuple` [`HiddenEffect`, ...], optional
+        Effects to choose from; `HIDDEN_EFFECTS` by default.
+
+    Raises
+    ------
+    UnknownNameError
+        An effect or a parameter that is not in the catalogue.
+    OutOfRangeError
+        A value outside the bounds of its parameter.
+    InputError
+        A value that is not a finite number, or a setting without a parameter.
+    """
+    effects = HIDDEN_EFFECTS if catalogue is None else catalogue
+    by_name = {effect.name: effect for effect in effects}
+    chosen: dict[str, dict[str, float]] = {}
+    for name, parameter_name, value in _flatten(settings or {}):
+        if name not in by_name:
+            raise UnknownNameError("effect", name, by_name)
+        parameter = by_name[name].parameter(parameter_name)
+        chosen.setdefault(name, {})[parameter_name] = _number(f"{name}.{parameter_name}", value, parameter)
+    return tuple((effect, chosen[effect.name]) for effect in effects if effect.name in chosen)
+
+
+def _flatten(settings: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            for parameter, number in value.items():
+                yield str(key), str(parameter), number
+            continue
+        effect, _, parameter = str(key).partition(".")
+        if not effect or not parameter:
+            raise InputError("effect setting", key, "name.parameter=value")
+        yield effect, parameter, value
+
+
+def _number(what: str, value: Any, parameter: HiddenParameter) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise InputError(what, value, "a number") from None
+    low, high = parameter.bounds
+    if not low <= number <= high:
+        raise OutOfRangeError(f"{what} [{parameter.unit or '1'}]", number, f"{low:g} to {high:g}")
+    return number
+
+
+# Optics ---------------------------------------------------------------------------------------------------
+
+
+def _bandwidth(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    fwhm = values["fwhm"]
+    return optics if math.isnan(fwhm) else replace(optics, bandwidth_fwhm_nm=fwhm)
+
+
+def _wavelength_offset(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(optics, wavelength_offset_nm=optics.wavelength_offset_nm + values["offset"])
+
+
+def _wavelength_scale(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(optics, wavelength_stretch=optics.wavelength_stretch + values["stretch"])
+
+
+def _temperature(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    kelvin = values["kelvin"]
+    return optics if math.isnan(kelvin) else replace(optics, temperature_k=kelvin)
+
+
+def _epoxy_index(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return optics.with_film("adhesive", index_shift=values["offset"], cauchy_um2=values["cauchy"])
+
+
+def _epoxy_absorption(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return optics.with_film("adhesive", extinction_shift=values["k"])
+
+
+def _silicon_thickness(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    film = optics.films[optics.position(optics.detection)]
+    return optics.with_film(optics.detection, thickness_um=film.thickness_um + values["offset"])
+
+
+def _silicon_absorption(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return optics.with_film(optics.detection, extinction_scale=values["scale"])
+
+
+def _ar_coating(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    for name in ("ar_outer", "ar_inner"):
+        film = optics.films[optics.position(name)]
+        optics = optics.with_film(name, thickness_um=film.thickness_um * values["scale"])
+    return optics
+
+
+def _support_index(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return optics.with_film("support", index_shift=values["offset"])
+
+
+def _gate_oxide(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    film = optics.films[optics.position("insulation")]
+    return optics.with_film("insulation", thickness_um=film.thickness_um + values["offset"])
+
+
+def _tilt(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(optics, theta=tuple(theta + math.radians(values["angle"]) for theta in optics.theta))
+
+
+def _roughness(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(optics, rough_face="support", roughness_nm=values["sigma"])
+
+
+def _converging_beam(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    aperture = values["numerical_aperture"]
+    if aperture == 0.0:
+        return optics
+    # Nodes enough for the phase between axis and rim: half a node per radian is ample for Gauss–Legendre.
+    path_um = sum(film.thickness_um for film in optics.films if math.isfinite(film.thickness_um))
+    phase = 2.0 * math.pi * path_um * aperture**2 / (1.6 * 0.85)
+    nodes, weight = np.polynomial.legendre.leggauss(8 + math.ceil(0.5 * phase))
+    # Equal light per unit of sin² of the angle: a uniformly bright source, or a pupil under the sine condition.
+    theta = np.arcsin(aperture * np.sqrt(0.5 * (nodes + 1.0)))
+    return replace(optics, theta=tuple(theta.tolist()), theta_weight=tuple((0.5 * weight).tolist()))
+
+
+# Light ----------------------------------------------------------------------------------------------------
+
+
+def _ghost_pedestal(light: FloatArray, values: Values) -> FloatArray:
+    return light + values["fraction"]
+
+
+def _contrast_loss(light: FloatArray, values: Values) -> FloatArray:
+    return 1.0 + values["factor"] * (light - 1.0)
+
+
+def _illumination(light: FloatArray, values: Values) -> FloatArray:
+    v, u = _sensor_coordinates(light.shape)
+    return light * (1.0 + 0.5 * values["gradient_x"] * u + 0.5 * values["gradient_y"] * v)
+
+
+def _vignetting(light: FloatArray, values: Values) -> FloatArray:
+    v, u = _sensor_coordinates(light.shape)
+    return light * (1.0 - 0.5 * values["corner"] * (u * u + v * v))
+
+
+def _midline_step(light: FloatArray, values: Values) -> FloatArray:
+    upper = np.arange(light.shape[0])[:, np.newaxis] >= light.shape[0] // 2
+    return light * np.where(upper, 1.0 + values["fraction"], 1.0)
+
+
+def _sensor_coordinates(shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+    """Coordinates from -1 to 1 along y and x."""
+    v = np.linspace(-1.0, 1.0, shape[0])[:, np.newaxis]
+    u = np.linspace(-1.0, 1.0, shape[1])[np.newaxis, :]
+    return v, u
+
+
+def _charge_diffusion(light: FloatArray, values: Values) -> FloatArray:
+    return gaussian_filter(light, values["sigma"], mode="reflect", truncate=6.0) if values["sigma"] else light
+
+
+# Charge and electronics -----------------------------------------------------------------------------------
+
+
+def _non_linearity(electrons: FloatArray, values: Values) -> FloatArray:
+    return electrons * (1.0 - values["quadratic"] * electrons / REFERENCE_CHARGE_E)
+
+
+def _dark_pedestal(state: AmplifierState, values: Values, deviate: float) -> AmplifierState:
+    return replace(state, dark_e=state.dark_e + values["electrons"])
+
+
+def _amplifier_gain(state: AmplifierState, values: Values, deviate: float) -> AmplifierState:
+    return replace(state, gain=state.gain * (1.0 + values[state.name] + values["rms"] * deviate))
+
+
+def _amplifier_offset(state: AmplifierState, values: Values, deviate: float) -> AmplifierState:
+    return replace(state, offset_e=state.offset_e + values[state.name] + values["rms"] * deviate)
+
+
+def _per_amplifier(
+    unit: str, low: float, high: float, high_rms: float, what: str
+) -> tuple[HiddenParameter, ...]:
+    each = tuple(
+        HiddenParameter(name, unit, 0.0, (low, high), f"{what} of {name}") for name in AMPLIFIER_NAMES
+    )
+    rms = HiddenParameter(
+        "rms", unit, 0.0, (0.0, high_rms), f"{what}: rms of a random one on every amplifier"
+    )
+    return (rms, *each)
+
+
+_UNSET = math.nan
+
+HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
+    HiddenEffect(
+        "bandwidth",
+        "bandpass width",
+        (HiddenParameter("fwhm", "nm", _UNSET, (0.05, 20.0), "full width at half maximum"),),
+        on_optics=_bandwidth,
+    ),
+    HiddenEffect(
+        "wavelength_offset",
+        "wavelength offset",
+        (HiddenParameter("offset", "nm", 0.0, (-10.0, 10.0), "true minus nominal wavelength"),),
+        on_optics=_wavelength_offset,
+    ),
+    HiddenEffect(
+        "wavelength_scale",
+        "wavelength scale",
+        (HiddenParameter("stretch", "nm/nm", 0.0, (-0.1, 0.1), "relative error of wavelength differences"),),
+        on_optics=_wavelength_scale,
+    ),
+    HiddenEffect(
+        "temperature",
+        "temperature",
+        (HiddenParameter("kelvin", "K", _UNSET, (120.0, 320.0), "temperature of the sensor"),),
+        on_optics=_temperature,
+    ),
+    HiddenEffect(
+        "epoxy_index",
+        "adhesive index and dispersion",
+        (
+            HiddenParameter("offset", "", 0.0, (-0.3, 0.3), "index minus the tabulated one at 960 nm"),
+            HiddenParameter("cauchy", "um2", 0.0, (-0.05, 0.05), "coefficient of 1/wavelength²"),
+        ),
+        on_optics=_epoxy_index,
+    ),
+    HiddenEffect(
+        "epoxy_absorption",
+        "adhesive absorption",
+        (HiddenParameter("k", "", 0.0, (0.0, 0.05), "extinction coefficient"),),
+        on_optics=_epoxy_absorption,
+    ),
+    HiddenEffect(
+        "silicon_thickness",
+        "silicon thickness",
+        (HiddenParameter("offset", "um", 0.0, (-20.0, 20.0), "thickness minus that of the stack"),),
+        on_optics=_silicon_thickness,
+    ),
+    HiddenEffect(
+        "silicon_absorption",
+        "silicon extinction",
+        (HiddenParameter("scale", "", 1.0, (0.5, 2.0), "factor on the extinction coefficient"),),
+        on_optics=_silicon_absorption,
+    ),
+    HiddenEffect(
+        "ar_coating",
+        "anti-reflection coating",
+        (HiddenParameter("scale", "", 1.0, (0.5, 1.5), "factor on both thicknesses"),),
+        on_optics=_ar_coating,
+    ),
+    HiddenEffect(
+        "support_index",
+        "index of the support",
+        (HiddenParameter("offset", "", 0.0, (-2.4, 1.0), "index minus that of the stack"),),
+        on_optics=_support_index,
+    ),
+    HiddenEffect(
+        "gate_oxide",
+        "insulation at the gates",
+        (HiddenParameter("offset", "um", 0.0, (-0.3, 0.5), "thickness minus that of the stack"),),
+        on_optics=_gate_oxide,
+    ),
+    HiddenEffect(
+        "tilt",
+        "tilted sensor",
+        (HiddenParameter("angle", "deg", 0.0, (0.0, 40.0), "angle of incidence"),),
+        on_optics=_tilt,
+    ),
+    HiddenEffect(
+        "roughness",
+        "interface roughness",
+        (HiddenParameter("sigma", "nm", 0.0, (0.0, 300.0), "rms height of the support surface"),),
+        on_optics=_roughness,
+    ),
+    HiddenEffect(
+        "converging_beam",
+        "converging beam or extended source",
+        (
+            HiddenParameter(
+                "numerical_aperture", "", 0.0, (0.0, 0.7), "sine of the largest angle of incidence"
+            ),
+        ),
+        on_optics=_converging_beam,
+    ),
+    HiddenEffect(
+        "ghost_pedestal",
+        "scattered light or ghost pedestal",
+        (HiddenParameter("fraction", "", 0.0, (0.0, 20.0), "pedestal over mean signal"),),
+        on_light=_ghost_pedestal,
+    ),
+    HiddenEffect(
+        "contrast_loss",
+        "constant contrast loss",
+        (HiddenParameter("factor", "", 1.0, (0.0, 1.5), "factor on the departure from the mean"),),
+        on_light=_contrast_loss,
+    ),
+    HiddenEffect(
+        "illumination",
+        "illumination gradient",
+        (
+            HiddenParameter(
+                "gradient_x", "", 0.0, (-0.5, 0.5), "relative rise from the left to the right edge"
+            ),
+            HiddenParameter(
+                "gradient_y", "", 0.0, (-0.5, 0.5), "relative rise from the lower to the upper edge"
+            ),
+        ),
+        on_light=_illumination,
+    ),
+    HiddenEffect(
+        "vignetting",
+        "vignetting",
+        (
+            HiddenParameter(
+                "corner", "", 0.0, (0.0, 0.9), "relative loss in the corners, quadratic in radius"
+            ),
+        ),
+        on_light=_vignetting,
+    ),
+    HiddenEffect(
+        "midline_step",
+        "step at the middle row",
+        (
+            HiddenParameter(
+                "fraction", "", 0.0, (-0.2, 0.2), "relative step from the lower to the upper half"
+            ),
+        ),
+        on_light=_midline_step,
+    ),
+    HiddenEffect(
+        "charge_diffusion",
+        "charge diffusion",
+        (HiddenParameter("sigma", "px", 0.0, (0.0, 5.0), "rms radius along one axis"),),
+        on_light=_charge_diffusion,
+    ),
+    HiddenEffect(
+        "dark_pedestal",
+        "dark signal or light leak",
+        (HiddenParameter("electrons", "electron", 0.0, (0.0, 100_000.0), "level in every flat"),),
+        on_amplifier=_dark_pedestal,
+    ),
+    HiddenEffect(
+        "non_linearity",
+        "non-linear response to charge",
+        (HiddenParameter("quadratic", "", 0.0, (-0.2, 0.2), "relative loss at 100 000 electrons"),),
+        on_charge=_non_linearity,
+    ),
+    HiddenEffect(
+        "amplifier_gain",
+        "gain errors of the amplifiers",
+        _per_amplifier("", -0.5, 0.5, 0.2, "relative gain error"),
+        on_amplifier=_amplifier_gain,
+    ),
+    HiddenEffect(
+        "amplifier_offset",
+        "bias residuals of the amplifiers",
+        _per_amplifier("electron", -5000.0, 5000.0, 1000.0, "offset in flats"),
+        on_amplifier=_amplifier_offset,
+    ),
+)
+"""Every effect that a mock can hide."""

@@ -1,0 +1,630 @@
+"""Signal of a flat field, computed without the fitting model.
+
+A second, separate implementation of thin-film optics: characteristic (admittance) matrices of the films, the
+tangential fields at the two faces of the detection layer, and the difference of the Poynting flux through them.
+The fitting model follows wave amplitudes and a closed form in the thickness instead. The two share the tables of
+the materials and the YAML files of stacks and set-ups, nothing else, so that an error in either shows.
+
+References: Macleod, Thin-Film Optical Filters (characteristic matrix, tilted admittance); Green 2008 (silicon and
+its temperature dependence); Guo, Walter, Lage & Lupton 2022, section 2.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, PchipInterpolator
+
+from ..errors import ConvergenceError, OutOfRangeError, StackError, UnknownNameError
+from ..resources import read_table, read_yaml
+
+__all__ = ["Film", "FlatFieldOptics", "SignalTable", "material_index"]
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+GREEN_TEMPERATURE_K = 300.0
+EXTINCTION_FLOOR = 1e-12
+
+DISPERSION_PIVOT_NM = 960.0
+"""Wavelength at which added dispersion leaves the index as it is [nm]."""
+
+SCALE_PIVOT_NM = 935.0
+"""Wavelength at which an error of the wavelength scale vanishes [nm]."""
+
+TABLE_STEP_UM = 0.003
+"""Spacing of the thickness grid [µm]: a hundred points per fringe order."""
+
+LINE_STEP_NM = 0.03
+"""Spacing of wavelength nodes [nm]: fifteen per fringe of detection layer and support together."""
+
+LINE_REACH = 6.0
+"""Half width of the sampled Gaussian line in standard deviations; 2e-9 of the light is left out."""
+
+HEIGHT_STEP_NM = 25.0
+"""Largest spacing of the heights of a rough face [nm]: a fifth of a fringe in silicon."""
+
+HEIGHT_REACH = 5.0
+"""Largest height of a rough face in standard deviations."""
+
+RELATIVE_TOLERANCE = 1e-5
+"""Largest error of a table that is accepted, relative to its mean: 1/700 of the noise of a 20 000 e⁻ pixel."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """One plane layer.
+
+    Attributes
+    ----------
+    name : `str`
+        Name in the stack: ``detection``, ``adhesive``...
+    medium : `str`
+        Name of its material in ``data/media/media.yaml``.
+    thickness_um : `float`
+        Thickness [µm]; infinite at the two ends.
+    index_shift : `float`
+        Added to the tabulated index.
+    cauchy_um2 : `float`
+        Added dispersion: coefficient of 1 / wavelength², zero at 960 nm [µm²].
+    extinction_scale, extinction_shift : `float`
+        Factor on the tabulated extinction coefficient, and what is added to it after that.
+    """
+
+    name: str
+    medium: str
+    thickness_um: float
+    index_shift: float = 0.0
+    cauchy_um2: float = 0.0
+    extinction_scale: float = 1.0
+    extinction_shift: float = 0.0
+
+    def index(self, wavelength_nm: FloatArray, temperature_k: float) -> ComplexArray:
+        """Complex index at some wavelengths in vacuum [nm] and one temperature [K]."""
+        table = material_index(self.medium, wavelength_nm, temperature_k)
+        tilt = (1e3 / wavelength_nm) ** 2 - (1e3 / DISPERSION_PIVOT_NM) ** 2
+        n = table.real + self.index_shift + self.cauchy_um2 * tilt
+        return n + 1j * (table.imag * self.extinction_scale + self.extinction_shift)
+
+
+@dataclass(frozen=True)
+class FlatFieldOptics:
+    """Sensor and light of a monochromatic flat field.
+
+    Attributes
+    ----------
+    films : `tuple` [`Film`, ...]
+        From the ambient medium to the substrate.
+    temperature_k : `float`
+        Temperature of the sensor [K].
+    bandwidth_fwhm_nm : `float`
+        Full width at half maximum of the line [nm].
+    line_shape : `str`
+        ``"gaussian"`` or ``"triangular"``.
+    wavelength_offset_nm : `float`
+        True minus nominal wavelength [nm].
+    wavelength_stretch : `float`
+        Further error per nm of distance from 935 nm.
+    theta, theta_weight : `tuple` [`float`, ...]
+        Angles of incidence [rad] and their weights, which sum to 1.
+    varying, detection : `str`
+        Layer whose thickness varies over the sensor; layer whose absorption is the signal.
+    rough_face : `str`
+        Layer whose upper face is rough.
+    roughness_nm : `float`
+        Rms height of that face [nm], on a lateral scale below a pixel and above a wavelength, so that a pixel
+        sees the average over thickness.
+    line_step_nm, height_step_nm : `float`
+        Largest spacing of the nodes over wavelength and over the height of the rough face [nm].
+
+    Raises
+    ------
+    StackError
+        Fewer than three films, a finite end, an infinite or negative thickness inside.
+    OutOfRangeError
+        A bandwidth or a step that is not positive, a negative roughness, weights that do not sum to one.
+    UnknownNameError
+        A layer that is not in the stack, or a line shape that is not known.
+    """
+
+    films: tuple[Film, ...]
+    temperature_k: float
+    bandwidth_fwhm_nm: float
+    line_shape: str = "gaussian"
+    wavelength_offset_nm: float = 0.0
+    wavelength_stretch: float = 0.0
+    theta: tuple[float, ...] = (0.0,)
+    theta_weight: tuple[float, ...] = (1.0,)
+    varying: str = "adhesive"
+    detection: str = "detection"
+    rough_face: str = "support"
+    roughness_nm: float = 0.0
+    line_step_nm: float = LINE_STEP_NM
+    height_step_nm: float = HEIGHT_STEP_NM
+
+    def __post_init__(self) -> None:
+        _check_films(self.films)
+        self.position(self.varying)
+        self.position(self.detection)
+        if not self.bandwidth_fwhm_nm > 0:
+            raise OutOfRangeError("bandwidth FWHM [nm]", self.bandwidth_fwhm_nm, "a positive number")
+        for name in ("line_step_nm", "height_step_nm"):
+            if not getattr(self, name) > 0:
+                raise OutOfRangeError(name, getattr(self, name), "a positive number")
+        if not self.roughness_nm >= 0:
+            raise OutOfRangeError("roughness [nm]", self.roughness_nm, "zero or a positive number")
+        if self.line_shape not in _LINE_SHAPES:
+            raise UnknownNameError("line shape", self.line_shape, _LINE_SHAPES)
+        if len(self.theta) != len(self.theta_weight) or not math.isclose(sum(self.theta_weight), 1.0):
+            raise OutOfRangeError("angle weights", self.theta_weight, "one per angle, with sum 1")
+
+    def position(self, name: str) -> int:
+        """Place of a film in the stack.
+
+        Raises
+        ------
+        UnknownNameError
+            There is no such film.
+        """
+        names = [film.name for film in self.films]
+        if name not in names:
+            raise UnknownNameError("layer", name, names)
+        return names.index(name)
+
+    def with_film(self, name: str, **changes: float) -> FlatFieldOptics:
+        """Return the same optics with some attributes of one film changed."""
+        place = self.position(name)
+        film = replace(self.films[place], **changes)  # type: ignore[arg-type]
+        return replace(self, films=(*self.films[:place], film, *self.films[place + 1 :]))
+
+    def true_wavelength(self, nominal_nm: float) -> float:
+        """Wavelength that the monochromator delivers when it is set to ``nominal_nm`` [nm]."""
+        error = self.wavelength_offset_nm + self.wavelength_stretch * (nominal_nm - SCALE_PIVOT_NM)
+        return nominal_nm + error
+
+    def absorbed_fraction(
+        self, thickness_um: ArrayLike, wavelength_nm: float, theta: float = 0.0, polarization: str = "mixed"
+    ) -> FloatArray:
+        """Fraction of strictly monochromatic light absorbed in the detection layer, all faces smooth.
+
+        Parameters
+        ----------
+        thickness_um : array_like, shape ``(D,)``
+            Thickness of the varying layer [µm].
+        wavelength_nm : `float`
+            Wavelength in vacuum [nm].
+        theta : `float`, optional
+            Angle of incidence [rad].
+        polarization : `str`, optional
+            ``"s"``, ``"p"`` or ``"mixed"``.
+
+        Returns
+        -------
+        fraction : `numpy.ndarray`, shape ``(D,)``
+            Absorbed over incident power.
+        """
+        modes = {"s": (True,), "p": (False,), "mixed": (True, False)}
+        if polarization not in modes:
+            raise UnknownNameError("polarization", polarization, modes)
+        thickness = np.atleast_1d(np.asarray(thickness_um, dtype=float))
+        wavelength = np.array([float(wavelength_nm)])
+        total = np.zeros(thickness.shape)
+        for s_wave in modes[polarization]:
+            weight = np.full(1, 1.0 / len(modes[polarization]))
+            _add_mode(total, _light(self, wavelength, weight, theta, s_wave, 0.0), thickness)
+        return total
+
+    def flat_field(self, thickness_um: ArrayLike, wavelength_nm: float) -> FloatArray:
+        """Detected fraction of the light of one flat: averaged over line, angles, polarisation and roughness.
+
+        Parameters
+        ----------
+        thickness_um : array_like, shape ``(D,)``
+            Thickness of the varying layer [µm].
+        wavelength_nm : `float`
+            Nominal wavelength of the flat [nm].
+
+        Returns
+        -------
+        fraction : `numpy.ndarray`, shape ``(D,)``
+            Detected over incident photons.
+        """
+        thickness = np.atleast_1d(np.asarray(thickness_um, dtype=float))
+        offset, line_weight = _LINE_SHAPES[self.line_shape](self.bandwidth_fwhm_nm, self.line_step_nm)
+        wavelength = self.true_wavelength(float(wavelength_nm)) + offset
+        total = np.zeros(thickness.shape)
+        for weight, theta, s_wave, height_um in self._modes():
+            light = _light(self, wavelength, weight * line_weight, theta, s_wave, height_um)
+            _add_mode(total, light, thickness)
+        return total
+
+    def table(self, thickness_range_um: tuple[float, float], wavelengths_nm: Sequence[float]) -> SignalTable:
+        """Tabulate the signal over thickness, one row per flat.
+
+        The error is measured, not assumed: at random thicknesses between the grid points the interpolated value is
+        compared with a direct calculation on a grid of wavelengths twice as fine.
+
+        Parameters
+        ----------
+        thickness_range_um : `tuple` [`float`, `float`]
+            Thinnest and thickest pixel [µm].
+        wavelengths_nm : sequence of `float`
+            Nominal wavelengths [nm].
+
+        Returns
+        -------
+        table : `SignalTable`
+            The table with its error.
+
+        Raises
+        ------
+        OutOfRangeError
+            The range is empty, or the layer would have a negative thickness.
+        ConvergenceError
+            The error exceeds 1e-5 of the mean signal.
+        """
+        low, high = thickness_range_um
+        if not 0.0 < low <= high < math.inf:
+            raise OutOfRangeError(
+                f"range of the {self.varying} [um]", (low, high), "positive, finite, ordered"
+            )
+        margin = 4.0 * TABLE_STEP_UM
+        points = math.ceil((high - low + 2.0 * margin) / TABLE_STEP_UM) + 1
+        grid: FloatArray = max(low - margin, 0.0) + TABLE_STEP_UM * np.arange(points, dtype=float)
+        signal = np.stack([self.flat_field(grid, wavelength) for wavelength in wavelengths_nm])
+        table = SignalTable(grid, signal, tuple(float(value) for value in wavelengths_nm))
+        return replace(table, relative_error=self._measure_error(table))
+
+    def _measure_error(self, table: SignalTable, samples: int = 24) -> float:
+        rng = np.random.default_rng(len(table.grid_um))
+        between = np.sort(rng.uniform(table.grid_um[1], table.grid_um[-2], samples))
+        finer = replace(self, line_step_nm=0.5 * self.line_step_nm, height_step_nm=0.5 * self.height_step_nm)
+        worst = 0.0
+        for row, wavelength in enumerate(table.wavelengths_nm):
+            direct = finer.flat_field(between, wavelength)
+            worst = max(worst, float(np.max(np.abs(table.evaluate(row, between) / direct - 1.0))))
+        if not worst < RELATIVE_TOLERANCE:
+            raise ConvergenceError(
+                f"signal table is off by {worst:.1e} of its value; allowed: {RELATIVE_TOLERANCE:g}"
+            )
+        return worst
+
+    def _modes(self) -> Iterator[tuple[float, float, bool, float]]:
+        """Weight, angle [rad], s-wave or not, and height of the rough face [µm]."""
+        heights = [(0.0, 1.0)]
+        if self.roughness_nm > 0.0:
+            # Equidistant nodes converge exponentially under a Gaussian.
+            count = max(12, math.ceil(HEIGHT_REACH * self.roughness_nm / self.height_step_nm))
+            node = np.linspace(-HEIGHT_REACH, HEIGHT_REACH, 2 * count + 1)
+            node_weight = np.exp(-0.5 * node * node)
+            node_weight /= node_weight.sum()
+            heights = list(zip(1e-3 * self.roughness_nm * node, node_weight, strict=True))
+        for height_um, height_weight in heights:
+            for theta, theta_weight in zip(self.theta, self.theta_weight, strict=True):
+                weight = float(height_weight * theta_weight)
+                if theta == 0.0:  # s and p are the same there
+                    yield weight, 0.0, True, float(height_um)
+                else:
+                    yield 0.5 * weight, theta, True, float(height_um)
+                    yield 0.5 * weight, theta, False, float(height_um)
+
+
+@dataclass(frozen=True, eq=False)
+class SignalTable:
+    """Signal as a function of thickness, on a uniform grid.
+
+    Attributes
+    ----------
+    grid_um : `numpy.ndarray`, shape ``(D,)``
+        Thickness of the varying layer [µm].
+    signal : `numpy.ndarray`, shape ``(W, D)``
+        Detected over incident photons of each flat.
+    wavelengths_nm : `tuple` [`float`, ...]
+        Nominal wavelength of each flat [nm].
+    relative_error : `float`
+        Largest relative difference found to a direct calculation with finer wavelength nodes.
+    """
+
+    grid_um: FloatArray
+    signal: FloatArray
+    wavelengths_nm: tuple[float, ...]
+    relative_error: float = math.nan
+
+    def evaluate(self, row: int, thickness_um: NDArray[np.floating]) -> FloatArray:
+        """Signal of flat number ``row`` at any thickness within the grid, by cubic spline.
+
+        Raises
+        ------
+        OutOfRangeError
+            A thickness that is not on the grid (or not a number).
+        """
+        thickness = np.asarray(thickness_um)
+        low, high = float(self.grid_um[0]), float(self.grid_um[-1])
+        smallest, largest = float(np.min(thickness)), float(np.max(thickness))
+        if not (smallest >= low and largest <= high):
+            raise OutOfRangeError("thickness [um]", (smallest, largest), f"{low:g} to {high:g}")
+        pieces = np.ascontiguousarray(CubicSpline(self.grid_um, self.signal[row]).c.T)
+        step = (high - low) / (len(self.grid_um) - 1)
+        return _evaluate_pieces(pieces, low, step, thickness.ravel()).reshape(thickness.shape)
+
+
+def material_index(medium: str, wavelength_nm: FloatArray, temperature_k: float) -> ComplexArray:
+    """Complex index of a shipped material; ``n`` by cubic spline, ``log k`` by monotone cubic.
+
+    Parameters
+    ----------
+    medium : `str`
+        Name in ``data/media/media.yaml``.
+    wavelength_nm : `numpy.ndarray`
+        Wavelength in vacuum [nm].
+    temperature_k : `float`
+        Temperature [K].
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such material.
+    OutOfRangeError
+        A wavelength at which it is not tabulated.
+    """
+    curve, low, high = _material(medium)
+    if not (np.min(wavelength_nm) >= low and np.max(wavelength_nm) <= high):
+        found = (float(np.min(wavelength_nm)), float(np.max(wavelength_nm)))
+        raise OutOfRangeError(f"wavelength [nm] in {medium}", found, f"{low:g} to {high:g}")
+    return curve(wavelength_nm, temperature_k)
+
+
+_Curve = Callable[[FloatArray, float], ComplexArray]
+
+
+@functools.lru_cache(maxsize=64)
+def _material(medium: str) -> tuple[_Curve, float, float]:
+    entries = read_yaml("media", "media.yaml")
+    if medium not in entries:
+        raise UnknownNameError("medium", medium, entries)
+    entry = entries[medium]
+    if "constant" in entry:
+        constant = complex(*entry["constant"])
+        low, high = entry["range_nm"]
+        return lambda wavelength, _: np.full(wavelength.shape, constant), float(low), float(high)
+    table = read_table("media", entry["table"])
+    nodes = table["wavelength"].quantity.to_value("nm")
+    n_curve = CubicSpline(nodes, table["n"])
+    extinction = np.asarray(table["k"], dtype=float)
+    log_k = PchipInterpolator(nodes, np.log(np.maximum(extinction, EXTINCTION_FLOOR)))
+    transparent = not np.any(extinction > 0.0)
+    exponents: tuple[PchipInterpolator, PchipInterpolator] | None = None
+    if entry.get("temperature") == "green2008":
+        exponents = (PchipInterpolator(nodes, table["C_n"]), PchipInterpolator(nodes, table["C_k"]))
+
+    def curve(wavelength: FloatArray, temperature_k: float) -> ComplexArray:
+        n = n_curve(wavelength)
+        k = np.zeros(wavelength.shape) if transparent else np.exp(log_k(wavelength))
+        if exponents is not None:
+            ratio = temperature_k / GREEN_TEMPERATURE_K
+            n = n * ratio ** (exponents[0](wavelength) * 1e-4 * GREEN_TEMPERATURE_K)
+            k = k * ratio ** (exponents[1](wavelength) * 1e-4 * GREEN_TEMPERATURE_K)
+        return n + 1j * k
+
+    return curve, float(nodes[0]), float(nodes[-1])
+
+
+def _gaussian_line(fwhm_nm: float, step_nm: float) -> tuple[FloatArray, FloatArray]:
+    """Offsets [nm] and weights; equidistant nodes, exponentially convergent for a Gaussian."""
+    sigma = fwhm_nm / math.sqrt(8.0 * math.log(2.0))
+    count = max(40, math.ceil(LINE_REACH * sigma / step_nm))
+    offset: FloatArray = np.arange(-count, count + 1, dtype=float) * (LINE_REACH * sigma / count)
+    weight = np.exp(-0.5 * (offset / sigma) ** 2)
+    return offset, weight / weight.sum()
+
+
+def _triangular_line(fwhm_nm: float, step_nm: float) -> tuple[FloatArray, FloatArray]:
+    """Offsets [nm] and weights; Gauss–Legendre on either flank."""
+    count = max(20, math.ceil(fwhm_nm / step_nm))
+    x, w = np.polynomial.legendre.leggauss(count)
+    flank = 0.5 * (x + 1.0)
+    offset = fwhm_nm * np.concatenate([flank - 1.0, flank])
+    weight = np.concatenate([w * flank, w * (1.0 - flank)])
+    return offset, weight / weight.sum()
+
+
+_LINE_SHAPES: Mapping[str, Callable[[float, float], tuple[FloatArray, FloatArray]]] = MappingProxyType(
+    {"gaussian": _gaussian_line, "triangular": _triangular_line}
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """All that one angle and polarisation need apart from the thickness; Q wavelengths.
+
+    Fields ``(E, H)`` stand at the lower face of the varying film as ``bottom`` and are carried by the film's own
+    matrix to its upper face. ``incident`` carries them on from there to the ambient medium. ``top_above`` and
+    ``top_below`` give the fields at the upper face of the detection film, from those above and below the varying
+    film; ``low_above`` and ``low_below`` at its lower face.
+    """
+
+    weight: FloatArray  # (Q,) includes 1 / incident power
+    phase: ComplexArray  # (Q,) phase thickness per µm of the varying film
+    admittance: ComplexArray  # (Q,) of the varying film
+    ambient: FloatArray  # (Q,) admittance of the ambient medium
+    bottom: ComplexArray  # (Q, 2)
+    incident: ComplexArray  # (Q, 2, 2)
+    top_above: ComplexArray  # (Q, 2, 2)
+    top_below: ComplexArray  # (Q, 2)
+    low_above: ComplexArray  # (Q, 2, 2)
+    low_below: ComplexArray  # (Q, 2)
+    extra_um: float  # thickness that a rough face adds to the varying film
+
+
+def _light(
+    optics: FlatFieldOptics,
+    wavelength_nm: FloatArray,
+    weight: FloatArray,
+    theta: float,
+    s_wave: bool,
+    height_um: float,
+) -> _Light:
+    thickness = _shifted_thickness(optics, height_um)
+    wave_number = 2.0 * np.pi / (1e-3 * wavelength_nm)  # rad/µm
+    index = np.stack([film.index(wavelength_nm, optics.temperature_k) for film in optics.films])
+    along = index[0].real * math.sin(theta)
+    normal = np.sqrt(index * index - along * along)  # n cos(theta); the principal root decays downwards
+    admittance = normal if s_wave else index * index / normal
+    last = len(optics.films) - 1
+    v, d = optics.position(optics.varying), optics.position(optics.detection)
+
+    def through(first: int, stop: int) -> ComplexArray:
+        """Matrix from the lower face of film ``stop - 1`` to the upper face of film ``first``, scaled."""
+        product = np.broadcast_to(np.eye(2, dtype=complex), (len(wavelength_nm), 2, 2))
+        for j in range(first, stop):
+            product = product @ _film_matrix(admittance[j], wave_number * normal[j] * thickness[j])
+        return product
+
+    def decay(first: int, stop: int) -> ComplexArray:
+        """The factor that the scaled matrices of the films first … stop - 1 leave out."""
+        exponent = np.zeros(len(wavelength_nm), dtype=complex)
+        for j in range(first, stop):
+            exponent += 1j * wave_number * normal[j] * thickness[j]
+        return np.exp(exponent)
+
+    substrate = np.stack([np.ones(len(wavelength_nm)), admittance[last]], axis=1)
+    bottom = np.einsum("qij,qj->qi", through(v + 1, last), substrate)
+    none_matrix = np.zeros((len(wavelength_nm), 2, 2), dtype=complex)
+    none_vector = np.zeros((len(wavelength_nm), 2), dtype=complex)
+
+    def face(above_film: int) -> tuple[ComplexArray, ComplexArray]:
+        """Fields at the upper face of a film, from the upper and from the lower face of the varying one."""
+        if above_film <= v:
+            scale = decay(1, above_film)[:, np.newaxis, np.newaxis]
+            return scale * through(above_film, v), none_vector
+        below = np.einsum("qij,qj->qi", through(above_film, last), substrate)
+        below = below * (decay(1, v) * decay(v + 1, above_film))[:, np.newaxis]
+        return none_matrix, below
+
+    top_above, top_below = face(d)
+    low_above, low_below = face(d + 1)
+    return _Light(
+        weight=weight,
+        phase=wave_number * normal[v],
+        admittance=admittance[v],
+        ambient=admittance[0].real.copy(),
+        bottom=bottom,
+        incident=np.ascontiguousarray(through(1, v)),
+        top_above=np.ascontiguousarray(top_above),
+        top_below=np.ascontiguousarray(top_below),
+        low_above=np.ascontiguousarray(low_above),
+        low_below=np.ascontiguousarray(low_below),
+        extra_um=thickness[v] - optics.films[v].thickness_um,
+    )
+
+
+def _shifted_thickness(optics: FlatFieldOptics, height_um: float) -> list[float]:
+    """Thickness of all films when the rough face lies lower by ``height_um``."""
+    thickness = [film.thickness_um for film in optics.films]
+    if height_um != 0.0:
+        face = optics.position(optics.rough_face)
+        thickness[face - 1] += height_um
+        thickness[face] -= height_um
+    return thickness
+
+
+def _film_matrix(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
+    """Characteristic matrix times ``exp(i phase)``, which keeps opaque films finite; shape ``(Q, 2, 2)``."""
+    round_trip = np.exp(2j * phase)
+    matrix = np.empty((*phase.shape, 2, 2), dtype=complex)
+    matrix[..., 0, 0] = matrix[..., 1, 1] = 0.5 * (1.0 + round_trip)
+    matrix[..., 0, 1] = 0.5 * (1.0 - round_trip) / admittance
+    matrix[..., 1, 0] = 0.5 * (1.0 - round_trip) * admittance
+    return matrix
+
+
+def _add_mode(total: FloatArray, light: _Light, thickness_um: FloatArray) -> None:
+    """Add the weighted absorbed fraction of one angle and polarisation to ``total``."""
+    _add_absorption(
+        total,
+        thickness_um + light.extra_um,
+        light.weight,
+        light.phase,
+        light.admittance,
+        light.ambient,
+        light.bottom,
+        light.incident,
+        light.top_above,
+        light.top_below,
+        light.low_above,
+        light.low_below,
+    )
+
+
+@numba.njit(cache=True)
+def _add_absorption(
+    total: FloatArray,
+    thickness: FloatArray,
+    weight: FloatArray,
+    phase: ComplexArray,
+    admittance: ComplexArray,
+    ambient: FloatArray,
+    bottom: ComplexArray,
+    incident: ComplexArray,
+    top_above: ComplexArray,
+    top_below: ComplexArray,
+    low_above: ComplexArray,
+    low_below: ComplexArray,
+) -> None:  # pragma: no cover - compiled
+    for q in range(weight.size):
+        y, e_bottom, h_bottom = admittance[q], bottom[q, 0], bottom[q, 1]
+        c, t, low = incident[q], top_above[q], low_above[q]
+        for i in range(thickness.size):
+            once = np.exp(1j * phase[q] * thickness[i])
+            even, odd = 0.5 * (1.0 + once * once), 0.5 * (1.0 - once * once)
+            e = even * e_bottom + odd * h_bottom / y
+            h = odd * y * e_bottom + even * h_bottom
+            e_top = t[0, 0] * e + t[0, 1] * h + once * top_below[q, 0]
+            h_top = t[1, 0] * e + t[1, 1] * h + once * top_below[q, 1]
+            e_low = low[0, 0] * e + low[0, 1] * h + once * low_below[q, 0]
+            h_low = low[1, 0] * e + low[1, 1] * h + once * low_below[q, 1]
+            flux = (
+                e_top.real * h_top.real
+                + e_top.imag * h_top.imag
+                - e_low.real * h_low.real
+                - e_low.imag * h_low.imag
+            )
+            e_front = c[0, 0] * e + c[0, 1] * h
+            h_front = c[1, 0] * e + c[1, 1] * h
+            forward = 0.5 * (e_front + h_front / ambient[q])
+            total[i] += weight[q] * flux / (ambient[q] * (forward.real**2 + forward.imag**2))
+
+
+@numba.njit(cache=True)
+def _evaluate_pieces(
+    pieces: FloatArray, low: float, step: float, position: NDArray[np.floating]
+) -> FloatArray:  # pragma: no cover - compiled
+    result = np.empty(position.size)
+    last = pieces.shape[0] - 1
+    for i in range(position.size):
+        where = (position[i] - low) / step
+        piece = min(int(where), last)
+        x = position[i] - (low + piece * step)
+        c = pieces[piece]
+        result[i] = ((c[0] * x + c[1]) * x + c[2]) * x + c[3]
+    return result
+
+
+def _check_films(films: tuple[Film, ...]) -> None:
+    if len(films) < 3:
+        raise StackError("number of layers", len(films), "three or more")
+    for end in (films[0], films[-1]):
+        if end.thickness_um != math.inf:
+            raise StackError(f"thickness [um] of end layer {end.name}", end.thickness_um, "infinite")
+    for film in films[1:-1]:
+        if not 0.0 <= film.thickness_um < math.inf:
+            raise StackError(
+                f"thickness [um] of layer {film.name}", film.thickness_um, "finite, not negative"
+            )

@@ -1,0 +1,432 @@
+"""Raw laboratory frames of a sensor whose every property is known: bias frames and monochromatic flats.
+
+The frames are in the LSST raw layout, as a test stand would have written them. What made them (thickness, hidden
+effects, true gains) is returned to the caller and stands nowhere in the files, their headers or their names.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..instrument.camera import Amplifier, Camera, Detector
+from ..resources import list_resources, read_yaml
+from .hidden_effects import AmplifierState, HiddenEffect, validate_effects
+from .optics import Film, FlatFieldOptics, SignalTable
+from .raw_files import Clock, primary_header, write_frame
+from .readout import Readout
+
+__all__ = [
+    "Defects",
+    "MockExposure",
+    "MockRun",
+    "MockTruth",
+    "parse_size",
+    "setup_optics",
+    "write_mock_flats",
+]
+
+FloatArray = NDArray[np.float64]
+
+DEFAULT_LEVEL_E = 20_000.0
+DEFAULT_BIAS_FRAMES = 5
+
+LEVEL_SCATTER = 0.01
+"""Rms scatter of the level of the flats."""
+
+FIRST_EXPOSURE = datetime.datetime(2018, 7, 24, 10, 0, 0)
+
+BRIGHT_COLUMN_E = 2_000.0
+"""Charge that a bright column adds to a flat [electrons]."""
+
+DEAD_COLUMN_RESPONSE = 0.4
+"""Response of a dead column."""
+
+HOT_PIXEL_E = (4_000.0, 30_000.0)
+"""Range of the charge that a hot pixel adds to a flat [electrons]."""
+
+
+@dataclass(frozen=True)
+class Defects:
+    """Blemishes of the sensor.
+
+    Attributes
+    ----------
+    bad_columns : `int`
+        Columns of an amplifier that are dead or bright from some row on; half of either kind.
+    hot_pixels : `int`
+        Single pixels with 4000 to 30 000 electrons too many in every flat.
+    prnu_rms : `float`
+        Rms of the pixel-to-pixel response.
+    """
+
+    bad_columns: int = 0
+    hot_pixels: int = 0
+    prnu_rms: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("bad_columns", "hot_pixels", "prnu_rms"):
+            if not getattr(self, name) >= 0:
+                raise OutOfRangeError(name, getattr(self, name), "zero or more")
+
+
+@dataclass(frozen=True)
+class MockExposure:
+    """One frame that was written.
+
+    Attributes
+    ----------
+    path : `~pathlib.Path`
+        The file.
+    wavelength_nm : `float` or `None`
+        Nominal wavelength; `None` for a bias.
+    level_e : `float`
+        Mean of the expected charge over the sensor [electrons].
+    """
+
+    path: Path
+    wavelength_nm: float | None
+    level_e: float
+
+
+@dataclass(frozen=True, eq=False)
+class MockTruth:
+    """Everything that made the frames. Keep it away from whoever analyses them.
+
+    Attributes
+    ----------
+    thickness_um : `numpy.ndarray` [y, x]
+        Thickness of the varying layer [µm].
+    effects : `dict`
+        Hidden effects, ``{"name": {"parameter": value}}``.
+    optics : `FlatFieldOptics`
+        Sensor and light with the hidden effects.
+    table : `SignalTable`
+        Signal against thickness with its error.
+    amplifiers : `tuple` [`AmplifierState`, ...]
+        True gain, noise, full well and offset, in the order of the raw file.
+    response : `numpy.ndarray` [y, x], float32
+        Relative response of the pixels, defects included.
+    excess_e : `numpy.ndarray` [y, x], float32
+        Charge of bright columns and hot pixels in a flat [electrons].
+    defective : `numpy.ndarray` [y, x], bool
+        Pixels of bad columns and hot pixels.
+    """
+
+    thickness_um: FloatArray
+    effects: dict[str, dict[str, float]]
+    optics: FlatFieldOptics
+    table: SignalTable
+    amplifiers: tuple[AmplifierState, ...]
+    response: NDArray[np.float32]
+    excess_e: NDArray[np.float32]
+    defective: NDArray[np.bool_]
+
+    def light(self, wavelength_nm: float) -> FloatArray:
+        """Light that becomes charge, relative to its mean over the sensor: fringes and illumination, no defects."""
+        row = self.table.wavelengths_nm.index(float(wavelength_nm))
+        signal = self.table.evaluate(row, self.thickness_um)
+        light = signal / signal.mean()
+        for effect, values in _active(self.effects):
+            if effect.on_light is not None:
+                light = effect.on_light(light, effect.complete(values))
+        return light / light.mean()
+
+    def expected_electrons(self, exposure: MockExposure) -> FloatArray:
+        """Mean charge of every pixel of one exposure before full well and non-linearity [electrons]."""
+        if exposure.wavelength_nm is None:
+            return np.zeros(self.thickness_um.shape)
+        return exposure.level_e * self.light(exposure.wavelength_nm) * self.response + self.excess_e
+
+
+@dataclass(frozen=True)
+class MockRun:
+    """Frames of one sensor and their truth.
+
+    Attributes
+    ----------
+    bias, flats : `tuple` [`MockExposure`, ...]
+        What was written, in order of time.
+    detector : `Detector`
+        The sensor as the tables describe it (nominal gains), with the size of the frames.
+    truth : `MockTruth`
+        What made the frames.
+    """
+
+    bias: tuple[MockExposure, ...]
+    flats: tuple[MockExposure, ...]
+    detector: Detector
+    truth: MockTruth
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All files, bias frames first."""
+        return tuple(exposure.path for exposure in (*self.bias, *self.flats))
+
+
+def parse_size(size: str) -> tuple[int, int]:
+    """Rows and columns from ``"NXxNY"``.
+
+    Raises
+    ------
+    InputError
+        The text is not two whole numbers with an ``x`` between them.
+    """
+    first, _, second = size.lower().partition("x")
+    if not (first.isdecimal() and second.isdecimal()):
+        raise InputError("size", size, "NXxNY, as 256x256")
+    return int(second), int(first)
+
+
+def setup_optics(setup: str) -> tuple[FlatFieldOptics, str]:
+    """Sensor and light of a laboratory set-up, and the camera it belongs to.
+
+    Parameters
+    ----------
+    setup : `str`
+        Name of a file in ``data/setups``.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such set-up.
+    InputError
+        It is not illuminated by a monochromator.
+    """
+    content = _read_named("set-up", "setups", setup)
+    light = content["illumination"]
+    if light["kind"] != "monochromator":
+        raise InputError("illumination.kind", light["kind"], "monochromator (flats need one)", source=setup)
+    beam = light["beam"]["kind"]
+    if beam != "collimated":
+        raise InputError("illumination.beam.kind", beam, "collimated", source=setup)
+    films = tuple(
+        Film(str(layer["name"]), str(layer["medium"]), float(layer["thickness_um"]))
+        for layer in _read_named("stack", "stacks", content["stack"])["layers"]
+    )
+    optics = FlatFieldOptics(
+        films=films,
+        temperature_k=float(content["temperature_k"]),
+        bandwidth_fwhm_nm=float(light["bandwidth_fwhm_nm"]),
+        line_shape=str(light["profile"]),
+        varying=str(content["varying"]),
+    )
+    return optics, str(content["camera"])
+
+
+def write_mock_flats(
+    out_dir: str | Path,
+    *,
+    setup: str,
+    detector: int | str,
+    thickness_um: NDArray[np.floating],
+    wavelengths_nm: Sequence[float],
+    rng: np.random.Generator,
+    effects: Mapping[str, Any] | None = None,
+    size: str | None = None,
+    n_bias: int = DEFAULT_BIAS_FRAMES,
+    repeats: int = 1,
+    level_e: float = DEFAULT_LEVEL_E,
+    defects: Defects | None = None,
+    first_exposure: datetime.datetime = FIRST_EXPOSURE,
+    progress: Callable[[Path], None] | None = None,
+) -> MockRun:
+    """Write bias frames and monochromatic flats of one sensor.
+
+    Parameters
+    ----------
+    out_dir : path-like
+        Folder for the files; made if it does not exist.
+    setup : `str`
+        Name of a laboratory set-up.
+    detector : `int` or `str`
+        Number, name or serial number of the sensor in the set-up's camera; the name of its place in LSSTCam too.
+    thickness_um : `numpy.ndarray` [y, x]
+        Thickness of the layer that varies [µm], of the size of the sensor.
+    wavelengths_nm : sequence of `float`
+        Wavelengths to which the monochromator is set [nm], all different.
+    rng : `numpy.random.Generator`
+        Source of all randomness; the same generator state gives the same files.
+    effects : mapping, optional
+        Hidden effects, as for `validate_effects`.
+    size : `str`, optional
+        ``"NXxNY"`` for a cut-down sensor: 16 amplifiers of NX/8 × NY/2 pixels with the usual overscan.
+    n_bias : `int`, optional
+        Number of bias frames.
+    repeats : `int`, optional
+        Number of flats at each wavelength.
+    level_e : `float`, optional
+        Mean charge of the flats [electrons].
+    defects : `Defects`, optional
+        Blemishes; none by default.
+    first_exposure : `datetime.datetime`, optional
+        Time of the first frame.
+    progress : callable, optional
+        Called with the path of each file once it is written.
+
+    Returns
+    -------
+    run : `MockRun`
+        The files and the truth.
+
+    Raises
+    ------
+    InputError, OutOfRangeError, UnknownNameError
+        An argument cannot be used; nothing has been written then.
+    """
+    optics, camera = setup_optics(setup)
+    sensor = _sensor(camera, detector, size)
+    thickness = _check_thickness(thickness_um, sensor.shape)
+    wavelengths = _check_wavelengths(wavelengths_nm)
+    for name, value, least in (("n_bias", n_bias, 0), ("repeats", repeats, 1), ("level_e", level_e, 1.0)):
+        if not least <= value < math.inf:
+            raise OutOfRangeError(name, value, f"{least:g} or more")
+    active = validate_effects(effects)
+
+    sensor_rng, amplifier_rng, level_rng, frames_rng = rng.spawn(4)
+    truth = _make_truth(
+        optics, sensor, thickness, wavelengths, active, defects or Defects(), sensor_rng, amplifier_rng
+    )
+    readout = Readout.of(sensor, truth.amplifiers, sensor_rng)
+    folder = Path(out_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+
+    plan: list[float | None] = [None] * n_bias
+    plan += [wavelength for wavelength in wavelengths for _ in range(repeats)]
+    clock = Clock(first_exposure)
+    written: list[MockExposure] = []
+    for number, (wavelength, frame_rng) in enumerate(zip(plan, frames_rng.spawn(len(plan)), strict=True)):
+        level = 0.0 if wavelength is None else level_e * (1.0 + LEVEL_SCATTER * level_rng.standard_normal())
+        header = primary_header(
+            camera, sensor, _nominal_celsius(setup), wavelength, number, *clock.next(wavelength)
+        )
+        exposure = MockExposure(folder / str(header["FILENAME"]), wavelength, level)
+        images = readout.read(truth.expected_electrons(exposure), wavelength is not None, active, frame_rng)
+        write_frame(exposure.path, header, sensor, images)
+        written.append(exposure)
+        if progress is not None:
+            progress(exposure.path)
+    return MockRun(tuple(written[:n_bias]), tuple(written[n_bias:]), sensor, truth)
+
+
+# Input ----------------------------------------------------------------------------------------------------
+
+
+def _read_named(what: str, folder: str, name: str) -> dict[str, Any]:
+    known = [entry.removesuffix(".yaml") for entry in list_resources(folder)]
+    if name not in known:
+        raise UnknownNameError(what, name, known)
+    return read_yaml(folder, f"{name}.yaml")
+
+
+def _nominal_celsius(setup: str) -> float:
+    return round(float(read_yaml("setups", f"{setup}.yaml")["temperature_k"]) - 273.15, 3)
+
+
+def _sensor(camera: str, detector: int | str, size: str | None) -> Detector:
+    sensor = Camera.from_name(camera).detector(detector)
+    if any(amp.raw is None for amp in sensor.amplifiers) or len(sensor.amplifiers) != 16:
+        raise InputError("detector", sensor.name, "a sensor with 16 amplifiers in the LSST raw layout")
+    return sensor if size is None else sensor.cut_down(parse_size(size))
+
+
+def _check_thickness(thickness_um: NDArray[np.floating], shape: tuple[int, int]) -> FloatArray:
+    thickness = np.asarray(thickness_um, dtype=float)
+    if thickness.shape != shape:
+        raise InputError(
+            "shape of the thickness map (rows, columns)", thickness.shape, f"that of the sensor, {shape}"
+        )
+    if not (np.min(thickness) > 0 and np.max(thickness) < math.inf):
+        found = (float(np.min(thickness)), float(np.max(thickness)))
+        raise OutOfRangeError("thickness [um]", found, "finite and positive everywhere")
+    return thickness
+
+
+def _check_wavelengths(wavelengths_nm: Sequence[float]) -> tuple[float, ...]:
+    wavelengths = tuple(float(value) for value in wavelengths_nm)
+    if not wavelengths:
+        raise InputError("wavelengths", wavelengths, "at least one")
+    if len(set(wavelengths)) != len(wavelengths):
+        raise InputError("wavelengths", wavelengths, "every wavelength once (see repeats)")
+    return wavelengths
+
+
+# Truth ----------------------------------------------------------------------------------------------------
+
+
+_ActiveEffects = tuple[tuple[HiddenEffect, dict[str, float]], ...]
+
+
+def _active(effects: Mapping[str, Mapping[str, float]]) -> _ActiveEffects:
+    return validate_effects(effects)
+
+
+def _make_truth(
+    optics: FlatFieldOptics,
+    sensor: Detector,
+    thickness: FloatArray,
+    wavelengths: tuple[float, ...],
+    active: _ActiveEffects,
+    defects: Defects,
+    sensor_rng: np.random.Generator,
+    amplifier_rng: np.random.Generator,
+) -> MockTruth:
+    for effect, values in active:
+        if effect.on_optics is not None:
+            optics = effect.on_optics(optics, effect.complete(values))
+    response, excess, defective = _make_defects(sensor, defects, sensor_rng)
+    return MockTruth(
+        thickness_um=thickness,
+        effects={effect.name: dict(values) for effect, values in active},
+        optics=optics,
+        table=optics.table((float(thickness.min()), float(thickness.max())), wavelengths),
+        amplifiers=tuple(_amplifier_state(amp, active, amplifier_rng) for amp in sensor.amplifiers),
+        response=response,
+        excess_e=excess,
+        defective=defective,
+    )
+
+
+def _amplifier_state(amp: Amplifier, active: _ActiveEffects, rng: np.random.Generator) -> AmplifierState:
+    state = AmplifierState(amp.name, amp.gain, amp.read_noise, amp.gain * amp.saturation)
+    for effect, values in active:
+        if effect.on_amplifier is not None:
+            state = effect.on_amplifier(state, effect.complete(values), float(rng.standard_normal()))
+    return state
+
+
+def _make_defects(
+    sensor: Detector, defects: Defects, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    shape = sensor.shape
+    response = np.ones(shape, dtype=np.float32)
+    if defects.prnu_rms > 0:
+        response += np.float32(defects.prnu_rms) * rng.standard_normal(shape, dtype=np.float32)
+    excess = np.zeros(shape, dtype=np.float32)
+    defective = np.zeros(shape, dtype=bool)
+    for number in range(defects.bad_columns):
+        amp = sensor.amplifiers[rng.integers(len(sensor.amplifiers))]
+        column = amp.x0 + int(rng.integers(amp.width))
+        # A column is bad from the defect away from the register, which lies at the outer edge.
+        first = int(rng.integers(amp.height // 2))
+        rows = slice(amp.y0, amp.y0 + amp.height - first)
+        if not amp.flip_y:
+            rows = slice(amp.y0 + first, amp.y0 + amp.height)
+        if number % 2:
+            excess[rows, column] += BRIGHT_COLUMN_E
+        else:
+            response[rows, column] *= DEAD_COLUMN_RESPONSE
+        defective[rows, column] = True
+    for _ in range(defects.hot_pixels):
+        y, x = int(rng.integers(shape[0])), int(rng.integers(shape[1]))
+        excess[y, x] += rng.uniform(*HOT_PIXEL_E)
+        defective[y, x] = True
+    return response, excess, defective
