@@ -1,1 +1,37 @@
-"""tasks."""
+"""PipelineTasks, one per file: they fetch, call one algorithm, and store what it returns.
+
+Each is imported on first use. Importing this package makes the storage classes known that their connections name.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from ..middleware import register_storage_classes
+
+register_storage_classes()
+
+_LAZY = {
+    "EpoxyFitConfig": ".epoxy_fit",
+    "EpoxyFitTask": ".epoxy_fit",
+    "FringeBiasConfig": ".fringe_bias",
+    "FringeBiasTask": ".fringe_bias",
+    "FringeModelConfig": ".model_config",
+    "FringePcaConfig": ".fringe_pca",
+    "FringePcaTask": ".fringe_pca",
+    "IsrFlatPrepConfig": ".isr_flat_prep",
+    "IsrFlatPrepTask": ".isr_flat_prep",
+    "RaftConfig": ".model_config",
+    "SkyFringeSimConfig": ".sky_fringe_sim",
+    "SkyFringeSimTask": ".sky_fringe_sim",
+    "UnusableDataError": ".quantum",
+}
+
+__all__ = sorted(_LAZY)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name], __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,226 @@
+"""From the flats of a sensor to the thickness of the layer that makes its fringes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lsst.pex.config import ChoiceField, Field, ListField
+from lsst.pipe.base import (
+    InputQuantizedConnection,
+    NoWorkFound,
+    OutputQuantizedConnection,
+    PipelineTask,
+    PipelineTaskConfig,
+    PipelineTaskConnections,
+    QuantumContext,
+    Struct,
+)
+from lsst.pipe.base.connectionTypes import Input, Output
+from lsst.utils.logging import getLogger
+
+from ..algorithms import fit_thickness
+from ..errors import InputError
+from ..instrument.camera import Detector
+from ..model import Setup
+from ..products import FringeCube, FringeFlat, ThicknessMap, describe_mask
+from .model_config import FringeModelConfig
+from .quantum import common_header, data_id_of, sensor_of, unusable
+
+__all__ = ["EpoxyFitConfig", "EpoxyFitConnections", "EpoxyFitTask"]
+
+_LOG = getLogger(__name__)
+
+SAME_WAVELENGTH_NM = 1.0
+"""A flat within this distance of a usual wavelength counts as taken there."""
+
+
+class EpoxyFitConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
+    """The flats of a sensor in, its thickness map out."""
+
+    flats = Input(
+        doc="Fringe patterns of the sensor at all wavelengths.",
+        name="fringeFlat",
+        storageClass="FringeFlat",
+        dimensions=("instrument", "exposure", "detector"),
+        multiple=True,
+        deferLoad=True,
+    )
+    thickness = Output(
+        doc="Thickness of the varying layer, with its uncertainty.",
+        name="epoxyThickness",
+        storageClass="ThicknessMap",
+        dimensions=("instrument", "detector"),
+    )
+
+    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
+        """Put the flats in the order of their wavelengths."""
+        connection, refs = inputs["flats"]
+        if not refs:
+            raise NoWorkFound(label, "flats", connection)
+        ordered = sorted(refs, key=_wavelength_order)
+        inputs["flats"] = (connection, ordered)
+        super().adjustQuantum(inputs, outputs, label, data_id)
+        return {"flats": (connection, ordered)}, {}
+
+
+def _wavelength_order(ref: Any) -> tuple[str, int]:
+    # The ingest writes the wavelength with a fixed number of digits, so the texts sort like the numbers.
+    exposure = ref.dataId.records["exposure"]
+    return exposure.target_name or "", exposure.id
+
+
+class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=EpoxyFitConnections):
+    """Configuration of `EpoxyFitTask`."""
+
+    task_name: ClassVar[str] = "epoxyFit"
+
+    method: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default="global",
+        doc="How the thickness is found.",
+        allowed={
+            "global": "fringe order solved for the whole sensor at once",
+            "guo2022": "walk from pixel to pixel, steps 1 to 4 of Guo, Walter, Lage & Lupton 2022",
+        },
+    )
+    observable: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default="detection",
+        doc="What a pixel responds to.",
+        allowed={
+            "detection": "light absorbed in the detection layer",
+            "total": "light absorbed in the whole stack, as the published fit had it",
+        },
+    )
+    min_wavelengths: Field[int] = Field(
+        dtype=int, default=4, doc="Least number of different wavelengths with which a sensor is fitted."
+    )
+    range_um: ListField[float] = ListField(
+        dtype=float,
+        optional=True,
+        length=2,
+        doc="Thicknesses that are searched, µm; by default the set-up's.",
+    )
+    start_pixel: ListField[int] = ListField(
+        dtype=int, optional=True, length=2, doc="Row and column at which the walk of 'guo2022' begins."
+    )
+    slip_limit: Field[float] = Field(
+        dtype=float,
+        default=0.01,
+        doc="Pixels whose fringe order is wrong with a larger probability are masked.",
+    )
+    threads: Field[int] = Field(
+        dtype=int,
+        optional=True,
+        doc="Number of threads, without influence on the result; by default as many as there are processors.",
+    )
+
+
+class EpoxyFitTask(PipelineTask):
+    """Fit the thickness of the varying layer at every pixel of a sensor."""
+
+    ConfigClass = EpoxyFitConfig
+    config: EpoxyFitConfig
+    _DefaultName = "epoxyFit"
+
+    def runQuantum(
+        self,
+        butlerQC: QuantumContext,
+        inputRefs: InputQuantizedConnection,
+        outputRefs: OutputQuantizedConnection,
+    ) -> None:
+        """Read the flats one by one into a cube, fit, store."""
+        detector = sensor_of(data_id_of(butlerQC))
+        flats = (butlerQC.get(ref).get() for ref in inputRefs.flats)
+        with unusable(detector.name):
+            result = self.run(flats, len(inputRefs.flats), detector)
+        butlerQC.put(result, outputRefs)
+
+    def run(self, flats: Iterable[FringeFlat], number: int, detector: Detector) -> Struct:
+        """Fit one sensor.
+
+        Parameters
+        ----------
+        flats : iterable of `FringeFlat`
+            Flats of the sensor; they need not all be in memory at once.
+        number : `int`
+            How many they are.
+        detector : `Detector`
+            The sensor.
+
+        Returns
+        -------
+        result : `~lsst.pipe.base.Struct`
+            ``thickness``, a `ThicknessMap`.
+
+        Raises
+        ------
+        InputError
+            Too few wavelengths, or flats that do not belong together.
+        """
+        choice = self.config.choice(detector.raft)
+        cube = FringeCube.from_flats(flats, number=number)
+        setup = Setup.from_name(choice.setup)
+        missing = self._check_wavelengths(cube.wavelength_nm, setup, detector)
+        fitted = fit_thickness(cube, choice.model(), self.config.method, **self._options())
+        metadata = {
+            **common_header(),
+            **choice.header(),
+            **fitted.metadata,
+            "NFLATS": number,
+            "MISSING": missing,
+        }
+        self._report(fitted, detector)
+        return Struct(thickness=dataclasses.replace(fitted, detector=detector.name, metadata=metadata))
+
+    def _options(self) -> dict[str, Any]:
+        config = self.config
+        return {
+            "observable": config.observable,
+            "range_um": None if config.range_um is None else tuple(config.range_um),
+            "start_pixel": None if config.start_pixel is None else tuple(config.start_pixel),
+            "slip_limit": config.slip_limit,
+            "threads": config.threads,
+        }
+
+    def _check_wavelengths(self, found_nm: NDArray[np.float64], setup: Setup, detector: Detector) -> str:
+        """Refuse too few wavelengths; return, and report, the usual ones that are missing."""
+        distinct = len(set(np.round(found_nm, 3)))
+        if distinct < self.config.min_wavelengths:
+            raise InputError(
+                "number of wavelengths",
+                distinct,
+                f"{self.config.min_wavelengths} or more",
+                source=detector.name,
+            )
+        missing = [
+            f"{usual:g}"
+            for usual in setup.wavelengths_nm
+            if np.abs(found_nm - usual).min() > SAME_WAVELENGTH_NM
+        ]
+        if missing:
+            self.log.warning(
+                "%s: no flats at %s nm; the fit is less certain without them",
+                detector.name,
+                ", ".join(missing),
+            )
+        return ",".join(missing)
+
+    def _report(self, fitted: ThicknessMap, detector: Detector) -> None:
+        good = fitted.mask == 0
+        if not good.any():
+            raise InputError("good pixels of the thickness map", 0, "at least one", source=detector.name)
+        self.log.info(
+            "%s: %s %.3f to %.3f um (1 to 99 %%), median sigma %.1f nm, %.4f %% of the pixels masked: %s",
+            detector.name,
+            fitted.layer,
+            *np.percentile(fitted.value[good], [1, 99]),
+            1e3 * float(np.median(fitted.sigma[good])),
+            100.0 * float(1.0 - good.mean()),
+            describe_mask(fitted.mask),
+        )

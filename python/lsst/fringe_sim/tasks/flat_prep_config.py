@@ -1,0 +1,107 @@
+"""Choices of the flat preparation as task configuration, shared by the combination of biases."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from lsst.pex.config import ChoiceField, Config, Field, FieldValidationError
+
+from ..algorithms.flat_prep import FlatPrepOptions
+from ..errors import InputError
+
+__all__ = ["FlatPrepConfig"]
+
+_DEFAULT = FlatPrepOptions()
+_OVERSCAN = ("overscan_method", "overscan_knots", "overscan_skip", "parallel_overscan")
+
+
+class FlatPrepConfig(Config):
+    """Every choice of `FlatPrepOptions`, by the same name."""
+
+    overscan_method: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default=_DEFAULT.overscan_method,
+        doc="Level of the serial overscan.",
+        allowed={"median": "the median of each row", "spline": "a smooth curve through the rows"},
+    )
+    overscan_knots: Field[int] = Field(
+        dtype=int, default=_DEFAULT.overscan_knots, doc="Intervals of that curve."
+    )
+    overscan_skip: Field[int] = Field(
+        dtype=int,
+        default=_DEFAULT.overscan_skip,
+        doc="Overscan columns and rows next to the imaging section that are left out.",
+    )
+    parallel_overscan: Field[bool] = Field(
+        dtype=bool,
+        default=_DEFAULT.parallel_overscan,
+        doc="Whether the parallel overscan is taken off every column.",
+    )
+    clip_sigma: Field[float] = Field(
+        dtype=float, default=_DEFAULT.clip_sigma, doc="Rejection in overscan and biases, standard deviations."
+    )
+    saturation_fraction: Field[float] = Field(
+        dtype=float,
+        default=_DEFAULT.saturation_fraction,
+        doc="Part of the saturation level above which a pixel counts as saturated.",
+    )
+    max_saturated: Field[float] = Field(
+        dtype=float,
+        default=_DEFAULT.max_saturated,
+        doc="Largest part of saturated pixels with which a flat is still used.",
+    )
+    defect_sigma: Field[float] = Field(
+        dtype=float, default=_DEFAULT.defect_sigma, doc="Departure of a defect, standard deviations."
+    )
+    defect_fraction: Field[float] = Field(
+        dtype=float, default=_DEFAULT.defect_fraction, doc="Least such departure, relative to the signal."
+    )
+    column_sigma: Field[float] = Field(
+        dtype=float,
+        default=_DEFAULT.column_sigma,
+        doc="Departure of a bad column, standard deviations between columns.",
+    )
+    column_fraction: Field[float] = Field(
+        dtype=float, default=_DEFAULT.column_fraction, doc="Least such departure, relative to the signal."
+    )
+    edge_px: Field[int] = Field(
+        dtype=int, default=_DEFAULT.edge_px, doc="Border of the sensor that is masked, px."
+    )
+    midline_px: Field[int] = Field(
+        dtype=int, default=_DEFAULT.midline_px, doc="Rows on either side of the middle that are masked, px."
+    )
+    smoothing_sigma_px: Field[float] = Field(
+        dtype=float,
+        default=_DEFAULT.smoothing_sigma_px,
+        doc="Standard deviation of the smoothing kernel, px; 0 for none.",
+    )
+
+    raws_limit_graph: Field[bool] = Field(
+        dtype=bool,
+        default=True,
+        doc="Whether only exposures that have raw frames enter the graph; False where the night to be simulated, "
+        "whose exposures have none, is in the same graph.",
+    )
+
+    def options(self) -> FlatPrepOptions:
+        """These choices as the algorithms take them."""
+        names = (item.name for item in dataclasses.fields(FlatPrepOptions))
+        return FlatPrepOptions(**{name: getattr(self, name) for name in names})
+
+    def validate(self) -> None:
+        """Refuse what the algorithms would refuse.
+
+        Raises
+        ------
+        lsst.pex.config.FieldValidationError
+            The field and what would be allowed are named.
+        """
+        super().validate()
+        try:
+            self.options()
+        except InputError as error:
+            raise FieldValidationError(getattr(type(self), error.field), self, str(error)) from error
+
+    def has_same_overscan(self, other: FlatPrepConfig) -> bool:
+        """Whether two tasks correct the overscan alike; for the contracts of pipelines."""
+        return all(getattr(self, name) == getattr(other, name) for name in _OVERSCAN)

@@ -1,0 +1,117 @@
+"""The bias frames of a sensor, combined."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+from lsst.pipe.base import (
+    InputQuantizedConnection,
+    NoWorkFound,
+    OutputQuantizedConnection,
+    PipelineTask,
+    PipelineTaskConfig,
+    PipelineTaskConnections,
+    QuantumContext,
+    Struct,
+)
+from lsst.pipe.base.connectionTypes import Input, Output
+from lsst.utils.logging import getLogger
+
+from ..algorithms.flat_prep import combine_biases
+from ..instrument.raw_frame import RawFrame
+from ..products import CombinedBias
+from .flat_prep_config import FlatPrepConfig
+from .quantum import common_header, data_id_of, sensor_of, unusable
+
+__all__ = ["FringeBiasConfig", "FringeBiasConnections", "FringeBiasTask"]
+
+_LOG = getLogger(__name__)
+
+
+class FringeBiasConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
+    """Raw biases in, one combined bias out."""
+
+    raws = Input(
+        doc="Raw frames of the sensor; those that are no biases are left aside.",
+        name="raw",
+        storageClass="RawFrame",
+        dimensions=("instrument", "exposure", "detector"),
+        multiple=True,
+        deferLoad=True,
+    )
+    bias = Output(
+        doc="Mean bias.",
+        name="fringeBias",
+        storageClass="CombinedBias",
+        dimensions=("instrument", "detector"),
+    )
+
+    def __init__(self, *, config: FringeBiasConfig | None = None) -> None:
+        if config is not None and not config.raws_limit_graph:
+            self.raws = dataclasses.replace(self.raws, deferGraphConstraint=True)
+
+    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
+        """Keep the biases only."""
+        connection, refs = inputs["raws"]
+        biases = [ref for ref in refs if ref.dataId.records["exposure"].observation_type == "bias"]
+        if not biases:
+            if refs:
+                _LOG.warning("%s: no bias frames of %s; its flats will not be prepared", label, data_id)
+            raise NoWorkFound(label, "raws", connection)
+        biases.sort(key=lambda ref: ref.dataId["exposure"])
+        inputs["raws"] = (connection, biases)
+        super().adjustQuantum(inputs, outputs, label, data_id)
+        return {"raws": (connection, biases)}, {}
+
+
+class FringeBiasConfig(FlatPrepConfig, PipelineTaskConfig, pipelineConnections=FringeBiasConnections):
+    """Configuration of `FringeBiasTask`."""
+
+
+class FringeBiasTask(PipelineTask):
+    """Combine the bias frames of a sensor."""
+
+    ConfigClass = FringeBiasConfig
+    config: FringeBiasConfig
+    _DefaultName = "fringeBias"
+
+    def runQuantum(
+        self,
+        butlerQC: QuantumContext,
+        inputRefs: InputQuantizedConnection,
+        outputRefs: OutputQuantizedConnection,
+    ) -> None:
+        """Read the frames one by one while they are combined."""
+        detector = sensor_of(data_id_of(butlerQC))
+        with unusable(detector.name):
+            result = self.run((butlerQC.get(ref).get() for ref in inputRefs.raws), detector.name)
+        butlerQC.put(result, outputRefs)
+
+    def run(self, raws: Iterable[RawFrame], detector: str) -> Struct:
+        """Combine bias frames.
+
+        Parameters
+        ----------
+        raws : iterable of `RawFrame`
+            Bias frames of one sensor.
+        detector : `str`
+            Name of the sensor.
+
+        Returns
+        -------
+        result : `~lsst.pipe.base.Struct`
+            ``bias``, a `CombinedBias`.
+
+        Raises
+        ------
+        InputError
+            There is no frame.
+        FrameFormatError
+            A frame is no bias, or of another sensor or size.
+        """
+        bias: CombinedBias = combine_biases(raws, self.config.options())
+        self.log.info("%s: %d bias frames combined", detector, bias.n_frames)
+        metadata = {**common_header(), **bias.metadata}
+        return Struct(bias=dataclasses.replace(bias, detector=detector, metadata=metadata))

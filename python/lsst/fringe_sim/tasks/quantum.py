@@ -1,0 +1,100 @@
+"""What the tasks share around a quantum: which sensor it is, whose failure it is, when it ran."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from lsst.daf.butler import DataCoordinate
+from lsst.pipe.base import AlgorithmError, Instrument, QuantumContext
+
+from .. import __version__
+from ..errors import FringeSimError, InputError
+from ..instrument.camera import Detector
+
+__all__ = ["UnusableDataError", "common_header", "data_id_of", "run_datetime", "sensor_of", "unusable"]
+
+_TIMESTAMP = re.compile(r"(\d{8}T\d{6})Z?$")
+
+
+class UnusableDataError(AlgorithmError):
+    """The data of one sensor cannot be used; the quanta of all others go on.
+
+    Parameters
+    ----------
+    where : `str`
+        Sensor, and exposure if there is one.
+    reason : `~lsst.fringe_sim.errors.FringeSimError`
+        What is wrong.
+    """
+
+    def __init__(self, where: str, reason: FringeSimError) -> None:
+        super().__init__(f"{where}: {reason}")
+        self.where = where
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.where, self.reason)
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Sensor, kind of error, and, for a bad input, field and value."""
+        found = {"where": self.where, "error": type(self.reason).__name__, "message": str(self.reason)}
+        if isinstance(self.reason, InputError):
+            found |= {
+                "field": self.reason.field,
+                "value": str(self.reason.value),
+                "allowed": self.reason.allowed,
+                "source": self.reason.source or "",
+            }
+        return found
+
+
+@contextlib.contextmanager
+def unusable(where: str) -> Iterator[None]:
+    """Turn what the package raises on purpose into the failure of one quantum, with its sensor named."""
+    try:
+        yield
+    except FringeSimError as error:
+        raise UnusableDataError(where, error) from error
+
+
+def data_id_of(butlerQC: QuantumContext) -> DataCoordinate:
+    """Expanded data id of the quantum that runs."""
+    data_id = butlerQC.quantum.dataId
+    if data_id is None:
+        raise AssertionError("a quantum that runs has a data id")
+    return data_id
+
+
+def sensor_of(data_id: DataCoordinate) -> Detector:
+    """Sensor of an expanded data id, as the camera of its instrument knows it."""
+    instrument: Any = Instrument.from_data_id(data_id)
+    return instrument.camera().detector(int(data_id["detector"]))  # type: ignore[no-any-return]
+
+
+def common_header() -> dict[str, Any]:
+    """Header keywords that every product of the tasks has."""
+    return {"ORIGIN": "lsst.fringe_sim", "FSIMVER": __version__}
+
+
+def run_datetime(run: str, otherwise: datetime.datetime) -> str:
+    """Date of a run, ``YYYY-MM-DDThh:mm:ss``, from the timestamp at the end of its name.
+
+    Parameters
+    ----------
+    run : `str`
+        Name of the run; ``pipetask`` ends it in ``20261121T031500Z`` unless told otherwise.
+    otherwise : `datetime.datetime`
+        Date of a run whose name tells none.
+
+    Notes
+    -----
+    The clock is not asked: repeating a quantum in its run gives the same bytes.
+    """
+    match = _TIMESTAMP.search(run)
+    found = datetime.datetime.strptime(match[1], "%Y%m%dT%H%M%S") if match else otherwise
+    return found.isoformat(timespec="seconds")
