@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import functools
 import sys
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lsst.daf.butler.cli.opt import options_file_option, repo_argument, transfer_option, where_option
 from lsst.daf.butler.cli.utils import ButlerCommand
 
-from ..errors import FringeSimError
+from ..errors import FringeSimError, InputError
+
+if TYPE_CHECKING:
+    from lsst.daf.butler import Butler
 
 __all__ = ["define_fringe_night", "get_cli_subcommands", "ingest_fringe_raws", "write_fringe_handoff"]
 
@@ -36,6 +40,19 @@ def _one_clear_message(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
+@contextlib.contextmanager
+def _butler(repo: str, *, writeable: bool) -> Iterator[Butler]:
+    """Open a repository; what is none is refused in one line."""
+    from lsst.daf.butler import Butler
+
+    try:
+        butler = Butler.from_config(repo, writeable=writeable)
+    except (FileNotFoundError, ValueError, RuntimeError) as error:
+        raise InputError("repository", repo, f"a butler repository ({error})") from error
+    with butler:
+        yield butler
+
+
 @click.command(short_help="Ingest raw frames in the LSST layout.", cls=ButlerCommand)
 @repo_argument(required=True)
 @click.argument("paths", metavar="PATH ...", nargs=-1, required=True)
@@ -53,11 +70,9 @@ def ingest_fringe_raws(
     repository has already are left alone. A file that cannot be used is reported in one line; the others go in,
     and the exit status is 1.
     """
-    from lsst.daf.butler import Butler
-
     from .raw_ingest import ingest_raws
 
-    with Butler.from_config(repo, writeable=not dry_run) as butler:
+    with _butler(repo, writeable=not dry_run) as butler:
         report = ingest_raws(butler, paths, transfer=transfer, run=output_run, dry_run=dry_run)
     for message in report.refused:
         click.echo(f"refused: {message}", err=True)
@@ -118,8 +133,6 @@ def define_fringe_night(
     INSTRUMENT is the name of an instrument that the repository knows, as LSSTCam. Only records are made, no
     images. Registering the same night again changes nothing.
     """
-    from lsst.daf.butler import Butler
-
     from .night import NightPlan, define_night, parse_hours
 
     plans = [
@@ -132,7 +145,7 @@ def define_fringe_night(
         )
         for date in dates
     ]
-    with Butler.from_config(repo, writeable=not dry_run) as butler:
+    with _butler(repo, writeable=not dry_run) as butler:
         records = define_night(butler, instrument, plans, dry_run=dry_run)
     for record in records:
         click.echo(
@@ -156,11 +169,9 @@ def write_fringe_handoff(repo: str, collection: str, directory: str, where: str,
     The frames of COLLECTION go into DIRECTORY, which must be new or empty, with their validity ranges if it is a
     calibration collection. There, "butler import OTHER_REPO DIRECTORY --transfer copy" takes them in as ExposureF.
     """
-    from lsst.daf.butler import Butler
-
     from .handoff import write_handoff
 
-    with Butler.from_config(repo, writeable=False) as butler:
+    with _butler(repo, writeable=False) as butler:
         refs = write_handoff(butler, collection, directory, where=where, dry_run=dry_run)
     for ref in refs:
         click.echo(str(ref.dataId))

@@ -8,7 +8,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lsst.daf.butler import Butler, CollectionType, DatasetRef, FileDataset, MissingDatasetTypeError
+from lsst.daf.butler import (
+    Butler,
+    ButlerUserError,
+    CollectionType,
+    DatasetRef,
+    FileDataset,
+    MissingDatasetTypeError,
+)
+from lsst.daf.butler.registry import RegistryError
 
 from ..errors import InputError
 
@@ -68,6 +76,8 @@ def _find(butler: Butler, collection: str, where: str) -> list[DatasetRef]:
         refs = set(butler.registry.queryDatasets(FRINGE, collections=collection, where=where))
     except MissingDatasetTypeError:
         refs = set()
+    except (ButlerUserError, RegistryError) as error:
+        raise InputError("where", where, f"a condition on data ids ({error})") from error
     if not refs:
         raise InputError(
             "fringe frames", 0, f"at least one in collection {collection!r} where {where or 'all'}"

@@ -1,0 +1,302 @@
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astro_metadata_translator import ObservationInfo
+from lsst.daf.butler import Butler
+from raw_frame_maker import LSSTCAM_HEADER, write_raw
+
+from conftest import Invoke
+from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_header
+from lsst.fringe_sim.middleware.raw_ingest import IngestReport, find_raw_files, ingest_raws
+from lsst.fringe_sim.middleware.translators import TRANSLATORS
+
+pytestmark = pytest.mark.middleware
+
+REAL_FRAME = "measured/ts8_raw_201807241028453-RTM-010-S11-det067.fits"
+
+
+def series(folder: Path, wavelengths: tuple[float, ...] = (880.0, 960.03, 990.0)) -> list[Path]:
+    """Two bias frames and flats, ten seconds apart."""
+    folder.mkdir(parents=True, exist_ok=True)
+    headers: list[dict[str, Any]] = [{"IMGTYPE": "BIAS", "TESTTYPE": "BIAS", "EXPTIME": 0.0}] * 2
+    headers += [{"MONOWL": nm} for nm in wavelengths]
+    return [
+        write_raw(
+            folder / f"raw_{number}.fits",
+            {**header, "DATE-OBS": f"2018-07-24T10:{number:02d}:45.3", "SEQNUM": number},
+        )
+        for number, header in enumerate(headers)
+    ]
+
+
+def exposures(butler: Butler, where: str = "") -> list[Any]:
+    instrument = "instrument='LSST-TS8'"
+    return sorted(
+        butler.query_dimension_records(
+            "exposure", where=f"{instrument} AND {where}" if where else instrument, explain=False
+        ),
+        key=lambda record: record.id,
+    )
+
+
+def raws(butler: Butler, run: str = "LSST-TS8/raw/all") -> list[Any]:
+    return butler.query_datasets("raw", collections=run, explain=False)
+
+
+# From the headers to the records
+
+
+def test_exposures_are_found_by_kind_and_by_wavelength(butler: Butler, tmp_path: Path) -> None:
+    series(tmp_path / "raw")
+    report = ingest_raws(butler, [str(tmp_path / "raw")])
+    assert (len(report.ingested), len(report.present), report.refused) == (5, 0, ())
+    assert report.run == {"LSST-TS8": "LSST-TS8/raw/all"}
+    assert len(raws(butler)) == 5
+    assert len(exposures(butler, "exposure.observation_type = 'bias'")) == 2
+    flats = exposures(butler, "exposure.observation_type = 'flat'")
+    assert [record.target_name for record in flats] == ["0880.000 nm", "0960.030 nm", "0990.000 nm"]
+    assert {record.physical_filter for record in flats} == {"monochromator"}
+    some = exposures(butler, "exposure.target_name >= '0900' AND exposure.target_name < '0985'")
+    assert [record.target_name for record in some] == ["0960.030 nm"]
+
+
+def test_record_of_a_flat(butler: Butler, tmp_path: Path) -> None:
+    ingest_raws(butler, [str(write_raw(tmp_path / "raw.fits"))])
+    (record,) = exposures(butler)
+    assert record.id == 201807241028453
+    assert (record.day_obs, record.seq_num) == (20180724, 17)
+    assert (record.observation_type, record.observation_reason) == ("flat", "lambda")
+    assert (record.exposure_time, record.dark_time) == (21.9, 21.9)
+    assert record.science_program == "6006D"
+    assert record.can_see_sky is False
+    assert record.timespan.begin.utc.isot.startswith("2018-07-24T10:28:45.342")
+    (ref,) = raws(butler)
+    assert dict(ref.dataId.required) == {
+        "instrument": "LSST-TS8",
+        "detector": 145,
+        "exposure": 201807241028453,
+    }
+    assert butler.registry.expandDataId(ref.dataId).records["detector"].full_name == "RTM-020_S01"
+
+
+def test_frames_of_the_camera_go_to_the_camera(butler: Butler, tmp_path: Path) -> None:
+    camera = {key: value for key, value in LSSTCAM_HEADER.items() if key != "OBSID"}
+    write_raw(tmp_path / "bias.fits", {"IMGTYPE": "BIAS", "FILTER": None, "SEQNUM": 1}, base=camera)
+    write_raw(tmp_path / "y.fits", {"FILTER": "y_04", "SEQNUM": 2}, base=camera)
+    write_raw(tmp_path / "lambda.fits", {"FILTER": None, "MONOWL": 950.0, "SEQNUM": 3}, base=camera)
+    write_raw(tmp_path / "stand.fits")
+    report = ingest_raws(butler, [str(tmp_path)])
+    assert report.refused == ()
+    assert set(report.run) == {"LSSTCam", "LSST-TS8"}
+    records = butler.query_dimension_records("exposure", instrument="LSSTCam")
+    assert {record.physical_filter for record in records} == {"none", "y_04", "monochromator"}
+    assert len(raws(butler, "LSSTCam/raw/all")) == 3
+
+
+def test_translators_are_chosen_by_the_header(tmp_path: Path) -> None:
+    for base, camera in ((None, "ts8"), (LSSTCAM_HEADER, "lsstCam")):
+        path = write_raw(tmp_path / f"{camera}.fits", **({} if base is None else {"base": base}))
+        info = ObservationInfo(read_raw_header(path), filename=str(path), pedantic=True)
+        assert info.translator_class_name == TRANSLATORS[camera].__name__
+        assert info.ext_temperature_k == pytest.approx(182.65 if camera == "ts8" else 172.982)
+    assert info.observation_id == "MC_C_20211212_000310"
+    assert info.ext_wavelength_nm is None
+
+
+@pytest.mark.shared
+def test_the_real_frame_is_ingested_and_read_back(butler: Butler, shared_dir: Path) -> None:
+    report = ingest_raws(butler, [str(shared_dir / REAL_FRAME)], transfer="direct")
+    assert report.refused == ()
+    (ref,) = raws(butler)
+    assert ref.dataId["detector"] == 67
+    frame = butler.get(ref)
+    assert isinstance(frame, RawFrame)
+    assert np.any(frame.amplifier("C00").data)
+
+
+# What is there already, and what cannot be used
+
+
+def test_ingesting_again_changes_nothing(butler: Butler, tmp_path: Path) -> None:
+    paths = series(tmp_path / "raw")
+    ingest_raws(butler, [str(tmp_path / "raw")])
+    before = {str(ref) for ref in raws(butler)}
+    again = ingest_raws(butler, [str(tmp_path / "raw"), str(paths[0])])
+    assert (len(again.ingested), len(again.present), again.refused) == (0, 5, ())
+    assert {str(ref) for ref in raws(butler)} == before
+    paths.append(write_raw(tmp_path / "raw" / "more.fits", {"DATE-OBS": "2018-07-24T11:00:00.0"}))
+    more = ingest_raws(butler, [str(tmp_path / "raw")])
+    assert (len(more.ingested), len(more.present)) == (1, 5)
+
+
+def test_bad_files_stay_out_and_the_others_go_in(butler: Butler, tmp_path: Path) -> None:
+    series(tmp_path)
+    content = (tmp_path / "raw_0.fits").read_bytes()
+    (tmp_path / "truncated.fits").write_bytes(content[: len(content) // 2])
+    (tmp_path / "text.fits").write_text("not a FITS file")
+    write_raw(tmp_path / "wavelength.fits", {"MONOWL": None, "DATE-OBS": "2018-07-24T11:00:00.0"})
+    write_raw(tmp_path / "sensor.fits", {"LSST_NUM": "E2V-CCD250-000", "RAFTNAME": None})
+    write_raw(tmp_path / "filter.fits", {"FILTER": "pinhole"}, base=LSSTCAM_HEADER)
+    report = ingest_raws(butler, [str(tmp_path), "nowhere/*.fits"])
+    assert len(report.ingested) == len(raws(butler)) == 5
+    found = "\n".join(report.refused)
+    assert len(report.refused) == 6
+    assert all("\n" not in message for message in report.refused)
+    for part in (
+        "truncated.fits: file is",
+        "text.fits: file is",
+        "wavelength.fits: MONOWL is None; allowed: a wavelength from 200 to 1300 nm",
+        "sensor.fits: detector is 'E2V-CCD250-000'",
+        "filter.fits: physical filter is 'pinhole'",
+        "path is 'nowhere/*.fits'",
+    ):
+        assert part in found
+
+
+def test_instrument_that_is_not_registered_is_named(tmp_path: Path) -> None:
+    from lsst.daf.butler import Config
+
+    Butler.makeRepo(str(tmp_path / "repo"), config=Config("resource://lsst.fringe_sim/configs/butler.yaml"))
+    path = write_raw(tmp_path / "raw.fits")
+    with Butler.from_config(str(tmp_path / "repo"), writeable=True) as butler:
+        (message,) = ingest_raws(butler, [str(path)]).refused
+    assert "instrument is 'LSST-TS8'; allowed: one that the repository knows (there is none)" in message
+    assert "lsst.fringe_sim.Ts8Fringe" in message
+
+
+def contradiction(butler: Butler, tmp_path: Path, changes: dict[str, Any]) -> IngestReport:
+    """Ingest a frame, then another one with the same start."""
+    ingest_raws(butler, [str(write_raw(tmp_path / "first.fits"))])
+    return ingest_raws(butler, [str(write_raw(tmp_path / "second.fits", changes))])
+
+
+def test_exposure_that_the_repository_tells_otherwise_is_refused(butler: Butler, tmp_path: Path) -> None:
+    other_sensor = {"LSST_NUM": "E2V-CCD250-319"}
+    report = contradiction(butler, tmp_path, {**other_sensor, "MONOWL": 910.0})
+    assert report.ingested == ()
+    (message,) = report.refused
+    assert "second.fits: exposure 201807241028453 of LSST-TS8 is in the repository with other" in message
+    assert "0910.000 nm" in message
+    assert exposures(butler)[0].target_name == "0960.030 nm"
+
+
+def test_sensors_read_together_share_an_exposure(butler: Butler, tmp_path: Path) -> None:
+    report = contradiction(butler, tmp_path, {"LSST_NUM": "E2V-CCD250-319"})
+    assert report.refused == ()
+    assert len(exposures(butler)) == 1
+    assert sorted(ref.dataId["detector"] for ref in raws(butler)) == [144, 145]
+
+
+def test_files_that_contradict_each_other_are_named(butler: Butler, tmp_path: Path) -> None:
+    write_raw(tmp_path / "a.fits")
+    write_raw(tmp_path / "b.fits", {"MONOWL": 910.0, "LSST_NUM": "E2V-CCD250-319"})
+    write_raw(tmp_path / "c.fits")
+    report = ingest_raws(butler, [str(tmp_path)])
+    assert [Path(exposure.path).name for exposure in report.ingested] == ["a.fits"]
+    assert len(report.refused) == 2
+    assert (
+        "b.fits: target_name of exposure 201807241028453 is '0910.000 nm'; allowed: 0960.030 nm"
+        in (report.refused[0])
+    )
+    assert "c.fits: exposure and detector" in report.refused[1]
+
+
+def test_nothing_is_stored_in_a_rehearsal(butler: Butler, tmp_path: Path) -> None:
+    series(tmp_path / "raw")
+    report = ingest_raws(butler, [str(tmp_path / "raw")], dry_run=True)
+    assert len(report.ingested) == 5
+    assert exposures(butler) == []
+    assert "LSST-TS8/raw/all" not in butler.collections.query("*")
+
+
+@pytest.mark.parametrize("transfer", ["copy", "direct", "symlink", "hardlink", "auto", "relsymlink"])
+def test_ways_to_bring_files_in(butler: Butler, tmp_path: Path, transfer: str) -> None:
+    path = write_raw(tmp_path / "raw.fits")
+    ingest_raws(butler, [str(path)], transfer=transfer, run="u/someone/raw")
+    (ref,) = raws(butler, "u/someone/raw")
+    assert butler.get(ref).metadata.wavelength_nm == 960.03
+    assert path.exists()
+
+
+# Which files are meant
+
+
+def test_files_directories_and_patterns(tmp_path: Path) -> None:
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    names = ["a.fits", "deep/b.fits.fz", "deep/er/c.fits.gz", "deep/er/d.fz", "deep/notes.txt"]
+    for name in names:
+        (tmp_path / name).touch()
+    everything = [str(tmp_path / name) for name in names[:4]]
+    assert find_raw_files([str(tmp_path)]) == (everything, [])
+    assert find_raw_files([f"{tmp_path}/**/*.fits*"])[0] == everything[:3]
+    assert find_raw_files([f"{tmp_path}/de*"])[0] == everything[1:]
+    assert find_raw_files([everything[0], str(tmp_path), everything[0]])[0] == everything
+    assert find_raw_files([f"{tmp_path}/deep/notes.txt"])[0] == [f"{tmp_path}/deep/notes.txt"]
+    files, refused = find_raw_files([f"{tmp_path}/x*", str(tmp_path / "deep" / "nothing")])
+    assert files == []
+    assert len(refused) == 2
+
+
+# The command
+
+
+def test_command_reports_and_sets_its_exit_status(repo: Path, tmp_path: Path, invoke: Invoke) -> None:
+    paths = series(tmp_path / "raw")
+    rehearsal = invoke("ingest-fringe-raws", repo, tmp_path / "raw", "--dry-run")
+    assert rehearsal.exit_code == 0, rehearsal.output
+    assert "raw_3.fits: LSST-TS8 RTM-020_S01 exposure 201807241003453 flat monochromator 0960.030 nm" in (
+        rehearsal.output
+    )
+    assert "5 raw frames would be ingested into LSST-TS8/raw/all; 0 were there already; 0 refused" in (
+        rehearsal.output
+    )
+    first = invoke("ingest-fringe-raws", repo, *paths[:3], "--transfer", "copy")
+    assert first.exit_code == 0, first.output
+    (tmp_path / "raw" / "bad.fits").write_text("bad")
+    second = invoke("ingest-fringe-raws", repo, tmp_path / "raw")
+    assert second.exit_code == 1
+    assert "2 raw frames ingested into LSST-TS8/raw/all; 3 were there already; 1 refused" in second.output
+    assert second.output.count("refused: ") == 1
+    nothing = invoke("ingest-fringe-raws", repo, tmp_path / "empty")
+    assert nothing.exit_code == 1
+    assert "path is" in nothing.output
+
+
+def test_commands_say_when_there_is_no_repository(tmp_path: Path, invoke: Invoke) -> None:
+    for command in (
+        ("ingest-fringe-raws", tmp_path / "nothing", "raw.fits"),
+        ("define-fringe-night", tmp_path, "LSSTCam", "--date", "20261121"),
+        ("write-fringe-handoff", tmp_path, "collection", "out"),
+    ):
+        result = invoke(*command)
+        assert result.exit_code == 1
+        assert "Error: repository is" in result.output
+        assert "Traceback" not in result.output
+
+
+def test_command_in_a_process_of_its_own(repo: Path, tmp_path: Path) -> None:
+    """The entry point is installed, and the exit status reaches the shell."""
+    (tmp_path / "bad.fits").write_text("bad")
+    write_raw(tmp_path / "good.fits")
+    butler = Path(sys.executable).with_name("butler")
+    command = [butler, "ingest-fringe-raws", repo, tmp_path / "good.fits", tmp_path / "bad.fits"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ})
+    assert result.returncode == 1
+    assert "1 raw frames ingested" in result.stdout
+    assert result.stderr.count("refused: ") == 1
+    assert "Traceback" not in result.stderr
+
+
+def test_translating_makes_no_noise(butler: Butler, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        series(tmp_path / "raw")
+        ingest_raws(butler, [str(tmp_path / "raw")])
+    assert caplog.records == []
