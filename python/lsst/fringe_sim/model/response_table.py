@@ -327,6 +327,7 @@ def content_key(
     add("index.imag", index.imag)
     add("thickness", system.stack.thickness_um)
     add("roughness", system.stack.roughness_nm)
+    add("spread", system.stack.thickness_spread_um)
     add("layers", " ".join(system.stack.names))
     for item in fields(OpticalSystem):
         # The illumination stands for the light; what is left are plain numbers and names.

@@ -37,6 +37,7 @@ class Layer:
     medium: Medium
     thickness_um: float
     roughness_nm: float = 0.0
+    thickness_spread_um: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,14 @@ class LayerStack:
                     "finite and not negative",
                     source=self.name,
                 )
+            inner = layer.thickness_um < math.inf
+            if not (layer.thickness_spread_um >= 0.0 if inner else layer.thickness_spread_um == 0.0):
+                raise StackError(
+                    f"thickness spread [um] of layer {layer.name}",
+                    layer.thickness_spread_um,
+                    "not negative" if inner else "zero (a half space has no thickness)",
+                    source=self.name,
+                )
 
     @classmethod
     def from_resource(cls, name: str) -> LayerStack:
@@ -110,6 +119,7 @@ class LayerStack:
                 get_medium(str(entry["medium"])),
                 float(entry["thickness_um"]),
                 float(entry.get("roughness_nm", 0.0)),
+                float(entry.get("thickness_spread_um", 0.0)),
             )
             for entry in content["layers"]
         ]
@@ -129,6 +139,11 @@ class LayerStack:
     def roughness_nm(self) -> NDArray[np.float64]:
         """Rms roughness of the upper interface of layers 1…L-1 [nm], shape ``(L-1,)``."""
         return np.array([layer.roughness_nm for layer in self.layers[1:]])
+
+    @property
+    def thickness_spread_um(self) -> NDArray[np.float64]:
+        """Rms thickness spread of every layer inside a pixel [µm], shape ``(L,)``."""
+        return np.array([layer.thickness_spread_um for layer in self.layers])
 
     def position(self, name: str) -> int:
         """Index of the layer called ``name``.

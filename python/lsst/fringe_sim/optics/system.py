@@ -96,4 +96,5 @@ class OpticalSystem:
             varying=self.stack.position(self.varying),
             layers=layers,
             roughness=1e-3 * self.stack.roughness_nm,
+            spread=self.stack.thickness_spread_um,
         )

@@ -10,6 +10,7 @@ References: Guo, Walter, Lage & Lupton 2022, section 2.1; Byrnes 2016, arXiv:160
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,6 +77,8 @@ def layer_absorption(
     wavelength: ArrayLike,
     theta: ArrayLike = 0.0,
     polarization: str = "mixed",
+    *,
+    roughness: ArrayLike | None = None,
 ) -> FloatArray:
     """Fraction of the incident light that each part of a stack takes.
 
@@ -91,12 +94,14 @@ def layer_absorption(
         Angle of incidence in layer 0 [rad], 0 ≤ θ < π/2.
     polarization : {"mixed", "s", "p"}, optional
         ``mixed`` is the mean of s and p.
+    roughness : array_like, shape ``(L-1,)``, optional
+        Rms height of the L-1 interfaces, in the unit of ``d``; see `interface_coefficients`.
 
     Returns
     -------
     fraction : `numpy.ndarray`, shape ``(L, ...)``
         Reflected fraction first, then the fraction absorbed in each inner layer, transmitted fraction last.
-        They sum to 1.
+        They sum to 1; what is missing from 1 behind a rough interface is scattered out of the beam.
 
     Raises
     ------
@@ -113,15 +118,22 @@ def layer_absorption(
     Guo et al. 2022, section 2.1: the absorbed fraction is the difference of the energy flow (Poynting vector)
     at the two faces of the layer.
     """
-    if polarization not in POLARIZATIONS:
-        raise InputError("polarization", polarization, "mixed, s or p")
-    index, thickness, wave, angle = _broadcast(n, d, wavelength, theta)
-    _check(index, thickness, wave, angle)
-    if polarization == "mixed":
-        return 0.5 * (
-            _absorption(index, thickness, wave, angle, "s") + _absorption(index, thickness, wave, angle, "p")
-        )
-    return _absorption(index, thickness, wave, angle, polarization)
+    index, thickness, wave, angle = checked_stack(n, d, wavelength, theta, polarization)
+    heights = None if roughness is None else np.asarray(roughness, dtype=float)
+    if heights is not None and (heights.shape != (len(index) - 1,) or not np.all(heights >= 0.0)):
+        raise StackError("roughness", heights.tolist(), f"{len(index) - 1} numbers, none negative")
+    each = [
+        absorption_of(index, thickness, wave, angle, one, roughness=heights)
+        for one in pure_polarizations(polarization, angle)
+    ]
+    return each[0] if len(each) == 1 else 0.5 * (each[0] + each[1])
+
+
+def pure_polarizations(polarization: str, theta: FloatArray) -> tuple[str, ...]:
+    """Polarisations to be averaged; at normal incidence s stands for both."""
+    if polarization != "mixed":
+        return (polarization,)
+    return ("s", "p") if np.any(theta) else ("s",)
 
 
 def reflection_transmission(
@@ -259,12 +271,24 @@ def forward_sweep(
     return WaveFields(top_f, top_b, bottom_f, bottom_b)
 
 
-def _absorption(
-    index: ComplexArray, thickness: FloatArray, wavelength: FloatArray, theta: FloatArray, polarization: str
+def absorption_of(
+    index: ComplexArray,
+    thickness: FloatArray,
+    wavelength: FloatArray,
+    theta: FloatArray,
+    polarization: str,
+    phases: Mapping[int, float] | None = None,
+    roughness: FloatArray | None = None,
 ) -> FloatArray:
+    """Fractions for one polarisation, with extra round-trip phases [rad] in some layers."""
     normal, admittance = layer_admittance(index, theta, polarization)
-    coefficients = interface_coefficients(admittance)
+    heights = None
+    if roughness is not None and np.any(roughness):
+        heights = roughness.reshape(-1, *(1,) * wavelength.ndim) / wavelength
+    coefficients = interface_coefficients(admittance, normal, heights)
     propagation = np.exp(1j * (2.0 * np.pi * normal[1:-1] / wavelength) * thickness[1:-1])
+    for layer, phase in (phases or {}).items():
+        propagation[layer - 1] *= np.exp(0.5j * phase)
     reflection = backward_sweep(coefficients, propagation)
     fields = forward_sweep(coefficients, propagation, reflection)
     top, bottom = fields.flux_top(admittance), fields.flux_bottom(admittance)
@@ -277,6 +301,17 @@ def _absorption(
 
 def _flux(forward: ComplexArray, backward: ComplexArray, admittance: ComplexArray) -> FloatArray:
     return ((forward + backward) * np.conj(admittance * (forward - backward))).real
+
+
+def checked_stack(
+    n: ArrayLike, d: ArrayLike, wavelength: ArrayLike, theta: ArrayLike, polarization: str
+) -> tuple[ComplexArray, FloatArray, FloatArray, FloatArray]:
+    """Arguments of `layer_absorption`, broadcast and checked; same errors."""
+    if polarization not in POLARIZATIONS:
+        raise InputError("polarization", polarization, "mixed, s or p")
+    index, thickness, wave, angle = _broadcast(n, d, wavelength, theta)
+    _check(index, thickness, wave, angle)
+    return index, thickness, wave, angle
 
 
 def _broadcast(

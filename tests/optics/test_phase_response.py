@@ -1,0 +1,165 @@
+"""The closed form and its harmonic series against the transfer matrix, and against each other."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lsst.fringe_sim.errors import InputError, OutOfRangeError
+from lsst.fringe_sim.optics import (
+    Beam,
+    Illumination,
+    LayerStack,
+    PhaseResponse,
+    layer_absorption,
+    reduce_to_phase,
+)
+from lsst.fringe_sim.optics.harmonics import series_at, series_on_grid
+from lsst.fringe_sim.optics.illumination import GaussianProfile
+from lsst.fringe_sim.optics.phase_response import _grid_kernel
+from lsst.fringe_sim.optics.system import OpticalSystem
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    layers=st.integers(3, 9),
+    polarization=st.sampled_from(["s", "p", "mixed"]),
+    data=st.data(),
+)
+def test_closed_form_is_the_transfer_matrix(
+    seed: int, layers: int, polarization: str, data: st.DataObject
+) -> None:
+    """Any varying layer, any set of absorbing layers, above, in and below it."""
+    rng = np.random.default_rng(seed)
+    varying = data.draw(st.integers(1, layers - 2))
+    chosen = data.draw(st.sets(st.integers(1, layers - 2), min_size=1))
+    n = rng.uniform(1.0, 4.0, layers) + 1j * rng.uniform(0.0, 0.5, layers) * (rng.random(layers) < 0.6)
+    n[0] = 1.0
+    d = rng.uniform(0.0, 2.0, layers)
+    d[[0, -1]] = np.inf
+    wavelength, theta = rng.uniform(0.4, 1.1, 3), rng.uniform(0.0, 1.5)
+    thickness = np.array([0.0, 0.3, 2.7])
+    finite = np.where(np.isinf(d), 0.0, d)
+    index = np.repeat(n[:, None], 3, axis=1)
+    reduced = reduce_to_phase(
+        index, finite, wavelength, theta, polarization, varying=varying, layers=sorted(chosen)
+    )
+    values = reduced.evaluate(thickness[:, None])
+    for row, value in enumerate(thickness):
+        moved = d.copy()
+        moved[varying] = value
+        expected = layer_absorption(index, moved, wavelength, theta, polarization)[sorted(chosen)].sum(axis=0)
+        np.testing.assert_allclose(values[row], expected, rtol=0.0, atol=2e-13)
+
+
+def random_response(rng: np.random.Generator, ratio: float, loss: float) -> tuple[PhaseResponse, np.ndarray]:
+    """Coefficients without a stack behind them: two polarisations, two exposures, nine nodes."""
+    shape = (2, 2, 9)
+    a, b, e = rng.normal(size=(3, *shape))
+    c = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+    g = ratio * rng.uniform(0.3, 1.0, shape) * np.exp(2j * np.pi * rng.random(shape))
+    kappa = rng.uniform(15.0, 25.0, shape) + 1j * loss * rng.uniform(0.1, 1.0, shape)
+    weight = rng.random(shape[1:])
+    return PhaseResponse(a, b, e, c, g, kappa), weight / weight.sum(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.2, 0.85])
+@pytest.mark.parametrize("loss", [0.0, 1e-3, 0.3])
+def test_series_is_the_closed_form(ratio: float, loss: float, rng: np.random.Generator) -> None:
+    response, weight = random_response(rng, ratio, loss)
+    arrays, spread, _ = response._grouped(weight)
+    for start, step, count in ((0.0, 0.01, 300), (14.0, 0.0007, 1111), (5.0, 0.5, 40)):
+        closed = _grid_kernel(*arrays, spread, start, step, count)
+        scale = np.abs(closed).max()
+        series = series_on_grid(arrays, spread, 0.0, start, step, count)
+        assert np.abs(series - closed).max() < 2e-12 * scale
+        some = start + step * np.arange(0, count, 101)
+        assert np.abs(series_at(*arrays, spread, 0.0, some, 0) - closed[:, ::101]).max() < 1e-12 * scale
+
+
+def test_grid_is_the_points(rng: np.random.Generator) -> None:
+    response, weight = random_response(rng, 0.4, 0.0)
+    for count in (1, 5, 200, 3000):
+        thickness = 7.0 + 0.01 * np.arange(count)
+        on_grid = response.averaged_on_grid(weight, 7.0, 0.01, count)
+        at_points = response.averaged(weight, thickness)
+        at_nodes = (weight[:, :, None] * response.evaluate(thickness[:, None, None]).transpose(1, 2, 0)).sum(
+            axis=1
+        )
+        assert on_grid.shape == (2, count)
+        np.testing.assert_allclose(on_grid, at_points, rtol=0.0, atol=2e-12)
+        np.testing.assert_allclose(at_nodes, at_points, rtol=0.0, atol=2e-12)
+        one = response.evaluate(thickness[0])
+        np.testing.assert_allclose((weight * one).sum(axis=1), on_grid[:, 0], rtol=0.0, atol=2e-12)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.05])
+def test_derivatives_in_thickness(loss: float, rng: np.random.Generator) -> None:
+    """Central differences of fourth order, whose own error is 1e-9 here."""
+    response, weight = random_response(rng, 0.4, loss)
+    step, count = 2e-4, 400
+    values = response.averaged_on_grid(weight, 6.0, step, count)
+    for order, of in ((1, values), (2, response.averaged_derivative_on_grid(weight, 6.0, step, count))):
+        numeric = (of[:, :-4] - 8 * of[:, 1:-3] + 8 * of[:, 3:-1] - of[:, 4:]) / (12 * step)
+        exact = response.averaged_derivative_on_grid(weight, 6.0, step, count, order)[:, 2:-2]
+        assert np.abs(numeric - exact).max() < 2e-8 * np.abs(exact).max()
+    thickness = 6.0 + step * np.arange(count)
+    first = response.averaged_derivative_on_grid(weight, 6.0, step, count)
+    np.testing.assert_allclose(response.averaged_derivative(weight, thickness), first, rtol=0.0, atol=1e-9)
+    at_nodes = response.thickness_derivative(thickness[5])
+    np.testing.assert_allclose((weight * at_nodes).sum(axis=1), first[:, 5], rtol=0.0, atol=1e-9)
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    system = OpticalSystem(
+        LayerStack.from_resource("e2v_ccd250"), 153.0, GaussianProfile(1.0), Beam.cone(1.234, 0.6, 16)
+    )
+    light = Illumination.spectrum(np.linspace(950.0, 1000.0, 20), np.ones(20), system.beam)
+    reduced = system.reduce(light)
+    many = numba.get_num_threads()
+    seen = set()
+    for threads in (1, many):
+        numba.set_num_threads(threads)
+        seen.add(
+            (
+                reduced.averaged_on_grid(light.weight, 14.0, 0.01, 800).tobytes(),
+                reduced.averaged_on_grid(light.weight, 14.0, 0.01, 80).tobytes(),
+                reduced.averaged(light.weight, np.linspace(14.0, 15.0, 50)).tobytes(),
+            )
+        )
+    numba.set_num_threads(many)
+    assert len(seen) == 1
+
+
+def test_total_is_one_minus_reflected_and_transmitted() -> None:
+    stack = LayerStack.from_resource("e2v_ccd250")
+    system = OpticalSystem(stack, 183.0, GaussianProfile(1.0), Beam.collimated(), observable="total")
+    light = Illumination.spectrum([960.0], [1.0], Beam.collimated())
+    total = system.reduce(light).averaged(light.weight, 14.0)
+    fractions = layer_absorption(stack.indices(960.0, 183.0), stack.thickness_um, 0.96)
+    assert float(total[0]) == pytest.approx(1.0 - fractions[0] - fractions[-1], abs=1e-12)
+
+
+def test_bad_arguments_are_refused(rng: np.random.Generator) -> None:
+    response, weight = random_response(rng, 0.3, 0.0)
+    for thickness in (-0.1, np.nan, np.inf):
+        with pytest.raises(OutOfRangeError, match="thickness"):
+            response.averaged(weight, thickness)
+    with pytest.raises(InputError, match="weights"):
+        response.averaged(weight[:, :4], 5.0)
+    with pytest.raises(InputError, match="grid"):
+        response.averaged_on_grid(weight, 5.0, 0.1, 0)
+    with pytest.raises(OutOfRangeError, match="thickness"):
+        response.averaged_on_grid(weight, -5.0, 0.1, 10)
+    with pytest.raises(InputError, match="derivative"):
+        response.averaged_derivative_on_grid(weight, 5.0, 0.1, 10, 0)
+    n, d = np.array([1.0, 1.6, 3.6]), np.array([0.0, 1.0, 0.0])
+    for varying, layers in ((0, [1]), (2, [1]), (1, [0]), (1, [2])):
+        with pytest.raises(InputError, match="layer"):
+            reduce_to_phase(n, d, 0.9, varying=varying, layers=layers)
+    with pytest.raises(InputError, match="polarization"):
+        reduce_to_phase(n, d, 0.9, 0.0, "circular", varying=1, layers=[1])
