@@ -260,6 +260,15 @@ class FringeModel:
         illumination = self.system.flat_fields(wavelength_nm)
         return self.system.reduce(illumination).averaged_derivative(illumination.weight, thickness_um)
 
+    def fringe_order_um(self, wavelength_nm: ArrayLike) -> FloatArray:
+        """Thickness of one fringe order at normal incidence, λ / 2n of the varying layer [µm].
+
+        Eq. 3 of the paper with cos θ in the denominator and θ = 0.
+        """
+        wavelength = np.asarray(wavelength_nm, dtype=float)
+        medium = self.system.stack.layers[self.system.stack.position(self.system.varying)].medium
+        return 0.5e-3 * wavelength / medium.index(wavelength, self.system.temperature_k).real
+
     def quadrature_error(self, wavelength_nm: ArrayLike, thickness_um: ArrayLike) -> float:
         """Largest change of the response when the wavelength nodes are twice as dense."""
         coarse = self.system.flat_fields(wavelength_nm)

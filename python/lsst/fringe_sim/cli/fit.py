@@ -1,0 +1,191 @@
+"""``fringe-sim fit``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from ..algorithms.flat_prep_options import FlatPrepOptions
+from ..algorithms.thickness_fit import FIT_METHODS, fit_thickness
+from ..errors import InputError
+from ..model import FringeModel, Setup
+from ..products import FringeCube, ThicknessMap
+from ..report.figures import flats_figure, phase_figure, thickness_figure
+from ..report.page import Report
+from .inputs import prepare_folder, read_settings
+from .lab_frames import find_series, read_cube
+from .parameters import EFFECT, effect_settings
+from .progress import progress
+
+__all__ = ["fit", "phase_folded"]
+
+LEAST_WAVELENGTHS = 4
+"""Below this the order of the fringe cannot be told."""
+
+PHASE_BINS = 32
+
+SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
+"""Smoothing of the flats [px]. It lowers the contrast where fringes are dense, so `global` does without."""
+
+
+@click.command()
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...")
+@click.option("--setup", default="ts8_e2v", show_default=True, help="Laboratory set-up.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for map, figures, report."
+)
+@click.option("--method", type=click.Choice(FIT_METHODS), default="global", show_default=True)
+@click.option(
+    "--smoothing",
+    type=click.FloatRange(0.0, 100.0),
+    default=None,
+    help="Gaussian smoothing of the flats, σ [px]; 0 for 'global', which needs none, and 3 for 'guo2022'.",
+)
+@click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
+@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
+@click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
+def fit(
+    paths: tuple[str, ...],
+    setup: str,
+    out: Path,
+    method: str,
+    smoothing: float | None,
+    effects: tuple[tuple[str, float], ...],
+    effects_file: Path | None,
+    skip_bad: bool,
+    dry_run: bool,
+) -> None:
+    """Fit the layer thickness of one sensor to raw flats (files, folders, patterns) or to a fringe cube.
+
+    \b
+    Examples:
+      fringe-sim fit raws --setup ts8_e2v --out fit
+      fringe-sim fit 'raws/*flat*.fits' 'raws/*bias*.fits' --method guo2022 --out fit_guo
+    """
+    chosen = Setup.from_name(setup)
+    if chosen.kind != "monochromator":
+        raise InputError("set-up", setup, "a laboratory set-up with a monochromator")
+    settings = dict(read_settings(effects_file)) if effects_file else {}
+    settings.update(effect_settings(effects))
+    model = FringeModel.from_setup(chosen, settings)
+    cube = read_cube(paths[0]) if len(paths) == 1 else None
+    if cube is None:
+        kernel_px = SMOOTHING_PX[method] if smoothing is None else smoothing
+        cube = _prepare(paths, chosen, kernel_px, skip_bad, dry_run)
+    if dry_run:
+        return
+    if cube is None or len(np.unique(cube.wavelength_nm)) < LEAST_WAVELENGTHS:
+        found = 0 if cube is None else len(np.unique(cube.wavelength_nm))
+        raise InputError("number of wavelengths", found, f"{LEAST_WAVELENGTHS} or more")
+    folder = prepare_folder(out)
+    click.echo("fitting the thickness", err=True)
+    fitted = fit_thickness(cube, model, method)
+    fitted.write_fits(folder / "thickness.fits", {"SETUP": setup, **_effect_cards(model)})
+    write_report(folder, cube, fitted, model, method)
+    good = fitted.mask == 0
+    if good.any():
+        low, high = np.percentile(fitted.value[good], [1.0, 99.0])
+        click.echo(
+            f"{fitted.layer}: {low:.3f} to {high:.3f} µm (1–99 %), median σ "
+            f"{1e3 * np.median(fitted.sigma[good]):.2f} nm, {100 * (1 - good.mean()):.2f} % of the pixels masked"
+        )
+    for name in ("thickness.fits", "report.html"):
+        click.echo(str(folder / name))
+
+
+def _prepare(
+    paths: tuple[str, ...], setup: Setup, smoothing: float, skip_bad: bool, dry_run: bool
+) -> FringeCube | None:
+    series = find_series(paths, skip_bad=skip_bad)
+    found = ", ".join(f"{w:g}" for w in series.wavelengths_nm)
+    click.echo(
+        f"{series.serial or 'sensor'}: {len(series.biases)} bias frames, {len(series.flats)} flats at {found} nm",
+        err=True,
+    )
+    missing = series.missing_nm(setup)
+    if missing:
+        listed = ", ".join(f"{w:g}" for w in missing)
+        click.echo(f"no flats at {listed} nm; the fit is less certain without them", err=True)
+    if len(series.wavelengths_nm) < LEAST_WAVELENGTHS:
+        raise InputError("number of wavelengths", len(series.wavelengths_nm), f"{LEAST_WAVELENGTHS} or more")
+    if dry_run:
+        click.echo(f"would prepare {series.steps} frames and fit the layer {setup.varying}")
+        return None
+    with progress("preparing frames", series.steps) as advance:
+        return series.read(setup, FlatPrepOptions(smoothing_sigma_px=smoothing), advance)
+
+
+def write_report(
+    folder: Path, cube: FringeCube, fitted: ThicknessMap, model: FringeModel, method: str
+) -> Path:
+    """One page with the map, the flats and the comparison of both."""
+    wavelength = [float(w) for w in cube.wavelength_nm]
+    report = Report(
+        f"Thickness of {fitted.layer}, {fitted.detector or 'one sensor'}",
+        f"Set-up {model.setup.name}, method {method}, {len(wavelength)} flats.",
+    )
+    order_um = float(model.fringe_order_um(960.0))
+    report.section("Thickness", "One contour is one fringe order at 960 nm.")
+    report.figure(
+        thickness_figure(fitted, order_um), "Fitted thickness, its uncertainty, and the chance of a slip."
+    )
+    report.section("Flats", "Counts over their mean, minus one.")
+    report.figure(
+        flats_figure(relative(cube), cube.mask, wavelength, title="prepared flats"), "All flats on one scale."
+    )
+    report.section(
+        "Data and model", "Folded on the fitted thickness, modulo one fringe order of each wavelength."
+    )
+    phase, data, modelled = phase_folded(cube, fitted, model)
+    report.figure(
+        phase_figure(phase, data, modelled, wavelength), "Mean of all pixels of equal fringe phase."
+    )
+    return report.write(folder / "report.html")
+
+
+def relative(cube: FringeCube) -> NDArray[np.float64]:
+    """Counts over mean, minus one, whatever the unit of the cube."""
+    image = np.where(cube.mask == 0, np.asarray(cube.image, dtype=float), np.nan)
+    mean = np.nanmean(image, axis=(1, 2), keepdims=True)
+    return image / mean - 1.0
+
+
+def phase_folded(
+    cube: FringeCube, fitted: ThicknessMap, model: FringeModel
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Mean amplitude of data and model in bins of fringe phase; shapes ``(B,)``, ``(W, B)``, ``(W, B)``."""
+    good = (fitted.mask == 0) & (cube.mask == 0).all(axis=0)
+    thickness = np.asarray(fitted.value, dtype=float)[good]
+    if thickness.size == 0:
+        empty = np.full((len(cube.wavelength_nm), PHASE_BINS), np.nan)
+        return (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS, empty, empty
+    low = float(thickness.min())
+    step = 1e-3
+    count = int(np.ceil((float(thickness.max()) - low) / step)) + 2
+    table = model.response_on_grid(cube.wavelength_nm, low, step, count)
+    place = (thickness - low) / step
+    index = np.minimum(place.astype(int), count - 2)
+    fraction = place - index
+    data = relative(cube)
+    measured = np.empty((len(table), PHASE_BINS))
+    modelled = np.empty_like(measured)
+    orders = model.fringe_order_um(cube.wavelength_nm)
+    for row, (values, order_um) in enumerate(zip(table, orders, strict=True)):
+        bins = np.minimum(((thickness / order_um) % 1.0 * PHASE_BINS).astype(int), PHASE_BINS - 1)
+        weight = np.maximum(np.bincount(bins, minlength=PHASE_BINS), 1)
+        predicted = values[index] * (1.0 - fraction) + values[index + 1] * fraction
+        predicted = predicted / predicted.mean() - 1.0
+        measured[row] = np.bincount(bins, data[row][good], PHASE_BINS) / weight
+        modelled[row] = np.bincount(bins, predicted, PHASE_BINS) / weight
+    return (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS, measured, modelled
+
+
+def _effect_cards(model: FringeModel) -> dict[str, object]:
+    cards: dict[str, object] = {}
+    for number, (name, value) in enumerate(sorted(model.effect_settings.items())):
+        cards[f"EFFECT{number}"], cards[f"EFFVAL{number}"] = name, value
+    return cards

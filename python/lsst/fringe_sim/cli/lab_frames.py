@@ -1,0 +1,171 @@
+"""From raw laboratory frames, a fringe cube or a Butler repository to one `FringeCube` of one sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from astropy.io import fits
+
+from ..algorithms.flat_prep import combine_biases, prepare_flat
+from ..algorithms.flat_prep_options import FlatPrepOptions
+from ..errors import FrameFormatError, FringeSimError, InputError
+from ..instrument.camera import Camera, Detector
+from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
+from ..middleware.raw_ingest import find_raw_files
+from ..model import Setup
+from ..products import FringeCube
+
+__all__ = ["LabSeries", "find_series", "read_cube"]
+
+LEAST_SIZE = (16, 64)
+"""Rows and columns below which a frame is no sensor."""
+
+
+@dataclass(frozen=True)
+class LabSeries:
+    """Bias frames and flats of one sensor.
+
+    Attributes
+    ----------
+    serial : `str`
+        Serial number of the sensor.
+    biases, flats : `tuple` [`RawMetadata`, ...]
+        What the headers say; ``source`` of each is the file.
+    """
+
+    serial: str
+    biases: tuple[RawMetadata, ...]
+    flats: tuple[RawMetadata, ...]
+
+    @property
+    def wavelengths_nm(self) -> tuple[float, ...]:
+        """Different wavelengths of the flats [nm], sorted."""
+        return tuple(sorted({flat.require_wavelength_nm() for flat in self.flats}))
+
+    @property
+    def steps(self) -> int:
+        """Number of frames that are read."""
+        return len(self.biases) + len(self.flats)
+
+    def missing_nm(self, setup: Setup, tolerance_nm: float = 1.0) -> tuple[float, ...]:
+        """Usual wavelengths of a set-up of which there is no flat [nm]."""
+        found = np.array(self.wavelengths_nm)
+        return tuple(w for w in setup.wavelengths_nm if np.abs(found - w).min() > tolerance_nm)
+
+    def read(self, setup: Setup, options: FlatPrepOptions, advance: Callable[[], None]) -> FringeCube:
+        """Prepare all frames, one at a time.
+
+        Parameters
+        ----------
+        setup : `Setup`
+            Decides the bandpass and the focal ratio where the headers do not.
+        options : `FlatPrepOptions`
+            Choices of the preparation.
+        advance : callable
+            Called after each frame.
+        """
+
+        def frames(several: Sequence[RawMetadata]) -> Any:
+            for one in several:
+                yield RawFrame.read(one.source)
+                advance()
+
+        bias = combine_biases(frames(self.biases), options) if self.biases else None
+        sensor = self._sensor(setup)
+        flats = (
+            prepare_flat(
+                frame,
+                bias,
+                sensor.cut_down(frame.detector_shape),
+                bandwidth_fwhm_nm=setup.bandwidth_fwhm_nm,
+                f_number=setup.f_number,
+                options=options,
+            )
+            for frame in frames(self.flats)
+        )
+        return FringeCube.from_flats(flats, number=len(self.flats))
+
+    def _sensor(self, setup: Setup) -> Detector:
+        camera = Camera.from_name(setup.camera)
+        try:
+            return camera.detector(self.serial)
+        except FringeSimError:
+            # A sensor that is not in the tables is read with the gains of the set-up's own.
+            return replace(camera.detector(setup.detector), serial="", name=self.serial or setup.detector)
+
+
+def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
+    """Bias frames and flats among files, folders and patterns.
+
+    Parameters
+    ----------
+    paths : sequence of `str`
+        What the user names.
+    skip_bad : `bool`, optional
+        Report files that cannot be read and go on without them.
+
+    Returns
+    -------
+    series : `LabSeries`
+
+    Raises
+    ------
+    FrameFormatError
+        A file that is not a raw frame (all such files are reported first).
+    InputError
+        Nothing there, no flats, or frames of more than one sensor.
+    """
+    files, refused = find_raw_files(paths)
+    frames: list[RawMetadata] = []
+    bad: list[FringeSimError] = []
+    for file in files:
+        try:
+            frames.append(_readable(file))
+        except FringeSimError as error:
+            bad.append(error)
+    for message in [*refused, *(str(error) for error in bad)]:
+        click.echo(f"refused: {message}", err=True)
+    if refused and not frames:
+        raise InputError("paths", " ".join(paths), "raw frames, or folders that hold some")
+    if (bad or refused) and not skip_bad:
+        raise FrameFormatError(
+            "raw frames", f"{len(bad) + len(refused)} unusable", "complete raw frames, or --skip-bad to go on"
+        )
+    flats = [frame for frame in frames if frame.observation_type == "flat"]
+    if not flats:
+        kinds = ", ".join(sorted({frame.observation_type for frame in frames})) or "no frame"
+        raise InputError("flats", kinds, "one flat or more (IMGTYPE FLAT)", source=" ".join(paths))
+    serials = sorted({frame.serial or f"{frame.raft}_{frame.slot}" for frame in flats})
+    if len(serials) > 1:
+        raise InputError("sensors", ", ".join(serials), "frames of one sensor", source=" ".join(paths))
+    flats.sort(key=lambda frame: (frame.require_wavelength_nm(), frame.exposure_id))
+    biases = [
+        frame for frame in frames if frame.observation_type == "bias" and frame.serial == flats[0].serial
+    ]
+    return LabSeries(flats[0].serial, tuple(biases), tuple(flats))
+
+
+def read_cube(path: str) -> FringeCube | None:
+    """The fringe cube in a file, or `None` if the path is something else."""
+    if not Path(path).is_file():
+        return None
+    try:
+        with fits.open(path, memmap=False) as hdus:
+            if "EXPOSURES" not in hdus or "IMAGE" not in hdus:
+                return None
+    except OSError as error:
+        raise FrameFormatError("file", str(error), "a complete FITS file", source=path) from None
+    return FringeCube.read_fits(path)
+
+
+def _readable(file: str) -> RawMetadata:
+    metadata = read_raw_metadata(file)
+    if metadata.observation_type == "flat":
+        metadata.require_wavelength_nm()
+        metadata.require_temperature_k()
+    return metadata
