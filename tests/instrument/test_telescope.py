@@ -19,6 +19,7 @@ from lsst.fringe_sim.instrument.telescope import (
     TracedOptics,
     beam_error,
     gauss_rule,
+    reduce_beam,
     telescope_beam,
 )
 from lsst.fringe_sim.optics import Beam
@@ -92,9 +93,20 @@ def test_mirror_and_rotation_stand_for_a_full_trace():
 
 @pytest.mark.parametrize("field_deg", [0.0, 0.9, 1.44, 1.75])
 @pytest.mark.parametrize(("index", "thickness_um"), [(1.6, 14.0), (1.6, 30.0), (3.6, 100.0), (3.6, 265.0)])
-def test_sixty_four_angles_stand_for_all_rays(lsst, field_deg, index, thickness_um):
+def test_few_angles_stand_for_all_rays(lsst, field_deg, index, thickness_um):
     rays = lsst.trace(field_deg)
     assert beam_error(rays.beam(), rays.sin_squared, index, thickness_um, 1000.0) < 2e-5
+
+
+def test_reduced_beam_keeps_the_moments(lsst):
+    full = lsst.beam(0.9)
+    small = reduce_beam(full, 12)
+    assert small.theta.size == 12
+    for power in range(24):
+        moments = [(beam.weight @ np.sin(beam.theta) ** (2 * power)) for beam in (small, full)]
+        assert moments[0] == pytest.approx(moments[1], rel=1e-9)
+    assert reduce_beam(small, 12) is small
+    assert reduce_beam(Beam.collimated(0.1), 4).theta.size == 1
 
 
 def test_beam_is_a_distribution(lsst):
