@@ -1,0 +1,193 @@
+"""What the demo leaves in its repository, and the page that shows it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units
+from astropy.table import Table
+
+from lsst.daf.butler import Butler
+
+from ..algorithms.single_pixel import fit_single_pixel, published_pixel
+from ..model import FringeModel
+from ..products import FringeComponents, FringeCube, FringeFrame, SkyFringe, ThicknessMap
+from ..report.figures import (
+    components_figure,
+    flats_figure,
+    phase_figure,
+    single_pixel_figure,
+    sky_figure,
+    template_figure,
+    thickness_figure,
+)
+from ..report.page import Report
+from ..report.style import save_figure
+from .fit import phase_folded, relative
+
+__all__ = ["DemoDatasets", "write_demo_report"]
+
+PERCENT = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class DemoDatasets:
+    """Products of the demo with the places of their files."""
+
+    cube: FringeCube
+    thickness: ThicknessMap
+    sky: tuple[SkyFringe, ...]
+    template: FringeFrame
+    components: FringeComponents
+    thickness_path: Path
+    sky_folder: Path
+    template_path: Path
+
+    @classmethod
+    def read(cls, repo: Path, lab: str, sky: str, calib: str) -> DemoDatasets:
+        """Read everything from the repository."""
+        with Butler.from_config(str(repo), collections=[sky, lab, calib]) as butler:
+            flats = _refs(butler, "fringeFlat", lab)
+            frames = sorted(_refs(butler, "skyFringe", sky), key=lambda ref: int(ref.dataId["exposure"]))
+            (thickness,) = _refs(butler, "epoxyThickness", lab)
+            (template,) = _refs(butler, "fringe", sky)
+            (components,) = _refs(butler, "fringeComponents", sky)
+            return cls(
+                cube=FringeCube.from_flats((butler.get(ref) for ref in flats), number=len(flats)),
+                thickness=butler.get(thickness),
+                sky=tuple(butler.get(ref) for ref in frames),
+                template=butler.get(template),
+                components=butler.get(components),
+                thickness_path=_path(butler, thickness),
+                sky_folder=_path(butler, frames[0]).parent,
+                template_path=_path(butler, template),
+            )
+
+
+def write_demo_report(folder: Path, datasets: DemoDatasets) -> None:
+    """Write ``report.html`` and the figures beside it."""
+    report = Report(
+        "Fringing of E2V-CCD250-321",
+        "Raw laboratory flats, thickness of the adhesive, fringes of a night through the LSST optics, templates.",
+    )
+    figures = folder / "figures"
+    figures.mkdir(exist_ok=True)
+
+    def add(name: str, made: Any, caption: str) -> None:
+        save_figure(made, figures / f"{name}.png")
+        report.figure(made, caption)
+
+    model = FringeModel.from_setup("ts8_e2v")
+    wavelength = [float(w) for w in datasets.cube.wavelength_nm]
+    report.section(
+        "Laboratory flats",
+        "Twelve monochromatic flats after overscan, bias and gain, divided by their mean. Contrast grows with "
+        "wavelength as the silicon turns transparent and more light reaches the adhesive behind it.",
+    )
+    gallery = flats_figure(relative(datasets.cube), datasets.cube.mask, wavelength, title="prepared flats")
+    add("flats", gallery, "Fringe amplitude of all flats on one scale.")
+    report.section("Thickness of the adhesive", "One contour is one fringe order at 960 nm, 0.3 µm.")
+    order = float(model.fringe_order_um(960.0))
+    add("thickness", thickness_figure(datasets.thickness, order), "Thickness, uncertainty, chance of a slip.")
+    phase, data, modelled = phase_folded(datasets.cube, datasets.thickness, model)
+    add("phase", phase_figure(phase, data, modelled, wavelength), "Flats and model folded on fringe phase.")
+    _sky_section(report, add, datasets)
+    _pixel_section(report, add, model)
+    _discovery_section(report, folder)
+    report.write(folder / "report.html")
+
+
+def _sky_section(report: Report, add: Any, datasets: DemoDatasets) -> None:
+    report.section(
+        "Night sky",
+        "The y band through the LSST optics at the place of this sensor in the focal plane: OH lines and "
+        "continuum, averaged over the converging beam. Eleven exposures of one night.",
+    )
+    add("sky", sky_figure(datasets.sky), "A sky frame, the distribution over its pixels, and the night.")
+    report.table(_amplitude_table(datasets.sky), "sky_fringe_amplitudes")
+    report.section(
+        "Templates",
+        "Principal components of the night. The template is what the fringe correction of the science pipelines "
+        "reads: the fractional departure from the mean sky.",
+    )
+    add("components", components_figure(datasets.components), "Mean, first components, explained variance.")
+    add("template", template_figure(datasets.template), "The certified fringe frame.")
+
+
+def _amplitude_table(frames: tuple[SkyFringe, ...]) -> Table:
+    rows = []
+    for frame in frames:
+        image = np.asarray(frame.image, dtype=float)[frame.mask == 0]
+        values = PERCENT * (image if frame.unit == "fraction" else image / frame.mean_electrons - 1.0)
+        low, high = np.percentile(values, [1.0, 99.0])
+        rows.append(
+            (frame.hour, frame.mean_electrons, values.std(), 0.5 * np.ptp(values), 0.5 * (high - low))
+        )
+    hour, level, rms, half, trimmed = (np.array(column) for column in zip(*rows, strict=True))
+    table = Table()
+    table["local time"] = hour * units.hour
+    table["sky"] = np.round(level, 1) * units.electron
+    table["rms"] = np.round(rms, 4) * units.percent
+    table["half peak to peak"] = np.round(half, 4) * units.percent
+    table["half range 1-99"] = np.round(trimmed, 4) * units.percent
+    return table
+
+
+def _pixel_section(report: Report, add: Any, model: FringeModel) -> None:
+    wavelength, amplitude = published_pixel()
+    total = FringeModel.from_setup("ts8_e2v", observable="total")
+    fits = [
+        ("detection layer, one offset", fit_single_pixel(wavelength, amplitude, model, free_offset=True)),
+        ("1 − R − T, as published", fit_single_pixel(wavelength, amplitude, total)),
+        (
+            "detection layer, contrast and offset free",
+            fit_single_pixel(wavelength, amplitude, model, free_contrast=True, free_offset=True),
+        ),
+    ]
+    damped = fits[-1][1]
+    report.section(
+        "One measured pixel",
+        "The only public laboratory numbers of such a sensor: twelve flats at one pixel of E2V-CCD250-321 (Guo, "
+        "Walter, Lage & Lupton 2022, Fig. 4). With the observable that the paper's text names, the light absorbed "
+        f"in the detection layer, the model has {1.0 / damped.contrast:.1f} times the measured contrast; with "
+        f"one contrast factor ({damped.contrast:.2f}) and one offset it follows the data to "
+        f"{PERCENT * damped.rms:.2f} %. What lowers the contrast in the laboratory is not known.",
+    )
+    add(
+        "pixel",
+        single_pixel_figure(wavelength, amplitude, fits),
+        "Measured points, three fits, all thicknesses.",
+    )
+
+
+def _discovery_section(report: Report, folder: Path) -> None:
+    path = folder / "discovery" / "discovery.json"
+    if not path.is_file():
+        return
+    verdict = json.loads(path.read_text(encoding="utf-8"))
+    gap = verdict.get("gap", {})
+    words = {
+        "no_discrepancy": "The flats agree with the model within their noise: no effect is missing.",
+        "named": "An effect is missing: "
+        + ", ".join(f"{item['name']} (probability {item['probability']:.2f})" for item in verdict["effects"]),
+        "unexplained": "The flats disagree with the model in a way that no known effect explains.",
+    }
+    report.section("Search for a missing effect", words[verdict["verdict"]])
+    if gap:
+        rows = [(key, value) for key, value in gap.items() if isinstance(value, int | float)]
+        report.table(
+            Table(rows=rows, names=["gap between data and model", "value"]) if rows else Table(),
+            "discovery_gap",
+        )
+
+
+def _refs(butler: Butler, name: str, collection: str) -> list[Any]:
+    return list(butler.query_datasets(name, collections=collection, find_first=True, limit=None))
+
+
+def _path(butler: Butler, ref: Any) -> Path:
+    return Path(butler.getURI(ref).ospath)
