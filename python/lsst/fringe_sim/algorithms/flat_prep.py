@@ -44,6 +44,9 @@ Mask = NDArray[np.int32]
 ADC_MAXIMUM = 2**18 - 1
 """Largest number of the 18-bit converters [ADU]; a pixel there has lost its value."""
 
+MINIMUM_SIGNAL = 5.0
+"""Least median signal of a flat, in units of its read noise."""
+
 DEAD_AMPLIFIER = 0.1
 """An amplifier with less than this part of the median signal of its sensor is taken as dead."""
 
@@ -236,14 +239,14 @@ def assemble_charge(
     missing = (mask & mask_bits("NO_DATA")) != 0
     image[missing] = 0.0
     variance[missing] = 0.0
-    _mask_dead_amplifiers(frame, image, mask)
+    _mask_dead_amplifiers(frame, image, mask, max(read_noise.values(), default=0.0))
     mask[isolated_defects(image, variance, mask == 0, options)] |= mask_bits("BAD")
     mask |= _border(image.shape, options)
     _mask_bad_columns(frame, image, mask, options)
     return PreparedCharge(image, variance, mask, read_noise)
 
 
-def _mask_dead_amplifiers(frame: RawFrame, image: Image, mask: Mask) -> None:
+def _mask_dead_amplifiers(frame: RawFrame, image: Image, mask: Mask, read_noise_e: float) -> None:
     """Set BAD where an amplifier reads out but sees next to nothing of the light that its neighbours see."""
     medians: dict[str, float] = {}
     for amp in frame.amplifiers:
@@ -251,8 +254,9 @@ def _mask_dead_amplifiers(frame: RawFrame, image: Image, mask: Mask) -> None:
         if usable.any():
             medians[amp.name] = float(np.median(image[amp.destination][::4, ::4][usable]))
     level = max(medians.values(), default=0.0)
-    if not level > 0.0:
-        raise InputError("signal [electrons]", level, "a flat with light", source=frame.metadata.source)
+    if not level > MINIMUM_SIGNAL * read_noise_e:
+        least = f"a flat with light, above {MINIMUM_SIGNAL * read_noise_e:.0f}"
+        raise InputError("signal [electrons]", round(level, 1), least, source=frame.metadata.source)
     typical = float(np.median([value for value in medians.values() if value > DEAD_AMPLIFIER * level]))
     for amp in frame.amplifiers:
         if amp.name in medians and medians[amp.name] < DEAD_AMPLIFIER * typical:
@@ -275,9 +279,10 @@ def _mask_bad_columns(frame: RawFrame, image: Image, mask: Mask, options: FlatPr
     """Set BAD in columns of one row of amplifiers whose mean does not continue that of the columns beside it."""
     starts = sorted({(amp.destination[0].start, amp.destination[0].stop) for amp in frame.amplifiers})
     for start, stop in starts:
-        rows = slice(start, stop)
-        bad = bad_columns(*column_means(image[rows], mask[rows]), options)
-        mask[rows, bad] |= mask_bits("BAD")
+        # Single hot pixels are found before, but not in the outermost rows.
+        inner = slice(start + 1, stop - 1)
+        bad = bad_columns(*column_means(image[inner], mask[inner]), options)
+        mask[start:stop, bad] |= mask_bits("BAD")
 
 
 # The whole ------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ class OverscanCorrected:
     level_adu : `float`
         Median level that was taken off [ADU].
     noise_adu : `float`
-        Robust standard deviation of the overscan pixels: the read noise [ADU].
+        Standard deviation of the overscan pixels about their rows, without outliers: the read noise [ADU].
     """
 
     image: Image
@@ -87,7 +87,10 @@ def _row_level(serial: Image, imaging_rows: slice, options: FlatPrepOptions) -> 
     """Level of every row, and the noise of one pixel about it [ADU]."""
     median = np.median(serial, axis=1)
     departure = serial - median[:, np.newaxis]
-    noise = GAUSSIAN_MAD * float(np.median(np.abs(departure)))
+    # The median deviation of integers is coarse, so it only decides what is an outlier.
+    rough = max(GAUSSIAN_MAD * float(np.median(np.abs(departure))), 1.0)
+    inside = np.abs(departure) <= options.clip_sigma * rough
+    noise = math.sqrt(float(np.mean(departure * departure, where=inside, dtype=np.float64)))
     noise = max(noise, 1.0 / math.sqrt(12.0))  # an integer is never known better than this
     if options.overscan_method == "median":
         return median, noise

@@ -41,7 +41,8 @@ def _find_isolated(
 ) -> None:  # pragma: no cover - compiled
     ny, nx = image.shape
     for line in numba.prange(ny - 2):
-        y = int(np.int64(line)) + 1  # the parallel index is unsigned; the outermost ring has too few neighbours
+        # The parallel index is unsigned; the outermost ring has too few neighbours.
+        y = int(np.int64(line)) + 1
         for x in range(1, nx - 1):
             # A cheap necessary condition first: beyond one of the two neighbours along x and along y.
             value = image[y, x]

@@ -233,6 +233,10 @@ def _roughness(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     return replace(optics, rough_face="support", roughness_nm=values["sigma"])
 
 
+def _thickness_spread(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(optics, spread_nm=values["sigma"])
+
+
 def _converging_beam(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     aperture = values["numerical_aperture"]
     if aperture == 0.0:
@@ -397,6 +401,12 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
         "interface roughness",
         (HiddenParameter("sigma", "nm", 0.0, (0.0, 300.0), "rms height of the support surface"),),
         on_optics=_roughness,
+    ),
+    HiddenEffect(
+        "thickness_spread",
+        "thickness variation inside a pixel",
+        (HiddenParameter("sigma", "nm", 0.0, (0.0, 300.0), "rms variation of the layer that varies"),),
+        on_optics=_thickness_spread,
     ),
     HiddenEffect(
         "converging_beam",

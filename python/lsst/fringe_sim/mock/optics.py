@@ -49,10 +49,10 @@ LINE_REACH = 6.0
 """Half width of the sampled Gaussian line in standard deviations; 2e-9 of the light is left out."""
 
 HEIGHT_STEP_NM = 25.0
-"""Largest spacing of the heights of a rough face [nm]: a fifth of a fringe in silicon."""
+"""Largest spacing of the thicknesses inside a pixel [nm]: a fifth of a fringe in silicon."""
 
 HEIGHT_REACH = 5.0
-"""Largest height of a rough face in standard deviations."""
+"""Largest departure of the thickness inside a pixel in standard deviations."""
 
 RELATIVE_TOLERANCE = 1e-5
 """Largest error of a table that is accepted, relative to its mean: 1/700 of the noise of a 20 000 e⁻ pixel."""
@@ -119,10 +119,11 @@ class FlatFieldOptics:
     rough_face : `str`
         Layer whose upper face is rough.
     roughness_nm : `float`
-        Rms height of that face [nm], on a lateral scale below a pixel and above a wavelength, so that a pixel
-        sees the average over thickness.
+        Rms height of that face [nm], on a lateral scale so short that light which is not specular is lost.
+    spread_nm : `float`
+        Rms variation of the varying layer inside a pixel [nm], slow enough for every part to be plane.
     line_step_nm, height_step_nm : `float`
-        Largest spacing of the nodes over wavelength and over the height of the rough face [nm].
+        Largest spacing of the nodes over wavelength and over the thicknesses inside a pixel [nm].
 
     Raises
     ------
@@ -146,6 +147,7 @@ class FlatFieldOptics:
     detection: str = "detection"
     rough_face: str = "support"
     roughness_nm: float = 0.0
+    spread_nm: float = 0.0
     line_step_nm: float = LINE_STEP_NM
     height_step_nm: float = HEIGHT_STEP_NM
 
@@ -158,8 +160,11 @@ class FlatFieldOptics:
         for name in ("line_step_nm", "height_step_nm"):
             if not getattr(self, name) > 0:
                 raise OutOfRangeError(name, getattr(self, name), "a positive number")
-        if not self.roughness_nm >= 0:
-            raise OutOfRangeError("roughness [nm]", self.roughness_nm, "zero or a positive number")
+        for name in ("roughness_nm", "spread_nm"):
+            if not getattr(self, name) >= 0:
+                raise OutOfRangeError(name, getattr(self, name), "zero or a positive number")
+        if self.position(self.rough_face) == 0:
+            raise UnknownNameError("rough face", self.rough_face, [film.name for film in self.films[1:]])
         if self.line_shape not in _LINE_SHAPES:
             raise UnknownNameError("line shape", self.line_shape, _LINE_SHAPES)
         if len(self.theta) != len(self.theta_weight) or not math.isclose(sum(self.theta_weight), 1.0):
@@ -192,7 +197,7 @@ class FlatFieldOptics:
     def absorbed_fraction(
         self, thickness_um: ArrayLike, wavelength_nm: float, theta: float = 0.0, polarization: str = "mixed"
     ) -> FloatArray:
-        """Fraction of strictly monochromatic light absorbed in the detection layer, all faces smooth.
+        """Fraction of strictly monochromatic light absorbed in the detection layer where it is plane.
 
         Parameters
         ----------
@@ -222,7 +227,7 @@ class FlatFieldOptics:
         return total
 
     def flat_field(self, thickness_um: ArrayLike, wavelength_nm: float) -> FloatArray:
-        """Detected fraction of the light of one flat: averaged over line, angles, polarisation and roughness.
+        """Detected fraction of the light of one flat: averaged over line, angles, polarisation and pixel.
 
         Parameters
         ----------
@@ -297,15 +302,15 @@ class FlatFieldOptics:
         return worst
 
     def _modes(self) -> Iterator[tuple[float, float, bool, float]]:
-        """Weight, angle [rad], s-wave or not, and height of the rough face [µm]."""
+        """Weight, angle [rad], s-wave or not, and departure of the varying layer from its mean [µm]."""
         heights = [(0.0, 1.0)]
-        if self.roughness_nm > 0.0:
+        if self.spread_nm > 0.0:
             # Equidistant nodes converge exponentially under a Gaussian.
-            count = max(12, math.ceil(HEIGHT_REACH * self.roughness_nm / self.height_step_nm))
+            count = max(12, math.ceil(HEIGHT_REACH * self.spread_nm / self.height_step_nm))
             node = np.linspace(-HEIGHT_REACH, HEIGHT_REACH, 2 * count + 1)
             node_weight = np.exp(-0.5 * node * node)
             node_weight /= node_weight.sum()
-            heights = list(zip(1e-3 * self.roughness_nm * node, node_weight, strict=True))
+            heights = list(zip(1e-3 * self.spread_nm * node, node_weight, strict=True))
         for height_um, height_weight in heights:
             for theta, theta_weight in zip(self.theta, self.theta_weight, strict=True):
                 weight = float(height_weight * theta_weight)
@@ -460,7 +465,7 @@ class _Light:
     top_below: ComplexArray  # (Q, 2)
     low_above: ComplexArray  # (Q, 2, 2)
     low_below: ComplexArray  # (Q, 2)
-    extra_um: float  # thickness that a rough face adds to the varying film
+    extra_um: float  # departure of the varying film from its mean thickness
 
 
 def _light(
@@ -471,7 +476,7 @@ def _light(
     s_wave: bool,
     height_um: float,
 ) -> _Light:
-    thickness = _shifted_thickness(optics, height_um)
+    thickness = [film.thickness_um for film in optics.films]
     wave_number = 2.0 * np.pi / (1e-3 * wavelength_nm)  # rad/µm
     index = np.stack([film.index(wavelength_nm, optics.temperature_k) for film in optics.films])
     along = index[0].real * math.sin(theta)
@@ -480,11 +485,22 @@ def _light(
     last = len(optics.films) - 1
     v, d = optics.position(optics.varying), optics.position(optics.detection)
 
+    smooth = np.broadcast_to(np.eye(2, dtype=complex), (len(wavelength_nm), 2, 2))
+    rough = optics.position(optics.rough_face) if optics.roughness_nm > 0.0 else -1
+
+    def into(film: int) -> ComplexArray:
+        """Matrix from the upper face of a film, inside it, to the lower face of the film above it."""
+        if film != rough:
+            return smooth  # tangential fields are continuous
+        height = 1e-3 * optics.roughness_nm * wave_number
+        return _rough_face(admittance[[film - 1, film]], normal[[film - 1, film]] * height)
+
     def through(first: int, stop: int) -> ComplexArray:
-        """Matrix from the lower face of film ``stop - 1`` to the upper face of film ``first``, scaled."""
-        product = np.broadcast_to(np.eye(2, dtype=complex), (len(wavelength_nm), 2, 2))
+        """Matrix from the upper face of film ``stop`` to the upper face of film ``first``, scaled."""
+        product = smooth
         for j in range(first, stop):
-            product = product @ _film_matrix(admittance[j], wave_number * normal[j] * thickness[j])
+            film = _film_matrix(admittance[j], wave_number * normal[j] * thickness[j])
+            product = product @ film @ into(j + 1)
         return product
 
     def decay(first: int, stop: int) -> ComplexArray:
@@ -495,44 +511,33 @@ def _light(
         return np.exp(exponent)
 
     substrate = np.stack([np.ones(len(wavelength_nm)), admittance[last]], axis=1)
-    bottom = np.einsum("qij,qj->qi", through(v + 1, last), substrate)
     none_matrix = np.zeros((len(wavelength_nm), 2, 2), dtype=complex)
     none_vector = np.zeros((len(wavelength_nm), 2), dtype=complex)
 
-    def face(above_film: int) -> tuple[ComplexArray, ComplexArray]:
-        """Fields at the upper face of a film, from the upper and from the lower face of the varying one."""
-        if above_film <= v:
-            scale = decay(1, above_film)[:, np.newaxis, np.newaxis]
-            return scale * through(above_film, v), none_vector
-        below = np.einsum("qij,qj->qi", through(above_film, last), substrate)
-        below = below * (decay(1, v) * decay(v + 1, above_film))[:, np.newaxis]
-        return none_matrix, below
+    def face(film: int) -> tuple[ComplexArray, ComplexArray]:
+        """Fields at the upper face of a film, from those at the upper and at the lower face of the varying one."""
+        if film <= v:
+            scale = decay(1, film)[:, np.newaxis, np.newaxis]
+            return scale * through(film, v), none_vector
+        below = np.einsum("qij,qj->qi", through(film, last), substrate)
+        return none_matrix, below * (decay(1, v) * decay(v + 1, film))[:, np.newaxis]
 
     top_above, top_below = face(d)
     low_above, low_below = face(d + 1)
+    low_above, low_below = into(d + 1) @ low_above, np.einsum("qij,qj->qi", into(d + 1), low_below)
     return _Light(
         weight=weight,
         phase=wave_number * normal[v],
         admittance=admittance[v],
         ambient=admittance[0].real.copy(),
-        bottom=bottom,
-        incident=np.ascontiguousarray(through(1, v)),
+        bottom=np.einsum("qij,qj->qi", into(v + 1) @ through(v + 1, last), substrate),
+        incident=np.ascontiguousarray(into(1) @ through(1, v)),
         top_above=np.ascontiguousarray(top_above),
         top_below=np.ascontiguousarray(top_below),
         low_above=np.ascontiguousarray(low_above),
         low_below=np.ascontiguousarray(low_below),
-        extra_um=thickness[v] - optics.films[v].thickness_um,
+        extra_um=height_um,
     )
-
-
-def _shifted_thickness(optics: FlatFieldOptics, height_um: float) -> list[float]:
-    """Thickness of all films when the rough face lies lower by ``height_um``."""
-    thickness = [film.thickness_um for film in optics.films]
-    if height_um != 0.0:
-        face = optics.position(optics.rough_face)
-        thickness[face - 1] += height_um
-        thickness[face] -= height_um
-    return thickness
 
 
 def _film_matrix(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
@@ -543,6 +548,40 @@ def _film_matrix(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
     matrix[..., 0, 1] = 0.5 * (1.0 - round_trip) / admittance
     matrix[..., 1, 0] = 0.5 * (1.0 - round_trip) * admittance
     return matrix
+
+
+def _rough_face(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
+    """Matrix of a face whose height is normally distributed, for the mean (specular) field.
+
+    Raised by h, a face changes the phase of the wave that it reflects upwards by 2 q1 h, downwards by -2 q2 h, and of
+    what it lets through by (q1 - q2) h, with q the normal wave number on either side. The mean of exp(i a h) is
+    exp(-a² σ² / 2).
+
+    Parameters
+    ----------
+    admittance : `numpy.ndarray`, shape ``(2, Q)``
+        Admittance above and below.
+    phase : `numpy.ndarray`, shape ``(2, Q)``
+        Normal wave number above and below times the rms height.
+    """
+    above, below = admittance
+    reflected = (above - below) / (above + below)
+    from_above = reflected * np.exp(-2.0 * phase[0] ** 2)
+    from_below = -reflected * np.exp(-2.0 * phase[1] ** 2)
+    passed = np.exp(-0.5 * (phase[0] - phase[1]) ** 2) / (above + below)
+    down, up = 2.0 * above * passed, 2.0 * below * passed
+    # Waves (down, up) above the face from those below it.
+    waves = np.empty((admittance.shape[1], 2, 2), dtype=complex)
+    waves[:, 0, 0] = 1.0 / down
+    waves[:, 0, 1] = -from_below / down
+    waves[:, 1, 0] = from_above / down
+    waves[:, 1, 1] = up - from_above * from_below / down
+    to_fields, to_waves = np.empty_like(waves), np.empty_like(waves)
+    to_fields[:, 0, :] = 1.0
+    to_fields[:, 1, 0], to_fields[:, 1, 1] = above, -above
+    to_waves[:, :, 0] = 0.5
+    to_waves[:, 0, 1], to_waves[:, 1, 1] = 0.5 / below, -0.5 / below
+    return to_fields @ waves @ to_waves
 
 
 def _add_mode(total: FloatArray, light: _Light, thickness_um: FloatArray) -> None:

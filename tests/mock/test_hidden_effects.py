@@ -1,0 +1,115 @@
+"""Hidden effects: identity at null, a visible change away from it, and the names of the model's catalogue."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
+from lsst.fringe_sim.mock import HIDDEN_EFFECTS, HiddenEffect, e2v_321, setup_optics, validate_effects
+from lsst.fringe_sim.mock.hidden_effects import AMPLIFIER_NAMES, AmplifierState
+
+BY_NAME = {effect.name: effect for effect in HIDDEN_EFFECTS}
+STATE = AmplifierState("C03", 1.5, 6.0, 150_000.0)
+
+
+def reach(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
+    """Everything that an effect can touch, after it acted."""
+    complete = effect.complete(values)
+    touched: list[object] = []
+    if effect.on_optics is not None:
+        optics = setup_optics("ts8_e2v")[0]
+        touched.append(effect.on_optics(optics, complete).flat_field([15.0, 15.1, 19.0], 970.0))
+    light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
+    if effect.on_light is not None:
+        touched.append(effect.on_light(light, complete))
+    if effect.on_charge is not None:
+        touched.append(effect.on_charge(20_000.0 * light, complete))
+    if effect.on_amplifier is not None:
+        touched.append(effect.on_amplifier(STATE, complete, 1.3))
+    return touched
+
+
+def untouched(effect: HiddenEffect) -> list[object]:
+    light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
+    everything: list[tuple[object, object]] = [
+        (effect.on_optics, setup_optics("ts8_e2v")[0].flat_field([15.0, 15.1, 19.0], 970.0)),
+        (effect.on_light, light),
+        (effect.on_charge, 20_000.0 * light),
+        (effect.on_amplifier, STATE),
+    ]
+    return [value for action, value in everything if action is not None]
+
+
+def same(left: object, right: object) -> bool:
+    if isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
+        return bool(np.array_equal(left, right))
+    return left == right
+
+
+@pytest.mark.parametrize("effect", HIDDEN_EFFECTS, ids=lambda effect: effect.name)
+def test_null_is_the_identity(effect: HiddenEffect) -> None:
+    before = untouched(effect)
+    assert before
+    for left, right in zip(reach(effect, {}), before, strict=True):
+        assert same(left, right)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter"),
+    [
+        (effect.name, parameter.name)
+        for effect in HIDDEN_EFFECTS
+        for parameter in effect.parameters
+        if parameter.name not in AMPLIFIER_NAMES or parameter.name == STATE.name
+    ],
+)
+def test_every_parameter_does_something(name: str, parameter: str) -> None:
+    effect = BY_NAME[name]
+    low, high = effect.parameter(parameter).bounds
+    null = effect.parameter(parameter).null
+    value = 0.3 * high if np.isnan(null) or null == 0.0 else null + 0.3 * (high - null)
+    if name == "temperature":
+        value = 210.0
+    changed = reach(effect, {parameter: value})
+    assert not all(same(left, right) for left, right in zip(changed, untouched(effect), strict=True))
+    assert low <= value <= high
+
+
+def test_names_agree_with_the_model() -> None:
+    """An effect that both know has the same parameters; a mock may have more (a random size)."""
+    shared = [effect for effect in EFFECTS if effect.name in BY_NAME]
+    assert len(shared) > 15
+    for effect in shared:
+        ours = {parameter.name: parameter.unit for parameter in BY_NAME[effect.name].parameters}
+        theirs = {parameter.name: parameter.unit for parameter in effect.parameters}
+        common = ours.keys() & theirs.keys()
+        assert common, effect.name
+        assert {name: ours[name] for name in common} == {name: theirs[name] for name in common}
+
+
+def test_settings_may_be_flat_or_nested() -> None:
+    flat = validate_effects({"bandwidth.fwhm": 3, "tilt.angle": "4.5"})
+    nested = validate_effects({"tilt": {"angle": 4.5}, "bandwidth": {"fwhm": 3.0}})
+    assert flat == nested
+    assert [effect.name for effect, _ in flat] == ["bandwidth", "tilt"]
+    assert validate_effects(None) == ()
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "names"),
+    [
+        ({"bandwith.fwhm": 3.0}, UnknownNameError, "did you mean bandwidth"),
+        ({"bandwidth.width": 3.0}, UnknownNameError, "fwhm"),
+        ({"bandwidth": 3.0}, InputError, "name.parameter=value"),
+        ({"bandwidth.fwhm": "wide"}, InputError, "a number"),
+        ({"bandwidth.fwhm": 0.0}, OutOfRangeError, "0.05 to 20"),
+        ({"bandwidth.fwhm": float("nan")}, OutOfRangeError, "0.05 to 20"),
+    ],
+)
+def test_unusable_settings_are_refused(
+    settings: dict[str, object], error: type[Exception], names: str
+) -> None:
+    with pytest.raises(error, match=names):
+        validate_effects(settings)

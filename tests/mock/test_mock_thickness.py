@@ -1,0 +1,170 @@
+"""Thickness maps: the measured one, random ones, hard ones."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from lsst.fringe_sim.errors import InputError, OutOfRangeError
+from lsst.fringe_sim.mock import E2V_SHAPE, HARD_MAPS, e2v_321, fit_to_sensor, random_field
+from lsst.fringe_sim.mock.thickness import closed_islands, steep_gradient, two_halves
+from lsst.fringe_sim.resources import read_table
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "fit_e2v_321_thickness.py"
+
+
+@pytest.fixture(scope="module")
+def whole() -> np.ndarray:
+    return e2v_321()
+
+
+def test_measured_sensor_has_the_published_range(whole: np.ndarray) -> None:
+    assert whole.shape == E2V_SHAPE
+    assert whole.min() == pytest.approx(14.022, abs=0.02)
+    assert whole.max() == pytest.approx(22.005, abs=0.02)
+
+
+def test_measured_sensor_at_the_pixel_of_figure_4(whole: np.ndarray) -> None:
+    """The paper's map has 17.50 µm at (2100, 2100) of the trimmed frame, which begins at row 15, column 48.
+
+    One colour level of that map is 0.031 µm, and its nearest cell lies 5 rows off, in a gradient of 1.2 nm per row.
+    """
+    assert whole[2100 + 15, 2100 + 48] == pytest.approx(17.50, abs=0.031 + 0.006)
+
+
+@pytest.mark.shared
+def test_model_differs_from_the_measured_map_by_its_quantisation(whole: np.ndarray, shared_dir: Path) -> None:
+    with fits.open(shared_dir / "measured" / "RTM-020_S01_E2V-321_epoxy_map.fits") as hdus:
+        measured = hdus["FINE"].data.astype(float) + hdus[0].header["ABSMIN"]
+        rows, columns = hdus["YSRC"].data, hdus["XSRC"].data
+        quantisation = hdus[0].header["QRMS"]
+    difference = whole[np.ix_(rows, columns)] - measured
+    assert difference.std() < 1.1 * quantisation
+    assert difference.std() == pytest.approx(
+        read_table("laboratory", "thickness_e2v_321.ecsv").meta["residual_rms_um"], abs=2e-5
+    )
+    assert abs(difference.mean()) < 1e-3
+
+
+@pytest.mark.shared
+def test_script_reproduces_the_shipped_coefficients(
+    shared_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = importlib.util.spec_from_file_location("fit_e2v_321_thickness", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    monkeypatch.setattr(script, "OUTPUT", tmp_path / "made.ecsv")
+    script.main(shared_dir)
+    shipped = read_table("laboratory", "thickness_e2v_321.ecsv")
+    made = type(shipped).read(tmp_path / "made.ecsv")
+    np.testing.assert_allclose(made["coefficient"], shipped["coefficient"], atol=2e-5)
+
+
+def test_script_puts_slipped_rows_back() -> None:
+    spec = importlib.util.spec_from_file_location("fit_e2v_321_thickness", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    smooth = 15.0 + 0.03 * np.arange(60.0)[:, np.newaxis] + np.zeros((60, 50))
+    slipped = smooth.copy()
+    slipped[20:] += 0.3
+    slipped[41:] -= 0.6
+    repaired, jumps = script.repair_row_orders(slipped)
+    assert jumps == 2
+    np.testing.assert_allclose(repaired, smooth, atol=1e-12)
+
+
+def test_window_is_a_part_of_the_whole(whole: np.ndarray) -> None:
+    window = e2v_321((64, 80), sampling="window", corner=(1500, 3000))
+    np.testing.assert_allclose(window, whole[1500:1564, 3000:3080], atol=1e-12)
+
+
+def test_resampled_map_spans_the_whole(whole: np.ndarray) -> None:
+    small = e2v_321((182, 256))  # 22 × 16 px of the sensor each
+    blocks = whole.reshape(182, 22, 256, 16).mean(axis=(1, 3))
+    np.testing.assert_allclose(small, blocks, atol=5e-3)
+
+
+def test_any_map_can_be_brought_to_a_sensor(whole: np.ndarray) -> None:
+    np.testing.assert_array_equal(fit_to_sensor(whole, E2V_SHAPE), whole)
+    cut = fit_to_sensor(whole, (40, 50), sampling="window", corner=(7, 9))
+    np.testing.assert_array_equal(cut, whole[7:47, 9:59])
+    np.testing.assert_allclose(fit_to_sensor(whole, (100, 128)), e2v_321((100, 128)), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("call", "names"),
+    [
+        (lambda: e2v_321((10, 10), sampling="window", corner=(4000, 0)), "window of rows"),
+        (lambda: e2v_321((10, 10), sampling="window", corner=(0, -1)), "window of columns"),
+        (lambda: e2v_321((0, 10)), "number of rows"),
+        (lambda: e2v_321((10, 10), sampling="crop"), "sampling"),  # type: ignore[arg-type]
+        (lambda: fit_to_sensor(np.zeros((3, 3, 3)), (2, 2)), "dimensions"),
+    ],
+)
+def test_impossible_cut_outs_are_refused(call: object, names: str) -> None:
+    with pytest.raises(InputError, match=names):
+        call()  # type: ignore[operator]
+
+
+def test_random_field_has_the_range_and_scale_asked_for(rng: np.random.Generator) -> None:
+    scale = 12.0
+    correlation = []
+    for _ in range(12):
+        field = random_field((200, 220), rng, mean=16.0, span=5.0, scale=scale)
+        assert field.min() == pytest.approx(13.5)
+        assert field.max() == pytest.approx(18.5)
+        residual = field - field.mean()
+        lag = round(scale)
+        correlation.append(np.mean(residual[:, lag:] * residual[:, :-lag]) / residual.var())
+    # exp(-lag² / (2 scale²)) at lag = scale
+    assert np.mean(correlation) == pytest.approx(np.exp(-0.5), abs=0.08)
+
+
+def test_random_field_depends_on_the_generator_only() -> None:
+    first = random_field((30, 40), np.random.default_rng(5))
+    np.testing.assert_array_equal(first, random_field((30, 40), np.random.default_rng(5)))
+    assert not np.allclose(first, random_field((30, 40), np.random.default_rng(6)))
+
+
+def test_impossible_random_fields_are_refused(rng: np.random.Generator) -> None:
+    with pytest.raises(OutOfRangeError, match="scale"):
+        random_field((8, 8), rng, scale=0.0)
+    with pytest.raises(OutOfRangeError, match="span"):
+        random_field((8, 8), rng, mean=2.0, span=5.0)
+
+
+@pytest.mark.parametrize("name", HARD_MAPS)
+def test_hard_maps_are_positive_and_finite(name: str) -> None:
+    thickness = HARD_MAPS[name]((96, 128))
+    assert thickness.shape == (96, 128)
+    assert np.all(np.isfinite(thickness))
+    assert thickness.min() > 5.0
+    assert thickness.max() < 30.0
+
+
+def test_steep_gradient_has_its_fringes() -> None:
+    thickness = steep_gradient((64, 64), fringes=45.0)
+    assert (thickness.max() - thickness.min()) / 0.3 == pytest.approx(45.0)
+
+
+def test_islands_are_closed() -> None:
+    """Every island's peak lies inside and stands at least two orders above (or below) all of the border."""
+    thickness = closed_islands((120, 120))
+    border = np.concatenate([thickness[0], thickness[-1], thickness[:, 0], thickness[:, -1]])
+    assert thickness.max() - border.max() > 0.6
+    assert border.min() - thickness.min() > 0.6
+
+
+def test_halves_are_disconnected() -> None:
+    thickness = two_halves((100, 80))
+    step = thickness[50] - thickness[49]
+    assert step[40] == pytest.approx(1.37, abs=0.15)
+    assert np.abs(np.diff(thickness, axis=0))[:49].max() < 0.1
