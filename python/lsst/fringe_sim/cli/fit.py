@@ -15,7 +15,7 @@ from ..model import FringeModel, Setup
 from ..products import FringeCube, ThicknessMap
 from ..report.figures import flats_figure, phase_figure, thickness_figure
 from ..report.page import Report
-from .inputs import prepare_folder, read_settings
+from .inputs import effect_cards, prepare_folder, read_settings
 from .lab_frames import find_series, read_cube
 from .parameters import EFFECT, effect_settings
 from .progress import progress
@@ -84,7 +84,7 @@ def fit(
     folder = prepare_folder(out)
     click.echo("fitting the thickness", err=True)
     fitted = fit_thickness(cube, model, method)
-    fitted.write_fits(folder / "thickness.fits", {"SETUP": setup, **_effect_cards(model)})
+    fitted.write_fits(folder / "thickness.fits", {"SETUP": setup, **effect_cards(model)})
     write_report(folder, cube, fitted, model, method)
     good = fitted.mask == 0
     if good.any():
@@ -182,10 +182,3 @@ def phase_folded(
         measured[row] = np.bincount(bins, data[row][good], PHASE_BINS) / weight
         modelled[row] = np.bincount(bins, predicted, PHASE_BINS) / weight
     return (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS, measured, modelled
-
-
-def _effect_cards(model: FringeModel) -> dict[str, object]:
-    cards: dict[str, object] = {}
-    for number, (name, value) in enumerate(sorted(model.effect_settings.items())):
-        cards[f"EFFECT{number}"], cards[f"EFFVAL{number}"] = name, value
-    return cards

@@ -12,8 +12,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError
+from ..model import FringeModel
 
-__all__ = ["prepare_folder", "read_settings", "read_thickness"]
+__all__ = ["effect_cards", "prepare_folder", "read_settings", "read_thickness"]
 
 
 def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
@@ -95,3 +96,11 @@ def prepare_folder(path: str | os.PathLike[str]) -> Path:
     if not os.access(folder, os.W_OK):
         raise InputError("output folder", str(folder), "a folder that can be written")
     return folder
+
+
+def effect_cards(model: FringeModel) -> dict[str, str | float]:
+    """Header keywords that state the effects of a model, ``EFFECTn`` and ``EFFVALn``."""
+    cards: dict[str, str | float] = {}
+    for number, (name, value) in enumerate(sorted(model.effect_settings.items())):
+        cards[f"EFFECT{number}"], cards[f"EFFVAL{number}"] = name, value
+    return cards

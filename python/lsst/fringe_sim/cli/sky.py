@@ -1,0 +1,139 @@
+"""``fringe-sim sky``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, sky_response
+from ..errors import InputError, OutOfRangeError
+from ..instrument.camera import Camera
+from ..instrument.night import NightHistory
+from ..instrument.sky import SkySpectrum
+from ..mock.thickness import e2v_321
+from ..model import FringeModel, Setup
+from ..products import SkyFringe
+from ..report.figures import sky_figure
+from ..report.style import save_figure
+from .inputs import effect_cards, prepare_folder, read_settings, read_thickness
+from .parameters import EFFECT, Quantity, effect_settings
+from .progress import progress
+
+__all__ = ["sky"]
+
+PERCENT = 100.0
+
+
+@click.command()
+@click.option("--setup", default="lsst_e2v", show_default=True, help="Sensor and telescope.")
+@click.option(
+    "--thickness", required=True, help="Map of the varying layer: a FITS file [µm], or 'e2v_321' (built in)."
+)
+@click.option("--detector", default=None, help="Place in the focal plane; decides the beam.")
+@click.option("--exptime", type=Quantity("s"), default=None, help="Exposure time; by default the set-up's.")
+@click.option("--airmass", type=click.FloatRange(1.0, 5.0), default=None, help="By default the set-up's.")
+@click.option("--night/--one-frame", default=False, help="Eleven hourly frames of the published night.")
+@click.option("--noise/--no-noise", default=False, help="Photon and read noise.")
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the noise.")
+@click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
+@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for frames and figure.")
+@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+def sky(
+    setup: str,
+    thickness: str,
+    detector: str | None,
+    exptime: float | None,
+    airmass: float | None,
+    night: bool,
+    noise: bool,
+    seed: int,
+    effects: tuple[tuple[str, float], ...],
+    effects_file: Path | None,
+    out: Path,
+    dry_run: bool,
+) -> None:
+    """Simulate the fringes of the night sky for one sensor behind a telescope.
+
+    \b
+    Examples:
+      fringe-sim sky --thickness fit/thickness.fits --detector R22_S11 --out sky
+      fringe-sim sky --setup monocam --thickness e2v_321 --noise --exptime 60s --out sky
+    """
+    chosen = Setup.from_name(setup)
+    if chosen.kind != "sky":
+        raise InputError("set-up", setup, "one behind a telescope, as lsst_e2v, monocam or hsc")
+    if night and exptime is not None:
+        raise InputError(
+            "--exptime", exptime, "nothing beside --night, whose frames have the set-up's exposure"
+        )
+    if exptime is not None and not exptime > 0.0:
+        raise OutOfRangeError("exposure time [s]", exptime, "positive")
+    sensor = Camera.from_name(chosen.camera).detector(detector or chosen.detector)
+    settings = dict(read_settings(effects_file)) if effects_file else {}
+    settings.update(effect_settings(effects))
+    layer = e2v_321() if thickness == "e2v_321" else read_thickness(thickness)
+    frames = 11 if night else 1
+    if dry_run:
+        click.echo(
+            f"would simulate {frames} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
+        )
+        return
+    folder = prepare_folder(out)
+    model = FringeModel.from_setup(
+        chosen, settings, field_x_deg=_angle(sensor.field_x_deg), field_y_deg=_angle(sensor.field_y_deg)
+    )
+    known = layer[np.isfinite(layer)]
+    dark = SkySpectrum.dark(airmass=airmass or chosen.airmass)
+    click.echo("tabulating the response to the sky", err=True)
+    response = sky_response(
+        model, dark, thickness_range_um=(float(known.min()) - 1e-6, float(known.max()) + 1e-6)
+    )
+    read_noise = sensor.read_noise if noise else 0.0
+    common = {"read_noise_e": read_noise, "detector": sensor.name, "physical_filter": chosen.bandpass}
+    if night:
+        series = simulate_night(
+            layer, model, response, NightHistory.guo2022(), seed=seed if noise else None, **common
+        )
+    else:
+        series = iter(
+            [
+                simulate_sky_frame(
+                    layer,
+                    model,
+                    response=response,
+                    exposure_s=exptime,
+                    seed=seed if noise else None,
+                    **common,
+                )
+            ]
+        )
+    made: list[SkyFringe] = []
+    with progress("simulating frames", frames) as advance:
+        for number, frame in enumerate(series):
+            frame.write_fits(
+                folder / f"sky_{sensor.name}_{number:02d}.fits", {"SETUP": setup, **effect_cards(model)}
+            )
+            made.append(frame)
+            advance()
+    save_figure(sky_figure(made), folder / "sky.png")
+    for frame in made:
+        click.echo(_describe(frame))
+    click.echo(str(folder))
+
+
+def _describe(frame: SkyFringe) -> str:
+    rms, half, trimmed = (
+        PERCENT * float(frame.metadata[key]) for key in ("FRINGRMS", "FRINGPTP", "FRING198")
+    )
+    return (
+        f"{frame.hour % 24.0:4.1f} h: {frame.mean_electrons:.0f} e-/pixel; fringes rms {rms:.4f} %, "
+        f"half peak to peak {half:.4f} %, half 1-99 % range {trimmed:.4f} %; "
+        f"quadrature error {PERCENT * frame.quadrature_error:.1e} %"
+    )
+
+
+def _angle(value: float) -> float:
+    return 0.0 if np.isnan(value) else value

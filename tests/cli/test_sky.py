@@ -1,0 +1,72 @@
+"""``fringe-sim sky``."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.mock.thickness import e2v_321
+from lsst.fringe_sim.products import SkyFringe
+
+
+@pytest.fixture(scope="module")
+def thickness(tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("map") / "thickness.fits"
+    layer = e2v_321((200, 208)).astype(np.float32)
+    layer[:5, :5] = np.nan
+    fits.PrimaryHDU(layer).writeto(path)
+    return str(path)
+
+
+def test_one_frame_is_written_with_its_errors(thickness, tmp_path, capsys) -> None:
+    assert run(["sky", "--thickness", thickness, "--detector", "R22_S11", "--out", str(tmp_path)]) == 0
+    frame = SkyFringe.read_fits(tmp_path / "sky_R22_S11_00.fits")
+    assert frame.image.shape == (200, 208)
+    assert np.all(frame.mask[:5, :5] != 0)
+    assert 0.0 < frame.quadrature_error < 1e-4
+    assert (tmp_path / "sky.png").read_bytes().startswith(b"\x89PNG")
+    assert "rms" in capsys.readouterr().out
+
+
+def test_fringes_fade_towards_the_edge_of_the_field(thickness, tmp_path) -> None:
+    rms = {}
+    for detector in ("R22_S11", "R11_S01"):
+        assert run(["sky", "--thickness", thickness, "--detector", detector, "--out", str(tmp_path)]) == 0
+        frame = SkyFringe.read_fits(tmp_path / f"sky_{detector}_00.fits")
+        rms[detector] = float(frame.metadata["FRINGRMS"])
+    assert rms["R11_S01"] < 0.5 * rms["R22_S11"]
+
+
+def test_noise_is_seeded(thickness, tmp_path) -> None:
+    images = []
+    for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
+        out = tmp_path / name
+        assert run(["sky", "--thickness", thickness, "--noise", "--seed", seed, "--out", str(out)]) == 0
+        images.append(SkyFringe.read_fits(out / "sky_R22_S11_00.fits").image)
+    np.testing.assert_array_equal(images[0], images[1])
+    assert not np.array_equal(images[0], images[2])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--setup", "ts8_e2v"], "behind a telescope"),
+        (["--detector", "R22_S19"], "R22_S1"),
+        (["--exptime", "-3"], "positive"),
+        (["--night", "--exptime", "30"], "--night"),
+        (["--effect", "epoxy_absorbtion.k=0.1"], "did you mean epoxy_absorption"),
+    ],
+)
+def test_bad_requests(thickness, tmp_path, capsys, arguments, words) -> None:
+    assert run(["sky", "--thickness", thickness, "--out", str(tmp_path / "a"), *arguments]) == 1
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_map_that_is_no_map_is_refused(tmp_path, capsys) -> None:
+    fits.PrimaryHDU(np.zeros((2, 3, 4))).writeto(tmp_path / "cube.fits")
+    arguments = ["sky", "--thickness", str(tmp_path / "cube.fits"), "--out", str(tmp_path / "a")]
+    assert run(arguments) == 1
+    assert "two-dimensional" in capsys.readouterr().err
