@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
 from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, sky_response
+from ..effects import EFFECTS, activate_effects
 from ..errors import InputError, OutOfRangeError
 from ..instrument.camera import Camera
 from ..instrument.night import NightHistory
@@ -76,15 +78,16 @@ def sky(
     settings.update(effect_settings(effects))
     layer = e2v_321() if thickness == "e2v_321" else read_thickness(thickness)
     frames = 11 if night else 1
+    activate_effects(settings, EFFECTS)
     if dry_run:
         click.echo(
             f"would simulate {frames} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
         )
         return
-    folder = prepare_folder(out)
     model = FringeModel.from_setup(
         chosen, settings, field_x_deg=_angle(sensor.field_x_deg), field_y_deg=_angle(sensor.field_y_deg)
     )
+    folder = prepare_folder(out)
     known = layer[np.isfinite(layer)]
     dark = SkySpectrum.dark(airmass=airmass or chosen.airmass)
     click.echo("tabulating the response to the sky", err=True)
@@ -92,7 +95,11 @@ def sky(
         model, dark, thickness_range_um=(float(known.min()) - 1e-6, float(known.max()) + 1e-6)
     )
     read_noise = sensor.read_noise if noise else 0.0
-    common = {"read_noise_e": read_noise, "detector": sensor.name, "physical_filter": chosen.bandpass}
+    common: dict[str, Any] = {
+        "read_noise_e": read_noise,
+        "detector": sensor.name,
+        "physical_filter": chosen.bandpass,
+    }
     if night:
         series = simulate_night(
             layer, model, response, NightHistory.guo2022(), seed=seed if noise else None, **common
