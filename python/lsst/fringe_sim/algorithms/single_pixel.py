@@ -105,7 +105,7 @@ def fit_single_pixel(
     contrast, offset, predicted = _scaled(templates, data, free_contrast, free_offset)
     rms = np.sqrt(((data[:, None] - predicted) ** 2).mean(axis=0))
     best = int(np.argmin(rms))
-    thickness = low + GRID_STEP_UM * np.arange(count)
+    thickness = low + GRID_STEP_UM * np.arange(count, dtype=np.float64)
     return SinglePixelFit(
         thickness_um=float(thickness[best]),
         contrast=float(contrast[best]),
