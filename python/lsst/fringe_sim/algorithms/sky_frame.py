@@ -1,0 +1,549 @@
+"""Night-sky fringe frames: the sum over lines and angles of Eq. 5, converged, with its error stated.
+
+What depends on thickness is computed once per component of the sky (an OH band, a continuum) as a table; a frame, or
+a whole night of frames, is then a weighted sum of table rows and one interpolation per pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..effects import ImageGeometry, apply_to_image
+from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..instrument.bandpass import Bandpass
+from ..instrument.night import NightHistory
+from ..instrument.readout import add_readout
+from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
+from ..instrument.telescope import reduce_beam
+from ..model import FringeModel, ResponseTable, tabulate
+from ..optics import Beam, Illumination
+from ..optics.phase_response import PhaseResponse
+from ..products import SkyFringe, mask_bits
+
+__all__ = [
+    "FringeAmplitudes",
+    "SkyQuadrature",
+    "SkyResponse",
+    "fringe_amplitudes",
+    "is_band",
+    "simulate_night",
+    "simulate_sky_frame",
+    "sky_response",
+    "throughput_electrons",
+]
+
+FloatArray = NDArray[np.float64]
+
+_ERROR_SAMPLES = 48
+"""Thicknesses at which the quadrature is compared with a finer one."""
+
+LABORATORY_EFFECTS = frozenset({"illumination", "chromatic_illumination", "vignetting", "dark_pedestal"})
+"""Effects on the image that belong to the lamp and the stand of flat fields; a sky frame does not have them."""
+
+_BASELINE_HOUR = 19.0
+"""Local time of hour 0 of a night [h]."""
+
+
+@dataclass(frozen=True)
+class FringeAmplitudes:
+    """The three numbers that are all called "amplitude", as fractions of the mean.
+
+    Attributes
+    ----------
+    rms, half_peak_to_peak, half_range_1_99 : `float`
+        Standard deviation, half of maximum minus minimum, half of the 99th minus the 1st percentile.
+    """
+
+    rms: float
+    half_peak_to_peak: float
+    half_range_1_99: float
+
+
+@dataclass(frozen=True)
+class SkyQuadrature:
+    """How finely a sky is summed.
+
+    Attributes
+    ----------
+    line_shift_nm : `float`
+        Rms shift allowed when close lines are merged [nm].
+    continuum_step_nm : `float`
+        Spacing of the wavelengths that stand for a continuum [nm].
+    continuum_angles : `int`
+        Angles used for a continuum, whose fringes average out over wavelength; lines use all of the beam.
+    table_tolerance : `float`
+        Interpolation error of a row of the table, relative to the mean sky.
+    """
+
+    line_shift_nm: float = 0.003
+    continuum_step_nm: float = 0.2
+    continuum_angles: int = 32
+    table_tolerance: float = 3e-7
+
+
+@dataclass(frozen=True, eq=False)
+class SkyResponse:
+    """Electrons from the components of a sky, over thickness.
+
+    Attributes
+    ----------
+    component : `tuple` [`str`, ...]
+        Names of the components, C of them.
+    photons : `numpy.ndarray`, shape ``(C,)``
+        Photons behind air and optics [s⁻¹ m⁻² arcsec⁻²].
+    level : `float`
+        Electrons [s⁻¹ m⁻² arcsec⁻²] of all components together, averaged over the tabulated thicknesses.
+    table : `ResponseTable`
+        Electrons from each component as a fraction of `level`, one row per component.
+    quadrature_error : `float`
+        Estimated error of the sums over lines and angles, relative to the mean sky.
+    airmass : `float`
+        Airmass of the sky.
+    """
+
+    component: tuple[str, ...]
+    photons: FloatArray
+    level: float
+    table: ResponseTable
+    quadrature_error: float
+    airmass: float
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Those components that are OH bands."""
+        return tuple(name for name in self.component if is_band(name))
+
+    def factors(self, scale: Mapping[str, float] | None = None) -> FloatArray:
+        """Factor on every component, 1 unless named.
+
+        Raises
+        ------
+        UnknownNameError
+            A component that this sky does not have.
+        OutOfRangeError
+            A factor that is negative or not finite, or no light left.
+        """
+        factors = np.ones(len(self.component))
+        for name, factor in (scale or {}).items():
+            if name not in self.component:
+                raise UnknownNameError("component of the sky", name, self.component)
+            if not 0.0 <= factor < math.inf:
+                raise OutOfRangeError(f"scale of {name}", factor, "finite and not negative")
+            factors[self.component.index(name)] = factor
+        if not factors @ self.photons > 0.0:
+            raise OutOfRangeError("photons of the sky", 0.0, "more than none")
+        return factors
+
+    def sky(self, scale: Mapping[str, float] | None = None) -> ResponseTable:
+        """Electrons s⁻¹ m⁻² arcsec⁻² as a table of one row.
+
+        Parameters
+        ----------
+        scale : mapping, optional
+            Factors on components, by name; those not named stay as they are.
+        """
+        factors = self.factors(scale)
+        rates = factors * self.photons
+        return ResponseTable(
+            self.table.start_um,
+            self.table.step_um,
+            self.level * (factors @ self.table.values)[None, :],
+            np.array([float(rates @ self.table.wavelength_nm / rates.sum())]),
+            self.level * self.table.interpolation_error * float(factors.sum()),
+        )
+
+
+def sky_response(
+    model: FringeModel,
+    sky: SkySpectrum,
+    bandpass: Bandpass | None = None,
+    thickness_range_um: tuple[float, float] | None = None,
+    quadrature: SkyQuadrature | None = None,
+) -> SkyResponse:
+    """Tabulate the response of a sensor to a sky.
+
+    Parameters
+    ----------
+    model : `FringeModel`
+        Sensor behind a telescope, with effects.
+    sky : `SkySpectrum`
+        Lines and continua.
+    bandpass : `Bandpass`, optional
+        By default that of the set-up.
+    thickness_range_um : `tuple` [`float`, `float`], optional
+        Thicknesses to cover [µm]; by default those of the set-up.
+    quadrature : `SkyQuadrature`, optional
+        How finely the sums are made.
+
+    Returns
+    -------
+    response : `SkyResponse`
+
+    Raises
+    ------
+    InputError
+        The set-up is not one of the sky and no bandpass is given, or no light passes.
+    OutOfRangeError
+        An empty range of thickness, or a wavelength for which a medium is not known.
+    """
+    fineness = SkyQuadrature() if quadrature is None else quadrature
+    band = _bandpass_of(model) if bandpass is None else bandpass
+    low, high = model.setup.thickness_range_um if thickness_range_um is None else thickness_range_um
+    if not 0.0 <= low < high < math.inf:
+        raise OutOfRangeError("thickness range [um]", (low, high), "two increasing, not negative numbers")
+    lights = _lights(sky, band, fineness, model.system.beam)
+    if not lights:
+        raise InputError("sky", "no light behind the bandpass", "lines or a continuum inside it")
+    sums = [_SpectralSum.of(model, light) for light in lights]
+    step = (high - low) / _ERROR_SAMPLES
+    samples = (low + 0.5 * step, step, _ERROR_SAMPLES)
+    level = float(sum(each.electrons(*samples).mean() for each in sums))
+
+    def contributions(start_um: float, step_um: float, count: int) -> FloatArray:
+        return np.stack([each.electrons(start_um, step_um, count) for each in sums]) / level
+
+    late = any(item.effect.acts_on == "response" for item in model.effects)
+    table = tabulate(
+        contributions,
+        (low, high),
+        [each.light.mean_wavelength_nm for each in sums],
+        # An effect on the response may change its derivatives; then they are measured.
+        fourth_derivative=None if late else max(each.derivative_bound(4, low) for each in sums) / level,
+        tolerance=fineness.table_tolerance,
+    )
+    return SkyResponse(
+        tuple(each.light.name for each in sums),
+        np.array([each.light.photons for each in sums]),
+        level,
+        table,
+        _quadrature_error(model, sky, band, fineness, samples) / level,
+        sky.airmass,
+    )
+
+
+def simulate_sky_frame(
+    thickness_um: ArrayLike,
+    model: FringeModel,
+    sky: SkySpectrum | None = None,
+    *,
+    response: SkyResponse | None = None,
+    scale: Mapping[str, float] | None = None,
+    exposure_s: float | None = None,
+    mean_electrons: float | None = None,
+    airglow_level: ArrayLike = 1.0,
+    read_noise_e: float = 0.0,
+    seed: int | None = None,
+    hour: float = 24.0,
+    detector: str = "",
+    physical_filter: str = "",
+) -> SkyFringe:
+    """Night-sky exposure of one sensor (Eq. 5).
+
+    Parameters
+    ----------
+    thickness_um : array_like, shape ``(ny, nx)``
+        Thickness of the varying layer [µm]; NaN where it is not known, which is masked ``NO_DATA``.
+    model : `FringeModel`
+        Sensor behind a telescope, with effects; its field position decides the beam.
+    sky : `SkySpectrum`, optional
+        Lines and continua; by default a dark sky at the airmass of the set-up.
+    response : `SkyResponse`, optional
+        Result of `sky_response` for this model and sky, so that many frames share it.
+    scale : mapping, optional
+        Factors on components of the sky: OH bands and continua by name.
+    exposure_s : `float`, optional
+        Exposure time [s]; by default that of the set-up.
+    mean_electrons : `float`, optional
+        Mean level of the frame [e⁻]. By default the level that the model itself detects, which for cold silicon is
+        below the level that measured quantum efficiencies give (see `throughput_electrons`).
+    airglow_level : array_like, optional
+        Brightness of the sky relative to the field centre; broadcasts to the image.
+    read_noise_e : `float`, optional
+        Read noise [e⁻ rms], added if ``seed`` is given.
+    seed : `int`, optional
+        Seed of photon and read noise (GalSim); a frame without noise if not given.
+    hour, detector, physical_filter
+        Go into the product.
+
+    Returns
+    -------
+    frame : `SkyFringe`
+        In electrons; its header states the estimated error of the quadrature, of the interpolation, and the three
+        amplitudes of the noiseless fringe.
+
+    Raises
+    ------
+    InputError
+        A map that is not two-dimensional, or that has no thickness at all.
+    OutOfRangeError
+        A thickness, factor, exposure or level that is not physical.
+    """
+    thickness = np.asarray(thickness_um)
+    if thickness.ndim != 2:
+        raise InputError("shape of the thickness map", thickness.shape, "two axes (y, x)")
+    known = np.isfinite(thickness)
+    if not known.any():
+        raise InputError("thickness map", "no finite value", "a thickness in at least one pixel")
+    exposure = model.setup.exposure_s if exposure_s is None else exposure_s
+    if not 0.0 < exposure < math.inf:
+        raise OutOfRangeError("exposure time [s]", exposure, "positive")
+    if response is None:
+        dark = SkySpectrum.dark(airmass=model.setup.airmass) if sky is None else sky
+        response = sky_response(model, dark, thickness_range_um=_range_of(thickness[known]))
+
+    level = response.sky(scale)
+    setup = model.setup
+    to_electrons = exposure * setup.effective_area_m2 * setup.pixel_scale_arcsec**2
+    image = level.frame(thickness)
+    image *= np.asarray(airglow_level, dtype=np.float32)
+    image = _with_image_effects(model, image, known, float(level.wavelength_nm[0]), to_electrons)
+    amplitudes = fringe_amplitudes(image, ~known)
+    mean = float(image.mean(dtype=np.float64, where=known))
+    wanted = mean * to_electrons if mean_electrons is None else mean_electrons
+    if not 0.0 < wanted < math.inf:
+        raise OutOfRangeError("mean level [e]", wanted, "positive")
+    image *= np.float32(wanted / mean)
+    image[~known] = wanted
+    if seed is not None:
+        noisy = add_readout(image, np.random.default_rng(seed), read_noise_e, gain=1.0)
+        image = noisy.astype(np.float32)
+    return SkyFringe(
+        image,
+        np.where(known, 0, mask_bits("NO_DATA")).astype(np.int32),
+        "electron",
+        mean_electrons=wanted,
+        exposure_s=exposure,
+        airmass=response.airmass,
+        hour=hour,
+        seed=seed,
+        quadrature_error=response.quadrature_error,
+        metadata={
+            "INTERR": level.interpolation_error / mean,
+            "FRINGRMS": amplitudes.rms,
+            "FRINGPTP": amplitudes.half_peak_to_peak,
+            "FRING198": amplitudes.half_range_1_99,
+            "RDNOISE": read_noise_e if seed is not None else 0.0,
+        },
+        detector=detector,
+        physical_filter=physical_filter,
+    )
+
+
+def simulate_night(
+    thickness_um: ArrayLike,
+    model: FringeModel,
+    response: SkyResponse,
+    night: NightHistory,
+    *,
+    exposure_s: float | None = None,
+    seed: int | None = None,
+    read_noise_e: float = 0.0,
+    detector: str = "",
+    physical_filter: str = "",
+) -> Iterator[SkyFringe]:
+    """Frames of a night, one per time, one after the other.
+
+    Parameters
+    ----------
+    thickness_um, model, response, exposure_s, read_noise_e, detector, physical_filter
+        See `simulate_sky_frame`.
+    night : `NightHistory`
+        Intensity of the OH bands through the night.
+    seed : `int`, optional
+        Seed of the night; every frame gets its own noise. No noise if not given.
+
+    Yields
+    ------
+    frame : `SkyFringe`
+    """
+    children = np.random.SeedSequence(0 if seed is None else seed).generate_state(len(night), np.uint32)
+    for time in range(len(night)):
+        yield simulate_sky_frame(
+            thickness_um,
+            model,
+            response=response,
+            scale=night.band_scale(time, response.bands),
+            exposure_s=exposure_s,
+            read_noise_e=read_noise_e,
+            seed=None if seed is None else int(children[time]),
+            hour=_BASELINE_HOUR + float(night.hours[time]),
+            detector=detector,
+            physical_filter=physical_filter,
+        )
+
+
+def throughput_electrons(
+    sky: SkySpectrum, bandpass: Bandpass, model: FringeModel, exposure_s: float | None = None
+) -> float:
+    """Mean sky [e⁻ per pixel] through the measured quantum efficiency of the throughput tables."""
+    electrons = sum(
+        float(item.photons @ bandpass.quantum_efficiency(item.wavelength_nm))
+        for item in sky.components(bandpass)
+    )
+    setup = model.setup
+    exposure = setup.exposure_s if exposure_s is None else exposure_s
+    return electrons * exposure * setup.effective_area_m2 * setup.pixel_scale_arcsec**2
+
+
+def fringe_amplitudes(image: ArrayLike, mask: ArrayLike | None = None) -> FringeAmplitudes:
+    """Amplitudes of a frame relative to its mean.
+
+    Parameters
+    ----------
+    image : array_like
+        Sky in any positive unit.
+    mask : array_like, optional
+        Non-zero where a pixel is not to be used.
+
+    Raises
+    ------
+    InputError
+        No pixel is left, or their mean is not positive.
+    """
+    values = np.asarray(image)
+    good = np.isfinite(values) if mask is None else np.isfinite(values) & (np.asarray(mask) == 0)
+    chosen = values[good].astype(np.float64)
+    if chosen.size == 0 or not chosen.mean() > 0.0:
+        raise InputError("image", "no good pixels" if chosen.size == 0 else chosen.mean(), "a positive mean")
+    chosen /= chosen.mean()
+    low, high = np.percentile(chosen, [1.0, 99.0])
+    return FringeAmplitudes(float(chosen.std()), 0.5 * float(np.ptp(chosen)), 0.5 * float(high - low))
+
+
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """Quadrature nodes of one component (or of several together) and its photons [s⁻¹ m⁻² arcsec⁻²]."""
+
+    name: str
+    photons: float
+    illumination: Illumination
+
+    @classmethod
+    def of(cls, components: list[SpectralComponent], beam: Beam) -> _Light:
+        photons = np.concatenate([item.photons for item in components])
+        wavelength = np.concatenate([item.wavelength_nm for item in components])
+        name = " + ".join(item.name for item in components)
+        return cls(name, float(photons.sum()), Illumination.spectrum(wavelength, photons, beam))
+
+    @property
+    def mean_wavelength_nm(self) -> float:
+        return float(self.illumination.mean_wavelength_nm[0])
+
+
+@dataclass(frozen=True, eq=False)
+class _SpectralSum:
+    """Closed form of the electrons from one light."""
+
+    model: FringeModel
+    light: _Light
+    reduced: PhaseResponse
+
+    @classmethod
+    def of(cls, model: FringeModel, light: _Light) -> _SpectralSum:
+        return cls(model, light, model.system.reduce(light.illumination))
+
+    def electrons(self, start_um: float, step_um: float, count: int) -> FloatArray:
+        """Electrons s⁻¹ m⁻² arcsec⁻² on a uniform grid of thickness, shape ``(count,)``."""
+        illumination = self.light.illumination
+        response = self.reduced.averaged_on_grid(illumination.weight, start_um, step_um, count)
+        return self.light.photons * self.model.finish(self.reduced, illumination, response, None)[0]
+
+    def derivative_bound(self, order: int, from_um: float) -> float:
+        bound = self.reduced.derivative_bound(self.light.illumination.weight, order, from_um)
+        return self.light.photons * float(bound.max())
+
+
+def _split(
+    sky: SkySpectrum, band: Bandpass, continuum_step_nm: float
+) -> tuple[list[SpectralComponent], list[SpectralComponent]]:
+    components = sky.components(band, continuum_step_nm)
+    lines = [item for item in components if is_band(item.name)]
+    return lines, [item for item in components if not is_band(item.name)]
+
+
+def _lights(sky: SkySpectrum, band: Bandpass, fineness: SkyQuadrature, beam: Beam) -> list[_Light]:
+    lines, continua = _split(sky, band, fineness.continuum_step_nm)
+    few = reduce_beam(beam, fineness.continuum_angles)
+    merged = blend_components(lines, fineness.line_shift_nm) if lines else []
+    return [_Light.of([item], beam) for item in merged] + [_Light.of([item], few) for item in continua]
+
+
+def _quadrature_error(
+    model: FringeModel,
+    sky: SkySpectrum,
+    band: Bandpass,
+    fineness: SkyQuadrature,
+    samples: tuple[float, float, int],
+) -> float:
+    """Largest change of the electrons s⁻¹ m⁻² arcsec⁻² with finer sums over wavelength and with fewer angles.
+
+    Angles cannot be added to a beam; leaving out a sixth of them changes the sum by several times its error. What
+    merging does to lines shows with few angles as well as with many.
+    """
+    lines, continua = _split(sky, band, fineness.continuum_step_nm)
+    beam = model.system.beam
+    few = reduce_beam(beam, fineness.continuum_angles)
+
+    def change(one: list[SpectralComponent], two: list[SpectralComponent], on: Beam, against: Beam) -> float:
+        sums = (_SpectralSum.of(model, _Light.of(one, on)), _SpectralSum.of(model, _Light.of(two, against)))
+        return float(np.abs(sums[0].electrons(*samples) - sums[1].electrons(*samples)).max())
+
+    error = 0.0
+    if lines:
+        merged = blend_components(lines, fineness.line_shift_nm)
+        error += change(merged, lines, few, few) + change(merged, merged, beam, _thinned(beam))
+    if continua:
+        _, halved = _split(sky, band, 0.5 * fineness.continuum_step_nm)
+        error += change(continua, halved, few, few) + change(continua, continua, few, _thinned(few))
+    return error
+
+
+def _thinned(beam: Beam) -> Beam:
+    return reduce_beam(beam, max(1, 5 * beam.theta.size // 6))
+
+
+def _with_image_effects(
+    model: FringeModel,
+    image: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    wavelength_nm: float,
+    to_electrons: float,
+) -> NDArray[np.float32]:
+    """Frame with the effects of sensor and read-out in it; the frame itself if there are none."""
+    active = [
+        item
+        for item in model.effects
+        if item.effect.acts_on == "image"
+        and item.effect.name not in LABORATORY_EFFECTS
+        and not item.is_null(model.base_system)
+    ]
+    if not active:
+        return image
+    mean = float(image.mean(dtype=np.float64, where=known))
+    relative = np.where(known, image / np.float32(mean), 1.0)[np.newaxis].astype(np.float64)
+    geometry = ImageGeometry.of_pixels(image.shape, np.array([wavelength_nm]), mean * to_electrons)
+    changed = apply_to_image(active, model.base_system, relative, geometry)[0]
+    return np.where(known, mean * changed, np.nan).astype(np.float32)
+
+
+def is_band(name: str) -> bool:
+    """Whether a component of the sky is an OH band, like ``8-4``."""
+    upper, _, lower = name.partition("-")
+    return upper.isdigit() and lower.isdigit()
+
+
+def _bandpass_of(model: FringeModel) -> Bandpass:
+    if not model.setup.bandpass:
+        raise InputError("set-up", model.setup.name, "one of the sky, or a bandpass")
+    return Bandpass.from_name(model.setup.bandpass)
+
+
+def _range_of(thickness: NDArray[np.floating]) -> tuple[float, float]:
+    """Range of a map, widened so that rounding cannot leave it; never empty."""
+    low, high = float(thickness.min()), float(thickness.max())
+    return max(low - 1e-3, 0.0), high + 1e-3
