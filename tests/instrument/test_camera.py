@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -130,6 +131,59 @@ def test_cameras_of_one_sensor() -> None:
     assert monocam[0].vendor == "e2v"
     assert hsc[0].pixel_um == 15.0
     assert all(amp.raw is None for amp in hsc[0].amplifiers)
+
+
+CAMERA = """
+title: a test stand of one sensor
+source: a test
+vendor: ITL
+pixel_um: 10.0
+layout: ITL
+readout: median of LSSTCam
+detectors:
+  - {id: 3, name: R00_S11, raft: R00, slot: S11, serial: "A-1", raft_serial: "", x_mm: 0.0, y_mm: 0.0,
+     field_x_deg: 0.0, field_y_deg: 0.0}
+"""
+
+
+def test_a_further_camera_is_a_file(tmp_path: Path) -> None:
+    (tmp_path / "stand.yaml").write_text(CAMERA)
+    camera = Camera.from_file(tmp_path / "stand.yaml")
+    assert camera.name == "stand"
+    assert camera.detector("A-1").shape == (4000, 4072)
+    assert camera.detector(3).readout_source == "median of the ITL science sensors of LSSTCam"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("vendor: ITL", "vendor: Fairchild", "vendor is 'Fairchild'; allowed: .*ITL"),
+        ("layout: ITL", "layout: itl", "vendor is 'itl'; allowed: .*ITL"),
+        ("pixel_um: 10.0", "pixel_um: 0", "pixel_um is 0; allowed: a positive number"),
+        ("pixel_um: 10.0", "pixel_um: small", "the description of a camera"),
+        ("pixel_um: 10.0", "", "entry is 'pixel_um'; allowed: every entry"),
+        ("title: a", "titel: a", "entry is 'title'"),
+        ("id: 3", "id: three", "the description of a camera"),
+        ("detectors:\n", "detectors: 3\nothers:\n", "the description of a camera"),
+        ("title", "[", "the description of a camera"),
+        (CAMERA, "a list", "content is 'str'; allowed: a mapping"),
+        (CAMERA, CAMERA + CAMERA[CAMERA.index("  - {") :], "id of a detector is 3"),
+    ],
+)
+def test_camera_that_is_not_described_well_is_refused(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    assert old in CAMERA
+    path = tmp_path / "stand.yaml"
+    path.write_text(CAMERA.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as caught:
+        Camera.from_file(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_camera_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="an existing YAML file"):
+        Camera.from_file(tmp_path / "nothing.yaml")
 
 
 @given(rows=st.integers(1, 60), columns=st.integers(1, 20), vendor=st.sampled_from([37, 0, 191]))

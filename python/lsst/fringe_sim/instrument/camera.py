@@ -1,7 +1,7 @@
 """Cameras as data: detectors, their place in the focal plane, their amplifiers.
 
 Every number comes from a table or a YAML file in ``data/instrument``; a further camera of few sensors is one more
-YAML file there (``monocam.yaml`` shows the form).
+YAML file there (``monocam.yaml`` and ``hsc.yaml`` show the two forms), or anywhere else by `Camera.from_file`.
 
 Coordinates are those of the assembled, trimmed CCD: ``[0, 0]`` is the lower-left pixel, ``y`` up.
 """
@@ -11,13 +11,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
-from ..errors import InputError, OutOfRangeError, ResourceError, UnknownNameError
-from ..resources import read_table, read_yaml
+from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..resources import list_resources, read_table, read_yaml
+from .detector import Amplifier, Detector, RawSegment
 
 __all__ = ["Amplifier", "Camera", "Detector", "RawSegment"]
 
@@ -26,207 +29,6 @@ VENDORS = {"E2V": "e2v", "ITL": "ITL", "HAMAMATSU": "Hamamatsu"}
 
 READOUT_FROM_LSSTCAM = "median of LSSTCam"
 """Value of ``readout`` in a camera's YAML file for sensors whose own readout is not published."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RawSegment:
-    """Where the pixels of one amplifier stand in its raw image, read-out order.
-
-    Attributes
-    ----------
-    hdu : `int`
-        Number of the FITS HDU; 0 is the primary header.
-    extname : `str`
-        Name of the HDU, ``Segment10``.
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of the raw image.
-    data_y0, data_x0 : `int`
-        First imaging row and column, counted from 0. Columns before ``data_x0`` are serial prescan; columns
-        right of the imaging section are serial overscan, rows above it parallel overscan.
-    """
-
-    hdu: int
-    extname: str
-    shape: tuple[int, int]
-    data_y0: int
-    data_x0: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Amplifier:
-    """One output of a CCD.
-
-    Attributes
-    ----------
-    name : `str`
-        Name, ``C00`` … ``C17`` for LSST sensors.
-    channel : `int`
-        Number, from 1, in the order of the raw file.
-    y0, x0 : `int`
-        Lower-left pixel of the amplifier in the assembled, trimmed CCD.
-    height, width : `int`
-        Imaging rows and columns.
-    flip_y, flip_x : `bool`
-        Whether the raw image is reversed along that axis when the CCD is assembled.
-    gain : `float`
-        Gain, electrons per ADU.
-    read_noise : `float`
-        Read noise, electrons rms.
-    saturation : `float`
-        Saturation level, ADU above bias.
-    raw : `RawSegment` or `None`
-        Layout of the raw image; `None` for cameras whose raw files are not in the LSST layout.
-    """
-
-    name: str
-    channel: int
-    y0: int
-    x0: int
-    height: int
-    width: int
-    flip_y: bool
-    flip_x: bool
-    gain: float
-    read_noise: float
-    saturation: float
-    raw: RawSegment | None = None
-
-    @property
-    def section(self) -> tuple[slice, slice]:
-        """The amplifier's pixels in the assembled CCD, as ``[y, x]`` slices."""
-        return slice(self.y0, self.y0 + self.height), slice(self.x0, self.x0 + self.width)
-
-
-@dataclasses.dataclass(frozen=True)
-class Detector:
-    """One sensor.
-
-    Attributes
-    ----------
-    id : `int`
-        Number within the camera.
-    name : `str`
-        ``R11_S01`` in LSSTCam, ``RTM-020_S01`` on TS8.
-    raft, slot : `str`
-        The two parts of the name.
-    vendor : `str`
-        ``e2v``, ``ITL`` or ``Hamamatsu``.
-    kind : `str`
-        ``science``, ``guider`` or ``wavefront``.
-    serial, raft_serial : `str`
-        Serial numbers of the sensor and of its raft; empty where not known.
-    x_mm, y_mm : `float`
-        Centre of the sensor in the focal plane, mm.
-    field_x_deg, field_y_deg : `float`
-        Field angle of the centre, degrees; nan on a test stand, which has no telescope.
-    yaw_deg : `float`
-        Rotation of the sensor in the focal plane, degrees.
-    pixel_um : `float`
-        Pixel pitch, µm.
-    amplifiers : `tuple` [`Amplifier`, ...]
-        Outputs, in the order of the raw file.
-    readout_source : `str`
-        Where gains and read noises come from.
-    """
-
-    id: int
-    name: str
-    raft: str
-    slot: str
-    vendor: str
-    kind: str
-    serial: str
-    raft_serial: str
-    x_mm: float
-    y_mm: float
-    field_x_deg: float
-    field_y_deg: float
-    yaw_deg: float
-    pixel_um: float
-    amplifiers: tuple[Amplifier, ...]
-    readout_source: str
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of the assembled, trimmed CCD."""
-        return (
-            max(amp.y0 + amp.height for amp in self.amplifiers),
-            max(amp.x0 + amp.width for amp in self.amplifiers),
-        )
-
-    @property
-    def gain(self) -> float:
-        """Mean gain of the amplifiers, electrons per ADU."""
-        return float(np.mean([amp.gain for amp in self.amplifiers]))
-
-    @property
-    def read_noise(self) -> float:
-        """Mean read noise of the amplifiers, electrons rms."""
-        return float(np.mean([amp.read_noise for amp in self.amplifiers]))
-
-    @property
-    def field_radius_deg(self) -> float:
-        """Distance of the centre from the optical axis, degrees; nan on a test stand."""
-        return math.hypot(self.field_x_deg, self.field_y_deg)
-
-    def amplifier(self, name: str) -> Amplifier:
-        """Return one amplifier by name.
-
-        Raises
-        ------
-        UnknownNameError
-            The sensor has no such amplifier.
-        """
-        for amp in self.amplifiers:
-            if amp.name == name:
-                return amp
-        raise UnknownNameError("amplifier", name, (amp.name for amp in self.amplifiers), source=self.name)
-
-    def cut_down(self, shape: tuple[int, int]) -> Detector:
-        """Return the same sensor with fewer (or more) pixels per amplifier.
-
-        Names, order, gains, flips and the widths of prescan and overscan stay; what changes is the number of
-        imaging rows and columns.
-
-        Parameters
-        ----------
-        shape : `tuple` [`int`, `int`]
-            Rows and columns of the assembled CCD; divisible by the rows and columns of amplifiers.
-
-        Raises
-        ------
-        InputError
-            The size cannot be divided evenly among the amplifiers.
-        """
-        n_columns = len({amp.x0 for amp in self.amplifiers})
-        n_rows = len({amp.y0 for amp in self.amplifiers})
-        height, rest_y = divmod(shape[0], n_rows)
-        width, rest_x = divmod(shape[1], n_columns)
-        if rest_y or rest_x or height < 1 or width < 1:
-            raise InputError(
-                "detector shape (rows, columns)",
-                shape,
-                f"positive multiples of {n_rows} rows and {n_columns} columns",
-                source=self.name,
-            )
-        return dataclasses.replace(
-            self, amplifiers=tuple(_resized(amp, height, width) for amp in self.amplifiers)
-        )
-
-
-def _resized(amp: Amplifier, height: int, width: int) -> Amplifier:
-    raw = amp.raw
-    if raw is not None:
-        shape = (raw.shape[0] + height - amp.height, raw.shape[1] + width - amp.width)
-        raw = dataclasses.replace(raw, shape=shape)
-    return dataclasses.replace(
-        amp,
-        y0=amp.y0 // amp.height * height,
-        x0=amp.x0 // amp.width * width,
-        height=height,
-        width=width,
-        raw=raw,
-    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -257,6 +59,31 @@ class Camera:
             There is no such camera; near misses are offered.
         """
         return _load_camera(name)
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Camera:
+        """Return the camera of few sensors that a YAML file describes; it is named after the file.
+
+        Raises
+        ------
+        InputError
+            There is no such file, or it does not describe a camera.
+        """
+        file = Path(path)
+        if not file.is_file():
+            raise InputError("file", str(path), "an existing YAML file")
+        try:
+            content = yaml.safe_load(file.read_text(encoding="utf-8"))
+            if not isinstance(content, dict):
+                raise InputError("content", type(content).__name__, "a mapping")
+            return _from_mapping(file.stem, content)
+        except InputError as error:
+            raise error.in_source(str(path)) from None
+        except (yaml.YAMLError, UnicodeDecodeError, TypeError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(
+                "content", reason, "the description of a camera in YAML", source=str(path)
+            ) from None
 
     @property
     def science(self) -> tuple[Detector, ...]:
@@ -341,15 +168,13 @@ def _raft_names(detector: Detector) -> tuple[str, str, str]:
 
 @functools.cache
 def _load_camera(name: str) -> Camera:
-    loaders: dict[str, Callable[[], Camera]] = {
-        "lsstCam": _load_lsstcam,
-        "ts8": _load_ts8,
-        "monocam": functools.partial(_load_from_yaml, "monocam"),
-        "hsc": functools.partial(_load_from_yaml, "hsc"),
-    }
-    if name not in loaders:
-        raise UnknownNameError("camera", name, loaders)
-    return loaders[name]()
+    from_tables: dict[str, Callable[[], Camera]] = {"lsstCam": _load_lsstcam, "ts8": _load_ts8}
+    described = [file.removesuffix(".yaml") for file in list_resources("instrument", ".yaml")]
+    if name in from_tables:
+        return from_tables[name]()
+    if name in described:
+        return _from_mapping(name, read_yaml("instrument", f"{name}.yaml"))
+    raise UnknownNameError("camera", name, [*from_tables, *described])
 
 
 def _vendor(spelling: str) -> str:
@@ -501,9 +326,8 @@ def _ts8_detector(row: Mapping[str, Any], by_serial: Mapping[str, Detector]) -> 
     )
 
 
-def _load_from_yaml(name: str) -> Camera:
-    """Camera of few sensors, described by ``data/instrument/<name>.yaml``."""
-    content = read_yaml("instrument", f"{name}.yaml")
+def _from_mapping(name: str, content: Mapping[str, Any]) -> Camera:
+    """Camera of few sensors, described in YAML."""
     try:
         amplifiers, source = _yaml_amplifiers(content)
         detectors = tuple(
@@ -511,8 +335,11 @@ def _load_from_yaml(name: str) -> Camera:
         )
         title = str(content["title"])
     except KeyError as missing:
-        raise ResourceError(f"data/instrument/{name}.yaml lacks the entry {missing}") from None
-    _refuse_twins(name, (detector.id for detector in detectors))
+        raise InputError("entry", missing.args[0], "every entry that monocam.yaml or hsc.yaml has") from None
+    for field in ("id", "name"):
+        _refuse_twins(field, [getattr(detector, field) for detector in detectors])
+    if not detectors:
+        raise InputError("detectors", "none", "one detector or more")
     return Camera(name, title, detectors)
 
 
@@ -570,7 +397,7 @@ def _positive(field: str, value: Any) -> float:
     return number
 
 
-def _refuse_twins(name: str, ids: Iterable[int]) -> None:
-    numbers = list(ids)
-    if len(set(numbers)) != len(numbers):
-        raise ResourceError(f"data/instrument/{name}.yaml gives one detector number to two detectors")
+def _refuse_twins(field: str, values: Sequence[Any]) -> None:
+    for value in values:
+        if values.count(value) > 1:
+            raise InputError(f"{field} of a detector", value, "a value of its own for each detector")

@@ -1,0 +1,216 @@
+"""A sensor and its amplifiers: numbers, positions, flips.
+
+Coordinates are those of the assembled, trimmed CCD: ``[0, 0]`` is the lower-left pixel, ``y`` up.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from ..errors import InputError, UnknownNameError
+
+__all__ = ["Amplifier", "Detector", "RawSegment"]
+
+
+@dataclasses.dataclass(frozen=True)
+class RawSegment:
+    """Where the pixels of one amplifier stand in its raw image, read-out order.
+
+    Attributes
+    ----------
+    hdu : `int`
+        Number of the FITS HDU; 0 is the primary header.
+    extname : `str`
+        Name of the HDU, ``Segment10``.
+    shape : `tuple` [`int`, `int`]
+        Rows and columns of the raw image.
+    data_y0, data_x0 : `int`
+        First imaging row and column, counted from 0. Columns before ``data_x0`` are serial prescan; columns
+        right of the imaging section are serial overscan, rows above it parallel overscan.
+    """
+
+    hdu: int
+    extname: str
+    shape: tuple[int, int]
+    data_y0: int
+    data_x0: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Amplifier:
+    """One output of a CCD.
+
+    Attributes
+    ----------
+    name : `str`
+        Name, ``C00`` … ``C17`` for LSST sensors.
+    channel : `int`
+        Number, from 1, in the order of the raw file.
+    y0, x0 : `int`
+        Lower-left pixel of the amplifier in the assembled, trimmed CCD.
+    height, width : `int`
+        Imaging rows and columns.
+    flip_y, flip_x : `bool`
+        Whether the raw image is reversed along that axis when the CCD is assembled.
+    gain : `float`
+        Gain, electrons per ADU.
+    read_noise : `float`
+        Read noise, electrons rms.
+    saturation : `float`
+        Saturation level, ADU above bias.
+    raw : `RawSegment` or `None`
+        Layout of the raw image; `None` for cameras whose raw files are not in the LSST layout.
+    """
+
+    name: str
+    channel: int
+    y0: int
+    x0: int
+    height: int
+    width: int
+    flip_y: bool
+    flip_x: bool
+    gain: float
+    read_noise: float
+    saturation: float
+    raw: RawSegment | None = None
+
+    @property
+    def section(self) -> tuple[slice, slice]:
+        """The amplifier's pixels in the assembled CCD, as ``[y, x]`` slices."""
+        return slice(self.y0, self.y0 + self.height), slice(self.x0, self.x0 + self.width)
+
+
+@dataclasses.dataclass(frozen=True)
+class Detector:
+    """One sensor.
+
+    Attributes
+    ----------
+    id : `int`
+        Number within the camera.
+    name : `str`
+        ``R11_S01`` in LSSTCam, ``RTM-020_S01`` on TS8.
+    raft, slot : `str`
+        The two parts of the name.
+    vendor : `str`
+        ``e2v``, ``ITL`` or ``Hamamatsu``.
+    kind : `str`
+        ``science``, ``guider`` or ``wavefront``.
+    serial, raft_serial : `str`
+        Serial numbers of the sensor and of its raft; empty where not known.
+    x_mm, y_mm : `float`
+        Centre of the sensor in the focal plane, mm.
+    field_x_deg, field_y_deg : `float`
+        Field angle of the centre, degrees; nan on a test stand, which has no telescope.
+    yaw_deg : `float`
+        Rotation of the sensor in the focal plane, degrees.
+    pixel_um : `float`
+        Pixel pitch, µm.
+    amplifiers : `tuple` [`Amplifier`, ...]
+        Outputs, in the order of the raw file.
+    readout_source : `str`
+        Where gains and read noises come from.
+    """
+
+    id: int
+    name: str
+    raft: str
+    slot: str
+    vendor: str
+    kind: str
+    serial: str
+    raft_serial: str
+    x_mm: float
+    y_mm: float
+    field_x_deg: float
+    field_y_deg: float
+    yaw_deg: float
+    pixel_um: float
+    amplifiers: tuple[Amplifier, ...]
+    readout_source: str
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the assembled, trimmed CCD."""
+        return (
+            max(amp.y0 + amp.height for amp in self.amplifiers),
+            max(amp.x0 + amp.width for amp in self.amplifiers),
+        )
+
+    @property
+    def gain(self) -> float:
+        """Mean gain of the amplifiers, electrons per ADU."""
+        return float(np.mean([amp.gain for amp in self.amplifiers]))
+
+    @property
+    def read_noise(self) -> float:
+        """Mean read noise of the amplifiers, electrons rms."""
+        return float(np.mean([amp.read_noise for amp in self.amplifiers]))
+
+    @property
+    def field_radius_deg(self) -> float:
+        """Distance of the centre from the optical axis, degrees; nan on a test stand."""
+        return math.hypot(self.field_x_deg, self.field_y_deg)
+
+    def amplifier(self, name: str) -> Amplifier:
+        """Return one amplifier by name.
+
+        Raises
+        ------
+        UnknownNameError
+            The sensor has no such amplifier.
+        """
+        for amp in self.amplifiers:
+            if amp.name == name:
+                return amp
+        raise UnknownNameError("amplifier", name, (amp.name for amp in self.amplifiers), source=self.name)
+
+    def cut_down(self, shape: tuple[int, int]) -> Detector:
+        """Return the same sensor with fewer (or more) pixels per amplifier.
+
+        Names, order, gains, flips and the widths of prescan and overscan stay; what changes is the number of
+        imaging rows and columns.
+
+        Parameters
+        ----------
+        shape : `tuple` [`int`, `int`]
+            Rows and columns of the assembled CCD; divisible by the rows and columns of amplifiers.
+
+        Raises
+        ------
+        InputError
+            The size cannot be divided evenly among the amplifiers.
+        """
+        n_columns = len({amp.x0 for amp in self.amplifiers})
+        n_rows = len({amp.y0 for amp in self.amplifiers})
+        height, rest_y = divmod(shape[0], n_rows)
+        width, rest_x = divmod(shape[1], n_columns)
+        if rest_y or rest_x or height < 1 or width < 1:
+            raise InputError(
+                "detector shape (rows, columns)",
+                shape,
+                f"positive multiples of {n_rows} rows and {n_columns} columns",
+                source=self.name,
+            )
+        return dataclasses.replace(
+            self, amplifiers=tuple(_resized(amp, height, width) for amp in self.amplifiers)
+        )
+
+
+def _resized(amp: Amplifier, height: int, width: int) -> Amplifier:
+    raw = amp.raw
+    if raw is not None:
+        shape = (raw.shape[0] + height - amp.height, raw.shape[1] + width - amp.width)
+        raw = dataclasses.replace(raw, shape=shape)
+    return dataclasses.replace(
+        amp,
+        y0=amp.y0 // amp.height * height,
+        x0=amp.x0 // amp.width * width,
+        height=height,
+        width=width,
+        raw=raw,
+    )
