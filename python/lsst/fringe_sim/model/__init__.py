@@ -4,5 +4,16 @@ from .fringe_model import FringeModel
 from .response_table import ResponseTable, response_table, tabulate
 from .setup import Setup, setup_names
 from .table_cache import TableCache
+from .two_layer_table import TwoLayerTable, two_layer_table
 
-__all__ = ["FringeModel", "ResponseTable", "Setup", "TableCache", "response_table", "setup_names", "tabulate"]
+__all__ = [
+    "FringeModel",
+    "ResponseTable",
+    "Setup",
+    "TableCache",
+    "TwoLayerTable",
+    "response_table",
+    "setup_names",
+    "tabulate",
+    "two_layer_table",
+]

@@ -6,6 +6,7 @@ from .media import Medium, constant_medium, get_medium, medium_names
 from .phase_response import PhaseResponse, reduce_to_phase
 from .stack import Layer, LayerStack
 from .transfer_matrix import layer_absorption, reflection_transmission
+from .two_phase_response import ThicknessGrid, TwoPhaseResponse, reduce_to_two_phases
 
 __all__ = [
     "Beam",
@@ -15,11 +16,14 @@ __all__ = [
     "Medium",
     "PhaseResponse",
     "SpectralProfile",
+    "ThicknessGrid",
+    "TwoPhaseResponse",
     "constant_medium",
     "get_medium",
     "layer_absorption",
     "medium_names",
     "partially_coherent_absorption",
     "reduce_to_phase",
+    "reduce_to_two_phases",
     "reflection_transmission",
 ]

@@ -11,6 +11,7 @@ from ..errors import InputError
 from .illumination import DEFAULT_STEP_NM, Beam, Illumination, SpectralProfile
 from .phase_response import PhaseResponse, reduce_to_phase
 from .stack import LayerStack
+from .two_phase_response import TwoPhaseResponse, reduce_to_two_phases
 
 __all__ = ["OBSERVABLES", "OpticalSystem"]
 
@@ -97,4 +98,32 @@ class OpticalSystem:
             layers=layers,
             roughness=1e-3 * self.stack.roughness_nm,
             spread=self.stack.thickness_spread_um,
+        )
+
+    def reduce_two_layers(self, illumination: Illumination) -> TwoPhaseResponse:
+        """Closed form in the thickness of the detection layer and of the varying layer below it.
+
+        Raises
+        ------
+        InputError
+            The observable is not the detection layer, the varying layer does not lie below it, or a layer is not
+            fully coherent.
+        """
+        if self.observable != "detection":
+            raise InputError("observable", self.observable, "detection (with two varying layers)")
+        if np.any(self.stack.thickness_spread_um):
+            raise InputError(
+                "thickness spread", self.stack.thickness_spread_um.tolist(), "zero in all layers"
+            )
+        index = self.stack.indices(illumination.wavelength_nm, self.temperature_k)
+        thickness = np.where(np.isinf(self.stack.thickness_um), 0.0, self.stack.thickness_um)
+        return reduce_to_two_phases(
+            index,
+            thickness,
+            1e-3 * illumination.wavelength_nm,
+            illumination.theta,
+            self.polarization,
+            upper=self.stack.position(self.detection),
+            lower=self.stack.position(self.varying),
+            roughness=1e-3 * self.stack.roughness_nm,
         )

@@ -1,0 +1,274 @@
+"""Response as a table over the thickness of two layers, and whole frames made from it."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import spline_filter1d
+
+from ..errors import ConvergenceError, InputError, OutOfRangeError
+from ..optics.illumination import Illumination
+from ..optics.system import OpticalSystem
+from ..optics.two_phase_response import ThicknessGrid, TwoPhaseResponse
+from .response_table import FloatArray, content_key
+from .table_cache import TableCache
+
+__all__ = ["TwoLayerTable", "two_layer_table"]
+
+_MARGIN = 14
+"""Grid points beyond each end: what the spline does there has decayed by 0.268^14 = 1e-8 inside the range."""
+
+_SAFETY = 1.3
+"""The error in the middle of the cells, where it peaks, is multiplied by this."""
+
+
+@dataclass(frozen=True, eq=False)
+class TwoLayerTable:
+    """Response on a grid of two thicknesses, interpolated by a bicubic spline.
+
+    Attributes
+    ----------
+    start_um, step_um : `numpy.ndarray`, shape ``(2,)``
+        First grid point and spacing of the lower and the upper layer [µm], the margin included.
+    values : `numpy.ndarray`, shape ``(W, N, M)``
+        Response of W exposures at N thicknesses of the lower and M of the upper layer.
+    wavelength_nm : `numpy.ndarray`, shape ``(W,)``
+        Mean wavelength of every exposure [nm].
+    interpolation_error : `float`
+        Largest absolute error, measured in the middle of every cell, times 1.3.
+    quadrature_error : `float`
+        Error estimate of the illumination quadrature; NaN if it was not estimated.
+    key : `str`
+        Hash of everything that enters.
+    """
+
+    start_um: FloatArray
+    step_um: FloatArray
+    values: FloatArray
+    wavelength_nm: FloatArray
+    interpolation_error: float
+    quadrature_error: float = math.nan
+    key: str = ""
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 3 or min(self.values.shape[1:]) < 2 * _MARGIN + 2:
+            raise InputError(
+                "shape of the table", self.values.shape, "(exposures, lower, upper) with margins"
+            )
+        if self.wavelength_nm.shape != self.values.shape[:1]:
+            raise InputError("wavelengths of the table", self.wavelength_nm.shape, f"{self.values.shape[:1]}")
+
+    @property
+    def range_um(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Thicknesses of the lower and of the upper layer that may be looked up [µm]."""
+        low = self.start_um + _MARGIN * self.step_um
+        high = self.start_um + self.step_um * (np.array(self.values.shape[1:]) - 1 - _MARGIN)
+        return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
+
+    @functools.cached_property
+    def _coefficients(self) -> NDArray[np.float32]:
+        filtered = spline_filter1d(self.values, 3, axis=1, mode="mirror")
+        return spline_filter1d(filtered, 3, axis=2, mode="mirror").astype(np.float32)
+
+    def frame(
+        self,
+        lower_um: ArrayLike,
+        upper_um: ArrayLike,
+        row: int = 0,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """Image of one exposure, in one pass over both thickness maps with all processor cores.
+
+        Parameters
+        ----------
+        lower_um, upper_um : array_like, shape ``(ny, nx)``
+            Thickness maps [µm]; NaN in either gives NaN.
+        row : `int`, optional
+            Which exposure.
+        out : `numpy.ndarray`, float32, optional
+            Where to write.
+
+        Returns
+        -------
+        image : `numpy.ndarray`, float32, shape ``(ny, nx)``
+            The same bits whatever the number of threads.
+
+        Raises
+        ------
+        OutOfRangeError
+            A thickness outside the table, or a row that does not exist.
+        InputError
+            Maps of different shapes, or ``out`` of another shape or type.
+        """
+        lower, upper = np.asarray(lower_um), np.asarray(upper_um)
+        if lower.ndim != 2 or lower.shape != upper.shape:
+            raise InputError("thickness maps", (lower.shape, upper.shape), "two maps of one shape (y, x)")
+        if not 0 <= row < len(self.values):
+            raise OutOfRangeError("row of the table", row, f"0 to {len(self.values) - 1}")
+        if out is None:
+            out = np.empty(lower.shape, dtype=np.float32)
+        elif out.shape != lower.shape or out.dtype != np.float32:
+            raise InputError("output image", (out.shape, str(out.dtype)), f"{lower.shape}, float32")
+        kind = np.result_type(lower, upper, np.float32)
+        lower, upper = lower.astype(kind, copy=False), upper.astype(kind, copy=False)
+        limits = np.array(self.range_um) + 1e-9 * np.outer(self.step_um, [-1.0, 1.0])
+        outside = _frame_kernel(
+            self._coefficients[row], self.start_um, 1.0 / self.step_um, limits, lower, upper, out
+        )
+        if np.any(outside):
+            self._complain(lower[int(np.argmax(outside))], upper[int(np.argmax(outside))])
+        return out
+
+    def _complain(self, lower: FloatArray, upper: FloatArray) -> None:
+        for name, values, (low, high) in zip(("lower", "upper"), (lower, upper), self.range_um, strict=True):
+            wrong = (values < low) | (values > high)
+            if np.any(wrong):
+                raise OutOfRangeError(
+                    f"thickness of the {name} layer [um]", float(values[wrong][0]), f"{low:.6g} to {high:.6g}"
+                )
+
+
+def two_layer_table(
+    system: OpticalSystem,
+    illumination: Illumination,
+    lower_range_um: tuple[float, float],
+    upper_range_um: tuple[float, float],
+    *,
+    tolerance: float = 1e-6,
+    quadrature_error: float = math.nan,
+    cache: TableCache | None = None,
+) -> TwoLayerTable:
+    """Tabulate the response over the thickness of the varying layer and of the detection layer above it.
+
+    Parameters
+    ----------
+    system : `OpticalSystem`
+        The sensor.
+    illumination : `Illumination`
+        The light of W exposures.
+    lower_range_um, upper_range_um : `tuple` [`float`, `float`]
+        Thicknesses of the varying and of the detection layer to cover [µm].
+    tolerance : `float`, optional
+        Largest interpolation error.
+    quadrature_error : `float`, optional
+        Error estimate of the illumination, to be carried along.
+    cache : `TableCache`, optional
+        Where finished tables are kept.
+
+    Raises
+    ------
+    OutOfRangeError
+        An empty range, or one so near zero that no margin is left.
+    ConvergenceError
+        The tolerance cannot be reached.
+    """
+    ranges = np.array([lower_range_um, upper_range_um], dtype=float)
+    if not (np.all(np.isfinite(ranges)) and np.all(ranges[:, 0] < ranges[:, 1]) and np.all(ranges >= 0.0)):
+        raise OutOfRangeError("thickness ranges [um]", ranges.tolist(), "two increasing pairs, not negative")
+    wavelength = illumination.mean_wavelength_nm
+    flat = (float(ranges[0, 0]), float(ranges[0, 1]))
+    base = content_key(system, illumination, flat, tolerance, wavelength, quadrature_error)
+    key = f"{base}x{np.ascontiguousarray(ranges[1]).tobytes().hex()}"
+
+    def build() -> TwoLayerTable:
+        reduced = system.reduce_two_layers(illumination)
+        return _build(reduced, illumination, ranges, tolerance, quadrature_error, key)
+
+    return build() if cache is None else cache.get(key, TwoLayerTable, build)
+
+
+def _build(
+    reduced: TwoPhaseResponse,
+    illumination: Illumination,
+    ranges: FloatArray,
+    tolerance: float,
+    quadrature_error: float,
+    key: str,
+) -> TwoLayerTable:
+    phase = np.array([np.abs(reduced.kappa_lower.real).max(), np.abs(reduced.kappa_upper.real).max()])
+    # A wave of 0.1 and its overtones, spline error (kappa h)^4 / 384 each, one half of it per axis.
+    step = (384.0 * 0.5 * tolerance / 0.2) ** 0.25 / phase
+    error = math.inf
+    for _ in range(4):
+        cells = np.maximum(2 * _MARGIN, np.ceil((ranges[:, 1] - ranges[:, 0]) / step)).astype(int)
+        step = (ranges[:, 1] - ranges[:, 0]) / cells
+        start = ranges[:, 0] - _MARGIN * step
+        if np.any(start < 0.0):
+            raise OutOfRangeError(
+                "start of a thickness range [um]", ranges[:, 0].tolist(), f"at least {_MARGIN * step}"
+            )
+        nodes = [ThicknessGrid(start[i], step[i], int(cells[i]) + 2 * _MARGIN + 1) for i in range(2)]
+        middles = [ThicknessGrid(ranges[i, 0] + 0.5 * step[i], step[i], int(cells[i])) for i in range(2)]
+        values = reduced.averaged_on_grid(illumination.weight, *nodes)
+        table = TwoLayerTable(
+            start, step, values, illumination.mean_wavelength_nm, math.nan, quadrature_error, key
+        )
+        exact = reduced.averaged_on_grid(illumination.weight, *middles)
+        error = _SAFETY * _middle_error(table, exact)
+        if error <= tolerance:
+            return TwoLayerTable(start, step, values, table.wavelength_nm, error, quadrature_error, key)
+        step = step * max(0.3, min(0.8, 0.9 * (tolerance / error) ** 0.25))
+    raise ConvergenceError(f"table of two layers: interpolation error {error:.2g}; asked for {tolerance:.2g}")
+
+
+def _middle_error(table: TwoLayerTable, exact: FloatArray) -> float:
+    weight = np.array([1.0, 23.0, 23.0, 1.0]) / 48.0
+    filtered = spline_filter1d(table.values, 3, axis=1, mode="mirror")
+    filtered = spline_filter1d(filtered, 3, axis=2, mode="mirror")
+    first = _MARGIN - 1
+    _, rows, columns = exact.shape
+    along = sum(weight[k] * filtered[:, first + k : first + k + rows] for k in range(4))
+    middle = sum(weight[k] * along[:, :, first + k : first + k + columns] for k in range(4))
+    return float(np.abs(middle - exact).max())
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract", "reassoc"})
+def _frame_kernel(
+    coefficients: NDArray,
+    start: NDArray,
+    per_step: NDArray,
+    limits: NDArray,
+    lower: NDArray,
+    upper: NDArray,
+    out: NDArray,
+) -> NDArray:  # pragma: no cover - compiled
+    height, width = lower.shape
+    rows, columns = coefficients.shape
+    outside = np.zeros(height, dtype=np.bool_)
+    s0, s1, f0, f1 = start[0], start[1], per_step[0], per_step[1]
+    sixth, half = np.float32(1.0 / 6.0), np.float32(0.5)
+    one, two_thirds = np.float32(1.0), np.float32(2.0 / 3.0)
+    for y in numba.prange(height):
+        wrong = 0
+        for x in range(width):
+            a, b = float(lower[y, x]), float(upper[y, x])
+            inside = a >= limits[0, 0] and a <= limits[0, 1] and b >= limits[1, 0] and b <= limits[1, 1]
+            if not inside:
+                out[y, x] = np.nan
+                # NaN is no complaint; a finite thickness outside is.
+                wrong += a < limits[0, 0] or a > limits[0, 1] or b < limits[1, 0] or b > limits[1, 1]
+                continue
+            u, v = (a - s0) * f0, (b - s1) * f1
+            i, j = min(max(int(u), 1), rows - 3), min(max(int(v), 1), columns - 3)
+            t, q = np.float32(u - i), np.float32(v - j)
+            s, p = one - t, one - q
+            w0, w3 = sixth * s * s * s, sixth * t * t * t
+            w1, w2 = two_thirds - half * t * t * (one + s), two_thirds - half * s * s * (one + t)
+            h0, h3 = sixth * p * p * p, sixth * q * q * q
+            h1, h2 = two_thirds - half * q * q * (one + p), two_thirds - half * p * p * (one + q)
+            c0, c1, c2, c3 = (
+                coefficients[i - 1], coefficients[i], coefficients[i + 1], coefficients[i + 2]
+            )  # fmt: skip
+            out[y, x] = (
+                w0 * (h0 * c0[j - 1] + h1 * c0[j] + h2 * c0[j + 1] + h3 * c0[j + 2])
+                + w1 * (h0 * c1[j - 1] + h1 * c1[j] + h2 * c1[j + 1] + h3 * c1[j + 2])
+                + w2 * (h0 * c2[j - 1] + h1 * c2[j] + h2 * c2[j + 1] + h3 * c2[j + 2])
+                + w3 * (h0 * c3[j - 1] + h1 * c3[j] + h2 * c3[j + 1] + h3 * c3[j + 2])
+            )
+        outside[y] = wrong > 0
+    return outside
