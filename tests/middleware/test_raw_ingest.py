@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from astro_metadata_translator import ObservationInfo
-from lsst.daf.butler import Butler
+from lsst.daf.butler import Butler, DatasetType
+from lsst.resources import ResourcePath
 from raw_frame_maker import LSSTCAM_HEADER, write_raw
 
 from conftest import Invoke
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_header
+from lsst.fringe_sim.middleware import get_cli_subcommands
 from lsst.fringe_sim.middleware.raw_ingest import IngestReport, find_raw_files, ingest_raws
 from lsst.fringe_sim.middleware.translators import TRANSLATORS
 
@@ -172,6 +175,16 @@ def test_instrument_that_is_not_registered_is_named(tmp_path: Path) -> None:
     assert "lsst.fringe_sim.Ts8Fringe" in message
 
 
+def test_raw_frames_of_another_package_are_left_alone(repo: Path, tmp_path: Path, invoke: Invoke) -> None:
+    with Butler.from_config(str(repo), writeable=True) as butler:
+        butler.registry.registerDatasetType(
+            DatasetType("raw", ("instrument", "exposure", "detector"), "Exposure", universe=butler.dimensions)
+        )
+    result = invoke("ingest-fringe-raws", repo, write_raw(tmp_path / "raw.fits"))
+    assert result.exit_code == 1
+    assert "Error: dataset type is 'raw'; allowed: one of storage class RawFrame" in result.output
+
+
 def contradiction(butler: Butler, tmp_path: Path, changes: dict[str, Any]) -> IngestReport:
     """Ingest a frame, then another one with the same start."""
     ingest_raws(butler, [str(write_raw(tmp_path / "first.fits"))])
@@ -280,6 +293,16 @@ def test_commands_say_when_there_is_no_repository(tmp_path: Path, invoke: Invoke
         assert result.exit_code == 1
         assert "Error: repository is" in result.output
         assert "Traceback" not in result.output
+
+
+def test_commands_are_known_without_an_entry_point() -> None:
+    """The file that an installation by EUPS names in DAF_BUTLER_PLUGINS has the same commands."""
+    resource = ResourcePath("resource://lsst.fringe_sim/middleware/butler_commands.yaml")
+    listed = yaml.safe_load(resource.read())["cmd"]
+    commands = {command.name: command for command in get_cli_subcommands()}
+    assert set(listed["commands"]) == set(commands)
+    for name, command in commands.items():
+        assert getattr(sys.modules[listed["import"]], name.replace("-", "_")) is command
 
 
 def test_command_in_a_process_of_its_own(repo: Path, tmp_path: Path) -> None:

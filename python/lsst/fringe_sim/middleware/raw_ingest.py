@@ -168,6 +168,11 @@ def ingest_raws(
     -------
     report : `IngestReport`
         What became of each file.
+
+    Raises
+    ------
+    InputError
+        The repository holds raw frames of another kind.
     """
     files, refused = find_raw_files(paths)
     registered = _registered_instruments(butler)
@@ -327,8 +332,7 @@ def _store(
     transfer: str | None,
 ) -> tuple[list[RawExposure], list[str]]:
     """Write records and files; exposures that contradict the repository are set aside."""
-    dataset_type = raw_dataset_type(butler)
-    butler.registry.registerDatasetType(dataset_type)
+    dataset_type = _registered_dataset_type(butler)
     refused = _sync_exposures(butler, exposures, registered)
     stored = [exposure for exposure in exposures if _exposure_key(exposure) not in refused]
     for run in {runs[exposure.instrument] for exposure in stored}:
@@ -355,6 +359,19 @@ def _store(
         if _exposure_key(exposure) in refused
     ]
     return stored, messages
+
+
+def _registered_dataset_type(butler: Butler) -> DatasetType:
+    dataset_type = raw_dataset_type(butler)
+    try:
+        butler.registry.registerDatasetType(dataset_type)
+    except ConflictingDefinitionError as error:
+        raise InputError(
+            "dataset type",
+            RAW,
+            f"one of storage class RawFrame; this repository holds raw frames of another package ({error})",
+        ) from error
+    return dataset_type
 
 
 def _exposure_key(exposure: RawExposure) -> tuple[str, int]:
