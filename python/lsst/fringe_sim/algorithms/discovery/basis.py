@@ -1,0 +1,208 @@
+"""The thickness field as a nuisance: a smooth spline over the sensor, or one free value per cell."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+__all__ = ["CellBasis", "FieldBasis", "NormalMatrix", "SplineBasis"]
+
+FloatArray = NDArray[np.float64]
+
+RIDGE = 1e-8
+"""Smallest curvature relative to the largest; keeps coefficients without data where they are."""
+
+
+class NormalMatrix(ABC):
+    """Curvature of χ² in the coefficients of a field."""
+
+    @abstractmethod
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Apply the inverse to the columns of ``right``, shape ``(M, K)``."""
+
+
+class FieldBasis(ABC):
+    """Linear parametrisation of a field on the cells."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Number of coefficients."""
+
+    @abstractmethod
+    def expand(self, coefficients: FloatArray) -> FloatArray:
+        """Field ``(ny, nx)`` of the given coefficients."""
+
+    @abstractmethod
+    def gather(self, fields: FloatArray) -> FloatArray:
+        """Transpose of `expand` for K fields: ``(K, ny, nx)`` to ``(M, K)``."""
+
+    @abstractmethod
+    def normal_matrix(self, curvature: FloatArray, prior: FloatArray | float = 0.0) -> NormalMatrix:
+        """Normal matrix for the curvature ``(ny, nx)`` of the cells; ``prior`` is the precision of a coefficient."""
+
+    def fit(self, field: FloatArray, weight: FloatArray) -> FloatArray:
+        """Weighted least-squares coefficients of a field."""
+        right = self.gather((weight * field)[np.newaxis])
+        return self.normal_matrix(weight).solve(right)[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class SplineBasis(FieldBasis):
+    """Tensor product of uniform cubic B-splines.
+
+    Attributes
+    ----------
+    along_y, along_x : `numpy.ndarray`, shapes ``(ny, my)`` and ``(nx, mx)``
+        Basis functions at the rows and columns of cells.
+    """
+
+    along_y: FloatArray
+    along_x: FloatArray
+
+    @classmethod
+    def of_grid(cls, shape: tuple[int, int], spacing: float) -> SplineBasis:
+        """Splines with knots about every ``spacing`` cells."""
+        return cls(*(_uniform_splines(size, spacing) for size in shape))
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.along_y.shape[1] * self.along_x.shape[1]
+
+    def expand(self, coefficients: FloatArray) -> FloatArray:
+        """Field on the cells; see `FieldBasis.expand`."""
+        square = coefficients.reshape(self.along_y.shape[1], self.along_x.shape[1])
+        return self.along_y @ square @ self.along_x.T
+
+    def gather(self, fields: FloatArray) -> FloatArray:
+        """Sums over cells; see `FieldBasis.gather`."""
+        partial = np.matmul(self.along_y.T, np.matmul(fields, self.along_x))
+        return np.ascontiguousarray(partial.reshape(len(fields), -1).T)
+
+    def normal_matrix(self, curvature: FloatArray, prior: FloatArray | float = 0.0) -> NormalMatrix:
+        """Banded matrix; see `FieldBasis.normal_matrix`."""
+        first_y, first_x = _first_nonzero(self.along_y), _first_nonzero(self.along_x)
+        band = _assemble(self.along_y, self.along_x, first_y, first_x, np.ascontiguousarray(curvature))
+        band[0] += RIDGE * max(float(band[0].max()), 1e-300) + prior
+        return _Banded(cholesky_banded(band, lower=True, overwrite_ab=True))
+
+
+@dataclass(frozen=True, eq=False)
+class CellBasis(FieldBasis):
+    """One coefficient per cell.
+
+    Attributes
+    ----------
+    shape : `tuple` [`int`, `int`]
+        Rows and columns of cells.
+    """
+
+    shape: tuple[int, int]
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.shape[0] * self.shape[1]
+
+    def expand(self, coefficients: FloatArray) -> FloatArray:
+        """Field on the cells; see `FieldBasis.expand`."""
+        return coefficients.reshape(self.shape)
+
+    def gather(self, fields: FloatArray) -> FloatArray:
+        """Cells themselves; see `FieldBasis.gather`."""
+        return np.ascontiguousarray(fields.reshape(len(fields), -1).T)
+
+    def normal_matrix(self, curvature: FloatArray, prior: FloatArray | float = 0.0) -> NormalMatrix:
+        """Diagonal matrix; see `FieldBasis.normal_matrix`."""
+        diagonal = curvature.ravel() + prior
+        return _Diagonal(diagonal + RIDGE * max(float(diagonal.max()), 1e-300))
+
+
+@dataclass(frozen=True, eq=False)
+class _Banded(NormalMatrix):
+    factor: FloatArray
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        solution: FloatArray = cho_solve_banded((self.factor, True), right)
+        return solution
+
+
+@dataclass(frozen=True, eq=False)
+class _Diagonal(NormalMatrix):
+    diagonal: FloatArray
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        return right / self.diagonal[:, np.newaxis]
+
+
+def _uniform_splines(size: int, spacing: float) -> FloatArray:
+    if size == 1:
+        return np.ones((1, 1))
+    intervals = max(1, round((size - 1) / spacing))
+    degree = min(3, size - 1)
+    inner = np.linspace(0.0, size - 1.0, intervals + 1)
+    step = inner[1] - inner[0]
+    knots = inner[0] + step * np.arange(-degree, intervals + degree + 1)
+    at = np.clip(np.arange(size, dtype=float), inner[0], inner[-1])
+    return np.asarray(BSpline.design_matrix(at, knots, degree).toarray())
+
+
+def _first_nonzero(basis: FloatArray) -> NDArray[np.int64]:
+    first: NDArray[np.int64] = np.argmax(basis != 0.0, axis=1)
+    return first
+
+
+@numba.njit(cache=True)
+def _assemble(
+    along_y: FloatArray,
+    along_x: FloatArray,
+    first_y: NDArray[np.int64],
+    first_x: NDArray[np.int64],
+    curvature: FloatArray,
+) -> FloatArray:  # pragma: no cover - compiled
+    """Lower band of the normal matrix; coefficients are numbered row by row."""
+    ny, my = along_y.shape
+    nx, mx = along_x.shape
+    reach_y, reach_x = min(4, my), min(4, mx)
+    bandwidth = (reach_y - 1) * mx + reach_x - 1
+    band = np.zeros((bandwidth + 1, my * mx))
+    row = np.zeros((mx, reach_x))
+    for iy in range(ny):
+        # Sum over the columns of one row of cells first: the y factors are common to it.
+        row[:] = 0.0
+        for ix in range(nx):
+            h = curvature[iy, ix]
+            if h == 0.0:
+                continue
+            fx = min(first_x[ix], mx - reach_x)
+            for a in range(reach_x):
+                wa = h * along_x[ix, fx + a]
+                for b in range(a + 1):
+                    row[fx + b, a - b] += wa * along_x[ix, fx + b]
+        fy = min(first_y[iy], my - reach_y)
+        for p in range(reach_y):
+            for q in range(reach_y):
+                wy = along_y[iy, fy + p] * along_y[iy, fy + q]
+                if wy == 0.0:
+                    continue
+                for jx in range(mx):
+                    for shift in range(min(reach_x, mx - jx)):
+                        value = wy * row[jx, shift]
+                        # element ((fy+p, jx+shift), (fy+q, jx)), kept once in the lower triangle
+                        i = (fy + p) * mx + jx + shift
+                        j = (fy + q) * mx + jx
+                        if i >= j:
+                            band[i - j, j] += value
+                        if shift > 0:
+                            i2 = (fy + p) * mx + jx
+                            j2 = (fy + q) * mx + jx + shift
+                            if i2 >= j2:
+                                band[i2 - j2, j2] += value
+    return band

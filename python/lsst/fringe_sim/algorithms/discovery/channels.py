@@ -1,0 +1,221 @@
+"""Is there a disagreement beyond noise, and where: score tests in channels that need no catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dctn
+from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import f as f_distribution
+
+from ...effects import AMPLIFIERS
+from .fit import Design
+
+__all__ = ["Channel", "State", "combined_probability", "fringe_phase", "measure_channels", "project_test"]
+
+FloatArray = NDArray[np.float64]
+
+HARMONICS = 3
+BANDS = 8
+"""Bands of spatial frequency in the test of texture."""
+
+SPATIAL_ORDER = 4
+"""Cosine patterns up to this order along both axes together."""
+
+RANK_TOLERANCE = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A fit with all that the tests need.
+
+    Attributes
+    ----------
+    design : `Design`
+        Linearised model at the fit, all nuisances and free effects in it.
+    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Whitened residual.
+    raw_residual : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Data minus model, relative; 0 where there are no data.
+    value : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Model.
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Fitted field.
+    whiten : callable
+        Whitens a derivative.
+    """
+
+    design: Design
+    residual: FloatArray
+    raw_residual: FloatArray
+    value: FloatArray
+    thickness_um: FloatArray
+    whiten: object
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Result of one test.
+
+    Attributes
+    ----------
+    name : `str`
+        What was looked at.
+    statistic, degrees : `float`
+        χ² and its degrees of freedom under the null hypothesis.
+    probability : `float`
+        Chance of so large a statistic from noise alone, corrected for the looks within the channel.
+    """
+
+    name: str
+    statistic: float
+    degrees: float
+    probability: float
+
+
+def project_test(design: Design, features: FloatArray, residual: FloatArray) -> tuple[float, int]:
+    """Score statistic of features with all nuisances projected out, and its degrees of freedom."""
+    score, information = design.project(features, residual)
+    scale = np.sqrt(np.maximum(np.einsum("fwyx,fwyx->f", features, features), 1e-300))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    keep = values > RANK_TOLERANCE
+    along = vectors[:, keep].T @ (score / scale)
+    return float((along**2 / values[keep]).sum()), int(keep.sum())
+
+
+def fringe_phase(thickness_um: FloatArray, wavelength_nm: FloatArray, index: FloatArray) -> FloatArray:
+    """Round-trip phase of the varying layer, ``(W, ny, nx)`` [rad]."""
+    return (4.0 * np.pi * index / (1e-3 * wavelength_nm))[:, None, None] * thickness_um
+
+
+def measure_channels(state: State, geometry: object, index: FloatArray) -> tuple[Channel, ...]:
+    """All tests that need no catalogue.
+
+    Parameters
+    ----------
+    state : `State`
+        Fit to be criticised.
+    geometry : `ImageGeometry`
+        Cells.
+    index : `numpy.ndarray`, shape ``(W,)``
+        Refractive index of the varying layer.
+    """
+    channels = [_feature_channel("thickness phase", phase_features(state, geometry, index), state)]
+    if min(state.thickness_um.shape) >= 8:
+        channels.append(_feature_channel("large scales", spatial_features(state, geometry), state))
+        channels.append(_feature_channel("amplifiers", amplifier_features(state, geometry), state))
+    if min(state.thickness_um.shape) >= 24:
+        channels.extend(texture_channels(state))
+    return tuple(channels)
+
+
+def combined_probability(channels: Sequence[Channel]) -> float:
+    """Chance that noise alone gives so small a smallest probability among the channels."""
+    smallest = min((channel.probability for channel in channels), default=1.0)
+    return float(-np.expm1(len(channels) * np.log1p(-min(smallest, 1.0 - 1e-16))))
+
+
+def _feature_channel(name: str, features: FloatArray, state: State) -> Channel:
+    statistic, degrees = project_test(state.design, features, state.residual)
+    return Channel(name, statistic, degrees, float(chi2_distribution.sf(statistic, max(degrees, 1))))
+
+
+def phase_features(state: State, geometry, index: FloatArray) -> FloatArray:  # type: ignore[no-untyped-def]
+    """Per wavelength: harmonics of the fringe, the first with a trend in thickness, and a smooth curve."""
+    phase = fringe_phase(state.thickness_um, geometry.wavelength_nm, index)
+    used = state.thickness_um
+    half = max(0.5 * float(np.ptp(used)), 1e-6)
+    depth = (used - 0.5 * (used.max() + used.min())) / half
+    columns = []
+    for plane in range(len(phase)):
+        shapes = [f(h * phase[plane]) for h in range(1, HARMONICS + 1) for f in (np.cos, np.sin)]
+        shapes += [np.cos(phase[plane]) * depth, np.sin(phase[plane]) * depth]
+        if half > 0.3:
+            shapes += [depth, depth**2]
+        for shape in shapes:
+            column = np.zeros(phase.shape)
+            column[plane] = shape
+            columns.append(state.whiten(column))  # type: ignore[operator]
+    return np.stack(columns)
+
+
+def spatial_features(state: State, geometry) -> FloatArray:  # type: ignore[no-untyped-def]
+    """Cosine patterns over the sensor, the same at all wavelengths and in proportion to wavelength."""
+    v, u = 0.5 * np.pi * (geometry.v + 1.0), 0.5 * np.pi * (geometry.u + 1.0)
+    colour = _colour(geometry.wavelength_nm)
+    columns = []
+    for j in range(SPATIAL_ORDER + 1):
+        for i in range(SPATIAL_ORDER + 1 - j):
+            if i + j == 0:
+                continue
+            pattern = state.value * (np.cos(j * v) * np.cos(i * u))
+            columns.append(state.whiten(pattern))  # type: ignore[operator]
+            if colour.any():
+                columns.append(state.whiten(pattern * colour))  # type: ignore[operator]
+    return np.stack(columns)
+
+
+def amplifier_features(state: State, geometry) -> FloatArray:  # type: ignore[no-untyped-def]
+    """One factor for each amplifier, the same at all wavelengths and in proportion to wavelength."""
+    place = geometry.amplifier
+    colour = _colour(geometry.wavelength_nm)
+    columns = []
+    for number in range(len(AMPLIFIERS)):
+        inside = state.value * (place == number)
+        if inside.any():
+            columns.append(state.whiten(inside))  # type: ignore[operator]
+            if colour.any():
+                columns.append(state.whiten(inside * colour))  # type: ignore[operator]
+    return np.stack(columns)
+
+
+def texture_channels(state: State) -> list[Channel]:
+    """Power of the residual in bands of spatial frequency against the highest band, and single peaks."""
+    used = (state.whiten(np.ones(state.value.shape)) != 0.0).any(axis=0)  # type: ignore[operator]
+    common = state.residual.sum(axis=0) / np.sqrt(len(state.residual))
+    result = []
+    for name, power in (
+        ("achromatic texture", dctn(common, norm="ortho") ** 2),
+        ("texture", np.mean([dctn(plane, norm="ortho") ** 2 for plane in state.residual], axis=0)),
+    ):
+        planes = 1 if name.startswith("achromatic") else len(state.residual)
+        result.append(_band_channel(name, power, planes, float(used.mean())))
+    power = dctn(common, norm="ortho") ** 2
+    power[0, 0] = 0.0
+    top = power / np.median(power[power > 0]) * chi2_distribution.ppf(0.5, 1)
+    single = float(chi2_distribution.sf(top.max(), 1))
+    result.append(
+        Channel("achromatic peak", float(top.max()), 1.0, float(-np.expm1(top.size * np.log1p(-min(single, 0.5)))))
+    )
+    return result
+
+
+def _band_channel(name: str, power: FloatArray, planes: int, filled: float) -> Channel:
+    ny, nx = power.shape
+    radius = np.hypot(np.arange(ny)[:, None] / ny, np.arange(nx)[None, :] / nx)
+    edges = np.linspace(0.0, 1.0, BANDS + 1)
+    top = radius >= edges[-2]
+    base, base_count = float(power[top].mean()), planes * int(top.sum()) * filled
+    smallest, statistic, degrees = 1.0, 0.0, 1.0
+    for low, high in zip(edges[:-2], edges[1:-1], strict=True):
+        inside = (radius >= low) & (radius < high) & (radius > 0.0)
+        if inside.sum() < 4:
+            continue
+        count = planes * int(inside.sum()) * filled
+        ratio = float(power[inside].mean()) / max(base, 1e-300)
+        chance = float(f_distribution.sf(ratio, count, base_count))
+        if chance < smallest:
+            smallest, statistic, degrees = chance, ratio * count, count
+    return Channel(name, statistic, degrees, float(-np.expm1((BANDS - 1) * np.log1p(-min(smallest, 1 - 1e-16)))))
+
+
+def _colour(wavelength_nm: FloatArray) -> FloatArray:
+    span = float(np.ptp(wavelength_nm))
+    if span == 0.0:
+        return np.zeros((len(wavelength_nm), 1, 1))
+    middle = 0.5 * (wavelength_nm.max() + wavelength_nm.min())
+    colour: FloatArray = (2.0 * (wavelength_nm - middle) / span)[:, None, None]
+    return colour

@@ -1,0 +1,155 @@
+"""Curves and numbers that say where model and data disagree, and what a leftover looks like."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dctn
+from scipy.stats import chi2 as chi2_distribution
+
+from ...effects import AMPLIFIERS, ImageGeometry
+from .channels import Channel, State, fringe_phase
+from .verdict import Where
+
+__all__ = ["describe_residual", "disagreement"]
+
+FloatArray = NDArray[np.float64]
+
+PHASE_BINS = 16
+
+
+def disagreement(
+    state: State, channels: tuple[Channel, ...], geometry: ImageGeometry, index: FloatArray, cell_px: int
+) -> Where:
+    """Where a fit and the data disagree."""
+    phase = fringe_phase(state.thickness_um, geometry.wavelength_nm, index)
+    return Where(
+        tuple(_by_wavelength(state, phase, geometry)),
+        tuple(_by_amplifier(state, geometry)),
+        _strongest_scale(state, cell_px),
+        tuple(_by_phase(state, phase)),
+        tuple(
+            {
+                "name": c.name,
+                "statistic": c.statistic,
+                "degrees": c.degrees,
+                "probability": c.probability,
+            }
+            for c in channels
+        ),
+    )
+
+
+def describe_residual(
+    state: State, geometry: ImageGeometry, index: FloatArray, cell_px: int, channels: tuple[Channel, ...]
+) -> dict[str, Any]:
+    """What a leftover looks like, without a name: waveform, colour, scales, pattern of amplifiers, modes."""
+    phase = fringe_phase(state.thickness_um, geometry.wavelength_nm, index)
+    colour = []
+    for plane, wavelength in enumerate(geometry.wavelength_nm):
+        used = state.raw_residual[plane] != 0.0
+        beyond = float((state.residual[plane][used] ** 2).mean() - 1.0) if used.any() else 0.0
+        colour.append({"wavelength_nm": float(wavelength), "variance_beyond_noise": beyond})
+    harmonics = []
+    for harmonic in (1, 2, 3):
+        cosine, sine, sigma = _harmonic(state, phase, harmonic)
+        harmonics.append({"harmonic": harmonic, "cos": cosine, "sin": sine, "sigma": sigma})
+    planes = state.residual.reshape(len(state.residual), -1)
+    modes = np.linalg.svd(planes @ planes.T / planes.shape[1], compute_uv=False)
+    return {
+        "channels": [c.name for c in sorted(channels, key=lambda c: c.probability) if c.probability < 1e-3],
+        "wavelength": colour,
+        "thickness_phase_waveform": _by_phase(state, phase),
+        "harmonics": harmonics,
+        "spatial_power": _radial_power(state, cell_px),
+        "amplifiers": _by_amplifier(state, geometry),
+        "principal_modes": [float(x) for x in modes[:5]],
+    }
+
+
+def _by_wavelength(state: State, phase: FloatArray, geometry: ImageGeometry) -> list[dict[str, float]]:
+    rows = []
+    for plane, wavelength in enumerate(geometry.wavelength_nm):
+        shapes = [f(h * phase[plane]) for h in (1, 2, 3) for f in (np.cos, np.sin)] + [np.ones(phase.shape[1:])]
+        weight = _plane_weight(state, plane)
+        root = np.sqrt(weight)
+        columns = np.stack([(root * shape).ravel() for shape in shapes], axis=1)
+        data = (root * state.raw_residual[plane]).ravel()
+        solution = np.linalg.lstsq(columns, data, rcond=None)[0]
+        explained = float(data @ columns @ solution)
+        rows.append(
+            {"wavelength_nm": float(wavelength), "chi2": explained, "degrees": float(len(shapes)),
+             "rms": float(np.sqrt((state.raw_residual[plane] ** 2).mean()))}
+        )  # fmt: skip
+    return rows
+
+
+def _plane_weight(state: State, plane: int) -> FloatArray:
+    unit = np.zeros(state.value.shape)
+    unit[plane] = 1.0
+    weight: FloatArray = (state.whiten(unit) ** 2).sum(axis=0)  # type: ignore[operator]
+    return weight
+
+
+def _by_amplifier(state: State, geometry: ImageGeometry) -> list[dict[str, Any]]:
+    place = geometry.amplifier
+    common = state.whiten(np.ones(state.value.shape))  # type: ignore[operator]
+    rows = []
+    for number, name in enumerate(AMPLIFIERS):
+        inside = place == number
+        if not inside.any():
+            continue
+        weight = float((common[:, inside] ** 2).sum())
+        if weight > 0.0:
+            offset = float((common * state.residual)[:, inside].sum()) / weight
+            rows.append({"amplifier": name, "offset": offset, "sigma": weight**-0.5})
+    return rows
+
+
+def _by_phase(state: State, phase: FloatArray) -> list[dict[str, float]]:
+    turn = np.mod(phase / (2.0 * np.pi), 1.0)
+    place = np.minimum((turn * PHASE_BINS).astype(int), PHASE_BINS - 1)
+    weight = np.stack([_plane_weight(state, plane) for plane in range(len(phase))])
+    rows = []
+    for number in range(PHASE_BINS):
+        inside = place == number
+        total = float(weight[inside].sum())
+        if total > 0.0:
+            mean = float((weight * state.raw_residual)[inside].sum()) / total
+            rows.append({"phase": (number + 0.5) / PHASE_BINS, "residual": mean, "sigma": total**-0.5})
+    return rows
+
+
+def _harmonic(state: State, phase: FloatArray, harmonic: int) -> tuple[float, float, float]:
+    weight = np.stack([_plane_weight(state, plane) for plane in range(len(phase))])
+    total = float(weight.sum())
+    cosine = 2.0 * float((weight * state.raw_residual * np.cos(harmonic * phase)).sum()) / total
+    sine = 2.0 * float((weight * state.raw_residual * np.sin(harmonic * phase)).sum()) / total
+    return cosine, sine, float(np.sqrt(2.0 / total))
+
+
+def _radial_power(state: State, cell_px: int) -> list[dict[str, float]]:
+    if min(state.thickness_um.shape) < 16:
+        return []
+    power = np.mean([dctn(plane, norm="ortho") ** 2 for plane in state.residual], axis=0)
+    ny, nx = power.shape
+    frequency = 0.5 * np.hypot(np.arange(ny)[:, None] / ny, np.arange(nx)[None, :] / nx)  # per cell
+    edges = np.geomspace(1.0 / max(ny, nx), 0.7, 13)
+    rows = []
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        inside = (frequency >= low) & (frequency < high)
+        count = int(inside.sum()) * len(state.residual)
+        if count:
+            mean = float(power[inside].mean())
+            rows.append(
+                {"scale_px": cell_px / float(np.sqrt(low * high)), "power": mean,
+                 "probability": float(chi2_distribution.sf(mean * count, count))}
+            )  # fmt: skip
+    return rows
+
+
+def _strongest_scale(state: State, cell_px: int) -> float:
+    rows = [row for row in _radial_power(state, cell_px) if row["probability"] < 1e-3]
+    return max(rows, key=lambda row: row["power"])["scale_px"] if rows else 0.0

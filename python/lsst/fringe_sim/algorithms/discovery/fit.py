@@ -1,0 +1,576 @@
+"""Joint fit of effects, levels and thickness field to the cells, and the projections that go with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...effects import Effect
+from .basis import FieldBasis, NormalMatrix
+from .cells import CellData
+from .forward import Forward, Prediction
+
+__all__ = [
+    "Coordinate",
+    "Design",
+    "Fit",
+    "Problem",
+    "Whitener",
+    "coordinate_derivative",
+    "coordinates_of",
+    "fit_model",
+    "linearise_at",
+]
+
+FloatArray = NDArray[np.float64]
+
+PRIOR_WIDTH = 3.0
+"""Width of the weak Gaussian prior of a parameter in units of its prior scale."""
+
+LARGEST_PHASE_STEP_UM = 0.06
+"""Largest step of the fringe phase, as a thickness: a fifth of a fringe order."""
+
+MOST_ITERATIONS = 25
+CONVERGED = 0.02
+"""Change of χ² at which a fit stops."""
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A parameter of an effect in the coordinate in which its onset is linear.
+
+    The coordinate is 0 at null. An effect that starts with the square of its parameter (roughness, aperture) is
+    followed in the square, so that data and coordinate are in proportion near the null.
+
+    Attributes
+    ----------
+    effect, parameter : `str`
+        Whose coordinate it is.
+    null, low, high, scale : `float`
+        Null value, bounds and prior scale of the parameter.
+    quadratic : `bool`
+        Whether the coordinate is the square of the departure from null.
+    """
+
+    effect: str
+    parameter: str
+    null: float
+    low: float
+    high: float
+    scale: float
+    quadratic: bool
+    unit: str = ""
+
+    @property
+    def key(self) -> str:
+        """``name.parameter``."""
+        return f"{self.effect}.{self.parameter}"
+
+    @property
+    def unit_step(self) -> float:
+        """Coordinate of a departure by one prior scale."""
+        return self.scale**2 if self.quadratic else self.scale
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether the null is at a bound."""
+        return self.quadratic or self.null <= self.low or self.null >= self.high
+
+    def value(self, coordinate: float) -> float:
+        """Value of the parameter, within its bounds."""
+        if self.quadratic:
+            departure = np.sqrt(max(coordinate, 0.0))
+            departure = departure if self.null < self.high else -departure
+        else:
+            departure = coordinate
+        return float(np.clip(self.null + departure, self.low, self.high))
+
+    def coordinate(self, value: float) -> float:
+        """Coordinate of a value."""
+        departure = value - self.null
+        return departure**2 if self.quadratic else departure
+
+    def clip(self, coordinate: float) -> float:
+        """Nearest coordinate within the bounds."""
+        return self.coordinate(self.value(coordinate))
+
+    def value_sigma(self, coordinate: float, sigma: float) -> float:
+        """Uncertainty of the value from that of the coordinate."""
+        if not self.quadratic:
+            return sigma
+        upper = self.value(coordinate + sigma)
+        lower = self.value(max(coordinate - sigma, 0.0))
+        return 0.5 * abs(upper - lower) if coordinate > sigma else abs(upper - self.value(coordinate))
+
+
+def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -> tuple[Coordinate, ...]:
+    """Coordinates of an effect; how it starts is found by trying."""
+    nulls = effect.null_values(forward.model.base_system)
+    found = []
+    for parameter in effect.parameters:
+        null, (low, high) = nulls[parameter.name], parameter.bounds
+        one_sided = null <= low or null >= high
+        quadratic = one_sided and _starts_quadratically(effect.name, parameter.name, null, high, parameter.prior_scale,
+                                                        forward, thickness_um)  # fmt: skip
+        found.append(
+            Coordinate(
+                effect.name, parameter.name, null, low, high, parameter.prior_scale, quadratic, parameter.unit
+            )
+        )
+    return tuple(found)
+
+
+def _starts_quadratically(
+    effect: str, parameter: str, null: float, high: float, scale: float, forward: Forward, thickness: FloatArray
+) -> bool:
+    sign = 1.0 if null < high else -1.0
+    base = forward.predict({}, thickness).value
+    small, large = (
+        np.abs(forward.predict({f"{effect}.{parameter}": null + sign * size * scale}, thickness).value - base).max()
+        for size in (0.05, 0.1)
+    )
+    return bool(large > 3.0 * small)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Data, model and nuisances of one search.
+
+    Attributes
+    ----------
+    cells : `CellData`
+        The data.
+    forward : `Forward`
+        The model.
+    basis : `FieldBasis`
+        The thickness field.
+    level_basis : `numpy.ndarray`, shape ``(W, L)``
+        Free levels: the unit matrix, or a few smooth functions of wavelength.
+    field_prior : `float`
+        Precision of the coefficients of the field about `prior_field` [1/µm²]; 0 for a free field.
+    """
+
+    cells: CellData
+    forward: Forward
+    basis: FieldBasis
+    level_basis: FloatArray
+    field_prior: float = 0.0
+
+    def with_cells(self, cells: CellData) -> Problem:
+        """Same problem with other data on the same cells."""
+        return replace(self, cells=cells)
+
+
+@dataclass(frozen=True, eq=False)
+class Whitener:
+    """Turns differences of cells into numbers with unit noise, response scatter included.
+
+    Noise of a cell: independent with variance ``1 / weight``, and a factor on its response common to all
+    wavelengths with variance ``scatter²``.
+    """
+
+    root: FloatArray
+    direction: FloatArray
+    gamma: FloatArray
+
+    @classmethod
+    def of_cells(cls, cells: CellData, reference: FloatArray) -> Whitener:
+        """Whitener for the noise of ``cells`` about the model ``reference``."""
+        root = np.sqrt(cells.weight)
+        direction = root * reference
+        square = (direction**2).sum(axis=0)
+        gamma = np.zeros(square.shape)
+        if cells.response_scatter > 0.0:
+            share = square / (1.0 / cells.response_scatter**2 + square)
+            np.divide(1.0 - np.sqrt(1.0 - share), square, out=gamma, where=square > 0.0)
+        return cls(root, direction, gamma)
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        """Whitened ``(..., W, ny, nx)``."""
+        scaled = self.root * values
+        if not self.gamma.any():
+            return scaled
+        along = (self.direction * scaled).sum(axis=-3, keepdims=True)
+        return scaled - self.direction * (self.gamma * along)
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Linearised model at one point, nuisances included.
+
+    Attributes
+    ----------
+    slope : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Whitened derivative with respect to thickness.
+    columns : `numpy.ndarray`, shape ``(K, W, ny, nx)``
+        Whitened derivatives with respect to levels, then effects.
+    normal : `NormalMatrix`
+        Curvature in the coefficients of the thickness field.
+    """
+
+    basis: FieldBasis
+    slope: FloatArray
+    columns: FloatArray
+    normal: NormalMatrix
+    _coupling: FloatArray
+    _curvature: FloatArray
+
+    @classmethod
+    def build(cls, basis: FieldBasis, slope: FloatArray, columns: FloatArray, prior: float) -> Design:
+        """Assemble normal matrices."""
+        normal = basis.normal_matrix((slope**2).sum(axis=0), prior)
+        coupling = basis.gather(np.einsum("wyx,kwyx->kyx", slope, columns))
+        flat = columns.reshape(len(columns), -1)
+        curvature = flat @ flat.T - coupling.T @ normal.solve(coupling)
+        return cls(basis, slope, columns, normal, coupling, curvature)
+
+    @property
+    def curvature(self) -> FloatArray:
+        """Curvature in the columns with the field profiled out, ``(K, K)``."""
+        return self._curvature
+
+    def step(self, residual: FloatArray, ridge: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Newton step of columns and field coefficients; ``ridge`` is a prior precision, ``pull`` its gradient."""
+        field_side = self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0]
+        solved = self.normal.solve(np.column_stack([field_side, self._coupling]))
+        right = self.columns.reshape(len(self.columns), -1) @ residual.ravel()
+        right = right - self._coupling.T @ solved[:, 0] - pull
+        step = _solve_symmetric(self._curvature + np.diag(ridge), right)
+        return step, solved[:, 0] - solved[:, 1:] @ step
+
+    def project(self, features: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Score and information of further columns with all nuisances of this design projected out.
+
+        Parameters
+        ----------
+        features : `numpy.ndarray`, shape ``(F, W, ny, nx)``
+            Whitened derivatives.
+        residual : `numpy.ndarray`, shape ``(W, ny, nx)``
+            Whitened residual at the minimum of this design.
+
+        Returns
+        -------
+        score : `numpy.ndarray`, shape ``(F,)``
+        information : `numpy.ndarray`, shape ``(F, F)``
+        """
+        flat = features.reshape(len(features), -1)
+        own = self.columns.reshape(len(self.columns), -1)
+        coupling = self.basis.gather(np.einsum("wyx,kwyx->kyx", self.slope, features))
+        solved = self.normal.solve(coupling)
+        information = flat @ flat.T - coupling.T @ solved
+        cross = own @ flat.T - self._coupling.T @ solved
+        score = flat @ residual.ravel()
+        field_side = self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0]
+        score = score - solved.T @ field_side
+        own_score = own @ residual.ravel() - self._coupling.T @ self.normal.solve(field_side[:, np.newaxis])[:, 0]
+        scale = np.sqrt(np.maximum(np.diag(self._curvature), 1e-300))
+        values, vectors = np.linalg.eigh(self._curvature / np.outer(scale, scale))
+        keep = values > 1e-10
+        inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T / np.outer(scale, scale)
+        solved_cross = inverse @ cross
+        return score - solved_cross.T @ own_score, information - cross.T @ solved_cross
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Result of a fit.
+
+    Attributes
+    ----------
+    settings : `dict`
+        Effects by ``name.parameter``, those held fixed included.
+    coordinates : `tuple` [`Coordinate`, ...]
+        The free ones.
+    position : `numpy.ndarray`
+        Values of the coordinates.
+    levels : `numpy.ndarray`, shape ``(L,)``
+        Coefficients of the levels.
+    field : `numpy.ndarray`, shape ``(M,)``
+        Coefficients of the thickness.
+    chi2 : `float`
+        Whitened sum of squares.
+    information : `numpy.ndarray`
+        Curvature in the free coordinates, nuisances profiled out, without prior.
+    """
+
+    settings: dict[str, float]
+    coordinates: tuple[Coordinate, ...]
+    position: FloatArray
+    levels: FloatArray
+    field: FloatArray
+    chi2: float
+    information: FloatArray
+    iterations: int = 0
+    converged: bool = True
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Uncertainty of the coordinates, weak prior included."""
+        if not self.coordinates:
+            return np.zeros(0)
+        total = self.information + np.diag(_ridge(self.coordinates))
+        return np.sqrt(np.maximum(np.diag(np.linalg.pinv(total, hermitian=True)), 0.0))
+
+
+def _ridge(coordinates: Sequence[Coordinate]) -> FloatArray:
+    return np.array([1.0 / (PRIOR_WIDTH * item.unit_step) ** 2 for item in coordinates])
+
+
+@dataclass(eq=False)
+class _Point:
+    """State of an iteration."""
+
+    position: FloatArray
+    levels: FloatArray
+    coefficients: FloatArray
+    prediction: Prediction = field(init=False)
+    residual: FloatArray = field(init=False)
+    chi2: float = field(init=False)
+
+
+def fit_model(
+    problem: Problem,
+    coordinates: Sequence[Coordinate],
+    start: FloatArray,
+    field_start: FloatArray,
+    levels_start: FloatArray | None = None,
+    fixed: Mapping[str, float] | None = None,
+    *,
+    iterations: int = MOST_ITERATIONS,
+) -> Fit:
+    """Minimise χ² in effects, levels and thickness field together (Gauss–Newton with damping).
+
+    Parameters
+    ----------
+    problem : `Problem`
+        Data, model, nuisances.
+    coordinates : sequence of `Coordinate`
+        Free effects.
+    start : `numpy.ndarray`
+        First guess of the coordinates.
+    field_start : `numpy.ndarray`, shape ``(M,)``
+        First coefficients of the thickness.
+    levels_start : `numpy.ndarray`, optional
+        First levels; all 1 by default.
+    fixed : mapping, optional
+        Effects held at a value.
+    iterations : `int`, optional
+        Largest number of iterations.
+
+    Returns
+    -------
+    fit : `Fit`
+    """
+    solver = _Solver(problem, tuple(coordinates), dict(fixed or {}), field_start)
+    return solver.run(np.asarray(start, dtype=float), field_start, levels_start, iterations)
+
+
+class _Solver:
+    def __init__(
+        self,
+        problem: Problem,
+        coordinates: tuple[Coordinate, ...],
+        fixed: dict[str, float],
+        field_start: FloatArray,
+    ) -> None:
+        self.problem, self.coordinates, self.fixed = problem, coordinates, fixed
+        self.ridge = _ridge(coordinates)
+        self.field_centre = field_start.copy()
+
+    def settings(self, position: FloatArray) -> dict[str, float]:
+        values = {c.key: c.value(x) for c, x in zip(self.coordinates, position, strict=True)}
+        return {**self.fixed, **values}
+
+    def evaluate(self, point: _Point) -> _Point:
+        problem = self.problem
+        thickness = problem.basis.expand(point.coefficients)
+        problem.forward.cover(thickness)
+        point.prediction = problem.forward.predict(self.settings(point.position), thickness)
+        level = (problem.level_basis @ point.levels)[:, np.newaxis, np.newaxis]
+        point.residual = self.whiten(problem.cells.value - level * point.prediction.value)
+        point.chi2 = float((point.residual**2).sum())
+        return point
+
+    def penalty(self, point: _Point) -> float:
+        total = float((self.ridge * point.position**2).sum())
+        if self.problem.field_prior:
+            total += self.problem.field_prior * float(((point.coefficients - self.field_centre) ** 2).sum())
+        return total
+
+    def run(
+        self, start: FloatArray, field_start: FloatArray, levels_start: FloatArray | None, iterations: int
+    ) -> Fit:
+        problem = self.problem
+        thickness = problem.basis.expand(field_start)
+        problem.forward.cover(thickness)
+        reference = problem.forward.predict(self.settings(start), thickness).value
+        self.whiten = Whitener.of_cells(problem.cells, reference / reference.mean())
+        levels = self._first_levels(reference) if levels_start is None else levels_start.copy()
+        point = self.evaluate(_Point(start.copy(), levels, field_start.copy()))
+        damping, count, converged = 0.0, 0, False
+        for count in range(1, iterations + 1):
+            design = self.linearise(point)
+            trial, damping = self._improve(point, design, damping)
+            if trial is None:
+                converged = True
+                break
+            gain = point.chi2 + self.penalty(point) - trial.chi2 - self.penalty(trial)
+            point = trial
+            if gain < CONVERGED:
+                converged = True
+                break
+        design = self.linearise(point)
+        number = len(self.coordinates)
+        return Fit(
+            self.settings(point.position), self.coordinates, point.position, point.levels, point.coefficients,
+            point.chi2, _profile(design.curvature, number), count, converged,
+        )  # fmt: skip
+
+    def _first_levels(self, reference: FloatArray) -> FloatArray:
+        cells, basis = self.problem.cells, self.problem.level_basis
+        weight = (cells.weight * reference**2).sum(axis=(1, 2))
+        ratio = (cells.weight * reference * cells.value).sum(axis=(1, 2)) / np.maximum(weight, 1e-300)
+        root = np.sqrt(weight)
+        return np.linalg.lstsq(root[:, None] * basis, root * ratio, rcond=None)[0]
+
+    def linearise(self, point: _Point, *, effects: bool = True) -> Design:
+        """Design at a point: columns are levels, then coordinates (if ``effects``)."""
+        problem = self.problem
+        thickness = problem.basis.expand(point.coefficients)
+        level = (problem.level_basis @ point.levels)[:, np.newaxis, np.newaxis]
+        columns = [
+            self.whiten(basis[:, np.newaxis, np.newaxis] * point.prediction.value)
+            for basis in problem.level_basis.T
+        ]
+        for number in range(len(self.coordinates) if effects else 0):
+            columns.append(self.whiten(level * self.derivative(point, thickness, number)))
+        slope = self.whiten(level * point.prediction.slope)
+        return Design.build(problem.basis, slope, np.stack(columns), problem.field_prior)
+
+    def derivative(self, point: _Point, thickness: FloatArray, number: int) -> FloatArray:
+        """Derivative of the prediction with respect to one coordinate, by a difference."""
+        return coordinate_derivative(
+            self.problem.forward, self.coordinates[number], point.position[number], self.settings(point.position),
+            thickness, point.prediction.value,
+        )  # fmt: skip
+
+    def _relax(self, point: _Point) -> _Point:
+        """Let levels and field follow a step of the effects: the valley in which phase is constant is curved."""
+        if not self.coordinates:
+            return point
+        for _ in range(2):
+            design = self.linearise(point, effects=False)
+            nothing = np.zeros(self.problem.level_basis.shape[1])
+            step, field_step = design.step(point.residual, nothing, nothing)
+            scale = 1.0 / max(1.0, self._phase_change(design, step, field_step) / LARGEST_PHASE_STEP_UM)
+            better = self.evaluate(
+                _Point(point.position, point.levels + scale * step, point.coefficients + scale * field_step)
+            )
+            gain = point.chi2 + self.penalty(point) - better.chi2 - self.penalty(better)
+            if gain > 0.0:
+                point = better
+            if gain < 1.0:
+                break
+        return point
+
+    def _phase_change(self, design: Design, step: FloatArray, field_step: FloatArray) -> float:
+        """Largest change of fringe phase in a step, as a thickness [µm]: of the field and of the effects together."""
+        thickness = self.problem.basis.expand(field_step)
+        square = (design.slope**2).sum(axis=0)
+        levels = self.problem.level_basis.shape[1]
+        change = design.slope * thickness
+        change = change + np.tensordot(step[levels:], design.columns[levels:], axes=1)
+        along = (design.slope * change).sum(axis=0)
+        used = square > 0.01 * square.max()
+        return float(np.percentile(np.abs(along[used] / square[used]), 98.0)) if used.any() else 0.0
+
+    def _improve(self, point: _Point, design: Design, damping: float) -> tuple[_Point | None, float]:
+        levels = self.problem.level_basis.shape[1]
+        ridge = np.concatenate([np.zeros(levels), self.ridge])
+        pull = np.concatenate([np.zeros(levels), self.ridge * point.position])
+        before = point.chi2 + self.penalty(point)
+        held = np.zeros(len(ridge), dtype=bool)
+        for _ in range(8):
+            extra = damping * np.diag(design.curvature)
+            extra = extra + np.where(held, 1e30, 0.0)
+            step, field_step = design.step(point.residual, ridge + extra, pull)
+            position = point.position + step[levels:]
+            clipped = np.array([c.clip(x) for c, x in zip(self.coordinates, position, strict=True)])
+            outside = np.abs(clipped - position) > 1e-12 + 1e-6 * np.abs(position)
+            at_bound = np.concatenate([np.zeros(levels, bool), outside & (clipped == point.position)])
+            if np.any(at_bound & ~held):
+                held |= at_bound
+                continue
+            scale = 1.0 / max(1.0, self._phase_change(design, step, field_step) / LARGEST_PHASE_STEP_UM)
+            position = point.position + scale * (clipped - point.position)
+            trial = _Point(
+                position, point.levels + scale * step[:levels], point.coefficients + scale * field_step
+            )
+            trial = self._relax(self.evaluate(trial))
+            if trial.chi2 + self.penalty(trial) <= before + 1e-9:
+                return trial, 0.2 * damping if damping > 1e-6 else 0.0
+            damping = max(10.0 * damping, 1e-3)
+        return None, damping
+
+
+def coordinate_derivative(
+    forward: Forward,
+    coordinate: Coordinate,
+    at: float,
+    settings: Mapping[str, float],
+    thickness_um: FloatArray,
+    value: FloatArray,
+) -> FloatArray:
+    """Derivative of the prediction with respect to a coordinate, by a central difference where the bounds allow.
+
+    A one-sided difference of a phase would keep a part of its curvature, which no thickness absorbs, and make
+    degenerate parameters look well measured.
+    """
+    size = 1e-3 * coordinate.unit_step
+    points = [at - size, at + size]
+    if coordinate.quadratic:
+        points = [at, at + max(size, 1e-3 * at)]
+    elif coordinate.clip(points[0]) != points[0]:
+        points[0] = at
+    elif coordinate.clip(points[1]) != points[1]:
+        points[1] = at
+    low, high = (
+        value
+        if point == at
+        else forward.predict({**settings, coordinate.key: coordinate.value(point)}, thickness_um).value
+        for point in points
+    )
+    return (high - low) / (points[1] - points[0])
+
+
+def _profile(curvature: FloatArray, number: int) -> FloatArray:
+    """Curvature of the last ``number`` columns with the others profiled out."""
+    if number == 0:
+        return np.zeros((0, 0))
+    first = len(curvature) - number
+    a, b, c = curvature[:first, :first], curvature[:first, first:], curvature[first:, first:]
+    return c - b.T @ _solve_symmetric(a, b)
+
+
+def _solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution scaled to a unit diagonal; directions without information stay put."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    keep = values > 1e-12 * max(float(values.max()), 1e-300)
+    column = right.reshape(len(right), -1) / scale[:, np.newaxis]
+    solution = (vectors[:, keep] / values[keep]) @ (vectors[:, keep].T @ column)
+    return (solution / scale[:, np.newaxis]).reshape(right.shape)
+
+
+def linearise_at(problem: Problem, fit: Fit) -> tuple[Design, FloatArray, Prediction, FloatArray, Whitener]:
+    """Design at a finished fit, its whitened residual, the prediction, the thickness and the whitener."""
+    solver = _Solver(problem, fit.coordinates, dict(fit.settings), fit.field)
+    thickness = problem.basis.expand(fit.field)
+    problem.forward.cover(thickness)
+    reference = problem.forward.predict(fit.settings, thickness).value
+    solver.whiten = Whitener.of_cells(problem.cells, reference / reference.mean())
+    point = solver.evaluate(_Point(fit.position, fit.levels, fit.field))
+    return solver.linearise(point), point.residual, point.prediction, thickness, solver.whiten

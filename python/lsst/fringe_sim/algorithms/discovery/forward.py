@@ -1,0 +1,192 @@
+"""What the model says of the cells: value and thickness derivative for any effects and any thickness field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
+from ...model import FringeModel
+from .cells import CellData
+
+__all__ = ["Forward", "Prediction"]
+
+FloatArray = NDArray[np.float64]
+Settings = Mapping[str, float]
+
+TABLE_STEP_UM = 0.004
+"""Spacing of the thickness grid [µm]: 75 per fringe order; cubic interpolation is good to 1e-6."""
+
+LINE_STEP_NM = 0.1
+"""Spacing of wavelength nodes [nm]: five per fringe of detection layer and support together."""
+
+MARGIN_UM = 0.45
+"""Thickness beyond the field that a table covers [µm]: a step of a fit may not leave it."""
+
+MOST_TABLES = 96
+"""Tables kept for reuse."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Model values of the cells.
+
+    Attributes
+    ----------
+    value : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Signal relative to the table mean of the unchanged model.
+    slope : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Its derivative with respect to thickness [1/µm].
+    """
+
+    value: FloatArray
+    slope: FloatArray
+
+
+@dataclass(eq=False)
+class Forward:
+    """Model of one sensor on cells.
+
+    Attributes
+    ----------
+    model : `FringeModel`
+        The model as it is known before the search.
+    catalogue : sequence of `Effect`
+        Effects that may be set.
+    geometry : `ImageGeometry`
+        The cells.
+    cell_px : `int`
+        Side of a cell [px].
+    range_um : `tuple` [`float`, `float`]
+        Thicknesses that the tables cover [µm]; grows on demand.
+    """
+
+    model: FringeModel
+    catalogue: Sequence[Effect]
+    geometry: ImageGeometry
+    cell_px: int
+    range_um: tuple[float, float]
+    _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
+    _scale: FloatArray | None = field(default=None, repr=False)
+
+    @classmethod
+    def of_cells(
+        cls, model: FringeModel, catalogue: Sequence[Effect], cells: CellData, range_um: tuple[float, float]
+    ) -> Forward:
+        """Forward model of the cells of ``cells`` for a thickness range [µm]."""
+        return cls(model, catalogue, cells.geometry, cells.cell_px, range_um)
+
+    def table(self, settings: Settings) -> FloatArray:
+        """Response ``(W, D)`` on the grid of thickness, relative to the mean of the unchanged model."""
+        known = {**self.model.effect_settings, **self._optical(settings)}
+        key = tuple(sorted(known.items()))
+        if key not in self._tables:
+            if len(self._tables) >= MOST_TABLES:
+                self._tables.pop(next(iter(self._tables)))
+            low, high = self.range_um
+            count = int(np.ceil((high - low) / TABLE_STEP_UM)) + 1
+            model = self.model.with_effects(known, self.catalogue)
+            wavelength = self.geometry.wavelength_nm
+            light = model.system.flat_fields(wavelength, LINE_STEP_NM)
+            response = model.respond_on_grid(light, low, TABLE_STEP_UM, count, wavelength)
+            if self._scale is None:
+                self._scale = response.mean(axis=1)
+            self._tables[key] = response / self._scale[:, np.newaxis]
+        return self._tables[key]
+
+    def cover(self, thickness_um: FloatArray) -> None:
+        """Extend the tables so that they cover a thickness field with a margin."""
+        low, high = self.range_um
+        wanted_low = max(float(thickness_um.min()) - MARGIN_UM, 0.05)
+        wanted_high = float(thickness_um.max()) + MARGIN_UM
+        if wanted_low < low or wanted_high > high:
+            self.range_um = (min(wanted_low - MARGIN_UM, low), max(wanted_high + MARGIN_UM, high))
+            self.range_um = (max(self.range_um[0], 0.05), self.range_um[1])
+            self._tables.clear()
+
+    def predict(self, settings: Settings, thickness_um: FloatArray) -> Prediction:
+        """Model of the cells.
+
+        Parameters
+        ----------
+        settings : mapping
+            Effects by ``name.parameter``.
+        thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+            Thickness at the centres of the cells [µm], within the tables.
+        """
+        table = self.table(settings)
+        spread = self._spread_in_cell(thickness_um)
+        value, slope = _interpolate(
+            table, self.range_um[0], TABLE_STEP_UM, thickness_um.ravel(), spread.ravel()
+        )
+        shape = (len(table), *thickness_um.shape)
+        value, slope = value.reshape(shape), slope.reshape(shape)
+        image_settings = self._image(settings)
+        if not image_settings:
+            return Prediction(value, slope)
+        active = activate_effects(image_settings, self.catalogue)
+        changed = apply_to_image(active, self.model.base_system, value, self.geometry)
+        nudge = 1e-3  # µm; effects on the image are nearly linear in the signal
+        beside = apply_to_image(active, self.model.base_system, value + nudge * slope, self.geometry)
+        return Prediction(changed, (beside - changed) / nudge)
+
+    def _spread_in_cell(self, thickness_um: FloatArray) -> FloatArray:
+        """Variance of the thickness within each cell [µm²], from the gradient of the field."""
+        if self.cell_px == 1:
+            return np.zeros(thickness_um.shape)
+        square = np.zeros(thickness_um.shape)
+        for axis in (0, 1):
+            if thickness_um.shape[axis] > 1:
+                square += np.gradient(thickness_um, axis=axis) ** 2
+        return square * (1.0 - 1.0 / self.cell_px**2) / 12.0
+
+    def is_image_effect(self, name: str) -> bool:
+        """Whether an effect acts on the image and not on the response."""
+        return next(effect for effect in self.catalogue if effect.name == name).acts_on == "image"
+
+    def _optical(self, settings: Settings) -> dict[str, float]:
+        return {key: value for key, value in settings.items() if not self.is_image_effect(key.split(".")[0])}
+
+    def _image(self, settings: Settings) -> dict[str, float]:
+        known = {**self.model.effect_settings, **settings}
+        return {key: value for key, value in known.items() if self.is_image_effect(key.split(".")[0])}
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _interpolate(
+    table: FloatArray, start: float, step: float, thickness: FloatArray, spread: FloatArray
+) -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
+    """Cubic interpolation of value and slope, both averaged over the thickness spread to second order."""
+    waves, nodes = table.shape
+    value = np.empty((waves, thickness.size))
+    slope = np.empty((waves, thickness.size))
+    for i in range(thickness.size):
+        position = (thickness[i] - start) / step
+        k = min(max(int(np.floor(position)), 2), nodes - 4)
+        x = position - k
+        half = 0.5 * spread[i] / (step * step)
+        for w in range(waves):
+            a, b, c, d = table[w, k - 1], table[w, k], table[w, k + 1], table[w, k + 2]
+            # Lagrange polynomial through four nodes, in powers of x
+            c1 = c - a / 3.0 - b / 2.0 - d / 6.0
+            c2 = 0.5 * (a + c) - b
+            c3 = (d - a) / 6.0 + 0.5 * (b - c)
+            if half == 0.0:
+                value[w, i] = b + x * (c1 + x * (c2 + x * c3))
+                slope[w, i] = (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
+                continue
+            # second derivatives of the outer nodes, so that the averaged curve is smooth across nodes
+            left, right = table[w, k - 2], table[w, k + 3]
+            s0 = a - 2.0 * b + c
+            s1 = b - 2.0 * c + d
+            sm = left - 2.0 * a + b
+            sp = c - 2.0 * d + right
+            second = s0 + x * (s1 - s0)
+            third = 0.5 * ((s1 - sm) + x * ((sp - s0) - (s1 - sm)))
+            value[w, i] = b + x * (c1 + x * (c2 + x * c3)) + half * second
+            slope[w, i] = (c1 + x * (2.0 * c2 + 3.0 * x * c3) + half * third) / step
+    return value, slope

@@ -1,0 +1,126 @@
+"""Noise of the cells, measured in the data themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cells import CellData
+
+__all__ = ["NoiseEstimate", "estimate_noise"]
+
+FloatArray = NDArray[np.float64]
+
+LEAST_TRIPLES = 60
+"""Fewest second differences from which a noise level is taken; with fewer, the stated variance is believed."""
+
+STATED_UNCERTAINTY = 0.2
+"""Relative uncertainty of a stated noise level that cannot be checked."""
+
+CLIP_SIGMA = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseEstimate:
+    """How the noise of the cells compares with what was stated.
+
+    Attributes
+    ----------
+    factor : `numpy.ndarray`, shape ``(W,)``
+        Measured over stated standard deviation of the independent noise.
+    response_scatter : `float`
+        Rms of the response of the cells that all wavelengths have in common.
+    measured : `bool`
+        Whether the data allowed a measurement; otherwise the stated noise stands.
+    neighbour_correlation : `float`
+        Correlation of the noise of neighbouring cells; 0 for independent pixels.
+    """
+
+    factor: FloatArray
+    response_scatter: float
+    measured: bool
+    neighbour_correlation: float
+
+
+def estimate_noise(cells: CellData, residual: FloatArray) -> NoiseEstimate:
+    """Compare second differences of the residual with the stated noise.
+
+    Second differences along both axes remove whatever is smooth on the scale of three cells. Their variance at one
+    wavelength is that of the noise; their covariance between wavelengths is the scatter of the response of the
+    cells, which no wavelength sees alone.
+
+    Parameters
+    ----------
+    cells : `CellData`
+        Data and stated weights.
+    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Data minus model, relative to the level.
+    """
+    waves = cells.shape[0]
+    assumed = NoiseEstimate(np.ones(waves), cells.response_scatter, False, 0.0)
+    if min(cells.shape[1:]) < 3:
+        return assumed
+    good = _all_of_nine(cells.weight > 0)
+    common = good.all(axis=0)
+    if min(int(plane.sum()) for plane in good) < LEAST_TRIPLES:
+        return assumed
+    difference = _second_difference(residual)
+    stated = np.zeros(waves)
+    measured = np.zeros(waves)
+    clean = common.copy()
+    for plane in range(waves):
+        own = difference[plane][good[plane]]
+        spread = 1.4826 * float(np.median(np.abs(own)))
+        inlier = np.abs(difference[plane]) < CLIP_SIGMA * spread
+        clean &= inlier
+        use = good[plane] & inlier
+        measured[plane] = float((difference[plane][use] ** 2).mean())
+        stated[plane] = float(_mean_of_nine(1.0 / np.maximum(cells.weight[plane], 1e-300))[use].mean())
+    scatter = _common_variance(difference[:, clean], measured) if waves > 1 and clean.sum() > LEAST_TRIPLES else 0.0
+    independent = np.maximum(measured - scatter, 0.05 * measured)
+    return NoiseEstimate(
+        np.sqrt(independent / stated), float(np.sqrt(scatter)), True, _neighbour_correlation(difference, good)
+    )
+
+
+def _common_variance(difference: FloatArray, measured: FloatArray) -> float:
+    """Mean covariance of different wavelengths, 0 unless it is significant."""
+    waves, count = difference.shape
+    scaled = difference / np.sqrt(measured)[:, np.newaxis]
+    total = scaled.sum(axis=0)
+    pairs = 0.5 * (total**2 - (scaled**2).sum(axis=0))
+    number = 0.5 * waves * (waves - 1)
+    mean = float(pairs.mean()) / number
+    # Second differences overlap: about one in three is independent.
+    error = float(pairs.std()) / number / np.sqrt(count / 3.0)
+    return mean * float(measured.mean()) if mean > 5.0 * error and mean > 1e-3 else 0.0
+
+
+def _neighbour_correlation(difference: FloatArray, good: NDArray[np.bool_]) -> float:
+    """Correlation of neighbours beyond the -2/3 that second differences of independent noise have."""
+    both = good[:, :, 1:] & good[:, :, :-1]
+    product = float((difference[:, :, 1:] * difference[:, :, :-1])[both].mean()) if both.any() else 0.0
+    square = float((difference[good] ** 2).mean())
+    return product / square + 2.0 / 3.0 if square > 0.0 else 0.0
+
+
+def _second_difference(image: FloatArray) -> FloatArray:
+    """Second difference along both axes with unit noise gain, ``(W, ny-2, nx-2)``."""
+    rows = image[:, :-2] - 2.0 * image[:, 1:-1] + image[:, 2:]
+    both: FloatArray = (rows[:, :, :-2] - 2.0 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 6.0
+    return both
+
+
+def _all_of_nine(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    rows = good[:, :-2] & good[:, 1:-1] & good[:, 2:]
+    both: NDArray[np.bool_] = rows[:, :, :-2] & rows[:, :, 1:-1] & rows[:, :, 2:]
+    return both
+
+
+def _mean_of_nine(image: FloatArray) -> FloatArray:
+    """Noise variance of a second difference of cells with the given variances."""
+    rows = image[:-2] + 4.0 * image[1:-1] + image[2:]
+    both: FloatArray = (rows[:, :-2] + 4.0 * rows[:, 1:-1] + rows[:, 2:]) / 36.0
+    return both

@@ -1,0 +1,618 @@
+"""The search: fit, test, rank, name, validate on data held out, describe what is left."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from ...effects import EFFECTS, Effect
+from ...errors import InputError
+from ...model import FringeModel, Setup
+from ...products.fringe_cube import FringeCube
+from .basis import CellBasis, FieldBasis, SplineBasis
+from .cells import CellData, bin_cube, finest_useful_cell
+from .channels import Channel
+from .describe import describe_residual, disagreement
+from .fit import Fit, Problem, fit_model
+from .forward import Forward
+from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
+from .selection import Candidate, Hypothesis, Selector, similarity
+from .start import starting_thickness
+from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
+
+__all__ = ["SearchOptions", "discover"]
+
+FloatArray = NDArray[np.float64]
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Thresholds and sizes of a search; the defaults were fixed before any challenge was run.
+
+    Attributes
+    ----------
+    most_cells : `int`
+        Cells that the data are averaged to, if the pattern allows it.
+    significance : `float`
+        Chance of noise below which the unchanged model is held to disagree.
+    consistency : `float`
+        Chance of noise above which a residual is held to be noise.
+    least_evidence : `float`
+        Gain in log evidence that an added effect must bring.
+    class_width : `float`
+        Difference in log evidence within which effects are one class.
+    least_probability : `float`
+        Probability of a class with which it is named.
+    most_effects : `int`
+        Largest number of effects named together.
+    refits : `int`
+        Effects that are refitted in each round, best scores first.
+    heldout_fraction : `float`
+        Part of the sensor that no selection sees.
+    outsider_prior : `float`
+        Prior probability of a cause that is not in the catalogue.
+    """
+
+    most_cells: int = 20_000
+    significance: float = 1e-3
+    consistency: float = 1e-3
+    least_evidence: float = 6.0
+    class_width: float = 5.0
+    least_probability: float = 0.95
+    most_effects: int = 3
+    refits: int = 10
+    heldout_fraction: float = 0.25
+    outsider_prior: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    problem: Problem
+    null: Fit
+    noise: NoiseEstimate
+    index: FloatArray
+    rich: bool
+    notes: tuple[str, ...] = field(default=())
+
+
+def discover(
+    cube: FringeCube,
+    setup: str | Setup | FringeModel,
+    effects: Sequence[Effect] = EFFECTS,
+    *,
+    rng: np.random.Generator,
+    options: SearchOptions | None = None,
+    report: Report | None = None,
+) -> Verdict:
+    """Find out whether flats and model disagree beyond noise, and which effect of a catalogue is the reason.
+
+    Parameters
+    ----------
+    cube : `FringeCube`
+        Flats of one sensor.
+    setup : `str`, `Setup` or `FringeModel`
+        What is known of sensor and light; a model may hold effects that are known already.
+    effects : sequence of `Effect`, optional
+        The catalogue.
+    rng : `numpy.random.Generator`
+        Decides which parts of the sensor are held out; nothing else is random.
+    options : `SearchOptions`, optional
+        Thresholds and sizes.
+    report : callable, optional
+        Called with a line of text at every stage.
+
+    Returns
+    -------
+    verdict : `Verdict`
+
+    Raises
+    ------
+    InputError
+        The set-up contradicts the data (temperature, bandpass), or is not one of a laboratory.
+    """
+    chosen = options or SearchOptions()
+    say = report or (lambda text: None)
+    model = setup if isinstance(setup, FringeModel) else FringeModel.from_setup(setup)
+    _check_setup(cube, model)
+    # Many small matrices: threads of the linear algebra would wait for each other.
+    with threadpool_limits(limits=1, user_api="blas"):
+        poor = _too_poor(cube, model)
+        if poor:
+            return _no_answer(model, poor, cube)
+        say("fitting the thickness with the unchanged model")
+        prepared = _prepare(cube, model, effects, chosen)
+        return _Search(prepared, model, effects, chosen, rng, say).run()
+
+
+def _check_setup(cube: FringeCube, model: FringeModel) -> None:
+    if model.setup.kind != "monochromator":
+        raise InputError("set-up", model.setup.name, "a laboratory set-up with a monochromator")
+    rows = cube.exposures
+    known = {item.effect.name for item in model.effects}
+    stated = model.base_system.temperature_k
+    if np.any(np.abs(rows.temperature_k - stated) > 5.0) and "temperature" not in known:
+        raise InputError("temperature [K]", rows.temperature_k.tolist(), f"within 5 of the set-up's {stated:g}")
+    width = model.setup.bandwidth_fwhm_nm
+    measured = rows.bandwidth_fwhm_nm[rows.bandwidth_fwhm_nm > 0.0]
+    if np.any(np.abs(measured - width) > 0.02 * width) and "bandwidth" not in known:
+        raise InputError("bandwidth FWHM [nm]", rows.bandwidth_fwhm_nm.tolist(), f"the set-up's {width:g}")
+    single = model.base_system.beam.theta.size == 1
+    if single and np.any(np.isfinite(rows.f_number)) and "converging_beam" not in known:
+        raise InputError("f_number", rows.f_number.tolist(), "infinite: the set-up's light is parallel")
+
+
+def _too_poor(cube: FringeCube, model: FringeModel) -> str:
+    """Why these data cannot answer, or nothing."""
+    good = (np.asarray(cube.mask) == 0).reshape(cube.shape[0], -1)
+    pixels = int(good.any(axis=0).sum())
+    if pixels == 0:
+        return "no good pixel"
+    dark = [f"{cube.wavelength_nm[k]:g} nm" for k in range(cube.shape[0]) if not good[k].any()]
+    if dark:
+        return f"no good pixel at {', '.join(dark)}"
+    constant = [
+        f"{cube.wavelength_nm[k]:g} nm"
+        for k in range(cube.shape[0])
+        if pixels > 1 and float(np.ptp(np.asarray(cube.image[k]).reshape(-1)[good[k]])) == 0.0
+    ]
+    if constant:
+        return f"the frame is constant at {', '.join(constant)}: no fringes and no noise, so not data"
+    waves = int(np.unique(cube.wavelength_nm).size)
+    if cube.thickness is None:
+        if waves < 3:
+            return f"{waves} wavelength(s) without a thickness map: thickness and effects cannot be told apart"
+        if pixels < 8 and waves < 6:
+            return f"{pixels} pixel(s) at {waves} wavelengths: fewer data than free parameters"
+    elif pixels < 16 and waves < 4:
+        return f"{pixels} pixel(s) at {waves} wavelength(s): fewer data than free parameters"
+    return ""
+
+
+def _no_answer(model: FringeModel, reason: str, cube: FringeCube) -> Verdict:
+    nan = math.nan
+    return Verdict(
+        "unexplained", (), Where(), Gap(_METRIC, nan, nan, nan, nan, nan), (), {"reason": reason, "too_poor": True},
+        model.setup.name, nan, data={"shape": list(cube.shape)},
+    )  # fmt: skip
+
+
+_METRIC = "rms of data minus model, relative counts"
+
+
+def _prepare(cube: FringeCube, model: FringeModel, effects: Sequence[Effect], options: SearchOptions) -> _Prepared:
+    size = finest_useful_cell(cube, most_cells=options.most_cells)
+    cells = bin_cube(cube, size)
+    rich = min(cells.shape[1:]) >= 6
+    stack = model.system.stack
+    medium = stack.layers[stack.position(model.system.varying)].medium
+    index = np.real(medium.index(cells.wavelength_nm, model.system.temperature_k))
+    notes: list[str] = []
+    if cells.thickness_um is not None:
+        problem, first = _known_thickness(cells, model, effects)
+        null = fit_model(problem, (), np.zeros(0), first)
+        noise = _measure_noise(problem, null)
+        problem = problem.with_cells(cells.scaled_noise(noise.factor, noise.response_scatter))
+        return _Prepared(problem, fit_model(problem, (), np.zeros(0), null.field), noise, index, rich)
+    start = starting_thickness(model, cells)
+    forward = Forward.of_cells(model, effects, cells, (float(start.min()) - 0.5, float(start.max()) + 0.5))
+    levels = np.eye(cells.shape[0]) if rich else np.ones((cells.shape[0], 1))
+    if not rich:
+        return _prepare_few(cells, model, forward, start, levels, index)
+    weight = (cells.weight > 0).any(axis=0).astype(float)
+    best: tuple[Problem, Fit] | None = None
+    noise = NoiseEstimate(np.ones(cells.shape[0]), 0.0, False, 0.0)
+    for spacing in (8.0, 4.0, 2.0, 0.0):
+        basis: FieldBasis = SplineBasis.of_grid(start.shape, spacing) if spacing else CellBasis(start.shape)
+        if spacing and basis.size > cells.shape[1] * cells.shape[2]:
+            continue
+        problem = Problem(cells, forward, basis, levels)
+        field_map = start if best is None else best[0].basis.expand(best[1].field)
+        fit = fit_model(problem, (), np.zeros(0), basis.fit(field_map, weight))
+        if best is not None and not _finer_is_better(best, (problem, fit)):
+            break
+        best = (problem, fit)
+    assert best is not None
+    problem, fit = best
+    noise = _measure_noise(problem, fit)
+    problem = problem.with_cells(cells.scaled_noise(noise.factor, noise.response_scatter))
+    fit = fit_model(problem, (), np.zeros(0), fit.field, fit.levels)
+    if abs(noise.neighbour_correlation) > 0.1:
+        notes.append(f"noise of neighbouring cells is correlated ({noise.neighbour_correlation:.2f})")
+    if not noise.measured:
+        notes.append("noise level taken as stated: too few cells to measure it")
+    return _Prepared(problem, fit, noise, index, rich, tuple(notes))
+
+
+def _finer_is_better(coarse: tuple[Problem, Fit], fine: tuple[Problem, Fit]) -> bool:
+    """Whether more coefficients of the field lower χ² beyond what noise (or misfit) lets them."""
+    extra = fine[0].basis.size - coarse[0].basis.size
+    degrees = max(fine[0].cells.n_values - fine[0].basis.size - fine[0].cells.shape[0], 1)
+    unit = fine[1].chi2 / degrees
+    return coarse[1].chi2 - fine[1].chi2 > unit * (extra + 5.0 * math.sqrt(2.0 * max(extra, 1)))
+
+
+def _known_thickness(
+    cells: CellData, model: FringeModel, effects: Sequence[Effect]
+) -> tuple[Problem, FloatArray]:
+    """Problem for a given thickness map: the field may move only within its uncertainty."""
+    assert cells.thickness_um is not None
+    known = np.where(np.isfinite(cells.thickness_um), cells.thickness_um, np.nanmedian(cells.thickness_um))
+    sigma = 0.01 if cells.thickness_sigma_um is None else float(np.nanmedian(cells.thickness_sigma_um))
+    forward = Forward.of_cells(model, effects, cells, (float(known.min()) - 0.5, float(known.max()) + 0.5))
+    rich = min(cells.shape[1:]) >= 6
+    levels = np.eye(cells.shape[0]) if rich else np.ones((cells.shape[0], 1))
+    basis = CellBasis(known.shape)
+    return Problem(cells, forward, basis, levels, 1.0 / max(sigma, 1e-4) ** 2), known.ravel()
+
+
+def _prepare_few(
+    cells: CellData, model: FringeModel, forward: Forward, start: FloatArray, levels: FloatArray, index: FloatArray
+) -> _Prepared:
+    """A few pixels with many wavelengths: every fringe order is tried, the stated noise is believed."""
+    basis = CellBasis(start.shape)
+    order = float(np.median(cells.wavelength_nm)) * 1e-3 / (2.0 * float(index.mean()))
+    spread = cells.scaled_noise(1.0 + STATED_UNCERTAINTY, 0.0)
+    problem = Problem(spread, forward, basis, levels)
+    fits = [
+        fit_model(problem, (), np.zeros(0), (start + shift * order).ravel())
+        for shift in range(-4, 5)
+        if float(start.min()) + shift * order > 0.5
+    ]
+    noise = NoiseEstimate(np.ones(cells.shape[0]), 0.0, False, 0.0)
+    best = min(fits, key=lambda fit: fit.chi2)
+    note = "noise taken as stated plus 20 %; flat levels taken as known up to a common factor"
+    return _Prepared(problem, best, noise, index, False, (note,))
+
+
+def _measure_noise(problem: Problem, fit: Fit) -> NoiseEstimate:
+    thickness = problem.basis.expand(fit.field)
+    value = problem.forward.predict(fit.settings, thickness).value
+    level = (problem.level_basis @ fit.levels)[:, None, None]
+    residual = np.where(problem.cells.weight > 0, problem.cells.value - level * value, 0.0)
+    return estimate_noise(problem.cells, residual)
+
+
+class _Search:
+    """One run of the search; every method is one stage."""
+
+    def __init__(
+        self,
+        prepared: _Prepared,
+        model: FringeModel,
+        effects: Sequence[Effect],
+        options: SearchOptions,
+        rng: np.random.Generator,
+        say: Report,
+    ) -> None:
+        self.prepared, self.model, self.effects = prepared, model, effects
+        self.options, self.say = options, say
+        self.cells = prepared.problem.cells
+        self.heldout = _held_out_blocks(self.cells.shape[1:], options.heldout_fraction, rng, prepared.rich)
+        self.notes = list(prepared.notes)
+
+    def run(self) -> Verdict:
+        whole = Selector(
+            self.prepared.problem, self.effects, self.prepared.null, self.prepared.index, generic=self.prepared.rich
+        )
+        self.where = self._where(whole)
+        chance = self._chance(whole, whole.null)
+        self.say(f"chance that noise alone disagrees as much: {chance:.3g}")
+        if chance > self.options.significance:
+            return self._verdict("no_discrepancy", whole, whole.null, chance, (), {})
+        training = self._training(whole)
+        chosen, steps = self._grow(training)
+        return self._conclude(whole, training, chosen, steps, chance)
+
+    # Stages -------------------------------------------------------------------------------------------------
+
+    def _where(self, whole: Selector) -> Where:
+        state = whole.state(whole.null.fit)
+        return disagreement(
+            state, whole.null.channels, self.cells.geometry, self.prepared.index, self.cells.cell_px
+        )
+
+    def _chance(self, selector: Selector, hypothesis: Hypothesis) -> float:
+        """Chance of noise, over the tests without a catalogue and the score tests of the catalogue together."""
+        from scipy.stats import chi2 as chi2_distribution
+
+        names = [name for name in selector.coordinates if name not in hypothesis.names]
+        scores = selector.score(hypothesis.fit, names)
+        smallest = min((float(chi2_distribution.sf(c.gain, c.degrees)) for c in scores), default=1.0)
+        # Effects are alike in groups; counting each as a look of its own errs on the safe side.
+        catalogue = float(-np.expm1(len(scores) * np.log1p(-min(smallest, 1 - 1e-16)))) if scores else 1.0
+        self.scores = scores
+        both = min(hypothesis.probability_of_noise, catalogue)
+        return float(-np.expm1(2.0 * np.log1p(-min(both, 1.0 - 1e-16))))
+
+    def _training(self, whole: Selector) -> Selector:
+        """Selector that does not see the part held out."""
+        if not self.heldout.any():
+            return whole
+        problem = whole.problem.with_cells(self.cells.restricted(~self.heldout))
+        null = fit_model(problem, (), np.zeros(0), self.prepared.null.field, self.prepared.null.levels)
+        self.say("ranking effects")
+        return Selector(problem, self.effects, null, self.prepared.index, generic=self.prepared.rich)
+
+    def _refit(self, selector: Selector, base: Hypothesis) -> list[Hypothesis]:
+        """Refits of the best-scored additions to a set, likeliest first."""
+        names = [name for name in selector.coordinates if name not in base.names]
+        scores = selector.score(base.fit, names)
+        worth = [c for c in scores if c.gain > 9.0][: self.options.refits]
+        refitted = [selector.hypothesis((*base.names, c.name), c.start, base.fit) for c in worth]
+        for hypothesis in refitted:
+            self.say(
+                f"  with {', '.join(hypothesis.names)}: chi2 falls by {base.fit.chi2 - hypothesis.fit.chi2:.1f}, "
+                f"log evidence {hypothesis.log_evidence:.1f}"
+            )
+        return sorted(refitted, key=lambda item: -item.log_evidence)
+
+    def _grow(self, selector: Selector) -> tuple[Hypothesis, list[Step]]:
+        """Add effects while they help; look two ahead where one is not enough."""
+        current, steps = selector.null, []
+        singles = self._refit(selector, current)
+        if not singles or singles[0].log_evidence < self.options.least_evidence:
+            return current, []
+        best = selector.with_channels(singles[0])
+        steps.append(self._step(selector, current, best))
+        current = best
+        while not steps[-1].consistent and len(current.names) < self.options.most_effects:
+            parents = selector.known(len(current.names))[:3]
+            larger = [item for parent in parents for item in self._refit(selector, parent)[:4]]
+            if not larger:
+                break
+            best = max(larger, key=lambda item: item.log_evidence)
+            if best.log_evidence < current.log_evidence + self.options.least_evidence:
+                break
+            best = selector.with_channels(best)
+            steps.append(self._step(selector, current, best))
+            current = best
+        return self._pruned(selector, current), steps
+
+    def _pruned(self, selector: Selector, hypothesis: Hypothesis) -> Hypothesis:
+        """Leave out members that bring nothing."""
+        for name in hypothesis.names:
+            rest = tuple(other for other in hypothesis.names if other != name)
+            smaller = selector.with_channels(selector.hypothesis(rest, None, hypothesis.fit))
+            if smaller.log_evidence > hypothesis.log_evidence - 3.0 and self._consistent(smaller):
+                return self._pruned(selector, smaller)
+        return hypothesis
+
+    def _consistent(self, hypothesis: Hypothesis) -> bool:
+        return hypothesis.probability_of_noise > self.options.consistency
+
+    def _step(self, selector: Selector, before: Hypothesis, after: Hypothesis) -> Step:
+        return Step(
+            tuple(name for name in after.names if name not in before.names),
+            after.log_evidence - before.log_evidence,
+            before.fit.chi2 - after.fit.chi2,
+            _rms(selector.problem, before.fit),
+            _rms(selector.problem, after.fit),
+            self._consistent(after),
+        )
+
+    # Conclusion ---------------------------------------------------------------------------------------------
+
+    def _conclude(
+        self, whole: Selector, training: Selector, chosen: Hypothesis, steps: list[Step], chance: float
+    ) -> Verdict:
+        if not chosen.names:
+            return self._unexplained(whole, whole.null, chance, steps, "no effect of the catalogue explains it")
+        final = whole.with_channels(self._transfer(whole, chosen))
+        classes = self._classes(training, chosen)
+        gains = self._validate(whole, final)
+        reasons = []
+        if not self._consistent(final) or not self._consistent(chosen):
+            worst = min(final.channels, key=lambda c: c.probability)
+            reasons.append(
+                f"with {', '.join(final.names)} a residual remains in '{worst.name}' (chance {worst.probability:.2g})"
+            )
+        if gains["blocks"] <= 0.0 or gains["wavelengths"] < -9.0:
+            reasons.append("data held out are not predicted better")
+        outsider = self._outsider_probability(final)
+        named = []
+        for name in final.names:
+            members, probability = classes[name]
+            probability *= 1.0 - outsider
+            if probability < self.options.least_probability:
+                reasons.append(f"the class of {name} has probability {probability:.2f} only")
+            named.append(self._named(whole, final, name, members, probability))
+        self.notes.append(f"held out: chi2 of blocks falls by {gains['blocks']:.1f}, of wavelengths by "
+                          f"{gains['wavelengths']:.1f}")  # fmt: skip
+        if reasons:
+            return self._unexplained(whole, final, chance, steps, "; ".join(reasons), partial=named)
+        return self._verdict("named", whole, final, chance, tuple(named), {}, steps)
+
+    def _transfer(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
+        """The chosen set fitted to all data."""
+        return whole.hypothesis(chosen.names, None, replace(chosen.fit, field=chosen.fit.field))
+
+    def _classes(self, selector: Selector, chosen: Hypothesis) -> dict[str, tuple[dict[str, float], float]]:
+        """For each effect: the members of its class with their shares, and the probability of the class."""
+        result = {}
+        state = selector.state(chosen.fit)
+        for name in chosen.names:
+            rest = tuple(other for other in chosen.names if other != name)
+            without = selector.hypothesis(rest, None, chosen.fit)
+            log_evidence = {name: chosen.log_evidence}
+            own = selector._features(state, chosen.fit, selector.coordinates[name])
+            base = selector.score(without.fit, [n for n in selector.coordinates if n not in chosen.names])
+            for candidate in base:
+                features = selector._features(state, chosen.fit, selector.coordinates[candidate.name])
+                alike = similarity(selector.state(without.fit).design, own, features) if candidate.gain > 4 else 0.0
+                known = frozenset((*rest, candidate.name)) in selector._known
+                if known or alike > 0.8:
+                    other = selector.hypothesis((*rest, candidate.name), candidate.start, without.fit)
+                    log_evidence[candidate.name] = other.log_evidence
+            top = max(log_evidence.values())
+            weight = {n: math.exp(max(v - top, -700.0)) for n, v in log_evidence.items()}
+            total = sum(weight.values())
+            members = {
+                n: weight[n] / total for n, v in log_evidence.items() if v > top - self.options.class_width
+            }
+            result[name] = (members, sum(members.values()))
+        return result
+
+    def _outsider_probability(self, hypothesis: Hypothesis) -> float:
+        """Probability of a cause outside the catalogue, from the smallest chance of noise in the residual.
+
+        The bound of Sellke, Bayarri & Berger (2001, doi 10.1198/000313001300339950): the evidence for noise against
+        the most favourable alternative is at least ``-e p log p``.
+        """
+        p = min(hypothesis.probability_of_noise, 1.0)
+        bound = 1.0 if p > 1.0 / math.e else -math.e * p * math.log(max(p, 1e-300))
+        prior = self.options.outsider_prior
+        # A residual that is noise leaves an outsider only the room that a perfect mimic has.
+        mimic = 0.05
+        odds = prior / (1.0 - prior) * (mimic / bound if p > 0.05 else 1.0 / bound)
+        return odds / (1.0 + odds)
+
+    def _validate(self, whole: Selector, final: Hypothesis) -> dict[str, float]:
+        """Fall of χ² on blocks and on wavelengths that did not take part in fitting the effects."""
+        gains = {"blocks": math.inf, "wavelengths": 0.0}
+        null = whole.null.fit
+        self.heldout_rms = (_rms(whole.problem, null), _rms(whole.problem, final.fit))
+        if self.heldout.any():
+            seen = whole.problem.with_cells(self.cells.restricted(~self.heldout))
+            fitted = fit_model(seen, final.fit.coordinates, final.fit.position, final.fit.field, final.fit.levels)
+            unseen = whole.problem.with_cells(self.cells.restricted(self.heldout))
+            before = fit_model(unseen, (), np.zeros(0), null.field, null.levels)
+            after = fit_model(unseen, (), np.zeros(0), fitted.field, fitted.levels, fitted.settings)
+            gains["blocks"] = before.chi2 - after.chi2
+            self.heldout_rms = (_rms(unseen, before), _rms(unseen, after))
+        waves = self.cells.shape[0]
+        if waves >= 8:
+            gains["wavelengths"] = self._validate_wavelengths(whole, final)
+        return gains
+
+    def _validate_wavelengths(self, whole: Selector, final: Hypothesis) -> float:
+        waves = self.cells.shape[0]
+        out = np.zeros(waves, dtype=bool)
+        out[2::4] = True
+        problem = whole.problem.with_cells(self.cells.restricted(~out[:, None, None]))
+        unseen = whole.problem.with_cells(self.cells.restricted(out[:, None, None]))
+        total = []
+        for fit in (whole.null.fit, final.fit):
+            fitted = fit_model(problem, fit.coordinates, fit.position, fit.field, fit.levels, fit.settings)
+            total.append(_predicted_chi2(unseen, fitted))
+        return total[0] - total[1]
+
+    def _named(
+        self, whole: Selector, final: Hypothesis, name: str, members: dict[str, float], probability: float
+    ) -> NamedEffect:
+        parameters = {}
+        for item, position, sigma in zip(final.fit.coordinates, final.fit.position, final.fit.sigma, strict=True):
+            if item.effect == name:
+                value, error = item.value(position), item.value_sigma(position, sigma)
+                parameters[item.parameter] = ParameterValue(value, float(error), item.unit)
+        others = tuple(sorted((n for n in members if n != name), key=lambda n: -members[n]))
+        share = members.get(name, 0.0) / max(sum(members.values()), 1e-300)
+        return NamedEffect(name, parameters, float(probability), others, "", float(share))
+
+    def _unexplained(
+        self,
+        whole: Selector,
+        hypothesis: Hypothesis,
+        chance: float,
+        steps: list[Step],
+        reason: str,
+        partial: Sequence[NamedEffect] = (),
+    ) -> Verdict:
+        state = whole.state(hypothesis.fit)
+        channels: tuple[Channel, ...] = hypothesis.channels or whole.criticise(hypothesis.fit)
+        description: dict[str, Any] = {
+            "reason": reason,
+            "too_poor": False,
+            "partial": [
+                {"name": e.name, "probability": e.probability,
+                 "parameters": {k: [p.value, p.sigma] for k, p in e.parameters.items()}}
+                for e in partial
+            ],
+            **describe_residual(state, self.cells.geometry, self.prepared.index, self.cells.cell_px, channels),
+        }  # fmt: skip
+        return self._verdict("unexplained", whole, hypothesis, chance, (), description, steps)
+
+    def _verdict(
+        self,
+        verdict: str,
+        whole: Selector,
+        final: Hypothesis,
+        chance: float,
+        effects: tuple[NamedEffect, ...],
+        unexplained: dict[str, Any],
+        steps: Sequence[Step] = (),
+    ) -> Verdict:
+        null = whole.null.fit
+        before, after = _rms(whole.problem, null), _rms(whole.problem, final.fit)
+        heldout = getattr(self, "heldout_rms", (before, after))
+        gap = Gap(_METRIC, before, after, *heldout, _noise_rms(self.cells))
+        candidates = tuple(
+            {"name": c.name, "score": c.gain, "degrees": c.degrees} for c in self.scores
+        )  # type: tuple[dict[str, Any], ...]
+        for name, why in whole.left_out.items():
+            self.notes.append(f"{name} was left out: {why}")
+        data = {
+            "shape": list(self.cells.shape),
+            "cell_px": self.cells.cell_px,
+            "wavelength_nm": self.cells.wavelength_nm.tolist(),
+            "noise_factor": self.prepared.noise.factor.tolist(),
+            "response_scatter": self.prepared.noise.response_scatter,
+            "thickness_um": [
+                float(whole.problem.basis.expand(final.fit.field).min()),
+                float(whole.problem.basis.expand(final.fit.field).max()),
+            ],
+        }
+        return Verdict(
+            verdict, effects, self.where, gap, tuple(steps), unexplained, self.model.setup.name, chance, candidates,
+            (), tuple(self.notes), data,
+        )  # fmt: skip
+
+
+def _held_out_blocks(
+    shape: tuple[int, int], fraction: float, rng: np.random.Generator, rich: bool
+) -> NDArray[np.bool_]:
+    """Blocks of cells that no selection sees, scattered over the sensor; none where there are few cells."""
+    if not rich or min(shape) < 32:
+        return np.zeros(shape, dtype=bool)
+    side = 8
+    blocks = rng.permutation(side * side).reshape(side, side) < round(fraction * side * side)
+    rows = np.arange(shape[0]) * side // shape[0]
+    columns = np.arange(shape[1]) * side // shape[1]
+    return blocks[np.ix_(rows, columns)]
+
+
+def _noise_rms(cells: CellData) -> float:
+    """Rms of the noise of the cells, response scatter included."""
+    used = cells.weight > 0
+    return float(np.sqrt((1.0 / cells.weight[used]).mean() + cells.response_scatter**2)) if used.any() else math.nan
+
+
+def _rms(problem: Problem, fit: Fit) -> float:
+    """Rms of data minus model, corrected for the freedom of the nuisances."""
+    degrees = problem.cells.n_values - _field_freedom(problem) - problem.level_basis.shape[1] - len(fit.coordinates)
+    return _noise_rms(problem.cells) * math.sqrt(fit.chi2 / max(degrees, 1))
+
+
+def _field_freedom(problem: Problem) -> int:
+    """Coefficients of the field that the data reach."""
+    if problem.field_prior:
+        return 0
+    seen = (problem.cells.weight > 0).any(axis=0).astype(float)
+    return int((problem.basis.gather(seen[np.newaxis])[:, 0] > 1e-3).sum())
+
+
+def _predicted_chi2(problem: Problem, fit: Fit) -> float:
+    """χ² of data that took no part in a fit, with their levels adjusted."""
+    value = problem.forward.predict(fit.settings, problem.basis.expand(fit.field)).value
+    weight = problem.cells.weight
+    square = (weight * value**2).sum(axis=(1, 2))
+    level = np.divide(
+        (weight * value * problem.cells.value).sum(axis=(1, 2)), square, out=np.ones(len(square)), where=square > 0
+    )
+    return float((weight * (problem.cells.value - level[:, None, None] * value) ** 2).sum())

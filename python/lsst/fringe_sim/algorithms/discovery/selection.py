@@ -1,0 +1,260 @@
+"""Which effect: score tests, refits, evidence, classes of effects that the data cannot tell apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_distribution
+
+from ...effects import Effect
+from ...errors import InputError
+from .channels import Channel, State, combined_probability, measure_channels
+from .fit import Coordinate, Design, Fit, Problem, coordinate_derivative, coordinates_of, fit_model, linearise_at
+
+__all__ = ["Candidate", "Hypothesis", "Selector"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Score test of one effect against a fit that lacks it.
+
+    Attributes
+    ----------
+    name : `str`
+        The effect.
+    gain : `float`
+        Expected fall of χ² if it is added.
+    degrees : `int`
+        Its free parameters that the data see.
+    start : `numpy.ndarray`
+        Coordinates at the expected minimum.
+    """
+
+    name: str
+    gain: float
+    degrees: int
+    start: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A set of effects, fitted.
+
+    Attributes
+    ----------
+    names : `tuple` [`str`, ...]
+        The effects; empty for the unchanged model.
+    fit : `Fit`
+        The fit.
+    log_evidence : `float`
+        Laplace approximation, relative to the unchanged model fitted to the same data.
+    """
+
+    names: tuple[str, ...]
+    fit: Fit
+    log_evidence: float
+    channels: tuple[Channel, ...] = field(default=())
+
+    @property
+    def probability_of_noise(self) -> float:
+        """Chance that noise alone leaves so large a residual; see `combined_probability`."""
+        return combined_probability(self.channels)
+
+
+class Selector:
+    """Fits and compares sets of effects on one problem.
+
+    Parameters
+    ----------
+    problem : `Problem`
+        Data, model and nuisances.
+    catalogue : sequence of `Effect`
+        Effects that may be named.
+    null : `Fit`
+        Fit of the unchanged model.
+    index : `numpy.ndarray`, shape ``(W,)``
+        Refractive index of the varying layer, for the fringe phase.
+    """
+
+    def __init__(
+        self, problem: Problem, catalogue: Sequence[Effect], null: Fit, index: FloatArray, *, generic: bool = True
+    ) -> None:
+        self.problem, self.index, self.generic = problem, index, generic
+        self.null = Hypothesis((), null, 0.0)
+        thickness = problem.basis.expand(null.field)
+        self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
+        self.left_out: dict[str, str] = {}
+        for effect in catalogue:
+            try:
+                found = coordinates_of(effect, problem.forward, thickness)
+                for item in found:
+                    problem.forward.predict({item.key: item.value(0.1 * item.unit_step)}, thickness)
+            except InputError as error:
+                self.left_out[effect.name] = str(error)
+            else:
+                self.coordinates[effect.name] = found
+        self.null = replace(self.null, channels=self.criticise(null))
+        self._known: dict[frozenset[str], Hypothesis] = {frozenset(): self.null}
+
+    def state(self, fit: Fit) -> State:
+        """Everything the tests need at a fit."""
+        design, residual, prediction, thickness, whiten = linearise_at(self.problem, fit)
+        level = (self.problem.level_basis @ fit.levels)[:, None, None]
+        raw = np.where(self.problem.cells.weight > 0, self.problem.cells.value - level * prediction.value, 0.0)
+        return State(design, residual, raw, level * prediction.value, thickness, whiten)
+
+    def criticise(self, fit: Fit) -> tuple[Channel, ...]:
+        """Tests without a catalogue."""
+        if not self.generic:
+            return (self._total(fit),)
+        return measure_channels(self.state(fit), self.problem.cells.geometry, self.index)
+
+    def _total(self, fit: Fit) -> Channel:
+        """χ² of all values, where there are too few for anything else."""
+        field_size = 0 if self.problem.field_prior else self.problem.basis.size
+        degrees = self.problem.cells.n_values - field_size - self.problem.level_basis.shape[1] - len(fit.coordinates)
+        chance = float(chi2_distribution.sf(fit.chi2, max(degrees, 1))) if degrees > 0 else 1.0
+        return Channel("all values", fit.chi2, float(max(degrees, 0)), chance)
+
+    def score(self, fit: Fit, names: Sequence[str]) -> list[Candidate]:
+        """Score test of every effect at a fit, best first."""
+        state = self.state(fit)
+        found = []
+        for name in names:
+            coordinates = self.coordinates[name]
+            features = self._features(state, fit, coordinates)
+            score, information = state.design.project(features, state.residual)
+            start, gain, degrees = _bounded_minimum(score, information, coordinates)
+            found.append(Candidate(name, gain, degrees, start, information))
+        return sorted(found, key=lambda item: -item.gain)
+
+    def _features(self, state: State, fit: Fit, coordinates: Sequence[Coordinate]) -> FloatArray:
+        forward = self.problem.forward
+        level = (self.problem.level_basis @ fit.levels)[:, None, None]
+        value = state.value / level
+        columns = []
+        for item in coordinates:
+            at = item.coordinate(fit.settings.get(item.key, item.null))
+            slope = coordinate_derivative(forward, item, at, fit.settings, state.thickness_um, value)
+            columns.append(state.whiten(level * slope))  # type: ignore[operator]
+        return np.stack(columns)
+
+    def hypothesis(self, names: Sequence[str], start: FloatArray | None = None, base: Fit | None = None) -> Hypothesis:
+        """Fit a set of effects; remembered.
+
+        Parameters
+        ----------
+        names : sequence of `str`
+            Effects.
+        start : `numpy.ndarray`, optional
+            First guess of the coordinates of the last effect.
+        base : `Fit`, optional
+            Fit of the others, from which the search starts.
+        """
+        key = frozenset(names)
+        if key in self._known:
+            return self._known[key]
+        ordered = tuple(names)
+        base = self.null.fit if base is None else base
+        coordinates = tuple(item for name in ordered for item in self.coordinates[name])
+        first = []
+        for name in ordered:
+            own = self.coordinates[name]
+            known = [item.key in base.settings for item in own]
+            if all(known):
+                first += [item.coordinate(base.settings[item.key]) for item in own]
+            else:
+                first += list(start) if start is not None else [0.1 * item.unit_step for item in own]
+        position = np.array([item.clip(x) for item, x in zip(coordinates, first, strict=True)])
+        # A quadratic coordinate has no slope in its parameter at 0; start beside it.
+        nudge = np.array([0.01 * item.unit_step if item.quadratic else 0.0 for item in coordinates])
+        fit = fit_model(
+            self.problem, coordinates, np.where(position == 0.0, nudge, position), base.field, base.levels
+        )
+        hypothesis = Hypothesis(ordered, fit, self._evidence(fit))
+        self._known[key] = hypothesis
+        return hypothesis
+
+    def with_channels(self, hypothesis: Hypothesis) -> Hypothesis:
+        """The hypothesis with its residual tested."""
+        if hypothesis.channels:
+            return hypothesis
+        tested = replace(hypothesis, channels=self.criticise(hypothesis.fit))
+        self._known[frozenset(hypothesis.names)] = tested
+        return tested
+
+    def known(self, size: int) -> list[Hypothesis]:
+        """All fitted sets of a size, likeliest first."""
+        found = [item for key, item in self._known.items() if len(key) == size]
+        return sorted(found, key=lambda item: -item.log_evidence)
+
+    def _evidence(self, fit: Fit) -> float:
+        """Laplace approximation of log Z(fit) - log Z(null) with half-Cauchy or Cauchy priors."""
+        total = 0.5 * (self.null.fit.chi2 - fit.chi2)
+        if not fit.coordinates:
+            return total
+        scale = np.array([item.unit_step for item in fit.coordinates])
+        information = fit.information * np.outer(scale, scale)
+        # In units of the prior scale; no parameter is worse known after the data than before.
+        sign, log_determinant = np.linalg.slogdet(information + np.eye(len(scale)))
+        total -= 0.5 * (log_determinant if sign > 0 else 0.0)
+        for item, position in zip(fit.coordinates, fit.position, strict=True):
+            departure = (item.value(position) - item.null) / item.scale
+            total -= math.log1p(departure**2)
+        return float(total)
+
+
+def _bounded_minimum(
+    score: FloatArray, information: FloatArray, coordinates: Sequence[Coordinate]
+) -> tuple[FloatArray, float, int]:
+    """Minimum of the quadratic expansion within the bounds, its depth and the number of parameters used."""
+    scale = np.array([item.unit_step for item in coordinates])
+    matrix = information * np.outer(scale, scale) + np.eye(len(scale)) / 9.0
+    right = score * scale
+    free = np.ones(len(scale), dtype=bool)
+    position = np.zeros(len(scale))
+    for _ in range(len(scale) + 1):
+        position[:] = 0.0
+        if not free.any():
+            break
+        position[free] = np.linalg.solve(matrix[np.ix_(free, free)], right[free])
+        outside = np.array(
+            [item.one_sided and item.clip(x * s) != x * s and abs(x) > 1e-9 and np.sign(x) != _inward(item)
+             for item, x, s in zip(coordinates, position, scale, strict=True)]
+        )  # fmt: skip
+        if not (outside & free).any():
+            break
+        free &= ~outside
+    gain = float(2.0 * position @ right - position @ matrix @ position)
+    seen = int((np.diag(matrix)[free] > 1.0).sum())
+    clipped = np.array([item.clip(x * s) for item, x, s in zip(coordinates, position, scale, strict=True)])
+    return clipped, max(gain, 0.0), max(seen, 1)
+
+
+def _inward(item: Coordinate) -> float:
+    """Sign of the coordinate inside the bounds of a one-sided parameter."""
+    return 1.0 if item.quadratic or item.null <= item.low else -1.0
+
+
+def similarity(design: Design, first: FloatArray, second: FloatArray) -> float:
+    """Cosine between the signatures of two effects with nuisances projected out; the largest canonical one."""
+    both = np.concatenate([first, second])
+    _, information = design.project(both, np.zeros(both.shape[1:]))
+    number = len(first)
+    a, b, c = information[:number, :number], information[number:, number:], information[:number, number:]
+    inverse_roots = [_inverse_root(matrix) for matrix in (a, b)]
+    return float(np.clip(np.linalg.svd(inverse_roots[0] @ c @ inverse_roots[1], compute_uv=False)[0], 0.0, 1.0))
+
+
+def _inverse_root(matrix: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(matrix)
+    keep = values > 1e-9 * max(float(values.max()), 1e-300)
+    root: FloatArray = (vectors[:, keep] / np.sqrt(values[keep])) @ vectors[:, keep].T
+    return root

@@ -1,0 +1,234 @@
+"""A first thickness field without any belief in the contrast of the model."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+
+from ...model import FringeModel
+from .cells import CellData
+
+__all__ = ["starting_thickness"]
+
+FloatArray = NDArray[np.float64]
+
+SEARCH_STEP_UM = 0.01
+HALF_WINDOW_UM = 0.12
+"""Reach of the search around a neighbour's thickness [µm]; below half a fringe order."""
+
+
+def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
+    """Thickness of every cell, with the fringe order decided by all cells together.
+
+    Each cell is compared with the model's fringes at every thickness of the set-up's range by correlation, in which
+    the contrast is free. The field grows from the clearest cell to its neighbours, each within less than half a
+    fringe order of what they predict; then the whole field is moved by whole orders to where the sum of all
+    correlations is best. Cells without data take the value of a neighbour.
+
+    Parameters
+    ----------
+    model : `FringeModel`
+        The model as it is known.
+    cells : `CellData`
+        The data.
+
+    Returns
+    -------
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+    """
+    low, high = model.setup.thickness_range_um
+    count = int(round((high - low) / SEARCH_STEP_UM)) + 1
+    response = model.response_on_grid(cells.wavelength_nm, low, SEARCH_STEP_UM, count)
+    template = response / _running_mean(response, model, cells) - 1.0
+    score = _correlate(template, cells)
+    order = _order_steps(model, cells)
+    best = _grow(score, cells.shape[1], cells.shape[2], int(HALF_WINDOW_UM / SEARCH_STEP_UM))
+    best = best + _common_shift(score, best, order, count)
+    best = _mend_orders(score, best, cells.shape[1:], order)
+    return low + SEARCH_STEP_UM * best.reshape(cells.shape[1:]).astype(float)
+
+
+def _running_mean(response: FloatArray, model: FringeModel, cells: CellData) -> FloatArray:
+    """Mean of the response over a fringe order around each thickness."""
+    width = max(3, 2 * int(_order_steps(model, cells) / 2) + 1)
+    padded = np.pad(response, ((0, 0), (width // 2, width // 2)), mode="reflect")
+    total = np.cumsum(np.pad(padded, ((0, 0), (1, 0))), axis=1)
+    mean: FloatArray = (total[:, width:] - total[:, :-width]) / width
+    return mean
+
+
+def _order_steps(model: FringeModel, cells: CellData) -> float:
+    """Fringe order at the middle wavelength in search steps."""
+    middle = float(np.median(cells.wavelength_nm))
+    stack = model.system.stack
+    medium = stack.layers[stack.position(model.system.varying)].medium
+    index = float(np.real(medium.index(middle, model.system.temperature_k)))
+    return middle * 1e-3 / (2.0 * index) / SEARCH_STEP_UM
+
+
+def _correlate(template: FloatArray, cells: CellData) -> NDArray[np.float32]:
+    """Likelihood gain of the best positive contrast, ``(cells, thickness)``."""
+    amplitude = (cells.value - 1.0).reshape(cells.shape[0], -1)
+    weight = cells.weight.reshape(cells.shape[0], -1)
+    score = np.empty((amplitude.shape[1], template.shape[1]), np.float32)
+    for first in range(0, amplitude.shape[1], 4096):
+        part = slice(first, first + 4096)
+        w = weight[:, part]
+        total = np.maximum(w.sum(axis=0), 1e-300)
+        # An offset common to all wavelengths of the cell is free as well: pixel response, illumination.
+        mean = (w * amplitude[:, part]).sum(axis=0) / total
+        cross = (w * (amplitude[:, part] - mean)).T @ template
+        power = w.T @ template**2 - (w.T @ template) ** 2 / total[:, np.newaxis]
+        gain = np.where(cross > 0.0, cross, 0.0) / np.sqrt(np.maximum(power, 1e-30 * total[:, np.newaxis]))
+        score[part] = gain / np.sqrt(np.maximum((w * (amplitude[:, part] - mean) ** 2).sum(axis=0), 1e-300))[:, None]
+    return score
+
+
+def _common_shift(score: NDArray[np.float32], best: NDArray[np.int64], order: float, count: int) -> int:
+    """Number of steps by which all cells are moved, a whole number of orders give or take a quarter."""
+    shifts = np.arange(-int(12 * order), int(12 * order) + 1)
+    cells = np.arange(len(best))
+    totals = np.full(shifts.size, -np.inf)
+    for number, shift in enumerate(shifts):
+        moved = best + shift
+        inside = (moved >= 0) & (moved < count)
+        if inside.mean() > 0.98:
+            totals[number] = float((score[cells[inside], moved[inside]].astype(float) ** 2).sum())
+    return int(shifts[int(np.argmax(totals))])
+
+
+def _mend_orders(
+    score: NDArray[np.float32], best: NDArray[np.int64], shape: tuple[int, int], order: float
+) -> NDArray[np.int64]:
+    """Move patches that grew across a fringe into the wrong order, if that is likelier or leaves fewer cliffs."""
+    if min(shape) < 12:
+        return best
+    cells, count = np.arange(len(best)), score.shape[1]
+    current = best
+    for window in (15, 9, 5):
+        totals = []
+        for turn in range(-2, 3):
+            moved = _nearby_peak(score, np.clip(current + round(turn * order), 0, count - 1))
+            power = (score[cells, moved].astype(float) ** 2).reshape(shape)
+            totals.append(uniform_filter(power, window, mode="nearest"))
+        turns = np.argmax(np.stack(totals), axis=0).ravel() - 2
+        mended = np.clip(current + np.rint(turns * order).astype(np.int64), 0, count - 1)
+        mended = _nearby_peak(score, mended)
+        cliffs = [_cliffs(field.reshape(shape), order) for field in (current, mended)]
+        power = [float((score[cells, field].astype(float) ** 2).mean()) for field in (current, mended)]
+        if cliffs[1] < cliffs[0] or (power[1] > 1.003 * power[0] and cliffs[1] < 3 * cliffs[0] + 10):
+            current = mended
+    return current
+
+
+def _nearby_peak(score: NDArray[np.float32], best: NDArray[np.int64], reach: int = 4) -> NDArray[np.int64]:
+    """Best thickness within a few search steps."""
+    around = np.clip(best[:, np.newaxis] + np.arange(-reach, reach + 1), 0, score.shape[1] - 1)
+    choice = np.argmax(np.take_along_axis(score, around, axis=1), axis=1)
+    return np.take_along_axis(around, choice[:, np.newaxis], axis=1)[:, 0]
+
+
+def _cliffs(field: NDArray[np.int64], order: float) -> int:
+    """Number of neighbours that differ by most of a fringe order from a straight continuation."""
+    return sum(int((np.abs(np.diff(field, 2, axis=axis)) > 0.6 * order).sum()) for axis in (0, 1))
+
+
+@numba.njit(cache=True)
+def _grow(
+    score: NDArray[np.float32], rows: int, columns: int, reach: int
+) -> NDArray[np.int64]:  # pragma: no cover - compiled
+    """Follow the best correlation from cell to cell, clearest first.
+
+    The cells at the rim of the grown region wait in buckets by their clarity.
+    """
+    cells, count = score.shape
+    best = np.full(cells, -1, np.int64)
+    clarity = np.zeros(cells)
+    for i in range(cells):
+        clarity[i] = score[i].max()
+    seed = 0
+    middle = 0.0
+    for i in range(cells):
+        # the seed lies inside, where it has neighbours on all sides
+        y, x = i // columns, i % columns
+        inside = min(y, rows - 1 - y) + 1 > rows // 8 and min(x, columns - 1 - x) + 1 > columns // 8
+        if inside and clarity[i] > middle:
+            middle, seed = clarity[i], i
+    best[seed] = np.argmax(score[seed])
+    buckets = 64
+    head = np.full(buckets, -1, np.int64)
+    follow = np.full(cells, -1, np.int64)
+    queued = np.zeros(cells, np.bool_)
+    queued[seed] = True
+    head[buckets - 1] = seed
+    while True:
+        level = buckets - 1
+        while level >= 0 and head[level] < 0:
+            level -= 1
+        if level < 0:
+            break
+        i = head[level]
+        head[level] = follow[i]
+        if best[i] < 0:
+            best[i] = _choose(score, best, rows, columns, i, reach)
+        y, x = i // columns, i % columns
+        for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            ny, nx = y + dy, x + dx
+            if ny < 0 or nx < 0 or ny >= rows or nx >= columns:
+                continue
+            j = ny * columns + nx
+            if not queued[j]:
+                queued[j] = True
+                place = min(buckets - 1, max(0, int(clarity[j] * (buckets - 1))))
+                follow[j] = head[place]
+                head[place] = j
+    return best
+
+
+@numba.njit(cache=True)
+def _choose(
+    score: NDArray[np.float32], best: NDArray[np.int64], rows: int, columns: int, i: int, reach: int
+) -> int:  # pragma: no cover - compiled
+    """Thickness of a cell: the best correlation near the plane through the grown cells around it."""
+    y, x = i // columns, i % columns
+    around = 3
+    n = sx = sy = sz = sxx = syy = sxy = sxz = syz = 0.0
+    for dy in range(-around, around + 1):
+        for dx in range(-around, around + 1):
+            yy, xx = y + dy, x + dx
+            if yy < 0 or xx < 0 or yy >= rows or xx >= columns:
+                continue
+            value = best[yy * columns + xx]
+            if value < 0:
+                continue
+            w = 1.0 / (dx * dx + dy * dy)
+            n += w
+            sx += w * dx
+            sy += w * dy
+            sz += w * value
+            sxx += w * dx * dx
+            syy += w * dy * dy
+            sxy += w * dx * dy
+            sxz += w * dx * value
+            syz += w * dy * value
+    mx, my, mz = sx / n, sy / n, sz / n
+    vxx, vyy, vxy = sxx / n - mx * mx + 0.3, syy / n - my * my + 0.3, sxy / n - mx * my
+    vxz, vyz = sxz / n - mx * mz, syz / n - my * mz
+    determinant = vxx * vyy - vxy * vxy
+    gx = (vxz * vyy - vyz * vxy) / determinant
+    gy = (vyz * vxx - vxz * vxy) / determinant
+    expected = mz - gx * mx - gy * my
+    count = score.shape[1]
+    low = max(0, int(round(expected)) - reach)
+    high = min(count - 1, int(round(expected)) + reach)
+    if high < low:
+        return min(max(int(round(expected)), 0), count - 1)
+    place, largest = low, -1.0
+    for k in range(low, high + 1):
+        away = (k - expected) / (0.7 * reach)
+        value = score[i, k] - 0.3 * away * away
+        if value > largest:
+            place, largest = k, value
+    return place

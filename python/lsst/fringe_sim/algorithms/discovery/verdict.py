@@ -1,0 +1,305 @@
+"""What a search for missing effects found: one frozen object, and the files it becomes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from astropy.table import Table
+
+__all__ = ["Gap", "NamedEffect", "ParameterValue", "Step", "Verdict", "Where", "read_effects_override"]
+
+VERDICTS = ("named", "no_discrepancy", "unexplained")
+
+
+@dataclass(frozen=True)
+class ParameterValue:
+    """Fitted value of one parameter with its standard deviation and unit."""
+
+    value: float
+    sigma: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """One effect that was found.
+
+    Attributes
+    ----------
+    name : `str`
+        The likeliest member of its class.
+    parameters : `dict`
+        Values by parameter.
+    probability : `float`
+        Probability that the cause is in the class: this effect or one of ``ambiguous_with``.
+    ambiguous_with : `tuple` [`str`, ...]
+        Effects that explain these data about as well.
+    break_ambiguity : `str`
+        Which data would decide.
+    share : `float`
+        Probability of this member within the class.
+    """
+
+    name: str
+    parameters: dict[str, ParameterValue]
+    probability: float
+    ambiguous_with: tuple[str, ...] = ()
+    break_ambiguity: str = ""
+    share: float = 1.0
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where model and data disagree before anything is added.
+
+    Attributes
+    ----------
+    wavelength : `tuple` of `dict`
+        ``wavelength_nm``, ``chi2``, ``degrees`` of the phase-folded residual of each plane.
+    amplifier : `tuple` of `dict`
+        ``amplifier``, ``offset`` (relative), ``sigma``.
+    scale_px : `float`
+        Spatial scale with the largest excess [px]; 0 if none stands out.
+    thickness_phase : `tuple` of `dict`
+        ``phase`` (fraction of an order), ``residual``, ``sigma``, folded over all wavelengths.
+    channels : `tuple` of `dict`
+        Tests with statistic, degrees of freedom and probability.
+    """
+
+    wavelength: tuple[dict[str, float], ...] = ()
+    amplifier: tuple[dict[str, Any], ...] = ()
+    scale_px: float = 0.0
+    thickness_phase: tuple[dict[str, float], ...] = ()
+    channels: tuple[dict[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Distance of model and data before and after; the noise floor is what a perfect model leaves."""
+
+    metric: str
+    before: float
+    after: float
+    heldout_before: float
+    heldout_after: float
+    noise_floor: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """One round of the search."""
+
+    added: tuple[str, ...]
+    log_evidence: float
+    delta_chi2: float
+    gap_before: float
+    gap_after: float
+    consistent: bool
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Outcome of a search.
+
+    Attributes
+    ----------
+    verdict : {"named", "no_discrepancy", "unexplained"}
+        What was found.
+    effects : `tuple` [`NamedEffect`, ...]
+        Effects, strongest first; empty unless named.
+    where : `Where`
+        Where they disagree.
+    gap : `Gap`
+        How far apart they are, before and after.
+    steps : `tuple` [`Step`, ...]
+        Rounds of the search.
+    unexplained : `dict`
+        Description of what is left over, or why there is no answer.
+    global_probability : `float`
+        Chance that noise alone disagrees as much with the unchanged model.
+    candidates : `tuple` of `dict`
+        Every effect that was tried, with score, gain in χ² and evidence.
+    next_measurements : `tuple` of `dict`
+        Measurements that would help, best first.
+    """
+
+    verdict: str
+    effects: tuple[NamedEffect, ...]
+    where: Where
+    gap: Gap
+    steps: tuple[Step, ...]
+    unexplained: dict[str, Any]
+    setup: str
+    global_probability: float
+    candidates: tuple[dict[str, Any], ...] = ()
+    next_measurements: tuple[dict[str, Any], ...] = ()
+    notes: tuple[str, ...] = ()
+    data: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """Effects by ``name.parameter``, as `FringeModel.from_setup` takes them."""
+        return {
+            f"{effect.name}.{name}": parameter.value
+            for effect in self.effects
+            for name, parameter in effect.parameters.items()
+        }
+
+    def as_mapping(self, model_override: str = "") -> dict[str, Any]:
+        """Plain mapping in the layout of the verdict file."""
+        effects = []
+        for effect in self.effects:
+            entry = asdict(effect)
+            entry["ambiguous_with"] = list(effect.ambiguous_with)
+            effects.append(entry)
+        content = {
+            "verdict": self.verdict,
+            "effects": effects,
+            "where": asdict(self.where),
+            "gap": asdict(self.gap),
+            "steps": [asdict(step) for step in self.steps],
+            "unexplained": self.unexplained,
+            "model_override": model_override,
+            "setup": self.setup,
+            "global_probability": self.global_probability,
+            "candidates": list(self.candidates),
+            "next_measurements": list(self.next_measurements),
+            "notes": list(self.notes),
+            "data": self.data,
+        }
+        cleaned: dict[str, Any] = _plain(content)
+        return cleaned
+
+    def to_json(self, model_override: str = "") -> str:
+        """Text of ``discovery.json``; what is not a number becomes null."""
+        return json.dumps(self.as_mapping(model_override), indent=2, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Verdict:
+        """Read the text of ``discovery.json`` back."""
+        content = json.loads(text)
+        effects = tuple(
+            NamedEffect(
+                entry["name"],
+                {
+                    key: ParameterValue(_number(p["value"]), _number(p["sigma"]), p["unit"])
+                    for key, p in entry["parameters"].items()
+                },
+                entry["probability"],
+                tuple(entry["ambiguous_with"]),
+                entry["break_ambiguity"],
+                entry["share"],
+            )
+            for entry in content["effects"]
+        )
+        where = content["where"]
+        gap = {key: value if key == "metric" else _number(value) for key, value in content["gap"].items()}
+        return cls(
+            content["verdict"],
+            effects,
+            Where(
+                tuple(where["wavelength"]),
+                tuple(where["amplifier"]),
+                where["scale_px"],
+                tuple(where["thickness_phase"]),
+                tuple(where["channels"]),
+            ),
+            Gap(**gap),
+            tuple(Step(**{**step, "added": tuple(step["added"])}) for step in content["steps"]),
+            content["unexplained"],
+            content["setup"],
+            content["global_probability"],
+            tuple(content["candidates"]),
+            tuple(content["next_measurements"]),
+            tuple(content["notes"]),
+            content["data"],
+        )
+
+    def table(self) -> Table:
+        """One row for each parameter of each effect that was found."""
+        rows = [
+            (effect.name, name, p.value, p.sigma, p.unit, effect.probability, ", ".join(effect.ambiguous_with))
+            for effect in self.effects
+            for name, p in effect.parameters.items()
+        ]
+        names = ("effect", "parameter", "value", "sigma", "unit", "probability", "ambiguous_with")
+        kinds = (str, str, float, float, str, float, str)
+        table = Table(rows=rows or None, names=names, dtype=kinds)
+        table.meta.update({"verdict": self.verdict, "setup": self.setup})
+        return table
+
+    def override(self) -> str:
+        """Text of a config override that puts the effects into fit, sky simulation and templates."""
+        lines = [
+            f"# Effects found in laboratory flats of set-up {self.setup}; verdict: {self.verdict}.",
+            "# Use with -C label:effects.py on any task that reads effects.",
+        ]
+        for key, value in self.settings.items():
+            lines.append(f'config.effects["{key}"] = {value!r}')
+        return "\n".join(lines) + "\n"
+
+    def write(self, out_dir: str | Path) -> Path:
+        """Write ``discovery.json``, ``discovery.ecsv`` and ``effects.py``; returns the path of the first."""
+        folder = Path(out_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        override = folder / "effects.py"
+        override.write_text(self.override(), encoding="utf-8")
+        self.table().write(folder / "discovery.ecsv", format="ascii.ecsv", overwrite=True)
+        path = folder / "discovery.json"
+        path.write_text(self.to_json(str(override)), encoding="utf-8")
+        return path
+
+    def summary(self) -> str:
+        """A few lines for people."""
+        lines = [f"verdict: {self.verdict}"]
+        for effect in self.effects:
+            values = ", ".join(
+                f"{name} = {p.value:.6g} ± {p.sigma:.2g} {p.unit}".rstrip()
+                for name, p in effect.parameters.items()
+            )
+            lines.append(f"  {effect.name}: {values}  (probability {effect.probability:.3f})")
+            if effect.ambiguous_with:
+                lines.append(f"    these data cannot tell it from: {', '.join(effect.ambiguous_with)}")
+                lines.append(f"    what would decide: {effect.break_ambiguity}")
+        if self.unexplained.get("reason"):
+            lines.append(f"  {self.unexplained['reason']}")
+        gap = self.gap
+        lines.append(
+            f"  {gap.metric}: {gap.before:.6g} -> {gap.after:.6g} "
+            f"(held out {gap.heldout_before:.6g} -> {gap.heldout_after:.6g}, noise floor {gap.noise_floor:.6g})"
+        )
+        return "\n".join(lines)
+
+
+def read_effects_override(text: str) -> dict[str, float]:
+    """Effects in the text of an override file written by `Verdict.override`; nothing is executed."""
+    found: dict[str, float] = {}
+    for line in text.splitlines():
+        if line.startswith('config.effects["'):
+            key, _, value = line.removeprefix('config.effects["').partition('"] = ')
+            found[key] = float(value)
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, bool) or value is None or isinstance(value, str):
+        return value
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, int):
+        return value
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
