@@ -19,12 +19,18 @@ from ..errors import FringeSimError, InputError
 if TYPE_CHECKING:
     from lsst.daf.butler import Butler
 
-__all__ = ["define_fringe_night", "get_cli_subcommands", "ingest_fringe_raws", "write_fringe_handoff"]
+__all__ = [
+    "adopt_sensor_datasets",
+    "define_fringe_night",
+    "get_cli_subcommands",
+    "ingest_fringe_raws",
+    "write_fringe_handoff",
+]
 
 
 def get_cli_subcommands() -> list[click.Command]:
     """Return the subcommands; the entry point ``butler.cli`` leads here."""
-    return [ingest_fringe_raws, define_fringe_night, write_fringe_handoff]
+    return [ingest_fringe_raws, define_fringe_night, adopt_sensor_datasets, write_fringe_handoff]
 
 
 def _one_clear_message(command: Callable[..., None]) -> Callable[..., None]:
@@ -176,3 +182,50 @@ def write_fringe_handoff(repo: str, collection: str, directory: str, where: str,
     for ref in refs:
         click.echo(str(ref.dataId))
     click.echo(f"{len(refs)} fringe frames {'would be written' if dry_run else 'written'} to {directory}")
+
+
+@click.command(short_help="Give datasets of sensors to another instrument.", cls=ButlerCommand)
+@repo_argument(required=True)
+@click.argument("dataset_type")
+@click.argument("collection")
+@click.argument("instrument")
+@click.argument("run")
+@where_option()
+@transfer_option(default="hardlink", show_default=True)
+@click.option("-n", "--dry-run", is_flag=True, help="Show the datasets, but store nothing.")
+@options_file_option()
+@_one_clear_message
+def adopt_sensor_datasets(
+    repo: str,
+    dataset_type: str,
+    collection: str,
+    instrument: str,
+    run: str,
+    where: str,
+    transfer: str,
+    dry_run: bool,
+) -> None:
+    """Give datasets of sensors the data ids that the same sensors have in another instrument.
+
+    What was measured of a sensor on a test stand, as its epoxyThickness, is found by its serial number and stored
+    in RUN once more, under INSTRUMENT. What RUN has already stays as it is.
+    """
+    from .adoption import adopt_datasets
+
+    with _butler(repo, writeable=not dry_run) as butler:
+        report = adopt_datasets(
+            butler,
+            dataset_type,
+            [collection],
+            instrument,
+            run,
+            where=where,
+            transfer=transfer,
+            dry_run=dry_run,
+        )
+    for ref in report.adopted:
+        click.echo(f"{ref.datasetType.name} {instrument} {ref.dataId['detector']}")
+    if report.homeless:
+        click.echo(f"not in {instrument}: {', '.join(report.homeless)}", err=True)
+    verb = "would be adopted" if dry_run else "adopted"
+    click.echo(f"{len(report.adopted)} datasets {verb} into {run}; {len(report.present)} were there already")

@@ -25,7 +25,7 @@ from lsst.utils.logging import getLogger
 
 from ..algorithms import fit_thickness
 from ..errors import InputError
-from ..instrument.camera import Detector
+from ..instrument.detector import Detector
 from ..model import Setup
 from ..products import FringeCube, FringeFlat, ThicknessMap, describe_mask
 from .model_config import FringeModelConfig

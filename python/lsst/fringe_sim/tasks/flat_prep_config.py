@@ -102,6 +102,7 @@ class FlatPrepConfig(Config):
         except InputError as error:
             raise FieldValidationError(getattr(type(self), error.field), self, str(error)) from error
 
-    def has_same_overscan(self, other: FlatPrepConfig) -> bool:
-        """Whether two tasks correct the overscan alike; for the contracts of pipelines."""
-        return all(getattr(self, name) == getattr(other, name) for name in _OVERSCAN)
+    @property
+    def overscan_choices(self) -> dict[str, object]:
+        """Choices that biases and flats must share; for the contracts of pipelines."""
+        return {name: getattr(self, name) for name in _OVERSCAN}

@@ -21,11 +21,12 @@ from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.flat_prep import prepare_flat
 from ..errors import InputError
-from ..instrument.camera import Detector
+from ..instrument.detector import Detector
 from ..instrument.raw_frame import RawFrame
 from ..model import Setup
 from ..products import CombinedBias, describe_mask
 from .flat_prep_config import FlatPrepConfig
+from .model_config import by_raft
 from .quantum import common_header, data_id_of, sensor_of, unusable
 
 __all__ = ["IsrFlatPrepConfig", "IsrFlatPrepConnections", "IsrFlatPrepTask"]
@@ -114,6 +115,11 @@ class IsrFlatPrepConfig(FlatPrepConfig, PipelineTaskConfig, pipelineConnections=
     def setup_of(self, raft: str) -> Setup:
         """Set-up of a raft."""
         return Setup.from_name(self.raft_setups.get(raft, self.setup))
+
+    @property
+    def setup_by_raft(self) -> dict[str, str]:
+        """Set-up of the task under ``""``, and those of rafts that differ; for the contracts of pipelines."""
+        return by_raft({"": self.setup, **self.raft_setups})
 
 
 class IsrFlatPrepTask(PipelineTask):

@@ -8,34 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from lsst.pex.config import Config, ConfigDictField, DictField, Field, FieldValidationError
 
+from ..algorithms.sky_frame import LABORATORY_EFFECTS
 from ..effects import EFFECTS, activate_effects
 from ..errors import InputError
 from ..model import FringeModel, Setup
 
-__all__ = ["FringeModelConfig", "ModelChoice", "RaftConfig"]
+__all__ = ["FringeModelConfig", "ModelChoice", "RaftConfig", "by_raft"]
 
-OF_THE_LABORATORY = frozenset(
-    {
-        "amplifier_gain",
-        "amplifier_offset",
-        "chromatic_illumination",
-        "dark_pedestal",
-        "ghost_pedestal",
-        "illumination",
-        "midline_step",
-        "non_linearity",
-        "temperature",
-        "vignetting",
-    }
-)
+Value = TypeVar("Value")
+
+OF_THE_LABORATORY = LABORATORY_EFFECTS | {"ghost_pedestal", "temperature"}
 """Effects that stay in the laboratory, besides all those that act on its light.
 
-A sensor takes its layers and the structure of its back side to the telescope, but not the temperature of the
-cryostat, the lamp and the reflections of the bench, nor the calibration of that day's electronics.
+A sensor takes its layers and its electronics to the telescope, but not the temperature of the cryostat nor the lamp
+and the reflections of the bench.
 """
 
 
@@ -143,26 +133,25 @@ class FringeModelConfig(Config):
         own = self.rafts[raft]
         return ModelChoice(own.setup or self.setup, {**effects, **own.effects})
 
-    def has_same_effects(self, other: FringeModelConfig) -> bool:
-        """Whether two tasks are told of the same effects, raft by raft; for the contracts of pipelines."""
-        return all(
-            dict(self.choice(raft).effects) == dict(other.choice(raft).effects)
-            for raft in {"", *self.rafts, *other.rafts}
-        )
+    @property
+    def effects_by_raft(self) -> dict[str, dict[str, float]]:
+        """Effects of the task under ``""``, and those of rafts that differ; for the contracts of pipelines."""
+        return by_raft({raft: dict(self.choice(raft).effects) for raft in ("", *self.rafts)})
 
-    def has_same_setups(self, flats: Any) -> bool:
-        """Whether flats were prepared (`IsrFlatPrepConfig`) in the set-ups of this task, raft by raft."""
-        return all(
-            self.choice(raft).setup == flats.setup_of(raft).name
-            for raft in {"", *self.rafts, *flats.raft_setups}
-        )
+    @property
+    def setup_by_raft(self) -> dict[str, str]:
+        """Set-up of the task under ``""``, and those of rafts that differ."""
+        return by_raft({raft: self.choice(raft).setup for raft in ("", *self.rafts)})
 
-    def has_same_sensor(self, other: FringeModelConfig) -> bool:
-        """Whether the set-ups of two tasks have the same stack and the same varying layer, raft by raft."""
-        return all(
-            _sensor(self.choice(raft).setup) == _sensor(other.choice(raft).setup)
-            for raft in {"", *self.rafts, *other.rafts}
-        )
+    @property
+    def sensor_by_raft(self) -> dict[str, tuple[str, str]]:
+        """Stack and varying layer of the task under ``""``, and those of rafts that differ."""
+        return by_raft({raft: _sensor(self.choice(raft).setup) for raft in ("", *self.rafts)})
+
+
+def by_raft(values: Mapping[str, Value]) -> dict[str, Value]:
+    """Drop the rafts that differ in nothing, so that two tasks agree if and only if their mappings are equal."""
+    return {raft: value for raft, value in values.items() if not raft or value != values[""]}
 
 
 def _sensor(setup: str) -> tuple[str, str]:

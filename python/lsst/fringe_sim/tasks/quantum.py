@@ -13,7 +13,7 @@ from lsst.pipe.base import AlgorithmError, Instrument, QuantumContext
 
 from .. import __version__
 from ..errors import FringeSimError, InputError
-from ..instrument.camera import Detector
+from ..instrument.detector import Detector
 
 __all__ = ["UnusableDataError", "common_header", "data_id_of", "run_datetime", "sensor_of", "unusable"]
 
