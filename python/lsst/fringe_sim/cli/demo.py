@@ -34,7 +34,7 @@ SENSOR = "E2V-CCD250-321"
 NIGHT = "20260115"
 FIRST_HOUR, LAST_HOUR = 19, 29
 VALID = ("2025-01-01", "2035-01-01")
-LAB_RUN, SKY_RUN, CALIBRATIONS = "demo/lab", "demo/sky", "demo/calib"
+LAB_RUN, THICKNESS_RUN, SKY_RUN, CALIBRATIONS = "demo/lab", "demo/thickness", "demo/sky", "demo/calib"
 PIPELINES = "resource://lsst.fringe_sim/pipelines"
 SEED_CONFIG = "resource://lsst.fringe_sim/configs/butler.yaml"
 STATE = "demo.json"
@@ -223,12 +223,19 @@ def _sky(run: DemoRun) -> None:
             "night", "butler", "define-fringe-night", repo, camera, "--date", NIGHT, "--hours", hours
         ),
     )
+    run.step(
+        "adopt",
+        "butler adopt-sensor-datasets",
+        lambda: run.program(
+            "adopt", "butler", "adopt-sensor-datasets", repo, "epoxyThickness", LAB_RUN, camera, THICKNESS_RUN
+        ),
+    )
     detector = Camera.from_name("lsstCam").detector(SENSOR).id
     where = f"instrument='{camera}' AND detector={detector}"
     run.step(
         "sky",
         "pipetask run: sky frames, templates",
-        lambda: _pipetask(run, "sky", LAB_RUN, SKY_RUN, "lsstCam/skyFringe.yaml", where),
+        lambda: _pipetask(run, "sky", THICKNESS_RUN, SKY_RUN, "lsstCam/skyFringe.yaml", where),
     )
     begin, end = VALID
     run.step(
