@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
@@ -21,13 +21,15 @@ from ...errors import InputError
 from .amplitudes import Amplitudes
 from .templates import LANES
 
-__all__ = ["Cells", "average_cells", "cell_edges", "effective_number", "sample_pixels"]
+__all__ = ["Cells", "average_cells", "cell_edges", "compensate_slopes", "effective_number", "sample_pixels"]
 
 _MATH = {"reassoc", "contract", "arcp", "nsz"}
 _SPIKE_SIGMA = 6.0
 """A row or column of a cell this many standard deviations off its neighbours is thrown out."""
 _FINEST_PERIOD_PX = 24.0
 """Shortest fringe whose curvature is not mistaken for a spike [px]."""
+_LEAST_CONTRAST = 0.4
+"""Smallest share of the contrast that a steep cell is taken to keep."""
 _LEAST_FILLED = 0.2
 """Smallest fraction of good pixels with which a cell counts at a wavelength."""
 
@@ -175,6 +177,48 @@ def average_cells(
 
     run_threaded(work, shape[0], threads)
     return Cells(value, weight, rise_y, rise_x, y_edges, x_edges)
+
+
+def compensate_slopes(
+    cells: Cells, slope_y: NDArray[np.float32], slope_x: NDArray[np.float32], order_um: float
+) -> tuple[Cells, NDArray[np.float32], NDArray[np.float32]]:
+    """Undo the loss of contrast that averaging over a steep cell brings.
+
+    A fringe whose phase turns by ``2 pi t`` across a cell keeps ``sin(pi t) / (pi t)`` of its amplitude, in each
+    direction; a slope that is taken from the two halves of a cell is too small by this and by the same loss over
+    half a cell.
+
+    Parameters
+    ----------
+    cells : `Cells`
+        Mean amplitudes.
+    slope_y, slope_x : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Slopes of the thickness as found from the halves [µm/px].
+    order_um : `float`
+        Thickness of one fringe order [µm].
+
+    Returns
+    -------
+    cells : `Cells`
+        With amplitudes divided by the loss, and weights to match.
+    slope_y, slope_x : `numpy.ndarray`
+        Corrected slopes.
+    """
+    turn_y = slope_y * np.diff(cells.y_edges)[:, None] / order_um
+    turn_x = slope_x * np.diff(cells.x_edges)[None, :] / order_um
+    true_y, true_x = turn_y, turn_x
+    kept = np.ones_like(turn_y)
+    for _ in range(4):
+        kept = np.maximum(np.sinc(true_y) * np.sinc(true_x), _LEAST_CONTRAST)
+        # Across a cell the difference of the halves keeps sinc(t/2) of the mean slope's sinc(t).
+        true_y = turn_y / np.maximum(np.sinc(true_x) * np.sinc(0.5 * np.clip(true_y, -1, 1)) ** 2, _LEAST_CONTRAST)
+        true_x = turn_x / np.maximum(np.sinc(true_y) * np.sinc(0.5 * np.clip(true_x, -1, 1)) ** 2, _LEAST_CONTRAST)
+    kept = np.where(np.isfinite(kept), kept, 1.0).astype(np.float32)[..., None]
+    return (
+        replace(cells, value=cells.value / kept, weight=cells.weight * kept**2),
+        (slope_y * np.where(turn_y == 0, 1, true_y / np.where(turn_y == 0, 1, turn_y))).astype(np.float32),
+        (slope_x * np.where(turn_x == 0, 1, true_x / np.where(turn_x == 0, 1, turn_x))).astype(np.float32),
+    )
 
 
 def sample_pixels(data: Amplitudes, most: int = 200_000) -> Cells:

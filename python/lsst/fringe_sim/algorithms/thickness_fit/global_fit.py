@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from .amplitudes import Amplitudes
-from .cells import Cells, average_cells, cell_edges, effective_number
+from .cells import Cells, average_cells, cell_edges, compensate_slopes, effective_number
 from .orders import OrderEvidence, OrderSolution, order_evidence, refine_cells, solve_orders
 from .pixels import CellSurface, PixelFit, fit_pixels
+from .relaxation import SettledCells, settle_orders
 from .templates import FringeTemplates
 
 __all__ = ["GlobalFit", "choose_cell_size", "global_fit", "normalise_to_cells", "spans_orders"]
@@ -21,8 +22,8 @@ LARGEST_CELL_PX = 8
 """Cells beyond this would wash out the steep fringes of real sensors (9 nm per pixel)."""
 MOST_CELLS = 600_000
 """Bound on the memory of the order evidence: about 84 orders of 4 bytes for each cell."""
-_STEEPEST_STRUCTURE = 0.6
-"""Largest ``1 - cos`` of the phase across a cell, in the steepest tenth of the sensor."""
+_STEEPEST_STRUCTURE = 1.0
+"""Largest ``1 - cos`` of the phase across a cell, in the steepest tenth of the sensor: a quarter of a fringe."""
 _MEAN_CHANGE = 0.15
 """Change of the mean response, in rms fringe amplitudes, at which the orders are solved a second time."""
 _MEAN_TOLERANCE = 2e-6
@@ -42,8 +43,8 @@ class GlobalFit:
         Value, uncertainty, chi-square of every pixel.
     cells : `Cells`
         Averages that the orders were solved on.
-    solution : `OrderSolution`
-        Order and region of every cell.
+    settled : `SettledCells`
+        Order of every cell, and how sure it is.
     templates : `FringeTemplates`
         The model as it was normalised in the end.
     order_um : `float`
@@ -54,7 +55,7 @@ class GlobalFit:
 
     pixels: PixelFit
     cells: Cells
-    solution: OrderSolution
+    settled: SettledCells
     templates: FringeTemplates
     order_um: float
     normalisation: str
@@ -97,23 +98,30 @@ def global_fit(
         largest_amplitude=np.abs(templates.amplitude()).max(axis=0),
         threads=threads,
     )
-    found, solution, fitted, normalisation = _solve(data, cells, templates, order, range_um, size, threads)
-    surface = _surface(cells, found, solution, order)
+    temper = _cell_independence(size, data.noise_correlation_px)
+    found, solution, fitted, normalisation = _solve(cells, templates, order, range_um, temper, threads)
+    cells, slope_y, slope_x = compensate_slopes(cells, found.slope_y, found.slope_x, order)
+    settled = settle_orders(
+        cells, fitted, solution.thickness_um, slope_y, slope_x, order,
+        range_um=range_um, temper=temper, threads=threads,
+    )  # fmt: skip
+    thickness = settled.thickness_um
+    if normalisation == "sensor":
+        thickness, fitted = normalise_to_cells(cells, fitted, thickness, threads)
+    surface = _surface(cells, thickness, slope_y, slope_x, order)
     pixels = fit_pixels(data, fitted, surface, order, threads=threads)
-    return GlobalFit(pixels, cells, solution, fitted, order, normalisation)
+    return GlobalFit(pixels, cells, settled, fitted, order, normalisation)
 
 
 def _solve(
-    data: Amplitudes,
     cells: Cells,
     templates: FringeTemplates,
     order: float,
     range_um: tuple[float, float],
-    size: int,
+    temper: float,
     threads: int,
 ) -> tuple[OrderEvidence, OrderSolution, FringeTemplates, str]:
     """Solve the orders, and once more if the sensor's own mean response turns out to be another."""
-    temper = _cell_independence(size, data.noise_correlation_px)
     fitted, normalisation = templates, "range"
     for _ in range(3):
         found = order_evidence(cells, fitted, order, range_um=range_um, temper=temper, threads=threads)
@@ -177,9 +185,14 @@ def _cell_independence(size: int, correlation_px: float) -> float:
     return min(whole / (block**2 * effective_number(size, size, correlation_px)), 1.0)
 
 
-def _surface(cells: Cells, found: OrderEvidence, solution: OrderSolution, order: float) -> CellSurface:
+def _surface(
+    cells: Cells,
+    thickness: NDArray[np.float32],
+    slope_y: NDArray[np.float32],
+    slope_x: NDArray[np.float32],
+    order: float,
+) -> CellSurface:
     """Surface on which the pixels begin; cells without data borrow from the nearest with data."""
-    thickness, slope_y, slope_x = solution.thickness_um, found.slope_y, found.slope_x
     empty = ~np.isfinite(thickness)
     if empty.any() and not empty.all():
         near = distance_transform_edt(empty, return_distances=False, return_indices=True)
@@ -257,6 +270,8 @@ def _structure(
             for step in (block[lag:] - block[:-lag], block[:, lag:] - block[:, :-lag]):
                 good = step[np.isfinite(step)]
                 if good.size >= 16:
-                    # The median of a squared normal deviate is 0.455; spikes do not reach it.
-                    values.append((np.median(good**2) / 0.455 - 2.0 * noise) / (2.0 * signal))
+                    square = good**2
+                    # Spikes are cut: neither a fringe nor noise has squares so far above the median.
+                    square = np.minimum(square, 8.0 * np.median(square))
+                    values.append((square.mean() - 2.0 * noise) / (2.0 * signal))
     return float(np.percentile(values, 90)) if values else np.inf

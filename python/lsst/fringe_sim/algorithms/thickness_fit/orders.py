@@ -46,6 +46,8 @@ _POLISHED = 6
 """Best minima of each cell that are refined on the full table before they are compared."""
 _POLISH_SHARE = 0.01
 """Minima are refined while they lie within this share of the chi-square of a wrong phase."""
+MISFIT = 3.0
+"""Cells whose chi-square is this many times the median lose their say on the order."""
 _IMPOSSIBLE = 1.0e6
 """Chi-square given to an order outside the thickness range."""
 
@@ -151,7 +153,22 @@ def order_evidence(
         )  # fmt: skip
 
     run_threaded(work, shape[0], threads)
+    _distrust_misfits(evidence, chi2)
     return OrderEvidence(phase, _smooth(slope_y), _smooth(slope_x), best, chi2, evidence, order_um)
+
+
+def _distrust_misfits(evidence: NDArray[np.float32], chi2: NDArray[np.float32]) -> None:
+    """Take evidence from cells that fit worse than most: what spoils them favours some order by chance.
+
+    Steep cells lose contrast, cells across a step are mixtures, and their neighbours err the same way.
+    """
+    seen = chi2[np.isfinite(chi2)]
+    if seen.size == 0:
+        return
+    limit = MISFIT * max(float(np.median(seen)), 1.0)
+    worse = np.nonzero(chi2 > limit)
+    inside = evidence[worse] < _IMPOSSIBLE
+    evidence[worse] *= np.where(inside, (limit / chi2[worse])[:, None] ** 2, np.float32(1))
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH)

@@ -22,9 +22,9 @@ def region_slip_probability(found: GlobalFit) -> NDArray[np.float32]:
     -------
     probability : `numpy.ndarray`, float32, shape ``(ny, nx)``
     """
-    evidence = found.solution.region_evidence.astype(float)
-    by_region = 1.0 - 1.0 / np.exp(-0.5 * evidence).sum(axis=1)
-    by_cell = np.append(by_region, 1.0)[found.solution.region]
+    settled = found.settled
+    by_segment = np.append(settled.segment_slip, 1.0)[settled.segment]
+    by_cell = 1.0 - (1.0 - by_segment) * (1.0 - settled.cell_slip)
     rows = np.diff(found.cells.y_edges)
     columns = np.diff(found.cells.x_edges)
     return np.repeat(np.repeat(by_cell.astype(np.float32), rows, axis=0), columns, axis=1)

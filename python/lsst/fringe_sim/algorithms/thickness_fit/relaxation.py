@@ -1,0 +1,442 @@
+"""Second thoughts about the orders of cells: lone cells, steps that phases cannot show, and how sure each is.
+
+Joining cells by their phases has two blind spots. Noise can put a single cell on a phase that is no whole order
+away from its neighbours; and a step in the layer of exactly one or more orders leaves no mark on the phases at
+all. Here every cell is asked again, with the templates as they are normalised by now, what chi-square it has a
+few orders above and below its thickness; blocks of cells, from large to small, move to the order that costs
+least, where the cost is the chi-square of their cells and a price for each break along their border.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from .cells import Cells, run_threaded
+from .newton import gauss_newton, score
+from .orders import EVIDENCE_CAP, MISFIT
+from .templates import FringeTemplates
+
+__all__ = ["SettledCells", "settle_orders"]
+
+SHIFTS = 3
+"""Orders above and below that are tried in one round."""
+BREAK_PRICE = 8.0
+"""Chi-square that a break of half an order or more between two neighbouring cells costs."""
+SAME_SURFACE = 0.25
+"""Cells that agree within this many orders, slopes allowed for, lie on one surface."""
+_LONE = 0.1
+"""A cell this many orders off the surface of its neighbours is looked at again."""
+_LARGEST_MENDED = 400
+"""Largest surface, in cells, that is moved onto the one around it, whatever the jump."""
+_MEND_ROUNDS = 4
+_LARGEST_BLOCK = 64
+_BOLD_BLOCK = 8
+_SWEEPS = 3
+_MOST_ROUNDS = 6
+_IMPOSSIBLE = 1.0e6
+
+
+@dataclass(frozen=True, eq=False)
+class SettledCells:
+    """Cells with their final order.
+
+    Attributes
+    ----------
+    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Thickness of each cell [µm]; NaN where a cell has no data.
+    segment : `numpy.ndarray`, int32, shape ``(ncy, ncx)``
+        Number of the connected surface each cell lies on, 0, 1, ... by size; -1 where a cell has no data.
+    segment_slip : `numpy.ndarray`, shape ``(n_segments,)``
+        Probability that a whole surface has the wrong order.
+    cell_slip : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Probability that a cell has another order than its surface suggests.
+    """
+
+    thickness_um: NDArray[np.float32]
+    segment: NDArray[np.int32]
+    segment_slip: NDArray[np.float64]
+    cell_slip: NDArray[np.float32]
+
+
+def settle_orders(
+    cells: Cells,
+    templates: FringeTemplates,
+    thickness_um: NDArray[np.float32],
+    slope_y: NDArray[np.float32],
+    slope_x: NDArray[np.float32],
+    order_um: float,
+    *,
+    range_um: tuple[float, float],
+    temper: float = 1.0,
+    threads: int = 2,
+) -> SettledCells:
+    """Revise the orders of all cells.
+
+    Parameters
+    ----------
+    cells : `Cells`
+        Mean amplitudes.
+    templates : `FringeTemplates`
+        The model, normalised to the sensor.
+    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Thickness so far [µm]; NaN where a cell has no data.
+    slope_y, slope_x : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Slopes of the thickness [µm/px].
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    range_um : `tuple` [`float`, `float`]
+        Thicknesses that are possible [µm].
+    temper : `float`, optional
+        Independent cells per cell, as for `order_evidence`.
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+    """
+    thickness = thickness_um.copy()
+    rise_y = slope_y * np.diff(cells.y_edges).astype(np.float32)[:, None]
+    rise_x = slope_x * np.diff(cells.x_edges).astype(np.float32)[None, :]
+    table = templates.table()
+    grid = (templates.start_um, templates.step_um)
+    limit = MISFIT * max(_typical_misfit(cells.value, cells.weight, table, *grid, thickness), 1.0)
+    for _ in range(_MEND_ROUNDS):
+        moved = _mend(
+            cells.value, cells.weight, table, *grid, thickness, rise_y, rise_x, order_um, temper, limit
+        )
+        if moved == 0:
+            break
+    shifted = np.zeros((*thickness.shape, 2 * SHIFTS + 1), np.float32)
+    cost = np.zeros_like(shifted)
+
+    def ask(row: int) -> None:
+        _ask_row(
+            cells.value[row], cells.weight[row], table, *grid, thickness[row], order_um, *range_um, temper, limit,
+            shifted[row], cost[row],
+        )  # fmt: skip
+
+    for _ in range(_MOST_ROUNDS):
+        run_threaded(ask, thickness.shape[0], threads)
+        label = np.zeros(thickness.shape, np.int64)
+        size = _LARGEST_BLOCK
+        while size >= 1:
+            if size < max(thickness.shape):
+                for _ in range(_SWEEPS):
+                    if _relax(cost, shifted, label, rise_y, rise_x, order_um, size) == 0:
+                        break
+            size //= 2
+        thickness = np.take_along_axis(shifted, (label + SHIFTS)[..., None], axis=2)[..., 0]
+        if not np.any(label):
+            break
+    segment = _segments(thickness, rise_y, rise_x, order_um)
+    segment_slip = _segment_slip(cost, label, segment)
+    cell_slip = np.zeros(thickness.shape, np.float32)
+    _cell_slip(cost, shifted, label, rise_y, rise_x, order_um, cell_slip)
+    return SettledCells(thickness, segment, segment_slip, cell_slip)
+
+
+@numba.njit(cache=True, nogil=True)
+def _typical_misfit(value, weight, table, start, step, thickness):  # type: ignore[no-untyped-def]
+    """Median reduced chi-square of all cells; 1 if there are none."""
+    ny, nx = thickness.shape
+    seen = np.empty(ny * nx, np.float32)
+    number = 0
+    for y in range(ny):
+        for x in range(nx):
+            if np.isfinite(thickness[y, x]):
+                place = min(max((thickness[y, x] - start) / step, 0.0), table.shape[0] - 1.0)
+                _, _, chi2 = score(table, place, value[y, x], weight[y, x])
+                seen[number] = chi2 / max(np.count_nonzero(weight[y, x]) - 1, 1)
+                number += 1
+    return float(np.median(seen[:number])) if number > 0 else 1.0
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _trust(misfit, temper, limit):  # type: ignore[no-untyped-def]
+    """Factor on the chi-square differences of a cell: less for one that fits badly, least beside better ones."""
+    share = min(limit / misfit, 1.0) if misfit > 0.0 else 1.0
+    return temper / max(1.0, misfit) * share * share
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _break_price(jump, order):  # type: ignore[no-untyped-def]
+    """Price of a jump between two neighbours: grows as its square, up to half an order."""
+    share = 2.0 * jump / order
+    return BREAK_PRICE * min(share * share, 1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _surfaces(thickness, rise_y, rise_x, limit):  # type: ignore[no-untyped-def]
+    """Number of the connected surface each cell lies on, in the order of their first cells; -1 without data."""
+    ny, nx = thickness.shape
+    parent = np.arange(ny * nx)
+    for y in range(ny):
+        for x in range(nx):
+            for side in range(2):
+                b, a = (y - 1, x) if side == 0 else (y, x - 1)
+                if b < 0 or a < 0:
+                    continue
+                rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) if side == 0 else 0.5 * (rise_x[y, x] + rise_x[b, a])
+                if abs(thickness[y, x] - thickness[b, a] - rise) < limit:
+                    first, second = _top(parent, y * nx + x), _top(parent, b * nx + a)
+                    parent[max(first, second)] = min(first, second)
+    number = np.full(ny * nx, -1, np.int64)
+    count = 0
+    for cell in range(ny * nx):
+        if np.isfinite(thickness[cell // nx, cell % nx]):
+            root = _top(parent, cell)
+            if root == cell:
+                number[cell] = count
+                count += 1
+            else:
+                number[cell] = number[root]
+    return number.reshape(ny, nx), count
+
+
+@numba.njit(cache=True, nogil=True)
+def _top(parent, cell):  # type: ignore[no-untyped-def]
+    while parent[cell] != cell:
+        parent[cell] = parent[parent[cell]]
+        cell = parent[cell]
+    return cell
+
+
+@numba.njit(cache=True, nogil=True)
+def _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond):  # type: ignore[no-untyped-def]
+    """Jumps from the cells of a surface to the cells around it; returns how many there are."""
+    ny, nx = thickness.shape
+    number = 0
+    for cell in members:
+        y, x = cell // nx, cell % nx
+        for side in range(4):
+            b = y - 1 if side == 0 else (y + 1 if side == 1 else y)
+            a = x - 1 if side == 2 else (x + 1 if side == 3 else x)
+            if 0 <= b < ny and 0 <= a < nx and surface[b, a] >= 0 and surface[b, a] != own:
+                rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (a - x)
+                jumps[number] = thickness[b, a] - thickness[y, x] - rise
+                beyond[number] = surface[b, a]
+                number += 1
+    return number
+
+
+@numba.njit(cache=True, nogil=True)
+def _main_jump(jumps, beyond, number):  # type: ignore[no-untyped-def]
+    """Middle jump to the neighbour that shares most of the border."""
+    ordered = np.sort(beyond[:number])
+    most, longest, run = ordered[0], 0, 0
+    for k in range(number):
+        run = run + 1 if k > 0 and ordered[k] == ordered[k - 1] else 1
+        if run > longest:
+            most, longest = ordered[k], run
+    return np.median(jumps[:number][beyond[:number] == most])
+
+
+@numba.njit(cache=True, nogil=True)
+def _mend(value, weight, table, start, step, thickness, rise_y, rise_x, order, temper, limit):  # type: ignore[no-untyped-def]
+    """Move small surfaces onto the one around them, if that costs less; returns how many moved."""
+    nx = thickness.shape[1]
+    surface, count = _surfaces(thickness, rise_y, rise_x, _LONE * order)
+    size = np.zeros(count, np.int64)
+    for number in surface.ravel():
+        if number >= 0:
+            size[number] += 1
+    if count <= 1:
+        return 0
+    first = np.zeros(count + 1, np.int64)
+    first[1:] = np.cumsum(size)
+    filled = first[:-1].copy()
+    listed = np.empty(first[count], np.int64)
+    for cell in range(surface.size):
+        number = surface[cell // nx, cell % nx]
+        if number >= 0:
+            listed[filled[number]] = cell
+            filled[number] += 1
+    jumps, beyond = np.empty(4 * _LARGEST_MENDED, np.float64), np.empty(4 * _LARGEST_MENDED, np.int64)
+    found = np.empty(_LARGEST_MENDED, np.float64)
+    top = table.shape[0] - 1.0
+    moved = 0
+    for own in np.argsort(size, kind="mergesort"):
+        if size[own] > _LARGEST_MENDED:
+            break
+        members = listed[first[own] : first[own + 1]]
+        number = _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond)
+        if number == 0:
+            continue
+        move = _main_jump(jumps, beyond, number)
+        change = 0.0
+        for k in range(number):
+            change += _break_price(jumps[k] - move, order) - _break_price(jumps[k], order)
+        for k in range(members.shape[0]):
+            y, x = members[k] // nx, members[k] % nx
+            v, w = value[y, x], weight[y, x]
+            place = min(max((thickness[y, x] - start) / step, 0.0), top)
+            _, _, here = score(table, place, v, w)
+            target = thickness[y, x] + move
+            place = min(max((target - start) / step, 0.0), top)
+            place, _, there = gauss_newton(table, place, v, w, 5, 0.03 / step)
+            found[k] = start + step * place
+            if abs(found[k] - target) > _LONE * order:
+                # No minimum there: the cell would have to lie on the surface against its own data.
+                found[k] = target
+                _, _, there = score(table, min(max((target - start) / step, 0.0), top), v, w)
+            misfit = min(here, there) / max(np.count_nonzero(w) - 1, 1)
+            change += _trust(misfit, temper, limit) * (there - here)
+        if change < 0.0:
+            moved += 1
+            for k in range(members.shape[0]):
+                thickness[members[k] // nx, members[k] % nx] = found[k]
+    return moved
+
+
+@numba.njit(cache=True, nogil=True)
+def _ask_row(value, weight, table, start, step, thickness, order, low, high, temper, limit, shifted, cost):  # type: ignore[no-untyped-def]
+    """Chi-square of each cell at whole orders around its thickness, above the least of them."""
+    top = table.shape[0] - 1.0
+    shifts = shifted.shape[1]
+    for c in range(value.shape[0]):
+        for k in range(shifts):
+            shifted[c, k] = thickness[c]
+            cost[c, k] = 0.0
+        if not np.isfinite(thickness[c]):
+            continue
+        least = np.inf
+        for k in range(shifts):
+            at = thickness[c] + (k - shifts // 2) * order
+            if at < low - 0.05 * order or at > high + 0.05 * order:
+                shifted[c, k] = at
+                cost[c, k] = np.inf
+                continue
+            place = min(max((at - start) / step, 0.0), top)
+            place, _, chi2 = gauss_newton(table, place, value[c], weight[c], 3, 0.03 / step)
+            found = start + step * place
+            # What ran away has no minimum there.
+            shifted[c, k] = found if abs(found - at) < SAME_SURFACE * order else at
+            cost[c, k] = max(chi2, np.float32(0.0))
+            least = min(least, cost[c, k])
+        used = np.count_nonzero(weight[c])
+        scale = _trust(least / max(used - 1, 1), temper, limit)
+        for k in range(shifts):
+            if np.isfinite(cost[c, k]):
+                cost[c, k] = min(scale * (cost[c, k] - least), EVIDENCE_CAP)
+            else:
+                cost[c, k] = _IMPOSSIBLE
+
+
+@numba.njit(cache=True, nogil=True)
+def _border_price(shifted, label, rise_y, rise_x, order, y, x, move, top, bottom, left, right):  # type: ignore[no-untyped-def]
+    """Price of the links of one cell that leave a block, if the block moves by some orders."""
+    ny, nx = label.shape
+    middle = shifted.shape[2] // 2
+    own = label[y, x] + move + middle
+    if not 0 <= own < shifted.shape[2]:
+        return _IMPOSSIBLE
+    here = shifted[y, x, own]
+    total = 0.0
+    for side in range(4):
+        b = y - 1 if side == 0 else (y + 1 if side == 1 else y)
+        a = x - 1 if side == 2 else (x + 1 if side == 3 else x)
+        inside = top <= b < bottom and left <= a < right
+        if inside or not (0 <= b < ny and 0 <= a < nx):
+            continue
+        there = shifted[b, a, label[b, a] + middle]
+        if np.isfinite(there):
+            rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (a - x)
+            total += _break_price(there - here - rise, order)
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _relax(cost, shifted, label, rise_y, rise_x, order, size):  # type: ignore[no-untyped-def]
+    """Give every block of cells the shift that costs least beside its neighbours; returns how many moved."""
+    ny, nx, shifts = cost.shape
+    middle = shifts // 2
+    price = np.empty(shifts, np.float64)
+    moved = 0
+    for top in range(0, ny, size):
+        bottom = min(top + size, ny)
+        for left in range(0, nx, size):
+            right = min(left + size, nx)
+            price[:] = 0.0
+            filled = 0
+            for y in range(top, bottom):
+                for x in range(left, right):
+                    if np.isfinite(shifted[y, x, middle]):
+                        filled += 1
+                        for k in range(shifts):
+                            at = label[y, x] + k
+                            price[k] += cost[y, x, at] if 0 <= at < shifts else _IMPOSSIBLE
+            # The border can only hold a block back: no need to look at it where the cells agree.
+            # Large blocks pay less: many cells do not err together, and someone has to move first.
+            share = 1.0 if size < _BOLD_BLOCK else 0.25
+            if filled == 0 or np.argmin(price) == middle and size > 1:
+                continue
+            for y in range(top, bottom):
+                edge = y == top or y == bottom - 1
+                for x in range(left, right):
+                    if (edge or x == left or x == right - 1) and np.isfinite(shifted[y, x, middle]):
+                        for k in range(shifts):
+                            price[k] += share * _border_price(
+                                shifted, label, rise_y, rise_x, order, y, x, k - middle, top, bottom, left, right
+                            )  # fmt: skip
+            best = np.argmin(price)
+            if price[best] < price[middle] - 1e-3:
+                moved += 1
+                for y in range(top, bottom):
+                    for x in range(left, right):
+                        if np.isfinite(shifted[y, x, middle]):
+                            label[y, x] += best - middle
+    return moved
+
+
+def _segments(
+    thickness: NDArray[np.float32], rise_y: NDArray[np.float32], rise_x: NDArray[np.float32], order: float
+) -> NDArray[np.int32]:
+    """Connected surfaces, numbered by size; -1 where there is no data."""
+    surface, count = _surfaces(thickness, rise_y, rise_x, SAME_SURFACE * order)
+    size = np.bincount(surface[surface >= 0], minlength=count)
+    place = np.full(count + 1, -1, np.int32)
+    place[np.argsort(-size, kind="stable")] = np.arange(count)
+    return place[surface]
+
+
+def _segment_slip(
+    cost: NDArray[np.float32], label: NDArray[np.int64], segment: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """Probability that a surface has another order than the one given, on the evidence of its own cells."""
+    shifts = cost.shape[2]
+    member = segment.ravel()
+    valid = member >= 0
+    total = np.empty((int(member.max(initial=-1)) + 1, shifts))
+    for k in range(shifts):
+        at = label.ravel() + k
+        inside = (at >= 0) & (at < shifts)
+        each = np.where(inside, np.take_along_axis(
+            cost.reshape(-1, shifts), np.clip(at, 0, shifts - 1)[:, None], axis=1
+        )[:, 0], _IMPOSSIBLE)
+        total[:, k] = np.bincount(member[valid], each[valid], minlength=len(total))
+    odds = np.exp(-0.5 * (total - total[:, shifts // 2 : shifts // 2 + 1]).clip(-200.0, 2000.0))
+    return 1.0 - 1.0 / odds.sum(axis=1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _cell_slip(cost, shifted, label, rise_y, rise_x, order, out):  # type: ignore[no-untyped-def]
+    ny, nx, shifts = cost.shape
+    middle = shifts // 2
+    for y in range(ny):
+        for x in range(nx):
+            if not np.isfinite(shifted[y, x, middle]):
+                continue
+            total, own = 0.0, 0.0
+            for k in range(shifts):
+                at = label[y, x] + k
+                if not 0 <= at < shifts:
+                    continue
+                price = cost[y, x, at] + _border_price(
+                    shifted, label, rise_y, rise_x, order, y, x, k - middle, y, y + 1, x, x + 1
+                )
+                weight = np.exp(-0.5 * price)
+                total += weight
+                if k == middle:
+                    own = weight
+            out[y, x] = 1.0 - own / total if total > 0.0 else 1.0
