@@ -1,0 +1,156 @@
+"""From raw files to thickness maps with the real commands on a real repository."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from lsst.daf.butler import Butler
+from task_commands import WAVELENGTHS_NM, Command, Outcome
+
+from lsst.fringe_sim.mock.raw_frames import MockRun
+
+pytestmark = [pytest.mark.middleware, pytest.mark.slow]
+
+PIPELINE = "resource://lsst.fringe_sim/pipelines/ts8/labFlats.yaml"
+DETECTORS = {"RTM-020_S01": 145, "RTM-006_S11": 40}
+GOOD, BAD = "RTM-020_S01", "RTM-006_S11"
+BAD_NM = 930.0
+
+# The sensors are so small that a kernel of 3 px is a good part of a fringe.
+CONFIG = ("-c", "isrFlatPrep:smoothing_sigma_px=1", "-c", "isrFlatPrep:edge_px=2")
+
+
+def run_lab(
+    command: Command, repo: Path, out: str, *extra: object, inputs: str = "LSST-TS8/raw/all"
+) -> Outcome:
+    where = ("-d", "instrument = 'LSST-TS8'") if "-d" not in extra else ()
+    arguments = ("-b", repo, "-i", inputs, "-o", out, *where, "-j", "1", "--register-dataset-types")
+    pipeline = () if "-p" in extra else ("-p", PIPELINE, *CONFIG)
+    return command("pipetask", "run", *arguments, *pipeline, *extra)
+
+
+@pytest.fixture(scope="module")
+def rafts_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What one raft has of its own, for a run of all rafts."""
+    path = tmp_path_factory.mktemp("config") / "rafts.py"
+    path.write_text(
+        "from lsst.fringe_sim.tasks import RaftConfig\n"
+        "config.rafts['RTM-020'] = RaftConfig()\n"
+        "config.rafts['RTM-020'].effects['bandwidth.fwhm'] = 2.01\n"
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def spoiled(raws: dict[str, MockRun], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """Folder of raw frames in which one flat of one sensor saw no light; that file, and what it should be."""
+    folder = tmp_path_factory.mktemp("spoiled")
+    for name, run in raws.items():
+        shutil.copytree(run.paths[0].parent, folder / name)
+    run = raws[BAD]
+    flat = next(item.path for item in run.flats if item.wavelength_nm == BAD_NM)
+    dark = folder / BAD / flat.name
+    with fits.open(dark, mode="update") as frame, fits.open(run.bias[0].path) as bias:
+        for number in range(1, 17):
+            frame[number].data = bias[number].data
+    return folder, dark, flat
+
+
+@pytest.fixture(scope="module")
+def first_run(
+    command: Command, empty_repo: Path, spoiled: tuple[Path, Path, Path], rafts_file: Path
+) -> tuple[Path, Outcome]:
+    """Repository after a run in which one flat could not be used."""
+    ingested = command("butler", "ingest-fringe-raws", empty_repo, spoiled[0], "--transfer", "direct")
+    assert ingested.code == 0, ingested.text
+    return empty_repo, run_lab(command, empty_repo, "u/lab", "-C", f"epoxyFit:{rafts_file}")
+
+
+def fitted(repo: Path, collection: str) -> set[int]:
+    with Butler.from_config(str(repo)) as butler:
+        refs = butler.query_datasets("epoxyThickness", collections=collection, explain=False)
+        return {int(ref.dataId["detector"]) for ref in refs}
+
+
+def test_a_bad_sensor_fails_alone_and_says_why(first_run: tuple[Path, Outcome]) -> None:
+    repo, outcome = first_run
+    assert outcome.code == 1, outcome.text
+    assert fitted(repo, "u/lab") == {DETECTORS[GOOD]}
+    said = next(line for line in outcome.text.splitlines() if "UnusableDataError: " in line)
+    assert f"UnusableDataError: {BAD}, exposure 2018" in said
+    assert "signal" in said
+    with Butler.from_config(str(repo), collections="u/lab") as butler:
+        flats = butler.query_datasets("fringeFlat")
+    assert len(flats) == len(DETECTORS) * len(WAVELENGTHS_NM) - 1
+
+
+def test_what_could_be_fitted_is_the_truth(first_run: tuple[Path, Outcome], raws: dict[str, MockRun]) -> None:
+    repo, _ = first_run
+    with Butler.from_config(str(repo), collections="u/lab", instrument="LSST-TS8") as butler:
+        found = butler.get("epoxyThickness", detector=DETECTORS[GOOD])
+    good = found.mask == 0
+    assert good.mean() > 0.85
+    error_nm = 1e3 * np.abs(found.value - raws[GOOD].truth.thickness_um)[good]
+    assert np.median(error_nm) < 3.0
+    assert (error_nm > 150.0).mean() == 0.0
+    assert found.detector == GOOD
+
+
+def test_headers_tell_what_entered(first_run: tuple[Path, Outcome]) -> None:
+    repo, _ = first_run
+    with Butler.from_config(str(repo), collections="u/lab", instrument="LSST-TS8") as butler:
+        found = butler.get("epoxyThickness", detector=DETECTORS[GOOD]).metadata
+        inputs = {
+            str(ref.id) for ref in butler.query_datasets("fringeFlat", where=f"detector = {DETECTORS[GOOD]}")
+        }
+    number = len(WAVELENGTHS_NM)
+    assert {found[f"LSST BUTLER INPUT {n} ID"] for n in range(number)} == inputs
+    assert found["LSST BUTLER N_INPUTS"] == number
+    assert (found["SETUP"], found["METHOD"], found["NFLATS"]) == ("ts8_e2v", "global", number)
+    assert found["MISSING"] == ""
+    assert found["FSIMVER"]
+
+
+def test_only_what_failed_runs_again(
+    command: Command, first_run: tuple[Path, Outcome], spoiled: tuple[Path, Path, Path], rafts_file: Path
+) -> None:
+    repo, _ = first_run
+    _, dark, flat = spoiled
+    shutil.copyfile(flat, dark)  # the frame is sent again
+    outcome = run_lab(command, repo, "u/lab", "-C", f"epoxyFit:{rafts_file}", "--skip-existing-in", "u/lab")
+    assert outcome.code == 0, outcome.text
+    assert "Executed 2 quanta successfully, 0 failed and 0 remain" in outcome.text
+    assert fitted(repo, "u/lab") == set(DETECTORS.values())
+
+
+def test_override_of_one_raft_within_a_run_of_all(first_run: tuple[Path, Outcome]) -> None:
+    repo, _ = first_run
+    with Butler.from_config(str(repo), collections="u/lab", instrument="LSST-TS8") as butler:
+        own = butler.get("epoxyThickness", detector=DETECTORS["RTM-020_S01"]).metadata
+        other = butler.get("epoxyThickness", detector=DETECTORS["RTM-006_S11"]).metadata
+    assert (own["EFFECT0"], own["EFFVAL0"]) == ("bandwidth.fwhm", 2.01)
+    assert "EFFECT0" not in other
+
+
+def test_override_of_one_raft_in_a_run_of_its_own(command: Command, first_run: tuple[Path, Outcome]) -> None:
+    repo, _ = first_run
+    file = Path(__file__).parents[2] / "config" / "ts8" / "rafts" / "RTM-020.py"
+    outcome = run_lab(
+        command,
+        repo,
+        "u/raft",
+        *("-p", f"{PIPELINE}#epoxyFit"),
+        *("-C", f"epoxyFit:{file}"),
+        *("-d", "instrument = 'LSST-TS8' AND detector.raft = 'RTM-020'"),
+        inputs="u/lab",
+    )
+    assert outcome.code == 0, outcome.text
+    with Butler.from_config(str(repo), collections="u/raft") as butler:
+        assert butler.get("epoxyFit_config").min_wavelengths == 8
+        run = butler.query_datasets("epoxyFit_config")[0].run
+    # The chain holds the maps of its input too; the run of its own has those of the raft alone.
+    assert fitted(repo, run) == {DETECTORS["RTM-020_S01"]}

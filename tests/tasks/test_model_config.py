@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lsst.pex.config import FieldValidationError
+
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.tasks import EpoxyFitConfig, FringeModelConfig, IsrFlatPrepConfig, RaftConfig
+from lsst.fringe_sim.tasks.model_config import OF_THE_LABORATORY, ModelChoice
+
+
+def config(setup: str = "ts8_e2v", **effects: float) -> FringeModelConfig:
+    made = FringeModelConfig(setup=setup)
+    for name, value in effects.items():
+        made.effects[name.replace("__", ".")] = value
+    return made
+
+
+def test_what_stays_in_the_laboratory_is_in_the_catalogue() -> None:
+    assert {effect.name for effect in EFFECTS} >= OF_THE_LABORATORY
+
+
+def test_the_laboratory_gets_every_effect_the_sky_those_of_the_sensor() -> None:
+    effects = {
+        "bandwidth.fwhm": 2.4,
+        "temperature.kelvin": 186.0,
+        "epoxy_absorption.k": 1e-4,
+        "contrast_loss.factor": 0.5,
+    }
+    in_laboratory, on_sky = ModelChoice("ts8_e2v", effects), ModelChoice("lsst_e2v", effects)
+    assert in_laboratory.applied_effects == effects
+    assert in_laboratory.left_out == ()
+    assert on_sky.applied_effects == {"epoxy_absorption.k": 1e-4, "contrast_loss.factor": 0.5}
+    assert on_sky.left_out == ("bandwidth.fwhm", "temperature.kelvin")
+
+
+def test_the_model_is_that_of_set_up_and_effects() -> None:
+    choice = ModelChoice("ts8_e2v", {"bandwidth.fwhm": 3.0})
+    expected = FringeModel.from_setup("ts8_e2v", {"bandwidth": {"fwhm": 3.0}})
+    thickness = np.linspace(10, 11, 7)
+    np.testing.assert_array_equal(
+        choice.model().response(thickness, [960.0]), expected.response(thickness, [960.0])
+    )
+
+
+def test_a_raft_adds_to_and_wins_over_the_task() -> None:
+    made = config(bandwidth__fwhm=2.4, epoxy_index__offset=0.0)
+    made.rafts["R11"] = RaftConfig(setup="bnl_ts8_e2v")
+    made.rafts["R11"].effects["bandwidth.fwhm"] = 0.7
+    assert made.choice("R01") == ModelChoice("ts8_e2v", {"bandwidth.fwhm": 2.4, "epoxy_index.offset": 0.0})
+    assert made.choice("R11") == ModelChoice(
+        "bnl_ts8_e2v", {"bandwidth.fwhm": 0.7, "epoxy_index.offset": 0.0}
+    )
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda c: setattr(c, "setup", "ts8_e2w"), "did you mean ts8_e2v"),
+        (lambda c: c.effects.update({"bandwith.fwhm": 2.0}), "did you mean bandwidth"),
+        (lambda c: c.effects.update({"bandwidth.fwmh": 2.0}), "did you mean fwhm"),
+        (lambda c: c.effects.update({"bandwidth.fwhm": -2.0}), "bandwidth.fwhm"),
+        (lambda c: c.effects.update({"bandwidth": 2.0}), "name.parameter"),
+        (lambda c: c.rafts.update({"R11": RaftConfig(setup="nowhere")}), "raft R11"),
+    ],
+)
+def test_a_wrong_name_or_value_is_found_before_anything_runs(spoil, message: str) -> None:  # type: ignore[no-untyped-def]
+    made = config()
+    spoil(made)
+    with pytest.raises(FieldValidationError, match=message):
+        made.validate()
+
+
+def test_header_says_what_was_modelled() -> None:
+    made = config(bandwidth__fwhm=2.4)
+    assert made.choice().header() == {"SETUP": "ts8_e2v", "EFFECT0": "bandwidth.fwhm", "EFFVAL0": 2.4}
+
+
+def test_agreements_look_at_every_raft() -> None:
+    lab, sky = config("ts8_e2v", bandwidth__fwhm=2.4), config("lsst_e2v", bandwidth__fwhm=2.4)
+    assert lab.effects_by_raft == sky.effects_by_raft
+    assert lab.sensor_by_raft == sky.sensor_by_raft
+    sky.rafts["R01"] = RaftConfig(setup="lsst_itl")
+    assert lab.effects_by_raft == sky.effects_by_raft
+    assert lab.sensor_by_raft != sky.sensor_by_raft
+    lab.rafts["R01"] = RaftConfig(setup="ts8_itl")
+    assert lab.sensor_by_raft == sky.sensor_by_raft
+    lab.rafts["R11"] = RaftConfig()
+    lab.rafts["R11"].effects["bandwidth.fwhm"] = 2.5
+    assert lab.effects_by_raft != sky.effects_by_raft
+
+
+def test_flats_are_prepared_in_the_set_up_in_which_they_are_fitted() -> None:
+    fit, flats = EpoxyFitConfig(), IsrFlatPrepConfig()
+    assert fit.setup_by_raft == flats.setup_by_raft
+    fit.rafts["R01"] = RaftConfig(setup="ts8_itl")
+    assert fit.setup_by_raft != flats.setup_by_raft
+    flats.raft_setups["R01"] = "ts8_itl"
+    flats.raft_setups["R02"] = "ts8_e2v"
+    assert fit.setup_by_raft == flats.setup_by_raft
+
+
+def test_flats_need_a_monochromator() -> None:
+    made = IsrFlatPrepConfig(setup="lsst_e2v")
+    with pytest.raises(FieldValidationError, match="no monochromator"):
+        made.validate()
+    made = IsrFlatPrepConfig()
+    made.raft_setups["R01"] = "tsb8_itl"
+    with pytest.raises(FieldValidationError, match="did you mean"):
+        made.validate()
+
+
+def test_choices_of_the_preparation_are_checked_with_the_field_named() -> None:
+    made = IsrFlatPrepConfig(clip_sigma=0.5)
+    with pytest.raises(FieldValidationError, match=r"clip_sigma is 0\.5"):
+        made.validate()

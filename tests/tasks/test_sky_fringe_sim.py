@@ -1,0 +1,161 @@
+"""The sky task without a repository."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from lsst.pex.config import FieldValidationError
+
+from lsst.fringe_sim.algorithms.sky_frame import simulate_sky_frame
+from lsst.fringe_sim.errors import InputError, OutOfRangeError
+from lsst.fringe_sim.instrument.camera import Camera
+from lsst.fringe_sim.instrument.night import NightHistory
+from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import SkyFringe, ThicknessMap, mask_bits
+from lsst.fringe_sim.tasks import RaftConfig, SkyFringeSimConfig, SkyFringeSimTask
+from lsst.fringe_sim.tasks.sky_fringe_sim import SkyExposure
+
+ROWS, COLUMNS = 12, 16
+DETECTOR = Camera.from_name("lsstCam").detector("R22_S11")
+EXPOSURE = SkyExposure(7026112100660, 20261121, 23.0, 30.0, 1.2, "y_10")
+
+
+def thickness(**changes: Any) -> ThicknessMap:
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    zero = np.zeros((ROWS, COLUMNS))
+    mask = zero.astype(int)
+    mask[0, :3] = mask_bits("NO_DATA")
+    mask[5, 5] = mask_bits("SLIP")
+    values: dict[str, Any] = {
+        "value": 14.0 + 0.02 * x + 0.01 * y,
+        "sigma": zero + 1e-3,
+        "chi2": zero + 1,
+        "slip_probability": zero,
+        "mask": mask,
+        "layer": "adhesive",
+    }
+    return ThicknessMap(**(values | changes))
+
+
+def run(
+    thickness_map: ThicknessMap | None = None, exposure: SkyExposure = EXPOSURE, **config: Any
+) -> SkyFringe:
+    made = SkyFringeSimConfig(**config)
+    made.validate()
+    given = thickness() if thickness_map is None else thickness_map
+    sky: SkyFringe = SkyFringeSimTask(config=made).run(given, exposure, DETECTOR).sky
+    return sky
+
+
+def test_the_frame_is_that_of_the_algorithm_with_the_hour_in_the_bands() -> None:
+    frame = run()
+    lines = EmissionLines.oh()
+    scale = NightHistory.guo2022().band_scale(4, lines.bands)  # 23 h
+    sky = SkySpectrum.dark(lines, 1.2).with_band_scale(scale)
+    expected = simulate_sky_frame(thickness().value, FringeModel.from_setup("lsst_e2v"), sky, exposure_s=30.0)
+    good = frame.mask == 0
+    np.testing.assert_allclose(frame.image[good], expected.image[good], rtol=2e-6)
+    assert frame.metadata["BAND 8-4"] == scale["8-4"] == 0.57
+    assert (frame.hour, frame.airmass, frame.exposure_s) == (23.0, 1.2, 30.0)
+    assert (frame.detector, frame.physical_filter, frame.seed) == ("R22_S11", "y_10", None)
+    assert 0 < frame.quadrature_error < 1e-4
+    assert frame.metadata["LINELIST"].startswith("PALACE")
+
+
+def test_doubts_about_the_map_reach_the_frame() -> None:
+    frame = run()
+    np.testing.assert_array_equal(frame.mask, thickness().mask)
+    assert np.isfinite(frame.image).all()
+
+
+def test_between_two_hours_the_bands_are_interpolated() -> None:
+    half = run(exposure=dataclasses.replace(EXPOSURE, hour=23.5))
+    assert half.metadata["BAND 8-4"] == pytest.approx((0.57 + 0.5) / 2)
+
+
+@pytest.mark.parametrize("hour", [18.9, 29.1])
+def test_an_hour_outside_the_tabulated_night_is_refused(hour: float) -> None:
+    with pytest.raises(OutOfRangeError, match="beginning of the night"):
+        run(exposure=dataclasses.replace(EXPOSURE, hour=hour))
+
+
+def test_a_random_night_is_one_night_for_all_its_exposures() -> None:
+    later = dataclasses.replace(EXPOSURE, exposure_id=7026112100661, hour=23.1)
+    other_date = dataclasses.replace(EXPOSURE, day_obs=20261122)
+    first, close, again, other = (
+        run(exposure=item, night="random").metadata["BAND 8-4"]
+        for item in (EXPOSURE, later, EXPOSURE, other_date)
+    )
+    assert first == again != other
+    assert abs(close / first - 1) < 0.2
+    assert run(exposure=EXPOSURE, night="random", seed=1).metadata["BAND 8-4"] != first
+
+
+def test_a_steady_night_has_the_reference_sky_at_any_hour() -> None:
+    first, last = (run(exposure=dataclasses.replace(EXPOSURE, hour=h), night="steady") for h in (19.0, 29.0))
+    np.testing.assert_array_equal(first.image, last.image)
+
+
+def test_noise_is_that_of_exposure_and_sensor() -> None:
+    first, again = run(noise=True), run(noise=True)
+    other = run(noise=True, exposure=dataclasses.replace(EXPOSURE, exposure_id=EXPOSURE.exposure_id + 1))
+    reseeded = run(noise=True, seed=1)
+    np.testing.assert_array_equal(first.image, again.image)
+    assert len({item.seed for item in (first, other, reseeded)}) == 3
+    clean = run()
+    residual = (first.image - clean.image)[clean.mask == 0] / np.sqrt(clean.image[clean.mask == 0])
+    assert 0.7 < residual.std() < 1.3
+
+
+def test_level_of_the_throughput_tables() -> None:
+    frame = run(level="throughput", night="steady", exposure=dataclasses.replace(EXPOSURE, airmass=1.0))
+    # The inventory of the paper: 2717 electrons per pixel in 30 s at the zenith, within 10 %.
+    assert frame.mean_electrons == pytest.approx(2717, rel=0.1)
+    assert frame.image[frame.mask == 0].mean() == pytest.approx(frame.mean_electrons, rel=1e-5)
+
+
+def test_effects_of_the_sensor_change_the_frame_those_of_the_lamp_do_not() -> None:
+    plain = run()
+    config = SkyFringeSimConfig()
+    config.effects.update({"bandwidth.fwhm": 3.0, "roughness.sigma": 120.0})
+    frame = SkyFringeSimTask(config=config).run(thickness(), EXPOSURE, DETECTOR).sky
+    assert frame.metadata["FRINGRMS"] < 0.9 * plain.metadata["FRINGRMS"]
+    assert (frame.metadata["EFFECT0"], frame.metadata["EFFVAL0"]) == ("roughness.sigma", 120.0)
+    assert "EFFECT1" not in frame.metadata
+
+
+def test_a_map_fitted_with_other_effects_is_refused() -> None:
+    header = {"SETUP": "ts8_e2v", "EFFECT0": "roughness.sigma", "EFFVAL0": 50.0}
+    with pytest.raises(InputError, match="with which the thickness was fitted"):
+        run(thickness(metadata=header))
+    # An effect of the lamp says nothing about the sky.
+    run(thickness(metadata={**header, "EFFECT0": "bandwidth.fwhm", "EFFVAL0": 2.4}))
+
+
+def test_a_map_of_another_layer_is_refused() -> None:
+    with pytest.raises(InputError, match="layer of the thickness map is 'detection'; allowed: adhesive"):
+        run(thickness(layer="detection"))
+
+
+def test_a_map_without_any_thickness_is_refused() -> None:
+    with pytest.raises(InputError, match="no known thickness"):
+        run(thickness(mask=np.full((ROWS, COLUMNS), mask_bits("NO_DATA"))))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda c: setattr(c, "setup", "ts8_e2v"), "does not see the sky"),
+        (lambda c: setattr(c, "seed", -1), "must not be negative"),
+        (lambda c: c.rafts.update({"R01": RaftConfig(setup="ts8_itl")}), "does not see the sky"),
+    ],
+)
+def test_configurations_that_make_no_sense(spoil: Any, message: str) -> None:
+    config = SkyFringeSimConfig()
+    spoil(config)
+    with pytest.raises(FieldValidationError, match=message):
+        config.validate()
