@@ -29,6 +29,10 @@ def test_the_planes_of_afw_keep_their_bits() -> None:
     assert min(set(MASK_PLANES.values()) - set(AFW_PLANES.values())) > max(AFW_PLANES.values())
 
 
+def test_every_plane_fits_into_the_narrow_mask_of_a_cube() -> None:
+    assert ALL_BITS <= np.iinfo(np.int16).max
+
+
 def test_bits_add_up_and_repeat_harmlessly() -> None:
     assert mask_bits() == 0
     assert mask_bits("SAT", "EDGE", "SAT") == 2 + 16

@@ -56,8 +56,10 @@ def as_float_array(
     return read_only(array)
 
 
-def as_mask(field: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.int32]:
-    """Read-only int32 mask of the given shape.
+def as_mask(
+    field: str, values: ArrayLike, shape: tuple[int, ...], dtype: type[np.signedinteger] = np.int32
+) -> NDArray[Any]:
+    """Read-only mask of the given shape; one that has the type already, in any byte order, is shared.
 
     Raises
     ------
@@ -71,8 +73,8 @@ def as_mask(field: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np
     used = int(np.bitwise_or.reduce(array, axis=None))
     if used & ~ALL_BITS:
         raise FrameFormatError(field, f"bits {used & ~ALL_BITS:#x}", "the bits of MASK_PLANES")
-    if array.dtype.newbyteorder("=") != np.dtype(np.int32):
-        array = array.astype(np.int32)
+    if array.dtype.newbyteorder("=") != np.dtype(dtype):
+        array = array.astype(dtype)
     return read_only(array)
 
 

@@ -324,9 +324,7 @@ def read_image(hdus: fits.HDUList, name: str, *, source: str, native: bool = Tru
     return np.array(data, dtype=data.dtype.newbyteorder("=")) if native else data
 
 
-def read_mask(
-    hdus: fits.HDUList, name: str = "MASK", *, source: str, native: bool = True
-) -> NDArray[np.int32]:
+def read_mask(hdus: fits.HDUList, name: str = "MASK", *, source: str, native: bool = True) -> NDArray[Any]:
     """Mask of an extension, its bits moved to the numbering of `MASK_PLANES`.
 
     Raises

@@ -22,6 +22,8 @@ __all__ = ["CUBE_UNITS", "FlatExposures", "FringeCube"]
 CUBE_UNITS = ("electron", "relative")
 """Units of a cube: counts in electrons, or counts divided by their mean over the sensor (so near 1)."""
 
+CUBE_MASK = np.int16
+
 _OWN = ("DETNAME", "LAYER")
 
 
@@ -99,8 +101,8 @@ class FringeCube:
         Counts, in ``unit``. May be memory-mapped and big-endian: convert what you take out of it.
     variance : `numpy.ndarray`, float32, shape of ``image``
         Variance, in the square of ``unit``.
-    mask : `numpy.ndarray`, int32, shape of ``image``
-        Planes of `MASK_PLANES`; 0 is good.
+    mask : `numpy.ndarray`, int16, shape of ``image``
+        Planes of `MASK_PLANES`; 0 is good. Narrower than other masks: it is as large as the image.
     exposures : `FlatExposures`
         Illumination of each plane.
     unit : `str`
@@ -124,7 +126,7 @@ class FringeCube:
 
     image: NDArray[np.float32]
     variance: NDArray[np.float32]
-    mask: NDArray[np.int32]
+    mask: NDArray[np.int16]
     exposures: FlatExposures
     unit: str = "electron"
     thickness: NDArray[np.float32] | None = None
@@ -140,7 +142,7 @@ class FringeCube:
             raise InputError("exposures", type(self.exposures).__name__, "FlatExposures")
         image = check.as_float_array("IMAGE", self.image, 3)
         variance = check.as_float_array("VARIANCE", self.variance, 3)
-        mask = check.as_mask("MASK", self.mask, image.shape)
+        mask = check.as_mask("MASK", self.mask, image.shape, CUBE_MASK)
         check.check_shape("VARIANCE", variance, image.shape)
         if len(self.exposures) != image.shape[0]:
             raise FrameFormatError(
@@ -325,7 +327,7 @@ class _Stack:
 
     image: NDArray[np.float32]
     variance: NDArray[np.float32]
-    mask: NDArray[np.int32]
+    mask: NDArray[np.int16]
     detector: str
     metadata: dict[str, Any]
     rows: list[tuple[float, ...]] = field(default_factory=list)
@@ -339,7 +341,7 @@ class _Stack:
                     raise InputError("number", None, "the number of flats, for an iterable without length")
                 cube = (number, *flat.shape)
                 image, variance = np.empty(cube, np.float32), np.empty(cube, np.float32)
-                mask = np.empty(cube, np.int32)
+                mask = np.empty(cube, CUBE_MASK)
                 stack = cls(image, variance, mask, flat.detector, dict(flat.metadata))
             stack.add(flat)
         if stack is None:
@@ -396,9 +398,7 @@ def _refuse_amplitudes(image: NDArray[Any], mask: NDArray[Any]) -> None:
         raise OutOfRangeError("IMAGE (relative)", middle, "counts over their mean, with a median near 1")
 
 
-def _mask_what_is_no_number(
-    image: NDArray[Any], variance: NDArray[Any], mask: NDArray[Any]
-) -> NDArray[np.int32]:
+def _mask_what_is_no_number(image: NDArray[Any], variance: NDArray[Any], mask: NDArray[Any]) -> NDArray[Any]:
     if not image.shape == variance.shape == mask.shape or image.ndim != 3:
         return mask  # the constructor says what is wrong
     result = mask
@@ -406,7 +406,7 @@ def _mask_what_is_no_number(
         wrong = ~(np.isfinite(image[plane]) & np.isfinite(variance[plane])) & (mask[plane] == 0)
         if wrong.any():
             if result is mask:
-                result = np.array(mask, dtype=np.int32)
+                result = np.array(mask, dtype=CUBE_MASK)
             result[plane][wrong] |= mask_bits("NO_DATA")
     return result
 

@@ -117,9 +117,7 @@ def planes_from_header(header: Mapping[str, object], *, source: str | None = Non
     return planes
 
 
-def remap_mask(
-    mask: NDArray[Any], planes: Mapping[str, int], *, source: str | None = None
-) -> NDArray[np.int32]:
+def remap_mask(mask: NDArray[Any], planes: Mapping[str, int], *, source: str | None = None) -> NDArray[Any]:
     """Move bits from a file's numbering to that of `MASK_PLANES`.
 
     Parameters
@@ -128,6 +126,11 @@ def remap_mask(
         Mask as it stands in the file.
     planes : `Mapping` [`str`, `int`]
         Bit of each plane in that file (`planes_from_header`). Empty: the numbering is the one used here.
+
+    Returns
+    -------
+    mask : `numpy.ndarray`, integer
+        The mask itself if no set bit has to move, else an int32 one.
 
     Raises
     ------
@@ -143,8 +146,7 @@ def remap_mask(
         )
     moved = {name: bit for name, bit in bits_in_file.items() if bit != MASK_PLANES[name]}
     if not any(used & (1 << bit) for bit in moved.values()):
-        same_type = mask.dtype.newbyteorder("=") == np.dtype(np.int32)
-        return mask if same_type else mask.astype(np.int32)
+        return mask
     result = np.zeros(mask.shape, dtype=np.int32)
     for name, bit in bits_in_file.items():
         result |= (((mask >> bit) & 1) << MASK_PLANES[name]).astype(np.int32)
