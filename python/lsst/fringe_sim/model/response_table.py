@@ -93,7 +93,11 @@ class ResponseTable:
 
     @functools.cached_property
     def _packed(self) -> NDArray[np.float32]:
-        return self.polynomials.astype(np.float32)
+        """Flat coefficients of every row, with one more cell for the last thickness itself."""
+        end = np.zeros((len(self.values), 1, 4))
+        end[:, 0, 0] = self.values[:, -1]
+        cells = np.concatenate([self.polynomials, end], axis=1)
+        return cells.astype(np.float32).reshape(len(self.values), -1)
 
     def lookup(self, thickness_um: ArrayLike) -> FloatArray:
         """Interpolated response.
@@ -399,26 +403,30 @@ def _lookup_kernel(
     return out
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract"})
 def _frame_kernel(
     polynomials: NDArray, start: float, per_step: float, thickness: NDArray, out: NDArray
 ) -> NDArray:  # pragma: no cover - compiled
-    cells = len(polynomials)
+    """Fill ``out`` from flat coefficients, four per cell; returns the rows in which a thickness lies outside."""
     height, width = thickness.shape
+    # The last cell only serves its left end.
+    last = polynomials.size // 4 - 1 + 1e-9
     outside = np.zeros(height, dtype=np.bool_)
-    last = float(cells)
+    # Unsigned indices spare the test for negative ones.
+    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
     for y in numba.prange(height):
-        wrong = 0
+        wrong = False
         for x in range(width):
             position = (float(thickness[y, x]) - start) * per_step
-            # NaN fails both comparisons and is not "outside".
-            wrong += (position < -1e-9) | (position > last + 1e-9)
-            clipped = min(max(position, 0.0), last) if position == position else 0.0
-            cell = min(int(clipped), cells - 1)
-            t = np.float32(clipped - cell)
-            c0, c1 = polynomials[cell, 0], polynomials[cell, 1]
-            c2, c3 = polynomials[cell, 2], polynomials[cell, 3]
-            value = c0 + t * (c1 + t * (c2 + t * c3))
-            out[y, x] = value if position == position else np.float32(np.nan)
-        outside[y] = wrong > 0
+            if position >= -1e-9 and position <= last:
+                cell = np.int32(position)
+                t = np.float32(position - cell)
+                k = np.uint64(np.uint32(4 * cell))
+                c0, c1 = polynomials[k], polynomials[k + one]
+                c2, c3 = polynomials[k + two], polynomials[k + three]
+                out[y, x] = c0 + t * (c1 + t * (c2 + t * c3))
+            else:
+                out[y, x] = np.nan
+                wrong |= position == position  # NaN is not "outside"
+        outside[y] = wrong
     return outside

@@ -118,7 +118,14 @@ class TwoLayerTable:
         lower, upper = lower.astype(kind, copy=False), upper.astype(kind, copy=False)
         limits = np.array(self.range_um) + 1e-9 * np.outer(self.step_um, [-1.0, 1.0])
         outside = _frame_kernel(
-            self._coefficients[row], self.start_um, 1.0 / self.step_um, limits, lower, upper, out
+            self._coefficients[row].ravel(),
+            self.values.shape[2],
+            self.start_um,
+            1.0 / self.step_um,
+            limits,
+            lower,
+            upper,
+            out,
         )
         if np.any(outside):
             self._complain(lower[int(np.argmax(outside))], upper[int(np.argmax(outside))])
@@ -227,9 +234,25 @@ def _middle_error(table: TwoLayerTable, exact: FloatArray) -> float:
     return float(np.abs(middle - exact).max())
 
 
+@numba.njit(error_model="numpy", inline="always")
+def _weights(t: float) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
+    """Cubic B-spline at distances 1 + t, t, 1 - t, 2 - t, in single precision."""
+    sixth, half, two_thirds = np.float32(1.0 / 6.0), np.float32(0.5), np.float32(2.0 / 3.0)
+    one = np.float32(1.0)
+    s = one - t
+    ss, tt = s * s, t * t
+    return (
+        sixth * ss * s,
+        two_thirds - half * tt * (one + s),
+        two_thirds - half * ss * (one + t),
+        sixth * tt * t,
+    )
+
+
 @numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract", "reassoc"})
 def _frame_kernel(
     coefficients: NDArray,
+    columns: int,
     start: NDArray,
     per_step: NDArray,
     limits: NDArray,
@@ -237,38 +260,33 @@ def _frame_kernel(
     upper: NDArray,
     out: NDArray,
 ) -> NDArray:  # pragma: no cover - compiled
+    """Fill ``out`` from flat coefficients; returns the rows in which a thickness lies outside."""
     height, width = lower.shape
-    rows, columns = coefficients.shape
     outside = np.zeros(height, dtype=np.bool_)
     s0, s1, f0, f1 = start[0], start[1], per_step[0], per_step[1]
-    sixth, half = np.float32(1.0 / 6.0), np.float32(0.5)
-    one, two_thirds = np.float32(1.0), np.float32(2.0 / 3.0)
+    a0, a1, b0, b1 = limits[0, 0], limits[0, 1], limits[1, 0], limits[1, 1]
+    one, two, three, line = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(columns)
     for y in numba.prange(height):
-        wrong = 0
+        wrong = False
         for x in range(width):
             a, b = float(lower[y, x]), float(upper[y, x])
-            inside = a >= limits[0, 0] and a <= limits[0, 1] and b >= limits[1, 0] and b <= limits[1, 1]
-            if not inside:
+            if a >= a0 and a <= a1 and b >= b0 and b <= b1:
+                u, v = (a - s0) * f0, (b - s1) * f1
+                i, j = np.int32(u), np.int32(v)
+                w0, w1, w2, w3 = _weights(np.float32(u - i))
+                h0, h1, h2, h3 = _weights(np.float32(v - j))
+                # The margins keep every neighbour inside.
+                k = np.uint64(np.uint32(i - 1)) * line + np.uint64(np.uint32(j - 1))
+                m, n, o = k + line, k + two * line, k + three * line
+                c = coefficients
+                out[y, x] = (
+                    w0 * (h0 * c[k] + h1 * c[k + one] + h2 * c[k + two] + h3 * c[k + three])
+                    + w1 * (h0 * c[m] + h1 * c[m + one] + h2 * c[m + two] + h3 * c[m + three])
+                    + w2 * (h0 * c[n] + h1 * c[n + one] + h2 * c[n + two] + h3 * c[n + three])
+                    + w3 * (h0 * c[o] + h1 * c[o + one] + h2 * c[o + two] + h3 * c[o + three])
+                )
+            else:
                 out[y, x] = np.nan
-                # NaN is no complaint; a finite thickness outside is.
-                wrong += a < limits[0, 0] or a > limits[0, 1] or b < limits[1, 0] or b > limits[1, 1]
-                continue
-            u, v = (a - s0) * f0, (b - s1) * f1
-            i, j = min(max(int(u), 1), rows - 3), min(max(int(v), 1), columns - 3)
-            t, q = np.float32(u - i), np.float32(v - j)
-            s, p = one - t, one - q
-            w0, w3 = sixth * s * s * s, sixth * t * t * t
-            w1, w2 = two_thirds - half * t * t * (one + s), two_thirds - half * s * s * (one + t)
-            h0, h3 = sixth * p * p * p, sixth * q * q * q
-            h1, h2 = two_thirds - half * q * q * (one + p), two_thirds - half * p * p * (one + q)
-            c0, c1, c2, c3 = (
-                coefficients[i - 1], coefficients[i], coefficients[i + 1], coefficients[i + 2]
-            )  # fmt: skip
-            out[y, x] = (
-                w0 * (h0 * c0[j - 1] + h1 * c0[j] + h2 * c0[j + 1] + h3 * c0[j + 2])
-                + w1 * (h0 * c1[j - 1] + h1 * c1[j] + h2 * c1[j + 1] + h3 * c1[j + 2])
-                + w2 * (h0 * c2[j - 1] + h1 * c2[j] + h2 * c2[j + 1] + h3 * c2[j + 2])
-                + w3 * (h0 * c3[j - 1] + h1 * c3[j] + h2 * c3[j + 1] + h3 * c3[j + 2])
-            )
-        outside[y] = wrong > 0
+                wrong |= (a < a0) | (a > a1) | (b < b0) | (b > b1)  # NaN is no complaint
+        outside[y] = wrong
     return outside

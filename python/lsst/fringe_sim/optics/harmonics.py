@@ -109,19 +109,23 @@ def _segment(
 ) -> FloatArray:
     middle = count // 2
     size = scipy.fft.next_fast_len(max(2 * count, 4 * _REACH))
-    # A fixed number of parts, whatever the number of threads, keeps the order of the sums.
-    parts = max(1, 8 // len(weight))
-    grid, constant = _gridding_kernel(
-        *coefficients, weight, spread_um, start_um + step_um * middle, step_um, size, order, powers, parts
-    )
-    wave = scipy.fft.ifft(grid, axis=-1, overwrite_x=True)
     offset = np.arange(count) - middle
     window = math.sqrt(4.0 * math.pi * _WIDTH) * np.exp(-_WIDTH * (2.0 * math.pi * offset / size) ** 2) / size
-    fringe = wave[:, :, offset].real / window + constant[:, :, None]
-    total = fringe[0]
-    for power in range(1, powers):
-        total = total + fringe[power] * (step_um * offset) ** power
-    return total
+    out = np.empty((len(weight), count))
+    # One group at a time: the grid then stays in the cache of the processor.
+    grid, fringe = np.empty((powers, size), dtype=complex), np.empty((powers, count))
+    for group, each in enumerate(zip(*coefficients, weight, strict=True)):
+        grid[:] = 0.0
+        constant = _gridding_kernel(*each, spread_um, start_um + step_um * middle, step_um, order, grid)
+        wave = scipy.fft.ifft(grid, axis=-1)
+        fringe[:, middle:] = wave[:, : count - middle].real
+        fringe[:, :middle] = wave[:, size - middle :].real
+        fringe /= window
+        fringe += constant[:, None]
+        out[group] = fringe[0]
+        for power in range(1, powers):
+            out[group] += fringe[power] * (step_um * offset) ** power
+    return out
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -195,7 +199,7 @@ def _harmonic(
     return largest
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@numba.njit(cache=True, error_model="numpy")
 def _gridding_kernel(
     a: NDArray,
     b: NDArray,
@@ -207,58 +211,62 @@ def _gridding_kernel(
     spread: float,
     where: float,
     step: float,
-    size: int,
     order: int,
-    powers: int,
-    parts: int,
-) -> tuple[NDArray, NDArray]:  # pragma: no cover - compiled
-    groups, nodes = w.shape
-    grid = np.zeros((powers, groups, parts, size), dtype=np.complex128)
-    constant = np.zeros((powers, groups, parts))
+    grid: NDArray,
+) -> NDArray:  # pragma: no cover - compiled
+    """Add the harmonics of the nodes of one group to the frequency grid; returns the constant terms."""
+    powers, size = grid.shape
+    constant = np.zeros(powers)
     shape = np.exp(-((np.arange(2 * _REACH) - (_REACH - 1.0)) ** 2) / (4.0 * _WIDTH))
-    for task in numba.prange(groups * parts):
-        group, part = task // parts, task % parts
-        harmonic = np.empty(powers, dtype=np.complex128)
-        window = np.empty(2 * _REACH)
-        for q in range(part * nodes // parts, (part + 1) * nodes // parts):
-            h = -g[group, q]
-            for m in range(_MOST_TERMS):
+    harmonic = np.empty(powers, dtype=np.complex128)
+    window = np.empty(2 * _REACH)
+    for q in range(w.size):
+        h, kr = -g[q], kappa[q].real
+        transparent = kappa[q].imag == 0.0
+        s = a[q] + b[q] + e[q]
+        turn = np.exp(1j * kr * where)
+        follow = (s * h + c[q] + c[q].conjugate() * h * h) * turn / (1.0 - abs(h) ** 2)
+        for m in range(_MOST_TERMS):
+            if m > 0 and transparent:
+                # C_m z^m by multiplication: as many roundings as there are harmonics.
+                value = follow
+                if spread > 0.0:
+                    value *= math.exp(-0.5 * (m * kr * spread) ** 2)
+                if order > 0:
+                    value *= (1j * m * kr) ** order
+                amount = abs(value)
+                harmonic[0] = value
+                follow *= h * turn
+            else:
                 amount = _harmonic(
-                    m, a[group, q], b[group, q], e[group, q], c[group, q], h, kappa[group, q], spread, where,
-                    order, harmonic,
+                    m, a[q], b[q], e[q], c[q], h, kappa[q], spread, where, order, harmonic
                 )  # fmt: skip
-                if m == 0:
-                    for power in range(powers):
-                        constant[power, group, part] += w[group, q] * harmonic[power].real
-                    continue
-                turns = m * kappa[group, q].real * step / (2.0 * math.pi)
-                position = (turns - math.floor(turns)) * size
-                first = int(position)
-                rest = position - first
-                # exp(-(l - rest)²/4w) = exp(-rest²/4w) exp(rest/2w)^l exp(-l²/4w)
-                ratio = math.exp(rest / (2.0 * _WIDTH))
-                factor = 2.0 * w[group, q] * math.exp(-rest * rest / (4.0 * _WIDTH)) * ratio ** (1 - _REACH)
-                for i in range(2 * _REACH):
-                    window[i] = factor * shape[i]
-                    factor *= ratio
-                low = first + 1 - _REACH
+            if m == 0:
                 for power in range(powers):
-                    value = harmonic[power]
-                    row = grid[power, group, part]
-                    if low >= 0 and low + 2 * _REACH <= size:
-                        for i in range(2 * _REACH):
-                            row[low + i] += value * window[i]
-                    else:
-                        for i in range(2 * _REACH):
-                            row[(low + i) % size] += value * window[i]
-                if m >= 2 and amount < _SMALLEST * (m * abs(kappa[group, q])) ** order:
-                    break
-    for task in numba.prange(groups * powers):
-        power, group = task // groups, task % groups
-        for part in range(1, parts):
-            grid[power, group, 0] += grid[power, group, part]
-            constant[power, group, 0] += constant[power, group, part]
-    return grid[:, :, 0].copy(), constant[:, :, 0].copy()
+                    constant[power] += w[q] * harmonic[power].real
+                continue
+            turns = m * kr * step / (2.0 * math.pi)
+            position = (turns - math.floor(turns)) * size
+            first = int(position)
+            rest = position - first
+            # exp(-(l - rest)²/4w) = exp(-rest²/4w) exp(rest/2w)^l exp(-l²/4w), from l = 1 - _REACH
+            ratio = math.exp(rest / (2.0 * _WIDTH))
+            factor = 2.0 * w[q] * math.exp(-rest * (rest - 2.0 * (1 - _REACH)) / (4.0 * _WIDTH))
+            for i in range(2 * _REACH):
+                window[i] = factor * shape[i]
+                factor *= ratio
+            low = first + 1 - _REACH
+            for power in range(powers):
+                value = harmonic[power]
+                if low >= 0 and low + 2 * _REACH <= size:
+                    for i in range(2 * _REACH):
+                        grid[power, low + i] += value * window[i]
+                else:
+                    for i in range(2 * _REACH):
+                        grid[power, (low + i) % size] += value * window[i]
+            if m >= 2 and amount < _SMALLEST * (m * abs(kappa[q])) ** order:
+                break
+    return constant
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
