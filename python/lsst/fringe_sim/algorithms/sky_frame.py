@@ -42,6 +42,9 @@ FloatArray = NDArray[np.float64]
 _ERROR_SAMPLES = 48
 """Thicknesses at which the quadrature is compared with a finer one."""
 
+_BOUND_ANGLES = 6
+"""Angles that stand for a beam where no phases are involved."""
+
 LABORATORY_EFFECTS = frozenset({"illumination", "chromatic_illumination", "vignetting", "dark_pedestal"})
 """Effects on the image that belong to the lamp and the stand of flat fields; a sky frame does not have them."""
 
@@ -217,7 +220,7 @@ def sky_response(
         tolerance=fineness.table_tolerance,
     )
     return SkyResponse(
-        tuple(each.light.name for each in sums),
+        tuple(each.light.component.name for each in sums),
         np.array([each.light.photons for each in sums]),
         level,
         table,
@@ -417,18 +420,22 @@ def fringe_amplitudes(image: ArrayLike, mask: ArrayLike | None = None) -> Fringe
 
 @dataclass(frozen=True, eq=False)
 class _Light:
-    """Quadrature nodes of one component (or of several together) and its photons [s⁻¹ m⁻² arcsec⁻²]."""
+    """One component (or several together) in a beam."""
 
-    name: str
-    photons: float
+    component: SpectralComponent
+    beam: Beam
     illumination: Illumination
 
     @classmethod
     def of(cls, components: list[SpectralComponent], beam: Beam) -> _Light:
         photons = np.concatenate([item.photons for item in components])
         wavelength = np.concatenate([item.wavelength_nm for item in components])
-        name = " + ".join(item.name for item in components)
-        return cls(name, float(photons.sum()), Illumination.spectrum(wavelength, photons, beam))
+        together = SpectralComponent(" + ".join(item.name for item in components), wavelength, photons)
+        return cls(together, beam, Illumination.spectrum(wavelength, photons, beam))
+
+    @property
+    def photons(self) -> float:
+        return float(self.component.photons.sum())
 
     @property
     def mean_wavelength_nm(self) -> float:
@@ -454,8 +461,14 @@ class _SpectralSum:
         return self.light.photons * self.model.finish(self.reduced, illumination, response, None)[0]
 
     def derivative_bound(self, order: int, from_um: float) -> float:
-        bound = self.reduced.derivative_bound(self.light.illumination.weight, order, from_um)
-        return self.light.photons * float(bound.max())
+        """Upper bound of a thickness derivative of `electrons`.
+
+        Sizes of harmonics vary slowly with angle, unlike their phases, so that a few angles give their mean; the
+        margin covers the etalons of the fixed layers, which change it by up to 4 %.
+        """
+        few = _Light.of([self.light.component], reduce_beam(self.light.beam, _BOUND_ANGLES)).illumination
+        bound = self.model.system.reduce(few).derivative_bound(few.weight, order, from_um)
+        return 1.1 * self.light.photons * float(bound.max())
 
 
 def _split(

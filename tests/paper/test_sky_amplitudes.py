@@ -1,0 +1,134 @@
+"""Amplitudes on the sky: sections 5.1 to 5.3, Figures 12 to 14 and Table 2 of the paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import gaussian_filter
+
+from lsst.fringe_sim.algorithms.sky_frame import fringe_amplitudes, sky_response
+from lsst.fringe_sim.instrument.bandpass import Bandpass
+from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
+from lsst.fringe_sim.mock.thickness import e2v_321
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.optics import Illumination
+
+RANGE = (13.9, 22.5)
+PERCENT = 100.0
+
+
+def lines_only(model: FringeModel):
+    """Sky of OH lines alone, as in the paper."""
+    return sky_response(model, SkySpectrum(EmissionLines.oh(), airmass=1.2), thickness_range_um=RANGE)
+
+
+@pytest.fixture(scope="module")
+def shipped_map() -> np.ndarray:
+    return e2v_321()[::16, ::16]
+
+
+@pytest.mark.parametrize(("field_deg", "rms", "tolerance"), [(0.0, 0.14, 0.02), (1.44, 0.04, 0.01)])
+def test_lsst_with_the_shipped_map(shipped_map, field_deg, rms, tolerance):
+    model = FringeModel.from_setup("lsst_e2v", field_x_deg=field_deg)
+    found = fringe_amplitudes(lines_only(model).sky().frame(shipped_map))
+    assert PERCENT * found.rms == pytest.approx(rms, abs=tolerance)
+    assert PERCENT * found.half_peak_to_peak == pytest.approx(2.1 * rms, rel=0.15)
+
+
+def test_continuum_dilutes_the_fringe(shipped_map):
+    """A term that the paper leaves out: a fifth of the light that does not fringe."""
+    model = FringeModel.from_setup("lsst_e2v")
+    with_continuum = sky_response(model, SkySpectrum.dark(airmass=1.2), thickness_range_um=RANGE)
+    whole = fringe_amplitudes(with_continuum.sky().frame(shipped_map)).rms
+    lines = fringe_amplitudes(lines_only(model).sky().frame(shipped_map)).rms
+    assert 0.75 * lines < whole < 0.9 * lines
+
+
+def test_hsc_from_a_random_field_of_silicon(rng):
+    """Section 5.2: 1.74 µm of relief in 200 µm of silicon over 1000 px, 10 to 15 fringes."""
+    model = FringeModel.from_setup("hsc")
+    relief = gaussian_filter(rng.standard_normal((250, 250)), 30, mode="wrap")
+    relief = 1.74 * ((relief - relief.min()) / np.ptp(relief) - 0.5)
+    response = sky_response(model, SkySpectrum.dark(airmass=1.2), thickness_range_um=(199.0, 201.0))
+    found = fringe_amplitudes(response.sky().frame(200.0 + relief))
+    assert 0.2 < PERCENT * found.half_peak_to_peak < 0.6
+
+
+# What the paper itself computed: its own map and its own lines.
+
+
+class PaperSky:
+    """The map of E2V-CCD250-321 and the line list of Figure 8, weighted as in Eq. 4."""
+
+    def __init__(self, shared: Path) -> None:
+        with fits.open(shared / "measured" / "RTM-020_S01_E2V-321_epoxy_map.fits") as hdus:
+            self.thickness = hdus["FINE"].data.astype(float) + 14.022
+            places = hdus["YSRC"].data.astype(float), hdus["XSRC"].data.astype(float)
+        self._map = RegularGridInterpolator(places, self.thickness, bounds_error=False, fill_value=None)
+        lines = Table.read(shared / "data" / "oh_lines_guo2022_fig8.ecsv")
+        band = Bandpass.from_name("lsst_y")
+        self.wavelength = np.asarray(lines["wavelength"])
+        self.weight = np.asarray(lines["intensity"]) * band.transmission(self.wavelength)
+        self.weight *= band.air.total(self.wavelength, 1.2)
+
+    def diagonal(self, count: int = 3970) -> np.ndarray:
+        """Thickness on the diagonal of the trimmed frame, FULL[15:-15, 48:-48]."""
+        step = np.arange(count)
+        return self._map(np.stack([step + 15, step + 48], axis=1))
+
+    def frame(self, model: FringeModel, thickness: np.ndarray) -> np.ndarray:
+        light = Illumination.spectrum(self.wavelength, self.weight, model.system.beam)
+        return model.table_of(light, RANGE, tolerance=1e-6).lookup(thickness)[0]
+
+
+@pytest.fixture(scope="module")
+def paper(shared_dir) -> PaperSky:
+    return PaperSky(shared_dir)
+
+
+def published_diagonal(shared: Path, name: str) -> np.ndarray:
+    table = Table.read(shared / "measured" / f"{name}.ecsv")
+    return np.interp(np.arange(3970), table["diagonal_pixel"], table["amp_percent"])
+
+
+@pytest.mark.shared
+def test_monocam_with_the_lines_of_the_paper(paper, shared_dir):
+    model = FringeModel.from_setup("monocam")
+    found = fringe_amplitudes(paper.frame(model, paper.thickness))
+    assert PERCENT * found.half_peak_to_peak == pytest.approx(1.75, abs=0.2)
+    diagonal = paper.frame(model, paper.diagonal())
+    published = published_diagonal(shared_dir, "MonoCam_sims_diagonal")
+    assert np.corrcoef(diagonal, published)[0, 1] > 0.97
+    assert PERCENT * fringe_amplitudes(diagonal).rms == pytest.approx(published.std(), rel=0.1)
+
+
+@pytest.mark.shared
+def test_lsst_centre_with_the_lines_of_the_paper(paper, shared_dir):
+    model = FringeModel.from_setup("lsst_e2v")
+    found = fringe_amplitudes(paper.frame(model, paper.thickness))
+    assert PERCENT * found.rms == pytest.approx(0.14, abs=0.02)
+    assert PERCENT * found.half_peak_to_peak == pytest.approx(0.29, abs=0.04)
+    published = published_diagonal(shared_dir, "LSST_fringe_sims_center")
+    assert np.corrcoef(paper.frame(model, paper.diagonal()), published)[0, 1] > 0.9
+
+
+@pytest.mark.shared
+def test_lsst_edge_with_the_lines_of_the_paper(paper):
+    model = FringeModel.from_setup("lsst_e2v", field_x_deg=1.44)
+    found = fringe_amplitudes(paper.frame(model, paper.thickness))
+    assert PERCENT * found.rms == pytest.approx(0.04, abs=0.01)
+    assert PERCENT * found.half_peak_to_peak == pytest.approx(0.09, abs=0.02)
+
+
+@pytest.mark.shared
+def test_modern_line_strengths_fringe_less_than_those_of_the_paper(paper):
+    """The list of Figure 8 gives 4-1 and 5-2, the reddest bands, about twice their weight (see test_sky)."""
+    model = FringeModel.from_setup("monocam")
+    theirs = fringe_amplitudes(paper.frame(model, paper.thickness))
+    ours = fringe_amplitudes(lines_only(model).sky().frame(paper.thickness))
+    assert 0.75 < ours.half_peak_to_peak / theirs.half_peak_to_peak < 0.95
