@@ -83,7 +83,8 @@ class ResponseTable:
     @property
     def thickness_um(self) -> FloatArray:
         """Thicknesses of the grid [µm], shape ``(N,)``."""
-        return self.start_um + self.step_um * np.arange(self.values.shape[1])
+        grid: FloatArray = self.start_um + self.step_um * np.arange(self.values.shape[1])
+        return grid
 
     @functools.cached_property
     def polynomials(self) -> FloatArray:
@@ -206,7 +207,7 @@ def response_table(
     tolerance : `float`, optional
         Largest interpolation error; bounded from the closed form, not only sampled.
     quadrature_error : `float`, optional
-        Error estimate of the illumination, to be carried along.
+        Error estimate of the illumination, to be carried along; that which the illumination states, if not given.
     cache : `TableCache`, optional
         Where finished tables are kept; nothing is stored if not given.
 
@@ -226,6 +227,8 @@ def response_table(
         wavelength = illumination.mean_wavelength_nm
     else:
         wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
+    if math.isnan(quadrature_error):
+        quadrature_error = illumination.error_estimate
     key = content_key(system, illumination, (low, high), tolerance, wavelength, quadrature_error)
 
     def build() -> ResponseTable:
@@ -335,7 +338,7 @@ def content_key(
     add("layers", " ".join(system.stack.names))
     for item in fields(OpticalSystem):
         # The illumination stands for the light; what is left are plain numbers and names.
-        if item.name not in ("stack", "profile", "beam"):
+        if item.name not in ("stack", "profile", "beam", "lamp"):
             add(f"system.{item.name}", repr(getattr(system, item.name)))
     return digest.hexdigest()
 

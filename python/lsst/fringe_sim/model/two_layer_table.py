@@ -178,6 +178,8 @@ def two_layer_table(
     if not (np.all(np.isfinite(ranges)) and np.all(ranges[:, 0] < ranges[:, 1]) and np.all(ranges >= 0.0)):
         raise OutOfRangeError("thickness ranges [um]", ranges.tolist(), "two increasing pairs, not negative")
     wavelength = illumination.mean_wavelength_nm
+    if math.isnan(quadrature_error):
+        quadrature_error = illumination.error_estimate
     flat = (float(ranges[0, 0]), float(ranges[0, 1]))
     base = content_key(system, illumination, flat, tolerance, wavelength, quadrature_error)
     key = f"{base}x{np.ascontiguousarray(ranges[1]).tobytes().hex()}"

@@ -1,7 +1,8 @@
 """Thin-film optics: media, stacks, transfer matrices, illumination."""
 
 from .coherence import partially_coherent_absorption
-from .illumination import Beam, Illumination, SpectralProfile
+from .convergence import converged, converged_flat_fields, converged_spectrum
+from .illumination import Beam, Illumination, LampSpectrum, SpectralProfile
 from .media import Medium, constant_medium, get_medium, medium_names
 from .phase_response import PhaseResponse, reduce_to_phase
 from .stack import Layer, LayerStack
@@ -11,6 +12,7 @@ from .two_phase_response import ThicknessGrid, TwoPhaseResponse, reduce_to_two_p
 __all__ = [
     "Beam",
     "Illumination",
+    "LampSpectrum",
     "Layer",
     "LayerStack",
     "Medium",
@@ -19,6 +21,9 @@ __all__ = [
     "ThicknessGrid",
     "TwoPhaseResponse",
     "constant_medium",
+    "converged",
+    "converged_flat_fields",
+    "converged_spectrum",
     "get_medium",
     "layer_absorption",
     "medium_names",

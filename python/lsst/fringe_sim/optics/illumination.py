@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -15,9 +16,12 @@ __all__ = [
     "Beam",
     "GaussianProfile",
     "Illumination",
+    "LampSpectrum",
     "MonochromaticProfile",
     "SpectralProfile",
+    "TabulatedProfile",
     "TriangularProfile",
+    "WingedGaussianProfile",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -80,6 +84,7 @@ class GaussianProfile(SpectralProfile):
         half = max(8, math.ceil(self.reach * sigma / step_nm))
         offset = np.linspace(-self.reach * sigma, self.reach * sigma, 2 * half + 1)
         weight = np.exp(-0.5 * (offset / sigma) ** 2)
+        weight[[0, -1]] *= 0.5  # otherwise the cut tail leaves an error of first order in the spacing
         return offset, weight / weight.sum()
 
 
@@ -107,6 +112,113 @@ class TriangularProfile(SpectralProfile):
         offset = np.concatenate([-offset[::-1], offset])
         weight = np.concatenate([weight[::-1], weight])
         return offset, weight / weight.sum()
+
+
+@dataclass(frozen=True)
+class WingedGaussianProfile(SpectralProfile):
+    """Gaussian line on a weak, wide Lorentzian: scattered light of the grating.
+
+    Attributes
+    ----------
+    fwhm_nm : `float`
+        Full width at half maximum of the core [nm].
+    wing_fraction : `float`
+        Part of the light in the wing, 0 to below 1.
+    wing_fwhm_nm : `float`
+        Full width at half maximum of the wing [nm].
+    wing_reach_nm : `float`
+        Distance at which the wing is cut off [nm].
+    """
+
+    fwhm_nm: float
+    wing_fraction: float
+    wing_fwhm_nm: float
+    wing_reach_nm: float = 20.0
+
+    def __post_init__(self) -> None:
+        _check_width(self.fwhm_nm)
+        _check_width(self.wing_fwhm_nm)
+        if not 0.0 <= self.wing_fraction < 1.0:
+            raise OutOfRangeError("fraction of light in the wing", self.wing_fraction, "0 to below 1")
+        if not 0.0 < self.wing_reach_nm <= 100.0:
+            raise OutOfRangeError("reach of the wing [nm]", self.wing_reach_nm, "above 0 and up to 100")
+
+    def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
+        """Nodes of the core and, unless it is empty, of the wing; see `SpectralProfile.nodes`."""
+        offset, weight = GaussianProfile(self.fwhm_nm).nodes(step_nm)
+        if self.wing_fraction == 0.0:
+            return offset, weight
+        # The wing varies over its own width near the middle and is sampled like the fringes elsewhere.
+        finest = min(8.0 * step_nm, 0.5 * self.wing_fwhm_nm)
+        place, share = _gauss_panels(np.array([-self.wing_reach_nm, 0.0, self.wing_reach_nm]), finest, 8)
+        share = share / (1.0 + (2.0 * place / self.wing_fwhm_nm) ** 2)
+        joint = [(1.0 - self.wing_fraction) * weight, self.wing_fraction * share / share.sum()]
+        return np.concatenate([offset, place]), np.concatenate(joint)
+
+
+@dataclass(frozen=True, eq=False)
+class TabulatedProfile(SpectralProfile):
+    """Measured line: straight lines between tabulated points.
+
+    Attributes
+    ----------
+    offset_nm : `numpy.ndarray`, shape ``(K,)``
+        Wavelength relative to the nominal one [nm], increasing.
+    light : `numpy.ndarray`, shape ``(K,)``
+        Relative number of photons per wavelength, not negative.
+    """
+
+    offset_nm: FloatArray
+    light: FloatArray
+
+    def __post_init__(self) -> None:
+        offset, light = _checked_table("line profile", self.offset_nm, self.light)
+        object.__setattr__(self, "offset_nm", offset)
+        object.__setattr__(self, "light", light)
+
+    def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
+        """Gauss–Legendre nodes between the points; see `SpectralProfile.nodes`."""
+        place, share = _gauss_panels(self.offset_nm, 4.0 * step_nm, 4)
+        share = share * np.interp(place, self.offset_nm, self.light)
+        return place, share / share.sum()
+
+
+@dataclass(frozen=True, eq=False)
+class LampSpectrum:
+    """Spectrum of the lamp in front of the monochromator, e.g. the arc lines of xenon.
+
+    Attributes
+    ----------
+    wavelength_nm : `numpy.ndarray`, shape ``(K,)``
+        Wavelengths [nm], increasing.
+    light : `numpy.ndarray`, shape ``(K,)``
+        Relative number of photons per wavelength; straight lines between the points.
+    """
+
+    wavelength_nm: FloatArray
+    light: FloatArray
+
+    def __post_init__(self) -> None:
+        wavelength, light = _checked_table("lamp spectrum", self.wavelength_nm, self.light)
+        object.__setattr__(self, "wavelength_nm", wavelength)
+        object.__setattr__(self, "light", light)
+
+    def at(self, wavelength_nm: ArrayLike) -> FloatArray:
+        """Relative number of photons at these wavelengths [nm].
+
+        Raises
+        ------
+        OutOfRangeError
+            A wavelength outside the table.
+        """
+        wavelength = np.asarray(wavelength_nm, dtype=float)
+        low, high = self.wavelength_nm[0], self.wavelength_nm[-1]
+        if not np.all((wavelength >= low) & (wavelength <= high)):
+            worst = wavelength.min() if wavelength.min() < low else wavelength.max()
+            raise OutOfRangeError(
+                "wavelength [nm] in the lamp spectrum", float(worst), f"{low:g} to {high:g}"
+            )
+        return np.interp(wavelength, self.wavelength_nm, self.light)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,11 +298,14 @@ class Illumination:
     ----------
     wavelength_nm, theta, weight : `numpy.ndarray`, shape ``(W, Q)``
         Nodes [nm, rad] and weights of W exposures; the weights of each sum to 1.
+    error_estimate : `float`
+        Estimated error of the response that is left by these nodes (see `convergence`); NaN if it is not known.
     """
 
     wavelength_nm: FloatArray
     theta: FloatArray
     weight: FloatArray
+    error_estimate: float = math.nan
 
     def __post_init__(self) -> None:
         shapes = {self.wavelength_nm.shape, self.theta.shape, self.weight.shape}
@@ -212,6 +327,7 @@ class Illumination:
         profile: SpectralProfile,
         beam: Beam,
         step_nm: float = DEFAULT_STEP_NM,
+        lamp: LampSpectrum | None = None,
     ) -> Illumination:
         """Monochromator flats, one per nominal wavelength.
 
@@ -225,6 +341,8 @@ class Illumination:
             Angles of incidence.
         step_nm : `float`, optional
             Largest spacing of the wavelength nodes [nm].
+        lamp : `LampSpectrum`, optional
+            Spectrum of the lamp, by which the line profile is multiplied; white if not given.
         """
         centre = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
         offset, weight = profile.nodes(step_nm)
@@ -232,7 +350,15 @@ class Illumination:
         shape = (len(centre), per_exposure.size)
         wave = centre[:, None] + np.repeat(offset, beam.theta.size)[None, :]
         theta = np.broadcast_to(np.tile(beam.theta, offset.size), shape)
-        return cls(wave, theta, np.broadcast_to(per_exposure, shape))
+        if lamp is None:
+            return cls(wave, theta, np.broadcast_to(per_exposure, shape))
+        photons = per_exposure * lamp.at(wave)
+        total = photons.sum(axis=1, keepdims=True)
+        if not np.all(total > 0.0):
+            raise InputError(
+                "lamp light at wavelength [nm]", float(centre[np.argmin(total)]), "more than none"
+            )
+        return cls(wave, theta, photons / total)
 
     @classmethod
     def spectrum(cls, wavelength_nm: ArrayLike, weight: ArrayLike, beam: Beam) -> Illumination:
@@ -256,6 +382,30 @@ class Illumination:
             np.tile(beam.theta, wave.size)[None, :],
             joint[None, :],
         )
+
+
+def _gauss_panels(edges: FloatArray, longest: float, order: int) -> tuple[FloatArray, FloatArray]:
+    """Composite Gauss–Legendre nodes and weights on panels that end at ``edges``."""
+    x, w = np.polynomial.legendre.leggauss(order)
+    places, weights = [], []
+    for low, high in itertools.pairwise(edges):
+        panels = max(1, math.ceil((high - low) / longest))
+        half = 0.5 * (high - low) / panels
+        middle = low + half * (2.0 * np.arange(panels) + 1.0)
+        places.append((middle[:, None] + half * x).ravel())
+        weights.append(np.tile(half * w, panels))
+    return np.concatenate(places), np.concatenate(weights)
+
+
+def _checked_table(what: str, place: ArrayLike, light: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    x, y = np.asarray(place, dtype=float), np.asarray(light, dtype=float)
+    if x.ndim != 1 or x.shape != y.shape or x.size < 2:
+        raise InputError(f"shapes of the {what}", (x.shape, y.shape), "equally long, two points or more")
+    if not (np.all(np.isfinite(x)) and np.all(np.diff(x) > 0.0)):
+        raise InputError(f"wavelengths of the {what}", x.tolist()[:4], "finite and increasing")
+    if not (np.all(np.isfinite(y)) and np.all(y >= 0.0) and y.sum() > 0.0):
+        raise InputError(f"light in the {what}", float(y.min()), "finite, not negative, not all zero")
+    return x, y
 
 
 def _check_width(fwhm_nm: float) -> None:

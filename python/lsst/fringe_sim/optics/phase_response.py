@@ -343,8 +343,8 @@ def reduce_to_phase(
                 )
             )
             shares.append(np.broadcast_to(state.share / len(polarizations), trailing))
-    columns = (np.stack(column) for column in zip(*parts, strict=True))
-    return PhaseResponse(*columns, share=np.stack(shares), spread_um=float(spreads[varying]))
+    a, b, e, c, g, kappa = (np.stack(column) for column in zip(*parts, strict=True))
+    return PhaseResponse(a, b, e, c, g, kappa, np.stack(shares), float(spreads[varying]))
 
 
 def _reduce_polarization(

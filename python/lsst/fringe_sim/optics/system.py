@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from .illumination import DEFAULT_STEP_NM, Beam, Illumination, SpectralProfile
+from .illumination import DEFAULT_STEP_NM, Beam, Illumination, LampSpectrum, SpectralProfile
 from .phase_response import PhaseResponse, reduce_to_phase
 from .stack import LayerStack
 from .two_phase_response import TwoPhaseResponse, reduce_to_two_phases
@@ -45,6 +45,8 @@ class OpticalSystem:
         Relative error of the wavelength scale, zero at `stretch_pivot_nm`.
     stretch_pivot_nm : `float`
         Wavelength at which the scale error vanishes [nm].
+    lamp : `LampSpectrum`, optional
+        Spectrum of the lamp behind the monochromator; white if not given.
     """
 
     stack: LayerStack
@@ -58,6 +60,7 @@ class OpticalSystem:
     wavelength_offset_nm: float = 0.0
     wavelength_stretch: float = 0.0
     stretch_pivot_nm: float = 935.0
+    lamp: LampSpectrum | None = None
 
     def __post_init__(self) -> None:
         self.stack.position(self.varying)
@@ -78,7 +81,8 @@ class OpticalSystem:
 
     def flat_fields(self, wavelength_nm: ArrayLike, step_nm: float = DEFAULT_STEP_NM) -> Illumination:
         """Illumination of monochromator flats at nominal wavelengths [nm]."""
-        return Illumination.flat_fields(self.true_wavelength(wavelength_nm), self.profile, self.beam, step_nm)
+        wavelength = self.true_wavelength(wavelength_nm)
+        return Illumination.flat_fields(wavelength, self.profile, self.beam, step_nm, self.lamp)
 
     def reduce(self, illumination: Illumination) -> PhaseResponse:
         """Closed form of the response in the thickness of the varying layer, one set per node."""

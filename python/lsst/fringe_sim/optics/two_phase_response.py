@@ -55,7 +55,8 @@ class ThicknessGrid:
     @property
     def thickness_um(self) -> FloatArray:
         """The thicknesses [µm], shape ``(count,)``."""
-        return self.start_um + self.step_um * np.arange(self.count)
+        grid: FloatArray = self.start_um + self.step_um * np.arange(self.count)
+        return grid
 
 
 @dataclass(frozen=True)
