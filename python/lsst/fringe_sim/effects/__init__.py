@@ -32,8 +32,10 @@ from .midline_step import MidlineStep
 from .non_linearity import NonLinearity
 from .silicon_absorption import SiliconAbsorption
 from .silicon_thickness import SiliconThickness
+from .support_coherence import SupportCoherence
 from .support_index import SupportIndex
 from .temperature import Temperature
+from .thickness_spread import ThicknessSpread
 from .tilt import Tilt
 from .vignetting import Vignetting
 from .wavelength_offset import WavelengthOffset
@@ -62,7 +64,9 @@ EFFECTS: tuple[Effect, ...] = (
     Temperature(),
     ArCoating(),
     InterfaceRoughness(),
+    ThicknessSpread(),
     SupportIndex(),
+    SupportCoherence(),
     GateOxide(),
     GateThickness(),
     BlackCoating(),

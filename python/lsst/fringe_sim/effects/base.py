@@ -46,6 +46,8 @@ class Parameter:
         Smallest and largest value in which the model is meaningful.
     prior_scale : `float`
         Typical departure from null in a real laboratory, in the same unit.
+    repeats_after : `float`
+        Distance after which the fringes look nearly the same again: neighbouring minima of a fit; 0 if they do not.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Parameter:
     bounds: tuple[float, float]
     prior_scale: float
     description: str
+    repeats_after: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,11 @@ class SiliconThickness(PlainNullEffect):
     title = "silicon thickness"
     acts_on = "stack"
     reference = "Guo, Walter, Lage & Lupton 2022, Table 1 (100 um, constant)"
-    parameters = (Parameter("offset", "um", 0.0, (-20.0, 20.0), 1.0, "thickness minus that of the stack"),)
+    parameters = (
+        Parameter(
+            "offset", "um", 0.0, (-20.0, 20.0), 1.0, "thickness minus that of the stack", repeats_after=0.13
+        ),
+    )
 
     def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
         """Change the thickness of the detection layer."""

@@ -53,6 +53,10 @@ class Coordinate:
         Null value, bounds and prior scale of the parameter.
     quadratic : `bool`
         Whether the coordinate is the square of the departure from null.
+    unit : `str`
+        Unit of the parameter.
+    neighbour : `float`
+        Distance of neighbouring minima of the misfit in the coordinate; 0 if there is only one.
     """
 
     effect: str
@@ -63,6 +67,7 @@ class Coordinate:
     scale: float
     quadratic: bool
     unit: str = ""
+    neighbour: float = 0.0
 
     @property
     def key(self) -> str:
@@ -117,9 +122,10 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
                                                         forward, thickness_um)  # fmt: skip
         found.append(
             Coordinate(
-                effect.name, parameter.name, null, low, high, parameter.prior_scale, quadratic, parameter.unit
+                effect.name, parameter.name, null, low, high, parameter.prior_scale, quadratic, parameter.unit,
+                parameter.repeats_after,
             )
-        )
+        )  # fmt: skip
     return tuple(found)
 
 

@@ -27,7 +27,7 @@ LINE_STEP_NM = 0.1
 MARGIN_UM = 0.45
 """Thickness beyond the field that a table covers [µm]: a step of a fit may not leave it."""
 
-MOST_TABLES = 96
+MOST_TABLES = 600
 """Tables kept for reuse."""
 
 

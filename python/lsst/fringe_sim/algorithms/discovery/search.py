@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -79,6 +79,7 @@ class _Prepared:
     noise: NoiseEstimate
     index: FloatArray
     rich: bool
+    stated: CellData
     notes: tuple[str, ...] = field(default=())
 
 
@@ -193,41 +194,51 @@ def _prepare(cube: FringeCube, model: FringeModel, effects: Sequence[Effect], op
     stack = model.system.stack
     medium = stack.layers[stack.position(model.system.varying)].medium
     index = np.real(medium.index(cells.wavelength_nm, model.system.temperature_k))
-    notes: list[str] = []
     if cells.thickness_um is not None:
         problem, first = _known_thickness(cells, model, effects)
         null = fit_model(problem, (), np.zeros(0), first)
         noise = _measure_noise(problem, null)
         problem = problem.with_cells(cells.scaled_noise(noise.factor, noise.response_scatter))
-        return _Prepared(problem, fit_model(problem, (), np.zeros(0), null.field), noise, index, rich)
+        return _Prepared(problem, fit_model(problem, (), np.zeros(0), null.field), noise, index, rich, cells)
     start = starting_thickness(model, cells)
     forward = Forward.of_cells(model, effects, cells, (float(start.min()) - 0.5, float(start.max()) + 0.5))
     levels = np.eye(cells.shape[0]) if rich else np.ones((cells.shape[0], 1))
     if not rich:
         return _prepare_few(cells, model, forward, start, levels, index)
+    problem, fit = _choose_field(Problem(cells, forward, CellBasis(start.shape), levels), start, {})
+    return _settle(problem, fit, fit, cells, index)
+
+
+def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, float]) -> tuple[Problem, Fit]:
+    """Coarsest parametrisation of the field that the data do not want finer, and its fit."""
+    cells = problem.cells
     weight = (cells.weight > 0).any(axis=0).astype(float)
     best: tuple[Problem, Fit] | None = None
-    noise = NoiseEstimate(np.ones(cells.shape[0]), 0.0, False, 0.0)
     for spacing in (8.0, 4.0, 2.0, 0.0):
         basis: FieldBasis = SplineBasis.of_grid(start.shape, spacing) if spacing else CellBasis(start.shape)
-        if spacing and basis.size > cells.shape[1] * cells.shape[2]:
+        if spacing and basis.size > start.size:
             continue
-        problem = Problem(cells, forward, basis, levels)
+        trial = replace(problem, basis=basis)
         field_map = start if best is None else best[0].basis.expand(best[1].field)
-        fit = fit_model(problem, (), np.zeros(0), basis.fit(field_map, weight))
-        if best is not None and not _finer_is_better(best, (problem, fit)):
+        fit = fit_model(trial, (), np.zeros(0), basis.fit(field_map, weight), None, settings)
+        if best is not None and not _finer_is_better(best, (trial, fit)):
             break
-        best = (problem, fit)
+        best = (trial, fit)
     assert best is not None
-    problem, fit = best
-    noise = _measure_noise(problem, fit)
-    problem = problem.with_cells(cells.scaled_noise(noise.factor, noise.response_scatter))
-    fit = fit_model(problem, (), np.zeros(0), fit.field, fit.levels)
+    return best
+
+
+def _settle(problem: Problem, fit: Fit, null: Fit, stated: CellData, index: FloatArray) -> _Prepared:
+    """Measure the noise at a fit and fit the unchanged model with it."""
+    noise = _measure_noise(replace(problem, cells=stated), fit)
+    problem = problem.with_cells(stated.scaled_noise(noise.factor, noise.response_scatter))
+    settled = fit_model(problem, (), np.zeros(0), null.field, null.levels)
+    notes = []
     if abs(noise.neighbour_correlation) > 0.1:
         notes.append(f"noise of neighbouring cells is correlated ({noise.neighbour_correlation:.2f})")
     if not noise.measured:
         notes.append("noise level taken as stated: too few cells to measure it")
-    return _Prepared(problem, fit, noise, index, rich, tuple(notes))
+    return _Prepared(problem, settled, noise, index, True, stated, tuple(notes))
 
 
 def _finer_is_better(coarse: tuple[Problem, Fit], fine: tuple[Problem, Fit]) -> bool:
@@ -268,7 +279,7 @@ def _prepare_few(
     noise = NoiseEstimate(np.ones(cells.shape[0]), 0.0, False, 0.0)
     best = min(fits, key=lambda fit: fit.chi2)
     note = "noise taken as stated plus 20 %; flat levels taken as known up to a common factor"
-    return _Prepared(problem, best, noise, index, False, (note,))
+    return _Prepared(problem, best, noise, index, False, cells, (note,))
 
 
 def _measure_noise(problem: Problem, fit: Fit) -> NoiseEstimate:
@@ -291,13 +302,17 @@ class _Search:
         rng: np.random.Generator,
         say: Report,
     ) -> None:
-        self.prepared, self.model, self.effects = prepared, model, effects
-        self.options, self.say = options, say
-        self.cells = prepared.problem.cells
-        self.heldout = _held_out_blocks(self.cells.shape[1:], options.heldout_fraction, rng, prepared.rich)
+        self.model, self.effects, self.options, self.say = model, effects, options, say
+        shape = prepared.problem.cells.shape[1:]
+        self.heldout = _held_out_blocks(shape, options.heldout_fraction, rng, prepared.rich)
+        self._take(prepared)
+
+    def _take(self, prepared: _Prepared) -> None:
+        self.prepared, self.cells = prepared, prepared.problem.cells
         self.notes = list(prepared.notes)
 
-    def run(self) -> Verdict:
+    def run(self, refinements: int = 2) -> Verdict:
+        """Search; start again if a named effect shows that field or noise were misjudged without it."""
         whole = Selector(
             self.prepared.problem, self.effects, self.prepared.null, self.prepared.index, generic=self.prepared.rich
         )
@@ -307,7 +322,14 @@ class _Search:
         if chance > self.options.significance:
             return self._verdict("no_discrepancy", whole, whole.null, chance, (), {})
         training = self._training(whole)
-        chosen, steps = self._grow(training)
+        singles = self._refit(training, training.null)
+        if singles and singles[0].log_evidence > self.options.least_evidence and refinements > 0:
+            refined = self._refined(whole, singles[0])
+            if refined is not None:
+                self.say("field and noise are judged again with the best effect in the model")
+                self._take(refined)
+                return self.run(refinements - 1)
+        chosen, steps = self._grow(training, singles)
         return self._conclude(whole, training, chosen, steps, chance)
 
     # Stages -------------------------------------------------------------------------------------------------
@@ -343,8 +365,8 @@ class _Search:
     def _refit(self, selector: Selector, base: Hypothesis) -> list[Hypothesis]:
         """Refits of the best-scored additions to a set, likeliest first."""
         names = [name for name in selector.coordinates if name not in base.names]
-        scores = selector.score(base.fit, names)
-        worth = [c for c in scores if c.gain > 9.0][: self.options.refits]
+        scores = selector.score(base.fit, names, scan=True)
+        worth = [c for c in scores if c.promise > 9.0][: self.options.refits]
         refitted = [selector.hypothesis((*base.names, c.name), c.start, base.fit) for c in worth]
         for hypothesis in refitted:
             self.say(
@@ -353,10 +375,41 @@ class _Search:
             )
         return sorted(refitted, key=lambda item: -item.log_evidence)
 
-    def _grow(self, selector: Selector) -> tuple[Hypothesis, list[Step]]:
+    def _refined(self, whole: Selector, best: Hypothesis) -> _Prepared | None:
+        """Field and noise as judged with an effect in the model, if that differs from the judgement without."""
+        prepared = self.prepared
+        if not prepared.rich or prepared.problem.field_prior:
+            return None
+        start = self._whole_field(whole, best.fit)
+        problem, fit = _choose_field(whole.problem, start, best.fit.settings)
+        null_map = whole.problem.basis.expand(whole.null.fit.field)
+        null_field = problem.basis.fit(null_map, np.ones(null_map.shape))
+        null = replace(whole.null.fit, field=null_field)
+        refined = _settle(problem, fit, null, prepared.stated, prepared.index)
+        change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
+        scatter = abs(refined.noise.response_scatter - prepared.noise.response_scatter)
+        typical = _noise_rms(self.cells)
+        if problem.basis.size <= prepared.problem.basis.size and change < 0.02 and scatter < 0.05 * typical:
+            return None
+        return refined
+
+    def _whole_field(self, whole: Selector, fit: Fit) -> FloatArray:
+        """Thickness of all cells from a fit to a part: what the part moved by, as a function of thickness."""
+        before = whole.problem.basis.expand(whole.null.fit.field)
+        if not self.heldout.any():
+            return whole.problem.basis.expand(fit.field)
+        moved = whole.problem.basis.expand(fit.field) - before
+        seen = ~self.heldout & (self.cells.weight > 0).any(axis=0)
+        middle, half = before.mean(), max(0.5 * float(np.ptp(before)), 1e-6)
+        depth = (before - middle) / half
+        columns = np.stack([depth**power for power in range(3)], axis=-1)
+        solution = np.linalg.lstsq(columns[seen], moved[seen], rcond=None)[0]
+        return before + columns @ solution
+
+    def _grow(self, selector: Selector, singles: list[Hypothesis]) -> tuple[Hypothesis, list[Step]]:
         """Add effects while they help; look two ahead where one is not enough."""
-        current, steps = selector.null, []
-        singles = self._refit(selector, current)
+        current: Hypothesis = selector.null
+        steps: list[Step] = []
         if not singles or singles[0].log_evidence < self.options.least_evidence:
             return current, []
         best = selector.with_channels(singles[0])
@@ -431,7 +484,9 @@ class _Search:
 
     def _transfer(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
         """The chosen set fitted to all data."""
-        return whole.hypothesis(chosen.names, None, replace(chosen.fit, field=chosen.fit.field))
+        start = self._whole_field(whole, chosen.fit)
+        weight = (self.cells.weight > 0).any(axis=0).astype(float)
+        return whole.hypothesis(chosen.names, None, replace(chosen.fit, field=whole.problem.basis.fit(start, weight)))
 
     def _classes(self, selector: Selector, chosen: Hypothesis) -> dict[str, tuple[dict[str, float], float]]:
         """For each effect: the members of its class with their shares, and the probability of the class."""
@@ -440,24 +495,36 @@ class _Search:
         for name in chosen.names:
             rest = tuple(other for other in chosen.names if other != name)
             without = selector.hypothesis(rest, None, chosen.fit)
-            log_evidence = {name: chosen.log_evidence}
-            own = selector._features(state, chosen.fit, selector.coordinates[name])
-            base = selector.score(without.fit, [n for n in selector.coordinates if n not in chosen.names])
-            for candidate in base:
-                features = selector._features(state, chosen.fit, selector.coordinates[candidate.name])
-                alike = similarity(selector.state(without.fit).design, own, features) if candidate.gain > 4 else 0.0
-                known = frozenset((*rest, candidate.name)) in selector._known
+            found = {name: chosen}
+            own = selector.features(state, chosen.fit, name)
+            bare = selector.state(without.fit)
+            others = [n for n in selector.coordinates if n not in chosen.names]
+            for candidate in selector.score(without.fit, others, scan=True):
+                alike = 0.0
+                if candidate.promise > 4.0:
+                    features = selector.features(bare, without.fit, candidate.name)
+                    alike = similarity(bare.design, own, features)
+                known = frozenset((*rest, candidate.name)) in selector.fitted
                 if known or alike > 0.8:
                     other = selector.hypothesis((*rest, candidate.name), candidate.start, without.fit)
-                    log_evidence[candidate.name] = other.log_evidence
-            top = max(log_evidence.values())
-            weight = {n: math.exp(max(v - top, -700.0)) for n, v in log_evidence.items()}
+                    found[candidate.name] = other
+            top = max(other.log_evidence for other in found.values())
+            weight = {n: math.exp(max(other.log_evidence - top, -700.0)) for n, other in found.items()}
             total = sum(weight.values())
-            members = {
-                n: weight[n] / total for n, v in log_evidence.items() if v > top - self.options.class_width
-            }
+            members = {n: weight[n] / total for n, other in found.items() if self._is_alike(other, chosen, top)}
             result[name] = (members, sum(members.values()))
         return result
+
+    def _is_alike(self, other: Hypothesis, chosen: Hypothesis, top: float) -> bool:
+        """Whether a replacement explains the data about as well, by evidence or by likelihood.
+
+        The evidence of weak effects leans on the scales of the priors; a fit as good with no more parameters is
+        an alternative whatever those are.
+        """
+        if other.log_evidence > top - self.options.class_width:
+            return True
+        extra = max(len(other.fit.coordinates) - len(chosen.fit.coordinates), 0)
+        return 0.5 * (other.fit.chi2 - chosen.fit.chi2) + 3.0 * extra < self.options.class_width
 
     def _outsider_probability(self, hypothesis: Hypothesis) -> float:
         """Probability of a cause outside the catalogue, from the smallest chance of noise in the residual.
@@ -466,7 +533,8 @@ class _Search:
         the most favourable alternative is at least ``-e p log p``.
         """
         p = min(hypothesis.probability_of_noise, 1.0)
-        bound = 1.0 if p > 1.0 / math.e else -math.e * p * math.log(max(p, 1e-300))
+        p = max(p, 1e-100)
+        bound = 1.0 if p > 1.0 / math.e else -math.e * p * math.log(p)
         prior = self.options.outsider_prior
         # A residual that is noise leaves an outsider only the room that a perfect mimic has.
         mimic = 0.05
@@ -483,7 +551,8 @@ class _Search:
             fitted = fit_model(seen, final.fit.coordinates, final.fit.position, final.fit.field, final.fit.levels)
             unseen = whole.problem.with_cells(self.cells.restricted(self.heldout))
             before = fit_model(unseen, (), np.zeros(0), null.field, null.levels)
-            after = fit_model(unseen, (), np.zeros(0), fitted.field, fitted.levels, fitted.settings)
+            start = whole.problem.basis.fit(self._whole_field(whole, fitted), np.ones(self.heldout.shape))
+            after = fit_model(unseen, (), np.zeros(0), start, fitted.levels, fitted.settings)
             gains["blocks"] = before.chi2 - after.chi2
             self.heldout_rms = (_rms(unseen, before), _rms(unseen, after))
         waves = self.cells.shape[0]

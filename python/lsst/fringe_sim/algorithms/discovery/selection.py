@@ -20,6 +20,10 @@ __all__ = ["Candidate", "Hypothesis", "Selector"]
 FloatArray = NDArray[np.float64]
 
 
+SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""Departures, in prior scales, at which the finite signature of an effect is tried."""
+
+
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """Score test of one effect against a fit that lacks it.
@@ -29,18 +33,21 @@ class Candidate:
     name : `str`
         The effect.
     gain : `float`
-        Expected fall of χ² if it is added.
+        Expected fall of χ² if it is added, from its derivative.
     degrees : `int`
         Its free parameters that the data see.
     start : `numpy.ndarray`
-        Coordinates at the expected minimum.
+        Coordinates from which a fit should start.
+    promise : `float`
+        Expected fall of χ² from its finite signatures, if that is more: effects whose onset is absorbed by the
+        thickness show only at a finite size.
     """
 
     name: str
     gain: float
     degrees: int
     start: FloatArray
-    information: FloatArray
+    promise: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +108,7 @@ class Selector:
             else:
                 self.coordinates[effect.name] = found
         self.null = replace(self.null, channels=self.criticise(null))
-        self._known: dict[frozenset[str], Hypothesis] = {frozenset(): self.null}
+        self.fitted: dict[frozenset[str], Hypothesis] = {frozenset(): self.null}
 
     def state(self, fit: Fit) -> State:
         """Everything the tests need at a fit."""
@@ -123,19 +130,66 @@ class Selector:
         chance = float(chi2_distribution.sf(fit.chi2, max(degrees, 1))) if degrees > 0 else 1.0
         return Channel("all values", fit.chi2, float(max(degrees, 0)), chance)
 
-    def score(self, fit: Fit, names: Sequence[str]) -> list[Candidate]:
-        """Score test of every effect at a fit, best first."""
+    def score(self, fit: Fit, names: Sequence[str], *, scan: bool = False) -> list[Candidate]:
+        """Score test of every effect at a fit, most promising first.
+
+        With ``scan``, finite signatures are tried besides the derivative.
+        """
         state = self.state(fit)
         found = []
         for name in names:
             coordinates = self.coordinates[name]
-            features = self._features(state, fit, coordinates)
+            try:
+                features = self.features(state, fit, name)
+            except InputError:
+                continue  # cannot be combined with an effect that is in already
             score, information = state.design.project(features, state.residual)
             start, gain, degrees = _bounded_minimum(score, information, coordinates)
-            found.append(Candidate(name, gain, degrees, start, information))
-        return sorted(found, key=lambda item: -item.gain)
+            candidate = Candidate(name, gain, degrees, start, gain)
+            if scan and not self.problem.forward.is_image_effect(name):
+                candidate = self._scanned(state, fit, candidate)
+            found.append(candidate)
+        return sorted(found, key=lambda item: -item.promise)
 
-    def _features(self, state: State, fit: Fit, coordinates: Sequence[Coordinate]) -> FloatArray:
+    def _scanned(self, state: State, fit: Fit, candidate: Candidate) -> Candidate:
+        """Candidate with the best of its finite signatures, where that promises more than the derivative."""
+        level = (self.problem.level_basis @ fit.levels)[:, None, None]
+        coordinates = self.coordinates[candidate.name]
+        places, columns = [], []
+        for number, item in enumerate(coordinates):
+            for size in SCAN:
+                for sign in (1.0,) if item.quadratic else (1.0, -1.0):
+                    departure = (size * item.scale) ** 2 if item.quadratic else sign * size * item.scale
+                    if abs(item.clip(departure) - departure) > 1e-9 * abs(departure):
+                        continue
+                    settings = {**fit.settings, item.key: item.value(departure)}
+                    changed = level * self.problem.forward.predict(settings, state.thickness_um).value
+                    places.append((number, departure))
+                    columns.append(state.whiten(changed - state.value))  # type: ignore[operator]
+        if not columns:
+            return candidate
+        score, information = state.design.project(np.stack(columns), state.residual)
+        strength = np.diag(information)
+        amplitude = np.divide(score, strength, out=np.zeros_like(score), where=strength > 1e-6)
+        # A finite signature may be scaled only a little: its shape changes with its size.
+        gain = np.where((amplitude > 0.3) & (amplitude < 2.5), score * amplitude, 0.0)
+        best = int(np.argmax(gain))
+        if gain[best] <= candidate.gain:
+            return candidate
+        number, departure = places[best]
+        start = np.zeros(len(coordinates))
+        start[number] = coordinates[number].clip(departure * min(amplitude[best], 1.5))
+        return replace(candidate, start=start, promise=float(gain[best]))
+
+    def features(self, state: State, fit: Fit, name: str) -> FloatArray:
+        """Whitened signature of an effect: derivatives with respect to its coordinates at a fit.
+
+        Raises
+        ------
+        InputError
+            The effect cannot be combined with those of the fit.
+        """
+        coordinates = self.coordinates[name]
         forward = self.problem.forward
         level = (self.problem.level_basis @ fit.levels)[:, None, None]
         value = state.value / level
@@ -159,40 +213,64 @@ class Selector:
             Fit of the others, from which the search starts.
         """
         key = frozenset(names)
-        if key in self._known:
-            return self._known[key]
+        if key in self.fitted:
+            return self.fitted[key]
         ordered = tuple(names)
         base = self.null.fit if base is None else base
         coordinates = tuple(item for name in ordered for item in self.coordinates[name])
-        first = []
-        for name in ordered:
+        fit = min(
+            (self._fit_from(ordered, coordinates, first, base) for first in self._starts(ordered, start, base)),
+            key=lambda item: item.chi2,
+        )
+        hypothesis = Hypothesis(ordered, fit, self._evidence(fit))
+        self.fitted[key] = hypothesis
+        return hypothesis
+
+    def _starts(self, names: tuple[str, ...], start: FloatArray | None, base: Fit) -> list[FloatArray]:
+        """First guesses: what is known of the others, and for the new effect its best start and its neighbours."""
+        known, fresh = [], []
+        for name in names:
             own = self.coordinates[name]
-            known = [item.key in base.settings for item in own]
-            if all(known):
-                first += [item.coordinate(base.settings[item.key]) for item in own]
-            else:
-                first += list(start) if start is not None else [0.1 * item.unit_step for item in own]
+            if all(item.key in base.settings for item in own):
+                known += [item.coordinate(base.settings[item.key]) for item in own]
+                continue
+            small = [0.1 * item.unit_step for item in own]
+            fresh = [np.array(small) if start is None else np.asarray(start, dtype=float)]
+            if len(own) == 1 and own[0].neighbour > 0.0:
+                fresh += [fresh[0] + turn * own[0].neighbour for turn in (-3, -2, -1, 1, 2, 3)]
+        if not fresh:
+            return [np.array(known)]
+        return [np.concatenate([known, one]) for one in fresh]
+
+    def _fit_from(
+        self, names: tuple[str, ...], coordinates: tuple[Coordinate, ...], first: FloatArray, base: Fit
+    ) -> Fit:
+        """Fit from one first guess, and from a small one if that led away from the data."""
         position = np.array([item.clip(x) for item, x in zip(coordinates, first, strict=True)])
         # A quadratic coordinate has no slope in its parameter at 0; start beside it.
         nudge = np.array([0.01 * item.unit_step if item.quadratic else 0.0 for item in coordinates])
-        fit = fit_model(
-            self.problem, coordinates, np.where(position == 0.0, nudge, position), base.field, base.levels
-        )
-        hypothesis = Hypothesis(ordered, fit, self._evidence(fit))
-        self._known[key] = hypothesis
-        return hypothesis
+        position = np.where(position == 0.0, nudge, position)
+        fit = fit_model(self.problem, coordinates, position, base.field, base.levels)
+        if fit.chi2 > base.chi2:
+            small = np.array(
+                [x if item.key in base.settings else 0.03 * item.unit_step
+                 for item, x in zip(coordinates, position, strict=True)]
+            )  # fmt: skip
+            other = fit_model(self.problem, coordinates, small, base.field, base.levels)
+            fit = min(fit, other, key=lambda item: item.chi2)
+        return fit
 
     def with_channels(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis with its residual tested."""
         if hypothesis.channels:
             return hypothesis
         tested = replace(hypothesis, channels=self.criticise(hypothesis.fit))
-        self._known[frozenset(hypothesis.names)] = tested
+        self.fitted[frozenset(hypothesis.names)] = tested
         return tested
 
     def known(self, size: int) -> list[Hypothesis]:
         """All fitted sets of a size, likeliest first."""
-        found = [item for key, item in self._known.items() if len(key) == size]
+        found = [item for key, item in self.fitted.items() if len(key) == size]
         return sorted(found, key=lambda item: -item.log_evidence)
 
     def _evidence(self, fit: Fit) -> float:
@@ -206,8 +284,10 @@ class Selector:
         sign, log_determinant = np.linalg.slogdet(information + np.eye(len(scale)))
         total -= 0.5 * (log_determinant if sign > 0 else 0.0)
         for item, position in zip(fit.coordinates, fit.position, strict=True):
-            departure = (item.value(position) - item.null) / item.scale
+            departure = abs(item.value(position) - item.null) / item.scale
             total -= math.log1p(departure**2)
+            if item.quadratic:  # the prior is one of the parameter, the fit one of its square
+                total -= math.log(max(2.0 * departure, 0.05))
         return float(total)
 
 
