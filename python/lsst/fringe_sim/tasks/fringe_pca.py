@@ -1,0 +1,160 @@
+"""From the sky frames of a sensor to the template that removes its fringes."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Sequence
+from typing import Any
+
+from lsst.pex.config import ChoiceField, Field
+from lsst.pipe.base import (
+    InputQuantizedConnection,
+    NoWorkFound,
+    OutputQuantizedConnection,
+    PipelineTask,
+    PipelineTaskConfig,
+    PipelineTaskConnections,
+    QuantumContext,
+    Struct,
+)
+from lsst.pipe.base.connectionTypes import Input, Output
+
+from ..algorithms.pca import fit_pca, fringe_templates
+from ..products import SkyFringe
+from .quantum import common_header, data_id_of, run_datetime, sensor_of, unusable
+
+__all__ = ["FringePcaConfig", "FringePcaConnections", "FringePcaTask"]
+
+
+class FringePcaConnections(PipelineTaskConnections, dimensions=("instrument", "physical_filter", "detector")):
+    """The sky frames of a sensor in a filter in, one template and all components out."""
+
+    frames = Input(
+        doc="Sky frames of the sensor in this filter.",
+        name="skyFringe",
+        storageClass="SkyFringe",
+        dimensions=("instrument", "exposure", "detector"),
+        multiple=True,
+    )
+    fringe = Output(
+        doc="Zero-mean fractional fringe frame, which instrument signature removal subtracts.",
+        name="fringe",
+        storageClass="FringeFrame",
+        dimensions=("instrument", "physical_filter", "detector"),
+        isCalibration=True,
+    )
+    components = Output(
+        doc="Mean and principal components of the frames.",
+        name="fringeComponents",
+        storageClass="FringeComponents",
+        dimensions=("instrument", "physical_filter", "detector"),
+    )
+
+    def __init__(self, *, config: FringePcaConfig | None = None) -> None:
+        if config is not None:
+            self.fringe = dataclasses.replace(self.fringe, storageClass=config.fringeStorageClass)
+
+    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
+        """Put the frames in the order of time; one alone has no components."""
+        connection, refs = inputs["frames"]
+        if len(refs) < 2:
+            raise NoWorkFound(label, "frames", connection)
+        ordered = sorted(refs, key=lambda ref: ref.dataId["exposure"])
+        inputs["frames"] = (connection, ordered)
+        super().adjustQuantum(inputs, outputs, label, data_id)
+        return {"frames": (connection, ordered)}, {}
+
+
+class FringePcaConfig(PipelineTaskConfig, pipelineConnections=FringePcaConnections):
+    """Configuration of `FringePcaTask`."""
+
+    n_components: Field[int] = Field(
+        dtype=int, optional=True, doc="Number of components to keep; by default those above the noise."
+    )
+    fringeStorageClass: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default="FringeFrame",
+        doc="Storage class of the template; the file is the same.",
+        allowed={
+            "FringeFrame": "readable with this package alone",
+            "ExposureF": "as ip_isr asks for it; for repositories in which 'fringe' is registered so",
+        },
+    )
+
+
+class FringePcaTask(PipelineTask):
+    """Decompose the sky frames of a sensor and make the fringe template."""
+
+    ConfigClass = FringePcaConfig
+    config: FringePcaConfig
+    _DefaultName = "fringePca"
+
+    def runQuantum(
+        self,
+        butlerQC: QuantumContext,
+        inputRefs: InputQuantizedConnection,
+        outputRefs: OutputQuantizedConnection,
+    ) -> None:
+        """Read the frames, decompose, store."""
+        data_id = data_id_of(butlerQC)
+        detector = sensor_of(data_id)
+        created = run_datetime(outputRefs.fringe.run, _end_of(inputRefs.frames))
+        with unusable(f"{detector.name}, {data_id['physical_filter']}"):
+            result = self.run(butlerQC.get(inputRefs.frames), created)
+        butlerQC.put(result, outputRefs)
+
+    def run(self, frames: Sequence[SkyFringe], creation_datetime: str) -> Struct:
+        """Decompose the frames of one sensor in one filter.
+
+        Parameters
+        ----------
+        frames : sequence of `SkyFringe`
+            Two frames or more.
+        creation_datetime : `str`
+            When the calibration is made, ``YYYY-MM-DDThh:mm:ss``.
+
+        Returns
+        -------
+        result : `~lsst.pipe.base.Struct`
+            ``fringe``, the mean pattern as a `FringeFrame`, and ``components``, `FringeComponents`.
+
+        Raises
+        ------
+        InputError
+            Too few frames, frames of different sensors or sizes, or all alike.
+        """
+        first = frames[0]
+        metadata = {**common_header(), **_shared_metadata(frames)}
+        components = fit_pca(
+            frames,
+            n_components=self.config.n_components,
+            metadata=metadata,
+            detector=first.detector,
+            physical_filter=first.physical_filter,
+        )
+        (template,) = fringe_templates(components, creation_datetime, most=1, metadata=metadata)
+        self.log.info(
+            "%s in %s: %d frames, components explain %s",
+            *(first.detector, first.physical_filter, len(frames)),
+            ", ".join(f"{100 * share:.2f} %" for share in components.explained_variance_ratio[:4]),
+        )
+        return Struct(fringe=template, components=components)
+
+
+def _end_of(refs: Sequence[Any]) -> datetime.datetime:
+    """End of the last exposure."""
+    ends = [ref.dataId.records["exposure"].timespan.end for ref in refs]
+    last: datetime.datetime = max(ends).utc.to_datetime()
+    return last
+
+
+def _shared_metadata(frames: Sequence[SkyFringe]) -> dict[str, Any]:
+    """What all frames say alike of how they were made: set-up, effects, lines; not whence a file came."""
+    first = frames[0].metadata
+    return {
+        keyword: value
+        for keyword, value in first.items()
+        if not keyword.startswith("LSST BUTLER")
+        and all(keyword in frame.metadata and frame.metadata[keyword] == value for frame in frames)
+    }
