@@ -83,8 +83,7 @@ class ResponseTable:
     @property
     def thickness_um(self) -> FloatArray:
         """Thicknesses of the grid [µm], shape ``(N,)``."""
-        grid: FloatArray = self.start_um + self.step_um * np.arange(self.values.shape[1])
-        return grid
+        return np.asarray(self.start_um + self.step_um * np.arange(self.values.shape[1]), dtype=np.float64)
 
     @functools.cached_property
     def polynomials(self) -> FloatArray:

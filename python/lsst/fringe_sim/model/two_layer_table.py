@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -237,7 +238,7 @@ def _middle_error(table: TwoLayerTable, exact: FloatArray) -> float:
 
 
 @numba.njit(error_model="numpy", inline="always")
-def _weights(t: float) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
+def _weights(t: np.float32) -> tuple[Any, Any, Any, Any]:  # pragma: no cover - compiled
     """Cubic B-spline at distances 1 + t, t, 1 - t, 2 - t, in single precision."""
     sixth, half, two_thirds = np.float32(1.0 / 6.0), np.float32(0.5), np.float32(2.0 / 3.0)
     one = np.float32(1.0)

@@ -5,6 +5,7 @@ from .convergence import converged, converged_flat_fields, converged_spectrum
 from .illumination import Beam, Illumination, LampSpectrum, SpectralProfile
 from .media import Medium, constant_medium, get_medium, medium_names
 from .phase_response import PhaseResponse, reduce_to_phase
+from .sensitivity import ResponseGradient, response_gradient
 from .stack import Layer, LayerStack
 from .transfer_matrix import layer_absorption, reflection_transmission
 from .two_phase_response import ThicknessGrid, TwoPhaseResponse, reduce_to_two_phases
@@ -17,6 +18,7 @@ __all__ = [
     "LayerStack",
     "Medium",
     "PhaseResponse",
+    "ResponseGradient",
     "SpectralProfile",
     "ThicknessGrid",
     "TwoPhaseResponse",
@@ -31,4 +33,5 @@ __all__ = [
     "reduce_to_phase",
     "reduce_to_two_phases",
     "reflection_transmission",
+    "response_gradient",
 ]

@@ -338,7 +338,7 @@ def reduce_to_phase(
         states = phase_states(index, thickness, wave, angle, each, shifted, spreads)
         for state in states:
             parts.append(
-                _reduce_polarization(
+                reduce_polarization(
                     index, thickness, wave, angle, each, varying, layers, heights, state.phases
                 )
             )
@@ -347,7 +347,7 @@ def reduce_to_phase(
     return PhaseResponse(a, b, e, c, g, kappa, np.stack(shares), float(spreads[varying]))
 
 
-def _reduce_polarization(
+def reduce_polarization(
     index: ComplexArray,
     thickness: FloatArray,
     wavelength: FloatArray,
@@ -358,6 +358,7 @@ def _reduce_polarization(
     roughness: FloatArray | None,
     phases: Mapping[int, float],
 ) -> tuple[np.ndarray, ...]:
+    """Coefficients ``a, b, e, c, g, kappa`` for one polarisation; also of dual numbers."""
     normal, admittance = layer_admittance(index, theta, polarization)
     column = (-1,) + (1,) * wavelength.ndim
     heights = None if roughness is None else roughness.reshape(column) / wavelength
@@ -385,12 +386,12 @@ def _reduce_polarization(
             flux = (
                 below.flux_top(admittance[varying:])[under] - below.flux_bottom(admittance[varying:])[under]
             )
-            e += np.abs(entering) ** 2 * flux / incident
+            e = e + np.abs(entering) ** 2 * flux / incident
             continue
         if layer == varying:
             faces = [((entering, np.zeros_like(entering)), (np.zeros_like(entering), coupling), 1.0)]
             sum_, difference = 1.0 + reflect_low, eta * (1.0 - reflect_low)
-            e -= np.abs(entering) ** 2 * (sum_ * np.conj(difference)).real / incident
+            e = e - np.abs(entering) ** 2 * (sum_ * np.conj(difference)).real / incident
         else:
             mirrored = varying - layer
             lit, back = from_above, from_below
@@ -415,9 +416,9 @@ def _reduce_polarization(
         for (u_forward, u_backward), (v_forward, v_backward), sign in faces:
             u_sum, u_diff = u_forward + u_backward, eta * (u_forward - u_backward)
             v_sum, v_diff = v_forward + v_backward, eta * (v_forward - v_backward)
-            a += sign * (u_sum * np.conj(u_diff)).real / incident
-            b += sign * (v_sum * np.conj(v_diff)).real / incident
-            c += sign * 0.5 * (np.conj(u_sum) * v_diff + v_sum * np.conj(u_diff)) / incident
+            a = a + sign * (u_sum * np.conj(u_diff)).real / incident
+            b = b + sign * (v_sum * np.conj(v_diff)).real / incident
+            c = c + sign * 0.5 * (np.conj(u_sum) * v_diff + v_sum * np.conj(u_diff)) / incident
     kappa = 2.0 * (2.0 * np.pi * normal[varying] / wavelength)
     return a, b, e, c, g, kappa
 

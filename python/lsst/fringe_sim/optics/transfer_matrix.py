@@ -249,26 +249,20 @@ def forward_sweep(
     reflection : `numpy.ndarray`, shape ``(L-1, ...)``
         What `backward_sweep` returned.
     """
-    count = len(reflection) + 1
-    shape = (count, *reflection.shape[1:])
-    top_f, top_b, bottom_f, bottom_b = (np.zeros(shape, dtype=complex) for _ in range(4))
-    bottom_f[0] = top_f[0] = 1.0
-    bottom_b[0] = top_b[0] = reflection[0]
-    for j in range(count - 1):
-        if j < count - 2:
-            round_trip = reflection[j + 1] * propagation[j] ** 2
-        else:
-            round_trip = np.zeros(shape[1:], dtype=complex)
-        top_f[j + 1] = (
+    last = len(reflection) - 1
+    zero = np.zeros_like(reflection[0])
+    forward, backward = zero + 1.0, reflection[0]
+    top_f, top_b, bottom_f, bottom_b = [forward], [backward], [forward], [backward]
+    for j in range(last + 1):
+        round_trip = reflection[j + 1] * propagation[j] ** 2 if j < last else zero
+        forward = (
             coefficients.transmit_down[j] * bottom_f[j] / (1.0 - coefficients.reflect_up[j] * round_trip)
         )
-        top_b[j + 1] = top_f[j + 1] * round_trip
-        if j < count - 2:
-            bottom_f[j + 1] = top_f[j + 1] * propagation[j]
-            bottom_b[j + 1] = bottom_f[j + 1] * reflection[j + 1]
-        else:
-            bottom_f[j + 1] = top_f[j + 1]
-    return WaveFields(top_f, top_b, bottom_f, bottom_b)
+        top_f.append(forward)
+        top_b.append(forward * round_trip)
+        bottom_f.append(forward * propagation[j] if j < last else forward)
+        bottom_b.append(bottom_f[-1] * reflection[j + 1] if j < last else zero)
+    return WaveFields(np.stack(top_f), np.stack(top_b), np.stack(bottom_f), np.stack(bottom_b))
 
 
 def absorption_of(

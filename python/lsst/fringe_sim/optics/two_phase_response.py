@@ -55,8 +55,7 @@ class ThicknessGrid:
     @property
     def thickness_um(self) -> FloatArray:
         """The thicknesses [µm], shape ``(count,)``."""
-        grid: FloatArray = self.start_um + self.step_um * np.arange(self.count)
-        return grid
+        return np.asarray(self.start_um + self.step_um * np.arange(self.count), dtype=np.float64)
 
 
 @dataclass(frozen=True)
