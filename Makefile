@@ -6,11 +6,12 @@ DEMO_DIR ?= demo
 PYTEST_ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types unit wheel-check bench clean
+.PHONY: help demo test lint types unit docs wheel-check bench clean
 
 help:
 	@echo "make demo   install into .venv and run the whole chain on the built-in sensor (a few minutes)"
 	@echo "make test   install into .venv with the test tools and run the whole test suite"
+	@echo "make docs   the documentation as HTML in doc/_build, every warning an error"
 	@echo "make bench  speed beside the peers, on the same work, in one run"
 	@echo "make clean  remove .venv, demo output and caches"
 
@@ -33,6 +34,10 @@ types: $(VENV)/.ready-test
 unit: $(VENV)/.ready-test
 	$(BIN)/pytest -n 2 $(PYTEST_ARGS)
 
+docs: $(VENV)/.ready-test
+	$(BIN)/python -m sphinx -b html -W --keep-going -q doc doc/_build
+	@echo "documentation: doc/_build/index.html"
+
 wheel-check: $(VENV)/.ready-test
 	BIN="$(BIN)" bash scripts/check_wheel.sh
 
@@ -42,4 +47,4 @@ bench: $(VENV)/.ready-test
 	$(BIN)/python -m benchmarks
 
 clean:
-	rm -rf $(VENV) $(DEMO_DIR) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(DEMO_DIR) doc/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
