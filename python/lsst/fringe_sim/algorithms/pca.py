@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
 
 from ..errors import InputError, OutOfRangeError
 from ..model import ResponseTable
@@ -34,7 +35,7 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
-TILE_BYTES = 64 * 2**20
+TILE_BYTES = 4 * 2**20
 """Memory of one tile of all frames."""
 
 _ROUNDING = 1e-13
@@ -87,7 +88,9 @@ def fit_pca(
         A number of components that N frames do not have.
     """
     reader = _TileReader.of(frames, mask, tile_bytes)
-    gram, pixels = reader.gram()
+    # Tiles are small: more than one thread of a matrix product would mostly wait.
+    with threadpool_limits(limits=1, user_api="blas"):
+        gram, pixels = reader.gram()
     total = float(np.trace(gram))
     if not total > 0.0:
         raise InputError("frames", "no differences between them", "frames that vary")
@@ -99,7 +102,8 @@ def fit_pca(
     if not 1 <= n_components <= len(frames):
         raise OutOfRangeError("number of components", n_components, f"1 to {len(frames)}")
     kept = np.maximum(eigenvalues[:n_components], np.finfo(float).tiny)
-    mean, components, sign = reader.components(vectors[:, :n_components] / np.sqrt(kept))
+    with threadpool_limits(limits=1, user_api="blas"):
+        mean, components, sign = reader.components(vectors[:, :n_components] / np.sqrt(kept))
     return FringeComponents(
         mean=mean,
         components=components,
@@ -420,12 +424,13 @@ class _TileReader:
             part = slice(start, start + self.rows)
             good = self.good[part]
             tile = np.empty((len(self.frames), int(good.sum())))
+            whole = bool(good.all())
             for number, image in enumerate(self.frames):
                 values = np.asarray(image[part])
-                tile[number] = values.ravel() if good.all() else values[good]
-            tile -= self.offset[:, None]
+                chosen = values.ravel() if whole else values[good]
+                np.subtract(chosen, self.offset[number], out=tile[number], dtype=np.float64)
             if self.unit != 1.0:
-                tile /= self.unit
+                tile *= 1.0 / self.unit
             yield part, good, tile
 
     def gram(self) -> tuple[FloatArray, int]:
@@ -440,23 +445,25 @@ class _TileReader:
         self, combination: FloatArray
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], FloatArray]:
         """Mean frame, components ``combination.T @ (frames - mean)`` and the signs that were given to them."""
-        number = combination.shape[1]
-        mean = np.zeros(self.good.shape, dtype=np.float32)
-        images = np.zeros((number, *self.good.shape), dtype=np.float32)
+        frames, number = combination.shape
+        # Weights of zero sum need no frames less their mean.
+        weights = np.vstack([np.full(frames, 1.0 / frames), (combination - combination.mean(axis=0)).T])
+        images = np.zeros((1 + number, *self.good.shape), dtype=np.float32)
         largest = np.zeros(number)
         for part, good, tile in self.tiles():
-            middle = tile.mean(axis=0)
-            values = combination.T @ (tile - middle)
-            mean[part][good] = middle
-            for index in range(number):
-                images[index, part][good] = values[index]
+            values = weights @ tile
+            for image, row in zip(images, values, strict=True):
+                if row.size == good.size:
+                    image[part] = row.reshape(good.shape)
+                else:
+                    image[part][good] = row
             if values.shape[1]:
-                extreme = values[np.arange(number), np.abs(values).argmax(axis=1)]
+                extreme = values[np.arange(1, 1 + number), np.abs(values[1:]).argmax(axis=1)]
                 largest = np.where(np.abs(extreme) > np.abs(largest), extreme, largest)
         sign = np.where(largest < 0.0, -1.0, 1.0)
         for index in np.flatnonzero(sign < 0.0):
-            np.negative(images[index], out=images[index])
-        return mean, images, sign
+            np.negative(images[1 + index], out=images[1 + index])
+        return images[0], images[1:], sign
 
 
 def _noise_of(frame: SkyFringe) -> float:
