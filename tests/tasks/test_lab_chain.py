@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from astropy.io import fits
 from lsst.daf.butler import Butler
 from task_commands import WAVELENGTHS_NM, Command, Outcome
 
+from lsst.fringe_sim.middleware.night import NightPlan, define_night
 from lsst.fringe_sim.mock.raw_frames import MockRun
 
 pytestmark = [pytest.mark.middleware, pytest.mark.slow]
@@ -154,3 +156,29 @@ def test_override_of_one_raft_in_a_run_of_its_own(command: Command, first_run: t
         run = butler.query_datasets("epoxyFit_config")[0].run
     # The chain holds the maps of its input too; the run of its own has those of the raft alone.
     assert fitted(repo, run) == {DETECTORS["RTM-020_S01"]}
+
+
+def test_from_the_stand_to_the_sky(command: Command, first_run: tuple[Path, Outcome]) -> None:
+    """The camera adopts the map; its sky frames and template follow."""
+    repo, _ = first_run
+    with Butler.from_config(str(repo), writeable=True) as butler:
+        define_night(butler, "LSSTCam", [NightPlan(datetime.date(2026, 1, 15), (20.0, 23.0))])
+    adopted = command(
+        "butler", "adopt-sensor-datasets", repo, "epoxyThickness", "u/lab", "LSSTCam", "u/adopted"
+    )
+    assert adopted.code == 0, adopted.text
+    outcome = command(
+        *("pipetask", "run", "-b", repo, "-i", "u/adopted", "-o", "u/sky"),
+        *("-p", "resource://lsst.fringe_sim/pipelines/lsstCam/skyFringe.yaml"),
+        *("-d", "instrument = 'LSSTCam' AND detector.raft = 'R11'", "-j", "1", "--register-dataset-types"),
+    )
+    # The map of this raft was fitted with an effect of the lamp only, which the sky does not know.
+    assert outcome.code == 0, outcome.text
+    with Butler.from_config(str(repo), collections="u/sky", instrument="LSSTCam") as butler:
+        sky = butler.get(butler.query_datasets("skyFringe")[0])
+        template = butler.get("fringe", detector=37, physical_filter="y_10")
+        (ref,) = butler.query_datasets("epoxyThickness", collections="u/adopted", where="detector = 37")
+    assert sky.metadata["LSST BUTLER INPUT 0 ID"] == str(ref.id)
+    assert (sky.detector, template.detector) == ("R11_S01", "R11_S01")
+    assert np.isfinite(template.image).all()
+    assert abs(template.image[template.mask == 0].mean(dtype=float)) < 1e-6
