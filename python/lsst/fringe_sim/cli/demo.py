@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
@@ -167,7 +168,8 @@ def demo(out: Path, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool
     _laboratory(run, shape, text, seed)
     _sky(run)
     datasets = DemoDatasets.read(run.repo, LAB_RUN, SKY_RUN, CALIBRATIONS)
-    run.step("discovery", "search for a missing effect", lambda: _discover(run, seed))
+    if importlib.util.find_spec("lsst.fringe_sim.cli.discover") is not None:
+        run.step("discovery", "search for a missing effect", lambda: _discover(run, seed))
     run.step("report", "figures and report", lambda: write_demo_report(folder, datasets))
     _closing_words(folder, datasets)
 

@@ -63,7 +63,7 @@ class DemoDatasets:
                 template=butler.get(template),
                 components=butler.get(components),
                 thickness_path=_path(butler, thickness),
-                sky_folder=_path(butler, frames[0]).parent,
+                sky_folder=_path(butler, frames[0]).parents[2],
                 template_path=_path(butler, template),
             )
 
@@ -125,7 +125,7 @@ def _amplitude_table(frames: tuple[SkyFringe, ...]) -> Table:
         values = PERCENT * (image if frame.unit == "fraction" else image / frame.mean_electrons - 1.0)
         low, high = np.percentile(values, [1.0, 99.0])
         rows.append(
-            (frame.hour, frame.mean_electrons, values.std(), 0.5 * np.ptp(values), 0.5 * (high - low))
+            (frame.hour % 24.0, frame.mean_electrons, values.std(), 0.5 * np.ptp(values), 0.5 * (high - low))
         )
     hour, level, rms, half, trimmed = (np.array(column) for column in zip(*rows, strict=True))
     table = Table()

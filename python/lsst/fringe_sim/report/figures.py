@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from ..algorithms.single_pixel import SinglePixelFit
@@ -154,11 +155,11 @@ def sky_figure(frames: Sequence[SkyFringe]) -> Figure:
             mask=first.mask,
             diverging=True,
             label="sky / mean - 1 [%]",
-            title=f"{first.detector} {first.physical_filter}, {first.hour:g} h, {first.exposure_s:g} s",
+            title=f"{first.detector} {first.physical_filter}, {first.hour % 24.0:g} h, {first.exposure_s:g} s",
         )
         for frame in (frames[0], frames[len(frames) // 2], frames[-1]):
             values = PERCENT * _fraction(frame)[frame.mask == 0]
-            middle.hist(values, bins=120, histtype="step", density=True, label=f"{frame.hour:g} h")
+            middle.hist(values, bins=120, histtype="step", density=True, label=f"{frame.hour % 24.0:g} h")
         middle.set_xlabel("sky / mean - 1 [%]")
         middle.set_ylabel("density")
         middle.set_title("distribution over pixels")
@@ -166,7 +167,7 @@ def sky_figure(frames: Sequence[SkyFringe]) -> Figure:
         hours = np.arange(len(frames))
         rms = [PERCENT * _fraction(frame)[frame.mask == 0].std() for frame in frames]
         right.plot(hours, rms, "o-")
-        right.set_xticks(hours, [f"{frame.hour:g}" for frame in frames])
+        right.set_xticks(hours, [f"{frame.hour % 24.0:g}" for frame in frames])
         right.set_xlabel("local time [h]")
         right.set_ylabel("rms over pixels [%]")
         right.set_title("through the night")
@@ -194,6 +195,7 @@ def components_figure(components: FringeComponents) -> Figure:
         scree = panels[-1]
         ratio = np.maximum(components.explained_variance_ratio, 1e-16)
         scree.semilogy(np.arange(1, len(ratio) + 1), ratio, "o-")
+        scree.xaxis.set_major_locator(MaxNLocator(integer=True))
         scree.set_xlabel("component")
         scree.set_ylabel("share of the variance")
         scree.set_title("scree")
