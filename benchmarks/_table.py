@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import statistics
@@ -66,6 +67,8 @@ def machine() -> str:
 
 def seconds(value: float) -> str:
     """Time with a fitting unit."""
+    if math.isnan(value):
+        return ""
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if value >= scale:
             return f"{value / scale:.3g} {unit}"
