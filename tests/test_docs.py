@@ -198,6 +198,15 @@ def test_site_is_whole_and_needs_no_network(site: Path) -> None:
 
 
 @pytest.mark.slow
+def test_linked_names_are_documented(site: Path) -> None:
+    for page in PAGES:
+        html = (site / page).with_suffix(".html").read_text(encoding="utf-8")
+        if page.parts[:2] != ("reference", "api"):
+            plain = re.findall(r'(?<!">)<code class="xref py[^>]*>.*?</code>', html)
+            assert not plain, f"{page}: {plain}"
+
+
+@pytest.mark.slow
 def test_catalogues_are_complete(site: Path) -> None:
     from lsst.fringe_sim.effects import EFFECTS
     from lsst.fringe_sim.model import setup_names
