@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 
 from lsst.fringe_sim.errors import ConvergenceError, InputError, OutOfRangeError
-from lsst.fringe_sim.model import ResponseTable, response_table, tabulate
+from lsst.fringe_sim.model import FringeModel, ResponseTable, TableCache, response_table, tabulate
 from lsst.fringe_sim.model.response_table import content_key
 from lsst.fringe_sim.optics import Beam, Illumination, LayerStack
 from lsst.fringe_sim.optics.illumination import GaussianProfile
@@ -173,3 +174,16 @@ def test_key_changes_with_everything_that_enters() -> None:
     keys.add(content_key(optics, light, span, tolerance, WAVELENGTHS, 1e-6))
     assert key not in keys
     assert len(keys) == len(variants) + 5
+
+
+@pytest.mark.parametrize("effects", [{}, {"bandwidth.fwhm": 1.5}, {"contrast_loss.factor": 0.3}])
+def test_table_of_a_model_is_its_response(
+    effects: dict[str, float], tmp_path: Path, rng: np.random.Generator
+) -> None:
+    model = FringeModel.from_setup("ts8_e2v", effects=effects)
+    thickness = rng.uniform(14.0, 15.0, 200)
+    for _ in range(2):
+        table = model.table((14.0, 15.0), WAVELENGTHS, cache=TableCache(tmp_path))
+        difference = np.abs(table.lookup(thickness) - model.response(thickness, WAVELENGTHS)).max()
+        assert difference <= table.interpolation_error <= 1e-7
+        np.testing.assert_array_equal(table.wavelength_nm, WAVELENGTHS)
