@@ -7,6 +7,8 @@ import datetime
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from lsst.pex.config import ChoiceField, Field
 from lsst.pipe.base import (
     InputQuantizedConnection,
@@ -21,7 +23,7 @@ from lsst.pipe.base import (
 from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.pca import fit_pca, fringe_templates
-from ..products import SkyFringe
+from ..products import FringeComponents, SkyFringe
 from .quantum import common_header, data_id_of, run_datetime, sensor_of, unusable
 
 __all__ = ["FringePcaConfig", "FringePcaConnections", "FringePcaTask"]
@@ -70,7 +72,16 @@ class FringePcaConfig(PipelineTaskConfig, pipelineConnections=FringePcaConnectio
     """Configuration of `FringePcaTask`."""
 
     n_components: Field[int] = Field(
-        dtype=int, optional=True, doc="Number of components to keep; by default those above the noise."
+        dtype=int,
+        optional=True,
+        doc="Number of components to keep; by default those above the noise and above least_rms.",
+    )
+    least_rms: Field[float] = Field(
+        dtype=float,
+        default=1e-5,
+        doc="A component is left out if it adds less than this to a typical frame, as a fraction of the sky. The "
+        "photon noise of an LSST y exposure averaged over 20 arcsec is 2e-4.",
+        check=lambda value: value >= 0,
     )
     fringeStorageClass: ChoiceField[str] = ChoiceField(
         dtype=str,
@@ -133,7 +144,10 @@ class FringePcaTask(PipelineTask):
             detector=first.detector,
             physical_filter=first.physical_filter,
         )
-        (template,) = fringe_templates(components, creation_datetime, most=1, metadata=metadata)
+        # The first template is the mean pattern; no component enters it.
+        (template,) = fringe_templates(_first(components, 1), creation_datetime, most=1, metadata=metadata)
+        if self.config.n_components is None:
+            components = _above(components, self.config.least_rms)
         self.log.info(
             "%s in %s: %d frames, components explain %s",
             *(first.detector, first.physical_filter, len(frames)),
@@ -147,6 +161,23 @@ def _end_of(refs: Sequence[Any]) -> datetime.datetime:
     ends = [ref.dataId.records["exposure"].timespan.end for ref in refs]
     last: datetime.datetime = max(ends).utc.to_datetime()
     return last
+
+
+def _above(components: FringeComponents, least_rms: float) -> FringeComponents:
+    """Components that add at least ``least_rms`` to a typical frame, and the first one in any case."""
+    pixels = int(np.count_nonzero(components.mask == 0))
+    rms = np.sqrt(components.explained_variance / pixels)
+    return _first(components, max(1, int(np.count_nonzero(rms >= least_rms))))
+
+
+def _first(components: FringeComponents, number: int) -> FringeComponents:
+    return dataclasses.replace(
+        components,
+        components=components.components[:number],
+        explained_variance=components.explained_variance[:number],
+        explained_variance_ratio=components.explained_variance_ratio[:number],
+        scores=components.scores[:, :number],
+    )
 
 
 def _shared_metadata(frames: Sequence[SkyFringe]) -> dict[str, Any]:
