@@ -15,6 +15,7 @@ copyright = author
 version = release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "catalogues", "mathml"]
+suppress_warnings = ["myst.header"]  # a page may leave out a level of headings
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build", "changes"]
 root_doc = "index"

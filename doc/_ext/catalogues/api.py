@@ -26,7 +26,11 @@ def module_reference(name: str) -> str:
     for member, value in sorted(members.items(), key=lambda item: (_rank(item[1]), item[0].lower())):
         if value is None or _is_of_another_room(value, name):
             continue
-        lines += [f".. {_directive(value)}:: {PACKAGE}.{name}.{member}", *_options(value), ""]
+        path = f"{PACKAGE}.{name}.{member}"
+        if isinstance(getattr(module, member), types.ModuleType):
+            # Once it is imported, a module hides the function that is called like it.
+            path = f"{path}.{member}"
+        lines += [f".. {_directive(value)}:: {path}", *_options(value), ""]
     return "\n".join(["```{eval-rst}", *lines, "```", ""])
 
 
@@ -45,7 +49,8 @@ def _is_of_another_room(value: object, name: str) -> bool:
 def importable(module: types.ModuleType, member: str) -> object | None:
     """Member of a module; `None` if it is announced but its own module does not exist."""
     try:
-        return getattr(module, member)
+        value: object = getattr(module, member)
+        return getattr(value, member) if isinstance(value, types.ModuleType) else value
     except ModuleNotFoundError as error:
         if not str(error.name).startswith(PACKAGE):
             raise
