@@ -129,22 +129,6 @@ def _segment(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _term(
-    a: float, b: float, c: complex, h: complex, j: int, k: int
-) -> complex:  # pragma: no cover - compiled
-    """Coefficient of ``z^j conj(z)^k``, without the one in ``|z|``."""
-    hc = h.conjugate()
-    total = a * h**j * hc**k
-    if j > 0 and k > 0:
-        total += b * h ** (j - 1) * hc ** (k - 1)
-    if j > 0:
-        total += c * h ** (j - 1) * hc**k
-    if k > 0:
-        total += c.conjugate() * h**j * hc ** (k - 1)
-    return total
-
-
-@numba.njit(cache=True, error_model="numpy")
 def _harmonic(
     m: int,
     a: float,
@@ -174,27 +158,41 @@ def _harmonic(
             value *= rate**order
         out[0] = value * np.exp(rate * where)
         return abs(value)
+    # C_(m+k)k falls by |h|² from one k to the next, after the first.
     powers = len(out)
-    largest = 0.0
-    r = math.exp(-ki * where)
+    ratio = h.real * h.real + h.imag * h.imag
+    hm = h**m
+    before = h ** (m - 1) if m > 0 else 0j
+    follow = (
+        a * hm * ratio + b * hm + c * (before * ratio if m > 0 else h.conjugate()) + c.conjugate() * h * hm
+    )
+    first, odd = a * hm + c * before, e * hm
+    # exp(lambda d + (lambda sigma)²/2) for p = m, m + 1, ...: one factor per step and a Gaussian in p.
+    wide, slow = (kr * spread) ** 2, (ki * spread) ** 2
+    turn = np.exp(complex(-ki * where, -m * kr * ki * spread * spread))
+    carry = np.exp(
+        complex(-m * ki * where - 0.5 * m * m * wide, m * kr * where - m * m * kr * ki * spread * spread)
+    )
+    largest, r = 0.0, math.exp(-ki * where)
     for k in range(_MOST_TERMS):
         bound = 0.0
         for half in range(2):
             p = m + 2 * k + half
-            value = _term(a, b, c, h, m + k, k) if half == 0 else e * h ** (m + k) * h.conjugate() ** k
-            rate = complex(-p * ki, m * kr)
-            value *= np.exp(rate * where + 0.5 * (rate * spread) ** 2)
+            value = odd if half == 1 else (first if k == 0 else follow)
+            value *= carry * math.exp(0.5 * p * p * slow)
             if order > 0:
-                value *= rate**order
+                value *= complex(-p * ki, m * kr) ** order
             bound += abs(value)
             for power in range(powers):
                 out[power] += value
                 value *= -p * ki / (power + 1)
+            carry *= turn
+        if k > 0:
+            follow *= ratio
+        odd *= ratio
         largest = max(largest, bound)
         # Terms of one harmonic fall by |h|² r² each (the first may vanish by symmetry).
-        if k >= 2 and bound < _SMALLEST:
-            break
-        if k >= 2 and (abs(h) * r) ** (m + 2 * k) < 1e-3 * _SMALLEST:
+        if k >= 2 and (bound < _SMALLEST or (abs(h) * r) ** (m + 2 * k) < 1e-3 * _SMALLEST):
             break
     return largest
 
