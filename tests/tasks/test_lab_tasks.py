@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lsst.daf.butler import DataCoordinate, DimensionUniverse
 
-from lsst.fringe_sim.errors import FrameFormatError, FringeSimError, InputError
+from lsst.fringe_sim.errors import FrameFormatError, FringeSimError, InputError, UnknownNameError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.raw_frame import RawFrame
 from lsst.fringe_sim.mock.raw_frames import MockRun
@@ -23,9 +24,9 @@ from lsst.fringe_sim.tasks import (
     IsrFlatPrepTask,
     UnusableDataError,
 )
-from lsst.fringe_sim.tasks.quantum import run_datetime, unusable
+from lsst.fringe_sim.tasks.quantum import run_datetime, sensor_of, unusable
 
-NAME = "RTM-020_S01"
+NAME, SERIAL = "RTM-020_S01", "E2V-CCD250-321"
 DETECTOR = Camera.from_name("ts8").detector(NAME)
 
 
@@ -52,7 +53,7 @@ def fit(flats: list[FringeFlat], **config: Any) -> Any:
 
 
 def test_bias_and_flats_say_which_sensor_and_how(bias: CombinedBias, flats: list[FringeFlat]) -> None:
-    assert (bias.n_frames, bias.detector, bias.serial) == (3, NAME, "E2V-CCD250-321")
+    assert (bias.n_frames, bias.detector, bias.serial) == (3, NAME, SERIAL)
     assert {flat.detector for flat in flats} == {NAME}
     assert {flat.bandwidth_fwhm_nm for flat in flats} == {2.0}
     assert {flat.metadata["SETUP"] for flat in flats} == {"ts8_e2v"}
@@ -118,6 +119,16 @@ def test_what_the_package_does_not_raise_on_purpose_is_left_alone() -> None:
         _ = 1 / 0
     with pytest.raises(UnusableDataError), unusable("R11_S01"):
         raise FringeSimError("on purpose")
+
+
+def test_the_sensor_is_found_by_the_name_of_its_instrument() -> None:
+    universe = DimensionUniverse()
+    for instrument, detector, serial in (("LSST-TS8", 145, SERIAL), ("LSSTCam", 37, SERIAL)):
+        data_id = DataCoordinate.standardize(instrument=instrument, detector=detector, universe=universe)
+        assert sensor_of(data_id).serial == serial
+    unknown = DataCoordinate.standardize(instrument="DECam", detector=1, universe=universe)
+    with pytest.raises(UnknownNameError, match="instrument is 'DECam'"):
+        sensor_of(unknown)
 
 
 def test_date_of_a_run_comes_from_its_name() -> None:

@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from typing import Any
 
 from lsst.daf.butler import DataCoordinate
-from lsst.pipe.base import AlgorithmError, Instrument, QuantumContext
+from lsst.pipe.base import AlgorithmError, QuantumContext
 
 from .. import __version__
-from ..errors import FringeSimError, InputError
+from ..errors import FringeSimError, InputError, UnknownNameError
 from ..instrument.detector import Detector
+from ..middleware.instruments import INSTRUMENTS
 
 __all__ = ["UnusableDataError", "common_header", "data_id_of", "run_datetime", "sensor_of", "unusable"]
 
@@ -71,9 +72,20 @@ def data_id_of(butlerQC: QuantumContext) -> DataCoordinate:
 
 
 def sensor_of(data_id: DataCoordinate) -> Detector:
-    """Sensor of an expanded data id, as the camera of its instrument knows it."""
-    instrument: Any = Instrument.from_data_id(data_id)
-    return instrument.camera().detector(int(data_id["detector"]))  # type: ignore[no-any-return]
+    """Sensor of a data id, as the camera of its instrument knows it.
+
+    By the name of the instrument, not by its class: a repository may have it from Rubin's own package.
+
+    Raises
+    ------
+    UnknownNameError
+        An instrument that this package does not know.
+    """
+    by_name = {cls.getName(): cls for cls in INSTRUMENTS.values()}
+    name = str(data_id["instrument"])
+    if name not in by_name:
+        raise UnknownNameError("instrument", name, by_name)
+    return by_name[name].camera().detector(int(data_id["detector"]))
 
 
 def common_header() -> dict[str, Any]:
