@@ -30,6 +30,8 @@ _COMMANDS = {
     "mock-flats": ("mock_flats", "Write raw laboratory frames of a simulated sensor."),
     "fit": ("fit", "Fit the layer thickness to raw flats."),
     "sky": ("sky", "Simulate the fringes of the night sky."),
+    "discover": ("discover", "Find the effect that the model lacks."),
+    "challenge": ("challenge", "Hide effects in simulated sensors and count what the search finds."),
 }
 
 

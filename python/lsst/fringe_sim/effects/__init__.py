@@ -48,6 +48,7 @@ __all__ = [
     "Effect",
     "ImageGeometry",
     "Parameter",
+    "Parameter",
     "ResponseContext",
     "activate_effects",
     "apply_to_image",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -188,7 +189,9 @@ def texture_channels(state: State) -> list[Channel]:
     top = power / np.median(power[power > 0]) * chi2_distribution.ppf(0.5, 1)
     single = float(chi2_distribution.sf(top.max(), 1))
     result.append(
-        Channel("achromatic peak", float(top.max()), 1.0, float(-np.expm1(top.size * np.log1p(-min(single, 0.5)))))
+        Channel(
+            "achromatic peak", float(top.max()), 1.0, float(-np.expm1(top.size * np.log1p(-min(single, 0.5))))
+        )
     )
     return result
 
@@ -200,7 +203,7 @@ def _band_channel(name: str, power: FloatArray, planes: int, filled: float) -> C
     top = radius >= edges[-2]
     base, base_count = float(power[top].mean()), planes * int(top.sum()) * filled
     smallest, statistic, degrees = 1.0, 0.0, 1.0
-    for low, high in zip(edges[:-2], edges[1:-1], strict=True):
+    for low, high in itertools.pairwise(edges):
         inside = (radius >= low) & (radius < high) & (radius > 0.0)
         if inside.sum() < 4:
             continue
@@ -209,7 +212,9 @@ def _band_channel(name: str, power: FloatArray, planes: int, filled: float) -> C
         chance = float(f_distribution.sf(ratio, count, base_count))
         if chance < smallest:
             smallest, statistic, degrees = chance, ratio * count, count
-    return Channel(name, statistic, degrees, float(-np.expm1((BANDS - 1) * np.log1p(-min(smallest, 1 - 1e-16)))))
+    return Channel(
+        name, statistic, degrees, float(-np.expm1((BANDS - 1) * np.log1p(-min(smallest, 1 - 1e-16))))
+    )
 
 
 def _colour(wavelength_nm: FloatArray) -> FloatArray:

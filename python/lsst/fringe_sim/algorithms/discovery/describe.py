@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,9 @@ def describe_residual(
 def _by_wavelength(state: State, phase: FloatArray, geometry: ImageGeometry) -> list[dict[str, float]]:
     rows = []
     for plane, wavelength in enumerate(geometry.wavelength_nm):
-        shapes = [f(h * phase[plane]) for h in (1, 2, 3) for f in (np.cos, np.sin)] + [np.ones(phase.shape[1:])]
+        shapes = [f(h * phase[plane]) for h in (1, 2, 3) for f in (np.cos, np.sin)] + [
+            np.ones(phase.shape[1:])
+        ]
         weight = _plane_weight(state, plane)
         root = np.sqrt(weight)
         columns = np.stack([(root * shape).ravel() for shape in shapes], axis=1)
@@ -138,7 +141,7 @@ def _radial_power(state: State, cell_px: int) -> list[dict[str, float]]:
     frequency = 0.5 * np.hypot(np.arange(ny)[:, None] / ny, np.arange(nx)[None, :] / nx)  # per cell
     edges = np.geomspace(1.0 / max(ny, nx), 0.7, 13)
     rows = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         inside = (frequency >= low) & (frequency < high)
         count = int(inside.sum()) * len(state.residual)
         if count:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...effects import Effect
+from ...effects import Effect, Parameter
 from .basis import FieldBasis, NormalMatrix
 from .cells import CellData
 from .forward import Forward, Prediction
@@ -118,8 +118,7 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
     for parameter in effect.parameters:
         null, (low, high) = nulls[parameter.name], parameter.bounds
         one_sided = null <= low or null >= high
-        quadratic = one_sided and _starts_quadratically(effect.name, parameter.name, null, high, parameter.prior_scale,
-                                                        forward, thickness_um)  # fmt: skip
+        quadratic = one_sided and _starts_quadratically(effect.name, parameter, null, forward, thickness_um)
         found.append(
             Coordinate(
                 effect.name, parameter.name, null, low, high, parameter.prior_scale, quadratic, parameter.unit,
@@ -130,12 +129,17 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
 
 
 def _starts_quadratically(
-    effect: str, parameter: str, null: float, high: float, scale: float, forward: Forward, thickness: FloatArray
+    effect: str, parameter: Parameter, null: float, forward: Forward, thickness: FloatArray
 ) -> bool:
-    sign = 1.0 if null < high else -1.0
+    sign = 1.0 if null < parameter.bounds[1] else -1.0
     base = forward.predict({}, thickness).value
     small, large = (
-        np.abs(forward.predict({f"{effect}.{parameter}": null + sign * size * scale}, thickness).value - base).max()
+        np.abs(
+            forward.predict(
+                {f"{effect}.{parameter.name}": null + sign * size * parameter.prior_scale}, thickness
+            ).value
+            - base
+        ).max()
         for size in (0.05, 0.1)
     )
     return bool(large > 3.0 * small)
@@ -238,7 +242,9 @@ class Design:
         """Curvature in the columns with the field profiled out, ``(K, K)``."""
         return self._curvature
 
-    def step(self, residual: FloatArray, ridge: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def step(
+        self, residual: FloatArray, ridge: FloatArray, pull: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Newton step of columns and field coefficients; ``ridge`` is a prior precision, ``pull`` its gradient."""
         field_side = self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0]
         solved = self.normal.solve(np.column_stack([field_side, self._coupling]))
@@ -271,7 +277,9 @@ class Design:
         score = flat @ residual.ravel()
         field_side = self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0]
         score = score - solved.T @ field_side
-        own_score = own @ residual.ravel() - self._coupling.T @ self.normal.solve(field_side[:, np.newaxis])[:, 0]
+        own_score = (
+            own @ residual.ravel() - self._coupling.T @ self.normal.solve(field_side[:, np.newaxis])[:, 0]
+        )
         scale = np.sqrt(np.maximum(np.diag(self._curvature), 1e-300))
         values, vectors = np.linalg.eigh(self._curvature / np.outer(scale, scale))
         keep = values > 1e-10
@@ -416,8 +424,9 @@ class _Solver:
         self.whiten = Whitener.of_cells(problem.cells, reference / reference.mean())
         levels = self._first_levels(reference) if levels_start is None else levels_start.copy()
         point = self.evaluate(_Point(start.copy(), levels, field_start.copy()))
-        damping, count, converged = 0.0, 0, False
-        for count in range(1, iterations + 1):
+        damping, converged, count = 0.0, False, 0
+        while count < iterations:
+            count += 1
             design = self.linearise(point)
             trial, damping = self._improve(point, design, damping)
             if trial is None:

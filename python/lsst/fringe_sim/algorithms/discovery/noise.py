@@ -78,7 +78,9 @@ def estimate_noise(cells: CellData, residual: FloatArray) -> NoiseEstimate:
         use = good[plane] & inlier
         measured[plane] = float((difference[plane][use] ** 2).mean())
         stated[plane] = float(_mean_of_nine(1.0 / np.maximum(cells.weight[plane], 1e-300))[use].mean())
-    scatter = _common_variance(difference[:, clean], measured) if waves > 1 and clean.sum() > LEAST_TRIPLES else 0.0
+    scatter = (
+        _common_variance(difference[:, clean], measured) if waves > 1 and clean.sum() > LEAST_TRIPLES else 0.0
+    )
     independent = np.maximum(measured - scatter, 0.05 * measured)
     return NoiseEstimate(
         np.sqrt(independent / stated), float(np.sqrt(scatter)), True, _neighbour_correlation(difference, good)

@@ -22,7 +22,7 @@ from .describe import describe_residual, disagreement
 from .fit import Fit, Problem, fit_model
 from .forward import Forward
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
-from .selection import Candidate, Hypothesis, Selector, similarity
+from .selection import Hypothesis, Selector, similarity
 from .start import starting_thickness
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
 
@@ -139,7 +139,9 @@ def _check_setup(cube: FringeCube, model: FringeModel) -> None:
     known = {item.effect.name for item in model.effects}
     stated = model.base_system.temperature_k
     if np.any(np.abs(rows.temperature_k - stated) > 5.0) and "temperature" not in known:
-        raise InputError("temperature [K]", rows.temperature_k.tolist(), f"within 5 of the set-up's {stated:g}")
+        raise InputError(
+            "temperature [K]", rows.temperature_k.tolist(), f"within 5 of the set-up's {stated:g}"
+        )
     width = model.setup.bandwidth_fwhm_nm
     measured = rows.bandwidth_fwhm_nm[rows.bandwidth_fwhm_nm > 0.0]
     if np.any(np.abs(measured - width) > 0.02 * width) and "bandwidth" not in known:
@@ -168,7 +170,9 @@ def _too_poor(cube: FringeCube, model: FringeModel) -> str:
     waves = int(np.unique(cube.wavelength_nm).size)
     if cube.thickness is None:
         if waves < 3:
-            return f"{waves} wavelength(s) without a thickness map: thickness and effects cannot be told apart"
+            return (
+                f"{waves} wavelength(s) without a thickness map: thickness and effects cannot be told apart"
+            )
         if pixels < 8 and waves < 6:
             return f"{pixels} pixel(s) at {waves} wavelengths: fewer data than free parameters"
     elif pixels < 16 and waves < 4:
@@ -187,7 +191,9 @@ def _no_answer(model: FringeModel, reason: str, cube: FringeCube) -> Verdict:
 _METRIC = "rms of data minus model, relative counts"
 
 
-def _prepare(cube: FringeCube, model: FringeModel, effects: Sequence[Effect], options: SearchOptions) -> _Prepared:
+def _prepare(
+    cube: FringeCube, model: FringeModel, effects: Sequence[Effect], options: SearchOptions
+) -> _Prepared:
     size = finest_useful_cell(cube, most_cells=options.most_cells)
     cells = bin_cube(cube, size)
     rich = min(cells.shape[1:]) >= 6
@@ -264,7 +270,12 @@ def _known_thickness(
 
 
 def _prepare_few(
-    cells: CellData, model: FringeModel, forward: Forward, start: FloatArray, levels: FloatArray, index: FloatArray
+    cells: CellData,
+    model: FringeModel,
+    forward: Forward,
+    start: FloatArray,
+    levels: FloatArray,
+    index: FloatArray,
 ) -> _Prepared:
     """A few pixels with many wavelengths: every fringe order is tried, the stated noise is believed."""
     basis = CellBasis(start.shape)
@@ -314,7 +325,11 @@ class _Search:
     def run(self, refinements: int = 2) -> Verdict:
         """Search; start again if a named effect shows that field or noise were misjudged without it."""
         whole = Selector(
-            self.prepared.problem, self.effects, self.prepared.null, self.prepared.index, generic=self.prepared.rich
+            self.prepared.problem,
+            self.effects,
+            self.prepared.null,
+            self.prepared.index,
+            generic=self.prepared.rich,
         )
         self.where = self._where(whole)
         chance = self._chance(whole, whole.null)
@@ -456,7 +471,9 @@ class _Search:
         self, whole: Selector, training: Selector, chosen: Hypothesis, steps: list[Step], chance: float
     ) -> Verdict:
         if not chosen.names:
-            return self._unexplained(whole, whole.null, chance, steps, "no effect of the catalogue explains it")
+            return self._unexplained(
+                whole, whole.null, chance, steps, "no effect of the catalogue explains it"
+            )
         final = whole.with_channels(self._transfer(whole, chosen))
         classes = self._classes(training, chosen)
         gains = self._validate(whole, final)
@@ -466,7 +483,7 @@ class _Search:
             reasons.append(
                 f"with {', '.join(final.names)} a residual remains in '{worst.name}' (chance {worst.probability:.2g})"
             )
-        if gains["blocks"] <= 0.0 or gains["wavelengths"] < -9.0:
+        if gains["blocks"] + gains["wavelengths"] <= 0.0 or min(gains.values()) < -9.0:
             reasons.append("data held out are not predicted better")
         outsider = self._outsider_probability(final)
         named = []
@@ -486,7 +503,9 @@ class _Search:
         """The chosen set fitted to all data."""
         start = self._whole_field(whole, chosen.fit)
         weight = (self.cells.weight > 0).any(axis=0).astype(float)
-        return whole.hypothesis(chosen.names, None, replace(chosen.fit, field=whole.problem.basis.fit(start, weight)))
+        return whole.hypothesis(
+            chosen.names, None, replace(chosen.fit, field=whole.problem.basis.fit(start, weight))
+        )
 
     def _classes(self, selector: Selector, chosen: Hypothesis) -> dict[str, tuple[dict[str, float], float]]:
         """For each effect: the members of its class with their shares, and the probability of the class."""
@@ -511,7 +530,9 @@ class _Search:
             top = max(other.log_evidence for other in found.values())
             weight = {n: math.exp(max(other.log_evidence - top, -700.0)) for n, other in found.items()}
             total = sum(weight.values())
-            members = {n: weight[n] / total for n, other in found.items() if self._is_alike(other, chosen, top)}
+            members = {
+                n: weight[n] / total for n, other in found.items() if self._is_alike(other, chosen, top)
+            }
             result[name] = (members, sum(members.values()))
         return result
 
@@ -548,7 +569,9 @@ class _Search:
         self.heldout_rms = (_rms(whole.problem, null), _rms(whole.problem, final.fit))
         if self.heldout.any():
             seen = whole.problem.with_cells(self.cells.restricted(~self.heldout))
-            fitted = fit_model(seen, final.fit.coordinates, final.fit.position, final.fit.field, final.fit.levels)
+            fitted = fit_model(
+                seen, final.fit.coordinates, final.fit.position, final.fit.field, final.fit.levels
+            )
             unseen = whole.problem.with_cells(self.cells.restricted(self.heldout))
             before = fit_model(unseen, (), np.zeros(0), null.field, null.levels)
             start = whole.problem.basis.fit(self._whole_field(whole, fitted), np.ones(self.heldout.shape))
@@ -576,7 +599,9 @@ class _Search:
         self, whole: Selector, final: Hypothesis, name: str, members: dict[str, float], probability: float
     ) -> NamedEffect:
         parameters = {}
-        for item, position, sigma in zip(final.fit.coordinates, final.fit.position, final.fit.sigma, strict=True):
+        for item, position, sigma in zip(
+            final.fit.coordinates, final.fit.position, final.fit.sigma, strict=True
+        ):
             if item.effect == name:
                 value, error = item.value(position), item.value_sigma(position, sigma)
                 parameters[item.parameter] = ParameterValue(value, float(error), item.unit)
@@ -621,9 +646,7 @@ class _Search:
         before, after = _rms(whole.problem, null), _rms(whole.problem, final.fit)
         heldout = getattr(self, "heldout_rms", (before, after))
         gap = Gap(_METRIC, before, after, *heldout, _noise_rms(self.cells))
-        candidates = tuple(
-            {"name": c.name, "score": c.gain, "degrees": c.degrees} for c in self.scores
-        )  # type: tuple[dict[str, Any], ...]
+        candidates = tuple({"name": c.name, "score": c.gain, "degrees": c.degrees} for c in self.scores)  # type: tuple[dict[str, Any], ...]
         for name, why in whole.left_out.items():
             self.notes.append(f"{name} was left out: {why}")
         data = {
@@ -659,12 +682,18 @@ def _held_out_blocks(
 def _noise_rms(cells: CellData) -> float:
     """Rms of the noise of the cells, response scatter included."""
     used = cells.weight > 0
-    return float(np.sqrt((1.0 / cells.weight[used]).mean() + cells.response_scatter**2)) if used.any() else math.nan
+    return (
+        float(np.sqrt((1.0 / cells.weight[used]).mean() + cells.response_scatter**2))
+        if used.any()
+        else math.nan
+    )
 
 
 def _rms(problem: Problem, fit: Fit) -> float:
     """Rms of data minus model, corrected for the freedom of the nuisances."""
-    degrees = problem.cells.n_values - _field_freedom(problem) - problem.level_basis.shape[1] - len(fit.coordinates)
+    degrees = (
+        problem.cells.n_values - _field_freedom(problem) - problem.level_basis.shape[1] - len(fit.coordinates)
+    )
     return _noise_rms(problem.cells) * math.sqrt(fit.chi2 / max(degrees, 1))
 
 
@@ -682,6 +711,9 @@ def _predicted_chi2(problem: Problem, fit: Fit) -> float:
     weight = problem.cells.weight
     square = (weight * value**2).sum(axis=(1, 2))
     level = np.divide(
-        (weight * value * problem.cells.value).sum(axis=(1, 2)), square, out=np.ones(len(square)), where=square > 0
+        (weight * value * problem.cells.value).sum(axis=(1, 2)),
+        square,
+        out=np.ones(len(square)),
+        where=square > 0,
     )
     return float((weight * (problem.cells.value - level[:, None, None] * value) ** 2).sum())

@@ -13,7 +13,16 @@ from scipy.stats import chi2 as chi2_distribution
 from ...effects import Effect
 from ...errors import InputError
 from .channels import Channel, State, combined_probability, measure_channels
-from .fit import Coordinate, Design, Fit, Problem, coordinate_derivative, coordinates_of, fit_model, linearise_at
+from .fit import (
+    Coordinate,
+    Design,
+    Fit,
+    Problem,
+    coordinate_derivative,
+    coordinates_of,
+    fit_model,
+    linearise_at,
+)
 
 __all__ = ["Candidate", "Hypothesis", "Selector"]
 
@@ -91,7 +100,13 @@ class Selector:
     """
 
     def __init__(
-        self, problem: Problem, catalogue: Sequence[Effect], null: Fit, index: FloatArray, *, generic: bool = True
+        self,
+        problem: Problem,
+        catalogue: Sequence[Effect],
+        null: Fit,
+        index: FloatArray,
+        *,
+        generic: bool = True,
     ) -> None:
         self.problem, self.index, self.generic = problem, index, generic
         self.null = Hypothesis((), null, 0.0)
@@ -114,7 +129,9 @@ class Selector:
         """Everything the tests need at a fit."""
         design, residual, prediction, thickness, whiten = linearise_at(self.problem, fit)
         level = (self.problem.level_basis @ fit.levels)[:, None, None]
-        raw = np.where(self.problem.cells.weight > 0, self.problem.cells.value - level * prediction.value, 0.0)
+        raw = np.where(
+            self.problem.cells.weight > 0, self.problem.cells.value - level * prediction.value, 0.0
+        )
         return State(design, residual, raw, level * prediction.value, thickness, whiten)
 
     def criticise(self, fit: Fit) -> tuple[Channel, ...]:
@@ -126,7 +143,12 @@ class Selector:
     def _total(self, fit: Fit) -> Channel:
         """χ² of all values, where there are too few for anything else."""
         field_size = 0 if self.problem.field_prior else self.problem.basis.size
-        degrees = self.problem.cells.n_values - field_size - self.problem.level_basis.shape[1] - len(fit.coordinates)
+        degrees = (
+            self.problem.cells.n_values
+            - field_size
+            - self.problem.level_basis.shape[1]
+            - len(fit.coordinates)
+        )
         chance = float(chi2_distribution.sf(fit.chi2, max(degrees, 1))) if degrees > 0 else 1.0
         return Channel("all values", fit.chi2, float(max(degrees, 0)), chance)
 
@@ -200,7 +222,9 @@ class Selector:
             columns.append(state.whiten(level * slope))  # type: ignore[operator]
         return np.stack(columns)
 
-    def hypothesis(self, names: Sequence[str], start: FloatArray | None = None, base: Fit | None = None) -> Hypothesis:
+    def hypothesis(
+        self, names: Sequence[str], start: FloatArray | None = None, base: Fit | None = None
+    ) -> Hypothesis:
         """Fit a set of effects; remembered.
 
         Parameters
@@ -219,7 +243,10 @@ class Selector:
         base = self.null.fit if base is None else base
         coordinates = tuple(item for name in ordered for item in self.coordinates[name])
         fit = min(
-            (self._fit_from(ordered, coordinates, first, base) for first in self._starts(ordered, start, base)),
+            (
+                self._fit_from(ordered, coordinates, first, base)
+                for first in self._starts(ordered, start, base)
+            ),
             key=lambda item: item.chi2,
         )
         hypothesis = Hypothesis(ordered, fit, self._evidence(fit))
@@ -330,7 +357,9 @@ def similarity(design: Design, first: FloatArray, second: FloatArray) -> float:
     number = len(first)
     a, b, c = information[:number, :number], information[number:, number:], information[:number, number:]
     inverse_roots = [_inverse_root(matrix) for matrix in (a, b)]
-    return float(np.clip(np.linalg.svd(inverse_roots[0] @ c @ inverse_roots[1], compute_uv=False)[0], 0.0, 1.0))
+    return float(
+        np.clip(np.linalg.svd(inverse_roots[0] @ c @ inverse_roots[1], compute_uv=False)[0], 0.0, 1.0)
+    )
 
 
 def _inverse_root(matrix: FloatArray) -> FloatArray:

@@ -39,7 +39,7 @@ def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
     """
     low, high = model.setup.thickness_range_um
-    count = int(round((high - low) / SEARCH_STEP_UM)) + 1
+    count = round((high - low) / SEARCH_STEP_UM) + 1
     response = model.response_on_grid(cells.wavelength_nm, low, SEARCH_STEP_UM, count)
     template = response / _running_mean(response, model, cells) - 1.0
     score = _correlate(template, cells)
@@ -76,13 +76,15 @@ def _correlate(template: FloatArray, cells: CellData) -> NDArray[np.float32]:
     for first in range(0, amplitude.shape[1], 4096):
         part = slice(first, first + 4096)
         w = weight[:, part]
-        total = np.maximum(w.sum(axis=0), 1e-300)
+        total = np.maximum(w.sum(axis=0), 1e-30)  # a cell without data scores nothing
         # An offset common to all wavelengths of the cell is free as well: pixel response, illumination.
         mean = (w * amplitude[:, part]).sum(axis=0) / total
         cross = (w * (amplitude[:, part] - mean)).T @ template
         power = w.T @ template**2 - (w.T @ template) ** 2 / total[:, np.newaxis]
         gain = np.where(cross > 0.0, cross, 0.0) / np.sqrt(np.maximum(power, 1e-30 * total[:, np.newaxis]))
-        score[part] = gain / np.sqrt(np.maximum((w * (amplitude[:, part] - mean) ** 2).sum(axis=0), 1e-300))[:, None]
+        score[part] = (
+            gain / np.sqrt(np.maximum((w * (amplitude[:, part] - mean) ** 2).sum(axis=0), 1e-300))[:, None]
+        )
     return score
 
 
@@ -143,7 +145,7 @@ def _grow(
 
     The cells at the rim of the grown region wait in buckets by their clarity.
     """
-    cells, count = score.shape
+    cells, _count = score.shape
     best = np.full(cells, -1, np.int64)
     clarity = np.zeros(cells)
     for i in range(cells):
@@ -221,10 +223,10 @@ def _choose(
     gy = (vyz * vxx - vxz * vxy) / determinant
     expected = mz - gx * mx - gy * my
     count = score.shape[1]
-    low = max(0, int(round(expected)) - reach)
-    high = min(count - 1, int(round(expected)) + reach)
+    low = max(0, round(expected) - reach)
+    high = min(count - 1, round(expected) + reach)
     if high < low:
-        return min(max(int(round(expected)), 0), count - 1)
+        return min(max(round(expected), 0), count - 1)
     place, largest = low, -1.0
     for k in range(low, high + 1):
         away = (k - expected) / (0.7 * reach)

@@ -223,7 +223,15 @@ class Verdict:
     def table(self) -> Table:
         """One row for each parameter of each effect that was found."""
         rows = [
-            (effect.name, name, p.value, p.sigma, p.unit, effect.probability, ", ".join(effect.ambiguous_with))
+            (
+                effect.name,
+                name,
+                p.value,
+                p.sigma,
+                p.unit,
+                effect.probability,
+                ", ".join(effect.ambiguous_with),
+            )
             for effect in self.effects
             for name, p in effect.parameters.items()
         ]

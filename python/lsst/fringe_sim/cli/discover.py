@@ -1,0 +1,150 @@
+"""``fringe-sim discover``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from ..algorithms.discovery import SearchOptions, Verdict
+from ..algorithms.discovery import discover as search
+from ..algorithms.flat_prep_options import FlatPrepOptions
+from ..errors import InputError
+from ..model import FringeModel, Setup
+from ..products import FringeCube
+from .inputs import prepare_folder, read_settings
+from .lab_frames import find_series, read_cube
+from .parameters import EFFECT, effect_settings
+from .progress import progress
+
+__all__ = ["discover"]
+
+
+@click.command()
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...")
+@click.option("--setup", default="ts8_e2v", show_default=True, help="Laboratory set-up.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the verdict.")
+@click.option(
+    "--seed", type=int, default=1, show_default=True, help="Which parts of the sensor are held out."
+)
+@click.option(
+    "--effect", "effects", type=EFFECT, multiple=True, help="Effect known already; may be repeated."
+)
+@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@click.option(
+    "--collections", default="*", show_default=True, help="Of a Butler repository, comma-separated."
+)
+@click.option("--detector", default=None, help="Sensor of a Butler repository, by number or name.")
+@click.option(
+    "--cells", type=click.IntRange(100), default=20_000, show_default=True, help="Cells to average to."
+)
+@click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
+@click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
+def discover(
+    paths: tuple[str, ...],
+    setup: str,
+    out: Path,
+    seed: int,
+    effects: tuple[tuple[str, float], ...],
+    effects_file: Path | None,
+    collections: str,
+    detector: str | None,
+    cells: int,
+    skip_bad: bool,
+    dry_run: bool,
+) -> None:
+    """Find the effect that the model of a sensor lacks: raw flats, a fringe cube, or a Butler repository.
+
+    \b
+    Examples:
+      fringe-sim discover raws --setup ts8_e2v --out verdict
+      fringe-sim discover cube.fits --setup ts8_e2v --effect bandwidth.fwhm=2.3 --out verdict
+      fringe-sim discover REPO --collections u/me/flats --detector 37 --out verdict
+    """
+    chosen = Setup.from_name(setup)
+    if chosen.kind != "monochromator":
+        raise InputError("set-up", setup, "a laboratory set-up with a monochromator")
+    settings = dict(read_settings(effects_file)) if effects_file else {}
+    settings.update(effect_settings(effects))
+    model = FringeModel.from_setup(chosen, settings)
+    cube = _read(paths, chosen, collections, detector, skip_bad, dry_run)
+    if cube is None:
+        return
+    folder = prepare_folder(out)
+    verdict = search(
+        cube,
+        model,
+        rng=np.random.default_rng(seed),
+        options=SearchOptions(most_cells=cells),
+        report=lambda line: click.echo(line, err=True),
+    )
+    path = verdict.write(folder)
+    _say(verdict)
+    for name in (path.name, "discovery.ecsv", "effects.py"):
+        click.echo(str(folder / name))
+
+
+def _say(verdict: Verdict) -> None:
+    click.echo(verdict.summary())
+    for note in verdict.notes:
+        click.echo(f"  note: {note}", err=True)
+
+
+def _read(
+    paths: tuple[str, ...],
+    setup: Setup,
+    collections: str,
+    detector: str | None,
+    skip_bad: bool,
+    dry_run: bool,
+) -> FringeCube | None:
+    """Cube of one sensor, or `None` after a dry run."""
+    if len(paths) == 1:
+        cube = read_cube(paths[0])
+        if cube is None and (Path(paths[0]) / "butler.yaml").is_file():
+            cube = _from_repository(paths[0], collections, detector)
+        if cube is not None:
+            if dry_run:
+                click.echo(f"would search {cube.shape[0]} flats of {cube.shape[1]} x {cube.shape[2]} pixels")
+            return None if dry_run else cube
+    series = find_series(paths, skip_bad=skip_bad)
+    listed = ", ".join(f"{w:g}" for w in series.wavelengths_nm)
+    click.echo(
+        f"{series.serial or 'sensor'}: {len(series.biases)} bias frames, {len(series.flats)} flats at {listed} nm",
+        err=True,
+    )
+    if dry_run:
+        click.echo(f"would prepare {series.steps} frames and search them")
+        return None
+    with progress("preparing frames", series.steps) as advance:
+        # Not smoothed: the noise is measured from neighbouring pixels.
+        return series.read(setup, FlatPrepOptions(smoothing_sigma_px=0.0), advance)
+
+
+def _from_repository(path: str, collections: str, detector: str | None) -> FringeCube:
+    """Cube from the prepared flats of one sensor of a repository."""
+    from lsst.daf.butler import Butler, EmptyQueryResultError, MissingDatasetTypeError
+
+    where, bind = "", {}
+    if detector is not None:
+        if detector.isdecimal():
+            where, bind = "detector = chosen", {"chosen": int(detector)}
+        else:
+            where, bind = "detector.full_name = chosen", {"chosen": detector}
+    with Butler.from_config(path) as butler:
+        try:
+            refs: list[Any] = butler.query_datasets(
+                "fringeFlat", collections=collections.split(","), where=where, bind=bind, find_first=False
+            )
+        except (EmptyQueryResultError, MissingDatasetTypeError) as error:
+            message = str(error).split("\n")[0]
+            raise InputError(
+                "repository", message, "one with fringeFlat datasets (task isrFlatPrep)", source=path
+            ) from None
+        latest = {(ref.dataId["detector"], ref.dataId["exposure"]): ref for ref in refs}
+        sensors = sorted({key[0] for key in latest})
+        if len(sensors) != 1:
+            raise InputError("sensors", sensors, "one; choose with --detector", source=path)
+        return FringeCube.from_flats((butler.get(ref) for ref in latest.values()), number=len(latest))

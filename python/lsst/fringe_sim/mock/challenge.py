@@ -1,0 +1,549 @@
+"""Sealed cases for the search for missing effects, and how well it did on them.
+
+The cases come from the mock's own optics and its own hidden effects. The search is given the frames of a case and
+the name of the set-up, never the truth; the oracle, which is told which effects are in, shows what could be reached.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from ..algorithms.discovery import SearchOptions, Verdict, discover
+from ..effects import EFFECTS
+from ..errors import UnknownNameError
+from ..products.fringe_cube import FlatExposures, FringeCube
+from ..products.mask import mask_bits
+from .hidden_effects import AmplifierState, HiddenEffect, validate_effects
+from .raw_frames import setup_optics
+from .thickness import random_field
+
+__all__ = [
+    "CASE_KINDS",
+    "OUTSIDERS",
+    "CaseResult",
+    "ChallengeResult",
+    "SealedCase",
+    "draw_case",
+    "run_challenge",
+]
+
+FloatArray = NDArray[np.float64]
+Draw = Callable[[np.random.Generator], dict[str, float]]
+
+CASE_KINDS = ("none", "one", "two", "outsider")
+STATED_FWHM_NM, STATED_KELVIN = 2.0, 183.15
+READ_NOISE_E = 6.0
+
+
+def _signed(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(rng.choice([-1.0, 1.0]) * _decades(rng, low, high))
+
+
+def _decades(rng: np.random.Generator, low: float, high: float) -> float:
+    """Log-uniform between two powers of ten."""
+    return float(10.0 ** rng.uniform(low, high))
+
+
+SIZES: Mapping[str, Draw] = MappingProxyType(
+    {
+        "bandwidth": lambda r: {"bandwidth.fwhm": STATED_FWHM_NM + _signed(r, -1.3, 0.0) * 0.9},
+        "wavelength_offset": lambda r: {"wavelength_offset.offset": _signed(r, -0.7, 0.5)},
+        "wavelength_scale": lambda r: {"wavelength_scale.stretch": _signed(r, -3.0, -1.5)},
+        "temperature": lambda r: {"temperature.kelvin": STATED_KELVIN + _signed(r, 0.3, 1.4)},
+        "epoxy_index": lambda r: {"epoxy_index.offset": _signed(r, -2.3, -1.0)},
+        "epoxy_dispersion": lambda r: {"epoxy_index.cauchy": _signed(r, -3.3, -2.0)},
+        "epoxy_absorption": lambda r: {"epoxy_absorption.k": _decades(r, -5.0, -2.5)},
+        "silicon_thickness": lambda r: {"silicon_thickness.offset": _signed(r, -0.5, 1.0)},
+        "silicon_absorption": lambda r: {"silicon_absorption.scale": 1.0 + _signed(r, -2.3, -0.7)},
+        "ar_coating": lambda r: {"ar_coating.scale": 1.0 + _signed(r, -1.7, -0.7)},
+        "roughness": lambda r: {"roughness.sigma": _decades(r, 0.8, 2.0)},
+        "thickness_spread": lambda r: {"thickness_spread.sigma": _decades(r, 0.3, 1.7)},
+        "converging_beam": lambda r: {"converging_beam.numerical_aperture": _decades(r, -1.3, -0.6)},
+        "support_index": lambda r: {"support_index.offset": -_decades(r, -2.0, 0.1)},
+        "ghost_pedestal": lambda r: {"ghost_pedestal.fraction": _decades(r, -2.5, 0.5)},
+        "contrast_loss": lambda r: {"contrast_loss.factor": 1.0 - _decades(r, -2.3, -0.1)},
+        "illumination": lambda r: {
+            "illumination.gradient_x": _signed(r, -3.5, -1.0),
+            "illumination.gradient_y": _signed(r, -3.5, -1.0),
+        },
+        "vignetting": lambda r: {"vignetting.corner": _decades(r, -3.3, -0.7)},
+        "midline_step": lambda r: {"midline_step.fraction": _signed(r, -3.5, -1.7)},
+        "amplifier_gain": lambda r: {"amplifier_gain.rms": _decades(r, -3.3, -1.7)},
+        "amplifier_offset": lambda r: {"amplifier_offset.rms": _decades(r, 1.0, 2.5)},
+        "dark_pedestal": lambda r: {"dark_pedestal.electrons": _decades(r, 2.0, 4.0)},
+        "non_linearity": lambda r: {"non_linearity.quadratic": _signed(r, -2.3, -0.9)},
+    }
+)
+"""Random sizes of the effects that are hidden, from hardly visible to overwhelming."""
+
+
+def _second_film(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
+    """Fringes of another layer, whose thickness has nothing to do with the adhesive."""
+    phase = 4.0 * math.pi * 1.46 * scene["film"] / (1e-3 * wavelength)
+    return image * (1.0 + scene["size"] * np.cos(phase))
+
+
+def _tree_rings(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
+    """Rings of the crystal around a point outside the sensor."""
+    y, x = np.indices(image.shape)
+    radius = np.hypot(y + 0.4 * image.shape[0], x + 0.3 * image.shape[1])
+    return image * (1.0 + scene["size"] * np.cos(2.0 * math.pi * radius / scene["period"]))
+
+
+def _ghost_image(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
+    """A faint image of the sensor on itself, upside down and out of focus."""
+    return image + scene["size"] * gaussian_filter(image[::-1, ::-1], 1.0)
+
+
+def _crosstalk(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
+    """Every amplifier echoes in its neighbour."""
+    width = image.shape[1] // 8
+    echo = np.zeros(image.shape)
+    for column in range(7):
+        source = image[:, column * width : (column + 1) * width]
+        echo[:, (column + 1) * width : (column + 2) * width] = source
+    return image + scene["size"] * echo
+
+
+def _stains(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
+    """A few round stains that absorb the more the shorter the wavelength."""
+    y, x = np.indices(image.shape)
+    depth = sum(np.exp(-0.5 * ((y - cy) ** 2 + (x - cx) ** 2) / r**2) for cy, cx, r in scene["stains"])
+    return image * (1.0 - scene["size"] * (900.0 / wavelength) ** 2 * depth)
+
+
+def _columns(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
+    """Every column has a response of its own."""
+    return image * (1.0 + scene["size"] * scene["columns"][np.newaxis, :])
+
+
+def _jitter(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
+    """A plane of light whose direction changes from exposure to exposure."""
+    angle = 2.399963 * wavelength / 10.0
+    v = np.linspace(-1.0, 1.0, image.shape[0])[:, np.newaxis]
+    u = np.linspace(-1.0, 1.0, image.shape[1])[np.newaxis, :]
+    return image * (1.0 + scene["size"] * (math.cos(angle) * u + math.sin(angle) * v))
+
+
+OUTSIDERS: Mapping[str, tuple[Callable[..., FloatArray], float, float]] = MappingProxyType(
+    {
+        "second_film": (_second_film, -3.5, -2.3),
+        "tree_rings": (_tree_rings, -3.5, -2.3),
+        "ghost_image": (_ghost_image, -2.5, -1.3),
+        "crosstalk": (_crosstalk, -3.0, -2.0),
+        "stains": (_stains, -3.0, -1.7),
+        "columns": (_columns, -3.5, -2.5),
+        "wandering_light": (_jitter, -3.5, -2.0),
+    }
+)
+"""Causes that the catalogue does not hold, with the decades of their size."""
+
+
+@dataclass(frozen=True, eq=False)
+class SealedCase:
+    """One case: what the search gets, and the truth.
+
+    Attributes
+    ----------
+    cube : `FringeCube`
+        Flats, masks, stated noise.
+    setup : `str`
+        What the search is told of sensor and light.
+    kind : `str`
+        One of `CASE_KINDS`.
+    names : `tuple` [`str`, ...]
+        Effects that are in, by their name in the catalogue; the name of an outsider.
+    values : `dict`
+        Their sizes by ``name.parameter``.
+    thickness_um : `numpy.ndarray`
+        True thickness [µm].
+    noise_factor : `float`
+        True over stated noise variance.
+    """
+
+    cube: FringeCube
+    setup: str
+    kind: str
+    names: tuple[str, ...]
+    values: dict[str, float]
+    thickness_um: FloatArray
+    noise_factor: float
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """What became of a case.
+
+    Attributes
+    ----------
+    truth, found : `tuple` [`str`, ...]
+        Effects that were in, and those that were named.
+    right_class : `bool`
+        Every effect that is in was named or is in the class of a named one, and nothing else was named.
+    exact : `bool`
+        The named effects are those that are in.
+    signal_to_noise : `float`
+        Square root of what the oracle takes off χ².
+    probability : `float`
+        Smallest probability that was stated; 0 if nothing was named.
+    pulls : `dict`
+        (found - true) / σ by ``name.parameter``, for exact names.
+    shrinkage : `float`
+        Part of the oracle's fall of the variance on held-out data that the search reached.
+    """
+
+    seed: int
+    kind: str
+    truth: tuple[str, ...]
+    values: dict[str, float]
+    verdict: str
+    found: tuple[str, ...]
+    ambiguous: tuple[tuple[str, ...], ...]
+    right_class: bool
+    exact: bool
+    signal_to_noise: float
+    probability: float
+    pulls: dict[str, float]
+    shrinkage: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class ChallengeResult:
+    """All cases of a challenge with the numbers that sum them up."""
+
+    seed: int
+    cases: tuple[CaseResult, ...]
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def of_kind(self, kind: str) -> list[CaseResult]:
+        """Cases of a kind."""
+        return [case for case in self.cases if case.kind == kind]
+
+    def confusion(self) -> Table:
+        """How often each truth led to each verdict."""
+        counts: dict[tuple[str, str], int] = {}
+        for case in self.cases:
+            row = "+".join(case.truth) or "none"
+            column = "+".join(sorted(case.found)) if case.found else case.verdict
+            counts[row, column] = counts.get((row, column), 0) + 1
+        rows = [(truth, found, number) for (truth, found), number in sorted(counts.items())]
+        return Table(rows=rows or None, names=("truth", "found", "cases"), dtype=(str, str, int))
+
+    def table(self) -> Table:
+        """One row per case."""
+        rows = [
+            (c.seed, c.kind, "+".join(c.truth), c.verdict, "+".join(c.found),
+             " ".join("|".join(a) for a in c.ambiguous), c.right_class, c.exact, c.signal_to_noise, c.probability,
+             c.shrinkage, c.seconds)
+            for c in self.cases
+        ]  # fmt: skip
+        names = ("seed", "kind", "truth", "verdict", "found", "ambiguous_with", "right_class", "exact",
+                 "signal_to_noise", "probability", "shrinkage", "seconds")  # fmt: skip
+        kinds = (int, str, str, str, str, str, bool, bool, float, float, float, float)
+        return Table(rows=rows or None, names=names, dtype=kinds)
+
+    def pulls(self) -> FloatArray:
+        """All pulls of exactly named effects."""
+        return np.array([pull for case in self.cases for pull in case.pulls.values()])
+
+    def summary(self) -> dict[str, Any]:
+        """The numbers of the protocol."""
+        null, one = self.of_kind("none"), self.of_kind("one")
+        two, outside = self.of_kind("two"), self.of_kind("outsider")
+        strong = [case for case in one if case.signal_to_noise >= 10.0]
+        pulls = self.pulls()
+        shrink = [case.shrinkage for case in strong if case.right_class and math.isfinite(case.shrinkage)]
+        named = [case for case in self.cases if case.verdict == "named"]
+        return {
+            "false_discoveries": [sum(case.verdict == "named" for case in null), len(null)],
+            "no_discrepancy": [sum(case.verdict == "no_discrepancy" for case in null), len(null)],
+            "one_right_class": [sum(case.right_class for case in strong), len(strong)],
+            "one_exact": [sum(case.exact for case in strong), len(strong)],
+            "two_right_class": [sum(case.right_class for case in two), len(two)],
+            "outsiders_named": [sum(case.verdict == "named" for case in outside), len(outside)],
+            "pull_mean": float(pulls.mean()) if pulls.size else math.nan,
+            "pull_median": float(np.median(pulls)) if pulls.size else math.nan,
+            "pull_width": float(1.4826 * np.median(np.abs(pulls - np.median(pulls))))
+            if pulls.size
+            else math.nan,
+            "pull_std": float(pulls.std()) if pulls.size else math.nan,
+            "shrinkage_median": float(np.median(shrink)) if shrink else math.nan,
+            "stated_probability": float(np.mean([case.probability for case in named])) if named else math.nan,
+            "named_right": [sum(case.right_class for case in named), len(named)],
+            "median_seconds": float(np.median([case.seconds for case in self.cases]))
+            if self.cases
+            else math.nan,
+        }
+
+    def accuracy(self) -> Table:
+        """Part of single effects in the right class, and exactly named, against signal to noise."""
+        rows = []
+        for low, high in (
+            (0.0, 3.0),
+            (3.0, 5.0),
+            (5.0, 10.0),
+            (10.0, 30.0),
+            (30.0, 100.0),
+            (100.0, math.inf),
+        ):
+            inside = [c for c in self.of_kind("one") if low <= c.signal_to_noise < high]
+            if inside:
+                right, exact = (
+                    np.mean([getattr(c, name) for c in inside]) for name in ("right_class", "exact")
+                )
+                rows.append((low, high, len(inside), float(right), float(exact)))
+        names = ("signal_to_noise_from", "signal_to_noise_to", "cases", "right_class", "exact")
+        return Table(rows=rows or None, names=names, dtype=(float, float, int, float, float))
+
+    def write(self, out_dir: str | Path) -> Path:
+        """Write the tables of the challenge; returns the path of the table of cases."""
+        folder = Path(out_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        table = self.table()
+        table.meta.update({"seed": self.seed, **dict(self.summary().items())})
+        table.write(folder / "challenge.ecsv", format="ascii.ecsv", overwrite=True)
+        self.confusion().write(folder / "confusion.ecsv", format="ascii.ecsv", overwrite=True)
+        self.accuracy().write(folder / "accuracy.ecsv", format="ascii.ecsv", overwrite=True)
+        return folder / "challenge.ecsv"
+
+
+def draw_case(
+    kind: str, rng: np.random.Generator, *, size: tuple[int, int] = (96, 96), only: Sequence[str] = ()
+) -> SealedCase:
+    """Draw a sensor, its effects and its noise.
+
+    Parameters
+    ----------
+    kind : `str`
+        One of `CASE_KINDS`.
+    rng : `numpy.random.Generator`
+        Decides everything.
+    size : `tuple` [`int`, `int`], optional
+        Rows and columns.
+    only : sequence of `str`, optional
+        Effects of `SIZES` (or of `OUTSIDERS`) from which to draw; all by default.
+    """
+    if kind not in CASE_KINDS:
+        raise UnknownNameError("kind of case", kind, CASE_KINDS)
+    values: dict[str, float] = {}
+    outsider = ""
+    if kind in ("one", "two"):
+        pool = list(only) or list(SIZES)
+        for name in rng.choice(pool, size=1 if kind == "one" else 2, replace=False):
+            values.update(SIZES[str(name)](rng))
+    elif kind == "outsider":
+        outsider = str(rng.choice(list(only) or list(OUTSIDERS)))
+    thickness = random_field(
+        size, rng, mean=float(rng.uniform(13.0, 20.0)), span=float(rng.uniform(1.5, 5.0))
+    )
+    noise_factor = float(rng.uniform(0.8, 1.2) ** 2)
+    cube, sizes = _expose(thickness, values, outsider, noise_factor, rng)
+    names = tuple(dict.fromkeys(key.split(".")[0] for key in values)) or ((outsider,) if outsider else ())
+    return SealedCase(cube, "ts8_e2v", kind, names, {**values, **sizes}, thickness, noise_factor)
+
+
+def _expose(
+    thickness: FloatArray,
+    values: Mapping[str, float],
+    outsider: str,
+    noise_factor: float,
+    rng: np.random.Generator,
+) -> tuple[FringeCube, dict[str, float]]:
+    optics, _ = setup_optics("ts8_e2v")
+    active = validate_effects(values)
+    for effect, own in active:
+        if effect.on_optics is not None:
+            optics = effect.on_optics(optics, effect.complete(own))
+    wavelengths = np.arange(880.0, 991.0, 10.0)
+    if rng.random() < 0.3:  # real runs lose exposures
+        wavelengths = np.sort(rng.choice(wavelengths, size=10, replace=False))
+    table = optics.table((float(thickness.min()), float(thickness.max())), tuple(wavelengths))
+    shape = thickness.shape
+    response = 1.0 + float(rng.choice([0.0, 0.003, 0.006])) * rng.standard_normal(shape)
+    gain, offset = _amplifiers(active, shape, rng)
+    scene, sizes = _scene(outsider, shape, rng)
+    level = _decades(rng, 4.0, 4.7)
+    images, variances = [], []
+    for row, wavelength in enumerate(wavelengths):
+        light = table.evaluate(row, thickness)
+        light = light / light.mean()
+        for effect, own in active:
+            if effect.on_light is not None:
+                light = effect.on_light(light, effect.complete(own))
+        if outsider:
+            light = OUTSIDERS[outsider][0](light, float(wavelength), scene)
+        light = light / light.mean() * level * (1.0 + 0.02 * rng.standard_normal())
+        charge = rng.poisson(light * response).astype(float)
+        for effect, own in active:
+            if effect.on_charge is not None:
+                charge = effect.on_charge(charge, effect.complete(own))
+        counts = (charge + offset + READ_NOISE_E * rng.standard_normal(shape)) / gain
+        images.append(counts)
+        variances.append((np.maximum(counts, 1.0) + READ_NOISE_E**2) / noise_factor)
+    mask = np.zeros((len(wavelengths), *shape), dtype=np.int32)
+    if rng.random() < 0.5:
+        mask[:, rng.random(shape) < 0.005] = mask_bits("BAD")
+        mask[:, :, rng.integers(shape[1])] = mask_bits("BAD")
+    cube = FringeCube(
+        np.array(images, dtype=np.float32),
+        np.array(variances, dtype=np.float32),
+        mask,
+        FlatExposures(wavelengths, STATED_FWHM_NM, STATED_KELVIN),
+        "electron",
+        detector="sealed",
+    )
+    return cube, sizes
+
+
+def _amplifiers(
+    active: Sequence[tuple[HiddenEffect, dict[str, float]]], shape: tuple[int, ...], rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Gain and offset of every pixel."""
+    gain, offset = np.ones(shape), np.zeros(shape)
+    deviates = rng.standard_normal((2, 8, max(len(active), 1)))
+    for row in range(2):
+        for column in range(8):
+            state = AmplifierState(f"C{row}{column}", 1.0, READ_NOISE_E, 1e9)
+            for number, (effect, own) in enumerate(active):
+                if effect.on_amplifier is not None:
+                    state = effect.on_amplifier(
+                        state, effect.complete(own), float(deviates[row, column, number])
+                    )
+            place = (
+                slice(shape[0] * row // 2, shape[0] * (row + 1) // 2),
+                slice(shape[1] * column // 8, shape[1] * (column + 1) // 8),
+            )
+            gain[place], offset[place] = state.gain, state.offset_e + state.dark_e
+    return gain, offset
+
+
+def _scene(
+    outsider: str, shape: tuple[int, ...], rng: np.random.Generator
+) -> tuple[dict[str, Any], dict[str, float]]:
+    if not outsider:
+        return {}, {}
+    _, low, high = OUTSIDERS[outsider]
+    size = _decades(rng, low, high)
+    scene = {
+        "size": size,
+        "film": random_field((shape[0], shape[1]), rng, mean=8.0, span=2.0),
+        "period": float(rng.uniform(6.0, 20.0)),
+        "stains": [
+            (rng.uniform(0, shape[0]), rng.uniform(0, shape[1]), rng.uniform(4, 12)) for _ in range(4)
+        ],
+        "columns": rng.standard_normal(shape[1]),
+    }
+    return scene, {f"{outsider}.size": size}
+
+
+def run_challenge(
+    counts: Mapping[str, int],
+    seed: int,
+    *,
+    size: tuple[int, int] = (96, 96),
+    options: SearchOptions | None = None,
+    only: Sequence[str] = (),
+    progress: Callable[[CaseResult], None] | None = None,
+) -> ChallengeResult:
+    """Draw cases, search each, and judge the answers.
+
+    Parameters
+    ----------
+    counts : mapping
+        How many cases of each of `CASE_KINDS`.
+    seed : `int`
+        Seed of the whole challenge; every case has a stream of its own.
+    size : `tuple` [`int`, `int`], optional
+        Rows and columns of the sensors.
+    options : `SearchOptions`, optional
+        Thresholds of the search.
+    only : sequence of `str`, optional
+        Effects from which to draw.
+    progress : callable, optional
+        Called with each result.
+    """
+    results: list[CaseResult] = []
+    kinds = [kind for kind in CASE_KINDS for _ in range(counts.get(kind, 0))]
+    for number, kind in enumerate(kinds):
+        case_rng, search_rng = np.random.default_rng([seed, number]).spawn(2)
+        case = draw_case(kind, case_rng, size=size, only=only if kind in ("one", "two") else ())
+        began = time.process_time()
+        verdict = discover(case.cube, case.setup, rng=search_rng, options=options)
+        seconds = time.process_time() - began
+        result = judge(case, verdict, number, seconds, _ask_oracle(case, options))
+        results.append(result)
+        if progress is not None:
+            progress(result)
+    return ChallengeResult(seed, tuple(results), asdict(options or SearchOptions()))
+
+
+def _ask_oracle(case: SealedCase, options: SearchOptions | None) -> Verdict | None:
+    """Verdict of the search when it is told which effects can be in."""
+    known = [effect for effect in EFFECTS if effect.name in case.names]
+    if not known:
+        return None
+    trusting = replace(options or SearchOptions(), significance=1.0, least_evidence=-math.inf)
+    return discover(case.cube, case.setup, known, rng=np.random.default_rng(0), options=trusting)
+
+
+def judge(
+    case: SealedCase, verdict: Verdict, seed: int, seconds: float, oracle: Verdict | None
+) -> CaseResult:
+    """Compare a verdict with the truth."""
+    found = tuple(effect.name for effect in verdict.effects)
+    classes = [{effect.name, *effect.ambiguous_with} for effect in verdict.effects]
+    right = (
+        case.kind in ("one", "two")
+        and verdict.verdict == "named"
+        and len(classes) == len(case.names)
+        and any(
+            all(name in group for name, group in zip(order, classes, strict=True))
+            for order in _orders(case.names)
+        )
+    )
+    exact = right and sorted(found) == sorted(case.names)
+    pulls = {}
+    if exact:
+        for effect in verdict.effects:
+            for name, parameter in effect.parameters.items():
+                key = f"{effect.name}.{name}"
+                if key in case.values and parameter.sigma > 0.0:
+                    pulls[key] = (parameter.value - case.values[key]) / parameter.sigma
+    strength, shrinkage = math.nan, math.nan
+    if oracle is not None:
+        strength = math.sqrt(max(sum(step.delta_chi2 for step in oracle.steps), 0.0))
+        whole = oracle.gap.heldout_before**2 - oracle.gap.heldout_after**2
+        own = verdict.gap.heldout_before**2 - verdict.gap.heldout_after**2
+        shrinkage = own / whole if whole > 0.0 else math.nan
+    return CaseResult(
+        seed,
+        case.kind,
+        case.names,
+        case.values,
+        verdict.verdict,
+        found,
+        tuple(effect.ambiguous_with for effect in verdict.effects),
+        right,
+        exact,
+        strength,
+        min((effect.probability for effect in verdict.effects), default=0.0),
+        pulls,
+        shrinkage,
+        seconds,
+    )
+
+
+def _orders(names: tuple[str, ...]) -> list[tuple[str, ...]]:
+    return [names] if len(names) < 2 else [names, names[::-1]]
