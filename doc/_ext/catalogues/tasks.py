@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from importlib import resources
 from typing import Any
 
@@ -81,12 +80,11 @@ def _fields(config: Any) -> list[tuple[str, ...]]:
 
 
 def _type(field: Any) -> str:
-    if isinstance(field, ConfigDictField):
+    if isinstance(field, ConfigDictField | DictField):
         return f"{field.keytype.__name__} → {field.itemtype.__name__}"
-    if isinstance(field, DictField):
-        return f"{field.keytype.__name__} → {field.itemtype.__name__}"
-    name = field.dtype.__name__ if inspect.isclass(getattr(field, "dtype", None)) else type(field).__name__
-    return f"list of {name}" if isinstance(field, ListField) else name
+    if isinstance(field, ListField):
+        return f"list of {field.itemtype.__name__}"
+    return str(field.dtype.__name__)
 
 
 def _default(config: Any, name: str) -> Any:
