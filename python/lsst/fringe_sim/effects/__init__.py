@@ -48,7 +48,6 @@ __all__ = [
     "Effect",
     "ImageGeometry",
     "Parameter",
-    "Parameter",
     "ResponseContext",
     "activate_effects",
     "apply_to_image",

@@ -1,0 +1,68 @@
+"""The search on sealed cases of the independent simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery import Verdict, discover, read_effects_override
+from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, SplineBasis
+from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.model import FringeModel
+
+SIZE = (48, 64)
+
+
+def test_banded_normal_matrix_is_the_dense_one() -> None:
+    rng = np.random.default_rng(1)
+    basis = SplineBasis.of_grid((20, 26), 4.0)
+    curvature = rng.random((20, 26))
+    dense = np.einsum("ya,xb->yxab", basis.along_y, basis.along_x).reshape(520, -1)
+    normal = dense.T @ (curvature.ravel()[:, None] * dense)
+    normal += np.eye(len(normal)) * RIDGE * normal.diagonal().max()
+    right = rng.random((basis.size, 3))
+    np.testing.assert_allclose(
+        basis.normal_matrix(curvature).solve(right), np.linalg.solve(normal, right), rtol=1e-5, atol=1e-6
+    )
+
+
+@pytest.mark.slow
+def test_nothing_is_found_where_nothing_is_hidden() -> None:
+    for seed in (11, 12):
+        case = draw_case("none", np.random.default_rng(seed), size=SIZE)
+        verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0))
+        assert verdict.verdict == "no_discrepancy"
+        assert verdict.effects == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["illumination", "amplifier_gain"])
+def test_a_hidden_effect_is_named(name: str, tmp_path) -> None:
+    case = draw_case("one", np.random.default_rng(21), size=SIZE, only=[name])
+    verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0))
+    assert verdict.verdict == "named"
+    effect = verdict.effects[0]
+    assert name in {effect.name, *effect.ambiguous_with}
+    assert effect.probability >= 0.95
+    assert verdict.gap.heldout_after < verdict.gap.heldout_before
+    path = verdict.write(tmp_path)
+    assert Verdict.from_json(path.read_text()).settings == verdict.settings
+    assert read_effects_override((tmp_path / "effects.py").read_text()) == verdict.settings
+    FringeModel.from_setup(case.setup, verdict.settings)
+
+
+def test_poor_data_are_told_to_be_poor() -> None:
+    cube = draw_case("none", np.random.default_rng(3), size=SIZE).cube
+    verdict = discover(cube.take([4]), "ts8_e2v", rng=np.random.default_rng(0))
+    assert verdict.verdict == "unexplained"
+    assert verdict.unexplained["too_poor"]
+    assert "thickness map" in verdict.unexplained["reason"]
+
+
+def test_contradicting_set_up_is_refused() -> None:
+    cube = draw_case("none", np.random.default_rng(3), size=SIZE).cube
+    with pytest.raises(InputError, match="bandwidth"):
+        discover(cube, "bnl_ts8_e2v", rng=np.random.default_rng(0))
+    with pytest.raises(InputError, match="monochromator"):
+        discover(cube, "lsst_e2v", rng=np.random.default_rng(0))
