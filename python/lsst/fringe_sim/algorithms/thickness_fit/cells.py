@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...errors import InputError
 from .amplitudes import Amplitudes
+from .medians import middle_of
 from .templates import LANES
 
 __all__ = ["Cells", "average_cells", "cell_edges", "compensate_slopes", "effective_number", "sample_pixels"]
@@ -211,8 +212,12 @@ def compensate_slopes(
     for _ in range(4):
         kept = np.maximum(np.sinc(true_y) * np.sinc(true_x), _LEAST_CONTRAST)
         # Across a cell the difference of the halves keeps sinc(t/2) of the mean slope's sinc(t).
-        true_y = turn_y / np.maximum(np.sinc(true_x) * np.sinc(0.5 * np.clip(true_y, -1, 1)) ** 2, _LEAST_CONTRAST)
-        true_x = turn_x / np.maximum(np.sinc(true_y) * np.sinc(0.5 * np.clip(true_x, -1, 1)) ** 2, _LEAST_CONTRAST)
+        true_y = turn_y / np.maximum(
+            np.sinc(true_x) * np.sinc(0.5 * np.clip(true_y, -1, 1)) ** 2, _LEAST_CONTRAST
+        )
+        true_x = turn_x / np.maximum(
+            np.sinc(true_y) * np.sinc(0.5 * np.clip(true_x, -1, 1)) ** 2, _LEAST_CONTRAST
+        )
     kept = np.where(np.isfinite(kept), kept, 1.0).astype(np.float32)[..., None]
     return (
         replace(cells, value=cells.value / kept, weight=cells.weight * kept**2),
@@ -339,13 +344,26 @@ def _average_strip(  # type: ignore[no-untyped-def]
             if count < _LEAST_FILLED * rows * width:
                 continue
             noise = np.sqrt(var / count)
-            # Rows: one pass over the cell, which is in cache.
-            for r in range(rows):
-                row_sum, row_count = np.float32(0.0), np.float32(0.0)
+            for r in range(rows):  # the cell is still in cache
+                row_sum = np.float32(0.0)
                 for x in range(low, high):
                     row_sum += value[r, x]
+                line[r] = row_sum
+            if count == rows * width:
+                across, along = column_sum[low:high], line[:rows]
+                tolerance_x = _tolerance(noise, rows, correlated, curvature[band])
+                tolerance_y = _tolerance(noise, width, correlated, curvature[band])
+                if _bend(across) <= rows * tolerance_x and _bend(along) <= width * tolerance_y:
+                    rise_x[c, band] = _half_slope(across) / rows
+                    rise_y[c, band] = _half_slope(along) / width
+                    out[c, band] = total / count
+                    out_weight[c, band] = count * count / (var * inflation)
+                    continue
+            for r in range(rows):
+                row_count = np.float32(0.0)
+                for x in range(low, high):
                     row_count += np.float32(1.0) if spread[r, x] > 0.0 else np.float32(0.0)
-                line[r], line_count[r] = row_sum, row_count
+                line_count[r] = row_count
             rejected = _reject(line, line_count, rows, noise, correlated, curvature[band], keep_row)
             rise_y[c, band] = _slope(line, line_count, rows, keep_row)
             for x in range(width):
@@ -367,6 +385,40 @@ def _average_strip(  # type: ignore[no-untyped-def]
             out_weight[c, band] = count * count / (var * inflation)
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _tolerance(noise, count, correlated, curvature):  # type: ignore[no-untyped-def]
+    """Second difference of line means up to which no line of a filled cell is rejected.
+
+    Inside, a line that is tolerated bends by less than ``2 (6 sigma sqrt(3/2) + curvature)``; the two ends are
+    tested on the same second difference, with ``6 sigma sqrt(6) + 2 curvature``: the same number.
+    """
+    sigma = noise if correlated else noise / np.sqrt(count)
+    return np.float32(_SPIKE_SIGMA * sigma * np.sqrt(6.0) + 2.0 * curvature)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _bend(line):  # type: ignore[no-untyped-def]
+    """Largest second difference."""
+    most = np.float32(0.0)
+    for k in range(1, line.shape[0] - 1):
+        most = max(most, abs(line[k - 1] - np.float32(2.0) * line[k] + line[k + 1]))
+    return most
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _half_slope(line):  # type: ignore[no-untyped-def]
+    """Mean of the upper half less mean of the lower half, over the distance of the two."""
+    size = line.shape[0]
+    half = size // 2
+    if half == 0:
+        return np.float32(0.0)
+    low, high = np.float32(0.0), np.float32(0.0)
+    for k in range(half):
+        low += line[k]
+        high += line[size - 1 - k]
+    return (high - low) / np.float32(half * (size - half))
+
+
 @numba.njit(cache=True, nogil=True)
 def _reject(total, count, size, noise, correlated, curvature, keep):  # type: ignore[no-untyped-def]
     """Mark lines whose mean does not lie between its neighbours; returns how many.
@@ -377,8 +429,6 @@ def _reject(total, count, size, noise, correlated, curvature, keep):  # type: ig
     """
     for k in range(size):
         keep[k] = count[k] > 0.0
-    if _is_smooth(total, count, size, noise, correlated, curvature):
-        return 0
     rejected = 0
     while rejected < size // 2:
         worst, least_ratio = -1, 1.0
@@ -401,27 +451,6 @@ def _reject(total, count, size, noise, correlated, curvature, keep):  # type: ig
         keep[worst] = False
         rejected += 1
     return rejected
-
-
-@numba.njit(cache=True, nogil=True)
-def _is_smooth(total, count, size, noise, correlated, curvature):  # type: ignore[no-untyped-def]
-    """Whether no line can be rejected, for the usual case of lines that are all filled alike.
-
-    Inside, a line that is tolerated bends by less than ``2 (6 sigma sqrt(3/2) + curvature)``; the two ends are
-    tested on the same second difference, with ``6 sigma sqrt(6) + 2 curvature``: the same number.
-    """
-    first = count[0]
-    if first <= 0.0:
-        return False
-    most = np.float32(0.0)
-    for k in range(1, size - 1):
-        if count[k] != first:
-            return False
-        most = max(most, abs(total[k - 1] - np.float32(2.0) * total[k] + total[k + 1]))
-    if size < 3 or count[size - 1] != first:
-        return False
-    sigma = noise if correlated else noise / np.sqrt(first)
-    return most <= first * (_SPIKE_SIGMA * sigma * np.sqrt(6.0) + 2.0 * curvature)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -481,5 +510,4 @@ def _median(total, count, size, keep):  # type: ignore[no-untyped-def]
         if keep[k]:
             means[number] = total[k] / count[k]
             number += 1
-    ordered = np.sort(means[:number])
-    return ordered[number // 2]
+    return middle_of(means, number)

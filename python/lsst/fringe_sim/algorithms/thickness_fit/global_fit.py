@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from .amplitudes import Amplitudes
+from .borders import settle_borders
 from .cells import Cells, average_cells, cell_edges, compensate_slopes, effective_number
-from .orders import OrderEvidence, OrderSolution, order_evidence, refine_cells, solve_orders
-from .pixels import CellSurface, PixelFit, fit_pixels
+from .evidence import OrderEvidence, order_evidence, refine_cells
+from .orders import OrderSolution, solve_orders
+from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
 from .relaxation import SettledCells, settle_orders
 from .templates import FringeTemplates
 
@@ -45,6 +48,8 @@ class GlobalFit:
         Averages that the orders were solved on.
     settled : `SettledCells`
         Order of every cell, and how sure it is.
+    border_slip : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        Probability that a pixel near a step lies on the other side of it.
     templates : `FringeTemplates`
         The model as it was normalised in the end.
     order_um : `float`
@@ -56,6 +61,7 @@ class GlobalFit:
     pixels: PixelFit
     cells: Cells
     settled: SettledCells
+    border_slip: NDArray[np.float32]
     templates: FringeTemplates
     order_um: float
     normalisation: str
@@ -109,8 +115,17 @@ def global_fit(
     if normalisation == "sensor":
         thickness, fitted = normalise_to_cells(cells, fitted, thickness, threads)
     surface = _surface(cells, thickness, slope_y, slope_x, order)
-    pixels = fit_pixels(data, fitted, surface, order, threads=threads)
-    return GlobalFit(pixels, cells, settled, fitted, order, normalisation)
+    pixels = fit_pixels(data, fitted, calm_surface(surface, threads), order, threads=threads)
+    rough = spread_to_pixels(cells, ~surface.smooth)
+    independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
+    pixels, border_slip = settle_borders(data, fitted, pixels, rough, order, independent)
+    return GlobalFit(pixels, cells, settled, border_slip, fitted, order, normalisation)
+
+
+def spread_to_pixels(cells: Cells, values: NDArray[Any]) -> NDArray[Any]:
+    """Image in which every pixel holds the value of its cell."""
+    rows = np.repeat(values, np.diff(cells.y_edges), axis=0)
+    return np.repeat(rows, np.diff(cells.x_edges), axis=1)
 
 
 def _solve(

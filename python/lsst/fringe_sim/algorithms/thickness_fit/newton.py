@@ -1,17 +1,42 @@
-"""Refinement of a thickness by Gauss-Newton steps on a fine table of templates."""
+"""Refinement of a thickness by Gauss-Newton steps on a fine table of templates.
+
+These are the innermost loops of the fit: rows of wavelengths are padded so that they fill vector registers, and
+the two steps that nearly every pixel needs are taken without a branch.
+"""
 
 from __future__ import annotations
 
 import numba
 import numpy as np
 
-__all__ = ["gauss_newton", "score"]
+__all__ = ["gauss_newton", "newton_inline", "score"]
 
 _MATH = {"reassoc", "contract", "arcp", "nsz"}
+_TINY = np.float32(1e-30)
+_CLOSE = np.float32(1.5)
+"""A second step shorter than this, in steps of a table with 300 per order, leaves nothing to a third."""
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
+def _score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
+    below = np.uint32(min(int(place), table.shape[0] - 2))
+    share = np.float32(place - below)
+    low, high = table[below], table[below + 1]
+    values, weights = value[item], weight[item]
+    gain, information, chi2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for band in range(table.shape[1]):
+        start = low[band]
+        slope = high[band] - start
+        miss = values[band] - (start + share * slope)
+        leverage = weights[band] * slope
+        gain += leverage * miss
+        information += leverage * slope
+        chi2 += weights[band] * miss * miss
+    return gain, information, chi2
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH)
-def score(table, place, value, weight):  # type: ignore[no-untyped-def]
+def score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
     """Score, information and chi-square at one place of the table, in units of its step.
 
     Parameters
@@ -20,40 +45,63 @@ def score(table, place, value, weight):  # type: ignore[no-untyped-def]
         Template amplitudes.
     place : `float`
         Thickness in steps of the table; between 0 and ``n_thickness - 1``.
-    value, weight : float32, shape ``(padded wavelengths,)``
+    value, weight : float32, shape ``(n, padded wavelengths)``
         Amplitudes and inverse variances; weight 0 where there is none.
+    item : `int`
+        Which row of them.
 
     Returns
     -------
     score, information, chi2 : `float`
         ``sum w g r``, ``sum w g²`` and ``sum w r²`` with the residual ``r`` and the slope ``g``.
     """
-    below = min(int(place), table.shape[0] - 2)
-    share = np.float32(place - below)
-    low, high = table[below], table[below + 1]
-    gain, information, chi2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    for band in range(value.shape[0]):
-        slope = high[band] - low[band]
-        miss = value[band] - (low[band] + share * slope)
-        leverage = weight[band] * slope
-        gain += leverage * miss
-        information += leverage * slope
-        chi2 += weight[band] * miss * miss
-    return gain, information, chi2
+    return _score(table, place, value, weight, item)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH)
-def gauss_newton(table, place, value, weight, steps, longest):  # type: ignore[no-untyped-def]
+def _go_on(table, place, value, weight, item, step, steps, limit):  # type: ignore[no-untyped-def]
+    """Third and further steps."""
+    top = table.shape[0] - 1.0
+    information, chi2 = np.float32(0.0), np.float32(0.0)
+    for _ in range(steps - 2):
+        place = min(max(place + min(max(step, -limit), limit), 0.0), top)
+        gain, information, chi2 = score(table, place, value, weight, item)
+        step = gain / max(information, _TINY)
+        if abs(step) <= _CLOSE:
+            return min(max(place + step, 0.0), top), information, chi2 - gain * step
+    return place, information, chi2
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
+def newton_inline(table, place, value, weight, item, steps, longest):  # type: ignore[no-untyped-def]
+    """Like `gauss_newton`, written out where it is called: a call costs more than the two usual steps."""
+    top = table.shape[0] - 1.0
+    limit = np.float32(longest)
+    gain, information, chi2 = _score(table, place, value, weight, item)
+    step = gain / max(information, _TINY)
+    place = min(max(place + min(max(step, -limit), limit), 0.0), top)
+    gain, information, chi2 = _score(table, place, value, weight, item)
+    step = gain / max(information, _TINY)
+    if abs(step) > _CLOSE:
+        place, information, chi2 = _go_on(table, place, value, weight, item, step, steps, limit)
+    else:
+        place = min(max(place + step, 0.0), top)
+        chi2 -= gain * step
+    return place, information, chi2
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+def gauss_newton(table, place, value, weight, item, steps, longest):  # type: ignore[no-untyped-def]
     """Least chi-square near a place of the table.
 
     Parameters
     ----------
-    table, value, weight
+    table, value, weight, item
         As for `score`.
     place : `float`
         Where to begin.
     steps : `int`
-        Largest number of steps; a step below a tenth of the standard deviation ends the search.
+        Largest number of steps, at least 3; a second step below half a per cent of an order ends the search.
     longest : `float`
         Longest single step, in steps of the table.
 
@@ -62,20 +110,4 @@ def gauss_newton(table, place, value, weight, steps, longest):  # type: ignore[n
     place, information, chi2 : `float`
         Where it ended, information there, and chi-square after the last (quadratic) step.
     """
-    top = table.shape[0] - 1.0
-    information, chi2 = np.float32(0.0), np.float32(0.0)
-    for _ in range(steps):
-        gain, information, chi2 = score(table, place, value, weight)
-        if information <= 0.0:
-            break
-        step = gain / information
-        if abs(step) > longest:
-            place = min(max(place + (longest if step > 0.0 else -longest), 0.0), top)
-            continue
-        moved = min(max(place + step, 0.0), top)
-        if moved == place + step:
-            chi2 -= gain * step
-        place = moved
-        if step * step * information < np.float32(0.01):
-            break
-    return place, information, chi2
+    return newton_inline(table, place, value, weight, item, steps, longest)

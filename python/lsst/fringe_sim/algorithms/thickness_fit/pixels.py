@@ -7,7 +7,7 @@ its own amplitudes prefer.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -16,10 +16,11 @@ from scipy.ndimage import binary_dilation
 
 from .amplitudes import Amplitudes
 from .cells import core, load_row, run_threaded
-from .newton import gauss_newton
+from .medians import middle_of
+from .newton import gauss_newton, newton_inline
 from .templates import FringeTemplates
 
-__all__ = ["CellSurface", "PixelFit", "fit_pixels"]
+__all__ = ["CellSurface", "PixelFit", "calm_surface", "fit_pixels"]
 
 _MATH = {"reassoc", "contract", "arcp", "nsz"}
 _STEPS = 5
@@ -31,6 +32,8 @@ _SAME_SURFACE = 0.25
 _LONE_CELL_PENALTY = 12.0
 """Chi-square by which a surface shown by a single cell must be better than one that several show."""
 _BAND_ROWS = 16
+_BLOCK = 16
+_KEEP_APART = 80
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +108,48 @@ class CellSurface:
         )
 
 
+def calm_surface(surface: CellSurface, threads: int = 2) -> CellSurface:
+    """Replace every smooth cell by the median of what the 5 by 5 cells around it foretell.
+
+    Only a place to begin: a cell that noise has put on a false minimum, a fraction of an order away, must not
+    take its pixels there.
+
+    Parameters
+    ----------
+    surface : `CellSurface`
+        Cells as they were solved.
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+    """
+    out = surface.thickness_um.copy()
+
+    def work(row: int) -> None:
+        _calm_row(
+            surface.thickness_um, surface.slope_y, surface.slope_x, surface.y_centre, surface.x_centre,
+            surface.smooth, row, out[row],
+        )  # fmt: skip
+
+    run_threaded(work, len(out), threads)
+    return replace(surface, thickness_um=out)
+
+
+@numba.njit(cache=True, nogil=True)
+def _calm_row(thickness, slope_y, slope_x, y_centre, x_centre, smooth, row, out):  # type: ignore[no-untyped-def]
+    ny, nx = thickness.shape
+    guess = np.empty(25, np.float64)
+    for x in range(nx):
+        if not smooth[row, x]:
+            continue
+        number = 0
+        for b in range(max(row - 2, 0), min(row + 3, ny)):
+            for a in range(max(x - 2, 0), min(x + 3, nx)):
+                if smooth[b, a]:
+                    up = slope_y[b, a] * (y_centre[row] - y_centre[b])
+                    guess[number] = thickness[b, a] + up + slope_x[b, a] * (x_centre[x] - x_centre[a])
+                    number += 1
+        out[x] = middle_of(guess, number)
+
+
 def fit_pixels(
     data: Amplitudes,
     templates: FringeTemplates,
@@ -168,57 +213,99 @@ def _fit_band(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     bands, rows, columns = image.shape
     padded = table.shape[1]
-    ncy, ncx = thickness.shape
     longest = _LONGEST_STEP * order / step
-    amplitude = np.zeros((bands, columns), np.float32)
-    spread = np.zeros((bands, columns), np.float32)
-    y, w = np.zeros(padded, np.float32), np.zeros(padded, np.float32)
+    # Rows of 2^n pixels would share the lines of the processor's cache; a few pixels more keep them apart.
+    amplitude = np.zeros((bands, columns + _KEEP_APART), np.float32)
+    weight = np.zeros((bands, columns + _KEEP_APART), np.float32)
+    # Amplitudes lie far apart in a cube; blocks of pixels bring those of one pixel together.
+    y, w = np.zeros((_BLOCK, padded), np.float32), np.zeros((_BLOCK, padded), np.float32)
+    begin, flat = np.empty(columns, np.float32), np.empty(columns, np.bool_)
+    upright = np.empty(thickness.shape[1], np.float32)
     for r in range(rows):
         for band in range(bands):
             vb = band if variance.shape[0] > 1 else 0
             bb = band if bad.shape[0] > 1 else 0
             vr = r if variance.shape[1] > 1 else 0
             br = r if bad.shape[1] > 1 else 0
-            load_row(
-                image[band, r], variance[vb, vr], bad[bb, br], scale[band], amplitude[band], spread[band]
-            )
-        j = below_y[first_row + r]
-        v = share_y[first_row + r]
-        jj = min(j + 1, ncy - 1)
-        for x in range(columns):
-            count = 0
+            line, spread = amplitude[band][:columns], weight[band][:columns]
+            load_row(image[band, r], variance[vb, vr], bad[bb, br], scale[band], line, spread)
+            _invert_row(spread, used_out[r])
+        own_y = _start_row(
+            thickness,
+            smooth,
+            below_y[first_row + r],
+            share_y[first_row + r],
+            below_x,
+            share_x,
+            upright,
+            begin,
+            flat,
+        )
+        for first in range(0, columns, _BLOCK):
+            size = min(_BLOCK, columns - first)
             for band in range(bands):
-                y[band] = amplitude[band, x]
-                if spread[band, x] > 0.0:
-                    w[band] = np.float32(1.0) / spread[band, x]
-                    count += 1
+                for b in range(size):
+                    y[b, band] = amplitude[band, first + b]
+                    w[b, band] = weight[band, first + b]
+            for b in range(size):
+                x = first + b
+                if used_out[r, x] == 0:
+                    continue
+                if flat[x]:
+                    place = min(max((begin[x] - start) / step, 0.0), table.shape[0] - 1.0)
+                    place, information, chi2 = newton_inline(table, place, y, w, b, _STEPS, longest)
                 else:
-                    w[band] = np.float32(0.0)
-            if count == 0:
-                continue
-            i, u = below_x[x], share_x[x]
-            ii = min(i + 1, ncx - 1)
-            own_y, own_x = (j if v < 0.5 else jj), (i if u < 0.5 else ii)
-            if smooth[own_y, own_x]:
-                left = thickness[j, i] + v * (thickness[jj, i] - thickness[j, i])
-                right = thickness[j, ii] + v * (thickness[jj, ii] - thickness[j, ii])
-                place = (left + u * (right - left) - start) / step
-                place = min(max(place, 0.0), table.shape[0] - 1.0)
-                place, information, chi2 = gauss_newton(table, place, y, w, _STEPS, longest)
-            else:
-                place, information, chi2 = _try_surfaces(
-                    table, start, step, order, y, w, thickness, slope_y, slope_x,
-                    y_centre, x_centre, first_row + r, x, own_y, own_x, longest,
-                )  # fmt: skip
-            value[r, x] = start + step * place
-            sigma[r, x] = step / np.sqrt(information) if information > 0.0 else np.inf
-            chi2_out[r, x] = max(chi2, np.float32(0.0)) / max(count - 1, 1)
-            used_out[r, x] = count
+                    own_x = below_x[x] if share_x[x] < 0.5 else min(below_x[x] + 1, thickness.shape[1] - 1)
+                    place, information, chi2 = _try_surfaces(
+                        table, start, step, order, y, w, b, thickness, slope_y, slope_x,
+                        y_centre, x_centre, first_row + r, x, own_y, own_x, longest,
+                    )  # fmt: skip
+                value[r, x] = start + step * place
+                sigma[r, x] = information
+                chi2_out[r, x] = chi2
+        _finish_row(sigma[r], chi2_out[r], used_out[r], np.float32(step))
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+def _invert_row(spread, used):  # type: ignore[no-untyped-def]
+    """Variance to weight, and one wavelength more where there is one."""
+    for x in range(spread.shape[0]):
+        good = spread[x] > 0.0
+        used[x] += 1 if good else 0
+        spread[x] = np.float32(1.0) / spread[x] if good else np.float32(0.0)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+def _start_row(thickness, smooth, below, share, below_x, share_x, upright, begin, flat):  # type: ignore[no-untyped-def]
+    """Thickness of the surface along one row, and where it is smooth; returns the row of the nearest cells."""
+    above = min(below + 1, thickness.shape[0] - 1)
+    own = below if share < 0.5 else above
+    for c in range(thickness.shape[1]):
+        upright[c] = thickness[below, c] + share * (thickness[above, c] - thickness[below, c])
+    last = thickness.shape[1] - 1
+    for x in range(begin.shape[0]):
+        left, right = below_x[x], min(below_x[x] + 1, last)
+        begin[x] = upright[left] + share_x[x] * (upright[right] - upright[left])
+        flat[x] = smooth[own, left if share_x[x] < 0.5 else right]
+    return own
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+def _finish_row(sigma, chi2, used, step):  # type: ignore[no-untyped-def]
+    """Information to standard uncertainty, chi-square to reduced chi-square, for a whole row at once."""
+    for x in range(sigma.shape[0]):
+        information = sigma[x]
+        safe = information if information > 0.0 else np.float32(1.0)
+        sigma[x] = step / np.sqrt(safe) if information > 0.0 else np.float32(np.inf)
+        chi2[x] = max(chi2[x], np.float32(0.0)) / np.float32(max(used[x] - 1, 1))
+        if used[x] == 0:
+            sigma[x] = np.float32(np.nan)
+            chi2[x] = np.float32(np.nan)
 
 
 @numba.njit(cache=True, nogil=True)
 def _try_surfaces(  # type: ignore[no-untyped-def]
-    table, start, step, order, y, w, thickness, slope_y, slope_x,
+    table, start, step, order, y, w, item, thickness, slope_y, slope_x,
     y_centre, x_centre, row, column, own_y, own_x, longest,
 ):  # fmt: skip
     """Best of the surfaces that the cells around a pixel show."""
@@ -241,7 +328,7 @@ def _try_surfaces(  # type: ignore[no-untyped-def]
     best, best_information, best_chi2, best_cost = 0.0, np.float32(0.0), np.float32(0.0), np.inf
     for k in range(number):
         place = min(max((guess[k] - start) / step, 0.0), table.shape[0] - 1.0)
-        place, information, chi2 = gauss_newton(table, place, y, w, 2 * _STEPS, longest)
+        place, information, chi2 = gauss_newton(table, place, y, w, item, 2 * _STEPS, longest)
         cost = chi2 + (_LONE_CELL_PENALTY if votes[k] == 1 else 0.0)
         if cost < best_cost:
             best, best_information, best_chi2, best_cost = place, information, chi2, cost

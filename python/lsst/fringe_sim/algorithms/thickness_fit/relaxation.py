@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cells import Cells, run_threaded
+from .evidence import EVIDENCE_CAP, IMPOSSIBLE, MISFIT
+from .medians import middle_of, sort_first
 from .newton import gauss_newton, score
-from .orders import EVIDENCE_CAP, MISFIT
 from .templates import FringeTemplates
 
 __all__ = ["SettledCells", "settle_orders"]
@@ -37,7 +38,6 @@ _LARGEST_BLOCK = 64
 _BOLD_BLOCK = 8
 _SWEEPS = 3
 _MOST_ROUNDS = 6
-_IMPOSSIBLE = 1.0e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +100,13 @@ def settle_orders(
     rise_x = slope_x * np.diff(cells.x_edges).astype(np.float32)[None, :]
     table = templates.table()
     grid = (templates.start_um, templates.step_um)
-    limit = MISFIT * max(_typical_misfit(cells.value, cells.weight, table, *grid, thickness), 1.0)
+    flat_value = cells.value.reshape(-1, cells.value.shape[-1])
+    flat_weight = cells.weight.reshape(flat_value.shape)
+    misfit = _misfits(flat_value, flat_weight, table, *grid, thickness.ravel())
+    limit = MISFIT * max(float(np.median(misfit[np.isfinite(misfit)])), 1.0)
     for _ in range(_MEND_ROUNDS):
         moved = _mend(
-            cells.value, cells.weight, table, *grid, thickness, rise_y, rise_x, order_um, temper, limit
+            flat_value, flat_weight, table, *grid, thickness, rise_y, rise_x, order_um, temper, limit
         )
         if moved == 0:
             break
@@ -137,19 +140,24 @@ def settle_orders(
 
 
 @numba.njit(cache=True, nogil=True)
-def _typical_misfit(value, weight, table, start, step, thickness):  # type: ignore[no-untyped-def]
-    """Median reduced chi-square of all cells; 1 if there are none."""
-    ny, nx = thickness.shape
-    seen = np.empty(ny * nx, np.float32)
+def _misfits(value, weight, table, start, step, thickness):  # type: ignore[no-untyped-def]
+    """Reduced chi-square of every cell; NaN where there is no data."""
+    out = np.full(thickness.shape[0], np.nan, np.float32)
+    for c in range(thickness.shape[0]):
+        if np.isfinite(thickness[c]):
+            place = min(max((thickness[c] - start) / step, 0.0), table.shape[0] - 1.0)
+            _, _, chi2 = score(table, place, value, weight, c)
+            out[c] = chi2 / max(_used(weight, c) - 1, 1)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _used(weight, item):  # type: ignore[no-untyped-def]
+    """Number of wavelengths of a cell."""
     number = 0
-    for y in range(ny):
-        for x in range(nx):
-            if np.isfinite(thickness[y, x]):
-                place = min(max((thickness[y, x] - start) / step, 0.0), table.shape[0] - 1.0)
-                _, _, chi2 = score(table, place, value[y, x], weight[y, x])
-                seen[number] = chi2 / max(np.count_nonzero(weight[y, x]) - 1, 1)
-                number += 1
-    return float(np.median(seen[:number])) if number > 0 else 1.0
+    for band in range(weight.shape[1]):
+        number += 1 if weight[item, band] > 0.0 else 0
+    return number
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -177,7 +185,9 @@ def _surfaces(thickness, rise_y, rise_x, limit):  # type: ignore[no-untyped-def]
                 b, a = (y - 1, x) if side == 0 else (y, x - 1)
                 if b < 0 or a < 0:
                     continue
-                rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) if side == 0 else 0.5 * (rise_x[y, x] + rise_x[b, a])
+                rise = (
+                    0.5 * (rise_y[y, x] + rise_y[b, a]) if side == 0 else 0.5 * (rise_x[y, x] + rise_x[b, a])
+                )
                 if abs(thickness[y, x] - thickness[b, a] - rise) < limit:
                     first, second = _top(parent, y * nx + x), _top(parent, b * nx + a)
                     parent[max(first, second)] = min(first, second)
@@ -213,7 +223,9 @@ def _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond):
             b = y - 1 if side == 0 else (y + 1 if side == 1 else y)
             a = x - 1 if side == 2 else (x + 1 if side == 3 else x)
             if 0 <= b < ny and 0 <= a < nx and surface[b, a] >= 0 and surface[b, a] != own:
-                rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (a - x)
+                rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (
+                    a - x
+                )
                 jumps[number] = thickness[b, a] - thickness[y, x] - rise
                 beyond[number] = surface[b, a]
                 number += 1
@@ -221,72 +233,92 @@ def _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond):
 
 
 @numba.njit(cache=True, nogil=True)
-def _main_jump(jumps, beyond, number):  # type: ignore[no-untyped-def]
+def _main_jump(jumps, beyond, number, kept):  # type: ignore[no-untyped-def]
     """Middle jump to the neighbour that shares most of the border."""
-    ordered = np.sort(beyond[:number])
-    most, longest, run = ordered[0], 0, 0
     for k in range(number):
-        run = run + 1 if k > 0 and ordered[k] == ordered[k - 1] else 1
+        kept[k] = beyond[k]
+    sort_first(kept, number)
+    most, longest, run = kept[0], 0, 0
+    for k in range(number):
+        run = run + 1 if k > 0 and kept[k] == kept[k - 1] else 1
         if run > longest:
-            most, longest = ordered[k], run
-    return np.median(jumps[:number][beyond[:number] == most])
+            most, longest = kept[k], run
+    count = 0
+    for k in range(number):
+        if beyond[k] == most:
+            kept[count] = jumps[k]
+            count += 1
+    return middle_of(kept, count)
+
+
+def _mend(
+    value: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    table: NDArray[np.float32],
+    start: float,
+    step: float,
+    thickness: NDArray[np.float32],
+    rise_y: NDArray[np.float32],
+    rise_x: NDArray[np.float32],
+    order: float,
+    temper: float,
+    limit: float,
+) -> int:
+    """Move small surfaces onto the one around them, if that costs less; returns how many moved."""
+    surface, count = _surfaces(thickness, rise_y, rise_x, _LONE * order)
+    if count <= 1:
+        return 0
+    flat = surface.ravel()
+    size = np.bincount(flat[flat >= 0], minlength=count)
+    listed = np.argsort(flat, kind="stable")[np.count_nonzero(flat < 0) :]
+    first = np.concatenate([[0], np.cumsum(size)])
+    moved = 0
+    for own in np.argsort(size, kind="stable"):
+        if size[own] > _LARGEST_MENDED:
+            break
+        moved += _move_surface(
+            value, weight, table, start, step, thickness, rise_y, rise_x, order, temper, limit,
+            surface, listed[first[own] : first[own + 1]], own,
+        )  # fmt: skip
+    return moved
 
 
 @numba.njit(cache=True, nogil=True)
-def _mend(value, weight, table, start, step, thickness, rise_y, rise_x, order, temper, limit):  # type: ignore[no-untyped-def]
-    """Move small surfaces onto the one around them, if that costs less; returns how many moved."""
+def _move_surface(  # type: ignore[no-untyped-def]
+    value, weight, table, start, step, thickness, rise_y, rise_x, order, temper, limit, surface, members, own
+):
+    """Move one surface by its main jump, if that costs less; returns whether it moved."""
     nx = thickness.shape[1]
-    surface, count = _surfaces(thickness, rise_y, rise_x, _LONE * order)
-    size = np.zeros(count, np.int64)
-    for number in surface.ravel():
-        if number >= 0:
-            size[number] += 1
-    if count <= 1:
-        return 0
-    first = np.zeros(count + 1, np.int64)
-    first[1:] = np.cumsum(size)
-    filled = first[:-1].copy()
-    listed = np.empty(first[count], np.int64)
-    for cell in range(surface.size):
-        number = surface[cell // nx, cell % nx]
-        if number >= 0:
-            listed[filled[number]] = cell
-            filled[number] += 1
-    jumps, beyond = np.empty(4 * _LARGEST_MENDED, np.float64), np.empty(4 * _LARGEST_MENDED, np.int64)
-    found = np.empty(_LARGEST_MENDED, np.float64)
+    most = 4 * members.shape[0]
+    jumps, kept, beyond = np.empty(most, np.float64), np.empty(most, np.float64), np.empty(most, np.int64)
+    found = np.empty(members.shape[0], np.float64)
     top = table.shape[0] - 1.0
-    moved = 0
-    for own in np.argsort(size, kind="mergesort"):
-        if size[own] > _LARGEST_MENDED:
-            break
-        members = listed[first[own] : first[own + 1]]
-        number = _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond)
-        if number == 0:
-            continue
-        move = _main_jump(jumps, beyond, number)
-        change = 0.0
-        for k in range(number):
-            change += _break_price(jumps[k] - move, order) - _break_price(jumps[k], order)
-        for k in range(members.shape[0]):
-            y, x = members[k] // nx, members[k] % nx
-            v, w = value[y, x], weight[y, x]
-            place = min(max((thickness[y, x] - start) / step, 0.0), top)
-            _, _, here = score(table, place, v, w)
-            target = thickness[y, x] + move
-            place = min(max((target - start) / step, 0.0), top)
-            place, _, there = gauss_newton(table, place, v, w, 5, 0.03 / step)
-            found[k] = start + step * place
-            if abs(found[k] - target) > _LONE * order:
-                # No minimum there: the cell would have to lie on the surface against its own data.
-                found[k] = target
-                _, _, there = score(table, min(max((target - start) / step, 0.0), top), v, w)
-            misfit = min(here, there) / max(np.count_nonzero(w) - 1, 1)
-            change += _trust(misfit, temper, limit) * (there - here)
-        if change < 0.0:
-            moved += 1
-            for k in range(members.shape[0]):
-                thickness[members[k] // nx, members[k] % nx] = found[k]
-    return moved
+    number = _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond)
+    if number == 0:
+        return 0
+    move = _main_jump(jumps, beyond, number, kept)
+    change = 0.0
+    for k in range(number):
+        change += _break_price(jumps[k] - move, order) - _break_price(jumps[k], order)
+    for k in range(members.shape[0]):
+        item = members[k]
+        own_thickness = thickness[item // nx, item % nx]
+        place = min(max((own_thickness - start) / step, 0.0), top)
+        _, _, here = score(table, place, value, weight, item)
+        target = min(max((own_thickness + move - start) / step, 0.0), top)
+        place, _, there = gauss_newton(table, target, value, weight, item, 5, 0.03 / step)
+        found[k] = start + step * place
+        if abs(place - target) * step > _LONE * order:
+            # No minimum there: the cell would have to lie on the surface against its own data.
+            found[k] = start + step * target
+            _, _, there = score(table, target, value, weight, item)
+        misfit = min(here, there) / max(_used(weight, item) - 1, 1)
+        change += _trust(misfit, temper, limit) * (there - here)
+    if change >= 0.0:
+        return 0
+    for k in range(members.shape[0]):
+        thickness[members[k] // nx, members[k] % nx] = found[k]
+    return 1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -308,19 +340,19 @@ def _ask_row(value, weight, table, start, step, thickness, order, low, high, tem
                 cost[c, k] = np.inf
                 continue
             place = min(max((at - start) / step, 0.0), top)
-            place, _, chi2 = gauss_newton(table, place, value[c], weight[c], 3, 0.03 / step)
+            place, _, chi2 = gauss_newton(table, place, value, weight, c, 3, 0.03 / step)
             found = start + step * place
             # What ran away has no minimum there.
             shifted[c, k] = found if abs(found - at) < SAME_SURFACE * order else at
             cost[c, k] = max(chi2, np.float32(0.0))
             least = min(least, cost[c, k])
-        used = np.count_nonzero(weight[c])
+        used = _used(weight, c)
         scale = _trust(least / max(used - 1, 1), temper, limit)
         for k in range(shifts):
             if np.isfinite(cost[c, k]):
                 cost[c, k] = min(scale * (cost[c, k] - least), EVIDENCE_CAP)
             else:
-                cost[c, k] = _IMPOSSIBLE
+                cost[c, k] = IMPOSSIBLE
 
 
 @numba.njit(cache=True, nogil=True)
@@ -330,7 +362,7 @@ def _border_price(shifted, label, rise_y, rise_x, order, y, x, move, top, bottom
     middle = shifted.shape[2] // 2
     own = label[y, x] + move + middle
     if not 0 <= own < shifted.shape[2]:
-        return _IMPOSSIBLE
+        return IMPOSSIBLE
     here = shifted[y, x, own]
     total = 0.0
     for side in range(4):
@@ -341,7 +373,9 @@ def _border_price(shifted, label, rise_y, rise_x, order, y, x, move, top, bottom
             continue
         there = shifted[b, a, label[b, a] + middle]
         if np.isfinite(there):
-            rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (a - x)
+            rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (
+                a - x
+            )
             total += _break_price(there - here - rise, order)
     return total
 
@@ -365,11 +399,11 @@ def _relax(cost, shifted, label, rise_y, rise_x, order, size):  # type: ignore[n
                         filled += 1
                         for k in range(shifts):
                             at = label[y, x] + k
-                            price[k] += cost[y, x, at] if 0 <= at < shifts else _IMPOSSIBLE
+                            price[k] += cost[y, x, at] if 0 <= at < shifts else IMPOSSIBLE
             # The border can only hold a block back: no need to look at it where the cells agree.
             # Large blocks pay less: many cells do not err together, and someone has to move first.
             share = 1.0 if size < _BOLD_BLOCK else 0.25
-            if filled == 0 or np.argmin(price) == middle and size > 1:
+            if filled == 0 or (np.argmin(price) == middle and size > 1):
                 continue
             for y in range(top, bottom):
                 edge = y == top or y == bottom - 1
@@ -411,9 +445,11 @@ def _segment_slip(
     for k in range(shifts):
         at = label.ravel() + k
         inside = (at >= 0) & (at < shifts)
-        each = np.where(inside, np.take_along_axis(
-            cost.reshape(-1, shifts), np.clip(at, 0, shifts - 1)[:, None], axis=1
-        )[:, 0], _IMPOSSIBLE)
+        each = np.where(
+            inside,
+            np.take_along_axis(cost.reshape(-1, shifts), np.clip(at, 0, shifts - 1)[:, None], axis=1)[:, 0],
+            IMPOSSIBLE,
+        )
         total[:, k] = np.bincount(member[valid], each[valid], minlength=len(total))
     odds = np.exp(-0.5 * (total - total[:, shifts // 2 : shifts // 2 + 1]).clip(-200.0, 2000.0))
     return 1.0 - 1.0 / odds.sum(axis=1)

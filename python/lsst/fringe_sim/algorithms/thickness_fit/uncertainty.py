@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .global_fit import GlobalFit
+from .global_fit import GlobalFit, spread_to_pixels
 
 __all__ = ["region_slip_probability"]
 
@@ -25,6 +25,5 @@ def region_slip_probability(found: GlobalFit) -> NDArray[np.float32]:
     settled = found.settled
     by_segment = np.append(settled.segment_slip, 1.0)[settled.segment]
     by_cell = 1.0 - (1.0 - by_segment) * (1.0 - settled.cell_slip)
-    rows = np.diff(found.cells.y_edges)
-    columns = np.diff(found.cells.x_edges)
-    return np.repeat(np.repeat(by_cell.astype(np.float32), rows, axis=0), columns, axis=1)
+    by_pixel = spread_to_pixels(found.cells, by_cell.astype(np.float32))
+    return np.asarray(1.0 - (1.0 - by_pixel) * (1.0 - found.border_slip), dtype=np.float32)

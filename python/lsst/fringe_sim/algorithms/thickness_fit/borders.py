@@ -1,0 +1,165 @@
+"""Pixels near a step in the layer: on which side of it each one lies.
+
+Where the cells around a pixel show several surfaces, the pixel's own amplitudes choose between them, and noise
+chooses wrong now and then. Pixels of one surface lie together; so each pixel there is asked again, with a price
+for every neighbour from which it would be torn off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from .amplitudes import Amplitudes
+from .newton import gauss_newton
+from .pixels import PixelFit
+from .templates import LANES, FringeTemplates
+
+__all__ = ["settle_borders"]
+
+_PRICE = 2.0
+"""Chi-square that a break of half an order or more between two neighbouring pixels costs."""
+_SWEEPS = 6
+_SAME_SURFACE = 0.25
+_MOST_SURFACES = 6
+
+
+def settle_borders(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    pixels: PixelFit,
+    rough: NDArray[np.bool_],
+    order_um: float,
+    temper: float,
+) -> tuple[PixelFit, NDArray[np.float32]]:
+    """Revise the pixels near steps.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    templates : `FringeTemplates`
+        The model, normalised to the sensor.
+    pixels : `PixelFit`
+        What the pixels found by themselves.
+    rough : `numpy.ndarray`, bool, shape ``(ny, nx)``
+        Pixels that have more than one surface within reach.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    temper : `float`
+        Independent pixels per pixel: below 1 where the noise is correlated.
+
+    Returns
+    -------
+    pixels : `PixelFit`
+        The revised fit.
+    slip : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        Probability that a pixel lies on another of the surfaces; 0 where there is only one.
+    """
+    slip = np.zeros(rough.shape, np.float32)
+    rows, columns = np.nonzero(rough & (pixels.n_wavelengths > 0))
+    if rows.size == 0:
+        return pixels, slip
+    value, weight = _gather(data, rows, columns)
+    freedom = np.maximum(np.count_nonzero(weight > 0, axis=1) - 1, 1).astype(np.float32)
+    thickness, information, chi2 = (np.array(a) for a in (pixels.value, pixels.sigma, pixels.chi2))
+    arguments = (
+        value, weight, freedom, rows, columns, templates.table(),
+        templates.start_um, templates.step_um, order_um, temper,
+        thickness, information, chi2, slip,
+    )  # fmt: skip
+    for sweep in range(_SWEEPS):
+        if _sweep(*arguments, sweep % 2 == 1) == 0:
+            break
+    return replace(pixels, value=thickness, sigma=information, chi2=chi2), slip
+
+
+def _gather(
+    data: Amplitudes, rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Amplitudes and weights of some pixels, shape ``(n, padded wavelengths)``."""
+    wavelengths = data.shape[0]
+    padded = -(-wavelengths // LANES) * LANES
+    value, weight = np.zeros((rows.size, padded), np.float32), np.zeros((rows.size, padded), np.float32)
+    scale = data.scale.astype(np.float32)
+    for band in range(wavelengths):
+        image = data.image[band][rows, columns].astype(np.float32)
+        variance = data.variance[band][rows, columns].astype(np.float32) * scale[band] ** 2
+        good = (
+            (data.bad[band][rows, columns] == 0) & np.isfinite(image) & np.isfinite(variance) & (variance > 0)
+        )
+        value[:, band] = np.where(good, image * scale[band] - 1, 0)
+        weight[:, band] = np.where(good, 1 / np.where(good, variance, 1), 0)
+    return value, weight
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _jump_price(jump, order):  # type: ignore[no-untyped-def]
+    share = 2.0 * jump / order
+    return _PRICE * min(share * share, 1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _sweep(  # type: ignore[no-untyped-def]
+    value, weight, freedom, rows, columns, table, start, step, order, temper,
+    thickness, sigma, reduced, slip, backwards,
+):  # fmt: skip
+    """Ask every pixel once; returns how many changed their mind."""
+    ny, nx = thickness.shape
+    top = table.shape[0] - 1.0
+    guess = np.empty(_MOST_SURFACES, np.float64)
+    changed = 0
+    for number in range(rows.shape[0]):
+        k = rows.shape[0] - 1 - number if backwards else number
+        y, x = rows[k], columns[k]
+        guess[0] = thickness[y, x]
+        count = 1
+        for b in range(max(y - 1, 0), min(y + 2, ny)):
+            for a in range(max(x - 1, 0), min(x + 2, nx)):
+                there = thickness[b, a]
+                if np.isfinite(there) and count < _MOST_SURFACES:
+                    known = False
+                    for g in range(count):
+                        known = known or abs(guess[g] - there) < _SAME_SURFACE * order
+                    if not known:
+                        guess[count] = there
+                        count += 1
+        if count == 1:
+            slip[y, x] = 0.0
+            continue
+        best, least, best_place, best_information, best_chi2 = (
+            0,
+            np.inf,
+            0.0,
+            np.float32(0.0),
+            np.float32(0.0),
+        )
+        total = 0.0
+        for g in range(count):
+            place = min(max((guess[g] - start) / step, 0.0), top)
+            place, information, chi2 = gauss_newton(table, place, value, weight, k, 5, 0.03 / step)
+            at = start + step * place
+            if g > 0 and abs(at - guess[g]) > _SAME_SURFACE * order:
+                continue
+            cost = temper * max(chi2, np.float32(0.0))
+            for b in range(max(y - 1, 0), min(y + 2, ny)):
+                for a in range(max(x - 1, 0), min(x + 2, nx)):
+                    if (b != y or a != x) and np.isfinite(thickness[b, a]):
+                        cost += _jump_price(thickness[b, a] - at, order)
+            if cost < least:
+                # Keep the sum of the odds relative to the best so far.
+                total = total * np.exp(0.5 * (cost - least)) + 1.0 if least < np.inf else 1.0
+                best, least = g, cost
+                best_place, best_information, best_chi2 = place, information, chi2
+            else:
+                total += np.exp(0.5 * (least - cost))
+        slip[y, x] = 1.0 - 1.0 / total if total > 0.0 else 1.0
+        if best != 0:
+            changed += 1
+            thickness[y, x] = start + step * best_place
+            sigma[y, x] = step / np.sqrt(best_information) if best_information > 0.0 else np.inf
+            reduced[y, x] = max(best_chi2, np.float32(0.0)) / freedom[k]
+    return changed
