@@ -25,7 +25,16 @@ ORDER = (
 ALLOWED: dict[str, set[str]] = {room: set(ORDER[: i + 1]) for i, room in enumerate(ORDER)}
 ALLOWED["middleware"] = {"errors", "resources", "instrument", "products", "middleware"}
 ALLOWED["tasks"] = set(ORDER) - {"mock"} | {"middleware", "tasks"}
-ALLOWED["report"] = {"errors", "resources", "optics", "instrument", "products", "model", "algorithms", "report"}
+ALLOWED["report"] = {
+    "errors",
+    "resources",
+    "optics",
+    "instrument",
+    "products",
+    "model",
+    "algorithms",
+    "report",
+}
 ALLOWED["cli"] = set(ORDER) | {"middleware", "tasks", "report", "cli"}
 
 
@@ -75,6 +84,10 @@ def test_the_parser_sees_a_forbidden_import(tmp_path: Path, monkeypatch: pytest.
     fake = tmp_path / "algorithms" / "x.py"
     fake.parent.mkdir()
     monkeypatch.setattr(f"{__name__}.PACKAGE", tmp_path)
-    for text in ("from ..mock.thickness import e2v_321", "import lsst.fringe_sim.mock", "from .. import mock"):
+    for text in (
+        "from ..mock.thickness import e2v_321",
+        "import lsst.fringe_sim.mock",
+        "from .. import mock",
+    ):
         fake.write_text(text)
         assert "mock" in imported_rooms(fake), text

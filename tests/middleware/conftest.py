@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import click.testing
@@ -12,18 +11,11 @@ import pytest
 from lsst.daf.butler import Butler, Config
 from lsst.daf.butler.cli.butler import cli
 from lsst.daf.butler.cli.utils import LogCliRunner
+from toy_repository import Invoke
 
 from lsst.fringe_sim.middleware import HscFringe, LsstCamFringe, MonoCamFringe, Ts8Fringe
 
-TESTS = Path(__file__).parents[1]
-# The makers of raw frames and of products live with the tests of their rooms.
-for room in ("instrument", "products"):
-    if str(TESTS / room) not in sys.path:
-        sys.path.append(str(TESTS / room))
-
 SEED_CONFIG = "resource://lsst.fringe_sim/configs/butler.yaml"
-
-Invoke = Callable[..., click.testing.Result]
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ from lsst.ctrl.bps.parsl.site import SiteConfig
 from lsst.daf.butler import Butler
 from lsst.pipe.base import Pipeline
 from lsst.resources import ResourcePath
-from test_pipeline import PIPELINE, SENSORS, fill
+from toy_repository import PIPELINE, SENSORS, fill
 
 from lsst.fringe_sim.middleware import bps_environment
 from lsst.fringe_sim.middleware.bps_service import FringeParslService, failed_jobs
@@ -184,7 +184,7 @@ def test_failed_jobs_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def submit(folder: Path, repo: Path, *options: str) -> subprocess.CompletedProcess[str]:
     environment = {k: v for k, v in os.environ.items() if k not in {"CTRL_MPEXEC_DIR", "DAF_BUTLER_DIR"}}
-    environment["PYTHONPATH"] = str(Path(__file__).parent)
+    environment["PYTHONPATH"] = str(Path(__file__).parents[1] / "helpers")
     bps = Path(sys.executable).with_name("bps")
     command = [bps, "submit", f"{SITES}/parsl_local.yaml", "-b", repo, "-i", "LSST-TS8/raw/all"]
     return subprocess.run(

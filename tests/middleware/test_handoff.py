@@ -12,8 +12,8 @@ from astropy.io import fits
 from astropy.time import Time
 from lsst.daf.butler import Butler, CollectionType, DatasetRef, DatasetType, FormatterV2, Timespan
 from product_makers import MAKERS
+from toy_repository import Invoke
 
-from conftest import Invoke
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.middleware import LsstCamFringe
 from lsst.fringe_sim.middleware.handoff import EXPOSURE_FORMATTER, write_handoff

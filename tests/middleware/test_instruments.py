@@ -7,9 +7,9 @@ import pytest
 from lsst.daf.butler import Butler
 from lsst.pipe.base import Instrument
 from lsst.resources import ResourcePath
+from toy_repository import Invoke
 
 import lsst.fringe_sim
-from conftest import Invoke
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.middleware import HscFringe, LsstCamFringe, MonoCamFringe, Ts8Fringe

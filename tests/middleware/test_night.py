@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lsst.daf.butler import Butler
+from toy_repository import Invoke
 
-from conftest import Invoke
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.middleware.night import NightPlan, airmass_of, define_night, hour_of_night, parse_hours
 

@@ -5,26 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from lsst.daf.butler import Butler
 from lsst.pipe.base import Pipeline
 from lsst.pipe.base.simple_pipeline_executor import SimplePipelineExecutor
-from raw_frame_maker import write_raw
+from toy_repository import PIPELINE, SENSORS, fill
 from toy_task import HeaderTask
 
-from lsst.fringe_sim.middleware.raw_ingest import ingest_raws
-
 pytestmark = pytest.mark.middleware
-
-PIPELINE = Path(__file__).with_name("toy_pipeline.yaml")
-SENSORS = ("E2V-CCD250-319", "E2V-CCD250-321")
-
-
-def fill(repo: Path, folder: Path) -> None:
-    folder.mkdir()
-    for serial in SENSORS:
-        write_raw(folder / f"{serial}.fits", {"LSST_NUM": serial})
-    with Butler.from_config(str(repo), writeable=True) as butler:
-        assert ingest_raws(butler, [str(folder)]).refused == ()
 
 
 def test_pipelines_build_without_a_repository() -> None:

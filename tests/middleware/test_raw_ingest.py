@@ -14,8 +14,8 @@ from astro_metadata_translator import ObservationInfo
 from lsst.daf.butler import Butler, DatasetType
 from lsst.resources import ResourcePath
 from raw_frame_maker import LSSTCAM_HEADER, write_raw
+from toy_repository import Invoke
 
-from conftest import Invoke
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_header
 from lsst.fringe_sim.middleware import get_cli_subcommands
 from lsst.fringe_sim.middleware.raw_ingest import IngestReport, find_raw_files, ingest_raws

@@ -1,0 +1,28 @@
+"""A small repository for the tests of the middleware: two sensors, one task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import click.testing
+from lsst.daf.butler import Butler
+from raw_frame_maker import write_raw
+
+from lsst.fringe_sim.middleware.raw_ingest import ingest_raws
+
+__all__ = ["PIPELINE", "SENSORS", "Invoke", "fill"]
+
+Invoke = Callable[..., click.testing.Result]
+
+PIPELINE = Path(__file__).with_name("toy_pipeline.yaml")
+SENSORS = ("E2V-CCD250-319", "E2V-CCD250-321")
+
+
+def fill(repo: Path, folder: Path) -> None:
+    """Ingest one raw frame of each sensor."""
+    folder.mkdir()
+    for serial in SENSORS:
+        write_raw(folder / f"{serial}.fits", {"LSST_NUM": serial})
+    with Butler.from_config(str(repo), writeable=True) as butler:
+        assert ingest_raws(butler, [str(folder)]).refused == ()
