@@ -245,7 +245,7 @@ def fringe_templates(
     components: FringeComponents,
     creation_datetime: str,
     *,
-    least_rms: float = 1e-5,
+    least_rms: float = 2e-5,
     most: int | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> list[FringeFrame]:
@@ -259,7 +259,8 @@ def fringe_templates(
         When the calibration was made, ``YYYY-MM-DDThh:mm:ss``.
     least_rms : `float`, optional
         A template is left out if it contributes less than this to a typical frame, as a fraction of the sky. The
-        photon noise of an LSST y exposure averaged over 20 arcsec is 2e-4; 1e-5 is a twentieth of it.
+        photon noise of an LSST y exposure averaged over 20 arcsec is 2e-4; 2e-5 is a tenth of it, and a fainter
+        template would bring more noise than it takes away.
     most : `int`, optional
         Largest number of templates.
     metadata : mapping, optional
@@ -355,24 +356,37 @@ def project(
     if patterns.ndim != 3 or patterns.shape[1:] != image.shape:
         raise InputError("shape of the basis", patterns.shape, f"(patterns, {image.shape})")
     noise = np.broadcast_to(np.asarray(variance, dtype=float), image.shape)
-    good = np.isfinite(image) & (noise > 0.0) & np.isfinite(patterns).all(axis=0)
-    if mask is not None:
-        good &= np.asarray(mask) == 0
-    if good.sum() <= len(patterns) + 1:
-        raise InputError("good pixels", int(good.sum()), f"more than {len(patterns) + 1}")
-    weight = 1.0 / np.sqrt(noise[good])
-    design = np.vstack([np.ones(weight.size), patterns[:, good]]) * weight
-    data = image[good] * weight
-    normal = design @ design.T
+    flags = None if mask is None else np.asarray(mask)
+    if flags is not None and flags.shape != image.shape:
+        raise InputError("shape of the mask", flags.shape, f"{image.shape}")
+    size = len(patterns) + 1
+    normal, moment, square, used = np.zeros((size, size)), np.zeros(size), 0.0, 0
+    rows = max(1, TILE_BYTES // (16 * size * image.shape[1]))
+    for start in range(0, image.shape[0], rows):
+        part = slice(start, start + rows)
+        good = np.isfinite(image[part]) & (noise[part] > 0.0) & np.isfinite(patterns[:, part]).all(axis=0)
+        if flags is not None:
+            good &= flags[part] == 0
+        weight = 1.0 / np.sqrt(noise[part][good])
+        design = np.vstack([np.ones(weight.size), patterns[:, part][:, good]]) * weight
+        data = image[part][good] * weight
+        normal += design @ design.T
+        moment += design @ data
+        square += float(data @ data)
+        used += weight.size
+    if used <= size:
+        raise InputError("good pixels", used, f"more than {size}")
     try:
         factor = scipy.linalg.cho_factor(normal)
-        solution = scipy.linalg.cho_solve(factor, design @ data)
     except np.linalg.LinAlgError:
         raise InputError("basis", "dependent patterns", "patterns that are independent") from None
-    covariance = scipy.linalg.cho_solve(factor, np.eye(len(normal)))
-    residual = data - solution @ design
+    solution = scipy.linalg.cho_solve(factor, moment)
+    covariance = scipy.linalg.cho_solve(factor, np.eye(size))
     return Projection(
-        solution[1:], covariance[1:, 1:], float(solution[0]), float(residual @ residual / residual.size)
+        solution[1:],
+        covariance[1:, 1:],
+        float(solution[0]),
+        max(square - float(solution @ moment), 0.0) / used,
     )
 
 
