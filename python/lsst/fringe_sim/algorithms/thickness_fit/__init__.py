@@ -4,6 +4,7 @@ from .amplitudes import Amplitudes
 from .fit import FIT_METHODS, fit_thickness, make_templates
 from .global_fit import GlobalFit, global_fit
 from .guo2022 import walk_fit
+from .nuisances import NuisanceFit, Nuisances
 from .pixels import PixelFit
 from .templates import FringeTemplates
 
@@ -12,6 +13,8 @@ __all__ = [
     "Amplitudes",
     "FringeTemplates",
     "GlobalFit",
+    "NuisanceFit",
+    "Nuisances",
     "PixelFit",
     "fit_thickness",
     "global_fit",

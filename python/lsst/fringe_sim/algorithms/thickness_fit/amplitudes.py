@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -33,6 +33,10 @@ class Amplitudes:
     noise_correlation_px : `float`, optional
         Standard deviation of the Gaussian kernel that was applied to the images [px]. The variance is that
         of the smoothed image; this number says how far its noise is correlated.
+    offset : `numpy.ndarray`, float32, shape ``(n_wavelengths, ncy, ncx)``, optional
+        What is to be subtracted from the amplitudes, for each cell of a grid.
+    y_edges, x_edges : `numpy.ndarray` of `int`, optional
+        Edges of the cells of ``offset`` [px].
 
     Raises
     ------
@@ -47,6 +51,9 @@ class Amplitudes:
     bad: NDArray[Any]
     scale: FloatArray
     noise_correlation_px: float = 0.0
+    offset: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 1, 1), np.float32))
+    y_edges: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    x_edges: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3:
@@ -101,6 +108,12 @@ class Amplitudes:
     def shape(self) -> tuple[int, int, int]:
         """Wavelengths, rows, columns."""
         return (self.image.shape[0], self.image.shape[1], self.image.shape[2])
+
+    def cell_of_row(self) -> NDArray[np.int64]:
+        """Row of cells of ``offset`` in which each row of pixels lies; zeros if there is no offset."""
+        if len(self.offset) == 0:
+            return np.zeros(self.shape[1], np.int64)
+        return np.repeat(np.arange(len(self.y_edges) - 1), np.diff(self.y_edges))
 
     def rows(self, start: int, stop: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]:
         """Image, variance and mask of some rows, in native byte order; without a copy where they are so."""

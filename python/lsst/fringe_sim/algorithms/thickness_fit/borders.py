@@ -85,13 +85,19 @@ def _gather(
     padded = -(-wavelengths // LANES) * LANES
     value, weight = np.zeros((rows.size, padded), np.float32), np.zeros((rows.size, padded), np.float32)
     scale = data.scale.astype(np.float32)
+    cell_of_row = data.cell_of_row()
     for band in range(wavelengths):
         image = data.image[band][rows, columns].astype(np.float32)
         variance = data.variance[band][rows, columns].astype(np.float32) * scale[band] ** 2
         good = (
             (data.bad[band][rows, columns] == 0) & np.isfinite(image) & np.isfinite(variance) & (variance > 0)
         )
-        value[:, band] = np.where(good, image * scale[band] - 1, 0)
+        amplitude = image * scale[band] - 1
+        if len(data.offset):
+            amplitude -= data.offset[band][
+                cell_of_row[rows], np.searchsorted(data.x_edges, columns, "right") - 1
+            ]
+        value[:, band] = np.where(good, amplitude, 0)
         weight[:, band] = np.where(good, 1 / np.where(good, variance, 1), 0)
     return value, weight
 

@@ -19,6 +19,7 @@ from .amplitudes import Amplitudes
 from .cells import sample_pixels
 from .global_fit import global_fit, normalise_to_cells, spans_orders
 from .guo2022 import walk_fit
+from .nuisances import Nuisances
 from .pixels import PixelFit
 from .templates import FringeTemplates
 from .uncertainty import region_slip_probability
@@ -45,6 +46,7 @@ def fit_thickness(
     start_pixel: tuple[int, int] | None = None,
     cell_px: int | None = None,
     noise_correlation_px: float | None = None,
+    nuisances: Nuisances | None = None,
     slip_limit: float = 0.01,
     threads: int | None = None,
 ) -> ThicknessMap:
@@ -71,6 +73,9 @@ def fit_thickness(
     noise_correlation_px : `float`, optional
         Standard deviation of the Gaussian kernel with which the flats were smoothed [px]. If not given, the
         keyword ``SMOOTHPX`` of the cube's metadata, else 0.
+    nuisances : `Nuisances`, optional
+        What else than thickness is free: levels, steps between zones, slow illumination, contrast. Nothing by
+        default; only with ``global``.
     slip_limit : `float`, optional
         Pixels whose order is wrong with a larger probability are flagged SLIP.
     threads : `int`, optional
@@ -91,6 +96,8 @@ def fit_thickness(
     """
     if method not in FIT_METHODS:
         raise UnknownNameError("method", method, FIT_METHODS)
+    if method == "guo2022" and nuisances is not None and nuisances.any:
+        raise InputError("nuisances", nuisances, "none with method guo2022, which has none")
     if not 0.0 < slip_limit <= 1.0:
         raise OutOfRangeError("slip limit", slip_limit, "above 0, at most 1")
     workers = threads if threads is not None else len(os.sched_getaffinity(0))
@@ -105,11 +112,14 @@ def fit_thickness(
         slip = np.zeros(data.shape[1:], np.float32)
         notes |= {"STARTROW": start[0], "STARTCOL": start[1]}
     else:
-        found = global_fit(data, templates, range_um=(low, high), cell_px=cell_px, threads=workers)
+        found = global_fit(
+            data, templates, range_um=(low, high), cell_px=cell_px, nuisances=nuisances, threads=workers
+        )
         pixels = found.pixels
         slip = region_slip_probability(found)
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
+        notes["CONTRAST"] = round(float(np.mean(found.nuisance.contrast)), 6)
     return _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes)
 
 

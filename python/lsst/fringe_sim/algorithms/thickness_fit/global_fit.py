@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,8 +12,9 @@ from scipy.ndimage import distance_transform_edt
 from .amplitudes import Amplitudes
 from .borders import settle_borders
 from .cells import Cells, average_cells, cell_edges, compensate_slopes, effective_number
-from .evidence import OrderEvidence, order_evidence, refine_cells
-from .orders import OrderSolution, solve_orders
+from .evidence import order_evidence, refine_cells
+from .nuisances import NuisanceFit, Nuisances, add_offset, first_nuisances, fit_nuisances, subtract_offset
+from .orders import solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
 from .relaxation import SettledCells, settle_orders
 from .templates import FringeTemplates
@@ -27,8 +27,9 @@ MOST_CELLS = 600_000
 """Bound on the memory of the order evidence: about 84 orders of 4 bytes for each cell."""
 _STEEPEST_STRUCTURE = 1.0
 """Largest ``1 - cos`` of the phase across a cell, in the steepest tenth of the sensor: a quarter of a fringe."""
-_MEAN_CHANGE = 0.15
-"""Change of the mean response, in rms fringe amplitudes, at which the orders are solved a second time."""
+_MODEL_CHANGE = 0.15
+"""Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
+_MOST_SOLUTIONS = 3
 _MEAN_TOLERANCE = 2e-6
 """Relative change of the mean response that is left alone: far below the noise of a smoothed flat."""
 _MOST_ROUNDS = 20
@@ -52,6 +53,8 @@ class GlobalFit:
         Probability that a pixel near a step lies on the other side of it.
     templates : `FringeTemplates`
         The model as it was normalised in the end.
+    nuisance : `NuisanceFit`
+        Patterns and contrast beside the fringes.
     order_um : `float`
         Thickness of one fringe order [µm].
     normalisation : `str`
@@ -63,6 +66,7 @@ class GlobalFit:
     settled: SettledCells
     border_slip: NDArray[np.float32]
     templates: FringeTemplates
+    nuisance: NuisanceFit
     order_um: float
     normalisation: str
 
@@ -73,8 +77,7 @@ def global_fit(
     *,
     range_um: tuple[float, float],
     cell_px: int | None = None,
-    y_breaks: Sequence[int] = (),
-    x_breaks: Sequence[int] = (),
+    nuisances: Nuisances | None = None,
     threads: int = 2,
 ) -> GlobalFit:
     """Fit a sensor.
@@ -89,14 +92,16 @@ def global_fit(
         Thicknesses that are possible [µm].
     cell_px : `int`, optional
         Size of the cells [px]; chosen from the steepness of the fringes if not given.
-    y_breaks, x_breaks : sequence of `int`, optional
-        Rows and columns at which a new zone begins; no cell crosses them.
+    nuisances : `Nuisances`, optional
+        What else than thickness is free; nothing by default.
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
     _, ny, nx = data.shape
+    nuisances = nuisances or Nuisances()
     order = templates.order_um()
     size = choose_cell_size(data) if cell_px is None else cell_px
+    y_breaks, x_breaks = nuisances.breaks(ny, nx)
     cells = average_cells(
         data,
         cell_edges(ny, size, y_breaks),
@@ -104,52 +109,113 @@ def global_fit(
         largest_amplitude=np.abs(templates.amplitude()).max(axis=0),
         threads=threads,
     )
-    temper = _cell_independence(size, data.noise_correlation_px)
-    found, solution, fitted, normalisation = _solve(cells, templates, order, range_um, temper, threads)
-    cells, slope_y, slope_x = compensate_slopes(cells, found.slope_y, found.slope_x, order)
+    solver = _Solver(order, range_um, _cell_independence(size, data.noise_correlation_px), nuisances, threads)
+    state = solver.solve(cells, templates)
     settled = settle_orders(
-        cells, fitted, solution.thickness_um, slope_y, slope_x, order,
-        range_um=range_um, temper=temper, threads=threads,
+        state.cells, state.templates, state.thickness_um, state.slope_y, state.slope_x, order,
+        range_um=range_um, temper=solver.temper, threads=threads,
     )  # fmt: skip
-    thickness = settled.thickness_um
-    if normalisation == "sensor":
-        thickness, fitted = normalise_to_cells(cells, fitted, thickness, threads)
-    surface = _surface(cells, thickness, slope_y, slope_x, order)
-    pixels = fit_pixels(data, fitted, calm_surface(surface, threads), order, threads=threads)
+    state = solver.adjust(replace(state, thickness_um=settled.thickness_um))
+    surface = _surface(state, order)
+    fringes = replace(data, offset=state.nuisance.offset, y_edges=cells.y_edges, x_edges=cells.x_edges)
+    pixels = fit_pixels(fringes, state.templates, calm_surface(surface, threads), order, threads=threads)
     rough = spread_to_pixels(cells, ~surface.smooth)
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
-    pixels, border_slip = settle_borders(data, fitted, pixels, rough, order, independent)
-    return GlobalFit(pixels, cells, settled, border_slip, fitted, order, normalisation)
+    pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)
+    # Near a step the pixels have been asked one by one, which is worth more than the answer of their cell.
+    settled = replace(settled, cell_slip=np.where(surface.smooth, settled.cell_slip, np.float32(0)))
+    return GlobalFit(
+        pixels, state.cells, settled, border_slip, state.templates, state.nuisance, order, state.normalisation
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where a solution stands: cells without nuisances and loss of contrast, and the model that fits them."""
+
+    cells: Cells
+    slope_y: NDArray[np.float32]
+    slope_x: NDArray[np.float32]
+    thickness_um: NDArray[np.float32]
+    templates: FringeTemplates
+    nuisance: NuisanceFit
+    normalisation: str
+
+
+@dataclass(frozen=True)
+class _Solver:
+    """Orders, mean response and nuisances of a sensor, in turn."""
+
+    order_um: float
+    range_um: tuple[float, float]
+    temper: float
+    free: Nuisances
+    threads: int
+
+    def solve(self, cells: Cells, templates: FringeTemplates) -> _State:
+        """Solve the orders, and again if the model turns out to be another than was thought."""
+        nuisance = first_nuisances(cells, templates, self.free)
+        fitted, normalisation = templates.with_contrast(nuisance.contrast), "range"
+        for _ in range(_MOST_SOLUTIONS):
+            fringes = subtract_offset(cells, nuisance)
+            found = order_evidence(
+                fringes,
+                fitted,
+                self.order_um,
+                range_um=self.range_um,
+                temper=self.temper,
+                threads=self.threads,
+            )
+            solution = solve_orders(fringes, found)
+            state = _State(
+                *compensate_slopes(fringes, found.slope_y, found.slope_x, self.order_um),
+                solution.thickness_um, fitted, nuisance, normalisation,
+            )  # fmt: skip
+            if not spans_orders(state.thickness_um, self.order_um):
+                return state
+            before, state = state, self.adjust(replace(state, normalisation="sensor"))
+            if _agree(before, state):
+                break
+            fitted, nuisance, normalisation = state.templates, state.nuisance, state.normalisation
+        return state
+
+    def adjust(self, state: _State) -> _State:
+        """Fit mean response and nuisances to the cells, the orders being as they are."""
+        if state.normalisation != "sensor":
+            return state
+        if self.free.patterned:  # a free level takes what is left of the mean
+            thickness, fitted = state.thickness_um, state.templates.normalised_to(state.thickness_um)
+        else:
+            thickness, fitted = normalise_to_cells(
+                state.cells, state.templates, state.thickness_um, self.threads
+            )
+        if not self.free.any:
+            return replace(state, thickness_um=thickness, templates=fitted)
+        whole = add_offset(state.cells, state.nuisance)
+        thickness, nuisance = fit_nuisances(whole, fitted, thickness, self.free, state.nuisance, self.threads)
+        return replace(
+            state,
+            cells=subtract_offset(whole, nuisance),
+            thickness_um=thickness,
+            templates=fitted.with_contrast(nuisance.contrast),
+            nuisance=nuisance,
+        )
+
+
+def _agree(before: _State, after: _State) -> bool:
+    """Whether two models differ too little to matter for the orders."""
+    strength = after.templates.amplitude().std(axis=0)
+    change = np.abs(after.templates.mean_response / before.templates.mean_response - 1.0)
+    change += np.abs(after.templates.contrast / before.templates.contrast - 1.0) * strength
+    if after.nuisance.offset.size:
+        change += np.abs(after.nuisance.offset - before.nuisance.offset).max(axis=(1, 2))
+    return bool(np.all(change < _MODEL_CHANGE * strength))
 
 
 def spread_to_pixels(cells: Cells, values: NDArray[Any]) -> NDArray[Any]:
     """Image in which every pixel holds the value of its cell."""
     rows = np.repeat(values, np.diff(cells.y_edges), axis=0)
     return np.repeat(rows, np.diff(cells.x_edges), axis=1)
-
-
-def _solve(
-    cells: Cells,
-    templates: FringeTemplates,
-    order: float,
-    range_um: tuple[float, float],
-    temper: float,
-    threads: int,
-) -> tuple[OrderEvidence, OrderSolution, FringeTemplates, str]:
-    """Solve the orders, and once more if the sensor's own mean response turns out to be another."""
-    fitted, normalisation = templates, "range"
-    for _ in range(3):
-        found = order_evidence(cells, fitted, order, range_um=range_um, temper=temper, threads=threads)
-        solution = solve_orders(cells, found)
-        if not spans_orders(solution.thickness_um, order):
-            break
-        before, normalisation = fitted, "sensor"
-        thickness, fitted = normalise_to_cells(cells, fitted, solution.thickness_um, threads)
-        solution = replace(solution, thickness_um=thickness)
-        change = fitted.mean_response / before.mean_response - 1.0
-        if np.all(np.abs(change) < _MEAN_CHANGE * fitted.amplitude().std(axis=0)):
-            break
-    return found, solution, fitted, normalisation
 
 
 def spans_orders(thickness_um: NDArray[np.float32], order_um: float) -> bool:
@@ -200,19 +266,15 @@ def _cell_independence(size: int, correlation_px: float) -> float:
     return min(whole / (block**2 * effective_number(size, size, correlation_px)), 1.0)
 
 
-def _surface(
-    cells: Cells,
-    thickness: NDArray[np.float32],
-    slope_y: NDArray[np.float32],
-    slope_x: NDArray[np.float32],
-    order: float,
-) -> CellSurface:
+def _surface(state: _State, order: float) -> CellSurface:
     """Surface on which the pixels begin; cells without data borrow from the nearest with data."""
+    thickness, slope_y, slope_x = state.thickness_um, state.slope_y, state.slope_x
     empty = ~np.isfinite(thickness)
     if empty.any() and not empty.all():
         near = distance_transform_edt(empty, return_distances=False, return_indices=True)
         thickness = thickness[tuple(near)]
         slope_y, slope_x = np.where(empty, 0.0, slope_y), np.where(empty, 0.0, slope_x)
+    cells = state.cells
     return CellSurface.from_cells(thickness, slope_y, slope_x, cells.y_centre, cells.x_centre, order)
 
 

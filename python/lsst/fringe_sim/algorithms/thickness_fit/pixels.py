@@ -180,6 +180,7 @@ def fit_pixels(
     scale = data.scale.astype(np.float32)
     below_x, share_x = _bracket(surface.x_centre, nx)
     below_y, share_y = _bracket(surface.y_centre, ny)
+    cell_of_row = data.cell_of_row()
 
     def work(band: int) -> None:
         low, high = band * _BAND_ROWS, min((band + 1) * _BAND_ROWS, ny)
@@ -187,7 +188,7 @@ def fit_pixels(
         _fit_band(
             image, core(variance), core(bad), scale, table, templates.start_um, templates.step_um, order_um,
             surface.thickness_um, surface.slope_y, surface.slope_x, surface.y_centre, surface.x_centre,
-            surface.smooth, low, below_y, share_y, below_x, share_x,
+            surface.smooth, low, below_y, share_y, below_x, share_x, data.offset, cell_of_row, data.x_edges,
             value[low:high], sigma[low:high], chi2[low:high], used[low:high],
         )  # fmt: skip
 
@@ -209,7 +210,7 @@ def _bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64
 def _fit_band(  # type: ignore[no-untyped-def]
     image, variance, bad, scale, table, start, step, order,
     thickness, slope_y, slope_x, y_centre, x_centre, smooth, first_row, below_y, share_y, below_x, share_x,
-    value, sigma, chi2_out, used_out,
+    offset, cell_of_row, x_edges, value, sigma, chi2_out, used_out,
 ):  # fmt: skip
     bands, rows, columns = image.shape
     padded = table.shape[1]
@@ -230,6 +231,8 @@ def _fit_band(  # type: ignore[no-untyped-def]
             line, spread = amplitude[band][:columns], weight[band][:columns]
             load_row(image[band, r], variance[vb, vr], bad[bb, br], scale[band], line, spread)
             _invert_row(spread, used_out[r])
+            if offset.shape[0] > 0:
+                _subtract_row(line, offset[band, cell_of_row[first_row + r]], x_edges)
         own_y = _start_row(
             thickness,
             smooth,
@@ -264,6 +267,13 @@ def _fit_band(  # type: ignore[no-untyped-def]
                 sigma[r, x] = information
                 chi2_out[r, x] = chi2
         _finish_row(sigma[r], chi2_out[r], used_out[r], np.float32(step))
+
+
+@numba.njit(cache=True, nogil=True)
+def _subtract_row(line, offset, x_edges):  # type: ignore[no-untyped-def]
+    for c in range(offset.shape[0]):
+        for x in range(x_edges[c], x_edges[c + 1]):
+            line[x] -= offset[c]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH)
