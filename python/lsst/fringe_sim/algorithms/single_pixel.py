@@ -92,7 +92,9 @@ def fit_single_pixel(
     """
     wavelength, data = np.asarray(wavelength_nm, dtype=float), np.asarray(amplitude, dtype=float)
     if wavelength.ndim != 1 or wavelength.shape != data.shape:
-        raise InputError("shapes of wavelengths and amplitudes", (wavelength.shape, data.shape), "equally long")
+        raise InputError(
+            "shapes of wavelengths and amplitudes", (wavelength.shape, data.shape), "equally long"
+        )
     needed = 2 + int(free_contrast) + int(free_offset)
     if len(wavelength) < needed:
         raise InputError("number of wavelengths", len(wavelength), f"{needed} or more for these parameters")

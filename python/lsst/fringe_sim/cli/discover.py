@@ -127,7 +127,8 @@ def _from_repository(path: str, collections: str, detector: str | None) -> Fring
     """Cube from the prepared flats of one sensor of a repository."""
     from lsst.daf.butler import Butler, EmptyQueryResultError, MissingDatasetTypeError
 
-    where, bind = "", {}
+    where = ""
+    bind: dict[str, int | str] = {}
     if detector is not None:
         if detector.isdecimal():
             where, bind = "detector = chosen", {"chosen": int(detector)}

@@ -400,7 +400,7 @@ def _expose(
         np.array(images, dtype=np.float32),
         np.array(variances, dtype=np.float32),
         mask,
-        FlatExposures(wavelengths, STATED_FWHM_NM, STATED_KELVIN),
+        FlatExposures(wavelengths, np.array(STATED_FWHM_NM), np.array(STATED_KELVIN)),
         "electron",
         detector="sealed",
     )

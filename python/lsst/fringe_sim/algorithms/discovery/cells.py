@@ -139,8 +139,8 @@ def bin_cube(
     order = spectral_order(cube)
     geometry = ImageGeometry(
         cube.shape[1:],
-        cell_px * np.arange(rows) + 0.5 * (cell_px - 1),
-        cell_px * np.arange(columns) + 0.5 * (cell_px - 1),
+        cell_px * np.arange(rows, dtype=np.float64) + 0.5 * (cell_px - 1),
+        cell_px * np.arange(columns, dtype=np.float64) + 0.5 * (cell_px - 1),
         np.asarray(cube.wavelength_nm, dtype=float)[order],
         level[order],
         y_edges,

@@ -644,8 +644,8 @@ class _Search:
     ) -> Verdict:
         null = whole.null.fit
         before, after = _rms(whole.problem, null), _rms(whole.problem, final.fit)
-        heldout = getattr(self, "heldout_rms", (before, after))
-        gap = Gap(_METRIC, before, after, *heldout, _noise_rms(self.cells))
+        heldout_before, heldout_after = getattr(self, "heldout_rms", (before, after))
+        gap = Gap(_METRIC, before, after, heldout_before, heldout_after, _noise_rms(self.cells))
         candidates = tuple({"name": c.name, "score": c.gain, "degrees": c.degrees} for c in self.scores)  # type: tuple[dict[str, Any], ...]
         for name, why in whole.left_out.items():
             self.notes.append(f"{name} was left out: {why}")

@@ -119,8 +119,8 @@ def _mend_orders(
         mended = np.clip(current + np.rint(turns * order).astype(np.int64), 0, count - 1)
         mended = _nearby_peak(score, mended)
         cliffs = [_cliffs(field.reshape(shape), order) for field in (current, mended)]
-        power = [float((score[cells, field].astype(float) ** 2).mean()) for field in (current, mended)]
-        if cliffs[1] < cliffs[0] or (power[1] > 1.003 * power[0] and cliffs[1] < 3 * cliffs[0] + 10):
+        gain = [float((score[cells, field].astype(float) ** 2).mean()) for field in (current, mended)]
+        if cliffs[1] < cliffs[0] or (gain[1] > 1.003 * gain[0] and cliffs[1] < 3 * cliffs[0] + 10):
             current = mended
     return current
 

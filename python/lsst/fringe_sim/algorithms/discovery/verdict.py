@@ -209,7 +209,7 @@ class Verdict:
                 tuple(where["thickness_phase"]),
                 tuple(where["channels"]),
             ),
-            Gap(**gap),
+            Gap(str(gap.pop("metric")), **gap),
             tuple(Step(**{**step, "added": tuple(step["added"])}) for step in content["steps"]),
             content["unexplained"],
             content["setup"],

@@ -29,6 +29,7 @@ _SPIKE_SIGMA = 6.0
 """A row or column of a cell this many standard deviations off its neighbours is thrown out."""
 _FINEST_PERIOD_PX = 24.0
 """Shortest fringe whose curvature is not mistaken for a spike [px]."""
+_HUGE = np.float32(1e30)
 _LEAST_CONTRAST = 0.4
 """Smallest share of the contrast that a steep cell is taken to keep."""
 _LEAST_FILLED = 0.2
@@ -297,8 +298,8 @@ def load_row(image, variance, bad, scale, value, spread):  # type: ignore[no-unt
             spread[x] = spread[x] if bad[x] == 0 else np.float32(0.0)
     for x in range(columns):
         amplitude = image[x] * scale - np.float32(1.0)
-        # Differences of infinities and NaN are NaN, which is not 0.
-        good = (amplitude - amplitude == 0.0) and (spread[x] > 0.0) and (spread[x] < np.float32(1e30))
+        # NaN fails every comparison.
+        good = (abs(amplitude) < _HUGE) and (spread[x] > 0.0) and (spread[x] < _HUGE)
         value[x] = amplitude if good else np.float32(0.0)
         spread[x] = spread[x] if good else np.float32(0.0)
 
