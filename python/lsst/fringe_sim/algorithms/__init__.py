@@ -9,7 +9,7 @@ import importlib
 from typing import Any
 
 _LAZY = {
-    "coadd_correlation": ".coadd_correlation",
+    "coadd_correlation": ".image_correlation",
     "combine_biases": ".flat_prep",
     "discover": ".discovery",
     "fit_pca": ".pca",

@@ -7,7 +7,7 @@ import pytest
 import treecorr
 from scipy.ndimage import gaussian_filter, spline_filter
 
-from lsst.fringe_sim.algorithms.coadd_correlation import (
+from lsst.fringe_sim.algorithms.image_correlation import (
     LogBins,
     coadd_correlation,
     coadd_model,
