@@ -18,7 +18,7 @@ from .newton import gauss_newton
 from .pixels import PixelFit
 from .templates import LANES, FringeTemplates
 
-__all__ = ["settle_borders"]
+__all__ = ["gather_pixels", "settle_borders"]
 
 _PRICE = 2.0
 """Chi-square that a break of half an order or more between two neighbouring pixels costs."""
@@ -63,7 +63,7 @@ def settle_borders(
     rows, columns = np.nonzero(rough & (pixels.n_wavelengths > 0))
     if rows.size == 0:
         return pixels, slip
-    value, weight = _gather(data, rows, columns)
+    value, weight = gather_pixels(data, rows, columns)
     freedom = np.maximum(np.count_nonzero(weight > 0, axis=1) - 1, 1).astype(np.float32)
     thickness, information, chi2 = (np.array(a) for a in (pixels.value, pixels.sigma, pixels.chi2))
     arguments = (
@@ -77,7 +77,7 @@ def settle_borders(
     return replace(pixels, value=thickness, sigma=information, chi2=chi2), slip
 
 
-def _gather(
+def gather_pixels(
     data: Amplitudes, rows: NDArray[np.intp], columns: NDArray[np.intp]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Amplitudes and weights of some pixels, shape ``(n, padded wavelengths)``."""

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
 
 from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ...model import FringeModel
@@ -21,6 +20,7 @@ from .global_fit import global_fit, normalise_to_cells, spans_orders
 from .guo2022 import walk_fit
 from .nuisances import Nuisances
 from .pixels import PixelFit
+from .rescue import chi2_limits, typical_misfit
 from .templates import FringeTemplates
 from .uncertainty import region_slip_probability
 
@@ -32,8 +32,6 @@ STEPS_PER_ORDER = 300
 """Template thicknesses in one fringe order: 1 nm of epoxy; linear interpolation is then good to 3e-5 of the swing."""
 FEWEST_WAVELENGTHS = 4
 """With fewer wavelengths than this a pixel is flagged: phase, order and fit quality cannot all be told."""
-SUSPECT_PROBABILITY = 1e-7
-"""A pixel whose chi-square is that improbable is flagged as SUSPECT."""
 
 
 def fit_thickness(
@@ -223,20 +221,13 @@ def _assemble(
     none = used == 0
     if none.all():
         raise InputError("pixels", "all masked", "at least one good pixel")
-    good_chi2 = pixels.chi2[used >= FEWEST_WAVELENGTHS]
-    scale = max(float(np.median(good_chi2)), 1.0) if good_chi2.size else 1.0
+    scale = typical_misfit(pixels)
     mask = np.where(none, mask_bits("NO_DATA"), 0).astype(np.int32)
     mask[(used < FEWEST_WAVELENGTHS) | ~np.isfinite(pixels.sigma)] |= mask_bits("LOW_SIGNAL")
     mask[slip > slip_limit] |= mask_bits("SLIP")
-    limit = _chi2_limits(int(used.max()))
+    limit = chi2_limits(int(used.max()))
     mask[pixels.chi2 > scale * limit[used]] |= mask_bits("SUSPECT")
-    notes = dict(notes) | {"NWAVE": len(cube.wavelength_nm), "CHI2MED": round(scale, 4)}
+    notes = dict(notes) | {"NWAVE": len(cube.wavelength_nm), "MISFIT": round(scale, 4)}
     return ThicknessMap(
         pixels.value, pixels.sigma, pixels.chi2, slip, mask, layer, notes, used, cube.detector
     )
-
-
-def _chi2_limits(most: int) -> NDArray[np.float32]:
-    """Reduced chi-square that is exceeded with `SUSPECT_PROBABILITY`, by number of wavelengths."""
-    degrees = np.maximum(np.arange(most + 1) - 1, 1)
-    return (chi2_distribution.isf(SUSPECT_PROBABILITY, degrees) / degrees).astype(np.float32)

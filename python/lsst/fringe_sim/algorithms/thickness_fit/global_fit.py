@@ -17,6 +17,7 @@ from .nuisances import NuisanceFit, Nuisances, add_offset, first_nuisances, fit_
 from .orders import solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
 from .relaxation import SettledCells, settle_orders
+from .rescue import rescue_pixels
 from .templates import FringeTemplates
 
 __all__ = ["GlobalFit", "choose_cell_size", "global_fit", "normalise_to_cells", "spans_orders"]
@@ -122,6 +123,7 @@ def global_fit(
     rough = spread_to_pixels(cells, ~surface.smooth)
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
     pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)
+    pixels = rescue_pixels(fringes, state.templates, pixels, order, range_um=range_um, threads=threads)
     # Near a step the pixels have been asked one by one, which is worth more than the answer of their cell.
     settled = replace(settled, cell_slip=np.where(surface.smooth, settled.cell_slip, np.float32(0)))
     return GlobalFit(

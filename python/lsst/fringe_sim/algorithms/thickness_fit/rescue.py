@@ -1,0 +1,190 @@
+"""Pixels that fit badly: one spoilt wavelength, or a void in the layer that is smaller than a cell.
+
+A cosmic ray or a hot pixel spoils one wavelength of a pixel whose others are sound. A void spoils nothing, but
+the pixel lies far from the surface on which its search began.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+from scipy.stats import chi2 as chi2_distribution
+
+from .amplitudes import Amplitudes
+from .borders import gather_pixels
+from .cells import Cells
+from .evidence import order_evidence
+from .medians import middle_of
+from .newton import gauss_newton
+from .pixels import PixelFit
+from .templates import FringeTemplates
+
+__all__ = ["SUSPECT_PROBABILITY", "chi2_limits", "rescue_pixels", "typical_misfit"]
+
+SUSPECT_PROBABILITY = 1e-7
+"""A pixel whose chi-square is that improbable is not believed."""
+_FEWEST_TO_SPARE = 6
+"""A wavelength is left out only of so many or more."""
+_COMPACT = 0.5
+"""Fraction of its 5 by 5 neighbours that fit badly too, from which a pixel may lie in a void: columns have less."""
+_MOST_SEARCHED = 200_000
+
+
+def chi2_limits(most: int) -> NDArray[np.float32]:
+    """Reduced chi-square that is exceeded with `SUSPECT_PROBABILITY`, by number of wavelengths 0 ... ``most``."""
+    degrees = np.maximum(np.arange(most + 1) - 1, 1)
+    return (chi2_distribution.isf(SUSPECT_PROBABILITY, degrees) / degrees).astype(np.float32)
+
+
+def rescue_pixels(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    pixels: PixelFit,
+    order_um: float,
+    *,
+    range_um: tuple[float, float],
+    threads: int = 2,
+) -> PixelFit:
+    """Fit again the pixels whose chi-square is improbable.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    templates : `FringeTemplates`
+        The model, normalised to the sensor.
+    pixels : `PixelFit`
+        The fit so far.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    range_um : `tuple` [`float`, `float`]
+        Thicknesses that are possible [µm].
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+
+    Returns
+    -------
+    pixels : `PixelFit`
+        With better values where there are; ``n_wavelengths`` is one less where one was left out.
+    """
+    used = pixels.n_wavelengths
+    limit = typical_misfit(pixels) * chi2_limits(int(used.max(initial=0)))
+    bad = pixels.chi2 > limit[used]
+    rows, columns = np.nonzero(bad)
+    if rows.size == 0:
+        return pixels
+    fields = {name: np.array(getattr(pixels, name)) for name in ("value", "sigma", "chi2", "n_wavelengths")}
+    table = templates.table()
+    for low in range(0, rows.size, _MOST_SEARCHED):
+        part = slice(low, low + _MOST_SEARCHED)
+        value, weight = gather_pixels(data, rows[part], columns[part])
+        _leave_one_out(
+            value, weight, rows[part], columns[part], table, templates.start_um, templates.step_um, order_um,
+            pixels.value, bad, limit, fields["value"], fields["sigma"], fields["chi2"], fields["n_wavelengths"],
+        )  # fmt: skip
+    still = fields["chi2"] > limit[fields["n_wavelengths"]]
+    compact = still & (uniform_filter(still.astype(np.float32), 5, mode="nearest") > _COMPACT)
+    rows, columns = (index[:_MOST_SEARCHED] for index in np.nonzero(compact))
+    if rows.size:
+        value, weight = gather_pixels(data, rows, columns)
+        _search_range(value, weight, rows, columns, templates, order_um, range_um, limit, fields, threads)
+    return replace(pixels, **fields)
+
+
+def typical_misfit(pixels: PixelFit) -> float:
+    """Median reduced chi-square over its expectation, at least 1: how far the model itself falls short."""
+    most = int(pixels.n_wavelengths.max(initial=0))
+    sample = pixels.n_wavelengths == most
+    if most < 2 or not sample.any():
+        return 1.0
+    expected = chi2_distribution.median(most - 1) / (most - 1)
+    return max(float(np.median(pixels.chi2[sample][:: max(1, sample.sum() // 200_000)])) / expected, 1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _leave_one_out(  # type: ignore[no-untyped-def]
+    value,
+    weight,
+    rows,
+    columns,
+    table,
+    start,
+    step,
+    order,
+    before,
+    bad,
+    limit,
+    thickness,
+    sigma,
+    reduced,
+    used,
+):
+    """Begin on the surface of the good neighbours, drop the worst wavelength, keep the result if it fits."""
+    ny, nx = before.shape
+    guess = np.empty(49, np.float64)
+    for k in range(rows.shape[0]):
+        y, x = rows[k], columns[k]
+        if used[y, x] < _FEWEST_TO_SPARE:
+            continue
+        number = 0
+        for b in range(max(y - 3, 0), min(y + 4, ny)):
+            for a in range(max(x - 3, 0), min(x + 4, nx)):
+                if not bad[b, a] and np.isfinite(before[b, a]):
+                    guess[number] = before[b, a]
+                    number += 1
+        if number < 4:
+            continue
+        place = min(max((middle_of(guess, number) - start) / step, 0.0), table.shape[0] - 1.0)
+        below = min(int(place), table.shape[0] - 2)
+        share = place - below
+        worst, most = -1, 0.0
+        for band in range(table.shape[1]):
+            model = table[below, band] + share * (table[below + 1, band] - table[below, band])
+            miss = weight[k, band] * (value[k, band] - model) ** 2
+            if miss > most:
+                worst, most = band, miss
+        if worst < 0:
+            continue
+        weight[k, worst] = 0.0
+        at, information, chi2 = gauss_newton(table, place, value, weight, k, 5, 0.03 / step)
+        left = used[y, x] - 1
+        if chi2 / (left - 1) < limit[left] and abs(at - place) * step < 0.5 * order and information > 0.0:
+            thickness[y, x] = start + step * at
+            sigma[y, x] = step / np.sqrt(information)
+            reduced[y, x] = max(chi2, np.float32(0.0)) / (left - 1)
+            used[y, x] = left
+
+
+def _search_range(
+    value: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    templates: FringeTemplates,
+    order_um: float,
+    range_um: tuple[float, float],
+    limit: NDArray[np.float32],
+    fields: dict[str, NDArray[np.generic]],
+    threads: int,
+) -> None:
+    """Look for each pixel by itself over the whole range, keep the result if it fits."""
+    none = np.zeros_like(value)[None]
+    single = Cells(value[None], weight[None], none, none, np.arange(2), np.arange(len(rows) + 1))
+    found = order_evidence(single, templates, order_um, range_um=range_um, threads=threads)
+    used = np.count_nonzero(weight > 0, axis=1)
+    reduced = found.chi2[0] / np.maximum(used - 1, 1)
+    fits = reduced < limit[used]
+    thickness = found.best_um[0][fits].astype(float)
+    margin = templates.step_um
+    slope = (templates.amplitude_at(thickness + margin) - templates.amplitude_at(thickness - margin)) / (
+        2 * margin
+    )
+    information = (weight[fits, : templates.n_wavelengths] * slope.T**2).sum(axis=1)
+    place = (rows[fits], columns[fits])
+    fields["value"][place] = thickness
+    fields["sigma"][place] = 1.0 / np.sqrt(np.maximum(information, 1e-30))
+    fields["chi2"][place] = reduced[fits]
