@@ -45,6 +45,7 @@ def fit_thickness(
     cell_px: int | None = None,
     noise_correlation_px: float | None = None,
     nuisances: Nuisances | None = None,
+    smoothing_px: float = 0.0,
     slip_limit: float = 0.01,
     threads: int | None = None,
 ) -> ThicknessMap:
@@ -74,6 +75,9 @@ def fit_thickness(
     nuisances : `Nuisances`, optional
         What else than thickness is free: levels, steps between zones, slow illumination, contrast. Nothing by
         default; only with ``global``.
+    smoothing_px : `float`, optional
+        Standard deviation of a Gaussian kernel over which the likelihood of neighbouring pixels is summed [px];
+        for flats that were not smoothed, and only with ``global``. Steep fringes lose nothing by it.
     slip_limit : `float`, optional
         Pixels whose order is wrong with a larger probability are flagged SLIP.
     threads : `int`, optional
@@ -96,6 +100,12 @@ def fit_thickness(
         raise UnknownNameError("method", method, FIT_METHODS)
     if method == "guo2022" and nuisances is not None and nuisances.any:
         raise InputError("nuisances", nuisances, "none with method guo2022, which has none")
+    if not 0.0 <= smoothing_px < 100.0:
+        raise OutOfRangeError("smoothing [px]", smoothing_px, "0 to 100")
+    if method == "guo2022" and smoothing_px > 0.0:
+        raise InputError(
+            "smoothing [px]", smoothing_px, "0 with method guo2022, which smooths the flats instead"
+        )
     if not 0.0 < slip_limit <= 1.0:
         raise OutOfRangeError("slip limit", slip_limit, "above 0, at most 1")
     workers = threads if threads is not None else len(os.sched_getaffinity(0))
@@ -111,7 +121,13 @@ def fit_thickness(
         notes |= {"STARTROW": start[0], "STARTCOL": start[1]}
     else:
         found = global_fit(
-            data, templates, range_um=(low, high), cell_px=cell_px, nuisances=nuisances, threads=workers
+            data,
+            templates,
+            range_um=(low, high),
+            cell_px=cell_px,
+            nuisances=nuisances,
+            smoothing_px=smoothing_px,
+            threads=workers,
         )
         pixels = found.pixels
         slip = region_slip_probability(found)

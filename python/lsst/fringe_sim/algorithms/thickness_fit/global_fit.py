@@ -18,6 +18,7 @@ from .orders import solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
 from .relaxation import SettledCells, settle_orders
 from .rescue import rescue_pixels
+from .smoothing import smooth_likelihood
 from .templates import FringeTemplates
 
 __all__ = ["GlobalFit", "choose_cell_size", "global_fit", "normalise_to_cells", "spans_orders"]
@@ -79,6 +80,7 @@ def global_fit(
     range_um: tuple[float, float],
     cell_px: int | None = None,
     nuisances: Nuisances | None = None,
+    smoothing_px: float = 0.0,
     threads: int = 2,
 ) -> GlobalFit:
     """Fit a sensor.
@@ -95,6 +97,8 @@ def global_fit(
         Size of the cells [px]; chosen from the steepness of the fringes if not given.
     nuisances : `Nuisances`, optional
         What else than thickness is free; nothing by default.
+    smoothing_px : `float`, optional
+        Standard deviation of a Gaussian kernel over which the likelihood of neighbouring pixels is summed [px].
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
@@ -119,11 +123,17 @@ def global_fit(
     state = solver.adjust(replace(state, thickness_um=settled.thickness_um))
     surface = _surface(state, order)
     fringes = replace(data, offset=state.nuisance.offset, y_edges=cells.y_edges, x_edges=cells.x_edges)
-    pixels = fit_pixels(fringes, state.templates, calm_surface(surface, threads), order, threads=threads)
+    calmed = calm_surface(surface, threads)
+    pixels = fit_pixels(fringes, state.templates, calmed, order, threads=threads)
     rough = spread_to_pixels(cells, ~surface.smooth)
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
     pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)
     pixels = rescue_pixels(fringes, state.templates, pixels, order, range_um=range_um, threads=threads)
+    if smoothing_px > 0.0:
+        edges = (cells.y_edges, cells.x_edges)
+        pixels = smooth_likelihood(
+            fringes, state.templates, pixels, calmed, edges, rough, smoothing_px, threads
+        )
     # Near a step the pixels have been asked one by one, which is worth more than the answer of their cell.
     settled = replace(settled, cell_slip=np.where(surface.smooth, settled.cell_slip, np.float32(0)))
     return GlobalFit(

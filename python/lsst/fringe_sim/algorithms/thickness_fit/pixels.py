@@ -20,7 +20,7 @@ from .medians import middle_of
 from .newton import gauss_newton, newton_inline
 from .templates import FringeTemplates
 
-__all__ = ["CellSurface", "PixelFit", "calm_surface", "fit_pixels"]
+__all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels", "subtract_row"]
 
 _MATH = {"reassoc", "contract", "arcp", "nsz"}
 _STEPS = 5
@@ -178,8 +178,8 @@ def fit_pixels(
     used = np.zeros((ny, nx), np.int32)
     table = templates.table()
     scale = data.scale.astype(np.float32)
-    below_x, share_x = _bracket(surface.x_centre, nx)
-    below_y, share_y = _bracket(surface.y_centre, ny)
+    below_x, share_x = bracket(surface.x_centre, nx)
+    below_y, share_y = bracket(surface.y_centre, ny)
     cell_of_row = data.cell_of_row()
 
     def work(band: int) -> None:
@@ -196,7 +196,7 @@ def fit_pixels(
     return PixelFit(value, sigma, chi2, used)
 
 
-def _bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """For each pixel the cell centre below it, and how far it is to the next (outside 0..1: beyond the ends)."""
     if len(centre) == 1:
         return np.zeros(length, np.int64), np.zeros(length, np.float32)
@@ -232,7 +232,7 @@ def _fit_band(  # type: ignore[no-untyped-def]
             load_row(image[band, r], variance[vb, vr], bad[bb, br], scale[band], line, spread)
             _invert_row(spread, used_out[r])
             if offset.shape[0] > 0:
-                _subtract_row(line, offset[band, cell_of_row[first_row + r]], x_edges)
+                subtract_row(line, offset[band, cell_of_row[first_row + r]], x_edges)
         own_y = _start_row(
             thickness,
             smooth,
@@ -270,7 +270,8 @@ def _fit_band(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _subtract_row(line, offset, x_edges):  # type: ignore[no-untyped-def]
+def subtract_row(line, offset, x_edges):  # type: ignore[no-untyped-def]
+    """Take what is added to the fringes in each cell from one row of amplitudes."""
     for c in range(offset.shape[0]):
         for x in range(x_edges[c], x_edges[c + 1]):
             line[x] -= offset[c]
