@@ -109,6 +109,8 @@ def fit_thickness(
     if not 0.0 < slip_limit <= 1.0:
         raise OutOfRangeError("slip limit", slip_limit, "above 0, at most 1")
     workers = threads if threads is not None else len(os.sched_getaffinity(0))
+    if not np.any(np.asarray(cube.mask) == 0):
+        raise InputError("good pixels of the cube", 0, "one or more", source=cube.detector or None)
     data = amplitudes_from_cube(cube, noise_correlation_px)
     low, high = range_um or model.setup.thickness_range_um
     templates = make_templates(model, cube.wavelength_nm, (low, high), observable)
