@@ -22,7 +22,15 @@ from .amplitudes import Amplitudes
 from .medians import middle_of
 from .templates import LANES
 
-__all__ = ["Cells", "average_cells", "cell_edges", "compensate_slopes", "effective_number", "sample_pixels"]
+__all__ = [
+    "Cells",
+    "average_cells",
+    "cell_edges",
+    "cell_independence",
+    "compensate_slopes",
+    "effective_number",
+    "sample_pixels",
+]
 
 _MATH = {"reassoc", "contract", "arcp", "nsz"}
 _SPIKE_SIGMA = 6.0
@@ -131,6 +139,15 @@ def _pair_sum(count: int, correlation_px: float) -> float:
     lag = np.arange(1, count)
     rho = np.exp(-(lag**2) / (4.0 * correlation_px**2))
     return float(1.0 + 2.0 * np.sum((1.0 - lag / count) * rho))
+
+
+def cell_independence(size: int, correlation_px: float) -> float:
+    """Independent cells per cell of a large area: cells share noise where the kernel is wider than they are."""
+    if correlation_px == 0.0:
+        return 1.0
+    block = max(16, int(12.0 * correlation_px / size))
+    whole = effective_number(block * size, block * size, correlation_px)
+    return min(whole / (block**2 * effective_number(size, size, correlation_px)), 1.0)
 
 
 def average_cells(

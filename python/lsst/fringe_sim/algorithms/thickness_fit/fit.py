@@ -22,7 +22,7 @@ from .nuisances import Nuisances
 from .pixels import PixelFit
 from .rescue import chi2_limits, typical_misfit
 from .templates import FringeTemplates
-from .uncertainty import region_slip_probability
+from .uncertainty import lone_slip_probability, slip_probability
 
 __all__ = ["FIT_METHODS", "amplitudes_from_cube", "fit_thickness", "make_templates"]
 
@@ -118,8 +118,8 @@ def fit_thickness(
     notes["OBSERVAB"] = observable or model.base_system.observable
     if method == "guo2022":
         start = start_pixel or (data.shape[1] // 2, data.shape[2] // 2)
-        pixels = _repeated_walk(data, templates, start, (low, high), workers)
-        slip = np.zeros(data.shape[1:], np.float32)
+        pixels, fitted = _repeated_walk(data, templates, start, (low, high), workers)
+        slip = lone_slip_probability(data, fitted, pixels.value, fitted.order_um(), workers)
         notes |= {"STARTROW": start[0], "STARTCOL": start[1]}
     else:
         found = global_fit(
@@ -132,7 +132,7 @@ def fit_thickness(
             threads=workers,
         )
         pixels = found.pixels
-        slip = region_slip_probability(found)
+        slip = slip_probability(found)
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
         notes["CONTRAST"] = round(float(np.mean(found.nuisance.contrast)), 6)
@@ -216,15 +216,15 @@ def _repeated_walk(
     start: tuple[int, int],
     range_um: tuple[float, float],
     threads: int,
-) -> PixelFit:
+) -> tuple[PixelFit, FringeTemplates]:
     """Walk twice: the mean response over the sensor is known after the first time."""
     first = walk_fit(data, templates, start_pixel=start, range_um=range_um, threads=threads)
     sample = sample_pixels(data)
     seen = first.value[np.ix_(sample.y_edges[:-1], sample.x_edges[:-1])]
     if not spans_orders(seen, templates.order_um()):
-        return first
+        return first, templates
     _, fitted = normalise_to_cells(sample, templates, seen, threads)
-    return walk_fit(data, fitted, start_pixel=start, range_um=range_um, threads=threads)
+    return walk_fit(data, fitted, start_pixel=start, range_um=range_um, threads=threads), fitted
 
 
 def _assemble(

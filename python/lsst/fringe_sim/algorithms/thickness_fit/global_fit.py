@@ -11,8 +11,8 @@ from scipy.ndimage import distance_transform_edt
 
 from .amplitudes import Amplitudes
 from .borders import settle_borders
-from .cells import Cells, average_cells, cell_edges, compensate_slopes, effective_number
-from .evidence import order_evidence, refine_cells
+from .cells import Cells, average_cells, cell_edges, cell_independence, compensate_slopes, effective_number
+from .evidence import OrderEvidence, order_evidence, refine_cells
 from .nuisances import NuisanceFit, Nuisances, add_offset, first_nuisances, fit_nuisances, subtract_offset
 from .orders import solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
@@ -114,11 +114,11 @@ def global_fit(
         largest_amplitude=np.abs(templates.amplitude()).max(axis=0),
         threads=threads,
     )
-    solver = _Solver(order, range_um, _cell_independence(size, data.noise_correlation_px), nuisances, threads)
+    solver = _Solver(order, range_um, cell_independence(size, data.noise_correlation_px), nuisances, threads)
     state = solver.solve(cells, templates)
     settled = settle_orders(
-        state.cells, state.templates, state.thickness_um, state.slope_y, state.slope_x, order,
-        range_um=range_um, temper=solver.temper, threads=threads,
+        state.cells, state.templates, state.thickness_um, state.slope_y, state.slope_x, order, state.found,
+        range_um=range_um, temper=solver.temper, correlation_px=data.noise_correlation_px, threads=threads,
     )  # fmt: skip
     state = solver.adjust(replace(state, thickness_um=settled.thickness_um))
     surface = _surface(state, order)
@@ -152,6 +152,7 @@ class _State:
     templates: FringeTemplates
     nuisance: NuisanceFit
     normalisation: str
+    found: OrderEvidence
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ class _Solver:
             solution = solve_orders(fringes, found)
             state = _State(
                 *compensate_slopes(fringes, found.slope_y, found.slope_x, self.order_um),
-                solution.thickness_um, fitted, nuisance, normalisation,
+                solution.thickness_um, fitted, nuisance, normalisation, found,
             )  # fmt: skip
             if not spans_orders(state.thickness_um, self.order_um):
                 return state
@@ -267,15 +268,6 @@ def normalise_to_cells(
         if np.abs(fitted.mean_response / before.mean_response - 1.0).max() < _MEAN_TOLERANCE:
             break
     return thickness, fitted
-
-
-def _cell_independence(size: int, correlation_px: float) -> float:
-    """Independent cells per cell: cells share noise where the kernel is wider than they are."""
-    if correlation_px == 0.0:
-        return 1.0
-    block = max(16, int(12.0 * correlation_px / size))
-    whole = effective_number(block * size, block * size, correlation_px)
-    return min(whole / (block**2 * effective_number(size, size, correlation_px)), 1.0)
 
 
 def _surface(state: _State, order: float) -> CellSurface:

@@ -15,8 +15,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import Cells, run_threaded
-from .evidence import EVIDENCE_CAP, IMPOSSIBLE, MISFIT
+from .cells import Cells, cell_independence, effective_number, run_threaded
+from .evidence import EVIDENCE_CAP, IMPOSSIBLE, MISFIT, OrderEvidence
 from .medians import middle_of, sort_first
 from .newton import gauss_newton, score
 from .templates import FringeTemplates
@@ -69,9 +69,11 @@ def settle_orders(
     slope_y: NDArray[np.float32],
     slope_x: NDArray[np.float32],
     order_um: float,
+    found: OrderEvidence,
     *,
     range_um: tuple[float, float],
     temper: float = 1.0,
+    correlation_px: float = 0.0,
     threads: int = 2,
 ) -> SettledCells:
     """Revise the orders of all cells.
@@ -88,10 +90,14 @@ def settle_orders(
         Slopes of the thickness [µm/px].
     order_um : `float`
         Thickness of one fringe order [µm].
+    found : `OrderEvidence`
+        What the cells said at first, over the whole range.
     range_um : `tuple` [`float`, `float`]
         Thicknesses that are possible [µm].
     temper : `float`, optional
         Independent cells per cell, as for `order_evidence`.
+    correlation_px : `float`, optional
+        Standard deviation of the kernel that correlates the noise [px].
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
@@ -133,7 +139,18 @@ def settle_orders(
         if not np.any(label):
             break
     segment = _segments(thickness, rise_y, rise_x, order_um)
-    segment_slip = _segment_slip(cost, label, segment)
+    price = _segment_prices(cost, shifted, label, segment, rise_y, rise_x, order_um)
+    better = np.argmin(price, axis=1) - SHIFTS
+    if np.any(better):
+        # Whole surfaces move last: blocks of cells had not found their shape.
+        label += np.append(better, 0)[segment]
+        thickness = np.take_along_axis(shifted, (label + SHIFTS)[..., None], axis=2)[..., 0]
+        segment = _segments(thickness, rise_y, rise_x, order_um)
+        price = _segment_prices(cost, shifted, label, segment, rise_y, rise_x, order_um)
+    share = _small_surfaces(segment, cells, correlation_px)
+    excess = share[:, None] * (price - price[:, SHIFTS : SHIFTS + 1])
+    odds = np.exp(-0.5 * excess.clip(-200.0, 2000.0)).sum(axis=1)
+    segment_slip = 1.0 - 1.0 / (odds + _far_odds(found, thickness, segment, share))
     cell_slip = np.zeros(thickness.shape, np.float32)
     _cell_slip(cost, shifted, label, rise_y, rise_x, order_um, cell_slip)
     return SettledCells(thickness, segment, segment_slip, cell_slip)
@@ -434,25 +451,95 @@ def _segments(
     return place[surface]
 
 
-def _segment_slip(
-    cost: NDArray[np.float32], label: NDArray[np.int64], segment: NDArray[np.int32]
+def _segment_prices(
+    cost: NDArray[np.float32],
+    shifted: NDArray[np.float32],
+    label: NDArray[np.int64],
+    segment: NDArray[np.int32],
+    rise_y: NDArray[np.float32],
+    rise_x: NDArray[np.float32],
+    order: float,
 ) -> NDArray[np.float64]:
-    """Probability that a surface has another order than the one given, on the evidence of its own cells."""
+    """What each surface would cost at each shift, the others staying: its cells and its borders."""
     shifts = cost.shape[2]
     member = segment.ravel()
     valid = member >= 0
-    total = np.empty((int(member.max(initial=-1)) + 1, shifts))
+    price = _segment_borders(shifted, label, segment, rise_y, rise_x, order, int(member.max(initial=-1)) + 1)
     for k in range(shifts):
         at = label.ravel() + k
         inside = (at >= 0) & (at < shifts)
-        each = np.where(
-            inside,
-            np.take_along_axis(cost.reshape(-1, shifts), np.clip(at, 0, shifts - 1)[:, None], axis=1)[:, 0],
-            IMPOSSIBLE,
-        )
-        total[:, k] = np.bincount(member[valid], each[valid], minlength=len(total))
-    odds = np.exp(-0.5 * (total - total[:, shifts // 2 : shifts // 2 + 1]).clip(-200.0, 2000.0))
-    return 1.0 - 1.0 / odds.sum(axis=1)
+        each = np.take_along_axis(cost.reshape(-1, shifts), np.clip(at, 0, shifts - 1)[:, None], axis=1)[:, 0]
+        each = np.where(inside, each, IMPOSSIBLE)
+        price[:, k] += np.bincount(member[valid], each[valid], minlength=len(price))
+    return price
+
+
+@numba.njit(cache=True, nogil=True)
+def _segment_borders(shifted, label, segment, rise_y, rise_x, order, count):  # type: ignore[no-untyped-def]
+    """Price of the borders of each surface at each shift."""
+    ny, nx, shifts = shifted.shape
+    middle = shifts // 2
+    price = np.zeros((count, shifts), np.float64)
+    for y in range(ny):
+        for x in range(nx):
+            for side in range(2):
+                b, a = (y + 1, x) if side == 0 else (y, x + 1)
+                if b >= ny or a >= nx or segment[y, x] == segment[b, a]:
+                    continue
+                if segment[y, x] < 0 or segment[b, a] < 0:
+                    continue
+                rise = (
+                    0.5 * (rise_y[y, x] + rise_y[b, a]) if side == 0 else 0.5 * (rise_x[y, x] + rise_x[b, a])
+                )
+                jump = shifted[b, a, label[b, a] + middle] - shifted[y, x, label[y, x] + middle] - rise
+                for k in range(shifts):
+                    price[segment[y, x], k] += _break_price(jump - (k - middle) * order, order)
+                    price[segment[b, a], k] += _break_price(jump + (k - middle) * order, order)
+    return price
+
+
+def _small_surfaces(segment: NDArray[np.int32], cells: Cells, correlation_px: float) -> NDArray[np.float64]:
+    """How much more independent the cells of a small surface are than those of an endless one."""
+    size = np.bincount(segment[segment >= 0], minlength=1)
+    if correlation_px == 0.0:
+        return np.ones(len(size))
+    pixels = int(np.diff(cells.y_edges).max())
+    side = np.minimum(np.rint(np.sqrt(size)).astype(int), _LARGEST_BLOCK)
+    endless = cell_independence(pixels, correlation_px)
+    factor = {
+        int(n): effective_number(n * pixels, n * pixels, correlation_px)
+        / (n**2 * effective_number(pixels, pixels, correlation_px) * endless)
+        for n in np.unique(side)
+    }
+    return np.array([max(factor[int(n)], 1.0) for n in side])
+
+
+def _far_odds(
+    found: OrderEvidence,
+    thickness: NDArray[np.float32],
+    segment: NDArray[np.int32],
+    share: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Summed odds of the orders farther off than `SHIFTS`, for surfaces too small to rule them out by number."""
+    size = np.bincount(segment[segment >= 0])
+    odds = np.zeros(len(size))
+    small = np.flatnonzero((segment.ravel() >= 0) & (np.append(size, 0)[segment.ravel()] <= _LARGEST_MENDED))
+    if small.size == 0:
+        return odds
+    evidence = found.evidence.reshape(segment.size, -1)[small]
+    orders = evidence.shape[1]
+    own = np.rint((thickness.ravel()[small] - found.phase_um.ravel()[small]) / found.order_um).astype(int)
+    member = segment.ravel()[small]
+    here = np.take_along_axis(evidence, np.clip(own, 0, orders - 1)[:, None], axis=1)[:, 0]
+    for move in (*range(-orders + 1, -SHIFTS), *range(SHIFTS + 1, orders)):
+        at = own + move
+        inside = (at >= 0) & (at < orders)
+        there = np.take_along_axis(evidence, np.clip(at, 0, orders - 1)[:, None], axis=1)[:, 0]
+        excess = np.where(inside, there - here, IMPOSSIBLE)
+        total = share * np.bincount(member, excess, minlength=len(odds))
+        ruled_out = np.bincount(member, minlength=len(odds)) == 0
+        odds += np.where(ruled_out, 0.0, np.exp(-0.5 * total.clip(-200.0, 2000.0)))
+    return odds
 
 
 @numba.njit(cache=True, nogil=True)

@@ -127,8 +127,8 @@ def _follow_pixels(
     return replace(
         surface,
         thickness_um=thickness,
-        slope_y=slope_y.astype(np.float32),
-        slope_x=slope_x.astype(np.float32),
+        slope_y=np.asarray(slope_y, np.float32),
+        slope_x=np.asarray(slope_x, np.float32),
     )
 
 

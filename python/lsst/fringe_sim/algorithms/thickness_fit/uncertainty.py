@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from .amplitudes import Amplitudes
+from .cells import core, load_row, run_threaded
 from .global_fit import GlobalFit, spread_to_pixels
+from .newton import gauss_newton
+from .templates import FringeTemplates
 
-__all__ = ["region_slip_probability"]
+__all__ = ["lone_slip_probability", "slip_probability"]
+
+_MATH = {"reassoc", "contract", "arcp", "nsz"}
+_BAND_ROWS = 16
+_SHIFTS = 2
+"""Orders on both sides that a lone pixel is compared with."""
 
 
-def region_slip_probability(found: GlobalFit) -> NDArray[np.float32]:
-    """Probability that the whole region in which a pixel lies has the wrong order.
+def slip_probability(found: GlobalFit) -> NDArray[np.float32]:
+    """Probability that the order of a pixel is wrong, all evidence of a global fit taken together.
+
+    Either the whole surface is off, on the summed evidence of its cells; or its cell is, against the neighbours;
+    or, near a step, the pixel lies on the other side of it.
 
     Parameters
     ----------
@@ -21,9 +34,85 @@ def region_slip_probability(found: GlobalFit) -> NDArray[np.float32]:
     Returns
     -------
     probability : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        1 where a cell has no data.
     """
     settled = found.settled
     by_segment = np.append(settled.segment_slip, 1.0)[settled.segment]
     by_cell = 1.0 - (1.0 - by_segment) * (1.0 - settled.cell_slip)
     by_pixel = spread_to_pixels(found.cells, by_cell.astype(np.float32))
     return np.asarray(1.0 - (1.0 - by_pixel) * (1.0 - found.border_slip), dtype=np.float32)
+
+
+def lone_slip_probability(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    thickness_um: NDArray[np.float32],
+    order_um: float,
+    threads: int = 2,
+) -> NDArray[np.float32]:
+    """Probability that the order of a pixel is wrong, on its own amplitudes alone.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    templates : `FringeTemplates`
+        The model.
+    thickness_um : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        Fitted thickness [µm].
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+
+    Returns
+    -------
+    probability : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        With a flat prior over two orders on both sides; 1 where there is no thickness.
+    """
+    out = np.ones(thickness_um.shape, np.float32)
+    table = templates.table()
+    scale = data.scale.astype(np.float32)
+
+    def work(band: int) -> None:
+        rows = slice(band * _BAND_ROWS, (band + 1) * _BAND_ROWS)
+        image, variance, bad = data.rows(rows.start, rows.stop)
+        _lone_band(
+            image, core(variance), core(bad), scale, table, templates.start_um, templates.step_um,
+            thickness_um[rows], order_um, out[rows],
+        )  # fmt: skip
+
+    run_threaded(work, -(-len(out) // _BAND_ROWS), threads)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+def _lone_band(image, variance, bad, scale, table, start, step, thickness, order, out):  # type: ignore[no-untyped-def]
+    bands, rows, columns = image.shape
+    amplitude, spread = np.zeros((bands, columns), np.float32), np.zeros((bands, columns), np.float32)
+    y, w = np.zeros((1, table.shape[1]), np.float32), np.zeros((1, table.shape[1]), np.float32)
+    top = table.shape[0] - 1.0
+    for r in range(rows):
+        for band in range(bands):
+            vb = band if variance.shape[0] > 1 else 0
+            bb = band if bad.shape[0] > 1 else 0
+            vr = r if variance.shape[1] > 1 else 0
+            br = r if bad.shape[1] > 1 else 0
+            load_row(
+                image[band, r], variance[vb, vr], bad[bb, br], scale[band], amplitude[band], spread[band]
+            )
+        for x in range(columns):
+            middle = (thickness[r, x] - start) / step
+            if not 0.0 <= middle <= top:
+                continue
+            for band in range(bands):
+                y[0, band] = amplitude[band, x]
+                w[0, band] = np.float32(1.0) / spread[band, x] if spread[band, x] > 0.0 else np.float32(0.0)
+            _, _, own = gauss_newton(table, middle, y, w, 0, 5, 0.03 / step)
+            odds = 0.0
+            for shift in range(-_SHIFTS, _SHIFTS + 1):
+                place = middle + shift * order / step
+                if shift != 0 and 0.0 <= place <= top:
+                    _, _, chi2 = gauss_newton(table, place, y, w, 0, 5, 0.03 / step)
+                    odds += np.exp(min(max(0.5 * (own - chi2), -100.0), 100.0))
+            out[r, x] = odds / (1.0 + odds)
