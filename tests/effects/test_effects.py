@@ -34,6 +34,14 @@ def observe(model: FringeModel, thickness: np.ndarray) -> np.ndarray:
     return np.concatenate([model.response(thickness, WAVELENGTHS), model.flat_image(thickness, geometry)])
 
 
+def test_light_and_bench_of_the_laboratory_stay_there() -> None:
+    """The telescope has its own light; the sensor's layers and electronics come along."""
+    left_behind = {effect.name for effect in EFFECTS if effect.laboratory_only}
+    assert {effect.name for effect in EFFECTS if effect.acts_on == "illumination"} <= left_behind
+    assert {"temperature", "ghost_pedestal", "vignetting", "dark_pedestal"} <= left_behind
+    assert not {"epoxy_index", "roughness", "silicon_thickness", "charge_diffusion"} & left_behind
+
+
 def null_of(effect: Effect, name: str, base: FringeModel) -> float:
     return effect.null_values(base.base_system)[name]
 

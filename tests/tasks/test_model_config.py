@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from lsst.pex.config import FieldValidationError
 
-from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.effects import EFFECTS, Effect
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.tasks import EpoxyFitConfig, FringeModelConfig, IsrFlatPrepConfig, RaftConfig
-from lsst.fringe_sim.tasks.model_config import OF_THE_LABORATORY, ModelChoice
+from lsst.fringe_sim.tasks.model_config import ModelChoice
 
 
 def config(setup: str = "ts8_e2v", **effects: float) -> FringeModelConfig:
@@ -17,8 +17,12 @@ def config(setup: str = "ts8_e2v", **effects: float) -> FringeModelConfig:
     return made
 
 
-def test_what_stays_in_the_laboratory_is_in_the_catalogue() -> None:
-    assert {effect.name for effect in EFFECTS} >= OF_THE_LABORATORY
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
+def test_an_effect_of_the_laboratory_stays_there(effect: Effect) -> None:
+    parameter = effect.parameters[0]
+    settings = {f"{effect.name}.{parameter.name}": parameter.bounds[1]}
+    assert ModelChoice("ts8_e2v", settings).applied_effects == settings
+    assert ModelChoice("lsst_e2v", settings).applied_effects == ({} if effect.laboratory_only else settings)
 
 
 def test_the_laboratory_gets_every_effect_the_sky_those_of_the_sensor() -> None:

@@ -45,9 +45,6 @@ _ERROR_SAMPLES = 48
 _BOUND_ANGLES = 6
 """Angles that stand for a beam where no phases are involved."""
 
-LABORATORY_EFFECTS = frozenset({"illumination", "chromatic_illumination", "vignetting", "dark_pedestal"})
-"""Effects on the image that belong to the lamp and the stand of flat fields; a sky frame does not have them."""
-
 _BASELINE_HOUR = 19.0
 """Local time of hour 0 of a night [h]."""
 
@@ -532,7 +529,7 @@ def _with_image_effects(
         item
         for item in model.effects
         if item.effect.acts_on == "image"
-        and item.effect.name not in LABORATORY_EFFECTS
+        and not item.effect.laboratory_only
         and not item.is_null(model.base_system)
     ]
     if not active:

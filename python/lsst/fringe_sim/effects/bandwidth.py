@@ -19,6 +19,7 @@ class Bandwidth(Effect):
     name = "bandwidth"
     title = "bandpass width"
     acts_on = "illumination"
+    laboratory_only = True
     reference = "Guo, Walter, Lage & Lupton 2022, section 2.2"
     parameters = (Parameter("fwhm", "nm", float("nan"), (0.05, 20.0), 0.5, "full width at half maximum"),)
 

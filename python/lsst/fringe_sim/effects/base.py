@@ -86,6 +86,8 @@ class Effect(ABC):
     title: ClassVar[str]
     acts_on: ClassVar[str]
     """``stack``, ``illumination``, ``response`` or ``image``."""
+    laboratory_only: ClassVar[bool] = False
+    """Whether it belongs to lamp, bench or cryostat, which a sensor does not take along to the telescope."""
     parameters: ClassVar[tuple[Parameter, ...]]
     reference: ClassVar[str]
 

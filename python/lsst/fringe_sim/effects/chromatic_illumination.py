@@ -21,6 +21,7 @@ class ChromaticIllumination(PlainNullEffect):
     name = "chromatic_illumination"
     title = "uneven illumination, changing with wavelength"
     acts_on = "image"
+    laboratory_only = True
     reference = "pattern of a diffuser or sphere depends on wavelength; no value is published for TS8"
     parameters = tuple(
         Parameter(name, "", 0.0, (-0.3, 0.3), scale, f"coefficient of {term} per {_REACH_NM:g} nm")

@@ -20,6 +20,7 @@ class ConvergingBeam(PlainNullEffect):
     name = "converging_beam"
     title = "converging beam or extended source"
     acts_on = "illumination"
+    laboratory_only = True
     reference = "Groom 2017; Guo, Walter, Lage & Lupton 2022, section 2.2 (4 inch sphere at 1 m: 2.9 deg)"
     parameters = (
         Parameter("numerical_aperture", "", 0.0, (0.0, 0.7), 0.05, "sine of the largest angle of incidence"),

@@ -16,6 +16,7 @@ class DarkPedestal(PlainNullEffect):
     name = "dark_pedestal"
     title = "dark signal or light leak"
     acts_on = "image"
+    laboratory_only = True
     reference = "EMVA standard 1288, release 4 (dark signal of a camera)"
     parameters = (
         Parameter("electrons", "electron", 0.0, (-5000.0, 100000.0), 200.0, "level in every exposure"),

@@ -15,6 +15,7 @@ class GhostPedestal(PlainNullEffect):
     name = "ghost_pedestal"
     title = "scattered light or ghost pedestal"
     acts_on = "response"
+    laboratory_only = True
     reference = "uniform ghost of a flat-field illumination"
     parameters = (Parameter("fraction", "", 0.0, (0.0, 20.0), 0.05, "pedestal over mean signal"),)
 

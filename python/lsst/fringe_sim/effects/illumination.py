@@ -27,6 +27,7 @@ class Illumination(PlainNullEffect):
     name = "illumination"
     title = "uneven illumination"
     acts_on = "image"
+    laboratory_only = True
     reference = "Guo, Walter, Lage & Lupton 2022, Fig. 5 (sawtooth of 0.4-0.7 % over each half)"
     parameters = (
         Parameter("gradient_x", "", 0.0, (-0.5, 0.5), 0.02, "relative rise from the left to the right edge"),

@@ -17,6 +17,7 @@ class Temperature(Effect):
     name = "temperature"
     title = "sensor temperature"
     acts_on = "stack"
+    laboratory_only = True
     reference = "Green 2008, doi 10.1016/j.solmat.2008.06.009"
     parameters = (Parameter("kelvin", "K", float("nan"), (120.0, 320.0), 5.0, "temperature of the silicon"),)
 

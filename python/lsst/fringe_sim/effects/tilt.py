@@ -20,6 +20,7 @@ class Tilt(PlainNullEffect):
     name = "tilt"
     title = "tilted sensor"
     acts_on = "illumination"
+    laboratory_only = True
     reference = "Born & Wolf, Principles of Optics, section 1.6"
     parameters = (Parameter("angle", "deg", 0.0, (0.0, 40.0), 3.0, "angle of incidence"),)
 

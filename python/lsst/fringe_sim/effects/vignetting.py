@@ -16,6 +16,7 @@ class Vignetting(PlainNullEffect):
     name = "vignetting"
     title = "vignetting"
     acts_on = "image"
+    laboratory_only = True
     reference = "Reshidko & Sasian 2016, doi 10.1117/1.OE.55.11.115105 (relative illumination)"
     parameters = (Parameter("corner", "", 0.0, (-0.5, 0.9), 0.03, "relative loss in the corners"),)
 

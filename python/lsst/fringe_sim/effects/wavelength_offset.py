@@ -17,6 +17,7 @@ class WavelengthOffset(PlainNullEffect):
     name = "wavelength_offset"
     title = "wavelength zero"
     acts_on = "illumination"
+    laboratory_only = True
     reference = "effect of a grating angle offset; MONOCH-WAVELENG against MONOWL in TS8 headers"
     parameters = (Parameter("offset", "nm", 0.0, (-10.0, 10.0), 0.5, "true minus nominal wavelength"),)
 

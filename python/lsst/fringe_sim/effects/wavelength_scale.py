@@ -17,6 +17,7 @@ class WavelengthScale(PlainNullEffect):
     name = "wavelength_scale"
     title = "wavelength scale"
     acts_on = "illumination"
+    laboratory_only = True
     reference = "linear part of a grating calibration error"
     parameters = (
         Parameter("stretch", "nm/nm", 0.0, (-0.1, 0.1), 0.005, "relative error of wavelength differences"),

@@ -12,7 +12,6 @@ from typing import Any, ClassVar, TypeVar
 
 from lsst.pex.config import Config, ConfigDictField, DictField, Field, FieldValidationError
 
-from ..algorithms.sky_frame import LABORATORY_EFFECTS
 from ..effects import EFFECTS, activate_effects
 from ..errors import InputError
 from ..model import FringeModel, Setup
@@ -20,13 +19,6 @@ from ..model import FringeModel, Setup
 __all__ = ["FringeModelConfig", "ModelChoice", "RaftConfig", "by_raft"]
 
 Value = TypeVar("Value")
-
-OF_THE_LABORATORY = LABORATORY_EFFECTS | {"ghost_pedestal", "temperature"}
-"""Effects that stay in the laboratory, besides all those that act on its light.
-
-A sensor takes its layers and its electronics to the telescope, but not the temperature of the cryostat nor the lamp
-and the reflections of the bench.
-"""
 
 
 @dataclass(frozen=True)
@@ -46,16 +38,18 @@ class ModelChoice:
 
     @property
     def applied_effects(self) -> dict[str, float]:
-        """Effects that belong to this set-up: on the sky, not those of the laboratory's light and bench."""
+        """Effects that belong to this set-up: on the sky, not those of the laboratory.
+
+        A sensor takes its layers and its electronics to the telescope, but not the temperature of the cryostat nor
+        the lamp and the reflections of the bench.
+        """
         active = activate_effects(self.effects, EFFECTS)
         on_sky = Setup.from_name(self.setup).kind == "sky"
         return {
             f"{item.effect.name}.{parameter}": value
             for item in active
             for parameter, value in item.values.items()
-            if not (
-                on_sky and (item.effect.acts_on == "illumination" or item.effect.name in OF_THE_LABORATORY)
-            )
+            if not (on_sky and item.effect.laboratory_only)
         }
 
     @property
