@@ -155,11 +155,15 @@ def bin_cube(
     return CellData(value, weight, geometry, cell_px, 0.0, known, sigma)
 
 
+KEPT_PATTERN = 0.88
+"""Part of the pattern's variance that cells must keep: a quarter of a fringe in a cell, which the model follows."""
+
+
 def finest_useful_cell(cube: FringeCube, *, most_cells: int, largest: int = 64) -> int:
     """Side of the largest cell that does not blur the pattern, or of the smallest that keeps ``most_cells``.
 
     The variance of an image falls with the cell size by its noise; what it falls beyond that is pattern. A size
-    is taken while at least 98 % of the pattern's variance is left at every wavelength.
+    is taken while the part `KEPT_PATTERN` of the pattern's variance is left at every wavelength.
 
     Parameters
     ----------
@@ -174,10 +178,10 @@ def finest_useful_cell(cube: FringeCube, *, most_cells: int, largest: int = 64) 
     reference: FloatArray | None = None
     while True:
         cells = bin_cube(cube, size)
-        signal = _pattern_variance(cells)
+        signal, error = _pattern_variance(cells)
         reference = signal if reference is None else reference
         enough = np.count_nonzero(cells.weight[0]) if size > 1 else np.inf
-        blurred = bool(np.any(signal < 0.98 * reference))
+        blurred = bool(np.any(signal + 3.0 * error < KEPT_PATTERN * reference))
         if size > 1 and (blurred or enough < 400):
             return size // 2
         few = cells.shape[1] * cells.shape[2] <= most_cells // 4
@@ -186,14 +190,26 @@ def finest_useful_cell(cube: FringeCube, *, most_cells: int, largest: int = 64) 
         size *= 2
 
 
-def _pattern_variance(cells: CellData) -> FloatArray:
-    """Variance of the amplitudes minus that of neighbouring differences, which is noise for a smooth pattern."""
-    result = np.zeros(cells.shape[0])
-    for plane in range(cells.shape[0]):
+def _pattern_variance(cells: CellData) -> tuple[FloatArray, FloatArray]:
+    """Variance of the amplitudes minus that of the noise, which second differences show, and its error."""
+    waves = cells.shape[0]
+    result, error = np.zeros(waves), np.zeros(waves)
+    for plane in range(waves):
         good = cells.weight[plane] > 0
-        noise = float(np.median(1.0 / cells.weight[plane][good])) if good.any() else 0.0
-        result[plane] = max(float(cells.value[plane][good].var()) - noise, 0.0) if good.any() else 0.0
-    return result
+        if good.sum() < 2:
+            continue
+        value = cells.value[plane]
+        near = good[2:, 2:] & good[2:, 1:-1] & good[2:, :-2] & good[1:-1, 2:] & good[1:-1, 1:-1]
+        near &= good[1:-1, :-2] & good[:-2, 2:] & good[:-2, 1:-1] & good[:-2, :-2]
+        if near.any():
+            rows = value[2:] - 2.0 * value[1:-1] + value[:-2]
+            both = (rows[:, 2:] - 2.0 * rows[:, 1:-1] + rows[:, :-2]) / 6.0
+            noise = (1.4826 * float(np.median(np.abs(both[near])))) ** 2
+        else:
+            noise = float(np.median(1.0 / cells.weight[plane][good]))
+        result[plane] = max(float(value[good].var()) - noise, 0.0)
+        error[plane] = noise * np.sqrt(2.0 / good.sum())
+    return result, error
 
 
 def _block_sum(image: FloatArray, size: int) -> FloatArray:

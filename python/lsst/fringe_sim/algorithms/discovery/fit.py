@@ -203,8 +203,60 @@ class Whitener:
         scaled = self.root * values
         if not self.gamma.any():
             return scaled
-        along = (self.direction * scaled).sum(axis=-3, keepdims=True)
-        return scaled - self.direction * (self.gamma * along)
+        return self.decorrelate(scaled)
+
+    def decorrelate(self, scaled: FloatArray) -> FloatArray:
+        """Symmetric part that takes the common response out of values in units of their own noise."""
+        if not self.gamma.any():
+            return scaled
+        along = np.einsum("wyx,...wyx->...yx", self.direction, scaled)
+        return scaled - self.direction * (self.gamma * along)[..., np.newaxis, :, :]
+
+
+@dataclass(frozen=True, eq=False)
+class LevelColumns:
+    """Whitened derivatives with respect to the levels, of which each wavelength has its own share.
+
+    A level touches one wavelength; written out, its columns would be zeros but for one plane in ``W``.
+
+    Attributes
+    ----------
+    amplitude : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Model in units of the noise.
+    basis : `numpy.ndarray`, shape ``(W, L)``
+        Levels at the wavelengths.
+    whiten : `Whitener`
+        The noise.
+    """
+
+    amplitude: FloatArray
+    basis: FloatArray
+    whiten: Whitener
+
+    @property
+    def number(self) -> int:
+        """Number of levels."""
+        return self.basis.shape[1]
+
+    def dot(self, values: FloatArray) -> FloatArray:
+        """Products with whitened ``(..., W, ny, nx)``, shape ``(..., L)``."""
+        planes = np.einsum("wyx,...wyx->...w", self.amplitude, self.whiten.decorrelate(values))
+        return np.asarray(planes @ self.basis)
+
+    def along(self, slope: FloatArray) -> FloatArray:
+        """Products cell by cell with a whitened slope ``(W, ny, nx)``, shape ``(L, ny, nx)``."""
+        planes = self.amplitude * self.whiten.decorrelate(slope)
+        return np.tensordot(self.basis.T, planes, axes=1)
+
+    def gram(self) -> FloatArray:
+        """Products with one another, shape ``(L, L)``."""
+        planes = np.diag((self.amplitude**2).sum(axis=(1, 2)))
+        if self.whiten.gamma.any():
+            direction, gamma = self.whiten.direction, self.whiten.gamma
+            share = 2.0 * gamma - gamma**2 * (direction**2).sum(axis=0)
+            both = (direction * self.amplitude * np.sqrt(share)).reshape(len(planes), -1)
+            planes = planes - both @ both.T
+        return np.asarray(self.basis.T @ planes @ self.basis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,41 +267,57 @@ class Design:
     ----------
     slope : `numpy.ndarray`, shape ``(W, ny, nx)``
         Whitened derivative with respect to thickness.
-    columns : `numpy.ndarray`, shape ``(K, W, ny, nx)``
-        Whitened derivatives with respect to levels, then effects.
+    levels : `LevelColumns`
+        Derivatives with respect to the levels.
+    effects : `numpy.ndarray`, shape ``(K, W, ny, nx)``
+        Whitened derivatives with respect to the effects.
     normal : `NormalMatrix`
         Curvature in the coefficients of the thickness field.
     """
 
     basis: FieldBasis
     slope: FloatArray
-    columns: FloatArray
+    levels: LevelColumns
+    effects: FloatArray
     normal: NormalMatrix
     _coupling: FloatArray
     _curvature: FloatArray
 
     @classmethod
-    def build(cls, basis: FieldBasis, slope: FloatArray, columns: FloatArray, prior: float) -> Design:
+    def build(
+        cls, basis: FieldBasis, slope: FloatArray, levels: LevelColumns, effects: FloatArray, prior: float
+    ) -> Design:
         """Assemble normal matrices."""
         normal = basis.normal_matrix((slope**2).sum(axis=0), prior)
-        coupling = basis.gather(np.einsum("wyx,kwyx->kyx", slope, columns))
-        flat = columns.reshape(len(columns), -1)
-        curvature = flat @ flat.T - coupling.T @ normal.solve(coupling)
-        return cls(basis, slope, columns, normal, coupling, curvature)
+        maps = np.concatenate([levels.along(slope), np.einsum("wyx,kwyx->kyx", slope, effects)])
+        coupling = basis.gather(maps)
+        flat = effects.reshape(len(effects), slope.size)
+        cross = levels.dot(effects)
+        curvature = np.block([[levels.gram(), cross.T], [cross, flat @ flat.T]])
+        curvature = curvature - coupling.T @ normal.solve(coupling)
+        return cls(basis, slope, levels, effects, normal, coupling, curvature)
 
     @property
     def curvature(self) -> FloatArray:
-        """Curvature in the columns with the field profiled out, ``(K, K)``."""
+        """Curvature in levels and effects with the field profiled out."""
         return self._curvature
+
+    def _products(self, values: FloatArray) -> FloatArray:
+        """Products of levels and effects with whitened ``(W, ny, nx)``."""
+        return np.concatenate(
+            [
+                self.levels.dot(values),
+                self.effects.reshape(len(self.effects), self.slope.size) @ values.ravel(),
+            ]
+        )
 
     def step(
         self, residual: FloatArray, ridge: FloatArray, pull: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Newton step of columns and field coefficients; ``ridge`` is a prior precision, ``pull`` its gradient."""
+        """Newton step of levels, effects and field; ``ridge`` is a prior precision, ``pull`` its gradient."""
         field_side = self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0]
         solved = self.normal.solve(np.column_stack([field_side, self._coupling]))
-        right = self.columns.reshape(len(self.columns), -1) @ residual.ravel()
-        right = right - self._coupling.T @ solved[:, 0] - pull
+        right = self._products(residual) - self._coupling.T @ solved[:, 0] - pull
         step = _solve_symmetric(self._curvature + np.diag(ridge), right)
         return step, solved[:, 0] - solved[:, 1:] @ step
 
@@ -269,16 +337,18 @@ class Design:
         information : `numpy.ndarray`, shape ``(F, F)``
         """
         flat = features.reshape(len(features), -1)
-        own = self.columns.reshape(len(self.columns), -1)
         coupling = self.basis.gather(np.einsum("wyx,kwyx->kyx", self.slope, features))
         solved = self.normal.solve(coupling)
         information = flat @ flat.T - coupling.T @ solved
-        cross = own @ flat.T - self._coupling.T @ solved
+        cross = np.concatenate(
+            [self.levels.dot(features).T, self.effects.reshape(len(self.effects), self.slope.size) @ flat.T]
+        )
+        cross = cross - self._coupling.T @ solved
         score = flat @ residual.ravel()
         field_side = self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0]
         score = score - solved.T @ field_side
         own_score = (
-            own @ residual.ravel() - self._coupling.T @ self.normal.solve(field_side[:, np.newaxis])[:, 0]
+            self._products(residual) - self._coupling.T @ self.normal.solve(field_side[:, np.newaxis])[:, 0]
         )
         scale = np.sqrt(np.maximum(np.diag(self._curvature), 1e-300))
         values, vectors = np.linalg.eigh(self._curvature / np.outer(scale, scale))
@@ -452,18 +522,16 @@ class _Solver:
         return np.linalg.lstsq(root[:, None] * basis, root * ratio, rcond=None)[0]
 
     def linearise(self, point: _Point, *, effects: bool = True) -> Design:
-        """Design at a point: columns are levels, then coordinates (if ``effects``)."""
+        """Design at a point: levels, then coordinates (if ``effects``)."""
         problem = self.problem
         thickness = problem.basis.expand(point.coefficients)
         level = (problem.level_basis @ point.levels)[:, np.newaxis, np.newaxis]
-        columns = [
-            self.whiten(basis[:, np.newaxis, np.newaxis] * point.prediction.value)
-            for basis in problem.level_basis.T
-        ]
-        for number in range(len(self.coordinates) if effects else 0):
-            columns.append(self.whiten(level * self.derivative(point, thickness, number)))
+        columns = np.empty((len(self.coordinates) if effects else 0, *point.residual.shape))
+        for number in range(len(columns)):
+            columns[number] = self.whiten(level * self.derivative(point, thickness, number))
         slope = self.whiten(level * point.prediction.slope)
-        return Design.build(problem.basis, slope, np.stack(columns), problem.field_prior)
+        levels = LevelColumns(self.whiten.root * point.prediction.value, problem.level_basis, self.whiten)
+        return Design.build(problem.basis, slope, levels, columns, problem.field_prior)
 
     def derivative(self, point: _Point, thickness: FloatArray, number: int) -> FloatArray:
         """Derivative of the prediction with respect to one coordinate, by a difference."""
@@ -497,7 +565,7 @@ class _Solver:
         square = (design.slope**2).sum(axis=0)
         levels = self.problem.level_basis.shape[1]
         change = design.slope * thickness
-        change = change + np.tensordot(step[levels:], design.columns[levels:], axes=1)
+        change = change + np.tensordot(step[levels:], design.effects, axes=1)
         along = (design.slope * change).sum(axis=0)
         used = square > 0.01 * square.max()
         return float(np.percentile(np.abs(along[used] / square[used]), 98.0)) if used.any() else 0.0

@@ -119,9 +119,9 @@ class Forward:
             Thickness at the centres of the cells [µm], within the tables.
         """
         table = self.table(settings)
-        spread = self._spread_in_cell(thickness_um)
+        second, fourth = self._spread_in_cell(thickness_um)
         value, slope = _interpolate(
-            table, self.range_um[0], TABLE_STEP_UM, thickness_um.ravel(), spread.ravel()
+            table, self.range_um[0], TABLE_STEP_UM, thickness_um.ravel(), second.ravel(), fourth.ravel()
         )
         shape = (len(table), *thickness_um.shape)
         value, slope = value.reshape(shape), slope.reshape(shape)
@@ -134,15 +134,20 @@ class Forward:
         beside = apply_to_image(active, self.model.base_system, value + nudge * slope, self.geometry)
         return Prediction(changed, (beside - changed) / nudge)
 
-    def _spread_in_cell(self, thickness_um: FloatArray) -> FloatArray:
-        """Variance of the thickness within each cell [µm²], from the gradient of the field."""
-        if self.cell_px == 1:
-            return np.zeros(thickness_um.shape)
-        square = np.zeros(thickness_um.shape)
+    def _spread_in_cell(self, thickness_um: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Second and fourth moment of the thickness within each cell [µm², µm⁴], from the gradient of the field."""
+        square = np.zeros((2, *thickness_um.shape))
+        size = self.cell_px
+        if size == 1:
+            return square[0], square[1]
         for axis in (0, 1):
             if thickness_um.shape[axis] > 1:
-                square += np.gradient(thickness_um, axis=axis) ** 2
-        return square * (1.0 - 1.0 / self.cell_px**2) / 12.0
+                square[axis] = np.gradient(thickness_um, axis=axis) ** 2
+        # Pixels stand evenly along both axes: moments of two discrete uniform distributions.
+        inverse = 1.0 / size**2
+        along = square * (1.0 - inverse) / 12.0
+        fourth = (square**2).sum(axis=0) * (1.0 - inverse) * (3.0 - 7.0 * inverse) / 240.0
+        return along.sum(axis=0), fourth + 6.0 * along[0] * along[1]
 
     def is_image_effect(self, name: str) -> bool:
         """Whether an effect acts on the image and not on the response."""
@@ -156,37 +161,47 @@ class Forward:
         return {key: value for key, value in known.items() if self.is_image_effect(key.split(".")[0])}
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def _interpolate(
-    table: FloatArray, start: float, step: float, thickness: FloatArray, spread: FloatArray
+    table: FloatArray,
+    start: float,
+    step: float,
+    thickness: FloatArray,
+    second: FloatArray,
+    fourth: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
-    """Cubic interpolation of value and slope, both averaged over the thickness spread to second order."""
+    """Cubic interpolation of value and slope, averaged over the thickness spread to fourth order."""
     waves, nodes = table.shape
     value = np.empty((waves, thickness.size))
     slope = np.empty((waves, thickness.size))
     for i in range(thickness.size):
         position = (thickness[i] - start) / step
-        k = min(max(int(np.floor(position)), 2), nodes - 4)
+        k = min(max(int(np.floor(position)), 3), nodes - 5)
         x = position - k
-        half = 0.5 * spread[i] / (step * step)
+        half = 0.5 * second[i] / (step * step)
+        rest = fourth[i] / 24.0 / (step * step) ** 2
         for w in range(waves):
             a, b, c, d = table[w, k - 1], table[w, k], table[w, k + 1], table[w, k + 2]
+            if half != 0.0:
+                # The spread is taken into the nodes, by their second and fourth differences.
+                o, p, q, r = table[w, k - 3], table[w, k - 2], table[w, k + 3], table[w, k + 4]
+                a, b, c, d = (
+                    _spread_node(o, p, a, b, c, half, rest),
+                    _spread_node(p, a, b, c, d, half, rest),
+                    _spread_node(a, b, c, d, q, half, rest),
+                    _spread_node(b, c, d, q, r, half, rest),
+                )
             # Lagrange polynomial through four nodes, in powers of x
             c1 = c - a / 3.0 - b / 2.0 - d / 6.0
             c2 = 0.5 * (a + c) - b
             c3 = (d - a) / 6.0 + 0.5 * (b - c)
-            if half == 0.0:
-                value[w, i] = b + x * (c1 + x * (c2 + x * c3))
-                slope[w, i] = (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
-                continue
-            # second derivatives of the outer nodes, so that the averaged curve is smooth across nodes
-            left, right = table[w, k - 2], table[w, k + 3]
-            s0 = a - 2.0 * b + c
-            s1 = b - 2.0 * c + d
-            sm = left - 2.0 * a + b
-            sp = c - 2.0 * d + right
-            second = s0 + x * (s1 - s0)
-            third = 0.5 * ((s1 - sm) + x * ((sp - s0) - (s1 - sm)))
-            value[w, i] = b + x * (c1 + x * (c2 + x * c3)) + half * second
-            slope[w, i] = (c1 + x * (2.0 * c2 + 3.0 * x * c3) + half * third) / step
+            value[w, i] = b + x * (c1 + x * (c2 + x * c3))
+            slope[w, i] = (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
     return value, slope
+
+
+@numba.njit(cache=True, inline="always")
+def _spread_node(a, b, c, d, e, half, rest):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Node ``c`` of five averaged over a spread of variance ``2 half`` and fourth moment ``24 rest``."""
+    second = (16.0 * (b + d) - a - e - 30.0 * c) / 12.0
+    return c + half * second + rest * (a - 4.0 * b + 6.0 * c - 4.0 * d + e)

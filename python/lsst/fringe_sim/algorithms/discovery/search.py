@@ -29,6 +29,13 @@ from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
 __all__ = ["SearchOptions", "discover"]
 
 FloatArray = NDArray[np.float64]
+
+MIMICKED = 0.05
+"""Part of the causes outside the catalogue that effects in it can mimic."""
+
+DECADES_OF_CHANCE = 200.0
+"""Powers of ten by which a residual of signal to noise 30 is improbable."""
+
 Report = Callable[[str], None]
 
 
@@ -548,18 +555,16 @@ class _Search:
         return 0.5 * (other.fit.chi2 - chosen.fit.chi2) + 3.0 * extra < self.options.class_width
 
     def _outsider_probability(self, hypothesis: Hypothesis) -> float:
-        """Probability of a cause outside the catalogue, from the smallest chance of noise in the residual.
+        """Probability of a cause outside the catalogue, from the chance of noise in what is left.
 
-        The bound of Sellke, Bayarri & Berger (2001, doi 10.1198/000313001300339950): the evidence for noise against
-        the most favourable alternative is at least ``-e p log p``.
+        An effect of the catalogue leaves noise: any chance is as likely as any other. A cause outside it either is
+        mimicked, and leaves noise as well, or leaves a residual whose chance may lie anywhere down to that of a
+        signal to noise of 30, each power of ten as likely as the other.
         """
-        p = min(hypothesis.probability_of_noise, 1.0)
-        p = max(p, 1e-100)
-        bound = 1.0 if p > 1.0 / math.e else -math.e * p * math.log(p)
+        p = min(max(hypothesis.probability_of_noise, 1e-100), 1.0)
+        density = MIMICKED + (1.0 - MIMICKED) / (p * math.log(10.0) * DECADES_OF_CHANCE)
         prior = self.options.outsider_prior
-        # A residual that is noise leaves an outsider only the room that a perfect mimic has.
-        mimic = 0.05
-        odds = prior / (1.0 - prior) * (mimic / bound if p > 0.05 else 1.0 / bound)
+        odds = prior / (1.0 - prior) * density
         return odds / (1.0 + odds)
 
     def _validate(self, whole: Selector, final: Hypothesis) -> dict[str, float]:
