@@ -17,7 +17,7 @@ __all__ = ["CellData", "bin_cube", "finest_useful_cell", "spectral_order"]
 
 FloatArray = NDArray[np.float64]
 
-LEAST_FILLED = 0.5
+LEAST_FILLED = 0.75
 """Smallest part of good pixels with which a cell is used."""
 
 BAD_PLANES = mask_bits("BAD", "SAT", "INTRP", "CR", "EDGE", "SUSPECT", "NO_DATA")
@@ -41,6 +41,8 @@ class CellData:
         Rms of the response of the cells, common to all wavelengths (pixel response non-uniformity).
     thickness_um, thickness_sigma_um : `numpy.ndarray`, shape ``(ny, nx)``, optional
         Known thickness and its uncertainty [µm].
+    centroid : `numpy.ndarray`, shape ``(2, W, ny, nx)``, optional
+        Where the good pixels of a cell have their mean, along rows and columns, from its centre [cells].
     """
 
     value: FloatArray
@@ -50,6 +52,7 @@ class CellData:
     response_scatter: float = 0.0
     thickness_um: FloatArray | None = None
     thickness_sigma_um: FloatArray | None = None
+    centroid: FloatArray | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -113,6 +116,7 @@ def bin_cube(
         raise InputError("cell size [px]", cell_px, f"at most {min(cube.shape[1:])}")
     shape = (cube.shape[0], rows, columns)
     value, weight = np.ones(shape), np.zeros(shape)
+    centroid = np.zeros((2, *shape))
     level = np.array(cube.exposures.level_e, dtype=float)
     for plane, source in enumerate(spectral_order(cube)):
         image = np.asarray(cube.image[source], dtype=np.float64)
@@ -129,6 +133,7 @@ def bin_cube(
         spread = _block_sum(np.where(good, variance, 0.0), cell_px)
         used = count >= max(1.0, LEAST_FILLED * cell_px**2)
         np.divide(total, count * mean, out=value[plane], where=used)
+        centroid[:, plane] = _centroid(good, count, used, cell_px)
         floor = 1e-14 * mean**2 * count  # noiseless data are fitted as if they were good to 1e-7
         np.divide((count * mean) ** 2, np.maximum(spread, floor), out=weight[plane], where=used)
         if cube.unit == "electron":
@@ -152,7 +157,25 @@ def bin_cube(
         weight = np.where(np.isfinite(known), weight, 0.0)
         if cube.thickness_sigma is not None:
             sigma = _block_mean(np.asarray(cube.thickness_sigma, dtype=float), cell_px)
-    return CellData(value, weight, geometry, cell_px, 0.0, known, sigma)
+    moved = centroid if centroid.any() else None
+    return CellData(value, weight, geometry, cell_px, 0.0, known, sigma, moved)
+
+
+def _centroid(
+    good: NDArray[np.bool_], count: FloatArray, used: NDArray[np.bool_], cell_px: int
+) -> FloatArray:
+    """Mean place of the good pixels of each cell from its centre, ``(2, ny, nx)`` [cells]."""
+    result = np.zeros((2, *count.shape))
+    partial = used & (count < cell_px**2)
+    if not partial.any():
+        return result
+    within = (np.arange(cell_px) + 0.5) / cell_px - 0.5
+    rows, columns = count.shape
+    blocks = good[: rows * cell_px, : columns * cell_px].reshape(rows, cell_px, columns, cell_px)
+    for axis, sums in enumerate((blocks.sum(axis=3, dtype=float), blocks.sum(axis=1, dtype=float))):
+        first = np.einsum("ypx,p->yx" if axis == 0 else "yxp,p->yx", sums, within)
+        np.divide(first, count, out=result[axis], where=partial)
+    return result
 
 
 KEPT_PATTERN = 0.88

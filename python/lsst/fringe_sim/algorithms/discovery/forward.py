@@ -63,6 +63,8 @@ class Forward:
         Side of a cell [px].
     range_um : `tuple` [`float`, `float`]
         Thicknesses that the tables cover [µm]; grows on demand.
+    centroid : `numpy.ndarray`, shape ``(2, W, ny, nx)``, optional
+        See `CellData`.
     """
 
     model: FringeModel
@@ -70,6 +72,7 @@ class Forward:
     geometry: ImageGeometry
     cell_px: int
     range_um: tuple[float, float]
+    centroid: FloatArray | None = None
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
     _scale: FloatArray | None = field(default=None, repr=False)
 
@@ -78,7 +81,7 @@ class Forward:
         cls, model: FringeModel, catalogue: Sequence[Effect], cells: CellData, range_um: tuple[float, float]
     ) -> Forward:
         """Forward model of the cells of ``cells`` for a thickness range [µm]."""
-        return cls(model, catalogue, cells.geometry, cells.cell_px, range_um)
+        return cls(model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid)
 
     def table(self, settings: Settings) -> FloatArray:
         """Response ``(W, D)`` on the grid of thickness, relative to the mean of the unchanged model."""
@@ -119,12 +122,16 @@ class Forward:
             Thickness at the centres of the cells [µm], within the tables.
         """
         table = self.table(settings)
-        second, fourth = self._spread_in_cell(thickness_um)
+        gradient = _gradient(thickness_um)
+        second, fourth = self._spread_in_cell(gradient)
+        place, beside = self._at_centroids(thickness_um, gradient)
         value, slope = _interpolate(
-            table, self.range_um[0], TABLE_STEP_UM, thickness_um.ravel(), second.ravel(), fourth.ravel()
+            table, self.range_um[0], TABLE_STEP_UM, place.ravel(), second.ravel(), fourth.ravel()
         )
         shape = (len(table), *thickness_um.shape)
         value, slope = value.reshape(shape), slope.reshape(shape)
+        if beside is not None:
+            value += slope * beside
         image_settings = self._image(settings)
         if not image_settings:
             return Prediction(value, slope)
@@ -134,17 +141,24 @@ class Forward:
         beside = apply_to_image(active, self.model.base_system, value + nudge * slope, self.geometry)
         return Prediction(changed, (beside - changed) / nudge)
 
-    def _spread_in_cell(self, thickness_um: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _at_centroids(
+        self, thickness_um: FloatArray, gradient: FloatArray
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Thickness where the good pixels lie: common to all wavelengths, and what single ones differ from it."""
+        if self.centroid is None:
+            return thickness_um, None
+        moved = np.einsum("ayx,awyx->wyx", gradient, self.centroid)
+        common = moved.mean(axis=0)
+        rest = moved - common
+        return thickness_um + common, rest if rest.any() else None
+
+    def _spread_in_cell(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Second and fourth moment of the thickness within each cell [µm², µm⁴], from the gradient of the field."""
-        square = np.zeros((2, *thickness_um.shape))
-        size = self.cell_px
-        if size == 1:
-            return square[0], square[1]
-        for axis in (0, 1):
-            if thickness_um.shape[axis] > 1:
-                square[axis] = np.gradient(thickness_um, axis=axis) ** 2
+        if self.cell_px == 1:
+            nothing = np.zeros(gradient.shape[1:])
+            return nothing, nothing
         # Pixels stand evenly along both axes: moments of two discrete uniform distributions.
-        inverse = 1.0 / size**2
+        square, inverse = gradient**2, 1.0 / self.cell_px**2
         along = square * (1.0 - inverse) / 12.0
         fourth = (square**2).sum(axis=0) * (1.0 - inverse) * (3.0 - 7.0 * inverse) / 240.0
         return along.sum(axis=0), fourth + 6.0 * along[0] * along[1]
@@ -159,6 +173,15 @@ class Forward:
     def _image(self, settings: Settings) -> dict[str, float]:
         known = {**self.model.effect_settings, **settings}
         return {key: value for key, value in known.items() if self.is_image_effect(key.split(".")[0])}
+
+
+def _gradient(field: FloatArray) -> FloatArray:
+    """Change of a field from cell to cell along rows and columns, ``(2, ny, nx)``."""
+    result = np.zeros((2, *field.shape))
+    for axis in (0, 1):
+        if field.shape[axis] > 1:
+            result[axis] = np.gradient(field, axis=axis)
+    return result
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)

@@ -33,6 +33,13 @@ SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Departures, in prior scales, at which the finite signature of an effect is tried."""
 
 
+MINIMA_TRIED = 12
+"""Neighbouring minima on both sides of the null and of the first guess among which the deepest are looked for."""
+
+STEPS_PER_MINIMUM = 5
+MINIMA_REFITTED = 4
+
+
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """Score test of one effect against a fit that lacks it.
@@ -264,10 +271,30 @@ class Selector:
             small = [0.1 * item.unit_step for item in own]
             fresh = [np.array(small) if start is None else np.asarray(start, dtype=float)]
             if len(own) == 1 and own[0].neighbour > 0.0:
-                fresh += [fresh[0] + turn * own[0].neighbour for turn in (-3, -2, -1, 1, 2, 3)]
+                fresh += self._minima(own[0], float(fresh[0][0]), base)
         if not fresh:
             return [np.array(known)]
         return [np.concatenate([known, one]) for one in fresh]
+
+    def _minima(self, item: Coordinate, around: float, base: Fit) -> list[FloatArray]:
+        """Deepest minima of the misfit along a coordinate that has many, nuisances projected out."""
+        state = self.state(base)
+        level = (self.problem.level_basis @ base.levels)[:, None, None]
+        step = item.neighbour / STEPS_PER_MINIMUM
+        reach = np.arange(-MINIMA_TRIED * STEPS_PER_MINIMUM, MINIMA_TRIED * STEPS_PER_MINIMUM + 1) * step
+        places = np.unique([item.clip(x) for x in np.concatenate([reach, around + reach])])
+        fall = np.zeros(len(places))
+        for number, place in enumerate(places):
+            settings = {**base.settings, item.key: item.value(place)}
+            changed = level * self.problem.forward.predict(settings, state.thickness_um).value
+            column = state.whiten(changed - state.value)[np.newaxis]  # type: ignore[operator]
+            score, information = state.design.project(column, state.residual)
+            fall[number] = 2.0 * score[0] - information[0, 0]
+        minimum = np.ones(len(places), dtype=bool)
+        minimum[1:] &= fall[1:] >= fall[:-1]
+        minimum[:-1] &= fall[:-1] >= fall[1:]
+        best = sorted(np.flatnonzero(minimum), key=lambda number: -fall[number])[:MINIMA_REFITTED]
+        return [np.array([places[number]]) for number in best]
 
     def _fit_from(
         self, names: tuple[str, ...], coordinates: tuple[Coordinate, ...], first: FloatArray, base: Fit
