@@ -88,6 +88,8 @@ class Effect(ABC):
     """``stack``, ``illumination``, ``response`` or ``image``."""
     laboratory_only: ClassVar[bool] = False
     """Whether it belongs to lamp, bench or cryostat, which a sensor does not take along to the telescope."""
+    couples_pixels: ClassVar[bool] = False
+    """Whether the signal of a pixel depends on other pixels, so that scattered samples of an image cannot show it."""
     parameters: ClassVar[tuple[Parameter, ...]]
     reference: ClassVar[str]
 

@@ -19,6 +19,7 @@ class ChargeDiffusion(PlainNullEffect):
     name = "charge_diffusion"
     title = "charge diffusion"
     acts_on = "image"
+    couples_pixels = True
     reference = "Lage 2019, doi 10.48550/arXiv.1911.09577 (a few um rms in 100 um of silicon)"
     parameters = (Parameter("sigma", "px", 0.0, (0.0, 5.0), 0.4, "rms radius along one axis"),)
 

@@ -6,16 +6,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..errors import InputError
 from ..optics.illumination import Beam
 from ..optics.system import OpticalSystem
 from .base import Parameter, PlainNullEffect
+from .beam_angles import widened
 
 __all__ = ["ConvergingBeam"]
 
 
 class ConvergingBeam(PlainNullEffect):
-    """A uniform cone of light in place of the parallel beam of the laboratory."""
+    """A uniform cone of light in place of every ray of the set-up, be it that of a lens or of an extended source."""
 
     name = "converging_beam"
     title = "converging beam or extended source"
@@ -27,9 +27,11 @@ class ConvergingBeam(PlainNullEffect):
     )
 
     def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
-        """Replace the beam by a cone."""
-        if system.beam.theta.size > 1:
-            raise InputError("effect converging_beam", "a beam of many angles", "set-ups with parallel light")
+        """Widen the beam by a cone."""
         aperture = values["numerical_aperture"]
         # Phase between axis and rim in 265 um of silicon is 240 rad times the aperture squared: a node per 2 rad.
-        return replace(system, beam=Beam.cone(0.5 / aperture, nodes=6 + math.ceil(120.0 * aperture**2)))
+        nodes = 6 + math.ceil(120.0 * aperture**2)
+        cone = Beam.cone(0.5 / aperture, nodes=nodes)
+        if system.beam.theta.any():
+            cone = widened(system.beam, cone, system.beam.theta.size + nodes)
+        return replace(system, beam=cone)

@@ -1,0 +1,626 @@
+"""Which measurement would tell effects apart that the present flats cannot.
+
+The data are flats of a sensor whose pixels each have a thickness and a response of their own, and whose flats each
+have a level of their own; the thickness of the silicon is known up to a constant. All of that is projected out of
+what the effects do to the flats: what is left are their signatures. With the signature ``a`` of the effect that was
+found and those ``B`` of another one,
+
+    separation² = |a|² (1 - likeness²),    likeness = |projection of a on B| / |a|
+
+is the χ² by which the second effect fits worse, whatever its size: the expected difference of two fits to noiseless
+("Asimov") data, to first order. Signatures, and their products (the Fisher information), add up over flats only
+together with the nuisances that flats share; so present and further flats are projected as one set.
+
+References
+----------
+Rao 1948 (doi 10.1017/S0305004100023987) for the projection; Cowan, Cranmer, Gross & Vitells 2011 (doi
+10.1140/epjc/s10052-011-1554-0) for Asimov data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from ..effects import EFFECTS, Effect, ImageGeometry, Parameter, activate_effects, apply_to_image
+from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..model import FringeModel
+from ..optics import Beam
+from ..optics.illumination import GaussianProfile, TriangularProfile
+from ..optics.system import OpticalSystem
+
+__all__ = [
+    "FlatSeries",
+    "Measurement",
+    "PairForecast",
+    "RankedMeasurement",
+    "break_ambiguity",
+    "candidate_measurements",
+    "rank_measurements",
+]
+
+FloatArray = NDArray[np.float64]
+Report = Callable[[str], None]
+
+SENSOR_PX = (4004, 4096)
+"""Rows and columns of the sensor whose information is forecast."""
+
+SAMPLES = (6, 24)
+"""Thicknesses of the silicon, within one of its fringe orders, and of the varying layer at each of them."""
+
+RESPONSE_SCATTER = 0.01
+"""Scatter of the response of single pixels that is known beforehand (relative)."""
+
+DERIVATIVE_STEP = 0.002
+"""Step of a difference in units of the prior scale of a parameter."""
+
+THICKNESS_STEP_UM = 1e-4
+"""Step of a difference in thickness [µm]; a fringe of the silicon takes 0.13."""
+
+LINE_STEP_NM = 0.1
+"""Spacing of wavelength nodes [nm]: five per fringe of detection layer and support together."""
+
+LEVEL_E = 20_000.0
+HIGH_LEVEL_E = 80_000.0
+NARROW_FWHM_NM = 0.5
+COOLER_K = 20.0
+SECOND_F_NUMBER = 2.0
+WIDE_NM = (800.0, 1050.0)
+
+DECISIVE_SIGMA = 5.0
+"""Separation with which two effects count as told apart."""
+
+
+@dataclass(frozen=True)
+class FlatSeries:
+    """Flats that are taken under the same conditions.
+
+    Attributes
+    ----------
+    wavelength_nm : `tuple` [`float`, ...]
+        Nominal wavelengths [nm].
+    level_e : `float`
+        Mean level [electrons].
+    bandwidth_fwhm_nm, temperature_k, f_number : `float` or `None`
+        Nominal width of the line [nm], temperature [K] and focal ratio; as in the set-up where not given.
+    """
+
+    wavelength_nm: tuple[float, ...]
+    level_e: float = LEVEL_E
+    bandwidth_fwhm_nm: float | None = None
+    temperature_k: float | None = None
+    f_number: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.wavelength_nm or not all(0.0 < w < math.inf for w in self.wavelength_nm):
+            raise InputError("wavelengths of a series [nm]", self.wavelength_nm, "one or more, positive")
+        if not 0.0 < self.level_e < math.inf:
+            raise OutOfRangeError("level of a series [e]", self.level_e, "positive")
+
+    def conditions(self, model: FringeModel) -> FringeModel:
+        """Model under the nominal conditions of the series.
+
+        Effects whose null is stated by the set-up (width of the line, temperature) keep their ratio to it.
+
+        Raises
+        ------
+        InputError
+            Another width of a line whose shape has none.
+        """
+        system = model.base_system
+        if self.bandwidth_fwhm_nm is not None:
+            if not isinstance(system.profile, GaussianProfile | TriangularProfile):
+                raise InputError(
+                    "bandwidth of a series [nm]", self.bandwidth_fwhm_nm, "none: the light has no line"
+                )
+            system = replace(system, profile=replace(system.profile, fwhm_nm=self.bandwidth_fwhm_nm))
+        if self.temperature_k is not None:
+            system = replace(system, temperature_k=self.temperature_k)
+        if self.f_number is not None:
+            nodes = 6 + math.ceil(120.0 * (0.5 / self.f_number) ** 2)
+            system = replace(system, beam=Beam.cone(self.f_number, nodes=nodes))
+        moved = tuple(
+            replace(item, values=_in_proportion(item.effect, item.values, model, system))
+            for item in model.effects
+        )
+        return replace(model, base_system=system, effects=moved)
+
+
+def _in_proportion(
+    effect: Effect, values: Mapping[str, float], model: FringeModel, system: OpticalSystem
+) -> dict[str, float]:
+    there = effect.null_values(system)
+    here = effect.null_values(model.base_system)
+    return {
+        name: value if there[name] == here[name] else value * there[name] / here[name]
+        for name, value in values.items()
+    }
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Flats that could be taken in addition.
+
+    Attributes
+    ----------
+    name, title : `str`
+        Key, and what to take, for people.
+    series : `FlatSeries`
+        The flats.
+    """
+
+    name: str
+    title: str
+    series: FlatSeries
+
+
+@dataclass(frozen=True)
+class PairForecast:
+    """How well the effect that was found is told from another one.
+
+    Attributes
+    ----------
+    effect, other : `str`
+        Names.
+    likeness_now, likeness_after : `float`
+        Cosine between the signatures, 0 to 1, with the present flats and with the further ones.
+    separation_now, separation_after : `float`
+        Expected difference of the two fits in standard deviations, the square root of Δχ².
+    """
+
+    effect: str
+    other: str
+    likeness_now: float
+    likeness_after: float
+    separation_now: float
+    separation_after: float
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        return (
+            f"{self.effect} against {self.other}: likeness {self.likeness_now:.3f} -> {self.likeness_after:.3f}, "
+            f"separation {self.separation_now:.3g} -> {self.separation_after:.3g} sigma"
+        )
+
+
+@dataclass(frozen=True)
+class RankedMeasurement:
+    """A measurement and what it would tell.
+
+    Attributes
+    ----------
+    measurement : `Measurement`
+        What to take.
+    pairs : `tuple` [`PairForecast`, ...]
+        The effect that was found against each of the others, hardest first.
+    """
+
+    measurement: Measurement
+    pairs: tuple[PairForecast, ...]
+
+    @property
+    def separation(self) -> float:
+        """Separation of the hardest pair [standard deviations]."""
+        return self.pairs[0].separation_after
+
+    @property
+    def gain(self) -> float:
+        """Factor by which the separation of the hardest pair grows; infinite if there was none."""
+        before = min(pair.separation_now for pair in self.pairs)
+        return self.separation / before if before > 0.0 else math.inf
+
+    @property
+    def decides(self) -> bool:
+        """Whether every pair is told apart."""
+        return self.separation >= DECISIVE_SIGMA
+
+    @property
+    def text(self) -> str:
+        """One line: the measurement and the hardest pair."""
+        return f"{self.measurement.title}: {self.pairs[0].text}"
+
+
+def candidate_measurements(
+    model: FringeModel, wavelength_nm: Sequence[float] | None = None, level_e: float = LEVEL_E
+) -> tuple[Measurement, ...]:
+    """Measurements that a test stand can make besides its usual flats.
+
+    Parameters
+    ----------
+    model : `FringeModel`
+        Laboratory set-up.
+    wavelength_nm : sequence of `float`, optional
+        Wavelengths of the present flats [nm]; by default those of the set-up.
+    level_e : `float`, optional
+        Their mean level [electrons].
+    """
+    present = _present(model, wavelength_nm, level_e)
+    waves, setup = present.wavelength_nm, model.setup
+    n = f"{len(waves)} flats"
+    found = [
+        Measurement("repeat", f"the same {n} once more", present),
+        Measurement(
+            "temperature",
+            f"{n} at {setup.temperature_k - COOLER_K:.0f} K",
+            replace(present, temperature_k=setup.temperature_k - COOLER_K),
+        ),
+    ]
+    level = HIGH_LEVEL_E if level_e < 0.5 * HIGH_LEVEL_E else 0.2 * level_e
+    found.append(Measurement("level", f"{n} of {level:.0f} electrons", replace(present, level_e=level)))
+    if setup.bandwidth_fwhm_nm > 1.5 * NARROW_FWHM_NM:
+        title = f"{n} with a bandpass of {NARROW_FWHM_NM:g} nm"
+        found.append(
+            Measurement("narrow_bandpass", title, replace(present, bandwidth_fwhm_nm=NARROW_FWHM_NM))
+        )
+    if math.isinf(setup.f_number) or setup.f_number > 2.0 * SECOND_F_NUMBER:
+        title = f"{n} in a beam of f/{SECOND_F_NUMBER:g}"
+        found.append(Measurement("f_number", title, replace(present, f_number=SECOND_F_NUMBER)))
+    further = tuple(
+        float(w) for w in np.linspace(*WIDE_NM, 26) if w < min(waves) - 5.0 or w > max(waves) + 5.0
+    )
+    if further:
+        title = f"{len(further)} flats at other wavelengths from {min(further):g} to {max(further):g} nm"
+        found.append(Measurement("wide_range", title, replace(present, wavelength_nm=further)))
+    return tuple(found)
+
+
+def rank_measurements(
+    model: FringeModel,
+    effects: Mapping[str, Mapping[str, float]],
+    *,
+    wavelength_nm: Sequence[float] | None = None,
+    level_e: float = LEVEL_E,
+    thickness_um: tuple[float, float] | None = None,
+    significance: float | None = None,
+    measurements: Sequence[Measurement] | None = None,
+    nuisance_effects: Sequence[str] = (),
+    catalogue: Sequence[Effect] = EFFECTS,
+    report: Report | None = None,
+) -> tuple[RankedMeasurement, ...]:
+    """Rank further measurements by how well they tell apart effects that the present flats cannot.
+
+    Parameters
+    ----------
+    model : `FringeModel`
+        Laboratory set-up with the effects that are beyond doubt, without those of the class.
+    effects : mapping
+        The class, the effect that was found first: fitted values by effect and parameter. Where nothing is known
+        (an empty mapping) an effect departs from null by its prior scale if it can do so to one side only, and
+        otherwise by little.
+    wavelength_nm, level_e
+        Wavelengths [nm] and mean level [electrons] of the present flats; by default those of the set-up.
+    thickness_um : `tuple` [`float`, `float`], optional
+        Smallest and largest thickness of the varying layer on the sensor [µm]; by default within 1.5 of the stack's.
+    significance : `float`, optional
+        Standard deviations by which the present data ask for the effect (root of Δχ²). Without it, that of a whole
+        sensor with photon noise and nothing else unknown, which is far too good: only ratios are to be trusted.
+    measurements : sequence of `Measurement`, optional
+        Those to compare; by default `candidate_measurements`.
+    nuisance_effects : sequence of `str`, optional
+        Effects known within their prior scale only; they are projected out, too.
+    catalogue : sequence of `Effect`, optional
+        Where the effects are.
+    report : callable, optional
+        Called with a line of text for each measurement.
+
+    Returns
+    -------
+    ranked : `tuple` [`RankedMeasurement`, ...]
+        Largest separation of the hardest pair first. Empty if fewer than two of the effects can be forecast: those
+        that couple neighbouring pixels cannot.
+
+    Raises
+    ------
+    UnknownNameError, OutOfRangeError
+        Effects or parameters that do not exist, values out of bounds.
+    InputError
+        The set-up is not one of a laboratory.
+    """
+    if model.setup.kind != "monochromator":
+        raise InputError("set-up", model.setup.name, "a laboratory set-up with a monochromator")
+    say = report or (lambda text: None)
+    known = {effect.name: effect for effect in catalogue}
+    unknown = [name for name in (*effects, *nuisance_effects) if name not in known]
+    if unknown:
+        raise UnknownNameError("effect", unknown[0], known)
+    tested = [_Tested.of(known[name], values, model) for name, values in effects.items()]
+    tested = [item for item in tested if not item.effect.couples_pixels]
+    if len(tested) < 2:
+        return ()
+    further = [_Tested.of(known[name], {}, model) for name in nuisance_effects if name not in effects]
+    present = _present(model, wavelength_nm, level_e)
+    forecast = _Forecast(model, catalogue, tuple(tested), tuple(further), _Sample.of(model, thickness_um))
+    chosen = measurements or candidate_measurements(model, wavelength_nm, level_e)
+    # Many small matrices: threads of the linear algebra would wait for each other.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _ranked(forecast, present, chosen, significance, say)
+
+
+def _ranked(
+    forecast: _Forecast,
+    present: FlatSeries,
+    measurements: Sequence[Measurement],
+    significance: float | None,
+    say: Report,
+) -> tuple[RankedMeasurement, ...]:
+    before = forecast.pairs([present])
+    first, *others = (item.effect.name for item in forecast.tested)
+    scale = 1.0 if significance is None else significance / max(before[0].strength, 1e-300)
+    ranked = []
+    for measurement in measurements:
+        after = forecast.pairs([present, measurement.series])
+        pairs = [
+            PairForecast(
+                first, other, now.likeness, then.likeness, scale * now.separation, scale * then.separation
+            )
+            for other, now, then in zip(others, before, after, strict=True)
+        ]
+        pairs.sort(key=lambda pair: pair.separation_after)
+        ranked.append(RankedMeasurement(measurement, tuple(pairs)))
+        say(ranked[-1].text)
+    return tuple(sorted(ranked, key=lambda item: -item.separation))
+
+
+def break_ambiguity(ranked: Sequence[RankedMeasurement]) -> str:
+    """What to measure next, in a sentence; an empty text if nothing could be forecast."""
+    if not ranked:
+        return ""
+    best = ranked[0]
+    if best.decides:
+        return best.text
+    return f"no measurement that was tried decides; the best are {best.text}"
+
+
+def _present(
+    model: FringeModel, wavelength_nm: Sequence[float] | None, level_e: float = LEVEL_E
+) -> FlatSeries:
+    waves = model.setup.wavelengths_nm if wavelength_nm is None else wavelength_nm
+    return FlatSeries(tuple(float(w) for w in waves), level_e)
+
+
+@dataclass(frozen=True)
+class _Tested:
+    """An effect, the values at which it is differentiated, and the direction from null that was found."""
+
+    effect: Effect
+    values: dict[str, float]
+    direction: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def of(cls, effect: Effect, values: Mapping[str, float], model: FringeModel) -> _Tested:
+        nulls = effect.null_values(model.base_system)
+        at, direction = {}, []
+        for parameter in effect.parameters:
+            null, (low, high) = nulls[parameter.name], parameter.bounds
+            if parameter.name in values:
+                at[parameter.name] = float(values[parameter.name])
+                direction.append(at[parameter.name] - null)
+                continue
+            # What starts from a bound may start with its square, without a derivative at the bound itself.
+            sign = -1.0 if null >= high else 1.0
+            one_sided = null <= low or null >= high
+            at[parameter.name] = null + sign * parameter.prior_scale * one_sided
+            direction.append(0.0 if values else sign * parameter.prior_scale)
+        for name in values:
+            effect.parameter(name)
+        activate_effects({effect.name: at}, (effect,))
+        scales = np.array([parameter.prior_scale for parameter in effect.parameters])
+        return cls(effect, at, np.array(direction), scales)
+
+    def neighbours(self, parameter: Parameter) -> tuple[float, float]:
+        """Values on both sides, within the bounds, between which a difference is taken."""
+        step = DERIVATIVE_STEP * parameter.prior_scale
+        if parameter.repeats_after:
+            step = min(step, 0.1 * DERIVATIVE_STEP * parameter.repeats_after)
+        low, high = parameter.bounds
+        value = self.values[parameter.name]
+        return max(value - step, low), min(value + step, high)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Pixels that stand for a sensor: every fringe phase of both layers, scattered over the sensor.
+
+    Attributes
+    ----------
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness of the varying layer [µm].
+    silicon_um : `numpy.ndarray`, shape ``(ny,)``
+        Thickness of the detection layer minus that of the stack [µm]; zero if that is the layer that varies.
+    """
+
+    thickness_um: FloatArray
+    silicon_um: FloatArray
+
+    @classmethod
+    def of(cls, model: FringeModel, range_um: tuple[float, float] | None) -> _Sample:
+        system = model.base_system
+        rows, columns = SAMPLES
+        if range_um is None:
+            middle = float(system.stack.thickness_um[system.stack.position(system.varying)])
+            range_um = (middle - 1.5, middle + 1.5)
+        low, high = range_um
+        if not 0.0 < low < high < math.inf:
+            raise OutOfRangeError("thickness range [um]", range_um, "two increasing, positive numbers")
+        golden = 0.5 * (math.sqrt(5.0) - 1.0)
+        place = ((np.arange(rows * columns) + 0.5) * golden) % 1.0
+        silicon: FloatArray = np.zeros(rows)
+        if system.varying != system.detection:
+            medium = system.stack.layers[system.stack.position(system.detection)].medium
+            order_um = 0.5e-3 * 950.0 / float(medium.index(950.0, system.temperature_k).real)
+            silicon = np.asarray(order_um * (((np.arange(rows) + 0.5) * golden) % 1.0 - 0.5))
+        thickness: FloatArray = np.asarray(low + (high - low) * place, dtype=float)
+        return cls(thickness.reshape(rows, columns), silicon)
+
+    def geometry(self, series: FlatSeries) -> ImageGeometry:
+        """Positions of the samples, spread over the sensor."""
+        y, x = (
+            np.linspace(0.0, size - 1.0, count)
+            for size, count in zip(SENSOR_PX, self.thickness_um.shape, strict=True)
+        )
+        waves = np.array(series.wavelength_nm)
+        return ImageGeometry(SENSOR_PX, y, x, waves, np.full(waves.shape, series.level_e))
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """One series of flats at the sample, shapes ``(W, P)`` and ``(K, W, P)``.
+
+    Attributes
+    ----------
+    image : `numpy.ndarray`
+        Signal relative to its mean.
+    weight : `numpy.ndarray`
+        Inverse standard deviation of the noise of a pixel.
+    thickness, silicon : `numpy.ndarray`
+        Derivatives with respect to the two thicknesses [1/µm].
+    tested, further : `numpy.ndarray`
+        Derivatives with respect to the parameters of the effects, in units of their prior scales.
+    """
+
+    image: FloatArray
+    weight: FloatArray
+    thickness: FloatArray
+    silicon: FloatArray
+    tested: FloatArray
+    further: FloatArray
+
+
+@dataclass(frozen=True)
+class _Likeness:
+    """Strength of the effect that was found, and how alike another one is."""
+
+    strength: float
+    likeness: float
+
+    @property
+    def separation(self) -> float:
+        return self.strength * math.sqrt(max(1.0 - self.likeness**2, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Forecast:
+    """Fisher information of sets of flats about the effects of a class."""
+
+    model: FringeModel
+    catalogue: Sequence[Effect]
+    tested: tuple[_Tested, ...]
+    further: tuple[_Tested, ...]
+    sample: _Sample
+    _blocks: dict[FlatSeries, _Block] = field(default_factory=dict)
+
+    def pairs(self, series: Sequence[FlatSeries]) -> list[_Likeness]:
+        """The first effect against each of the others."""
+        signature = self.signatures([self._block(each) for each in series])
+        sizes = [item.scale.size for item in self.tested]
+        first, *others = np.split(signature, np.cumsum(sizes)[:-1], axis=1)
+        found = first @ (self.tested[0].direction / self.tested[0].scale)
+        strength = float(np.linalg.norm(found))
+        result = []
+        for other in others:
+            basis = _orthonormal(other)
+            alike = float(np.linalg.norm(basis.T @ found)) / strength if strength > 0.0 else math.nan
+            result.append(_Likeness(strength, min(alike, 1.0)))
+        return result
+
+    def signatures(self, blocks: Sequence[_Block]) -> FloatArray:
+        """What the effects do to the flats of a sensor and nothing else does, in units of the noise.
+
+        Returns
+        -------
+        signature : `numpy.ndarray`, shape ``(rows, K)``
+            One column for each parameter; the products of columns are the Fisher information.
+        """
+        joined = [np.concatenate([getattr(block, name) for block in blocks], axis=-2) for name in _FIELDS]
+        image, weight, thickness, silicon, tested, further = joined
+        flats, pixels = image.shape
+        level = np.zeros((flats, flats, pixels))
+        level[np.arange(flats), np.arange(flats)] = image
+        columns = np.concatenate([tested, further, silicon[np.newaxis], level]) * weight
+        local = np.stack([thickness, image]) * weight
+        # The response of a pixel is known a little: a further datum of each pixel, whose expectation no effect moves.
+        columns = np.concatenate([columns, np.zeros((len(columns), 1, pixels))], axis=1)
+        known = np.zeros((2, 1, pixels))
+        known[1] = 1.0 / RESPONSE_SCATTER
+        local = np.concatenate([local, known], axis=1)
+        basis, _ = np.linalg.qr(np.ascontiguousarray(local.transpose(2, 1, 0)))
+        design = np.ascontiguousarray(columns.transpose(2, 1, 0))
+        design -= basis @ (basis.transpose(0, 2, 1) @ design)
+        design = design.reshape(-1, len(columns)) * math.sqrt(SENSOR_PX[0] * SENSOR_PX[1] / pixels)
+        wanted, nuisance = np.split(design, [len(tested)], axis=1)
+        # Derivatives are per prior scale, so that the priors are unit rows.
+        prior = np.eye(nuisance.shape[1])[: len(further)]
+        nuisance = _orthonormal(np.concatenate([nuisance, prior]))
+        wanted = np.concatenate([wanted, np.zeros((len(prior), wanted.shape[1]))])
+        signature: FloatArray = wanted - nuisance @ (nuisance.T @ wanted)
+        return signature
+
+    def _block(self, series: FlatSeries) -> _Block:
+        if series not in self._blocks:
+            self._blocks[series] = self._differentiated(series)
+        return self._blocks[series]
+
+    def _differentiated(self, series: FlatSeries) -> _Block:
+        step = THICKNESS_STEP_UM
+        image = self._observe(series, {})
+        thickness = self._observe(series, {}, step) - self._observe(series, {}, -step)
+        silicon = np.zeros(image.shape)
+        if self.model.base_system.varying != self.model.base_system.detection:
+            silicon = self._observe(series, {}, 0.0, step) - self._observe(series, {}, 0.0, -step)
+        tested, further = (
+            np.array([self._slope(series, item, parameter) for item in items for parameter in item.effect.parameters])
+            .reshape(-1, *image.shape)
+            for items in (self.tested, self.further)
+        )  # fmt: skip
+        weight = np.sqrt(series.level_e / np.maximum(image, 1e-6))
+        return _Block(image, weight, thickness / (2.0 * step), silicon / (2.0 * step), tested, further)
+
+    def _slope(self, series: FlatSeries, item: _Tested, parameter: Parameter) -> FloatArray:
+        """Derivative with respect to a parameter, in units of its prior scale."""
+        low, high = item.neighbours(parameter)
+        ends = [
+            self._observe(series, {item.effect.name: {**item.values, parameter.name: value}})
+            for value in (low, high)
+        ]
+        slope: FloatArray = (ends[1] - ends[0]) * (parameter.prior_scale / (high - low))
+        return slope
+
+    def _observe(
+        self,
+        series: FlatSeries,
+        effects: Mapping[str, Mapping[str, float]],
+        shift_um: float = 0.0,
+        silicon_um: float = 0.0,
+    ) -> FloatArray:
+        """Flats of the sample over their means, shape ``(W, P)``."""
+        model = self.model.with_effects({**self.model.effect_settings, **effects}, self.catalogue)
+        model = series.conditions(model)
+        system, waves = model.base_system, np.array(series.wavelength_nm)
+        nominal = system.stack.layers[system.stack.position(system.detection)].thickness_um
+        rows = []
+        for thickness, offset in zip(self.sample.thickness_um, self.sample.silicon_um, strict=True):
+            moved = system.with_layer(system.detection, thickness_um=nominal + offset + silicon_um)
+            one = replace(model, base_system=moved)
+            rows.append(one.respond(one.system.flat_fields(waves, LINE_STEP_NM), thickness + shift_um, waves))
+        image = np.stack(rows, axis=1)
+        image /= image.mean(axis=(1, 2), keepdims=True)
+        image = apply_to_image(model.effects, system, image, self.sample.geometry(series))
+        return image.reshape(len(waves), -1)
+
+
+_FIELDS = ("image", "weight", "thickness", "silicon", "tested", "further")
+
+
+def _orthonormal(columns: FloatArray) -> FloatArray:
+    """Orthonormal basis of what the columns span; directions that are only rounding are left out."""
+    norm = np.linalg.norm(columns, axis=0)
+    scaled = columns / np.where(norm > 0.0, norm, 1.0)
+    basis, size, _ = np.linalg.svd(scaled, full_matrices=False)
+    return np.asarray(basis[:, size > 1e-9 * max(float(size.max()), 1e-300)])
