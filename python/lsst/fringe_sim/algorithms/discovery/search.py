@@ -435,6 +435,8 @@ class _Search:
         if not singles or singles[0].log_evidence < self.options.least_evidence:
             return current, []
         best = selector.with_channels(singles[0])
+        if not self._consistent(best):
+            best = selector.with_channels(self._searched_harder(selector, singles))
         steps.append(self._step(selector, current, best))
         current = best
         while not steps[-1].consistent and len(current.names) < self.options.most_effects:
@@ -450,11 +452,19 @@ class _Search:
             current = best
         return self._pruned(selector, current), steps
 
+    def _searched_harder(self, selector: Selector, singles: list[Hypothesis]) -> Hypothesis:
+        """Best single effect when the nearly best ones are tried at other sizes too."""
+        near = [h for h in singles if h.log_evidence > 0.7 * singles[0].log_evidence][:6]
+        again = [selector.improved(h.names, selector.null.fit, scan=True) for h in near]
+        return max(again, key=lambda item: item.log_evidence)
+
     def _pruned(self, selector: Selector, hypothesis: Hypothesis) -> Hypothesis:
         """Leave out members that bring nothing."""
         for name in hypothesis.names:
             rest = tuple(other for other in hypothesis.names if other != name)
-            smaller = selector.with_channels(selector.hypothesis(rest, None, hypothesis.fit))
+            if not rest:
+                continue
+            smaller = selector.with_channels(selector.improved(rest, hypothesis.fit))
             if smaller.log_evidence > hypothesis.log_evidence - 3.0 and self._consistent(smaller):
                 return self._pruned(selector, smaller)
         return hypothesis

@@ -34,7 +34,7 @@ SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
 
 
 MINIMA_TRIED = 12
-"""Neighbouring minima on both sides of the null and of the first guess among which the deepest are looked for."""
+"""Neighbouring minima on both sides of the first one found among which the deepest is looked for."""
 
 STEPS_PER_MINIMUM = 5
 MINIMA_REFITTED = 4
@@ -256,9 +256,50 @@ class Selector:
             ),
             key=lambda item: item.chi2,
         )
+        fit = self._deepest(fit)
         hypothesis = Hypothesis(ordered, fit, self._evidence(fit))
         self.fitted[key] = hypothesis
         return hypothesis
+
+    def improved(self, names: Sequence[str], base: Fit, *, scan: bool = False) -> Hypothesis:
+        """Fit a set again from what a fit of more effects found, or from a scan; the better fit is remembered.
+
+        Parameters
+        ----------
+        names : sequence of `str`
+            Effects, all of them in ``base`` or fitted before.
+        base : `Fit`
+            Where to start.
+        scan : `bool`, optional
+            Try sizes from the smallest to the largest of the last effect as well: a strong effect may have
+            several minima.
+        """
+        known = self.hypothesis(names, None, base)
+        coordinates = known.fit.coordinates
+        first = np.array([item.coordinate(base.settings.get(item.key, known.fit.settings[item.key]))
+                          for item in coordinates])  # fmt: skip
+        starts = [first] if any(item.key in base.settings for item in coordinates) else []
+        if scan:
+            starts += self._spread_starts(known.fit)
+        for start in starts:
+            trial = fit_model(self.problem, coordinates, start, base.field, base.levels)
+            if trial.chi2 < known.fit.chi2 - 1.0:
+                trial = self._deepest(trial)
+                known = Hypothesis(known.names, trial, self._evidence(trial))
+        self.fitted[frozenset(names)] = known
+        return known
+
+    def _spread_starts(self, fit: Fit) -> list[FloatArray]:
+        """The fit with its last effect moved to other sizes, from near the null to near the bound."""
+        last = fit.coordinates[-1]
+        if len(fit.coordinates) > 1 and fit.coordinates[-2].effect == last.effect:
+            return []
+        value = last.value(fit.position[-1])
+        bound = last.high if value >= last.null else last.low
+        sizes = last.null + np.sign(value - last.null) * last.scale * np.array(SCAN)
+        sizes = np.append(sizes, last.null + np.array([0.3, 0.6, 0.9]) * (bound - last.null))
+        inside = [size for size in sizes if last.low <= size <= last.high]
+        return [np.append(fit.position[:-1], last.coordinate(size)) for size in inside]
 
     def _starts(self, names: tuple[str, ...], start: FloatArray | None, base: Fit) -> list[FloatArray]:
         """First guesses: what is known of the others, and for the new effect its best start and its neighbours."""
@@ -270,22 +311,24 @@ class Selector:
                 continue
             small = [0.1 * item.unit_step for item in own]
             fresh = [np.array(small) if start is None else np.asarray(start, dtype=float)]
-            if len(own) == 1 and own[0].neighbour > 0.0:
-                fresh += self._minima(own[0], float(fresh[0][0]), base)
         if not fresh:
             return [np.array(known)]
         return [np.concatenate([known, one]) for one in fresh]
 
-    def _minima(self, item: Coordinate, around: float, base: Fit) -> list[FloatArray]:
-        """Deepest minima of the misfit along a coordinate that has many, nuisances projected out."""
-        state = self.state(base)
-        level = (self.problem.level_basis @ base.levels)[:, None, None]
-        step = item.neighbour / STEPS_PER_MINIMUM
-        reach = np.arange(-MINIMA_TRIED * STEPS_PER_MINIMUM, MINIMA_TRIED * STEPS_PER_MINIMUM + 1) * step
-        places = np.unique([item.clip(x) for x in np.concatenate([reach, around + reach])])
+    def _deepest(self, fit: Fit) -> Fit:
+        """The fit, or a better one in a neighbouring minimum of a coordinate that has many."""
+        last = fit.coordinates[-1]
+        if not last.neighbour:
+            return fit
+        held = replace(fit, coordinates=(), position=np.zeros(0), information=np.zeros((0, 0)))
+        state = self.state(held)
+        level = (self.problem.level_basis @ fit.levels)[:, None, None]
+        reach = np.arange(-MINIMA_TRIED * STEPS_PER_MINIMUM, MINIMA_TRIED * STEPS_PER_MINIMUM + 1)
+        around = fit.position[-1] + reach * (last.neighbour / STEPS_PER_MINIMUM)
+        places = np.unique([last.clip(x) for x in around])
         fall = np.zeros(len(places))
         for number, place in enumerate(places):
-            settings = {**base.settings, item.key: item.value(place)}
+            settings = {**fit.settings, last.key: last.value(place)}
             changed = level * self.problem.forward.predict(settings, state.thickness_um).value
             column = state.whiten(changed - state.value)[np.newaxis]  # type: ignore[operator]
             score, information = state.design.project(column, state.residual)
@@ -293,8 +336,13 @@ class Selector:
         minimum = np.ones(len(places), dtype=bool)
         minimum[1:] &= fall[1:] >= fall[:-1]
         minimum[:-1] &= fall[:-1] >= fall[1:]
+        minimum &= np.abs(places - fit.position[-1]) > 0.5 * last.neighbour
         best = sorted(np.flatnonzero(minimum), key=lambda number: -fall[number])[:MINIMA_REFITTED]
-        return [np.array([places[number]]) for number in best]
+        for number in best:
+            start = np.append(fit.position[:-1], places[number])
+            trial = fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels)
+            fit = min(fit, trial, key=lambda item: item.chi2)
+        return fit
 
     def _fit_from(
         self, names: tuple[str, ...], coordinates: tuple[Coordinate, ...], first: FloatArray, base: Fit
