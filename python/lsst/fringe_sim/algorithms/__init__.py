@@ -15,7 +15,10 @@ _LAZY = {
     "fit_pca": ".pca",
     "fit_single_pixel": ".single_pixel",
     "fit_thickness": ".thickness_fit",
+    "forecast_flats": ".flat_plan",
     "prepare_flat": ".flat_prep",
+    "rank_flats": ".flat_plan",
+    "recommend_flats": ".flat_plan",
     "simulate_sky_frame": ".sky_frame",
 }
 

@@ -9,7 +9,7 @@ import click
 import numpy as np
 from astropy import units
 
-__all__ = ["EFFECT", "SIZE", "WAVELENGTHS", "Quantity", "effect_settings"]
+__all__ = ["EFFECT", "SIZE", "THICKNESS_RANGE", "WAVELENGTHS", "Quantity", "effect_settings"]
 
 
 class Quantity(click.ParamType):
@@ -64,6 +64,23 @@ class _Wavelengths(click.ParamType):
         return tuple(quantity.convert(part, param, ctx) for part in value.split(","))
 
 
+class _ThicknessRange(click.ParamType):
+    """``7:15`` or ``7um:15um``: two increasing, positive numbers; µm."""
+
+    name = "low:high"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float]:
+        if isinstance(value, tuple):
+            return value
+        quantity = Quantity("um")
+        parts = [quantity.convert(part, param, ctx) for part in str(value).split(":")]
+        if len(parts) != 2 or not 0.0 < parts[0] < parts[1]:
+            self.fail(f"{value!r} is not low:high with 0 < low < high", param, ctx)
+        return parts[0], parts[1]
+
+
 class _Size(click.ParamType):
     """``512x512``: columns times rows."""
 
@@ -100,6 +117,7 @@ class _EffectSetting(click.ParamType):
 
 
 WAVELENGTHS = _Wavelengths()
+THICKNESS_RANGE = _ThicknessRange()
 SIZE = _Size()
 EFFECT = _EffectSetting()
 

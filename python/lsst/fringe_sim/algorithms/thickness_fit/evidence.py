@@ -29,8 +29,8 @@ MISFIT = 3.0
 """Cells whose chi-square is this many times the median lose their say on the order."""
 IMPOSSIBLE = 1.0e6
 """Chi-square given to an order outside the thickness range."""
-_POLISHED = 6
-"""Best minima of each cell that are refined on the full table before they are compared."""
+_POLISHED = 64
+"""Most minima of a cell that are refined on the full table before they are compared: few wavelengths have many."""
 _POLISH_SHARE = 0.01
 """Minima are refined while they lie within this share of the chi-square of a wrong phase."""
 _STRIDE = 4

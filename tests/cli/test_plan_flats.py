@@ -1,0 +1,61 @@
+"""``fringe-sim plan-flats``."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from lsst.fringe_sim.cli.main import run
+
+SHORT = [
+    "--thickness",
+    "9um:10um",
+    "--search",
+    "8:11",
+    "--wavelengths",
+    "880:990:22",
+    "--candidates",
+    "890:990:50",
+]
+
+
+def test_table(capsys, tmp_path) -> None:
+    path = tmp_path / "plan.ecsv"
+    assert run(["plan-flats", *SHORT, "--ecsv", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "Δχ²" in text
+    assert "next flat" in text
+    assert "ambiguous" in text.lower()
+    table = QTable.read(path)
+    assert table["thickness"].unit == "um"
+    assert table["sigma"].unit == "nm"
+    assert np.all(table["sigma"].value > 0)
+
+
+def test_json_and_units(capsys) -> None:
+    assert run(["plan-flats", *SHORT, "--json", "--electrons", "20000"]) == 0
+    plain = json.loads(capsys.readouterr().out)
+    other = ["--thickness", "9000nm:10000nm", "--search", "8:11um", "--wavelengths", "0.88um:0.99um:22nm"]
+    assert run(["plan-flats", *other, "--candidates", "890:990:50", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["forecast"]["worst"] == pytest.approx(
+        plain["forecast"]["worst"]
+    )
+    assert len(plain["next"]) == 6
+    assert plain["forecast"]["region_px"] == 64
+
+
+def test_dry_run_writes_nothing(capsys, tmp_path) -> None:
+    path = tmp_path / "plan.ecsv"
+    assert run(["plan-flats", *SHORT, "--ecsv", str(path), "--dry-run"]) == 0
+    assert "would" in capsys.readouterr().out
+    assert not path.exists()
+
+
+def test_bad_arguments(capsys) -> None:
+    assert run(["plan-flats", "--thickness", "10:9"]) == 2
+    assert run(["plan-flats", "--setup", "lsst_e2v"]) == 1
+    assert "monochromator" in capsys.readouterr().err
+    assert run(["plan-flats", "--setup", "ts8_e2v", "--thickness", "9:10", "--search", "9.5:11"]) == 1
