@@ -44,7 +44,7 @@ def thickness(**changes: Any) -> ThicknessMap:
 def run(
     thickness_map: ThicknessMap | None = None, exposure: SkyExposure = EXPOSURE, **config: Any
 ) -> SkyFringe:
-    made = SkyFringeSimConfig(**config)
+    made = SkyFringeSimConfig(**({"beams": "centre"} | config))
     made.validate()
     given = thickness() if thickness_map is None else thickness_map
     sky: SkyFringe = SkyFringeSimTask(config=made).run(given, exposure, DETECTOR).sky
@@ -70,6 +70,32 @@ def test_doubts_about_the_map_reach_the_frame() -> None:
     frame = run()
     np.testing.assert_array_equal(frame.mask, thickness().mask)
     assert np.isfinite(frame.image).all()
+
+
+def test_every_pixel_has_the_beam_of_its_place_and_its_photons_migrate() -> None:
+    """At the centre of the field the corners of the sensor differ most from its middle."""
+    one, all_of_them, blurred = (
+        run(beams="centre"),
+        run(),
+        run(beams="pixel", migration=True),
+    )
+    pixel = run(beams="pixel")
+    np.testing.assert_array_equal(one.image, all_of_them.image)
+    difference = pixel.fraction() - one.fraction()
+    assert 0.1 * np.ptp(one.fraction()) < np.abs(difference).max() < 2.0 * np.ptp(one.fraction())
+    assert pixel.metadata["BEAMS"] == "pixel"
+    assert 0 < pixel.quadrature_error < 1e-4
+    # Nine tenths of the photons stay in their pixel or the next, so that the frame is hardly smoother.
+    assert 0.8 * pixel.fraction().std() < blurred.fraction().std() < pixel.fraction().std()
+
+
+def test_a_sensor_without_a_map_gets_a_stand_in_if_that_is_wanted() -> None:
+    config = SkyFringeSimConfig(beams="centre", stand_in=True, stand_in_shape=[20, 24])
+    frame = SkyFringeSimTask(config=config).run(None, EXPOSURE, DETECTOR).sky
+    assert frame.shape == (20, 24)
+    assert frame.metadata["STANDIN"] is True
+    with pytest.raises(InputError, match="one, or stand_in=True"):
+        SkyFringeSimTask(config=SkyFringeSimConfig()).run(None, EXPOSURE, DETECTOR)
 
 
 def test_between_two_hours_the_bands_are_interpolated() -> None:
@@ -120,7 +146,7 @@ def test_level_of_the_throughput_tables() -> None:
 
 def test_effects_of_the_sensor_change_the_frame_those_of_the_lamp_do_not() -> None:
     plain = run()
-    config = SkyFringeSimConfig()
+    config = SkyFringeSimConfig(beams="centre")
     config.effects.update({"bandwidth.fwhm": 3.0, "roughness.sigma": 120.0})
     frame = SkyFringeSimTask(config=config).run(thickness(), EXPOSURE, DETECTOR).sky
     assert frame.metadata["FRINGRMS"] < 0.9 * plain.metadata["FRINGRMS"]
@@ -151,6 +177,7 @@ def test_a_map_without_any_thickness_is_refused() -> None:
     [
         (lambda c: setattr(c, "setup", "ts8_e2v"), "does not see the sky"),
         (lambda c: setattr(c, "seed", -1), "must not be negative"),
+        (lambda c: c.update(setup="monocam", migration=True), "needs a traced telescope"),
         (lambda c: c.rafts.update({"R01": RaftConfig(setup="ts8_itl")}), "does not see the sky"),
     ],
 )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +25,7 @@ from ..model import FringeModel, ResponseTable, tabulate
 from ..optics import Beam, Illumination
 from ..optics.phase_response import PhaseResponse
 from ..products import SkyFringe, mask_bits
+from .photon_migration import spread_charge
 
 __all__ = [
     "FringeAmplitudes",
@@ -86,6 +88,44 @@ class SkyQuadrature:
     table_tolerance: float = 3e-7
 
 
+class FrameTable(Protocol):
+    """What makes frames from thickness: a `ResponseTable` of one row, or a `FieldTable`."""
+
+    @property
+    def wavelength_nm(self) -> FloatArray:
+        """Mean wavelength [nm], shape ``(1,)``."""
+
+    @property
+    def interpolation_error(self) -> float:
+        """Largest error of interpolation, in the units of the frame."""
+
+    def frame(self, thickness_um: ArrayLike) -> NDArray[np.float32]:
+        """Frame of a thickness map [µm]."""
+
+
+class Response(Protocol):
+    """Response of a sensor to a sky: a `SkyResponse`, or a `SensorResponse` with the beam of every pixel."""
+
+    @property
+    def component(self) -> tuple[str, ...]:
+        """Names of the components of the sky."""
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Those that are OH bands."""
+
+    @property
+    def quadrature_error(self) -> float:
+        """Estimated error of the sums over lines and angles, relative to the mean sky."""
+
+    @property
+    def airmass(self) -> float:
+        """Airmass of the sky."""
+
+    def sky(self, scale: Mapping[str, float] | None = None) -> FrameTable:
+        """Electrons s⁻¹ m⁻² arcsec⁻² over thickness."""
+
+
 @dataclass(frozen=True, eq=False)
 class SkyResponse:
     """Electrons from the components of a sky, over thickness.
@@ -128,16 +168,7 @@ class SkyResponse:
         OutOfRangeError
             A factor that is negative or not finite, or no light left.
         """
-        factors = np.ones(len(self.component))
-        for name, factor in (scale or {}).items():
-            if name not in self.component:
-                raise UnknownNameError("component of the sky", name, self.component)
-            if not 0.0 <= factor < math.inf:
-                raise OutOfRangeError(f"scale of {name}", factor, "finite and not negative")
-            factors[self.component.index(name)] = factor
-        if not factors @ self.photons > 0.0:
-            raise OutOfRangeError("photons of the sky", 0.0, "more than none")
-        return factors
+        return component_factors(self.component, self.photons, scale)
 
     def sky(self, scale: Mapping[str, float] | None = None) -> ResponseTable:
         """Electrons s⁻¹ m⁻² arcsec⁻² as a table of one row.
@@ -156,6 +187,22 @@ class SkyResponse:
             np.array([float(rates @ self.table.wavelength_nm / rates.sum())]),
             self.level * self.table.interpolation_error * float(factors.sum()),
         )
+
+
+def component_factors(
+    component: tuple[str, ...], photons: FloatArray, scale: Mapping[str, float] | None
+) -> FloatArray:
+    """Factor on every component, 1 unless named; errors as of `SkyResponse.factors`."""
+    factors = np.ones(len(component))
+    for name, factor in (scale or {}).items():
+        if name not in component:
+            raise UnknownNameError("component of the sky", name, component)
+        if not 0.0 <= factor < math.inf:
+            raise OutOfRangeError(f"scale of {name}", factor, "finite and not negative")
+        factors[component.index(name)] = factor
+    if not factors @ photons > 0.0:
+        raise OutOfRangeError("photons of the sky", 0.0, "more than none")
+    return factors
 
 
 def sky_response(
@@ -192,7 +239,24 @@ def sky_response(
         An empty range of thickness, or a wavelength for which a medium is not known.
     """
     fineness = SkyQuadrature() if quadrature is None else quadrature
-    band = _bandpass_of(model) if bandpass is None else bandpass
+    band = bandpass_of(model) if bandpass is None else bandpass
+    table, photons, level = tabulate_components(model, sky, band, thickness_range_um, fineness)
+    samples = error_samples((table.start_um, table.stop_um))
+    error = spectral_error(model, sky, band, fineness, samples)
+    error += _angular_error(model, sky, band, fineness, samples)
+    lines, continua = split_components(sky, band, fineness.continuum_step_nm)
+    names = tuple(item.name for item in [*lines, *continua])
+    return SkyResponse(names, photons, level, table, error / level, sky.airmass)
+
+
+def tabulate_components(
+    model: FringeModel,
+    sky: SkySpectrum,
+    band: Bandpass,
+    thickness_range_um: tuple[float, float] | None,
+    fineness: SkyQuadrature,
+) -> tuple[ResponseTable, FloatArray, float]:
+    """Table of `SkyResponse`, photons of its components, and its level; parameters as of `sky_response`."""
     low, high = model.setup.thickness_range_um if thickness_range_um is None else thickness_range_um
     if not 0.0 <= low < high < math.inf:
         raise OutOfRangeError("thickness range [um]", (low, high), "two increasing, not negative numbers")
@@ -200,9 +264,7 @@ def sky_response(
     if not lights:
         raise InputError("sky", "no light behind the bandpass", "lines or a continuum inside it")
     sums = [_SpectralSum.of(model, light) for light in lights]
-    step = (high - low) / _ERROR_SAMPLES
-    samples = (low + 0.5 * step, step, _ERROR_SAMPLES)
-    level = float(sum(each.electrons(*samples).mean() for each in sums))
+    level = float(sum(each.electrons(*error_samples((low, high))).mean() for each in sums))
 
     def contributions(start_um: float, step_um: float, count: int) -> FloatArray:
         return np.stack([each.electrons(start_um, step_um, count) for each in sums]) / level
@@ -216,14 +278,7 @@ def sky_response(
         fourth_derivative=None if late else max(each.derivative_bound(4, low) for each in sums) / level,
         tolerance=fineness.table_tolerance,
     )
-    return SkyResponse(
-        tuple(each.light.component.name for each in sums),
-        np.array([each.light.photons for each in sums]),
-        level,
-        table,
-        _quadrature_error(model, sky, band, fineness, samples) / level,
-        sky.airmass,
-    )
+    return table, np.array([each.light.photons for each in sums]), level
 
 
 def simulate_sky_frame(
@@ -231,12 +286,13 @@ def simulate_sky_frame(
     model: FringeModel,
     sky: SkySpectrum | None = None,
     *,
-    response: SkyResponse | None = None,
+    response: Response | None = None,
     scale: Mapping[str, float] | None = None,
     exposure_s: float | None = None,
     mean_electrons: float | None = None,
     airglow_level: ArrayLike = 1.0,
     read_noise_e: float = 0.0,
+    charge_kernel: ArrayLike | None = None,
     seed: int | None = None,
     hour: float = 24.0,
     detector: str = "",
@@ -252,8 +308,9 @@ def simulate_sky_frame(
         Sensor behind a telescope, with effects; its field position decides the beam.
     sky : `SkySpectrum`, optional
         Lines and continua; by default a dark sky at the airmass of the set-up.
-    response : `SkyResponse`, optional
-        Result of `sky_response` for this model and sky, so that many frames share it.
+    response : `SkyResponse` or `SensorResponse`, optional
+        Result of `sky_response` (one beam for all pixels) or `sensor_response` (the beam of every pixel) for this
+        model and sky, so that many frames share it. By default one beam, that of the model.
     scale : mapping, optional
         Factors on components of the sky: OH bands and continua by name.
     exposure_s : `float`, optional
@@ -265,8 +322,10 @@ def simulate_sky_frame(
         Brightness of the sky relative to the field centre; broadcasts to the image.
     read_noise_e : `float`, optional
         Read noise [e⁻ rms], added if ``seed`` is given.
+    charge_kernel : array_like, optional
+        Where the photons of a pixel are absorbed (`PhotonMigration.pixel_kernel`); all of them in it if not given.
     seed : `int`, optional
-        Seed of photon and read noise (GalSim); a frame without noise if not given.
+        Seed of photon and read noise; a frame without noise if not given.
     hour, detector, physical_filter
         Go into the product.
 
@@ -301,6 +360,8 @@ def simulate_sky_frame(
     to_electrons = exposure * setup.effective_area_m2 * setup.pixel_scale_arcsec**2
     image = level.frame(thickness)
     image *= np.asarray(airglow_level, dtype=np.float32)
+    if charge_kernel is not None:
+        image = _spread(image, known, charge_kernel)
     image = _with_image_effects(model, image, known, float(level.wavelength_nm[0]), to_electrons)
     amplitudes = fringe_amplitudes(image, ~known)
     mean = float(image.mean(dtype=np.float64, where=known))
@@ -337,12 +398,13 @@ def simulate_sky_frame(
 def simulate_night(
     thickness_um: ArrayLike,
     model: FringeModel,
-    response: SkyResponse,
+    response: Response,
     night: NightHistory,
     *,
     exposure_s: float | None = None,
     seed: int | None = None,
     read_noise_e: float = 0.0,
+    charge_kernel: ArrayLike | None = None,
     detector: str = "",
     physical_filter: str = "",
 ) -> Iterator[SkyFringe]:
@@ -350,7 +412,7 @@ def simulate_night(
 
     Parameters
     ----------
-    thickness_um, model, response, exposure_s, read_noise_e, detector, physical_filter
+    thickness_um, model, response, exposure_s, read_noise_e, charge_kernel, detector, physical_filter
         See `simulate_sky_frame`.
     night : `NightHistory`
         Intensity of the OH bands through the night.
@@ -370,6 +432,7 @@ def simulate_night(
             scale=night.band_scale(time, response.bands),
             exposure_s=exposure_s,
             read_noise_e=read_noise_e,
+            charge_kernel=charge_kernel,
             seed=None if seed is None else int(children[time]),
             hour=_BASELINE_HOUR + float(night.hours[time]),
             detector=detector,
@@ -381,13 +444,19 @@ def throughput_electrons(
     sky: SkySpectrum, bandpass: Bandpass, model: FringeModel, exposure_s: float | None = None
 ) -> float:
     """Mean sky [e⁻ per pixel] through the measured quantum efficiency of the throughput tables."""
-    electrons = sum(
-        float(item.photons @ bandpass.quantum_efficiency(item.wavelength_nm))
+    exposure = model.setup.exposure_s if exposure_s is None else exposure_s
+    return sum(component_electrons(sky, bandpass, model, exposure).values())
+
+
+def component_electrons(
+    sky: SkySpectrum, bandpass: Bandpass, model: FringeModel, exposure_s: float
+) -> dict[str, float]:
+    """Mean electrons per pixel from each component of a sky, through the measured quantum efficiency."""
+    to_electrons = exposure_s * model.setup.effective_area_m2 * model.setup.pixel_scale_arcsec**2
+    return {
+        item.name: to_electrons * float(item.photons @ bandpass.quantum_efficiency(item.wavelength_nm))
         for item in sky.components(bandpass)
-    )
-    setup = model.setup
-    exposure = setup.exposure_s if exposure_s is None else exposure_s
-    return electrons * exposure * setup.effective_area_m2 * setup.pixel_scale_arcsec**2
+    }
 
 
 def fringe_amplitudes(image: ArrayLike, mask: ArrayLike | None = None) -> FringeAmplitudes:
@@ -468,49 +537,84 @@ class _SpectralSum:
         return 1.1 * self.light.photons * float(bound.max())
 
 
-def _split(
+def split_components(
     sky: SkySpectrum, band: Bandpass, continuum_step_nm: float
 ) -> tuple[list[SpectralComponent], list[SpectralComponent]]:
+    """OH bands and continua behind air and optics."""
     components = sky.components(band, continuum_step_nm)
     lines = [item for item in components if is_band(item.name)]
     return lines, [item for item in components if not is_band(item.name)]
 
 
 def _lights(sky: SkySpectrum, band: Bandpass, fineness: SkyQuadrature, beam: Beam) -> list[_Light]:
-    lines, continua = _split(sky, band, fineness.continuum_step_nm)
+    lines, continua = split_components(sky, band, fineness.continuum_step_nm)
     few = reduce_beam(beam, fineness.continuum_angles)
     merged = blend_components(lines, fineness.line_shift_nm) if lines else []
     return [_Light.of([item], beam) for item in merged] + [_Light.of([item], few) for item in continua]
 
 
-def _quadrature_error(
+def error_samples(thickness_range_um: tuple[float, float]) -> tuple[float, float, int]:
+    """First, step and number of the thicknesses at which sums are compared with finer ones."""
+    low, high = thickness_range_um
+    step = (high - low) / _ERROR_SAMPLES
+    return low + 0.5 * step, step, _ERROR_SAMPLES
+
+
+def spectral_error(
     model: FringeModel,
     sky: SkySpectrum,
     band: Bandpass,
     fineness: SkyQuadrature,
     samples: tuple[float, float, int],
 ) -> float:
-    """Largest change of the electrons s⁻¹ m⁻² arcsec⁻² with finer sums over wavelength and with fewer angles.
+    """Largest change of the electrons s⁻¹ m⁻² arcsec⁻² with finer sums over wavelength.
 
-    Angles cannot be added to a beam; leaving out a sixth of them changes the sum by several times its error. What
-    merging does to lines shows with few angles as well as with many.
+    What merging does to lines shows with few angles as well as with many.
     """
-    lines, continua = _split(sky, band, fineness.continuum_step_nm)
-    beam = model.system.beam
-    few = reduce_beam(beam, fineness.continuum_angles)
-
-    def change(one: list[SpectralComponent], two: list[SpectralComponent], on: Beam, against: Beam) -> float:
-        sums = (_SpectralSum.of(model, _Light.of(one, on)), _SpectralSum.of(model, _Light.of(two, against)))
-        return float(np.abs(sums[0].electrons(*samples) - sums[1].electrons(*samples)).max())
-
+    lines, continua = split_components(sky, band, fineness.continuum_step_nm)
+    few = reduce_beam(model.system.beam, fineness.continuum_angles)
     error = 0.0
     if lines:
         merged = blend_components(lines, fineness.line_shift_nm)
-        error += change(merged, lines, few, few) + change(merged, merged, beam, _thinned(beam))
+        error += _change(model, (merged, few), (lines, few), samples)
     if continua:
-        _, halved = _split(sky, band, 0.5 * fineness.continuum_step_nm)
-        error += change(continua, halved, few, few) + change(continua, continua, few, _thinned(few))
+        _, halved = split_components(sky, band, 0.5 * fineness.continuum_step_nm)
+        error += _change(model, (continua, few), (halved, few), samples)
     return error
+
+
+def _angular_error(
+    model: FringeModel,
+    sky: SkySpectrum,
+    band: Bandpass,
+    fineness: SkyQuadrature,
+    samples: tuple[float, float, int],
+) -> float:
+    """The same with fewer angles.
+
+    Angles cannot be added to a beam; leaving out a sixth of them changes the sum by several times its error.
+    """
+    lines, continua = split_components(sky, band, fineness.continuum_step_nm)
+    beam = model.system.beam
+    few = reduce_beam(beam, fineness.continuum_angles)
+    error = 0.0
+    if lines:
+        merged = blend_components(lines, fineness.line_shift_nm)
+        error += _change(model, (merged, beam), (merged, _thinned(beam)), samples)
+    if continua:
+        error += _change(model, (continua, few), (continua, _thinned(few)), samples)
+    return error
+
+
+def _change(
+    model: FringeModel,
+    one: tuple[list[SpectralComponent], Beam],
+    two: tuple[list[SpectralComponent], Beam],
+    samples: tuple[float, float, int],
+) -> float:
+    """Largest difference between the electrons of two lights."""
+    sums = [_SpectralSum.of(model, _Light.of(*light)).electrons(*samples) for light in (one, two)]
+    return float(np.abs(sums[0] - sums[1]).max())
 
 
 def _thinned(beam: Beam) -> Beam:
@@ -541,13 +645,22 @@ def _with_image_effects(
     return np.where(known, mean * changed, np.nan).astype(np.float32)
 
 
+def _spread(image: NDArray[np.float32], known: NDArray[np.bool_], kernel: ArrayLike) -> NDArray[np.float32]:
+    """Frame after photon migration; pixels that are not known take part with the mean of the others."""
+    mean = np.float32(image.mean(dtype=np.float64, where=known))
+    spread = spread_charge(np.where(known, image, mean), kernel)
+    spread[~known] = np.nan
+    return spread
+
+
 def is_band(name: str) -> bool:
     """Whether a component of the sky is an OH band, like ``8-4``."""
     upper, _, lower = name.partition("-")
     return upper.isdigit() and lower.isdigit()
 
 
-def _bandpass_of(model: FringeModel) -> Bandpass:
+def bandpass_of(model: FringeModel) -> Bandpass:
+    """Bandpass that the set-up of a model names."""
     if not model.setup.bandpass:
         raise InputError("set-up", model.setup.name, "one of the sky, or a bandpass")
     return Bandpass.from_name(model.setup.bandpass)

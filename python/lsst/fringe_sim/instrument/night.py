@@ -13,7 +13,7 @@ from scipy.interpolate import RegularGridInterpolator
 from ..errors import InputError, OutOfRangeError
 from ..resources import read_table
 
-__all__ = ["AirglowField", "NightHistory", "StochasticNight"]
+__all__ = ["AirglowField", "NightHistory", "StochasticNight", "join_nights"]
 
 FloatArray = NDArray[np.float64]
 
@@ -212,6 +212,26 @@ class AirglowField:
                 f"{self.x_deg[0]} to {self.x_deg[-1]} in x and y",
             )
         return np.asarray(RegularGridInterpolator((self.x_deg, self.y_deg), self.level)((x, y)))
+
+
+def join_nights(nights: Sequence[NightHistory]) -> NightHistory:
+    """Times of several nights, one night after the other.
+
+    Raises
+    ------
+    InputError
+        No night, or nights of different levels.
+    """
+    if not nights:
+        raise InputError("nights", 0, "one or more")
+    first = nights[0]
+    if any(not np.array_equal(night.upper_level, first.upper_level) for night in nights):
+        raise InputError("upper levels of the nights", "different", "the same")
+    return NightHistory(
+        np.concatenate([night.hours for night in nights]),
+        first.upper_level,
+        np.concatenate([night.intensity for night in nights]),
+    )
 
 
 def _upper_level(band: str) -> int:

@@ -13,10 +13,16 @@ from ..middleware import register_storage_classes
 register_storage_classes()
 
 _LAZY = {
+    "EffectDiscoveryConfig": ".effect_discovery",
+    "EffectDiscoveryTask": ".effect_discovery",
     "EpoxyFitConfig": ".epoxy_fit",
     "EpoxyFitTask": ".epoxy_fit",
+    "FocalPlaneSummaryConfig": ".focal_plane_summary",
+    "FocalPlaneSummaryTask": ".focal_plane_summary",
     "FringeBiasConfig": ".fringe_bias",
     "FringeBiasTask": ".fringe_bias",
+    "FringeForecastConfig": ".fringe_forecast",
+    "FringeForecastTask": ".fringe_forecast",
     "FringeModelConfig": ".model_config",
     "FringePcaConfig": ".fringe_pca",
     "FringePcaTask": ".fringe_pca",

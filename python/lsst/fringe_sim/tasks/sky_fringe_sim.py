@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -22,26 +21,35 @@ from lsst.pipe.base import (
     QuantumContext,
     Struct,
 )
-from lsst.pipe.base.connectionTypes import Input, Output
+from lsst.pipe.base.connectionTypes import Output
 
-from ..algorithms.sky_frame import SkyResponse, simulate_sky_frame, sky_response, throughput_electrons
-from ..errors import InputError, OutOfRangeError
+from ..algorithms.photon_migration import photon_migration
+from ..algorithms.sky_frame import simulate_sky_frame, throughput_electrons
+from ..errors import OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
 from ..instrument.night import NightHistory, StochasticNight
 from ..instrument.sky import EmissionLines, SkySpectrum
+from ..instrument.telescope import Telescope
 from ..middleware.night import airmass_of, hour_of_night
 from ..model import FringeModel, Setup
-from ..products import ThicknessMap, mask_bits
-from .model_config import FringeModelConfig, ModelChoice
+from ..products import ThicknessMap
 from .quantum import common_header, data_id_of, sensor_of, unusable
+from .sky_model import (
+    LINE_LIST,
+    SkyModel,
+    SkyModelConfig,
+    known_thickness,
+    takes_images,
+    thickness_input,
+    without_constraint,
+)
 
 __all__ = [
     "SkyExposure",
     "SkyFringeSimConfig",
     "SkyFringeSimConnections",
     "SkyFringeSimTask",
-    "SkyModel",
 ]
 
 FIRST_HOUR = 19.0
@@ -49,10 +57,6 @@ FIRST_HOUR = 19.0
 
 RANDOM_NIGHT_H = (12.0, 36.0, 0.25)
 """First, last and step of the times at which a random night is drawn [h]: the same for all its exposures."""
-
-RANGE_MARGIN_UM = 1e-3
-
-LINE_LIST = "PALACE OH (Noll et al. 2025)"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,67 +83,12 @@ class SkyExposure:
     physical_filter: str
 
 
-@dataclasses.dataclass(frozen=True)
-class SkyModel:
-    """All that the response of a sensor to the sky depends on; the hour is not among it.
-
-    Parameters
-    ----------
-    choice : `tuple`
-        Set-up, and sorted pairs of effects and values.
-    field_x_deg, field_y_deg : `float`
-        Place of the sensor in the field [deg].
-    airmass, solar_flux_sfu : `float`
-        Airmass, and solar radio flux [sfu].
-    rotational_temperature_k, vibrational_temperature_k : `float` or `None`
-        Temperatures of OH [K].
-    thickness_range_um : `tuple` [`float`, `float`]
-        Thicknesses of the map [µm].
-    """
-
-    choice: tuple[str, tuple[tuple[str, float], ...]]
-    field_x_deg: float
-    field_y_deg: float
-    airmass: float
-    solar_flux_sfu: float
-    rotational_temperature_k: float | None
-    vibrational_temperature_k: float | None
-    thickness_range_um: tuple[float, float]
-
-    def fringe_model(self) -> FringeModel:
-        """Sensor behind the telescope."""
-        setup, effects = self.choice
-        return ModelChoice(setup, dict(effects)).model(
-            field_x_deg=self.field_x_deg, field_y_deg=self.field_y_deg
-        )
-
-    def spectrum(self) -> SkySpectrum:
-        """Dark sky with all OH bands at their reference intensity."""
-        lines = EmissionLines.oh(self.rotational_temperature_k, self.vibrational_temperature_k)
-        return SkySpectrum.dark(lines, self.airmass, solar_flux_sfu=self.solar_flux_sfu)
-
-
-@functools.lru_cache(maxsize=4)
-def _responses(sky_model: SkyModel) -> tuple[FringeModel, SkySpectrum, SkyResponse]:
-    """Model, sky and response, shared by the exposures of a night that this process simulates.
-
-    The response takes seconds, a frame tenths of one.
-    """
-    model, sky = sky_model.fringe_model(), sky_model.spectrum()
-    return model, sky, sky_response(model, sky, thickness_range_um=sky_model.thickness_range_um)
-
-
 class SkyFringeSimConnections(PipelineTaskConnections, dimensions=("instrument", "exposure", "detector")):
     """A thickness map in, one sky frame out."""
 
     config: SkyFringeSimConfig
 
-    thickness = Input(
-        doc="Thickness of the varying layer.",
-        name="epoxyThickness",
-        storageClass="ThicknessMap",
-        dimensions=("instrument", "detector"),
-    )
+    thickness = thickness_input()
     sky = Output(
         doc="Night sky with its fringes, in electrons.",
         name="skyFringe",
@@ -147,17 +96,21 @@ class SkyFringeSimConnections(PipelineTaskConnections, dimensions=("instrument",
         dimensions=("instrument", "exposure", "detector"),
     )
 
+    def __init__(self, *, config: SkyFringeSimConfig | None = None) -> None:
+        if config is not None and config.stand_in:
+            self.thickness = without_constraint(self.thickness)
+
     def adjust_all_quanta(self, adjuster: QuantaAdjuster) -> None:
         """Keep the exposures of the sky in the band of the set-up: laboratory frames have exposures too."""
         for data_id in list(adjuster.iter_data_ids()):
             expanded = adjuster.expand_quantum_data_id(data_id)
             exposure: Any = expanded.records["exposure"]
             wanted = exposure.observation_type in self.config.observation_types
-            if not wanted or expanded["band"] != self.config.band:
+            if not wanted or expanded["band"] != self.config.band or not takes_images(expanded):
                 adjuster.remove_quantum(data_id)
 
 
-class SkyFringeSimConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=SkyFringeSimConnections):
+class SkyFringeSimConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnections=SkyFringeSimConnections):
     """Configuration of `SkyFringeSimTask`."""
 
     task_name: ClassVar[str] = "skyFringeSim"
@@ -190,44 +143,19 @@ class SkyFringeSimConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnecti
         default=0,
         doc="With exposure and sensor, the seed of the noise; with the date, of random nights.",
     )
-    rotational_temperature_k: Field[float] = Field(
-        dtype=float, optional=True, doc="Rotational temperature of OH, K; by default the PALACE populations."
+    migration: Field[bool] = Field(
+        dtype=bool,
+        default=False,
+        doc="Whether photons walk to neighbouring pixels before they are absorbed (behind a traced telescope).",
     )
-    vibrational_temperature_k: Field[float] = Field(
-        dtype=float, optional=True, doc="Vibrational temperature of OH, K; by default the PALACE populations."
-    )
-    solar_flux_sfu: Field[float] = Field(
-        dtype=float, default=129.0, doc="Solar radio flux, sfu, which scales the airglow continuum."
-    )
-
-    def setDefaults(self) -> None:
-        """Look at the sky."""
-        super().setDefaults()
-        self.setup = "lsst_e2v"
 
     def validate(self) -> None:
-        """Refuse set-ups without a sky, or of different bands."""
+        """Refuse what makes no frame."""
         super().validate()
         if self.seed < 0:
             raise FieldValidationError(type(self).seed, self, "must not be negative")
-        for raft in ("", *self.rafts):
-            setup = Setup.from_name(self.choice(raft).setup)
-            if setup.kind != "sky":
-                raise FieldValidationError(
-                    type(self).setup, self, f"set-up {setup.name} does not see the sky"
-                )
-            if _band(setup) != self.band:
-                message = f"raft {raft} has band {_band(setup)}, the others have {self.band}"
-                raise FieldValidationError(type(self).rafts, self, message)
-
-    @property
-    def band(self) -> str:
-        """Band of the set-up, as ``y``."""
-        return _band(Setup.from_name(self.setup))
-
-
-def _band(setup: Setup) -> str:
-    return setup.bandpass.rpartition("_")[2]
+        if self.migration and not Setup.from_name(self.setup).telescope:
+            raise FieldValidationError(type(self).migration, self, "needs a traced telescope")
 
 
 class SkyFringeSimTask(PipelineTask):
@@ -257,16 +185,17 @@ class SkyFringeSimTask(PipelineTask):
                 airmass=airmass_of(record) or setup.airmass,
                 physical_filter=str(data_id["physical_filter"]),
             )
-            result = self.run(butlerQC.get(inputRefs.thickness), exposure, detector)
+            thickness = butlerQC.get(inputRefs.thickness) if hasattr(inputRefs, "thickness") else None
+            result = self.run(thickness, exposure, detector)
         butlerQC.put(result, outputRefs)
 
-    def run(self, thickness: ThicknessMap, exposure: SkyExposure, detector: Detector) -> Struct:
+    def run(self, thickness: ThicknessMap | None, exposure: SkyExposure, detector: Detector) -> Struct:
         """Simulate one frame.
 
         Parameters
         ----------
-        thickness : `ThicknessMap`
-            Thickness of the varying layer of this sensor.
+        thickness : `ThicknessMap` or `None`
+            Thickness of the varying layer of this sensor; `None` where a stand-in is wanted.
         exposure : `SkyExposure`
             When, how long, through what.
         detector : `Detector`
@@ -285,11 +214,12 @@ class SkyFringeSimTask(PipelineTask):
             An hour outside the tabulated night.
         """
         choice = self.config.choice(detector.raft)
-        _check_map(thickness, choice)
+        layer = self.config.map_of(thickness, detector)
         if choice.left_out:
             self.log.info("%s: on the sky without %s", detector.name, ", ".join(choice.left_out))
-        known = np.where(thickness.mask & mask_bits("NO_DATA"), np.float32(np.nan), thickness.value)
-        model, sky, response = _responses(self._sky_model(choice, exposure, detector, known))
+        known = known_thickness(layer)
+        sky_model = self.config.sky_model(detector, exposure.airmass, known)
+        model, sky, response = sky_model.response()
         scale = self._band_scale(exposure, sky.lines)
         frame = simulate_sky_frame(
             known,
@@ -299,6 +229,7 @@ class SkyFringeSimTask(PipelineTask):
             exposure_s=exposure.exposure_s,
             mean_electrons=self._level(sky.with_band_scale(scale), model, exposure),
             read_noise_e=detector.read_noise,
+            charge_kernel=_charge_kernel(sky_model) if self.config.migration else None,
             seed=self._seed(exposure, detector) if self.config.noise else None,
             hour=exposure.hour,
             detector=detector.name,
@@ -310,6 +241,8 @@ class SkyFringeSimTask(PipelineTask):
             "LINELIST": LINE_LIST,
             "NIGHT": self.config.night,
             "LEVEL": self.config.level,
+            "BEAMS": self.config.beams,
+            "STANDIN": thickness is None,
             **{f"BAND {name}": factor for name, factor in scale.items()},
             **frame.metadata,
         }
@@ -319,25 +252,7 @@ class SkyFringeSimTask(PipelineTask):
             *(100.0 * float(frame.metadata["FRINGRMS"]), frame.quadrature_error),
         )
         # What the map calls doubtful stays doubtful.
-        return Struct(sky=dataclasses.replace(frame, mask=frame.mask | thickness.mask, metadata=metadata))
-
-    def _sky_model(
-        self,
-        choice: ModelChoice,
-        exposure: SkyExposure,
-        detector: Detector,
-        thickness_um: NDArray[np.float32],
-    ) -> SkyModel:
-        return SkyModel(
-            choice=(choice.setup, tuple(sorted(choice.applied_effects.items()))),
-            field_x_deg=_place(detector.field_x_deg),
-            field_y_deg=_place(detector.field_y_deg),
-            airmass=exposure.airmass,
-            solar_flux_sfu=self.config.solar_flux_sfu,
-            rotational_temperature_k=self.config.rotational_temperature_k,
-            vibrational_temperature_k=self.config.vibrational_temperature_k,
-            thickness_range_um=_range_of(thickness_um),
-        )
+        return Struct(sky=dataclasses.replace(frame, mask=frame.mask | layer.mask, metadata=metadata))
 
     def _band_scale(self, exposure: SkyExposure, lines: EmissionLines) -> Mapping[str, float]:
         """Factors on the OH bands at the time of the exposure."""
@@ -362,9 +277,16 @@ class SkyFringeSimTask(PipelineTask):
         return int(sequence.generate_state(1, np.uint64)[0] >> 1)
 
 
-def _place(angle_deg: float) -> float:
-    """Field angle; zero for cameras without one, whose beam is the same everywhere."""
-    return angle_deg if math.isfinite(angle_deg) else 0.0
+@functools.lru_cache(maxsize=4)
+def _charge_kernel(sky_model: SkyModel) -> NDArray[np.float64]:
+    """Where the photons of a pixel at the centre of a sensor are absorbed."""
+    model, sky, _ = sky_model.response()
+    setup = model.setup
+    telescope = Telescope.from_name(setup.telescope)
+    rays = telescope.trace(sky_model.placement.field_x_deg, sky_model.placement.field_y_deg)
+    light = sky.components(Bandpass.from_name(setup.bandpass))
+    migration = photon_migration(rays, light, model.system.stack, setup.temperature_k)
+    return migration.pixel_kernel(telescope.pixel_um)
 
 
 def _at_hour(night: NightHistory, hour: float) -> NightHistory:
@@ -381,34 +303,3 @@ def _at_hour(night: NightHistory, hour: float) -> NightHistory:
         raise OutOfRangeError("time since the beginning of the night [h]", hour, f"{first:g} to {last:g}")
     intensity = [np.interp(hour, night.hours, level) for level in night.intensity.T]
     return NightHistory(np.array([hour]), night.upper_level, np.array([intensity]))
-
-
-def _range_of(thickness_um: NDArray[np.float32]) -> tuple[float, float]:
-    """Range of the known thicknesses, widened so that rounding cannot leave it."""
-    finite = thickness_um[np.isfinite(thickness_um)]
-    if finite.size == 0:
-        raise InputError("thickness map", "no known thickness", "one in at least one pixel")
-    return max(float(finite.min()) - RANGE_MARGIN_UM, 0.0), float(finite.max()) + RANGE_MARGIN_UM
-
-
-def _check_map(thickness: ThicknessMap, choice: ModelChoice) -> None:
-    """Refuse a map that means something else than the model takes it for."""
-    varying = Setup.from_name(choice.setup).varying
-    if thickness.layer != varying:
-        raise InputError("layer of the thickness map", thickness.layer, varying)
-    if "SETUP" not in thickness.metadata:
-        return  # not fitted here
-    fitted = _effects_in(thickness.metadata)
-    on_sky = ModelChoice(choice.setup, fitted).applied_effects
-    if on_sky != choice.applied_effects:
-        raise InputError(
-            "effects of skyFringeSim",
-            choice.applied_effects,
-            f"{on_sky}, with which the thickness was fitted",
-            source=thickness.detector or None,
-        )
-
-
-def _effects_in(header: Mapping[str, Any]) -> dict[str, float]:
-    numbers = [key.removeprefix("EFFECT") for key in header if key.startswith("EFFECT")]
-    return {str(header[f"EFFECT{number}"]): float(header[f"EFFVAL{number}"]) for number in numbers}

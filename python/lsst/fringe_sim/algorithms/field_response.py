@@ -1,0 +1,669 @@
+"""Response of sensors anywhere in the field of a telescope, with the beam of every pixel.
+
+The beam changes across a sensor: one beam for all of its pixels is wrong by 15 to 100 % of the peak-to-peak of an
+LSST sky frame. But a beam is only a distribution of ``s = sin²θ``, and the response under a single angle is a smooth
+function of s. It is tabulated once at the nodes of a Gauss-Legendre rule; any beam is then a set of weights for
+these nodes, exact as long as the rule resolves the response, and the frames of a whole focal plane share one table
+(Eq. 5 of the paper, with the sums over lines and angles exchanged).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError, OutOfRangeError
+from ..instrument.bandpass import Bandpass
+from ..instrument.detector import Detector
+from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
+from ..instrument.telescope import BeamField, Telescope, TracedOptics
+from ..model import FringeModel, ResponseTable
+from ..optics import Illumination
+from .sky_frame import (
+    Response,
+    SkyQuadrature,
+    SkyResponse,
+    bandpass_of,
+    component_factors,
+    error_samples,
+    is_band,
+    sky_response,
+    spectral_error,
+    split_components,
+    tabulate_components,
+)
+
+__all__ = [
+    "AngularResponse",
+    "FieldResponse",
+    "FieldTable",
+    "SensorPlacement",
+    "SensorResponse",
+    "angular_response",
+    "beam_field",
+    "beam_limits",
+    "field_response",
+    "sensor_response",
+]
+
+FloatArray = NDArray[np.float64]
+
+ANGLES = 192
+"""Nodes in sin²θ for lines: 3e-5 of the peak-to-peak of an LSST sky frame at any radius (128 give 2e-3)."""
+
+CONTINUUM_ANGLES = 128
+"""The same for continua, whose fringes average out over wavelength: 2e-4 of the peak-to-peak where fringes are
+faintest (96 give 4e-3)."""
+
+RADIUS_STEP_DEG = 0.005
+"""Spacing of the tabulated field radii. Where the pupil is vignetted, beyond 1.75 deg, the phase of the light from
+its edge turns once in 0.085 deg."""
+
+_STENCIL = 4
+
+_CELLS = 16_384
+"""Cells of the histogram of rays; the phase between two of them differs by less than 0.01 rad."""
+
+
+@dataclass(frozen=True)
+class SensorPlacement:
+    """Where the pixels of a sensor lie in the field.
+
+    Attributes
+    ----------
+    field_x_deg, field_y_deg : `float`
+        Field angle of the centre [deg].
+    width_deg, height_deg : `float`
+        Extent along columns and along rows [deg].
+    yaw_deg : `float`
+        Rotation of the sensor in the focal plane [deg].
+    """
+
+    field_x_deg: float
+    field_y_deg: float
+    width_deg: float
+    height_deg: float
+    yaw_deg: float = 0.0
+
+    @classmethod
+    def of(cls, detector: Detector, pixel_scale_arcsec: float) -> SensorPlacement:
+        """Placement of a sensor of a camera; on the axis where the camera states no field angles."""
+        rows, columns = detector.shape
+        on_axis = math.isnan(detector.field_radius_deg)
+        return cls(
+            0.0 if on_axis else detector.field_x_deg,
+            0.0 if on_axis else detector.field_y_deg,
+            columns * pixel_scale_arcsec / 3600.0,
+            rows * pixel_scale_arcsec / 3600.0,
+            detector.yaw_deg,
+        )
+
+    def plane(self, shape: tuple[int, int]) -> FloatArray:
+        """Field angles as a linear function of pixel indices, for a map of any shape that covers the sensor.
+
+        Returns
+        -------
+        plane : `numpy.ndarray`, shape ``(2, 3)``
+            Rows for x and y; ``angle = plane @ (1, column, row)`` [deg].
+        """
+        turn = math.radians(self.yaw_deg)
+        along = np.array([math.cos(turn), math.sin(turn)]) * self.width_deg / shape[1]
+        across = np.array([-math.sin(turn), math.cos(turn)]) * self.height_deg / shape[0]
+        centre = np.array([self.field_x_deg, self.field_y_deg])
+        corner = centre - 0.5 * (shape[1] - 1) * along - 0.5 * (shape[0] - 1) * across
+        return np.stack([corner, along, across], axis=1)
+
+    def radius_deg(self, shape: tuple[int, int]) -> FloatArray:
+        """Field radius of every pixel of a map that covers the sensor [deg], ``shape``."""
+        plane = self.plane(shape)
+        rows, columns = np.arange(shape[0])[:, None], np.arange(shape[1])[None, :]
+        return np.asarray(np.hypot(*(line[0] + line[1] * columns + line[2] * rows for line in plane)))
+
+    @property
+    def radius_range_deg(self) -> tuple[float, float]:
+        """Smallest and largest field radius on the sensor [deg]."""
+        turn = math.radians(-self.yaw_deg)
+        x = math.cos(turn) * self.field_x_deg - math.sin(turn) * self.field_y_deg
+        y = math.sin(turn) * self.field_x_deg + math.cos(turn) * self.field_y_deg
+        half = 0.5 * self.width_deg, 0.5 * self.height_deg
+        near = math.hypot(max(abs(x) - half[0], 0.0), max(abs(y) - half[1], 0.0))
+        return near, math.hypot(abs(x) + half[0], abs(y) + half[1])
+
+
+@dataclass(frozen=True, eq=False)
+class AngularResponse:
+    """Electrons from the components of a sky at fixed angles of incidence, over thickness.
+
+    Attributes
+    ----------
+    component : `tuple` [`str`, ...]
+        Names of the components, C of them.
+    photons : `numpy.ndarray`, shape ``(C,)``
+        Photons behind air and optics [s⁻¹ m⁻² arcsec⁻²].
+    wavelength_nm : `numpy.ndarray`, shape ``(C,)``
+        Mean wavelength of every component [nm].
+    limits : `tuple` [`float`, `float`]
+        Smallest and largest sin²θ.
+    start_um, step_um : `float`
+        Grid of thickness [µm].
+    values : `numpy.ndarray`, shape ``(C, A, N)``
+        Electrons s⁻¹ m⁻² arcsec⁻² at the A nodes of a Gauss-Legendre rule in sin²θ and N thicknesses.
+    interpolation_error, quadrature_error : `float`
+        Estimated errors of the interpolation in thickness and of the sums over wavelength and angle, relative to the
+        mean sky.
+    airmass : `float`
+        Airmass of the sky.
+    """
+
+    component: tuple[str, ...]
+    photons: FloatArray
+    wavelength_nm: FloatArray
+    limits: tuple[float, float]
+    start_um: float
+    step_um: float
+    values: FloatArray
+    interpolation_error: float
+    quadrature_error: float
+    airmass: float
+
+    def weights(self, sin_squared: ArrayLike) -> FloatArray:
+        """Weights of the nodes that stand for a beam.
+
+        Parameters
+        ----------
+        sin_squared : array_like, shape ``(R,)``
+            sin²θ of rays that carry the same light.
+
+        Returns
+        -------
+        weights : `numpy.ndarray`, shape ``(A,)``
+            They sum to 1; some may be negative.
+        """
+        return _moment_weights(self.values.shape[1]) @ _ray_histogram(sin_squared, self.limits)
+
+    def response(self, sin_squared: ArrayLike) -> SkyResponse:
+        """Response of a sensor under one beam; parameter as for `weights`."""
+        rows = self.weights(sin_squared) @ self.values
+        level = float(rows.sum(axis=0).mean())
+        table = ResponseTable(
+            self.start_um, self.step_um, rows / level, self.wavelength_nm, self.interpolation_error
+        )
+        return SkyResponse(self.component, self.photons, level, table, self.quadrature_error, self.airmass)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldResponse:
+    """Response to a sky over field radius.
+
+    Attributes
+    ----------
+    angular : `AngularResponse`
+        Response by angle.
+    start_deg, step_deg : `float`
+        Grid of field radii [deg].
+    weights : `numpy.ndarray`, shape ``(K, A)``
+        Beam at every field radius.
+    kept : `numpy.ndarray`, shape ``(K,)``
+        Unvignetted share of the pupil relative to the axis.
+    """
+
+    angular: AngularResponse
+    start_deg: float
+    step_deg: float
+    weights: FloatArray
+    kept: FloatArray
+
+    @property
+    def radius_deg(self) -> FloatArray:
+        """Tabulated field radii [deg], shape ``(K,)``."""
+        return np.asarray(self.start_deg + self.step_deg * np.arange(len(self.weights)), dtype=float)
+
+    def relative_illumination(self, radius_deg: ArrayLike) -> FloatArray:
+        """Light at a field radius relative to the axis; that of the last tabulated radius beyond it."""
+        return np.asarray(np.interp(np.asarray(radius_deg, dtype=float), self.radius_deg, self.kept))
+
+    def on(self, placement: SensorPlacement) -> SensorResponse:
+        """Response of a sensor at its place.
+
+        Raises
+        ------
+        OutOfRangeError
+            The sensor begins outside the tabulated radii.
+        """
+        low, high = placement.radius_range_deg
+        radii = self.radius_deg
+        if low < radii[0] - 1e-9 or low > radii[-1]:
+            raise OutOfRangeError("field radius [deg]", low, f"{radii[0]:g} to {radii[-1]:g}")
+        first = max(0, math.floor((low - self.start_deg) / self.step_deg) - 1)
+        last = min(radii.size - 1, math.ceil((high - self.start_deg) / self.step_deg) + 1)
+        first = max(0, min(first, last + 1 - _STENCIL))
+        part = slice(first, last + 1)
+        cut = replace(self, start_deg=float(radii[first]), weights=self.weights[part], kept=self.kept[part])
+        return SensorResponse(cut, placement)
+
+
+@dataclass(frozen=True, eq=False)
+class SensorResponse:
+    """Response of one sensor with the beam of every pixel; stands for a `SkyResponse` in `simulate_sky_frame`.
+
+    Attributes
+    ----------
+    field : `FieldResponse`
+        Tabulated at the radii of the sensor.
+    placement : `SensorPlacement`
+        Where its pixels lie.
+
+    Notes
+    -----
+    Frames are those of flat-fielded exposures: the mean over thickness of the reference sky is the same at every
+    radius. How much light reaches a radius (`FieldResponse.relative_illumination`) and how absorption changes with the
+    angle (a slope of 0.1 % over a sensor at the edge of the field) are divided out, as a flat field does, which has the
+    same beams and no fringes.
+    """
+
+    field: FieldResponse
+    placement: SensorPlacement
+
+    @property
+    def component(self) -> tuple[str, ...]:
+        """Names of the components of the sky."""
+        return self.field.angular.component
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Those components that are OH bands."""
+        return tuple(name for name in self.component if is_band(name))
+
+    @property
+    def airmass(self) -> float:
+        """Airmass of the sky."""
+        return self.field.angular.airmass
+
+    @property
+    def quadrature_error(self) -> float:
+        """Estimated error of the sums over wavelength and angle, relative to the mean sky."""
+        return self.field.angular.quadrature_error
+
+    def factors(self, scale: Mapping[str, float] | None = None) -> FloatArray:
+        """Factor on every component, 1 unless named; errors as of `SkyResponse.factors`."""
+        return component_factors(self.component, self.field.angular.photons, scale)
+
+    def sky(self, scale: Mapping[str, float] | None = None) -> FieldTable:
+        """Electrons s⁻¹ m⁻² arcsec⁻² over field radius and thickness."""
+        factors = self.factors(scale)
+        angular = self.field.angular
+        rates = factors * angular.photons
+        rows = self._flat() @ np.tensordot(factors, angular.values, axes=1)
+        wavelength = float(rates @ angular.wavelength_nm / rates.sum())
+        return self._table(rows, wavelength, float(rows.mean()) * angular.interpolation_error)
+
+    def component_tables(self) -> list[FieldTable]:
+        """The parts of `sky` that come from each component, all at their reference level."""
+        angular = self.field.angular
+        rows = np.einsum("ka,can->ckn", self._flat(), angular.values, optimize=True)
+        error = float(rows.sum(axis=0).mean()) * angular.interpolation_error
+        return [self._table(*item, error) for item in zip(rows, angular.wavelength_nm, strict=True)]
+
+    def _flat(self) -> FloatArray:
+        """Weights of the angles by field radius, such that the reference sky has the same mean everywhere."""
+        angular = self.field.angular
+        means = self.field.weights @ angular.values.sum(axis=0).mean(axis=1)
+        return np.asarray(self.field.weights * (means.mean() / means)[:, None])
+
+    def _table(self, rows: FloatArray, wavelength_nm: float, error: float) -> FieldTable:
+        angular = self.field.angular
+        table = ResponseTable(
+            angular.start_um, angular.step_um, rows, np.full(len(rows), wavelength_nm), error
+        )
+        return FieldTable(table, self.field.start_deg, self.field.step_deg, self.placement)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldTable:
+    """Electrons over field radius and thickness.
+
+    Attributes
+    ----------
+    table : `ResponseTable`
+        One row per field radius.
+    start_deg, step_deg : `float`
+        Field radii of the rows [deg].
+    placement : `SensorPlacement`
+        Where the pixels of the frames lie.
+    """
+
+    table: ResponseTable
+    start_deg: float
+    step_deg: float
+    placement: SensorPlacement
+
+    @property
+    def wavelength_nm(self) -> FloatArray:
+        """Mean wavelength [nm], shape ``(1,)``."""
+        return self.table.wavelength_nm[:1]
+
+    @property
+    def interpolation_error(self) -> float:
+        """Largest error of the interpolation in thickness."""
+        return self.table.interpolation_error
+
+    def frame(self, thickness_um: ArrayLike) -> NDArray[np.float32]:
+        """Image of the sensor.
+
+        Parameters
+        ----------
+        thickness_um : array_like, shape ``(ny, nx)``
+            Thickness [µm] on pixels of any size that cover the sensor; NaN gives NaN.
+
+        Returns
+        -------
+        image : `numpy.ndarray`, float32, shape ``(ny, nx)``
+            The same bits whatever the number of threads.
+
+        Raises
+        ------
+        InputError
+            A map that is not two-dimensional.
+        OutOfRangeError
+            A thickness outside the table.
+        """
+        thickness = np.asarray(thickness_um)
+        if thickness.dtype not in (np.float32, np.float64):
+            thickness = thickness.astype(np.float64)
+        if thickness.ndim != 2:
+            raise InputError("shape of the thickness map", thickness.shape, "two axes (y, x)")
+        low, high = np.nanmin(thickness), np.nanmax(thickness)
+        margin = 1e-6
+        if not (low >= self.table.start_um - margin and high <= self.table.stop_um + margin):
+            allowed = f"{self.table.start_um:.6g} to {self.table.stop_um:.6g} (range of the table)"
+            raise OutOfRangeError("thickness [um]", (float(low), float(high)), allowed)
+        coefficients = self.table.polynomials.astype(np.float32)
+        return _frame_kernel(
+            coefficients.reshape(len(coefficients), -1),
+            self.table.start_um,
+            1.0 / self.table.step_um,
+            self.start_deg,
+            1.0 / self.step_deg,
+            self.placement.plane((thickness.shape[0], thickness.shape[1])),
+            thickness,
+        )
+
+
+def angular_response(
+    model: FringeModel,
+    sky: SkySpectrum,
+    limits: tuple[float, float],
+    bandpass: Bandpass | None = None,
+    thickness_range_um: tuple[float, float] | None = None,
+    quadrature: SkyQuadrature | None = None,
+    angles: int = ANGLES,
+) -> AngularResponse:
+    """Tabulate the response of a sensor to a sky under single angles.
+
+    Parameters
+    ----------
+    model : `FringeModel`
+        The sensor, with effects; its own beam only decides how fine the table is in thickness.
+    sky, bandpass, thickness_range_um, quadrature
+        See `sky_response`.
+    limits : `tuple` [`float`, `float`]
+        Range of sin²θ that the beams may have.
+    angles : `int`, optional
+        Nodes in that range.
+
+    Returns
+    -------
+    response : `AngularResponse`
+
+    Raises
+    ------
+    InputError
+        An effect changes the beam, so that the beams of the telescope are not those on the sensor.
+    OutOfRangeError
+        Limits that do not ascend within 0 to 1.
+    """
+    if not 0.0 <= limits[0] < limits[1] < 1.0:
+        raise OutOfRangeError("limits of sin² of the angle", limits, "two increasing numbers within 0 to 1")
+    if model.system.beam is not model.base_system.beam:
+        raise InputError("effects", sorted(model.effect_settings), "none that changes the beam")
+    fineness = SkyQuadrature() if quadrature is None else quadrature
+    band = bandpass_of(model) if bandpass is None else bandpass
+    table, photons, level = tabulate_components(model, sky, band, thickness_range_um, fineness)
+    grid = (table.start_um, table.step_um, table.values.shape[1])
+    lines, continua = split_components(sky, band, fineness.continuum_step_nm)
+    merged = blend_components(lines, fineness.line_shift_nm) if lines else []
+    few = min(CONTINUUM_ANGLES, angles)
+    of_lines = [_single_angles(model, item, limits, angles, grid) for item in merged]
+    of_continua = [_single_angles(model, item, limits, few, grid) for item in continua]
+    refine = _legendre_interpolation(few, angles)
+    samples = error_samples((table.start_um, table.stop_um))
+    error = spectral_error(model, sky, band, fineness, samples)
+    error += _angular_error(model, (merged, angles), (continua, few), limits=limits, samples=samples)
+    return AngularResponse(
+        tuple(item.name for item in [*merged, *continua]),
+        photons,
+        table.wavelength_nm,
+        limits,
+        table.start_um,
+        table.step_um,
+        np.stack([*of_lines, *(refine @ values for values in of_continua)]),
+        table.interpolation_error,
+        error / level,
+        sky.airmass,
+    )
+
+
+def field_response(
+    angular: AngularResponse,
+    beams: BeamField,
+    radius_range_deg: tuple[float, float],
+    step_deg: float = RADIUS_STEP_DEG,
+) -> FieldResponse:
+    """Give an angular response the beams of a range of field radii.
+
+    Parameters
+    ----------
+    angular : `AngularResponse`
+        Response by angle.
+    beams : `BeamField`
+        Beams of the telescope.
+    radius_range_deg : `tuple` [`float`, `float`]
+        Field radii to cover [deg]; what lies beyond the field of the telescope gets the beam of its edge.
+    step_deg : `float`, optional
+        Largest spacing of the radii.
+
+    Raises
+    ------
+    OutOfRangeError
+        A range that is empty or outside the field.
+    """
+    low, high = radius_range_deg
+    edge = beams.largest_deg
+    if not 0.0 <= low <= high or low > edge:
+        raise OutOfRangeError("field radii [deg]", radius_range_deg, f"ascending, from 0 to {edge:g}")
+    high = min(high, edge)
+    first = max(0.0, low - step_deg)
+    cells = max(_STENCIL - 1, math.ceil((min(high + step_deg, edge) - first) / step_deg - 1e-9))
+    first = max(0.0, min(first, edge - cells * step_deg))
+    weights, kept = [], []
+    on_axis = beams.kept_fraction(0.0)
+    for number in range(cells + 1):
+        rays, share = beams.sin_squared_at(min(first + number * step_deg, edge))
+        weights.append(angular.weights(rays))
+        kept.append(share / on_axis)
+    return FieldResponse(angular, first, step_deg, np.stack(weights), np.array(kept))
+
+
+def sensor_response(
+    model: FringeModel,
+    sky: SkySpectrum,
+    placement: SensorPlacement,
+    thickness_range_um: tuple[float, float] | None = None,
+    quadrature: SkyQuadrature | None = None,
+) -> Response:
+    """Response of one sensor with the beam of every pixel, where the telescope has such beams.
+
+    Parameters
+    ----------
+    model, sky, thickness_range_um, quadrature
+        See `sky_response`.
+    placement : `SensorPlacement`
+        Where the pixels of the sensor lie.
+
+    Returns
+    -------
+    response : `SensorResponse` or `SkyResponse`
+        The latter, with the one beam of the model, behind a cone, and behind a telescope whose beams do not depend
+        on the distance from the axis alone.
+    """
+    beams = beam_field(model.setup.telescope)
+    if beams is None:
+        return sky_response(model, sky, None, thickness_range_um, quadrature)
+    angular = angular_response(model, sky, beam_limits(beams), None, thickness_range_um, quadrature)
+    return field_response(angular, beams, placement.radius_range_deg).on(placement)
+
+
+@functools.lru_cache(maxsize=2)
+def beam_field(telescope: str) -> BeamField | None:
+    """Beams at any field radius of a telescope; `None` for a cone, or if they do not depend on the radius alone."""
+    if not telescope:
+        return None
+    found = Telescope.from_name(telescope)
+    if not isinstance(found.optics, TracedOptics) or not found.optics.axisymmetric:
+        return None
+    return BeamField.trace(found)
+
+
+def beam_limits(beams: BeamField) -> tuple[float, float]:
+    """Range of sin²θ of all beams, with room for rays between the traced radii."""
+    low, high = float(beams.sin_squared.min()), float(beams.sin_squared.max())
+    margin = 1e-3 * (high - low)
+    return max(0.0, low - margin), high + margin
+
+
+def _single_angles(
+    model: FringeModel,
+    component: SpectralComponent,
+    limits: tuple[float, float],
+    angles: int,
+    grid: tuple[float, float, int],
+) -> FloatArray:
+    """Electrons from one component under every angle, shape ``(angles, thicknesses)``."""
+    nodes, _ = np.polynomial.legendre.leggauss(angles)
+    sine = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * nodes
+    shape = (angles, component.photons.size)
+    light = Illumination(
+        np.broadcast_to(component.wavelength_nm, shape),
+        np.broadcast_to(np.arcsin(np.sqrt(sine))[:, None], shape),
+        np.broadcast_to(component.photons / component.photons.sum(), shape),
+    )
+    reduced = model.system.reduce(light)
+    response = reduced.averaged_on_grid(light.weight, *grid)
+    return float(component.photons.sum()) * model.finish(reduced, light, response, None)
+
+
+def _legendre_interpolation(few: int, many: int) -> FloatArray:
+    """Matrix from values at the nodes of one Gauss-Legendre rule to those of another, shape ``(many, few)``."""
+    nodes, rule = np.polynomial.legendre.leggauss(few)
+    targets, _ = np.polynomial.legendre.leggauss(many)
+    vander = np.polynomial.legendre.legvander
+    inner = vander(nodes, few - 1) * (np.arange(few) + 0.5) * rule[:, None]
+    return np.asarray(vander(targets, few - 1) @ inner.T)
+
+
+def _angular_error(
+    model: FringeModel,
+    *groups: tuple[list[SpectralComponent], int],
+    limits: tuple[float, float],
+    samples: tuple[float, float, int],
+) -> float:
+    """Largest change of the electrons under the beam of the model when a sixth of the angles is left out.
+
+    As for `sky_response`, several times the error of all angles.
+    """
+    beam = model.system.beam
+    light = _ray_histogram(np.sin(beam.theta) ** 2, limits, beam.weight)
+    error = 0.0
+    for components, angles in groups:
+        if components:
+            sums = [
+                (_moment_weights(count) @ light)
+                @ sum(_single_angles(model, item, limits, count, samples) for item in components)
+                for count in (angles, 5 * angles // 6)
+            ]
+            error += float(np.abs(sums[0] - sums[1]).max())
+    return error
+
+
+@functools.lru_cache(maxsize=4)
+def _moment_weights(count: int) -> FloatArray:
+    """Weights of ``count`` nodes for unit light at each of the cells of the ray histogram."""
+    nodes, rule = np.polynomial.legendre.leggauss(count)
+    vander = np.polynomial.legendre.legvander
+    expansion = vander(nodes, count - 1) * (np.arange(count) + 0.5) * rule[:, None]
+    return np.asarray(expansion @ vander(np.linspace(-1.0, 1.0, _CELLS + 1), count - 1).T)
+
+
+def _ray_histogram(
+    sin_squared: ArrayLike, limits: tuple[float, float], weight: FloatArray | float = 1.0
+) -> FloatArray:
+    """Light at evenly spaced sin²θ; every ray is shared between its neighbours, which keeps the mean."""
+    rays = np.asarray(sin_squared, dtype=float)
+    place = np.clip((rays - limits[0]) * (_CELLS / (limits[1] - limits[0])), 0.0, _CELLS - 1e-9)
+    cell = place.astype(np.int64)
+    upper = place - cell
+    mass = np.bincount(cell, weight * (1.0 - upper), _CELLS + 1)
+    mass += np.bincount(cell + 1, weight * upper, _CELLS + 1)
+    return np.asarray(mass / mass.sum())
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract"})
+def _frame_kernel(
+    polynomials: NDArray,
+    start_um: float,
+    per_step: float,
+    start_deg: float,
+    per_deg: float,
+    plane: NDArray,
+    thickness: NDArray,
+) -> NDArray:  # pragma: no cover - compiled
+    """Cubic in thickness within a cell, and through four neighbouring field radii."""
+    height, width = thickness.shape
+    rows = polynomials.shape[0]
+    last = polynomials.shape[1] // 4 - 1
+    out = np.empty((height, width), dtype=np.float32)
+    for y in numba.prange(height):
+        for x in range(width):
+            d = (float(thickness[y, x]) - start_um) * per_step
+            if d != d:  # NaN
+                out[y, x] = np.nan
+                continue
+            cell = min(max(int(d), 0), last)
+            t = np.float32(d - cell)
+            u = plane[0, 0] + plane[0, 1] * x + plane[0, 2] * y
+            v = plane[1, 0] + plane[1, 1] * x + plane[1, 2] * y
+            r = min(max((math.sqrt(u * u + v * v) - start_deg) * per_deg, 0.0), rows - 1.0)
+            first = min(max(int(r) - 1, 0), rows - 4)
+            s = np.float32(r - first)
+            one, two, three = s - np.float32(1.0), s - np.float32(2.0), s - np.float32(3.0)
+            half, sixth = np.float32(0.5), np.float32(1.0 / 6.0)
+            total = np.float32(0.0)
+            for k in range(4):
+                if k == 0:
+                    weight = -sixth * one * two * three
+                elif k == 1:
+                    weight = half * s * two * three
+                elif k == 2:
+                    weight = -half * s * one * three
+                else:
+                    weight = sixth * s * one * two
+                c = polynomials[first + k, 4 * cell : 4 * cell + 4]
+                total += weight * (c[0] + t * (c[1] + t * (c[2] + t * c[3])))
+            out[y, x] = total
+    return out

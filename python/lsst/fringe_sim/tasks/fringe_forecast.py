@@ -1,0 +1,193 @@
+"""How strong the fringes of a sensor will be, and what a correction will leave of them."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from lsst.pex.config import Field, FieldValidationError, ListField
+from lsst.pipe.base import (
+    InputQuantizedConnection,
+    OutputQuantizedConnection,
+    PipelineTask,
+    PipelineTaskConfig,
+    PipelineTaskConnections,
+    QuantaAdjuster,
+    QuantumContext,
+    Struct,
+)
+from lsst.pipe.base.connectionTypes import Output
+
+from ..algorithms.field_response import SensorResponse
+from ..algorithms.focal_plane import ForecastOptions, SkyLevel, forecast_sensor
+from ..errors import InputError
+from ..instrument.detector import Detector
+from ..instrument.night import NightHistory, StochasticNight, join_nights
+from ..model import Setup
+from ..products import ThicknessMap
+from .quantum import common_header, data_id_of, sensor_of, unusable
+from .sky_model import (
+    LINE_LIST,
+    SkyModelConfig,
+    known_thickness,
+    takes_images,
+    thickness_input,
+    without_constraint,
+)
+
+__all__ = ["FringeForecastConfig", "FringeForecastConnections", "FringeForecastTask"]
+
+
+class FringeForecastConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
+    """A thickness map in, where there is one; one table out."""
+
+    config: FringeForecastConfig
+
+    thickness = thickness_input()
+    forecast = Output(
+        doc="Fringes in cells of the sensor; the header has those of the whole sensor.",
+        name="fringeForecast",
+        storageClass="AstropyTable",
+        dimensions=("instrument", "detector"),
+    )
+
+    def __init__(self, *, config: FringeForecastConfig | None = None) -> None:
+        if config is not None and config.stand_in:
+            self.thickness = without_constraint(self.thickness)
+
+    def adjust_all_quanta(self, adjuster: QuantaAdjuster) -> None:
+        """Keep the science sensors."""
+        for data_id in list(adjuster.iter_data_ids()):
+            if not takes_images(adjuster.expand_quantum_data_id(data_id)):
+                adjuster.remove_quantum(data_id)
+
+
+class FringeForecastConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnections=FringeForecastConnections):
+    """Configuration of `FringeForecastTask`."""
+
+    task_name: ClassVar[str] = "fringeForecast"
+
+    airmass: Field[float] = Field(
+        dtype=float, default=1.2, doc="Airmass of the exposures.", check=lambda airmass: 1.0 <= airmass < 10.0
+    )
+    cells: Field[int] = Field(
+        dtype=int, default=8, doc="Cells along each side of a sensor.", check=lambda cells: cells > 0
+    )
+    apertures_arcsec: ListField[float] = ListField(
+        dtype=float,
+        default=[1.0, 2.0, 5.0, 10.0, 20.0],
+        doc="Sides of the square apertures in which fringe and noise are compared, whole arcseconds.",
+    )
+    templates: Field[int] = Field(
+        dtype=int,
+        default=3,
+        doc="Largest number of templates of the correction.",
+        check=lambda count: count > 0,
+    )
+    nights: Field[int] = Field(
+        dtype=int, default=5, doc="Random nights that are corrected.", check=lambda count: count > 0
+    )
+    nights_seed: Field[int] = Field(
+        dtype=int, default=0, doc="Seed of the random nights.", check=lambda seed: seed >= 0
+    )
+
+    def setDefaults(self) -> None:
+        """Every sensor has a forecast."""
+        super().setDefaults()
+        self.stand_in = True
+
+    def validate(self) -> None:
+        """Refuse apertures and telescopes that a forecast cannot have."""
+        super().validate()
+        try:
+            self.options()
+        except InputError as error:
+            raise FieldValidationError(type(self).apertures_arcsec, self, str(error)) from error
+        if not Setup.from_name(self.setup).telescope or self.beams != "pixel":
+            raise FieldValidationError(
+                SkyModelConfig.beams, self, "a forecast needs a traced telescope and the beams of its pixels"
+            )
+
+    def options(self) -> ForecastOptions:
+        """Cells, apertures and templates."""
+        return ForecastOptions(self.cells, tuple(self.apertures_arcsec), self.templates)
+
+    def observed(self) -> NightHistory:
+        """Hours of random nights, none of which makes a template."""
+        hours = np.arange(0.0, 11.0)
+        return join_nights(
+            [
+                StochasticNight().draw(hours, np.random.default_rng([self.nights_seed, number]))
+                for number in range(self.nights)
+            ]
+        )
+
+
+class FringeForecastTask(PipelineTask):
+    """Forecast the fringes of one sensor."""
+
+    ConfigClass = FringeForecastConfig
+    config: FringeForecastConfig
+    _DefaultName = "fringeForecast"
+
+    def runQuantum(
+        self,
+        butlerQC: QuantumContext,
+        inputRefs: InputQuantizedConnection,
+        outputRefs: OutputQuantizedConnection,
+    ) -> None:
+        """Read the map if there is one, forecast, store."""
+        detector = sensor_of(data_id_of(butlerQC))
+        with unusable(detector.name):
+            thickness = butlerQC.get(inputRefs.thickness) if hasattr(inputRefs, "thickness") else None
+            result = self.run(thickness, detector)
+        butlerQC.put(result, outputRefs)
+
+    def run(self, thickness: ThicknessMap | None, detector: Detector) -> Struct:
+        """Forecast one sensor.
+
+        Parameters
+        ----------
+        thickness : `ThicknessMap` or `None`
+            Thickness of the varying layer of this sensor; `None` where a stand-in is wanted.
+        detector : `Detector`
+            The sensor; its place in the focal plane decides the beams.
+
+        Returns
+        -------
+        result : `~lsst.pipe.base.Struct`
+            ``forecast``, an `astropy.table.Table` (`SensorForecast.to_table`).
+
+        Raises
+        ------
+        InputError
+            No map where one is needed; a map of another layer, or fitted with other effects than those configured
+            here; a telescope whose beams do not depend on the distance from the axis alone.
+        """
+        known = known_thickness(self.config.map_of(thickness, detector))
+        model, sky, response = self.config.sky_model(detector, self.config.airmass, known).response()
+        if not isinstance(response, SensorResponse):
+            raise InputError(
+                "telescope", model.setup.telescope, "one whose beams depend on the field radius alone"
+            )
+        light = float(response.field.relative_illumination(detector.field_radius_deg))
+        forecast = forecast_sensor(
+            known,
+            response,
+            detector,
+            SkyLevel.of(sky, model, detector.read_noise, light),
+            NightHistory.guo2022(),
+            self.config.observed(),
+            stand_in=thickness is None,
+            options=self.config.options(),
+        )
+        table = forecast.to_table()
+        header: dict[str, Any] = {**common_header(), **self.config.choice(detector.raft).header()}
+        table.meta.update(header, LINELIST=LINE_LIST)
+        self.log.info(
+            "%s: fringe rms %.4f %%, %.2f times the shot noise; after correction with %d templates %.3f times",
+            *(detector.name, 100.0 * forecast.amplitudes.rms, forecast.over_noise.max()),
+            *(len(forecast.residual_over_noise), forecast.residual_over_noise[-1].max()),
+        )
+        return Struct(forecast=table)

@@ -1,0 +1,188 @@
+"""Frames with the beam of every pixel, against models that trace that beam themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.field_response import (
+    SensorPlacement,
+    SensorResponse,
+    angular_response,
+    beam_field,
+    beam_limits,
+    field_response,
+    sensor_response,
+)
+from lsst.fringe_sim.algorithms.sky_frame import (
+    SkyQuadrature,
+    SkyResponse,
+    simulate_sky_frame,
+    sky_response,
+)
+from lsst.fringe_sim.errors import InputError, OutOfRangeError
+from lsst.fringe_sim.instrument.camera import Camera
+from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum, airglow_continuum
+from lsst.fringe_sim.instrument.telescope import telescope_beam
+from lsst.fringe_sim.model import FringeModel
+
+RANGE = (15.0, 17.0)
+SCALE = 0.2
+
+
+def bright_sky(count: int = 20) -> SkySpectrum:
+    """The brightest lines and a continuum."""
+    lines = EmissionLines.oh()
+    chosen = np.sort(np.argsort(lines.photon_radiance)[-count:])
+    bright = EmissionLines(
+        lines.wavelength_nm[chosen],
+        lines.photon_radiance[chosen],
+        lines.transmission[chosen],
+        lines.band[chosen],
+    )
+    return SkySpectrum(bright, (airglow_continuum(),), 1.2)
+
+
+@pytest.fixture(scope="module")
+def angular():
+    beams = beam_field("LSST")
+    assert beams is not None
+    model = FringeModel.from_setup("lsst_e2v")
+    return angular_response(model, bright_sky(), beam_limits(beams), thickness_range_um=RANGE)
+
+
+def on_sensor(angular, name: str) -> SensorResponse:
+    placement = SensorPlacement.of(Camera.from_name("lsstCam").detector(name), SCALE)
+    return field_response(angular, beam_field("LSST"), placement.radius_range_deg).on(placement)
+
+
+@pytest.mark.parametrize("name", ["R22_S11", "R11_S01", "R14_S02"])
+def test_every_pixel_has_its_own_beam(angular, name):
+    """Within 0.5 % of peak-to-peak of a model with the traced beam of that place, over all thicknesses."""
+    sensor = on_sensor(angular, name)
+    shape = (200, 1)  # a thickness per row, so that the whole range is seen at nearly one place
+    points = np.linspace(*RANGE, shape[0])
+    place = sensor.placement
+    edge = place.field_x_deg + 0.45 * place.width_deg, place.field_y_deg + 0.3 * place.height_deg
+    at_edge = SensorPlacement(*edge, 1e-7, 1e-7)
+    frame = SensorResponse(sensor.field, at_edge).sky().frame(points[:, None])[:, 0].astype(float)
+    model = FringeModel.from_setup("lsst_e2v")
+    # More angles than usual: here the reference must not be the one that errs.
+    finer = SkyQuadrature(continuum_angles=128)
+    beam = telescope_beam("LSST", *edge, nodes=192)
+    model = replace(model, base_system=replace(model.base_system, beam=beam))
+    traced = sky_response(model, bright_sky(), thickness_range_um=RANGE, quadrature=finer)
+    exact = traced.sky().lookup(points)[0]
+    difference = frame / frame.mean() - exact / exact.mean()
+    assert np.abs(difference).max() < 0.005 * np.ptp(exact / exact.mean())
+
+
+@pytest.mark.parametrize(("name", "least"), [("R22_S11", 0.15), ("R14_S02", 0.15)])
+def test_one_beam_for_the_whole_sensor_is_wrong(angular, name, least):
+    sensor = on_sensor(angular, name)
+    shape = (64, 64)
+    thickness = np.random.default_rng(3).uniform(*RANGE, shape)
+    varying = sensor.sky().frame(thickness)
+    centre = SensorPlacement(sensor.placement.field_x_deg, sensor.placement.field_y_deg, 1e-7, 1e-7)
+    fixed = SensorResponse(sensor.field, centre).sky().frame(thickness)
+    difference = varying / varying.mean() - fixed / fixed.mean()
+    assert np.abs(difference).max() > least * np.ptp(fixed / fixed.mean())
+
+
+def test_one_beam_gives_an_ordinary_response(angular):
+    rays, _ = beam_field("LSST").sin_squared_at(1.0)
+    ours = angular.response(rays)
+    model = FringeModel.from_setup("lsst_e2v", field_x_deg=1.0)
+    theirs = sky_response(model, bright_sky(), thickness_range_um=RANGE)
+    points = np.linspace(*RANGE, 57)
+    assert ours.component == theirs.component
+    one, two = ours.sky().lookup(points)[0], theirs.sky().lookup(points)[0]
+    stated = (ours.quadrature_error + theirs.quadrature_error) * two.mean()
+    assert np.abs(one - two).max() < stated + 2 * theirs.sky().interpolation_error
+    assert ours.quadrature_error < 5e-5
+
+
+def test_too_few_angles_are_confessed():
+    model = FringeModel.from_setup("lsst_e2v")
+    limits = beam_limits(beam_field("LSST"))
+    coarse = angular_response(model, bright_sky(8), limits, thickness_range_um=RANGE, angles=48)
+    fine = angular_response(model, bright_sky(8), limits, thickness_range_um=RANGE)
+    rays, _ = beam_field("LSST").sin_squared_at(0.3)
+    points = np.linspace(*RANGE, 41)
+    one, two = (each.response(rays) for each in (coarse, fine))
+    error = np.abs(one.sky().lookup(points) - two.sky().lookup(points)).max() / two.level
+    assert 3e-4 < error < coarse.quadrature_error
+    assert fine.quadrature_error < 5e-5
+
+
+def test_weights_of_any_beam_sum_to_one(angular, rng):
+    low, high = angular.limits
+    for rays in (np.array([0.1]), rng.uniform(low, high, 500), beam_field("LSST").sin_squared_at(1.9)[0]):
+        assert angular.weights(rays).sum() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_components_add_up_to_the_sky(angular, rng):
+    sensor = on_sensor(angular, "R11_S01")
+    thickness = rng.uniform(*RANGE, (20, 30))
+    parts = sum(table.frame(thickness) for table in sensor.component_tables())
+    np.testing.assert_allclose(parts, sensor.sky().frame(thickness), rtol=2e-6)
+
+
+def test_a_frame_does_not_depend_on_how_finely_the_sensor_is_sampled(angular):
+    """The same places of the sensor, as pixels of a fine and of a coarse map."""
+    sensor = on_sensor(angular, "R14_S02")
+    fine = np.full((99, 99), 16.1)
+    coarse = fine[1::3, 1::3]
+    np.testing.assert_allclose(sensor.sky().frame(fine)[1::3, 1::3], sensor.sky().frame(coarse), rtol=1e-6)
+
+
+def test_placement_of_a_turned_sensor():
+    straight = SensorPlacement(0.5, -0.2, 0.2, 0.1)
+    turned = SensorPlacement(0.5, -0.2, 0.1, 0.2, 90.0)
+    corners = np.sort(straight.radius_deg((101, 201))[[0, 0, -1, -1], [0, -1, 0, -1]])
+    np.testing.assert_allclose(
+        np.sort(turned.radius_deg((201, 101))[[0, 0, -1, -1], [0, -1, 0, -1]]), corners
+    )
+    for place in (straight, turned):
+        radius = place.radius_deg((400, 400))
+        low, high = place.radius_range_deg
+        assert low <= radius.min() < low + 1e-3
+        assert high - 1e-3 < radius.max() <= high
+
+
+def test_sky_frames_take_either_response(angular, rng):
+    sensor = on_sensor(angular, "R22_S11")
+    thickness = rng.uniform(*RANGE, (24, 32))
+    thickness[2, 3] = np.nan
+    model = FringeModel.from_setup("lsst_e2v")
+    frame = simulate_sky_frame(thickness, model, response=sensor, mean_electrons=2700.0, seed=4)
+    assert frame.mask[2, 3] != 0
+    assert np.isfinite(frame.image).all()
+    assert frame.quadrature_error == sensor.quadrature_error
+
+
+def test_a_cone_has_one_beam():
+    placement = SensorPlacement(0.0, 0.0, 0.4, 0.4)
+    for setup, layer in (("monocam", RANGE), ("hsc", (199.9, 200.1))):
+        model = FringeModel.from_setup(setup)
+        found = sensor_response(model, bright_sky(2), placement, layer)
+        assert isinstance(found, SkyResponse)
+
+
+def test_what_is_refused(angular):
+    beams = beam_field("LSST")
+    with pytest.raises(OutOfRangeError, match="field radii"):
+        field_response(angular, beams, (2.5, 2.6))
+    part = field_response(angular, beams, (0.9, 1.1))
+    with pytest.raises(OutOfRangeError, match="field radius"):
+        part.on(SensorPlacement(0.0, 0.0, 0.2, 0.2))
+    sensor = part.on(SensorPlacement(1.0, 0.0, 0.1, 0.1))
+    with pytest.raises(OutOfRangeError, match="thickness"):
+        sensor.sky().frame(np.full((3, 3), 30.0))
+    with pytest.raises(InputError, match="two axes"):
+        sensor.sky().frame(np.full(3, 16.0))
+    tilted = FringeModel.from_setup("lsst_e2v", {"tilt.angle": 2.0})
+    with pytest.raises(InputError, match="none that changes the beam"):
+        angular_response(tilted, bright_sky(4), beam_limits(beams), thickness_range_um=RANGE)
