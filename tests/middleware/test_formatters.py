@@ -144,6 +144,15 @@ def test_raw_frames_and_their_metadata_alone(butler: Butler, tmp_path: Path) -> 
 # JSON
 
 
+def test_overrides_are_files_that_tasks_read(butler: Butler) -> None:
+    text = 'config.effects["bandwidth.fwhm"] = 2.4  # ± 0.1\n'
+    ref = put(butler, text, "effectOverride", "ConfigOverride")
+    assert butler.get(ref) == text
+    uri = butler.getURI(ref)
+    assert uri.getExtension() == ".py"
+    assert uri.read().decode() == text
+
+
 def test_verdicts_are_json(butler: Butler) -> None:
     verdict = {
         "verdict": "named",

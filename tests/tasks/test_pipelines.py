@@ -46,8 +46,10 @@ def test_pipelines_of_a_camera_name_its_instrument(name: str) -> None:
 
 
 def test_dataset_types_and_dimensions_are_those_agreed() -> None:
-    graph = load("lsstCam/fringe.yaml").to_graph()
+    graphs = [load(f"lsstCam/{name}.yaml").to_graph() for name in ("fringe", "discovery")]
     agreed = {
+        "effectDiscovery": ("FringeJson", {"instrument", "detector"}),
+        "effectOverride": ("ConfigOverride", {"instrument", "detector"}),
         "raw": ("RawFrame", {"instrument", "exposure", "detector"}),
         "fringeFlat": ("FringeFlat", {"instrument", "exposure", "detector"}),
         "epoxyThickness": ("ThicknessMap", {"instrument", "detector"}),
@@ -55,7 +57,7 @@ def test_dataset_types_and_dimensions_are_those_agreed() -> None:
         "fringe": ("FringeFrame", {"instrument", "physical_filter", "detector"}),
         "fringeComponents": ("FringeComponents", {"instrument", "physical_filter", "detector"}),
     }
-    for task in graph.tasks.values():
+    for task in (task for graph in graphs for task in graph.tasks.values()):
         for edge in (*task.inputs.values(), *task.outputs.values()):
             name = edge.parent_dataset_type_name
             if name in agreed:
@@ -69,6 +71,25 @@ def test_dataset_types_and_dimensions_are_those_agreed() -> None:
 @pytest.mark.parametrize(
     ("name", "label", "override", "message"),
     [
+        (
+            "ts8/discovery.yaml",
+            "effectDiscovery",
+            "config.connections.flats = 'other'",
+            "flats that isrFlatPrep prepares",
+        ),
+        (
+            "ts8/discovery.yaml",
+            "effectDiscovery",
+            "config.setup = 'bnl_ts8_e2v'",
+            "in which they were prepared",
+        ),
+        ("ts8/discovery.yaml", "isrFlatPrep", "config.smoothing_sigma_px = 3.0", "neighbouring pixels"),
+        (
+            "ts8/discovery.yaml",
+            "fringeBias",
+            "config.connections.bias = 'other'",
+            "the bias that fringeBias makes",
+        ),
         ("ts8/labFlats.yaml", "isrFlatPrep", "config.overscan_method = 'spline'", "corrected alike"),
         (
             "ts8/labFlats.yaml",
@@ -131,9 +152,10 @@ def test_one_override_file_reaches_fit_and_sky(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("camera", ["lsstCam", "ts8"])
 def test_each_raft_is_fitted_with_the_stack_of_its_vendor(camera: str) -> None:
-    made = configs(load(f"{camera}/labFlats.yaml"))
+    made = configs(load(f"{camera}/labFlats.yaml")) | configs(load(f"{camera}/discovery.yaml"))
     for detector in Camera.from_name(camera).science:
         setup = {"e2v": "ts8_e2v", "ITL": "ts8_itl"}[detector.vendor]
+        assert made["effectDiscovery"].choice(detector.raft).setup == setup
         assert made["epoxyFit"].choice(detector.raft).setup == setup
         assert made["isrFlatPrep"].setup_of(detector.raft).name == setup
 

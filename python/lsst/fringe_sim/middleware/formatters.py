@@ -1,4 +1,4 @@
-"""How datasets lie in files: FITS for arrays, JSON for verdicts. No pickle."""
+"""How datasets lie in files: FITS for arrays, JSON for verdicts, Python for overrides. No pickle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ from ..instrument.raw_frame import RawFrame, read_raw_metadata
 from ..products import FringeFrame
 from .afw import read_exposure
 
-__all__ = ["FitsProductFormatter", "FringeFrameFormatter", "RawFrameFormatter", "StrictJsonFormatter"]
+__all__ = [
+    "ConfigOverrideFormatter",
+    "FitsProductFormatter",
+    "FringeFrameFormatter",
+    "RawFrameFormatter",
+    "StrictJsonFormatter",
+]
 
 PROVENANCE_PREFIX = "LSST BUTLER"
 """Start of the header keywords that say from which datasets a product was made, as in other Rubin images."""
@@ -126,3 +132,19 @@ class StrictJsonFormatter(FormatterV2):
         except (TypeError, ValueError) as error:
             raise InputError("content", str(error), "finite numbers, text, lists and mappings") from None
         return f"{text}\n".encode()
+
+
+class ConfigOverrideFormatter(FormatterV2):
+    """Reads and writes the text of a configuration override as it is. Reading executes nothing."""
+
+    default_extension = ".py"
+    supported_extensions = frozenset({".py"})
+    can_read_from_uri = True
+
+    def read_from_uri(self, uri: ResourcePath, component: str | None = None, expected_size: int = -1) -> Any:
+        """Read the text."""
+        return uri.read().decode("utf-8")
+
+    def to_bytes(self, in_memory_dataset: Any) -> bytes:
+        """The text in UTF-8."""
+        return str(in_memory_dataset).encode("utf-8")

@@ -19,22 +19,19 @@ from lsst.pipe.base import (
     Struct,
 )
 from lsst.pipe.base.connectionTypes import Input, Output
-from lsst.utils.logging import getLogger
 
 from ..algorithms import discover
 from ..algorithms.discovery import SearchOptions, Verdict
 from ..instrument.detector import Detector
 from ..products import FringeCube, FringeFlat
-from .model_config import FringeModelConfig
+from .model_config import FringeModelConfig, ModelChoice
 from .quantum import data_id_of, sensor_of, unusable
 
 __all__ = ["EffectDiscoveryConfig", "EffectDiscoveryConnections", "EffectDiscoveryTask"]
 
-_LOG = getLogger(__name__)
-
 
 class EffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
-    """The flats of a sensor in, a verdict out."""
+    """The flats of a sensor in; a verdict, and what it means for the model of all other tasks, out."""
 
     flats = Input(
         doc="Fringe patterns of the sensor at all wavelengths.",
@@ -48,6 +45,13 @@ class EffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrumen
         doc="Whether flats and model disagree, and which effect is the reason.",
         name="effectDiscovery",
         storageClass="FringeJson",
+        dimensions=("instrument", "detector"),
+    )
+    override = Output(
+        doc="Effects that were known and that were found, as an override for any task with a fringe model: "
+        "-C label:FILE.",
+        name="effectOverride",
+        storageClass="ConfigOverride",
         dimensions=("instrument", "detector"),
     )
 
@@ -96,7 +100,7 @@ class EffectDiscoveryTask(PipelineTask):
         flats = (butlerQC.get(ref).get() for ref in inputRefs.flats)
         with unusable(detector.name):
             result = self.run(flats, len(inputRefs.flats), detector)
-        butlerQC.put(Struct(verdict=result.verdict.as_mapping()), outputRefs)
+        butlerQC.put(result, outputRefs)
 
     def run(self, flats: Iterable[FringeFlat], number: int, detector: Detector) -> Struct:
         """Search one sensor.
@@ -113,17 +117,33 @@ class EffectDiscoveryTask(PipelineTask):
         Returns
         -------
         result : `~lsst.pipe.base.Struct`
-            ``verdict``, a `Verdict`.
+            ``verdict``, the layout of ``discovery.json``; ``override``, the text of a configuration override. The
+            verdict names the dataset type of the override in place of a file.
 
         Raises
         ------
         InputError
             Flats that do not belong together, or a set-up that contradicts them.
         """
-        model = self.config.choice(detector.raft).model()
+        choice = self.config.choice(detector.raft)
         cube = FringeCube.from_flats(flats, number=number)
         options = SearchOptions(most_cells=self.config.most_cells, significance=self.config.significance)
         rng = np.random.default_rng([self.config.seed, detector.id])
-        verdict: Verdict = discover(cube, model, rng=rng, options=options, report=self.log.verbose)
+        verdict = discover(cube, choice.model(), rng=rng, options=options, report=self._say)
         self.log.info("%s: %s", detector.name, verdict.summary())
-        return Struct(verdict=verdict)
+        return Struct(
+            verdict=verdict.as_mapping(model_override=self.config.connections.override),
+            override=_override(choice, verdict, detector),
+        )
+
+    def _say(self, line: str) -> None:
+        self.log.verbose("%s", line)
+
+
+def _override(choice: ModelChoice, verdict: Verdict, detector: Detector) -> str:
+    """Override with the effects that were known before, and behind them those that were found."""
+    known = "".join(f'config.effects["{key}"] = {value!r}\n' for key, value in sorted(choice.effects.items()))
+    head = f"# Sensor {detector.name}.\n"
+    if known:
+        head += f"# Known before the search:\n{known}"
+    return head + verdict.override()
