@@ -52,7 +52,8 @@ class GlobalFit:
     settled : `SettledCells`
         Order of every cell, and how sure it is.
     border_slip : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Probability that a pixel near a step lies on the other side of it.
+        Probability that a pixel near a step lies on the other side of it, or that one which was fitted by itself
+        has another order.
     templates : `FringeTemplates`
         The model as it was normalised in the end.
     nuisance : `NuisanceFit`
@@ -128,7 +129,10 @@ def global_fit(
     rough = spread_to_pixels(cells, ~surface.smooth)
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
     pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)
-    pixels = rescue_pixels(fringes, state.templates, pixels, order, range_um=range_um, threads=threads)
+    pixels, lone_slip = rescue_pixels(
+        fringes, state.templates, pixels, order, range_um=range_um, threads=threads
+    )
+    border_slip = np.maximum(border_slip, lone_slip)
     if smoothing_px > 0.0:
         edges = (cells.y_edges, cells.x_edges)
         pixels = smooth_likelihood(
@@ -279,7 +283,7 @@ def _surface(state: _State, order: float) -> CellSurface:
         thickness = thickness[tuple(near)]
         slope_y, slope_x = np.where(empty, 0.0, slope_y), np.where(empty, 0.0, slope_x)
     cells = state.cells
-    return CellSurface.from_cells(thickness, slope_y, slope_x, cells.y_centre, cells.x_centre, order)
+    return CellSurface.from_cells(thickness, slope_y, slope_x, cells.y_centre, cells.x_centre, order, ~empty)
 
 
 def choose_cell_size(data: Amplitudes) -> int:

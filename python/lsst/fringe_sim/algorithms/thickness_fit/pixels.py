@@ -68,6 +68,8 @@ class CellSurface:
         Centres of the cells [px].
     smooth : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
         Whether a cell and its eight neighbours lie on one surface.
+    known : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
+        Whether a cell has data; the thickness of the others is borrowed, and no evidence for a surface.
     """
 
     thickness_um: NDArray[np.float32]
@@ -76,6 +78,7 @@ class CellSurface:
     y_centre: NDArray[np.float64]
     x_centre: NDArray[np.float64]
     smooth: NDArray[np.bool_]
+    known: NDArray[np.bool_]
 
     @classmethod
     def from_cells(
@@ -86,6 +89,7 @@ class CellSurface:
         y_centre: NDArray[np.float64],
         x_centre: NDArray[np.float64],
         order_um: float,
+        known: NDArray[np.bool_],
     ) -> CellSurface:
         """Find out which cells lie on one surface."""
         rise = np.diff(y_centre)[:, None] * 0.5 * (slope_y[1:] + slope_y[:-1])
@@ -105,6 +109,7 @@ class CellSurface:
             y_centre,
             x_centre,
             ~broken,
+            known,
         )
 
 
@@ -188,7 +193,8 @@ def fit_pixels(
         _fit_band(
             image, core(variance), core(bad), scale, table, templates.start_um, templates.step_um, order_um,
             surface.thickness_um, surface.slope_y, surface.slope_x, surface.y_centre, surface.x_centre,
-            surface.smooth, low, below_y, share_y, below_x, share_x, data.offset, cell_of_row, data.x_edges,
+            surface.smooth, surface.known, low, below_y, share_y, below_x, share_x,
+            data.offset, cell_of_row, data.x_edges,
             value[low:high], sigma[low:high], chi2[low:high], used[low:high],
         )  # fmt: skip
 
@@ -209,7 +215,7 @@ def bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64]
 @numba.njit(cache=True, nogil=True, fastmath=_MATH)
 def _fit_band(  # type: ignore[no-untyped-def]
     image, variance, bad, scale, table, start, step, order,
-    thickness, slope_y, slope_x, y_centre, x_centre, smooth, first_row, below_y, share_y, below_x, share_x,
+    thickness, slope_y, slope_x, y_centre, x_centre, smooth, known, first_row, below_y, share_y, below_x, share_x,
     offset, cell_of_row, x_edges, value, sigma, chi2_out, used_out,
 ):  # fmt: skip
     bands, rows, columns = image.shape
@@ -260,7 +266,7 @@ def _fit_band(  # type: ignore[no-untyped-def]
                 else:
                     own_x = below_x[x] if share_x[x] < 0.5 else min(below_x[x] + 1, thickness.shape[1] - 1)
                     place, information, chi2 = _try_surfaces(
-                        table, start, step, order, y, w, b, thickness, slope_y, slope_x,
+                        table, start, step, order, y, w, b, thickness, slope_y, slope_x, known,
                         y_centre, x_centre, first_row + r, x, own_y, own_x, longest,
                     )  # fmt: skip
                 value[r, x] = start + step * place
@@ -316,14 +322,19 @@ def _finish_row(sigma, chi2, used, step):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _try_surfaces(  # type: ignore[no-untyped-def]
-    table, start, step, order, y, w, item, thickness, slope_y, slope_x,
+    table, start, step, order, y, w, item, thickness, slope_y, slope_x, known,
     y_centre, x_centre, row, column, own_y, own_x, longest,
 ):  # fmt: skip
-    """Best of the surfaces that the cells around a pixel show."""
+    """Best of the surfaces that the cells around a pixel show.
+
+    Cells without data show none; only a pixel in such a cell has nothing better to begin with.
+    """
     guess, votes = np.empty(9, np.float64), np.zeros(9, np.int64)
     number = 0
     for a in range(max(own_y - 1, 0), min(own_y + 2, thickness.shape[0])):
         for b in range(max(own_x - 1, 0), min(own_x + 2, thickness.shape[1])):
+            if known[own_y, own_x] and not known[a, b]:
+                continue
             at = (
                 thickness[a, b] + slope_y[a, b] * (row - y_centre[a]) + slope_x[a, b] * (column - x_centre[b])
             )

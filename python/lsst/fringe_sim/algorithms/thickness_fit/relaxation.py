@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .cells import Cells, cell_independence, effective_number, run_threaded
 from .evidence import EVIDENCE_CAP, IMPOSSIBLE, MISFIT, OrderEvidence
+from .lone_surfaces import settle_lone_surfaces
 from .medians import middle_of, sort_first
 from .newton import gauss_newton, score
 from .templates import FringeTemplates
@@ -151,6 +152,12 @@ def settle_orders(
     excess = share[:, None] * (price - price[:, SHIFTS : SHIFTS + 1])
     odds = np.exp(-0.5 * excess.clip(-200.0, 2000.0)).sum(axis=1)
     segment_slip = 1.0 - 1.0 / (odds + _far_odds(found, thickness, segment, share))
+    lone = settle_lone_surfaces(
+        cells, templates, thickness, segment, share, order_um,
+        range_um=range_um, temper=temper, most_cells=_LARGEST_MENDED, threads=threads,
+    )  # fmt: skip
+    thickness = lone.thickness_um
+    segment_slip[lone.surface] = lone.slip
     cell_slip = np.zeros(thickness.shape, np.float32)
     _cell_slip(cost, shifted, label, rise_y, rise_x, order_um, cell_slip)
     return SettledCells(thickness, segment, segment_slip, cell_slip)

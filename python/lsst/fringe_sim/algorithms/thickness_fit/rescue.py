@@ -48,7 +48,7 @@ def rescue_pixels(
     *,
     range_um: tuple[float, float],
     threads: int = 2,
-) -> PixelFit:
+) -> tuple[PixelFit, NDArray[np.float32]]:
     """Fit again the pixels whose chi-square is improbable.
 
     Parameters
@@ -70,13 +70,16 @@ def rescue_pixels(
     -------
     pixels : `PixelFit`
         With better values where there are; ``n_wavelengths`` is one less where one was left out.
+    slip : `numpy.ndarray`, float32, shape of ``pixels.value``
+        Probability that the order of a pixel is wrong which had to be looked for by itself; 0 for all others.
     """
+    slip = np.zeros(pixels.value.shape, np.float32)
     used = pixels.n_wavelengths
     limit = typical_misfit(pixels) * chi2_limits(int(used.max(initial=0)))
     bad = pixels.chi2 > limit[used]
     rows, columns = np.nonzero(bad)
     if rows.size == 0:
-        return pixels
+        return pixels, slip
     fields = {name: np.array(getattr(pixels, name)) for name in ("value", "sigma", "chi2", "n_wavelengths")}
     table = templates.table()
     for low in range(0, rows.size, _MOST_SEARCHED):
@@ -91,8 +94,10 @@ def rescue_pixels(
     rows, columns = (index[:_MOST_SEARCHED] for index in np.nonzero(compact))
     if rows.size:
         value, weight = gather_pixels(data, rows, columns)
-        _search_range(value, weight, rows, columns, templates, order_um, range_um, limit, fields, threads)
-    return replace(pixels, **fields)
+        _search_range(
+            value, weight, rows, columns, templates, order_um, range_um, limit, fields, slip, threads
+        )
+    return replace(pixels, **fields), slip
 
 
 def typical_misfit(pixels: PixelFit) -> float:
@@ -169,6 +174,7 @@ def _search_range(
     range_um: tuple[float, float],
     limit: NDArray[np.float32],
     fields: dict[str, NDArray[np.generic]],
+    slip: NDArray[np.float32],
     threads: int,
 ) -> None:
     """Look for each pixel by itself over the whole range, keep the result if it fits."""
@@ -188,3 +194,4 @@ def _search_range(
     fields["value"][place] = thickness
     fields["sigma"][place] = 1.0 / np.sqrt(np.maximum(information, 1e-30))
     fields["chi2"][place] = reduced[fits]
+    slip[place] = 1.0 - 1.0 / np.maximum(np.exp(-0.5 * found.evidence[0][fits]).sum(axis=1), 1.0)

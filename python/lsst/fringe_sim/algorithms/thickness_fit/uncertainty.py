@@ -16,7 +16,7 @@ __all__ = ["lone_slip_probability", "slip_probability"]
 
 _MATH = {"reassoc", "contract", "arcp", "nsz"}
 _BAND_ROWS = 16
-_SHIFTS = 2
+_SHIFTS = 4
 """Orders on both sides that a lone pixel is compared with."""
 
 
@@ -68,7 +68,7 @@ def lone_slip_probability(
     Returns
     -------
     probability : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        With a flat prior over two orders on both sides; 1 where there is no thickness.
+        With a flat prior over four orders on both sides; 1 where there is no thickness.
     """
     out = np.ones(thickness_um.shape, np.float32)
     table = templates.table()
