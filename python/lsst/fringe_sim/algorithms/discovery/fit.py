@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from ...effects import Effect, Parameter
 from .basis import FieldBasis, NormalMatrix
@@ -146,35 +147,6 @@ def _starts_quadratically(
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """Data, model and nuisances of one search.
-
-    Attributes
-    ----------
-    cells : `CellData`
-        The data.
-    forward : `Forward`
-        The model.
-    basis : `FieldBasis`
-        The thickness field.
-    level_basis : `numpy.ndarray`, shape ``(W, L)``
-        Free levels: the unit matrix, or a few smooth functions of wavelength.
-    field_prior : `float`
-        Precision of the coefficients of the field about `prior_field` [1/µm²]; 0 for a free field.
-    """
-
-    cells: CellData
-    forward: Forward
-    basis: FieldBasis
-    level_basis: FloatArray
-    field_prior: float = 0.0
-
-    def with_cells(self, cells: CellData) -> Problem:
-        """Same problem with other data on the same cells."""
-        return replace(self, cells=cells)
-
-
-@dataclass(frozen=True, eq=False)
 class Whitener:
     """Turns differences of cells into numbers with unit noise, response scatter included.
 
@@ -221,42 +193,101 @@ class LevelColumns:
 
     Attributes
     ----------
-    amplitude : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Model in units of the noise.
-    basis : `numpy.ndarray`, shape ``(W, L)``
-        Levels at the wavelengths.
+    amplitude : `numpy.ndarray`, shape ``(C, ny, nx)``
+        What a level multiplies, in units of the noise.
+    plane : `numpy.ndarray`, shape ``(C,)``
+        The wavelength that it belongs to.
+    basis : `numpy.ndarray`, shape ``(C, L)``
+        Free parameters of which they are made.
     whiten : `Whitener`
         The noise.
     """
 
     amplitude: FloatArray
+    plane: NDArray[np.int64]
     basis: FloatArray
     whiten: Whitener
 
-    @property
-    def number(self) -> int:
-        """Number of levels."""
-        return self.basis.shape[1]
-
     def dot(self, values: FloatArray) -> FloatArray:
         """Products with whitened ``(..., W, ny, nx)``, shape ``(..., L)``."""
-        planes = np.einsum("wyx,...wyx->...w", self.amplitude, self.whiten.decorrelate(values))
-        return np.asarray(planes @ self.basis)
+        planes = self.whiten.decorrelate(values)[..., self.plane, :, :]
+        return np.asarray(np.einsum("cyx,...cyx->...c", self.amplitude, planes) @ self.basis)
 
     def along(self, slope: FloatArray) -> FloatArray:
         """Products cell by cell with a whitened slope ``(W, ny, nx)``, shape ``(L, ny, nx)``."""
-        planes = self.amplitude * self.whiten.decorrelate(slope)
+        planes = self.amplitude * self.whiten.decorrelate(slope)[self.plane]
         return np.tensordot(self.basis.T, planes, axes=1)
 
     def gram(self) -> FloatArray:
         """Products with one another, shape ``(L, L)``."""
-        planes = np.diag((self.amplitude**2).sum(axis=(1, 2)))
+        flat = self.amplitude.reshape(len(self.amplitude), -1)
+        planes = np.where(self.plane[:, np.newaxis] == self.plane, flat @ flat.T, 0.0)
         if self.whiten.gamma.any():
             direction, gamma = self.whiten.direction, self.whiten.gamma
             share = 2.0 * gamma - gamma**2 * (direction**2).sum(axis=0)
-            both = (direction * self.amplitude * np.sqrt(share)).reshape(len(planes), -1)
+            both = (direction[self.plane] * self.amplitude * np.sqrt(share)).reshape(len(flat), -1)
             planes = planes - both @ both.T
         return np.asarray(self.basis.T @ planes @ self.basis)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Data, model and nuisances of one search.
+
+    Attributes
+    ----------
+    cells : `CellData`
+        The data.
+    forward : `Forward`
+        The model.
+    basis : `FieldBasis`
+        The thickness field.
+    level_basis : `numpy.ndarray`, shape ``(W, L)``
+        Free levels: the unit matrix, or a few smooth functions of wavelength.
+    field_prior : `float`
+        Precision of the coefficients of the field about `prior_field` [1/µm²]; 0 for a free field.
+    free_contrast : `bool`
+        Whether the fringes of each wavelength have an amplitude of their own: the ``W`` contrasts, relative to
+        the model's, follow the levels.
+    """
+
+    cells: CellData
+    forward: Forward
+    basis: FieldBasis
+    level_basis: FloatArray
+    field_prior: float = 0.0
+    free_contrast: bool = False
+
+    @property
+    def n_levels(self) -> int:
+        """Number of free levels, contrasts among them."""
+        return self.level_basis.shape[1] + (self.cells.shape[0] if self.free_contrast else 0)
+
+    def amplitudes(self, levels: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Level and amplitude of the fringes at each wavelength, ``(W, 1, 1)``."""
+        number = self.level_basis.shape[1]
+        level = (self.level_basis @ levels[:number])[:, np.newaxis, np.newaxis]
+        if not self.free_contrast:
+            return level, level
+        return level, levels[number:][:, np.newaxis, np.newaxis]
+
+    def expected(self, levels: FloatArray, value: FloatArray) -> FloatArray:
+        """Data that the model says, from its prediction."""
+        level, fringes = self.amplitudes(levels)
+        return level + fringes * (value - 1.0) if self.free_contrast else level * value
+
+    def level_columns(self, value: FloatArray, whiten: Whitener) -> LevelColumns:
+        """Derivatives of the expected data with respect to the levels."""
+        planes = np.arange(self.cells.shape[0])
+        if not self.free_contrast:
+            return LevelColumns(whiten.root * value, planes, self.level_basis, whiten)
+        basis = block_diag(self.level_basis, np.eye(len(planes)))
+        amplitude = np.concatenate([whiten.root, whiten.root * (value - 1.0)])
+        return LevelColumns(amplitude, np.tile(planes, 2), basis, whiten)
+
+    def with_cells(self, cells: CellData) -> Problem:
+        """Same problem with other data on the same cells."""
+        return replace(self, cells=cells)
 
 
 @dataclass(frozen=True, eq=False)
@@ -473,8 +504,8 @@ class _Solver:
         thickness = problem.basis.expand(point.coefficients)
         problem.forward.cover(thickness)
         point.prediction = problem.forward.predict(self.settings(point.position), thickness)
-        level = (problem.level_basis @ point.levels)[:, np.newaxis, np.newaxis]
-        point.residual = self.whiten(problem.cells.value - level * point.prediction.value)
+        expected = problem.expected(point.levels, point.prediction.value)
+        point.residual = self.whiten(problem.cells.value - expected)
         point.chi2 = float((point.residual**2).sum())
         return point
 
@@ -519,18 +550,19 @@ class _Solver:
         weight = (cells.weight * reference**2).sum(axis=(1, 2))
         ratio = (cells.weight * reference * cells.value).sum(axis=(1, 2)) / np.maximum(weight, 1e-300)
         root = np.sqrt(weight)
-        return np.linalg.lstsq(root[:, None] * basis, root * ratio, rcond=None)[0]
+        levels = np.linalg.lstsq(root[:, None] * basis, root * ratio, rcond=None)[0]
+        return np.concatenate([levels, basis @ levels]) if self.problem.free_contrast else levels
 
     def linearise(self, point: _Point, *, effects: bool = True) -> Design:
         """Design at a point: levels, then coordinates (if ``effects``)."""
         problem = self.problem
         thickness = problem.basis.expand(point.coefficients)
-        level = (problem.level_basis @ point.levels)[:, np.newaxis, np.newaxis]
+        _, level = problem.amplitudes(point.levels)
         columns = np.empty((len(self.coordinates) if effects else 0, *point.residual.shape))
         for number in range(len(columns)):
             columns[number] = self.whiten(level * self.derivative(point, thickness, number))
         slope = self.whiten(level * point.prediction.slope)
-        levels = LevelColumns(self.whiten.root * point.prediction.value, problem.level_basis, self.whiten)
+        levels = problem.level_columns(point.prediction.value, self.whiten)
         return Design.build(problem.basis, slope, levels, columns, problem.field_prior)
 
     def derivative(self, point: _Point, thickness: FloatArray, number: int) -> FloatArray:
@@ -546,7 +578,7 @@ class _Solver:
             return point
         for _ in range(2):
             design = self.linearise(point, effects=False)
-            nothing = np.zeros(self.problem.level_basis.shape[1])
+            nothing = np.zeros(self.problem.n_levels)
             step, field_step = design.step(point.residual, nothing, nothing)
             scale = 1.0 / max(1.0, self._phase_change(design, step, field_step) / LARGEST_PHASE_STEP_UM)
             better = self.evaluate(
@@ -563,7 +595,7 @@ class _Solver:
         """Largest change of fringe phase in a step, as a thickness [µm]: of the field and of the effects together."""
         thickness = self.problem.basis.expand(field_step)
         square = (design.slope**2).sum(axis=0)
-        levels = self.problem.level_basis.shape[1]
+        levels = self.problem.n_levels
         change = design.slope * thickness
         change = change + np.tensordot(step[levels:], design.effects, axes=1)
         along = (design.slope * change).sum(axis=0)
@@ -571,7 +603,7 @@ class _Solver:
         return float(np.percentile(np.abs(along[used] / square[used]), 98.0)) if used.any() else 0.0
 
     def _improve(self, point: _Point, design: Design, damping: float) -> tuple[_Point | None, float]:
-        levels = self.problem.level_basis.shape[1]
+        levels = self.problem.n_levels
         ridge = np.concatenate([np.zeros(levels), self.ridge])
         pull = np.concatenate([np.zeros(levels), self.ridge * point.position])
         before = point.chi2 + self.penalty(point)

@@ -88,6 +88,7 @@ class _Prepared:
     rich: bool
     stated: CellData
     notes: tuple[str, ...] = field(default=())
+    undistorted_field: FloatArray | None = None
 
 
 def discover(
@@ -219,11 +220,15 @@ def _prepare(
     if not rich:
         return _prepare_few(cells, model, forward, start, levels, index)
     problem, fit = _choose_field(Problem(cells, forward, CellBasis(start.shape), levels), start, {})
-    return _settle(problem, fit, fit, cells, index)
+    return _settle(problem, fit, cells, index)
 
 
 def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, float]) -> tuple[Problem, Fit]:
-    """Coarsest parametrisation of the field that the data do not want finer, and its fit."""
+    """Coarsest parametrisation of the field that the data do not want finer, and its fit.
+
+    The contrast of each wavelength is free: a field that had to make up for a wrong contrast would be drawn into
+    ever finer coefficients.
+    """
     cells = problem.cells
     weight = (cells.weight > 0).any(axis=0).astype(float)
     best: tuple[Problem, Fit] | None = None
@@ -231,9 +236,10 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
         basis: FieldBasis = SplineBasis.of_grid(start.shape, spacing) if spacing else CellBasis(start.shape)
         if spacing and basis.size > start.size:
             continue
-        trial = replace(problem, basis=basis)
+        trial = replace(problem, basis=basis, free_contrast=True)
         field_map = start if best is None else best[0].basis.expand(best[1].field)
-        fit = fit_model(trial, (), np.zeros(0), basis.fit(field_map, weight), None, settings)
+        levels = None if best is None else best[1].levels
+        fit = fit_model(trial, (), np.zeros(0), basis.fit(field_map, weight), levels, settings)
         if best is not None and not _finer_is_better(best, (trial, fit)):
             break
         best = (trial, fit)
@@ -241,17 +247,19 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
     return best
 
 
-def _settle(problem: Problem, fit: Fit, null: Fit, stated: CellData, index: FloatArray) -> _Prepared:
-    """Measure the noise at a fit and fit the unchanged model with it."""
+def _settle(problem: Problem, fit: Fit, stated: CellData, index: FloatArray) -> _Prepared:
+    """Measure the noise at a fit with free contrast, and fit the unchanged model with it."""
     noise = _measure_noise(replace(problem, cells=stated), fit)
-    problem = problem.with_cells(stated.scaled_noise(noise.factor, noise.response_scatter))
-    settled = fit_model(problem, (), np.zeros(0), null.field, null.levels)
+    cells = stated.scaled_noise(noise.factor, noise.response_scatter)
+    problem = replace(problem, cells=cells, free_contrast=False)
+    levels = fit.levels[: problem.n_levels]
+    settled = fit_model(problem, (), np.zeros(0), fit.field, levels)
     notes = []
     if abs(noise.neighbour_correlation) > 0.1:
         notes.append(f"noise of neighbouring cells is correlated ({noise.neighbour_correlation:.2f})")
     if not noise.measured:
         notes.append("noise level taken as stated: too few cells to measure it")
-    return _Prepared(problem, settled, noise, index, True, stated, tuple(notes))
+    return _Prepared(problem, settled, noise, index, True, stated, tuple(notes), fit.field)
 
 
 def _finer_is_better(coarse: tuple[Problem, Fit], fine: tuple[Problem, Fit]) -> bool:
@@ -303,8 +311,8 @@ def _prepare_few(
 def _measure_noise(problem: Problem, fit: Fit) -> NoiseEstimate:
     thickness = problem.basis.expand(fit.field)
     value = problem.forward.predict(fit.settings, thickness).value
-    level = (problem.level_basis @ fit.levels)[:, None, None]
-    residual = np.where(problem.cells.weight > 0, problem.cells.value - level * value, 0.0)
+    expected = problem.expected(fit.levels, value)
+    residual = np.where(problem.cells.weight > 0, problem.cells.value - expected, 0.0)
     return estimate_noise(problem.cells, residual)
 
 
@@ -337,6 +345,7 @@ class _Search:
             self.prepared.null,
             self.prepared.index,
             generic=self.prepared.rich,
+            first_field=self.prepared.undistorted_field,
         )
         self.where = self._where(whole)
         chance = self._chance(whole, whole.null)
@@ -382,7 +391,14 @@ class _Search:
         problem = whole.problem.with_cells(self.cells.restricted(~self.heldout))
         null = fit_model(problem, (), np.zeros(0), self.prepared.null.field, self.prepared.null.levels)
         self.say("ranking effects")
-        return Selector(problem, self.effects, null, self.prepared.index, generic=self.prepared.rich)
+        return Selector(
+            problem,
+            self.effects,
+            null,
+            self.prepared.index,
+            generic=self.prepared.rich,
+            first_field=self.prepared.undistorted_field,
+        )
 
     def _refit(self, selector: Selector, base: Hypothesis) -> list[Hypothesis]:
         """Refits of the best-scored additions to a set, likeliest first."""
@@ -404,10 +420,7 @@ class _Search:
             return None
         start = self._whole_field(whole, best.fit)
         problem, fit = _choose_field(whole.problem, start, best.fit.settings)
-        null_map = whole.problem.basis.expand(whole.null.fit.field)
-        null_field = problem.basis.fit(null_map, np.ones(null_map.shape))
-        null = replace(whole.null.fit, field=null_field)
-        refined = _settle(problem, fit, null, prepared.stated, prepared.index)
+        refined = _settle(problem, fit, prepared.stated, prepared.index)
         change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
         scatter = abs(refined.noise.response_scatter - prepared.noise.response_scatter)
         typical = _noise_rms(self.cells)
@@ -454,7 +467,7 @@ class _Search:
 
     def _searched_harder(self, selector: Selector, singles: list[Hypothesis]) -> Hypothesis:
         """Best single effect when the nearly best ones are tried at other sizes too."""
-        near = [h for h in singles if h.log_evidence > 0.7 * singles[0].log_evidence][:6]
+        near = [h for h in singles if h.log_evidence > 0.7 * singles[0].log_evidence][:4]
         again = [selector.improved(h.names, selector.null.fit, scan=True) for h in near]
         return max(again, key=lambda item: item.log_evidence)
 

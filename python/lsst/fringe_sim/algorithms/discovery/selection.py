@@ -104,6 +104,10 @@ class Selector:
         Fit of the unchanged model.
     index : `numpy.ndarray`, shape ``(W,)``
         Refractive index of the varying layer, for the fringe phase.
+    generic : `bool`, optional
+        Whether there are enough cells for the tests without a catalogue.
+    first_field : `numpy.ndarray`, optional
+        Field from which the first effect is fitted; that of ``null`` by default, which a strong effect distorts.
     """
 
     def __init__(
@@ -114,8 +118,10 @@ class Selector:
         index: FloatArray,
         *,
         generic: bool = True,
+        first_field: FloatArray | None = None,
     ) -> None:
         self.problem, self.index, self.generic = problem, index, generic
+        self.first_field = null.field if first_field is None else first_field
         self.null = Hypothesis((), null, 0.0)
         thickness = problem.basis.expand(null.field)
         self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
@@ -338,7 +344,7 @@ class Selector:
         minimum[:-1] &= fall[:-1] >= fall[1:]
         minimum &= np.abs(places - fit.position[-1]) > 0.5 * last.neighbour
         best = sorted(np.flatnonzero(minimum), key=lambda number: -fall[number])[:MINIMA_REFITTED]
-        for number in best:
+        for number in map(int, best):
             start = np.append(fit.position[:-1], places[number])
             trial = fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels)
             fit = min(fit, trial, key=lambda item: item.chi2)
@@ -352,7 +358,8 @@ class Selector:
         # A quadratic coordinate has no slope in its parameter at 0; start beside it.
         nudge = np.array([0.01 * item.unit_step if item.quadratic else 0.0 for item in coordinates])
         position = np.where(position == 0.0, nudge, position)
-        fit = fit_model(self.problem, coordinates, position, base.field, base.levels)
+        field_start = base.field if base.coordinates else self.first_field
+        fit = fit_model(self.problem, coordinates, position, field_start, base.levels)
         if fit.chi2 > base.chi2:
             small = np.array(
                 [x if item.key in base.settings else 0.03 * item.unit_step
