@@ -19,14 +19,18 @@ from lsst.fringe_sim.algorithms.field_response import (
 from lsst.fringe_sim.algorithms.sky_frame import (
     SkyQuadrature,
     SkyResponse,
+    fringe_amplitudes,
     simulate_sky_frame,
     sky_response,
+    white_light,
 )
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
+from lsst.fringe_sim.instrument.bandpass import Bandpass
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum, airglow_continuum
-from lsst.fringe_sim.instrument.telescope import telescope_beam
+from lsst.fringe_sim.instrument.telescope import reduce_beam, telescope_beam
 from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.optics import Illumination
 
 RANGE = (15.0, 17.0)
 SCALE = 0.2
@@ -74,7 +78,11 @@ def test_every_pixel_has_its_own_beam(angular, name):
     beam = telescope_beam("LSST", *edge, nodes=192)
     model = replace(model, base_system=replace(model.base_system, beam=beam))
     traced = sky_response(model, bright_sky(), thickness_range_um=RANGE, quadrature=finer)
-    exact = traced.sky().lookup(points)[0]
+    white = white_light(Bandpass.from_name("lsst_y"), 0.2)
+    flat = model.respond(
+        Illumination.spectrum(white.wavelength_nm, white.photons, reduce_beam(beam, 128)), points
+    )
+    exact = traced.sky().lookup(points)[0] / flat[0]
     difference = frame / frame.mean() - exact / exact.mean()
     assert np.abs(difference).max() < 0.005 * np.ptp(exact / exact.mean())
 
@@ -136,6 +144,21 @@ def test_a_frame_does_not_depend_on_how_finely_the_sensor_is_sampled(angular):
     fine = np.full((99, 99), 16.1)
     coarse = fine[1::3, 1::3]
     np.testing.assert_allclose(sensor.sky().frame(fine)[1::3, 1::3], sensor.sky().frame(coarse), rtol=1e-6)
+
+
+def test_a_flat_field_takes_the_thickness_of_silicon_out():
+    """Thicker silicon absorbs more of the y band; behind a black coating that is all that a raw frame shows."""
+    model = FringeModel.from_setup("lsst_itl", field_x_deg=1.2)
+    span = (99.5, 100.5)
+    placement = SensorPlacement(1.2, 0.0, 1e-3, 1e-3)
+    thickness = np.linspace(*span, 400)[:, None]
+    flat_fielded = fringe_amplitudes(
+        sensor_response(model, bright_sky(6), placement, span).sky().frame(thickness)
+    )
+    raw = fringe_amplitudes(
+        sky_response(model, bright_sky(6), thickness_range_um=span).sky().frame(thickness)
+    )
+    assert flat_fielded.rms < 0.3 * raw.rms
 
 
 def test_placement_of_a_turned_sensor():

@@ -37,6 +37,7 @@ from .sky_frame import (
     spectral_error,
     split_components,
     tabulate_components,
+    white_light,
 )
 
 __all__ = [
@@ -154,6 +155,8 @@ class AngularResponse:
         Grid of thickness [µm].
     values : `numpy.ndarray`, shape ``(C, A, N)``
         Electrons s⁻¹ m⁻² arcsec⁻² at the A nodes of a Gauss-Legendre rule in sin²θ and N thicknesses.
+    flat : `numpy.ndarray`, shape ``(A, N)``
+        The same from the light of a flat field, in arbitrary units.
     interpolation_error, quadrature_error : `float`
         Estimated errors of the interpolation in thickness and of the sums over wavelength and angle, relative to the
         mean sky.
@@ -168,6 +171,7 @@ class AngularResponse:
     start_um: float
     step_um: float
     values: FloatArray
+    flat: FloatArray
     interpolation_error: float
     quadrature_error: float
     airmass: float
@@ -261,10 +265,10 @@ class SensorResponse:
 
     Notes
     -----
-    Frames are those of flat-fielded exposures: the mean over thickness of the reference sky is the same at every
-    radius. How much light reaches a radius (`FieldResponse.relative_illumination`) and how absorption changes with the
-    angle (a slope of 0.1 % over a sensor at the edge of the field) are divided out, as a flat field does, which has the
-    same beams and no fringes.
+    Frames are those of flat-fielded exposures. A flat field of white light sees the same beams and the same silicon
+    without fringes of lines; divided by it, frames lose the vignetting (`FieldResponse.relative_illumination`), the
+    change of absorption with the angle (0.1 % over a sensor at the edge of the field), and its change with the
+    thickness of silicon (0.3 % per micrometre, ten times the fringes of a sensor with black coating).
     """
 
     field: FieldResponse
@@ -299,22 +303,21 @@ class SensorResponse:
         factors = self.factors(scale)
         angular = self.field.angular
         rates = factors * angular.photons
-        rows = self._flat() @ np.tensordot(factors, angular.values, axes=1)
+        rows = self._flat_fielded(np.tensordot(factors, angular.values, axes=1))
         wavelength = float(rates @ angular.wavelength_nm / rates.sum())
         return self._table(rows, wavelength, float(rows.mean()) * angular.interpolation_error)
 
     def component_tables(self) -> list[FieldTable]:
         """The parts of `sky` that come from each component, all at their reference level."""
         angular = self.field.angular
-        rows = np.einsum("ka,can->ckn", self._flat(), angular.values, optimize=True)
-        error = float(rows.sum(axis=0).mean()) * angular.interpolation_error
+        rows = [self._flat_fielded(values) for values in angular.values]
+        error = float(np.sum(rows, axis=0).mean()) * angular.interpolation_error
         return [self._table(*item, error) for item in zip(rows, angular.wavelength_nm, strict=True)]
 
-    def _flat(self) -> FloatArray:
-        """Weights of the angles by field radius, such that the reference sky has the same mean everywhere."""
-        angular = self.field.angular
-        means = self.field.weights @ angular.values.sum(axis=0).mean(axis=1)
-        return np.asarray(self.field.weights * (means.mean() / means)[:, None])
+    def _flat_fielded(self, values: FloatArray) -> FloatArray:
+        """Values ``[angle, thickness]`` for the beam of each field radius, over the flat field there."""
+        flat = self.field.weights @ self.field.angular.flat
+        return np.asarray((self.field.weights @ values) * (flat.mean() / flat))
 
     def _table(self, rows: FloatArray, wavelength_nm: float, error: float) -> FieldTable:
         angular = self.field.angular
@@ -453,6 +456,7 @@ def angular_response(
         table.start_um,
         table.step_um,
         np.stack([*of_lines, *(refine @ values for values in of_continua)]),
+        refine @ _single_angles(model, white_light(band, fineness.continuum_step_nm), limits, few, grid),
         table.interpolation_error,
         error / level,
         sky.airmass,

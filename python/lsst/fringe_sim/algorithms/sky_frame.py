@@ -659,6 +659,15 @@ def is_band(name: str) -> bool:
     return upper.isdigit() and lower.isdigit()
 
 
+def white_light(band: Bandpass, step_nm: float) -> SpectralComponent:
+    """Light of a flat field: as many photons at every wavelength, behind the filter."""
+    low, high = band.support()
+    count = math.ceil((high - low) / step_nm)
+    wave = low + (np.arange(count) + 0.5) * (high - low) / count
+    photons = band.transmission(wave)
+    return SpectralComponent("flat field", wave[photons > 0.0], photons[photons > 0.0])
+
+
 def bandpass_of(model: FringeModel) -> Bandpass:
     """Bandpass that the set-up of a model names."""
     if not model.setup.bandpass:
