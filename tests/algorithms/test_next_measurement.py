@@ -116,7 +116,7 @@ def test_separation_is_the_misfit_of_a_real_fit(model: FringeModel, monkeypatch:
             moved = replace(
                 sample, thickness_um=sample.thickness_um + 1e-3 * shift.reshape(sample.thickness_um.shape)
             )
-            fitted = replace(forecast, sample=moved, _blocks={})
+            fitted = replace(forecast, sample=moved)
             image = [
                 fitted._observe(each, {other: {"scale": 1.0 + 1e-2 * p[0]}}, 0.0, 1e-3 * p[1])
                 for each in series
@@ -244,6 +244,27 @@ def test_what_cannot_be_forecast_is_left_out(model: FringeModel, few_samples: No
         model, {"bandwidth": {}, "charge_diffusion": {}, "thickness_spread": {}}, measurements=[AGAIN]
     )
     assert [pair.other for pair in ranked.pairs] == ["thickness_spread"]
+
+
+def test_a_rival_that_was_fitted_at_null_is_compared_at_its_usual_size(
+    model: FringeModel, few_samples: None
+) -> None:
+    """At null a quadratic onset has no direction; the search may well leave a rival there."""
+    at_null, unknown = (
+        rank_measurements(model, {"bandwidth": {"fwhm": 2.3}, "roughness": values}, measurements=[AGAIN])
+        for values in ({"sigma": 0.0}, {})
+    )
+    assert at_null[0].pairs == unknown[0].pairs
+
+
+def test_a_brighter_series_has_the_optics_of_the_present_one(model: FringeModel, few_samples: None) -> None:
+    forecast = forecast_of(model, ghost_pedestal={"fraction": 0.02}, non_linearity={"quadratic": 0.01})
+    forecast.pairs([FlatSeries(FLATS)])
+    computed = len(forecast._flats)
+    forecast.pairs([FlatSeries(FLATS), BRIGHT.series])
+    assert len(forecast._flats) == computed
+    present, bright = forecast._blocks[FlatSeries(FLATS)], forecast._blocks[BRIGHT.series]
+    np.testing.assert_allclose(bright.tested[1], 4.0 * present.tested[1], rtol=1e-6)
 
 
 def test_the_silicon_may_be_the_layer_that_varies(few_samples: None) -> None:

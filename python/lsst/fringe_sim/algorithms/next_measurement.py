@@ -399,13 +399,14 @@ class _Tested:
         at, direction = {}, []
         for parameter in effect.parameters:
             null, (low, high) = nulls[parameter.name], parameter.bounds
-            if parameter.name in values:
-                at[parameter.name] = float(values[parameter.name])
-                direction.append(at[parameter.name] - null)
+            one_sided = null <= low or null >= high
+            given = float(values.get(parameter.name, null))
+            if parameter.name in values and not (one_sided and given == null):
+                at[parameter.name] = given
+                direction.append(given - null)
                 continue
             # What starts from a bound may start with its square, without a derivative at the bound itself.
             sign = -1.0 if null >= high else 1.0
-            one_sided = null <= low or null >= high
             at[parameter.name] = null + sign * parameter.prior_scale * one_sided
             direction.append(0.0 if values else sign * parameter.prior_scale)
         for name in values:
@@ -514,7 +515,8 @@ class _Forecast:
     tested: tuple[_Tested, ...]
     further: tuple[_Tested, ...]
     sample: _Sample
-    _blocks: dict[FlatSeries, _Block] = field(default_factory=dict)
+    _blocks: dict[FlatSeries, _Block] = field(default_factory=dict, init=False)
+    _flats: dict[tuple[object, ...], FloatArray] = field(default_factory=dict, init=False)
 
     def pairs(self, series: Sequence[FlatSeries]) -> list[_Likeness]:
         """The first effect against each of the others."""
@@ -602,6 +604,21 @@ class _Forecast:
         """Flats of the sample over their means, shape ``(W, P)``."""
         model = self.model.with_effects({**self.model.effect_settings, **effects}, self.catalogue)
         model = series.conditions(model)
+        optical = tuple(item for item in model.effects if item.effect.acts_on != "image")
+        # Neither the level nor an effect on the image changes what the optics do.
+        settings = tuple((item.effect.name, *sorted(item.values.items())) for item in optical)
+        key = (replace(series, level_e=1.0), settings, shift_um, silicon_um)
+        if key not in self._flats:
+            bare = replace(model, effects=optical)
+            self._flats[key] = self._optical(bare, series, shift_um, silicon_um)
+        geometry = self.sample.geometry(series)
+        image = apply_to_image(model.effects, model.base_system, self._flats[key], geometry)
+        return image.reshape(len(image), -1)
+
+    def _optical(
+        self, model: FringeModel, series: FlatSeries, shift_um: float, silicon_um: float
+    ) -> FloatArray:
+        """Response of the sample over its means, shape ``(W, ny, nx)``."""
         system, waves = model.base_system, np.array(series.wavelength_nm)
         nominal = system.stack.layers[system.stack.position(system.detection)].thickness_um
         rows = []
@@ -611,8 +628,7 @@ class _Forecast:
             rows.append(one.respond(one.system.flat_fields(waves, LINE_STEP_NM), thickness + shift_um, waves))
         image = np.stack(rows, axis=1)
         image /= image.mean(axis=(1, 2), keepdims=True)
-        image = apply_to_image(model.effects, system, image, self.sample.geometry(series))
-        return image.reshape(len(waves), -1)
+        return image
 
 
 _FIELDS = ("image", "weight", "thickness", "silicon", "tested", "further")
