@@ -25,6 +25,7 @@ ORDER = (
 ALLOWED: dict[str, set[str]] = {room: set(ORDER[: i + 1]) for i, room in enumerate(ORDER)}
 ALLOWED["middleware"] = {"errors", "resources", "instrument", "products", "middleware"}
 ALLOWED["tasks"] = set(ORDER) - {"mock"} | {"middleware", "tasks"}
+ALLOWED["paper"] = set(ORDER) | {"paper"}
 ALLOWED["report"] = {
     "errors",
     "resources",
@@ -33,9 +34,10 @@ ALLOWED["report"] = {
     "products",
     "model",
     "algorithms",
+    "paper",
     "report",
 }
-ALLOWED["cli"] = set(ORDER) | {"middleware", "tasks", "report", "cli"}
+ALLOWED["cli"] = set(ORDER) | {"middleware", "tasks", "paper", "report", "cli"}
 
 
 def room_of(path: Path) -> str:

@@ -32,6 +32,7 @@ _COMMANDS = {
     "fit": ("fit", "Fit the layer thickness to raw flats."),
     "sky": ("sky", "Simulate the fringes of the night sky."),
     "discover": ("discover", "Find the effect that the model lacks."),
+    "reproduce-paper": ("reproduce_paper", "Recompute the paper, number by number."),
     "challenge": ("challenge", "Hide effects in simulated sensors and count what the search finds."),
 }
 

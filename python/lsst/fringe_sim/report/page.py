@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,16 +21,21 @@ _STYLE = """
 :root { color-scheme: light; }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 0 auto; padding: 1rem; color: #1b1b1b; }
 h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
-.lead { color: #444; margin-top: 0; } nav a { margin-right: 1rem; }
+.lead { color: #444; margin-top: 0; } nav a { display: inline-block; margin-right: 1.1rem; }
 figure { margin: 1rem 0; } figcaption { color: #444; font-size: .92rem; }
-img { max-width: 100%; height: auto; border: 1px solid #ddd; }
+img { box-sizing: border-box; max-width: 100%; height: auto; border: 1px solid #ddd; }
 .zoom input { position: absolute; opacity: 0; } .zoom { display: block; overflow-x: auto; cursor: zoom-in; }
 .zoom input:checked + img { max-width: none; cursor: zoom-out; }
 .zoom input:focus-visible + img { outline: 3px solid #0072b2; }
 .tables { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .92rem; }
 th, td { padding: .25rem .7rem; border-bottom: 1px solid #ddd; text-align: right; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
+th:first-child, td:first-child, .words { text-align: left; }
+td.words { white-space: normal; min-width: 4.5rem; max-width: 26rem; }
+td.mark { white-space: nowrap; } tr.good td.mark { color: #00634a; } tr.note td.mark { color: #0060a0; }
+tr.bad td { background: #fff1e5; } tr.bad td.mark { color: #a03c00; font-weight: 600; } tr.void td { color: #767676; }
+.small { font-size: .92rem; color: #333; }
+@media (max-width: 40rem) { body { padding: .7rem; } th, td { padding: .2rem .4rem; } td.words { max-width: 11rem; } }
 """
 
 
@@ -62,6 +68,12 @@ class Report:
         """Add a paragraph of plain text."""
         self._body.append(f"<p>{html.escape(text)}</p>")
 
+    def remarks(self, items: Sequence[tuple[str, str]]) -> None:
+        """Add a list of remarks, each a subject and a text; nothing if there are none."""
+        if items:
+            lines = "".join(f"<li><b>{html.escape(one)}</b>: {html.escape(two)}</li>" for one, two in items)
+            self._body.append(f'<ul class="small">{lines}</ul>')
+
     def figure(self, made: Figure, caption: str) -> None:
         """Add a figure; a click enlarges it."""
         data = base64.b64encode(to_png(made)).decode("ascii")
@@ -71,7 +83,14 @@ class Report:
             f'src="data:image/png;base64,{data}"></label><figcaption>{text}</figcaption></figure>'
         )
 
-    def table(self, table: Table, name: str) -> None:
+    def table(
+        self,
+        table: Table,
+        name: str,
+        *,
+        download: Table | None = None,
+        marks: Sequence[str] | None = None,
+    ) -> None:
         """Add a table with its units, and a link that saves it as ECSV.
 
         Parameters
@@ -80,23 +99,33 @@ class Report:
             Few rows; numbers are shown as astropy formats them.
         name : `str`
             File name of the download, without its ending.
+        download : `astropy.table.Table`, optional
+            What is saved in place of ``table``, as with more columns and more digits.
+        marks : sequence of `str`, optional
+            One of ``good``, ``note``, ``bad``, ``void`` for every row: its colour; the last column says the same.
         """
+        words = [column.dtype.kind in "US" for column in table.itercols()]
+        kinds = [' class="words"' if word else "" for word in words]
         heads = "".join(
-            f"<th>{html.escape(column.name)}{f' [{column.unit}]' if column.unit else ''}</th>"
-            for column in table.itercols()
+            f"<th{kind}>{html.escape(column.name)}{f' [{column.unit}]' if column.unit else ''}</th>"
+            for column, kind in zip(table.itercols(), kinds, strict=True)
+        )
+        if marks is not None and kinds:
+            kinds[-1] = ' class="words mark"'
+        cells = zip(
+            *(column.pformat(show_name=False, show_unit=False, max_lines=-1) for column in table.itercols()),
+            strict=True,
         )
         rows = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in cells) + "</tr>"
-            for cells in zip(
-                *(
-                    column.pformat(show_name=False, show_unit=False, max_lines=-1)
-                    for column in table.itercols()
-                ),
-                strict=True,
+            (f'<tr class="{mark}">' if mark else "<tr>")
+            + "".join(
+                f"<td{kind}>{html.escape(str(cell))}</td>" for cell, kind in zip(row, kinds, strict=True)
             )
+            + "</tr>"
+            for row, mark in zip(cells, marks or [""] * len(table), strict=True)
         )
         text = io.StringIO()
-        table.write(text, format="ascii.ecsv")
+        (table if download is None else download).write(text, format="ascii.ecsv")
         data = base64.b64encode(text.getvalue().encode()).decode("ascii")
         self._body.append(
             f'<div class="tables"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'

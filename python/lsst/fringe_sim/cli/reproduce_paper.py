@@ -1,0 +1,105 @@
+"""``fringe-sim reproduce-paper``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from ..errors import InputError
+from ..mock.thickness import E2V_SHAPE, e2v_321
+from ..paper import SECTIONS, reproduce
+from ..paper.section import Context
+from ..report.paper_page import write_paper_page
+from .inputs import prepare_folder
+from .parameters import SIZE
+from .progress import progress
+
+__all__ = ["reproduce_paper"]
+
+ENVIRONMENT = "FRINGE_SIM_SHARED"
+DETAIL_PX = 1000
+DETAIL_CORNER = (1500, 1500)
+LEAST_SIDE = 64
+
+
+@click.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for the page and the table."
+)
+@click.option(
+    "--size", type=SIZE, default="1024x1001", show_default=True, help="Pixels for the whole sensor."
+)
+@click.option(
+    "--coadds", type=click.IntRange(2), default=800, show_default=True, help="Exposures of the deepest coadd."
+)
+@click.option(
+    "--published",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    default=None,
+    help=f"Folder with curves read off the published figures (measured/); by default ${ENVIRONMENT}, if set.",
+)
+@click.option(
+    "--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of noise and rotations."
+)
+@click.option("--dry-run", is_flag=True, help="Say what would be computed, write nothing.")
+def reproduce_paper(
+    out: Path, size: tuple[int, int], coadds: int, published: Path | None, seed: int, dry_run: bool
+) -> None:
+    """Recompute every figure and number of the paper, beside what it states.
+
+    Writes one page, paper.html, and one table, paper.ecsv. Every number is judged by a stated tolerance; where the
+    paper errs, the correction and its reason are given; where the recomputation misses, that is said.
+
+    \b
+    Examples:
+      fringe-sim reproduce-paper --out paper
+      fringe-sim reproduce-paper --out paper --published ../shared
+    """
+    columns, rows = size
+    if min(size) < LEAST_SIDE or rows > E2V_SHAPE[0] or columns > E2V_SHAPE[1]:
+        raise InputError(
+            "--size", f"{columns}x{rows}", f"{LEAST_SIDE} px a side to {E2V_SHAPE[1]}x{E2V_SHAPE[0]}"
+        )
+    folder = published or _from_environment()
+    if dry_run:
+        click.echo(f"would recompute {len(SECTIONS)} sections into {out}")
+        return
+    context = Context(
+        e2v_321((rows, columns)),
+        e2v_321((DETAIL_PX, DETAIL_PX), sampling="window", corner=DETAIL_CORNER),
+        coadds,
+        seed,
+        folder,
+    )
+    target = prepare_folder(out)
+    notices = []
+    if folder is None:
+        notices.append(
+            "Curves and maps read off the published figures are not at hand: comparisons with them are skipped "
+            f"(--published FOLDER or ${ENVIRONMENT})."
+        )
+        click.echo(
+            f"skipping comparisons with published curves; --published FOLDER or ${ENVIRONMENT}", err=True
+        )
+    with progress("recomputing", len(SECTIONS)) as advance:
+        made = reproduce(context, advance=advance)
+    made.table().write(target / "paper.ecsv", format="ascii.ecsv", overwrite=True)
+    write_paper_page(made, target / "paper.html", notices)
+    for finding in made.all_findings:
+        if finding.status == "differs":
+            number = finding.number
+            click.echo(
+                f"differs: {number.place}: {number.quantity}: {finding.value:.4g} {number.unit} "
+                f"(paper {number.stated} ± {number.tolerance:g})"
+            )
+    click.echo(made.summary())
+    for name in ("paper.html", "paper.ecsv"):
+        click.echo(str(target / name))
+
+
+def _from_environment() -> Path | None:
+    """Folder that the environment names, if there are curves in it."""
+    path = Path(os.environ[ENVIRONMENT]) if os.environ.get(ENVIRONMENT) else None
+    return path if path is not None and (path / "measured").is_dir() else None

@@ -1,0 +1,160 @@
+"""Light on the sensor: OH lines, beams, photons in the silicon. Figures 8 to 11, Eqs. 4 and 5."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..algorithms.photon_migration import photon_migration
+from ..algorithms.sky_frame import fringe_amplitudes, is_band
+from ..instrument.bandpass import Bandpass
+from ..instrument.sky import EmissionLines, SkySpectrum
+from ..instrument.telescope import RayBundle, Telescope
+from ..model import FringeModel, Setup
+from ..optics import Beam, Illumination
+from ..resources import read_table
+from .section import Context, Curve, Graph, Section
+
+__all__ = ["angles", "oh_lines", "photon_walk"]
+
+FloatArray = NDArray[np.float64]
+
+PERCENT = 100.0
+SECOND_RADIATION_CONSTANT = 1.4387769
+"""hc/k [cm K]."""
+
+NAMED_BANDS = ("7-3", "8-4", "3-0", "9-5", "4-1", "5-2")
+EDGE_DEG = 1.44
+BINS = (10, 20, 50, 100)
+BEAM_NODES = 192
+
+
+def oh_lines(context: Context) -> Section:
+    """Section 4.1, Figure 8, Eq. 4."""
+    bandpass = Bandpass.from_name("lsst_y")
+    sky = SkySpectrum(EmissionLines.oh(), airmass=1.2)
+    bands = [item for item in sky.components(bandpass) if is_band(item.name)]
+    wavelength = np.concatenate([item.wavelength_nm for item in bands])
+    photons = np.concatenate([item.photons for item in bands])
+    light = Illumination.spectrum(wavelength, photons, Beam.collimated())
+    named = sum(item.photons.sum() for item in bands if item.name in NAMED_BANDS)
+    curves = tuple(
+        Curve(item.wavelength_nm, np.maximum(item.photons / photons.sum(), 1e-6), item.name, ".")
+        for item in bands
+        if item.name in NAMED_BANDS
+    )
+    return Section(
+        "OH lines: section 4.1, Fig. 8, Eq. 4",
+        "Weights of the lines behind air, mirrors and filter, without the detector, whose efficiency the stack "
+        "computes. The lines are those of PALACE, not those of the figure.",
+        {
+            "rotational_temperature": _rotational_temperature(),
+            "vibrational_temperature": _vibrational_temperature(),
+            "line_weights": float(light.weight.sum()),
+            "six_bands": float(named / photons.sum()),
+        },
+        (Graph("LSST y band", "wavelength [nm]", "weight of a line", curves, logarithmic=True),),
+        "Normalised weight of every OH line, by vibrational band.",
+    )
+
+
+def _rotational_temperature() -> float:
+    """Mean over the named bands of the slope of ln(I / A g) against energy, lowest levels."""
+    table = read_table("sky", "oh_lines_palace_yband.ecsv")
+    found = []
+    for name in NAMED_BANDS:
+        rows = table[(table["band"] == name) & (table["N_up"] <= 4)]
+        rate = np.asarray(rows["A"] * rows["g_up"], dtype=float)
+        population = np.log(np.asarray(rows["photon_radiance"], dtype=float) / rate)
+        slope = np.polyfit(np.asarray(rows["E_rot"], dtype=float), population, 1)[0]
+        found.append(-SECOND_RADIATION_CONSTANT / slope)
+    return float(np.mean(found))
+
+
+def _vibrational_temperature() -> float:
+    table = read_table("sky", "oh_levels_palace.ecsv")
+    rows = table[(table["v_up"] >= 3) & (table["v_up"] <= 9)]
+    energy, population = (np.asarray(rows[name], dtype=float) for name in ("E_v0", "ln_pop_N1"))
+    return float(-SECOND_RADIATION_CONSTANT / np.polyfit(energy, population, 1)[0])
+
+
+def angles(context: Context) -> Section:
+    """Figures 9 and 10, Eq. 5."""
+    centre, edge = (Telescope.from_name("lsst").trace(field) for field in (0.0, EDGE_DEG))
+    hsc = Telescope.from_name("hsc").trace(0.0)
+    degrees = {name: np.degrees(rays.theta) for name, rays in (("c", centre), ("e", edge), ("h", hsc))}
+    curves = []
+    for key, label in (("c", "LSST, centre"), ("e", f"LSST, {EDGE_DEG}° off axis"), ("h", "HSC, centre")):
+        density, limits = np.histogram(degrees[key], bins=80, range=(0.0, 32.0), density=True)
+        curves.append(Curve(0.5 * (limits[1:] + limits[:-1]), density, label))
+    convergence = []
+    for rays, label in ((centre, "LSST, centre"), (edge, f"LSST, {EDGE_DEG}° off axis")):
+        converged = _rms(context, rays.beam(BEAM_NODES))
+        ratio = [_rms(context, _histogram_beam(rays, bins)) / converged for bins in BINS]
+        convergence.append(Curve(np.array(BINS, dtype=float), np.array(ratio), label, "o"))
+    return Section(
+        "Beams: Figs. 9 and 10, Eq. 5",
+        "Angles of incidence traced through the telescopes, and what too few of them do to the sum of Eq. 5.",
+        {
+            "beam_centre_low": float(degrees["c"].min()),
+            "beam_centre_high": float(degrees["c"].max()),
+            "beam_edge_low": float(degrees["e"].min()),
+            "beam_edge_high": float(degrees["e"].max()),
+            "beam_hsc_high": float(degrees["h"].max()),
+            "angle_bins": float(convergence[0].y[BINS.index(50)]),
+        },
+        (
+            Graph("angles of incidence", "angle of incidence [deg]", "density [1/deg]", tuple(curves)),
+            Graph(
+                "sum over bins of angle",
+                "bins",
+                "rms fringe / converged",
+                tuple(convergence),
+                logarithmic=True,
+            ),
+        ),
+        "Distribution of the angle of incidence, and the fringe that too few of them leave.",
+    )
+
+
+def _histogram_beam(rays: RayBundle, bins: int) -> Beam:
+    """Beam of a few bins of angle, each at its left edge."""
+    count, limits = np.histogram(rays.theta, bins=bins)
+    return Beam(limits[:-1], count / count.sum())
+
+
+def _rms(context: Context, beam: Beam) -> float:
+    """Rms fringe of the OH lines in a beam, in the centre of the LSST field."""
+    model = FringeModel.from_setup("lsst_e2v")
+    components = SkySpectrum(EmissionLines.oh(), airmass=1.2).components(Bandpass.from_name("lsst_y"))
+    wavelength = np.concatenate([item.wavelength_nm for item in components])
+    photons = np.concatenate([item.photons for item in components])
+    # A thousand lines of any strength: those below 1e-4 of the strongest carry nothing.
+    strong = photons > 1e-4 * photons.max()
+    light = Illumination.spectrum(wavelength[strong], photons[strong], beam)
+    layer = np.asarray(context.thickness_um)
+    table = model.table_of(light, (float(layer.min()) - 1e-3, float(layer.max()) + 1e-3), tolerance=1e-5)
+    return fringe_amplitudes(table.lookup(layer)[0]).rms
+
+
+def photon_walk(context: Context) -> Section:
+    """Section 4.2, Figure 11."""
+    setup = Setup.from_name("lsst_e2v")
+    light = SkySpectrum(EmissionLines.oh()).components(Bandpass.from_name("lsst_y"))
+    widths = np.linspace(0.5, 20.0, 40)
+    values, curves = {}, []
+    for field_deg, label in ((0.0, "field centre"), (EDGE_DEG, f"{EDGE_DEG}° off axis")):
+        rays = Telescope.from_name("lsst").trace(field_deg)
+        walk = photon_migration(rays, light, setup.stack, setup.temperature_k)
+        share = np.array([walk.fraction_inside(float(width)) for width in widths])
+        curves.append(Curve(widths, PERCENT * share, label))
+        if field_deg > 0.0:
+            values["walk_edge"] = PERCENT * walk.fraction_inside(10.0)
+            values["walk_pixel"] = PERCENT * walk.fraction_inside(5.0)
+    return Section(
+        "Photons in the silicon: section 4.2, Fig. 11",
+        "How far photons walk sideways before they are absorbed.",
+        values,
+        (Graph("inside a square", "half width [µm]", "photons [%]", tuple(curves)),),
+        "A pixel has a half width of 5 µm.",
+    )

@@ -1,0 +1,132 @@
+"""What the recomputation of a section of the paper consists of: numbers, and what is drawn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+__all__ = ["Context", "Curve", "Graph", "Picture", "Section"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One line of a graph; ``style`` is that of matplotlib, ``-``, ``--``, ``.`` or ``o``."""
+
+    x: NDArray[np.floating]
+    y: NDArray[np.floating]
+    label: str
+    style: str = "-"
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """Curves over one axis."""
+
+    title: str
+    xlabel: str
+    ylabel: str
+    curves: tuple[Curve, ...]
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An image ``[y, x]``; diverging colours for values of both signs."""
+
+    title: str
+    label: str
+    values: NDArray[np.floating]
+    diverging: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A section of the paper, recomputed.
+
+    Attributes
+    ----------
+    title, text : `str`
+        Heading, and what was done.
+    values : mapping
+        Recomputed numbers by item of the table of published numbers; NaN where one could not be computed.
+    panels : `tuple` [`Graph` or `Picture`, ...]
+        What is drawn, side by side.
+    caption : `str`
+        Caption of the panels.
+    """
+
+    title: str
+    text: str
+    values: Mapping[str, float]
+    panels: tuple[Graph | Picture, ...] = ()
+    caption: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What a recomputation starts from.
+
+    Attributes
+    ----------
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Adhesive of E2V-CCD250-321 over the whole sensor [µm], on any number of pixels.
+    detail_um : `numpy.ndarray`, shape ``(ny, nx)``
+        A part of it pixel by pixel [µm].
+    coadds : `int`
+        Largest number of exposures in a coadd.
+    seed : `int`
+        Seed of noise, random fields and rotations.
+    shared : `pathlib.Path` or `None`
+        Folder with ``measured/`` and ``data/``: curves and maps read off the published figures.
+    """
+
+    thickness_um: FloatArray
+    detail_um: FloatArray
+    coadds: int = 800
+    seed: int = 1
+    shared: Path | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("thickness_um", "detail_um"):
+            if np.ndim(getattr(self, name)) != 2:
+                raise InputError(name, np.shape(getattr(self, name)), "two axes (y, x)")
+        if self.coadds < 2:
+            raise InputError("exposures in a coadd", self.coadds, "2 or more")
+        if self.shared is not None and not (self.shared / "measured").is_dir():
+            raise InputError("published curves", str(self.shared), "a folder with a folder 'measured' in it")
+
+    def rng(self, section: str) -> np.random.Generator:
+        """Generator of one section, so that sections do not depend on each other."""
+        return np.random.default_rng([self.seed, *section.encode()])
+
+    def curve(self, name: str) -> Table | None:
+        """Curve read off a published figure, or `None` where the curves are not at hand."""
+        return self._table(f"measured/{name}.ecsv")
+
+    def lines_of_figure_8(self) -> Table | None:
+        """OH lines of Figure 8, or `None` where they are not at hand."""
+        return self._table("data/oh_lines_guo2022_fig8.ecsv")
+
+    def map_path(self, name: str) -> Path | None:
+        """File of a published map, or `None`."""
+        path = None if self.shared is None else self.shared / "measured" / name
+        return path if path is not None and path.is_file() else None
+
+    def _table(self, name: str) -> Table | None:
+        path = None if self.shared is None else self.shared / name
+        return None if path is None or not path.is_file() else Table.read(path, format="ascii.ecsv")
+
+
+def missing(*items: str) -> dict[str, float]:
+    """Items that cannot be computed."""
+    return dict.fromkeys(items, math.nan)

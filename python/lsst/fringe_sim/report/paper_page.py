@@ -1,0 +1,145 @@
+"""The page of ``fringe-sim reproduce-paper``: the paper beside its recomputation."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..paper.published import Finding
+from ..paper.reproduce import Reproduction, findings_table
+from ..paper.section import Graph, Picture, Section
+from .page import Report
+from .style import figure, show_image
+
+__all__ = ["section_figures", "write_paper_page"]
+
+PER_ROW = 3
+MANY = 5
+"""More panels than this are drawn small, as a gallery."""
+
+STATUS_MARKS = {"agrees": "good", "erratum": "note", "differs": "bad", "skipped": "void"}
+STATUS_WORDS = {
+    "agrees": "agrees",
+    "erratum": "paper errs",
+    "differs": "differs",
+    "skipped": "skipped",
+}
+
+
+def write_paper_page(made: Reproduction, path: str | os.PathLike[str], notices: Sequence[str] = ()) -> Path:
+    """Write the page.
+
+    Parameters
+    ----------
+    made : `Reproduction`
+        Sections and findings.
+    path : path-like
+        HTML file.
+    notices : sequence of `str`, optional
+        What the reader must know first, as that published curves were not at hand.
+    """
+    report = Report(
+        "The paper, recomputed",
+        "Guo, Walter, Lage & Lupton, PASP 135, 034503 (doi 10.1088/1538-3873/acbe67): every number that can be "
+        "recomputed, beside the published one.",
+    )
+    report.section("Summary", f"{made.summary()[0].upper()}{made.summary()[1:]}.")
+    report.paragraph(
+        '"Paper errs" means that the recomputed number confirms a correction of the paper, for the reason given. '
+        '"Amplitude" is not defined in the paper; every line says which of its meanings is used.'
+    )
+    for notice in notices:
+        report.paragraph(notice)
+    _add_table(report, made.all_findings, "paper_summary", made.table())
+    open_points = [f for f in made.all_findings if f.status == "differs"]
+    if open_points:
+        report.section(
+            "Where they differ", "Neither the paper nor a correction of it is met, within the tolerance."
+        )
+        _explain(report, open_points)
+    for section, findings in zip(made.sections, made.findings, strict=True):
+        report.section(section.title, section.text)
+        for drawn in section_figures(section):
+            report.figure(drawn, section.caption)
+        name = f"paper_{section.title.split(':')[0].replace(' ', '_').lower()}"
+        _add_table(report, findings, name, findings_table(findings))
+        _explain(report, [f for f in findings if f.status != "differs"])
+    return report.write(path)
+
+
+def section_figures(section: Section) -> Iterator[Figure]:
+    """Panels of a section, in rows."""
+    if not section.panels:
+        return
+    gallery = len(section.panels) > MANY
+    columns = min(PER_ROW, len(section.panels))
+    rows = -(-len(section.panels) // columns)
+    width, height = (3.6, 3.1) if gallery else (4.9, 3.9)
+    with figure(width * columns, height * rows) as made:
+        axes = np.atleast_1d(made.subplots(rows, columns)).ravel()
+        for panel, place in zip(section.panels, axes, strict=False):
+            if isinstance(panel, Picture):
+                show_image(
+                    place, panel.values, label=panel.label, title=panel.title, diverging=panel.diverging
+                )
+            else:
+                _draw_graph(place, panel)
+        for place in axes[len(section.panels) :]:
+            place.set_visible(False)
+        yield made
+
+
+def _draw_graph(axes: Axes, graph: Graph) -> None:
+    for curve in graph.curves:
+        thick = {"o": {"ms": 4}, ".": {"ms": 3}}.get(curve.style, {"lw": 1.0})
+        style = "o-" if curve.style == "o" and len(curve.x) > 2 and curve.label != "measured" else curve.style
+        axes.plot(curve.x, curve.y, style, label=curve.label, **thick)  # type: ignore[arg-type]
+    axes.set_title(graph.title)
+    axes.set_xlabel(graph.xlabel)
+    axes.set_ylabel(graph.ylabel)
+    if graph.logarithmic:
+        axes.set_yscale("log")
+    if len(graph.curves) > 1:
+        axes.legend(fontsize=7)
+
+
+def _add_table(report: Report, findings: Sequence[Finding], name: str, download: Table) -> None:
+    """The few columns that a reader compares."""
+    shown = Table(
+        {
+            "where": [f.number.place for f in findings],
+            "quantity": [f.number.quantity for f in findings],
+            "paper": _with_unit(findings, [f.number.stated for f in findings]),
+            "here": _with_unit(findings, [f"{f.value:.4g}" for f in findings]),
+            "tolerance": [f"±{f.number.tolerance:g}" for f in findings],
+            "corrected": [
+                "" if np.isnan(f.number.corrected) else f"{f.number.corrected:g}" for f in findings
+            ],
+            "verdict": [STATUS_WORDS[f.status] for f in findings],
+        }
+    )
+    report.table(shown, name, download=download, marks=[STATUS_MARKS[f.status] for f in findings])
+
+
+def _with_unit(findings: Sequence[Finding], numbers: Sequence[str]) -> list[str]:
+    units = (f.number.unit.replace("um", "µm").replace("uJy", "µJy").replace("-2", "⁻²") for f in findings)
+    return [
+        f"{number} {unit}".strip() if number not in ("–", "nan") else "–"
+        for number, unit in zip(numbers, units, strict=True)
+    ]
+
+
+def _explain(report: Report, findings: Sequence[Finding]) -> None:
+    report.remarks(
+        [
+            (f"{f.number.place}, {f.number.quantity}", f.number.note)
+            for f in findings
+            if f.number.note and f.status != "skipped"
+        ]
+    )
