@@ -18,13 +18,13 @@ from ..effects import ImageGeometry, apply_to_image
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.bandpass import Bandpass
 from ..instrument.night import NightHistory
-from ..instrument.readout import add_readout
 from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
 from ..instrument.telescope import reduce_beam
 from ..model import FringeModel, ResponseTable, tabulate
 from ..optics import Beam, Illumination
 from ..optics.phase_response import PhaseResponse
 from ..products import SkyFringe, mask_bits
+from .image_noise import add_exposure_noise
 from .photon_migration import spread_charge
 
 __all__ = [
@@ -371,8 +371,7 @@ def simulate_sky_frame(
     image *= np.float32(wanted / mean)
     image[~known] = wanted
     if seed is not None:
-        noisy = add_readout(image, np.random.default_rng(seed), read_noise_e, gain=1.0)
-        image = noisy.astype(np.float32)
+        image = add_exposure_noise(image, np.random.default_rng(seed), read_noise_e)
     return SkyFringe(
         image,
         np.where(known, 0, mask_bits("NO_DATA")).astype(np.int32),

@@ -31,6 +31,8 @@ _COMMANDS = {
     "plan-flats": ("plan_flats", "Say which flats a thickness fit needs."),
     "fit": ("fit", "Fit the layer thickness to raw flats."),
     "sky": ("sky", "Simulate the fringes of the night sky."),
+    "focal-plane": ("focal_plane", "Forecast the fringes of every sensor of the LSST Camera."),
+    "amplitudes": ("amplitudes", "Tabulate the fringe amplitudes of every set-up of the paper."),
     "discover": ("discover", "Find the effect that the model lacks."),
     "reproduce-paper": ("reproduce_paper", "Recompute the paper, number by number."),
     "challenge": ("challenge", "Hide effects in simulated sensors and count what the search finds."),

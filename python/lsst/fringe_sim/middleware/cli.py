@@ -137,7 +137,8 @@ def define_fringe_night(
     """Register a night of sky exposures, for which sky fringes are to be simulated.
 
     INSTRUMENT is the name of an instrument that the repository knows, as LSSTCam. Only records are made, no
-    images. Registering the same night again changes nothing.
+    images. The run INSTRUMENT/raw/all is there afterwards, an input for graphs that need no other. Registering the
+    same night again changes nothing.
     """
     from .night import NightPlan, define_night, parse_hours
 

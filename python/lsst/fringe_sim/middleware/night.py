@@ -122,7 +122,7 @@ def airmass_of(record: Any) -> float | None:
 def define_night(
     butler: Butler, instrument: str, plans: Iterable[NightPlan], *, dry_run: bool = False
 ) -> list[dict[str, Any]]:
-    """Register the exposures of one or more nights.
+    """Register the exposures of one or more nights, and the run of raw images, which may stay empty.
 
     Parameters
     ----------
@@ -154,6 +154,8 @@ def define_night(
     cls = _instrument(instrument)
     records = [record for plan in plans for record in _records(cls, plan)]
     if not dry_run:
+        # A graph needs an input collection, even one without a thickness map.
+        butler.collections.register(cls().makeDefaultRawIngestRunName())
         with butler.transaction():
             for record in records:
                 _store(butler, cls, record)

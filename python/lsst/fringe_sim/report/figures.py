@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from astropy.table import Table
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from ..algorithms.focal_plane import DES_CRITERION
 from ..algorithms.single_pixel import SinglePixelFit
+from ..errors import InputError
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
-from .style import LINES, figure, finite_range, show_image
+from .style import DIVERGING, LINES, SEQUENTIAL, figure, finite_range, show_image
 
 __all__ = [
     "components_figure",
     "flats_figure",
+    "focal_plane_figure",
     "phase_figure",
     "single_pixel_figure",
     "sky_figure",
@@ -254,6 +262,89 @@ def single_pixel_figure(
         right.set_yscale("log")
         right.set_title("misfit at every thickness")
         return made
+
+
+def focal_plane_figure(cells: Table, sensors: Table) -> Figure:
+    """Fringes over a focal plane: strength, ratio to the shot noise, what a correction leaves, and field radius.
+
+    Parameters
+    ----------
+    cells : `astropy.table.Table`
+        Cells of all sensors (`SensorForecast.to_table`), with the sensor in a column ``detector``.
+    sensors : `astropy.table.Table`
+        One row per sensor (`summary_table`).
+    """
+    templates = sum(name.startswith("residual_") for name in sensors.colnames)
+    with figure(12.5, 10.5) as made:
+        panels = made.subplots(2, 2)
+        strength, noise, residual, radius = panels.ravel()
+        rms = np.asarray(cells["rms"], dtype=float)
+        brightness = float(np.nanmedian(np.asarray(cells["rms_brightness"]) / rms))
+        high = float(np.nanpercentile(rms, 99.5))
+        drawn = _draw_cells(strength, cells, "rms", Normalize(0.0, high), SEQUENTIAL)
+        bar = made.colorbar(
+            drawn, ax=strength, label="right: rms [% of the sky]; left: [µJy arcsec⁻²]", shrink=0.85
+        )
+        bar.ax.secondary_yaxis("left", functions=(_times(brightness), _times(1.0 / brightness)))
+        strength.set_title("rms of the fringe in cells of each sensor")
+        for panel, column, title in (
+            (noise, "over_noise", "fringe over shot noise, largest at 1 to 20″"),
+            (residual, "residual_over_noise", f"the same after correction with {templates} templates"),
+        ):
+            values = np.asarray(cells[column], dtype=float)
+            reach = float(np.nanpercentile(np.abs(np.log(values / DES_CRITERION)), 99.0))
+            norm = LogNorm(DES_CRITERION * np.exp(-reach), DES_CRITERION * np.exp(reach))
+            drawn = _draw_cells(panel, cells, column, norm, DIVERGING)
+            made.colorbar(drawn, ax=panel, label="ratio (white: 0.1, the DES criterion)", shrink=0.85)
+            panel.set_title(title)
+        for number, vendor in enumerate(sorted(set(sensors["vendor"]))):
+            chosen = sensors[sensors["vendor"] == vendor]
+            radius.semilogy(
+                chosen["field_radius"],
+                chosen["rms"],
+                "os^"[number % 3],
+                ms=4,
+                color=LINES[number],
+                label=vendor,
+            )
+        radius.semilogy(
+            [0.0, 1.44], [0.14, 0.04], "x", ms=9, mew=2, color="black", label="Guo et al. 2022, lines alone"
+        )
+        radius.set_xlabel("distance of the sensor from the axis [deg]")
+        radius.set_ylabel("fringe rms of the sensor [%]")
+        radius.set_title("strength over field radius")
+        radius.legend()
+        return made
+
+
+def _times(factor: float) -> Callable[[ArrayLike], ArrayLike]:
+    """Scale of a second axis."""
+    return lambda value: np.asarray(value, dtype=float) * factor
+
+
+def _draw_cells(panel: Axes, cells: Table, column: str, norm: Normalize, cmap: str) -> AxesImage:
+    """Draw one image per sensor at its place in the focal plane."""
+    names, x, y = np.asarray(cells["detector"]), np.asarray(cells["x"]), np.asarray(cells["y"])
+    values = np.asarray(cells[column], dtype=float)
+    drawn: AxesImage | None = None
+    for name in dict.fromkeys(names.tolist()):
+        chosen = names == name
+        side = math.isqrt(int(chosen.sum()))
+        half = [0.5 * np.ptp(axis[chosen]) / max(side - 1, 1) for axis in (x, y)]
+        extent = (
+            *(x[chosen].min() - half[0], x[chosen].max() + half[0]),
+            *(y[chosen].min() - half[1], y[chosen].max() + half[1]),
+        )
+        image = values[chosen].reshape(side, side)
+        drawn = panel.imshow(image, extent=extent, norm=norm, cmap=cmap, aspect="equal")
+    reach = 1.05 * max(np.abs(x).max(), np.abs(y).max())
+    panel.set_xlim(-reach, reach)
+    panel.set_ylim(-reach, reach)
+    panel.set_xlabel("x in the focal plane [mm]")
+    panel.set_ylabel("y in the focal plane [mm]")
+    if drawn is None:
+        raise InputError("cells of the focal plane", 0, "one sensor or more")
+    return drawn
 
 
 def _fraction(frame: SkyFringe) -> NDArray[np.float64]:

@@ -1,0 +1,88 @@
+"""``fringe-sim amplitudes``: Table 2 of the paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from astropy.table import Table
+
+from ..algorithms.amplitude_table import CASES, SkyCase, amplitude_table, contradiction
+from ..errors import FrameFormatError
+from ..mock.thickness import e2v_321
+from .inputs import prepare_folder, read_settings, read_thickness
+from .parameters import EFFECT, effect_settings
+
+__all__ = ["amplitudes"]
+
+STEP_PX = 16
+
+
+@click.command()
+@click.option(
+    "--thickness", default="e2v_321", show_default=True, help="Adhesive: 'e2v_321' or a FITS file [µm]."
+)
+@click.option(
+    "--lines",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    multiple=True,
+    help="Another line list beside PALACE: ECSV with wavelength [nm] and intensity; may be repeated.",
+)
+@click.option(
+    "--case",
+    "cases",
+    type=click.Choice([case.name for case in CASES]),
+    multiple=True,
+    help="Row of the table; may be repeated. All by default.",
+)
+@click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
+@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@click.option("--out", type=click.Path(path_type=Path), default=None, help="Folder for the table as ECSV.")
+@click.option("--dry-run", is_flag=True, help="Check everything, compute nothing.")
+def amplitudes(
+    thickness: str,
+    lines: tuple[Path, ...],
+    cases: tuple[str, ...],
+    effects: tuple[tuple[str, float], ...],
+    effects_file: Path | None,
+    out: Path | None,
+    dry_run: bool,
+) -> None:
+    """Fringe amplitudes of every set-up of the paper: its Table 2.
+
+    One set of effects is used in the laboratory and, without those of the bench, on the sky.
+
+    \b
+    Examples:
+      fringe-sim amplitudes
+      fringe-sim amplitudes --effect contrast_loss.factor=0.13 --out table2
+    """
+    settings = dict(read_settings(effects_file)) if effects_file else {}
+    settings.update(effect_settings(effects))
+    skies = [_line_list(path) for path in lines] + list(SkyCase.palace())
+    adhesive = e2v_321()[::STEP_PX, ::STEP_PX] if thickness == "e2v_321" else read_thickness(thickness)
+    if dry_run:
+        click.echo(f"would compute every set-up with {', '.join(sky.name for sky in skies)}")
+        return
+    folder = prepare_folder(out) if out is not None else None
+    rows = [case for case in CASES if not cases or case.name in cases]
+    table = amplitude_table(adhesive, skies, settings, rows)
+    if {"SLAC-TS8, flat", "MonoCam"} <= set(table["case"]):
+        table.meta["contradiction"] = contradiction(table)
+    shown = table.copy(copy_data=False)
+    shown.remove_columns(["setup", "temperature", "layer"])
+    click.echo("\n".join(shown.pformat(max_lines=-1, max_width=-1, align="<")))
+    click.echo(table.meta.get("contradiction", ""))
+    if folder is not None:
+        table.write(folder / "amplitudes.ecsv", format="ascii.ecsv", overwrite=True)
+        click.echo(str(folder / "amplitudes.ecsv"))
+
+
+def _line_list(path: Path) -> SkyCase:
+    try:
+        table = Table.read(path, format="ascii.ecsv")
+    except Exception as error:
+        raise FrameFormatError(
+            "line list", str(error).split("\n")[0], "an ECSV table", source=str(path)
+        ) from None
+    return SkyCase.of_table(path.stem, table)

@@ -1,0 +1,235 @@
+"""``fringe-sim focal-plane``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from astropy.table import Column, Table, vstack
+from numpy.typing import NDArray
+
+from ..algorithms.cost_model import FocalPlaneCost
+from ..algorithms.field_response import (
+    FieldResponse,
+    SensorPlacement,
+    angular_response,
+    beam_field,
+    beam_limits,
+    field_response,
+)
+from ..algorithms.focal_plane import DES_CRITERION, SkyLevel, forecast_sensor, summary_table
+from ..algorithms.thickness_stand_in import ThicknessField, stand_in_thickness
+from ..effects import EFFECTS, activate_effects
+from ..errors import InputError
+from ..instrument.camera import Camera
+from ..instrument.detector import Detector
+from ..instrument.night import NightHistory, StochasticNight, join_nights
+from ..instrument.sky import SkySpectrum
+from ..model import FringeModel
+from ..report.figures import focal_plane_figure
+from ..report.style import save_figure
+from .inputs import prepare_folder, read_settings, read_thickness
+from .progress import progress
+
+__all__ = ["focal_plane"]
+
+SETUPS = {"e2v": "lsst_e2v", "ITL": "lsst_itl"}
+"""Set-up of the sensors of each vendor."""
+
+SAMPLE_PX = 5
+"""Pixels between the sampled ones: one per arcsecond, a tenth of the width of a fringe or less."""
+
+
+@dataclass(frozen=True)
+class SensorMap:
+    """File with the thickness of one sensor."""
+
+    name: str
+    path: Path
+
+
+class _SensorMapType(click.ParamType):
+    name = "SENSOR=FILE"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> SensorMap:
+        if isinstance(value, SensorMap):
+            return value
+        name, equals, path = str(value).partition("=")
+        if not equals or not name or not path:
+            self.fail(f"{value!r} is not SENSOR=FILE, such as R11_S01=thickness.fits", param, ctx)
+        return SensorMap(name, Path(path))
+
+
+@click.command()
+@click.option(
+    "--sensor", "sensors", multiple=True, help="A sensor or a raft; may be repeated. By default all 189."
+)
+@click.option(
+    "--thickness",
+    "maps",
+    type=_SensorMapType(),
+    multiple=True,
+    help="Measured map [µm] of a sensor; may be repeated. Other sensors get a random field like the measured ones.",
+)
+@click.option("--airmass", type=click.FloatRange(1.0, 5.0), default=1.2, show_default=True, help="Airmass.")
+@click.option(
+    "--nights", type=click.IntRange(1, 1000), default=5, show_default=True, help="Random nights to correct."
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of stand-ins and nights.")
+@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and figure.")
+@click.option("--dry-run", is_flag=True, help="Check everything, state the cost, write nothing.")
+def focal_plane(
+    sensors: tuple[str, ...],
+    maps: tuple[SensorMap, ...],
+    airmass: float,
+    nights: int,
+    seed: int,
+    effects_file: Path | None,
+    out: Path,
+    dry_run: bool,
+) -> None:
+    """Forecast the fringes of every sensor of the LSST Camera.
+
+    Templates are made from the published night, and correct random nights. The same forecast in a Butler, with the
+    frames of every exposure if they are wanted, is pipelines/lsstCam/focalPlane.yaml.
+
+    \b
+    Examples:
+      fringe-sim focal-plane --out focal_plane
+      fringe-sim focal-plane --sensor R22 --thickness R22_S11=fit/thickness.fits --out centre
+    """
+    chosen = _chosen(sensors)
+    measured = {Camera.from_name("lsstCam").detector(item.name).name: item.path for item in maps}
+    settings = dict(read_settings(effects_file)) if effects_file else {}
+    activate_effects(settings, EFFECTS)
+    for path in measured.values():
+        if not path.is_file():
+            raise InputError("--thickness", str(path), "an existing FITS file")
+    if dry_run:
+        click.echo(FocalPlaneCost(len(chosen), len(NightHistory.guo2022())).describe())
+        return
+    folder = prepare_folder(out)
+    thickness = {name: read_thickness(path) for name, path in measured.items()}
+    observed = join_nights(
+        [
+            StochasticNight().draw(np.arange(11.0), np.random.default_rng([seed, number]))
+            for number in range(nights)
+        ]
+    )
+    sky = SkySpectrum.dark(airmass=airmass)
+    tables = []
+    with progress("forecasting sensors", len(chosen)) as advance:
+        for setup_name in SETUPS.values():
+            detectors = [detector for detector in chosen if SETUPS[detector.vendor] == setup_name]
+            if not detectors:
+                continue
+            model = FringeModel.from_setup(setup_name, _of_stack(settings, setup_name))
+            field = _field(model, sky, [thickness[d.name] for d in detectors if d.name in thickness])
+            for detector in detectors:
+                tables.append(
+                    _forecast(detector, model, sky, field, thickness.get(detector.name), observed, seed)
+                )
+                advance()
+    cells, summary = _gather(tables)
+    cells.write(folder / "cells.ecsv", format="ascii.ecsv", overwrite=True)
+    summary.write(folder / "focal_plane.ecsv", format="ascii.ecsv", overwrite=True)
+    save_figure(focal_plane_figure(cells, summary), folder / "focal_plane.png")
+    for line in _describe(summary):
+        click.echo(line)
+    click.echo(str(folder))
+
+
+def _chosen(names: Iterable[str]) -> list[Detector]:
+    camera = Camera.from_name("lsstCam")
+    if not names:
+        return list(camera.science)
+    found: dict[str, Detector] = {}
+    for name in names:
+        members = camera.raft(name) if name in camera.rafts else (camera.detector(name),)
+        for detector in members:
+            if detector.kind != "science":
+                raise InputError("--sensor", name, "a science sensor or a raft of them")
+            found[detector.name] = detector
+    return list(found.values())
+
+
+def _of_stack(settings: dict[str, Any], setup_name: str) -> dict[str, Any]:
+    """Effects that a set-up can have: those of a layer that its stack lacks concern the other vendor."""
+    kept: dict[str, Any] = {}
+    for key, value in settings.items():
+        try:
+            FringeModel.from_setup(setup_name, {key: value})
+        except InputError as error:
+            click.echo(f"{setup_name}: without {key} ({error})", err=True)
+            continue
+        kept[key] = value
+    return kept
+
+
+def _field(model: FringeModel, sky: SkySpectrum, maps: list[NDArray[np.float64]]) -> FieldResponse:
+    """Response at every field radius, for the thickness of all stand-ins and of the given maps."""
+    beams = beam_field(model.setup.telescope)
+    if beams is None:
+        raise InputError(
+            "telescope", model.setup.telescope, "one whose beams depend on the field radius alone"
+        )
+    statistics = ThicknessField.of(model.setup)
+    half = 0.53 * statistics.span_um[1]
+    low = min([statistics.mean_um - half, *(float(np.nanmin(each)) - 1e-3 for each in maps)])
+    high = max([statistics.mean_um + half, *(float(np.nanmax(each)) + 1e-3 for each in maps)])
+    angular = angular_response(model, sky, beam_limits(beams), thickness_range_um=(low, high))
+    return field_response(angular, beams, (0.0, beams.largest_deg))
+
+
+def _forecast(
+    detector: Detector,
+    model: FringeModel,
+    sky: SkySpectrum,
+    field: FieldResponse,
+    measured: NDArray[np.float64] | None,
+    observed: NightHistory,
+    seed: int,
+) -> Table:
+    shape = (detector.shape[0] // SAMPLE_PX, detector.shape[1] // SAMPLE_PX)
+    thickness = (
+        stand_in_thickness(model.setup, detector, seed, shape).value
+        if measured is None
+        else measured.astype(np.float32)
+    )
+    response = field.on(SensorPlacement.of(detector, model.setup.pixel_scale_arcsec))
+    light = float(field.relative_illumination(detector.field_radius_deg))
+    level = SkyLevel.of(sky, model, detector.read_noise, light)
+    forecast = forecast_sensor(
+        thickness, response, detector, level, NightHistory.guo2022(), observed, stand_in=measured is None
+    )
+    return forecast.to_table()
+
+
+def _gather(tables: list[Table]) -> tuple[Table, Table]:
+    """Cells of all sensors in one table, and one row per sensor."""
+    summary = summary_table([table.meta for table in tables])
+    for table in tables:
+        table.add_column(Column([table.meta["detector"]] * len(table), name="detector"), index=0)
+    return vstack(tables, metadata_conflicts="silent"), summary
+
+
+def _describe(summary: Table) -> Iterable[str]:
+    for vendor in sorted(set(summary["vendor"])):
+        rows = summary[summary["vendor"] == vendor]
+        rms, ratio = np.asarray(rows["rms"]), np.asarray(rows["over_noise"])
+        yield (
+            f"{vendor}: {len(rows)} sensors, fringe rms {rms.min():.4f} to {rms.max():.4f} %, "
+            f"{ratio.min():.2f} to {ratio.max():.2f} times the shot noise at up to 20 arcsec"
+        )
+        for number in range(1, 1 + sum(name.startswith("residual_") for name in rows.colnames)):
+            left = np.asarray(rows[f"residual_{number}"])
+            good = int(np.count_nonzero(left < DES_CRITERION))
+            yield (
+                f"  {number} template{'s' if number > 1 else ''}: at most {left.max():.3f} times the noise; "
+                f"{good} of {len(rows)} sensors below {DES_CRITERION}"
+            )

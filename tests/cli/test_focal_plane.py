@@ -1,0 +1,89 @@
+"""``fringe-sim focal-plane`` and ``fringe-sim amplitudes``."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from lsst.fringe_sim.algorithms.cost_model import FocalPlaneCost
+from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.mock.thickness import e2v_321
+
+
+@pytest.mark.slow
+def test_two_sensors_of_a_focal_plane(tmp_path, capsys) -> None:
+    path = tmp_path / "thickness.fits"
+    fits.PrimaryHDU(e2v_321((800, 819)).astype(np.float32)).writeto(path)
+    out = tmp_path / "out"
+    status = run(
+        [
+            *("focal-plane", "--sensor", "R22_S11", "--sensor", "R22_S12", "--thickness", f"R22_S11={path}"),
+            *("--nights", "2", "--airmass", "1.0", "--out", str(out)),
+        ]
+    )
+    assert status == 0
+    sensors = Table.read(out / "focal_plane.ecsv")
+    assert list(sensors["detector"]) == ["R22_S11", "R22_S12"]
+    assert list(sensors["stand_in"]) == [False, True]
+    assert sensors["rms"][0] == pytest.approx(0.11, abs=0.01)
+    assert np.all(sensors["residual_2"] < 0.1)
+    assert len(Table.read(out / "cells.ecsv")) == 128
+    assert (out / "focal_plane.png").read_bytes().startswith(b"\x89PNG")
+    said = capsys.readouterr().out
+    assert "e2v: 2 sensors" in said
+    assert "2 templates" in said
+
+
+def test_cost_is_stated_and_nothing_is_written(tmp_path, capsys) -> None:
+    assert run(["focal-plane", "--out", str(tmp_path / "out"), "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "189 sensors" in said
+    assert "2458 quanta" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_cost_grows_with_sensors_and_exposures() -> None:
+    one, all_of_them = FocalPlaneCost(1, 11), FocalPlaneCost(189, 11)
+    assert all_of_them.disk_bytes == 189 * one.disk_bytes
+    assert one.sensor_night_s < 20.0
+    assert one.frame_bytes == 4004 * 4096 * 8
+    assert FocalPlaneCost(1, 22).disk_bytes - one.disk_bytes == 11 * one.frame_bytes
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--sensor", "R44_SG0"], "a science sensor"),
+        (["--sensor", "R99_S00"], "R99_S00"),
+        (["--thickness", "R22_S11=missing.fits"], "an existing FITS file"),
+    ],
+)
+def test_bad_input_is_named(arguments, message, tmp_path, capsys) -> None:
+    assert run(["focal-plane", *arguments, "--out", str(tmp_path / "out")]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_map_without_its_sensor_is_a_usage_error(tmp_path) -> None:
+    assert run(["focal-plane", "--thickness", "thickness.fits", "--out", str(tmp_path / "out")]) == 2
+
+
+def test_amplitudes_names_what_it_would_compute(tmp_path, capsys) -> None:
+    lines = tmp_path / "mine.ecsv"
+    Table({"wavelength": [960.0], "intensity": [1.0]}).write(lines, format="ascii.ecsv")
+    assert run(["amplitudes", "--lines", str(lines), "--dry-run"]) == 0
+    assert "mine, PALACE lines" in capsys.readouterr().out
+    lines.write_text("no table")
+    assert run(["amplitudes", "--lines", str(lines), "--dry-run"]) == 1
+
+
+def test_amplitudes_of_a_given_map(tmp_path, capsys) -> None:
+    path = tmp_path / "thickness.fits"
+    fits.PrimaryHDU(e2v_321((60, 60)).astype(np.float32)).writeto(path)
+    cases = ("--case", "MonoCam", "--case", "SLAC-TS8, flat")
+    assert run(["amplitudes", "--thickness", str(path), *cases, "--out", str(tmp_path / "out")]) == 0
+    table = Table.read(tmp_path / "out" / "amplitudes.ecsv")
+    assert len(table) == 3
+    assert "no contrast that is common to both" in table.meta["contradiction"]
+    assert "PALACE and continuum" in capsys.readouterr().out
