@@ -18,7 +18,15 @@ from .cells import Cells, run_threaded
 from .newton import gauss_newton
 from .templates import FringeTemplates, arc_length_nodes
 
-__all__ = ["EVIDENCE_CAP", "IMPOSSIBLE", "MISFIT", "OrderEvidence", "order_evidence", "refine_cells"]
+__all__ = [
+    "EVIDENCE_CAP",
+    "IMPOSSIBLE",
+    "MISFIT",
+    "OrderEvidence",
+    "order_evidence",
+    "refine_cells",
+    "refine_row",
+]
 
 _MATH = {"reassoc", "contract", "arcp", "nsz"}
 NODES_PER_ORDER = 16
@@ -364,7 +372,7 @@ def refine_cells(
     out = np.full(cells.shape, np.nan, np.float32)
 
     def work(row: int) -> None:
-        _refine_row(
+        refine_row(
             cells.value[row], cells.weight[row], table, templates.start_um, templates.step_um,
             thickness_um[row], out[row],
         )  # fmt: skip
@@ -374,7 +382,8 @@ def refine_cells(
 
 
 @numba.njit(cache=True, nogil=True)
-def _refine_row(value, weight, table, start, step, thickness, out):  # type: ignore[no-untyped-def]
+def refine_row(value, weight, table, start, step, thickness, out):  # type: ignore[no-untyped-def]
+    """Least chi-square of every cell of a row near its thickness."""
     for c in range(value.shape[0]):
         if np.isfinite(thickness[c]):
             place = min(max((thickness[c] - start) / step, 0.0), table.shape[0] - 1.0)

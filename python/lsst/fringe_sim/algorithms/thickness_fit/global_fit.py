@@ -13,6 +13,7 @@ from .amplitudes import Amplitudes
 from .borders import settle_borders
 from .cells import Cells, average_cells, cell_edges, cell_independence, compensate_slopes, effective_number
 from .evidence import OrderEvidence, order_evidence, refine_cells
+from .narrow_sensor import is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, first_nuisances, fit_nuisances, subtract_offset
 from .orders import solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
@@ -35,8 +36,10 @@ _MOST_SOLUTIONS = 3
 _MEAN_TOLERANCE = 2e-6
 """Relative change of the mean response that is left alone: far below the noise of a smoothed flat."""
 _MOST_ROUNDS = 20
-_SENSOR_ORDERS = 2.0
-"""Orders of thickness that a sensor must span before its own mean can be told from that of the range."""
+_SENSOR_ORDERS = 3.0
+"""Orders of thickness that a sensor must span before its mean is near that of the range, whatever its order."""
+_NARROW_MARGIN = 2.0
+"""Orders beyond what a narrow sensor showed in a sample that its other cells may have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +64,10 @@ class GlobalFit:
     order_um : `float`
         Thickness of one fringe order [µm].
     normalisation : `str`
-        ``sensor`` or ``range``: over which thicknesses the mean response was taken.
+        ``sensor``, ``narrow`` or ``range``: over which thicknesses the mean response was taken. ``narrow`` is a
+        sensor of few orders, whose mean response was found together with its order.
+    common_slip : `float`
+        Probability that a narrow sensor has another common order; 0 for others.
     """
 
     pixels: PixelFit
@@ -72,6 +78,7 @@ class GlobalFit:
     nuisance: NuisanceFit
     order_um: float
     normalisation: str
+    common_slip: float = 0.0
 
 
 def global_fit(
@@ -119,7 +126,7 @@ def global_fit(
     state = solver.solve(cells, templates)
     settled = settle_orders(
         state.cells, state.templates, state.thickness_um, state.slope_y, state.slope_x, order, state.found,
-        range_um=range_um, temper=solver.temper, correlation_px=data.noise_correlation_px, threads=threads,
+        range_um=state.range_um, temper=solver.temper, correlation_px=data.noise_correlation_px, threads=threads,
     )  # fmt: skip
     state = solver.adjust(replace(state, thickness_um=settled.thickness_um))
     surface = _surface(state, order)
@@ -130,7 +137,7 @@ def global_fit(
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
     pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)
     pixels, lone_slip = rescue_pixels(
-        fringes, state.templates, pixels, order, range_um=range_um, threads=threads
+        fringes, state.templates, pixels, order, range_um=state.range_um, threads=threads
     )
     border_slip = np.maximum(border_slip, lone_slip)
     if smoothing_px > 0.0:
@@ -138,11 +145,15 @@ def global_fit(
         pixels = smooth_likelihood(
             fringes, state.templates, pixels, calmed, edges, rough, smoothing_px, threads
         )
+    if state.common_sigma_um > 0.0:
+        whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))
+        pixels = replace(pixels, sigma=np.asarray(whole, np.float32))
     # Near a step the pixels have been asked one by one, which is worth more than the answer of their cell.
     settled = replace(settled, cell_slip=np.where(surface.smooth, settled.cell_slip, np.float32(0)))
     return GlobalFit(
-        pixels, state.cells, settled, border_slip, state.templates, state.nuisance, order, state.normalisation
-    )
+        pixels, state.cells, settled, border_slip, state.templates, state.nuisance, order, state.normalisation,
+        state.common_slip,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +168,9 @@ class _State:
     nuisance: NuisanceFit
     normalisation: str
     found: OrderEvidence
+    range_um: tuple[float, float]
+    common_slip: float = 0.0
+    common_sigma_um: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -174,32 +188,61 @@ class _Solver:
         nuisance = first_nuisances(cells, templates, self.free)
         fitted, normalisation = templates.with_contrast(nuisance.contrast), "range"
         for _ in range(_MOST_SOLUTIONS):
-            fringes = subtract_offset(cells, nuisance)
-            found = order_evidence(
-                fringes,
-                fitted,
-                self.order_um,
-                range_um=self.range_um,
-                temper=self.temper,
-                threads=self.threads,
-            )
-            solution = solve_orders(fringes, found)
-            state = _State(
-                *compensate_slopes(fringes, found.slope_y, found.slope_x, self.order_um),
-                solution.thickness_um, fitted, nuisance, normalisation, found,
-            )  # fmt: skip
+            state = self._state(cells, fitted, nuisance, normalisation, self.range_um)
             if not spans_orders(state.thickness_um, self.order_um):
-                return state
+                own = not self.free.any and is_own_mean(state.cells, templates)
+                return self._narrow(cells, state) if own else state
             before, state = state, self.adjust(replace(state, normalisation="sensor"))
             if _agree(before, state):
                 break
             fitted, nuisance, normalisation = state.templates, state.nuisance, state.normalisation
         return state
 
+    def _state(
+        self,
+        cells: Cells,
+        templates: FringeTemplates,
+        nuisance: NuisanceFit,
+        normalisation: str,
+        range_um: tuple[float, float],
+    ) -> _State:
+        """Orders of all cells, the model being as it is."""
+        fringes = subtract_offset(cells, nuisance)
+        found = order_evidence(
+            fringes, templates, self.order_um, range_um=range_um, temper=self.temper, threads=self.threads
+        )
+        solution = solve_orders(fringes, found)
+        return _State(
+            *compensate_slopes(fringes, found.slope_y, found.slope_x, self.order_um),
+            solution.thickness_um, templates, nuisance, normalisation, found, range_um,
+        )  # fmt: skip
+
+    def _narrow(self, cells: Cells, first: _State) -> _State:
+        """Orders of a sensor of few orders, whose mean response depends on them."""
+        narrow = settle_narrow_sensor(
+            first.cells,
+            first.templates,
+            first.thickness_um,
+            self.order_um,
+            range_um=self.range_um,
+            temper=self.temper,
+            threads=self.threads,
+        )
+        margin = _NARROW_MARGIN * self.order_um
+        range_um = (
+            max(self.range_um[0], narrow.range_um[0] - margin),
+            min(self.range_um[1], narrow.range_um[1] + margin),
+        )
+        state = self._state(cells, narrow.templates, first.nuisance, "narrow", range_um)
+        return self.adjust(replace(state, common_slip=narrow.slip, common_sigma_um=narrow.sigma_um))
+
     def adjust(self, state: _State) -> _State:
         """Fit mean response and nuisances to the cells, the orders being as they are."""
-        if state.normalisation != "sensor":
+        if state.normalisation == "range":
             return state
+        if state.normalisation == "narrow":  # refitting and renormalising in turn would crawl
+            thickness = refine_cells(state.cells, state.templates, state.thickness_um, self.threads)
+            return replace(state, thickness_um=thickness)
         if self.free.patterned:  # a free level takes what is left of the mean
             thickness, fitted = state.thickness_um, state.templates.normalised_to(state.thickness_um)
         else:

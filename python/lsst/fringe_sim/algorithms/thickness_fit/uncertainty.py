@@ -40,7 +40,8 @@ def slip_probability(found: GlobalFit) -> NDArray[np.float32]:
     by_segment = np.append(settled.segment_slip, 1.0)[settled.segment]
     by_cell = 1.0 - (1.0 - by_segment) * (1.0 - settled.cell_slip)
     by_pixel = spread_to_pixels(found.cells, by_cell.astype(np.float32))
-    return np.asarray(1.0 - (1.0 - by_pixel) * (1.0 - found.border_slip), dtype=np.float32)
+    stays = (1.0 - found.common_slip) * (1.0 - by_pixel) * (1.0 - found.border_slip)
+    return np.asarray(1.0 - stays, dtype=np.float32)
 
 
 def lone_slip_probability(

@@ -1,0 +1,301 @@
+"""Sensors, or parts of them, whose thickness spans less than a few fringe orders.
+
+Flats are divided by their mean over the sensor, and the mean response depends on the thicknesses that are there. A
+sensor of many orders has about the mean of all phases, whatever its thickness. One of few orders does not: a wrong
+order comes with a mean response of its own, which hides part of the misfit, and the mean of all phases would be
+wrong for every order. So each possible thickness is tried with the mean response that it implies,
+
+    a_k(x) = R_k(d(x)) / <R_k(d)> - 1,
+
+from starts all over the range, and the least chi-square decides. In the limit of a flat sensor only the ratios of
+slopes between the wavelengths are left; the result says how little that is: a probability that another solution is
+true, and the variance of the common thickness from the Fisher information of all cells together, mean included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cells import Cells, run_threaded
+from .evidence import refine_row
+from .templates import FringeTemplates, pad_wavelengths
+
+__all__ = ["NarrowSensor", "is_own_mean", "settle_narrow_sensor"]
+
+FloatArray = NDArray[np.float64]
+
+_MOST_CELLS = 600
+"""Cells that are asked; more would only add certainty."""
+_FEW_CELLS = 120
+"""Cells with which all starts are compared; only the best of these go on with more."""
+_STARTS_PER_ORDER = 12
+_FIRST_ROUNDS = 8
+_KEPT = 40
+_COMPARED = 6
+_JOINT_STEPS = 25
+_LONGEST_STEP_UM = 0.02
+_SAME_SOLUTION = 0.25
+"""Solutions whose common thickness agrees within this many orders are one."""
+_OWN_MEAN = 0.1
+"""Mean amplitude, in rms amplitudes of the model, up to which flats have been divided by their own mean."""
+
+
+@dataclass(frozen=True, eq=False)
+class NarrowSensor:
+    """What a sensor of few orders says about its common thickness.
+
+    Attributes
+    ----------
+    templates : `FringeTemplates`
+        The model with the mean response of the best solution.
+    range_um : `tuple` [`float`, `float`]
+        Least and largest thickness of the solution [µm].
+    slip : `float`
+        Probability that another solution is true.
+    sigma_um : `float`
+        Uncertainty of the mean thickness of the sensor [µm].
+    """
+
+    templates: FringeTemplates
+    range_um: tuple[float, float]
+    slip: float
+    sigma_um: float
+
+
+def is_own_mean(cells: Cells, templates: FringeTemplates) -> bool:
+    """Whether the flats are over their mean over these very cells, not over a larger sensor they were cut from.
+
+    Parameters
+    ----------
+    cells : `Cells`
+        Mean amplitudes.
+    templates : `FringeTemplates`
+        The model.
+    """
+    wavelengths = templates.n_wavelengths
+    weight = cells.weight[..., :wavelengths] > 0.0
+    number = weight.sum(axis=(0, 1))
+    total = np.where(weight, cells.value[..., :wavelengths], 0.0).sum(axis=(0, 1), dtype=float)
+    mean = np.abs(total[number > 0] / number[number > 0])
+    return bool(mean.size and np.all(mean < _OWN_MEAN * templates.amplitude().std(axis=0)[number > 0]))
+
+
+def settle_narrow_sensor(
+    cells: Cells,
+    templates: FringeTemplates,
+    thickness_um: NDArray[np.float32],
+    order_um: float,
+    *,
+    range_um: tuple[float, float],
+    temper: float,
+    threads: int = 2,
+) -> NarrowSensor:
+    """Find the common thickness of a sensor together with its mean response.
+
+    Parameters
+    ----------
+    cells : `Cells`
+        Mean amplitudes.
+    templates : `FringeTemplates`
+        The model, with any mean response.
+    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        First idea of the thickness [µm], of which the shape is used; NaN where a cell has no data.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    range_um : `tuple` [`float`, `float`]
+        Possible thicknesses [µm].
+    temper : `float`
+        Independent cells per cell, as for `order_evidence`.
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+    """
+    sample, shape_um = _Sample.of(cells, thickness_um, _MOST_CELLS)
+    few = sample.every(max(len(shape_um) // _FEW_CELLS, 1))
+    form = shape_um[:: max(len(shape_um) // _FEW_CELLS, 1)]
+    starts = np.arange(range_um[0], range_um[1], order_um / _STARTS_PER_ORDER)[:, None]
+    tried = few.follow(
+        templates, np.concatenate([starts + 0.0 * form, starts + form]), _FIRST_ROUNDS, threads
+    )
+    together = [_settle_together(few, solution, templates) for solution in _distinct(tried, order_um)[:_KEPT]]
+    best = _distinct(together, order_um)[:_COMPARED]
+    again = np.concatenate([sample.starts(solution, shape_um, form) for solution in best])
+    followed = sample.follow(templates, again, _FIRST_ROUNDS, threads)
+    pairs = zip(followed[::2], followed[1::2], strict=True)
+    final = [_settle_together(sample, min(pair, key=lambda s: s.chi2), templates) for pair in pairs]
+    low, high = range_um
+    inside = [s for s in final if low - 0.1 * order_um < s.mean_um < high + 0.1 * order_um] or final
+    ranked = _distinct(inside, order_um)
+    chosen = ranked[0]
+    slip = _slip(ranked, temper, sample)
+    sigma = _common_sigma(sample, chosen, templates)
+    sigma *= np.sqrt(len(shape_um) / max(int(np.count_nonzero(cells.n_wavelengths)), 1) / temper)
+    return NarrowSensor(
+        replace(templates, mean_response=chosen.mean_response),
+        (float(chosen.thickness_um.min()), float(chosen.thickness_um.max())),
+        slip,
+        sigma,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """Thickness of some cells and the mean response that goes with it."""
+
+    thickness_um: FloatArray
+    mean_response: FloatArray
+    chi2: float
+
+    @property
+    def mean_um(self) -> float:
+        """Common thickness [µm]."""
+        return float(self.thickness_um.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Some cells: relative flats ``1 + a`` and their weights, shape ``(n, padded wavelengths)``."""
+
+    level: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, cells: Cells, thickness_um: NDArray[np.float32], most: int) -> tuple[_Sample, FloatArray]:
+        """Cells at equal distances that have every wavelength, and their thickness about its middle."""
+        number = cells.n_wavelengths
+        seen = np.flatnonzero((number == number.max()) & np.isfinite(thickness_um))
+        seen = seen[:: -(-seen.size // most)]
+        depth = cells.value.shape[-1]
+        value, weight = (part.reshape(-1, depth)[seen] for part in (cells.value, cells.weight))
+        shape = thickness_um.ravel()[seen].astype(float)
+        return cls(value + np.float32(1), weight), shape - np.median(shape)
+
+    def every(self, stride: int) -> _Sample:
+        """One cell in so many."""
+        return _Sample(self.level[::stride], self.weight[::stride])
+
+    def follow(
+        self, templates: FringeTemplates, starts_um: FloatArray, rounds: int, threads: int
+    ) -> list[_Solution]:
+        """Refit and renormalise in turn, from each of some starts of shape ``(starts, n)``.
+
+        ``R / m - 1`` against ``a`` with weight ``w`` is ``R`` against ``m (1 + a)`` with weight ``w / m²``: the
+        mean response goes into the data, and the table stays as it is.
+        """
+        table = pad_wavelengths(templates.response)
+        origin, step = templates.start_um, templates.step_um
+        out = np.empty(starts_um.shape)
+        mean = np.empty((len(starts_um), table.shape[1]))
+        chi2 = np.empty(len(starts_um))
+
+        def work(item: int) -> None:
+            thickness = starts_um[item].astype(np.float32)
+            response = _interpolate(table, (thickness - origin) / step)
+            for _ in range(rounds):
+                level = response.mean(axis=0, dtype=float)
+                scale = np.where(level > 0.0, level, 1.0).astype(np.float32)
+                before, thickness = thickness, np.full_like(thickness, np.nan)
+                value, weight = self.level * scale, self.weight / scale**2
+                refine_row(value, weight, table, origin, step, before, thickness)
+                response = _interpolate(table, (thickness - origin) / step)
+                if np.abs(thickness - before).max() < 0.02 * step:
+                    break
+            mean[item] = response.mean(axis=0, dtype=float)
+            miss = self.level - response / np.where(mean[item] > 0.0, mean[item], 1.0)
+            out[item], chi2[item] = thickness, float((self.weight * miss**2).sum())
+
+        run_threaded(work, len(starts_um), threads)
+        wavelengths = templates.n_wavelengths
+        return [_Solution(t, m[:wavelengths], float(c)) for t, m, c in zip(out, mean, chi2, strict=True)]
+
+    def starts(self, solution: _Solution, shape_um: FloatArray, form: FloatArray) -> FloatArray:
+        """Starts for these cells from the solution of fewer: its common thickness, without and with the shape."""
+        middle = float(np.median(solution.thickness_um - form))
+        return np.stack([np.full(len(shape_um), solution.mean_um), middle + shape_um])
+
+
+def _interpolate(table: NDArray[Any], place: NDArray[np.floating]) -> NDArray[Any]:
+    """Rows of a table between its nodes, in the precision of the table."""
+    inside = np.clip(place, 0.0, len(table) - 1.001)
+    below = inside.astype(np.intp)
+    share = (inside - below).astype(table.dtype)[:, None]
+    low = table[below]
+    return np.asarray(low + share * (table[below + 1] - low))
+
+
+def _distinct(solutions: list[_Solution], order_um: float) -> list[_Solution]:
+    """Best first, and of those with the same common thickness only the best."""
+    found: list[_Solution] = []
+    for solution in sorted(solutions, key=lambda solution: solution.chi2):
+        if all(abs(solution.mean_um - other.mean_um) > _SAME_SOLUTION * order_um for other in found):
+            found.append(solution)
+    return found
+
+
+def _slip(ranked: list[_Solution], temper: float, sample: _Sample) -> float:
+    """Probability of all solutions but the best."""
+    freedom = max(int(np.count_nonzero(sample.weight > 0)) - len(sample.weight), 1)
+    trust = temper / max(1.0, ranked[0].chi2 / freedom)
+    excess = np.array([trust * (solution.chi2 - ranked[0].chi2) for solution in ranked])
+    return float(1.0 - 1.0 / np.exp(-0.5 * excess.clip(0.0, 2000.0)).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Together:
+    """Normal equations of all cells and the mean that they share.
+
+    With ``g = R' / <R>`` and ``r = R / <R>``, moving cell ``j`` changes the amplitude of cell ``i`` by
+    ``g_ik δ_ij - r_ik g_jk / n``: by itself, and through the mean.
+    """
+
+    gradient: FloatArray
+    fisher: FloatArray
+    chi2: float
+
+    @classmethod
+    def of(cls, sample: _Sample, thickness_um: FloatArray, templates: FringeTemplates) -> _Together:
+        """At a thickness of every cell; the mean is that of these thicknesses."""
+        wavelengths, count, step = templates.n_wavelengths, len(sample.weight), templates.step_um
+        place = (thickness_um - templates.start_um) / step
+        parts = (_interpolate(templates.response, place + shift) for shift in (-1.0, 0.0, 1.0))
+        behind, here, ahead = parts
+        mean = here.mean(axis=0)
+        slope, relative = (ahead - behind) / (2.0 * step * mean), here / mean
+        weight = sample.weight[:, :wavelengths].astype(float)
+        miss = sample.level[:, :wavelengths] - relative
+        cross = (weight * slope * relative) @ slope.T / count
+        total = (weight * relative**2).sum(axis=0) / count**2
+        fisher = np.diag((weight * slope**2).sum(axis=1)) - cross - cross.T + (slope * total) @ slope.T
+        through_mean = (weight * miss * relative).sum(axis=0) / count
+        gradient = (weight * miss * slope).sum(axis=1) - slope @ through_mean
+        return cls(gradient, fisher, float((weight * miss**2).sum()))
+
+
+def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> _Solution:
+    """Levenberg-Marquardt steps of all cells at once: refitting and renormalising in turn crawls."""
+    thickness, damping = solution.thickness_um.astype(float), 1e-6
+    state = _Together.of(sample, thickness, templates)
+    for _ in range(_JOINT_STEPS):
+        bound = state.fisher + np.diag(damping * np.diag(state.fisher) + np.finfo(float).tiny)
+        step = np.linalg.lstsq(bound, state.gradient, rcond=1e-14)[0]
+        tried = thickness + np.clip(step, -_LONGEST_STEP_UM, _LONGEST_STEP_UM)
+        after = _Together.of(sample, tried, templates)
+        if after.chi2 < state.chi2:
+            gained = state.chi2 - after.chi2
+            thickness, state, damping = tried, after, 0.1 * damping
+            if gained < 1e-4:
+                break
+        else:
+            damping *= 30.0
+    place = (thickness - templates.start_um) / templates.step_um
+    return _Solution(thickness, _interpolate(templates.response, place).mean(axis=0), state.chi2)
+
+
+def _common_sigma(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> float:
+    """Standard uncertainty of the mean thickness of the sampled cells, as if they were the whole sensor [µm]."""
+    values, vectors = np.linalg.eigh(_Together.of(sample, solution.thickness_um, templates).fisher)
+    lowest = max(float(values[-1]) * 1e-12, np.finfo(float).tiny)
+    return float(np.sqrt((vectors.sum(axis=0) ** 2 / np.maximum(values, lowest)).sum()) / len(values))

@@ -1,0 +1,84 @@
+"""Sensors of few fringe orders, whose mean response depends on the very thickness that is looked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms import fit_thickness
+from lsst.fringe_sim.mock.thickness import random_field
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube
+
+TEN_NM = np.arange(880.0, 991.0, 10.0)
+SEARCH_UM = (5.0, 20.0)
+HALF_ORDER_UM = 0.15
+
+
+@pytest.fixture(scope="module")
+def model() -> FringeModel:
+    return FringeModel.from_setup("ts8_e2v")
+
+
+def cube_of(truth: np.ndarray, model: FringeModel, noise: float, rng: np.random.Generator) -> FringeCube:
+    """Flats over their own mean."""
+    image = model.response(truth, TEN_NM)
+    image = image / image.mean(axis=(1, 2), keepdims=True) + noise * rng.standard_normal(image.shape)
+    return FringeCube(
+        image.astype(np.float32),
+        np.full(image.shape, noise**2, np.float32),
+        np.zeros(image.shape, np.int16),
+        FlatExposures(TEN_NM, np.array(2.0), np.array(183.15)),
+        "relative",
+    )
+
+
+@pytest.mark.parametrize("span", [0.05, 0.15, 0.3, 0.6, 0.85])
+def test_order_is_found_together_with_the_mean(span, model, rng) -> None:
+    for _ in range(2):
+        truth = random_field((64, 64), rng, mean=rng.uniform(7.0, 15.0), span=span)
+        fitted = fit_thickness(cube_of(truth, model, 0.007, rng), model, range_um=SEARCH_UM)
+        good = fitted.mask == 0
+        assert good.mean() > 0.99
+        assert np.mean(np.abs(fitted.value - truth)[good] > HALF_ORDER_UM) == 0.0
+        assert fitted.metadata["NORMALIS"] == "narrow"
+        assert np.abs(np.mean((fitted.value - truth)[good] / fitted.sigma[good])) < 3.0
+
+
+def test_uncertainty_of_the_common_thickness(model, rng) -> None:
+    """The mean over a nearly flat sensor errs as much as is stated, and by far more than a mean of pixels."""
+    pulls, gain = [], []
+    for _ in range(10):
+        truth = random_field((32, 32), rng, mean=rng.uniform(9.0, 12.0), span=0.01)
+        fitted = fit_thickness(cube_of(truth, model, 0.002, rng), model, range_um=(8.0, 13.0))
+        good = fitted.mask == 0
+        if good.mean() > 0.9:
+            error = (fitted.value - truth)[good]
+            pulls.append(float(error.mean() / np.median(fitted.sigma[good])))
+            gain.append(float(abs(error.mean()) / (error.std() / np.sqrt(good.sum()))))
+    assert len(pulls) >= 8
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.6
+    assert np.median(gain) > 3.0
+
+
+def test_what_cannot_be_told_is_said(model, rng) -> None:
+    """Noise that leaves a flat sensor without a fringe: wrong orders are flagged."""
+    for span in (0.005, 0.01, 0.02):
+        truth = random_field((32, 32), rng, mean=rng.uniform(7.0, 15.0), span=span)
+        fitted = fit_thickness(cube_of(truth, model, 0.01, rng), model, range_um=SEARCH_UM)
+        wrong = np.abs(fitted.value - truth) > HALF_ORDER_UM
+        assert np.mean(wrong & (fitted.mask == 0)) == 0.0
+
+
+def test_a_piece_of_a_larger_sensor_keeps_its_level(model, rng) -> None:
+    """Flats over the mean of the whole sensor they were cut from are not forced to a mean of one."""
+    truth = random_field((256, 256), rng, mean=12.0, span=5.0)
+    whole = cube_of(truth, model, 0.004, rng)
+    part = (slice(100, 124), slice(100, 124))
+    piece = FringeCube(
+        whole.image[:, *part], whole.variance[:, *part], whole.mask[:, *part], whole.exposures, "relative"
+    )
+    fitted = fit_thickness(piece, model, range_um=SEARCH_UM)
+    good = fitted.mask == 0
+    assert good.mean() > 0.9
+    assert np.mean(np.abs(fitted.value - truth[part])[good] > HALF_ORDER_UM) == 0.0
