@@ -1,5 +1,6 @@
 """The catalogue of physical effects: one file each, one line in `EFFECTS`."""
 
+from .air_gap import AirGap
 from .amplifier_gain import AmplifierGain
 from .amplifier_offset import AmplifierOffset
 from .ar_coating import ArCoating
@@ -28,6 +29,9 @@ from .ghost_pedestal import GhostPedestal
 from .illumination import Illumination
 from .image_geometry import AMPLIFIERS, ImageGeometry
 from .interface_roughness import InterfaceRoughness
+from .lamp_lines import LampLines
+from .line_triangle import LineTriangle
+from .line_wing import LineWing
 from .midline_step import MidlineStep
 from .non_linearity import NonLinearity
 from .silicon_absorption import SiliconAbsorption
@@ -65,6 +69,7 @@ EFFECTS: tuple[Effect, ...] = (
     ArCoating(),
     InterfaceRoughness(),
     ThicknessSpread(),
+    AirGap(),
     SupportIndex(),
     SupportCoherence(),
     GateOxide(),
@@ -72,6 +77,9 @@ EFFECTS: tuple[Effect, ...] = (
     BlackCoating(),
     # illumination
     Bandwidth(),
+    LineWing(),
+    LineTriangle(),
+    LampLines(),
     WavelengthOffset(),
     WavelengthScale(),
     ConvergingBeam(),

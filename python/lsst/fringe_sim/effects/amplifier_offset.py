@@ -26,6 +26,7 @@ class AmplifierOffset(PlainNullEffect):
     def change_image(
         self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
     ) -> FloatArray:
-        """Add the offset of the amplifier that reads the sample, relative to the level."""
+        """Let the offset be its part of the level of the amplifier that reads the sample, and light the rest."""
         offset = np.array([values[name] for name in AMPLIFIERS])
-        return image + offset[geometry.amplifier] / geometry.require_levels(self.name)
+        level = geometry.require_levels(self.name)
+        return (1.0 - offset.mean() / level) * image + offset[geometry.amplifier] / level

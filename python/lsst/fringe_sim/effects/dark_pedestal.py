@@ -25,5 +25,6 @@ class DarkPedestal(PlainNullEffect):
     def change_image(
         self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
     ) -> FloatArray:
-        """Add the level."""
-        return image + values["electrons"] / geometry.require_levels(self.name)
+        """Let the pedestal be its part of the level, and light the rest."""
+        part = values["electrons"] / geometry.require_levels(self.name)
+        return (1.0 - part) * image + part

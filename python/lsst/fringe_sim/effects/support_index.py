@@ -19,7 +19,9 @@ class SupportIndex(PlainNullEffect):
     reference = "Guo, Walter, Lage & Lupton 2022, Table 1 assumes silicon; ceramics have an index of 1.7-2.2"
     # The support is an etalon of its own: its fringes return after half a wavelength in its optical thickness.
     parameters = (
-        Parameter("offset", "", 0.0, (-2.4, 1.0), 0.3, "index minus that of the set-up", repeats_after=0.00285),
+        Parameter(
+            "offset", "", 0.0, (-2.4, 1.0), 0.3, "index minus that of the set-up", repeats_after=0.00285
+        ),
     )
 
     def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
