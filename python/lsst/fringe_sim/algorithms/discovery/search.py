@@ -21,6 +21,7 @@ from .channels import Channel
 from .describe import describe_residual, disagreement
 from .fit import Fit, Problem, fit_model
 from .forward import Forward
+from .next_step import with_next_measurements
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
 from .selection import Hypothesis, Selector, similarity
 from .start import starting_thickness
@@ -316,6 +317,22 @@ def _measure_noise(problem: Problem, fit: Fit) -> NoiseEstimate:
     return estimate_noise(problem.cells, residual)
 
 
+@dataclass(frozen=True)
+class _Class:
+    """Effects that explain the data about as well: shares and fitted values by name, what is sure of all together."""
+
+    members: dict[str, float]
+    probability: float
+    values: dict[str, dict[str, float]]
+    significance: float
+
+
+def _values_of(name: str, fit: Fit) -> dict[str, float]:
+    return {
+        key.partition(".")[2]: value for key, value in fit.settings.items() if key.partition(".")[0] == name
+    }
+
+
 class _Search:
     """One run of the search; every method is one stage."""
 
@@ -331,6 +348,7 @@ class _Search:
         self.model, self.effects, self.options, self.say = model, effects, options, say
         shape = prepared.problem.cells.shape[1:]
         self.heldout = _held_out_blocks(shape, options.heldout_fraction, rng, prepared.rich)
+        self.next_measurements: tuple[dict[str, Any], ...] = ()
         self._take(prepared)
 
     def _take(self, prepared: _Prepared) -> None:
@@ -518,16 +536,26 @@ class _Search:
         outsider = self._outsider_probability(final)
         named = []
         for name in final.names:
-            members, probability = classes[name]
-            probability *= 1.0 - outsider
+            probability = classes[name].probability * (1.0 - outsider)
             if probability < self.options.least_probability:
                 reasons.append(f"the class of {name} has probability {probability:.2f} only")
-            named.append(self._named(whole, final, name, members, probability))
+            named.append(self._named(final, name, classes[name].members, probability))
         self.notes.append(f"held out: chi2 of blocks falls by {gains['blocks']:.1f}, of wavelengths by "
                           f"{gains['wavelengths']:.1f}")  # fmt: skip
         if reasons:
             return self._unexplained(whole, final, chance, steps, "; ".join(reasons), partial=named)
-        return self._verdict("named", whole, final, chance, tuple(named), {}, steps)
+        thickness = whole.problem.basis.expand(final.fit.field)
+        decided, self.next_measurements = with_next_measurements(
+            named,
+            {name: group.values for name, group in classes.items()},
+            {name: group.significance for name, group in classes.items()},
+            self.model,
+            self.cells,
+            (float(thickness.min()), float(thickness.max())),
+            self.effects,
+            self.say,
+        )
+        return self._verdict("named", whole, final, chance, decided, {}, steps)
 
     def _transfer(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
         """The chosen set fitted to all data."""
@@ -537,8 +565,8 @@ class _Search:
             chosen.names, None, replace(chosen.fit, field=whole.problem.basis.fit(start, weight))
         )
 
-    def _classes(self, selector: Selector, chosen: Hypothesis) -> dict[str, tuple[dict[str, float], float]]:
-        """For each effect: the members of its class with their shares, and the probability of the class."""
+    def _classes(self, selector: Selector, chosen: Hypothesis) -> dict[str, _Class]:
+        """Class of each effect."""
         result = {}
         state = selector.state(chosen.fit)
         for name in chosen.names:
@@ -563,7 +591,9 @@ class _Search:
             members = {
                 n: weight[n] / total for n, other in found.items() if self._is_alike(other, chosen, top)
             }
-            result[name] = (members, sum(members.values()))
+            values = {n: _values_of(n, found[n].fit) for n in members}
+            significance = math.sqrt(max(without.fit.chi2 - chosen.fit.chi2, 0.0))
+            result[name] = _Class(members, sum(members.values()), values, significance)
         return result
 
     def _is_alike(self, other: Hypothesis, chosen: Hypothesis, top: float) -> bool:
@@ -624,7 +654,7 @@ class _Search:
         return total[0] - total[1]
 
     def _named(
-        self, whole: Selector, final: Hypothesis, name: str, members: dict[str, float], probability: float
+        self, final: Hypothesis, name: str, members: dict[str, float], probability: float
     ) -> NamedEffect:
         parameters = {}
         for item, position, sigma in zip(
@@ -690,7 +720,7 @@ class _Search:
         }
         return Verdict(
             verdict, effects, self.where, gap, tuple(steps), unexplained, self.model.setup.name, chance, candidates,
-            (), tuple(self.notes), data,
+            self.next_measurements, tuple(self.notes), data,
         )  # fmt: skip
 
 

@@ -1,0 +1,111 @@
+"""What to measure next, so that effects that were left in one class come apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ...effects import Effect
+from ...errors import FringeSimError
+from ...model import FringeModel
+from ..next_measurement import RankedMeasurement, break_ambiguity, rank_measurements
+from .cells import CellData
+from .verdict import NamedEffect
+
+__all__ = ["with_next_measurements"]
+
+MOST_RIVALS = 4
+"""Members of a class, likeliest first, that a measurement is asked to tell from the effect."""
+
+Values = Mapping[str, Mapping[str, float]]
+
+
+def with_next_measurements(
+    named: Sequence[NamedEffect],
+    rivals: Mapping[str, Values],
+    significance: Mapping[str, float],
+    model: FringeModel,
+    cells: CellData,
+    thickness_um: tuple[float, float],
+    catalogue: Sequence[Effect],
+    report: Callable[[str], None],
+) -> tuple[tuple[NamedEffect, ...], tuple[dict[str, Any], ...]]:
+    """Effects with the data that would decide between the members of their class, and all that was compared.
+
+    Parameters
+    ----------
+    named : sequence of `NamedEffect`
+        Effects with their classes.
+    rivals : mapping
+        For each effect, the fitted values of the other members of its class.
+    significance : mapping
+        Standard deviations by which the data ask for each effect.
+    model : `FringeModel`
+        The model before the search.
+    cells : `CellData`
+        The data, for their wavelengths and levels.
+    thickness_um : `tuple` [`float`, `float`]
+        Smallest and largest thickness [µm].
+    catalogue : sequence of `Effect`
+        Where the effects are.
+    report : callable
+        Called with a line of text at every stage.
+    """
+    result, table = [], []
+    for effect in named:
+        if not effect.ambiguous_with:
+            result.append(effect)
+            continue
+        report(f"which measurement would tell {effect.name} from {', '.join(effect.ambiguous_with)}")
+        ranked = _rank(effect, named, rivals[effect.name], significance[effect.name], model, cells, thickness_um,
+                       catalogue)  # fmt: skip
+        text = break_ambiguity(ranked) or "no forecast: the effects couple neighbouring pixels"
+        result.append(replace(effect, break_ambiguity=text))
+        table += [_row(effect.name, item) for item in ranked]
+    return tuple(result), tuple(table)
+
+
+def _rank(
+    effect: NamedEffect,
+    named: Sequence[NamedEffect],
+    rivals: Values,
+    significance: float,
+    model: FringeModel,
+    cells: CellData,
+    thickness_um: tuple[float, float],
+    catalogue: Sequence[Effect],
+) -> tuple[RankedMeasurement, ...]:
+    certain = dict(model.effect_settings)
+    for other in named:
+        if other is not effect:
+            certain |= {f"{other.name}.{key}": p.value for key, p in other.parameters.items()}
+    members: dict[str, Mapping[str, float]] = {
+        effect.name: {key: p.value for key, p in effect.parameters.items()}
+    }
+    members |= {name: rivals[name] for name in effect.ambiguous_with[:MOST_RIVALS]}
+    levels = [level for level in cells.geometry.level_e if math.isfinite(level) and level > 0.0]
+    known = {"level_e": sum(levels) / len(levels)} if levels else {}
+    try:
+        return rank_measurements(
+            model.with_effects(certain, catalogue), members, wavelength_nm=cells.wavelength_nm.tolist(),
+            thickness_um=thickness_um, significance=significance, catalogue=catalogue, **known,
+        )  # fmt: skip
+    except FringeSimError:  # an effect at the edge of its bounds has no derivative there
+        return ()
+
+
+def _row(name: str, item: RankedMeasurement) -> dict[str, Any]:
+    return {
+        "effect": name,
+        "measurement": item.measurement.name,
+        "title": item.measurement.title,
+        "separation_sigma": item.separation,
+        "decides": item.decides,
+        "pairs": [
+            {"other": pair.other, "likeness_now": pair.likeness_now, "likeness_after": pair.likeness_after,
+             "separation_now": pair.separation_now, "separation_after": pair.separation_after}
+            for pair in item.pairs
+        ],
+    }  # fmt: skip
