@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,10 @@ __all__ = [
     "check_whole_number",
     "read_only",
 ]
+
+
+_ROWS = 256
+"""Rows of an image that are looked at at a time."""
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -89,9 +93,11 @@ def check_good_pixels(
 ) -> None:
     """Refuse a pixel that the mask calls good and that holds no usable number.
 
-    One leading plane is looked at at a time, so a memory-mapped cube is never in memory as a whole.
+    One leading plane (or some rows of an image) is looked at at a time, so a memory-mapped cube is never in memory
+    as a whole.
     """
-    planes = range(values.shape[0]) if values.ndim == 3 else (slice(None),)
+    rows = (slice(low, low + _ROWS) for low in range(0, len(values), _ROWS))
+    planes: Iterable[int | slice] = range(len(values)) if values.ndim == 3 else rows
     bad = 0
     for plane in planes:
         part = values[plane]

@@ -69,7 +69,7 @@ class ThicknessMap:
         mask = check.as_mask("MASK", self.mask, value.shape)
         check.check_good_pixels("VALUE", value, mask)
         good = mask == 0
-        if bool(np.any(value[good] <= 0)):
+        if bool(np.any((value <= 0) & good)):
             raise OutOfRangeError("VALUE", float(value[good].min()), "a positive thickness in um")
         values: dict[str, Any] = {
             "value": value,
@@ -84,7 +84,7 @@ class ThicknessMap:
             check.check_shape(name.upper(), array, value.shape)
             check.check_good_pixels(name.upper(), array, mask, nonnegative=True)
             values[name] = array
-        if bool(np.any(values["slip_probability"][good] > 1)):
+        if bool(np.any((values["slip_probability"] > 1) & good)):
             worst = float(values["slip_probability"][good].max())
             raise OutOfRangeError("SLIP_PROBABILITY", worst, "0 to 1")
         for name, item in values.items():
@@ -158,4 +158,4 @@ def _counts(values: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.int3
     check.check_shape("N_WAVELENGTHS", array, shape)
     if bool(np.any(array < 0)) or bool(np.any(array > 2**31 - 1)):
         raise OutOfRangeError("N_WAVELENGTHS", int(array.min()), "0 or more")
-    return check.read_only(array.astype(np.int32))
+    return check.read_only(array.astype(np.int32, copy=False))

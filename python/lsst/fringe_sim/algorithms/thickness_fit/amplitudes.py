@@ -115,13 +115,26 @@ class Amplitudes:
             return np.zeros(self.shape[1], np.int64)
         return np.repeat(np.arange(len(self.y_edges) - 1), np.diff(self.y_edges))
 
-    def rows(self, start: int, stop: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]:
-        """Image, variance and mask of some rows, in native byte order; without a copy where they are so."""
+    def rows(
+        self, start: int, stop: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int16]]:
+        """Image, variance and mask of some rows, in native byte order; without a copy where they are so.
+
+        The mask is non-zero where a pixel is not to be used; its bits mean nothing.
+        """
         return (
             native(self.image[:, start:stop], np.float32),
             native(self.variance[:, start:stop], np.float32),
-            native(self.bad[:, start:stop], np.int32),
+            _flags(self.bad[:, start:stop]),
         )
+
+
+def _flags(bad: NDArray[Any]) -> NDArray[np.int16]:
+    """Mask as int16, non-zero where it was; other types are only asked whether they are zero."""
+    if bad.dtype == np.int16:
+        return native(bad, np.int16)
+    core = bad[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in bad.strides)]
+    return np.broadcast_to((core != 0).astype(np.int16), bad.shape)
 
 
 def native(array: NDArray[Any], dtype: Any) -> NDArray[Any]:

@@ -7,8 +7,6 @@ for every neighbour from which it would be torn off.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +42,7 @@ def settle_borders(
     templates : `FringeTemplates`
         The model, normalised to the sensor.
     pixels : `PixelFit`
-        What the pixels found by themselves.
+        What the pixels found by themselves; its arrays are revised in place.
     rough : `numpy.ndarray`, bool, shape ``(ny, nx)``
         Pixels that have more than one surface within reach.
     order_um : `float`
@@ -65,16 +63,15 @@ def settle_borders(
         return pixels, slip
     value, weight = gather_pixels(data, rows, columns)
     freedom = np.maximum(np.count_nonzero(weight > 0, axis=1) - 1, 1).astype(np.float32)
-    thickness, information, chi2 = (np.array(a) for a in (pixels.value, pixels.sigma, pixels.chi2))
     arguments = (
         value, weight, freedom, rows, columns, templates.table(),
         templates.start_um, templates.step_um, order_um, temper,
-        thickness, information, chi2, slip,
+        pixels.value, pixels.sigma, pixels.chi2, slip,
     )  # fmt: skip
     for sweep in range(_SWEEPS):
         if _sweep(*arguments, sweep % 2 == 1) == 0:
             break
-    return replace(pixels, value=thickness, sigma=information, chi2=chi2), slip
+    return pixels, slip
 
 
 def gather_pixels(

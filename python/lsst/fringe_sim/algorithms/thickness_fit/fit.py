@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +16,7 @@ from ...model import FringeModel
 from ...optics.system import OBSERVABLES
 from ...products import FringeCube, ThicknessMap, mask_bits
 from .amplitudes import Amplitudes
-from .cells import sample_pixels
+from .cells import run_threaded, sample_pixels
 from .global_fit import global_fit, normalise_to_cells, spans_orders
 from .guo2022 import walk_fit
 from .nuisances import Nuisances
@@ -32,6 +33,8 @@ STEPS_PER_ORDER = 300
 """Template thicknesses in one fringe order: 1 nm of epoxy; linear interpolation is then good to 3e-5 of the swing."""
 FEWEST_WAVELENGTHS = 4
 """With fewer wavelengths than this a pixel is flagged: phase, order and fit quality cannot all be told."""
+_ROWS = 64
+"""Rows that are flagged at a time by one thread."""
 
 
 def fit_thickness(
@@ -109,7 +112,7 @@ def fit_thickness(
     if not 0.0 < slip_limit <= 1.0:
         raise OutOfRangeError("slip limit", slip_limit, "above 0, at most 1")
     workers = threads if threads is not None else len(os.sched_getaffinity(0))
-    if not np.any(np.asarray(cube.mask) == 0):
+    if not any((plane == 0).any() for plane in cube.mask):
         raise InputError("good pixels of the cube", 0, "one or more", source=cube.detector or None)
     data = amplitudes_from_cube(cube, noise_correlation_px)
     low, high = range_um or model.setup.thickness_range_um
@@ -136,7 +139,7 @@ def fit_thickness(
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
         notes["CONTRAST"] = round(float(np.mean(found.nuisance.contrast)), 6)
-    return _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes)
+    return _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes, workers)
 
 
 def amplitudes_from_cube(cube: FringeCube, noise_correlation_px: float | None = None) -> Amplitudes:
@@ -234,18 +237,37 @@ def _assemble(
     cube: FringeCube,
     layer: str,
     notes: Mapping[str, Any],
+    threads: int,
 ) -> ThicknessMap:
     used = pixels.n_wavelengths
-    none = used == 0
-    if none.all():
+    if not used.any():
         raise InputError("pixels", "all masked", "at least one good pixel")
     scale = typical_misfit(pixels)
-    mask = np.where(none, mask_bits("NO_DATA"), 0).astype(np.int32)
-    mask[(used < FEWEST_WAVELENGTHS) | ~np.isfinite(pixels.sigma)] |= mask_bits("LOW_SIGNAL")
-    mask[slip > slip_limit] |= mask_bits("SLIP")
-    limit = chi2_limits(int(used.max()))
-    mask[pixels.chi2 > scale * limit[used]] |= mask_bits("SUSPECT")
+    limit = np.asarray(scale * chi2_limits(int(used.max())), np.float32)
+    bits = np.array([mask_bits(name) for name in ("NO_DATA", "LOW_SIGNAL", "SLIP", "SUSPECT")], np.int32)
+    mask = np.empty(used.shape, np.int32)
+
+    def flag(band: int) -> None:
+        rows = slice(band * _ROWS, (band + 1) * _ROWS)
+        _flag_rows(
+            used[rows], pixels.sigma[rows], pixels.chi2[rows], slip[rows], limit, slip_limit, bits, mask[rows]
+        )
+
+    run_threaded(flag, -(-len(mask) // _ROWS), threads)
     notes = dict(notes) | {"NWAVE": len(cube.wavelength_nm), "MISFIT": round(scale, 4)}
     return ThicknessMap(
         pixels.value, pixels.sigma, pixels.chi2, slip, mask, layer, notes, used, cube.detector
     )
+
+
+@numba.njit(cache=True, nogil=True)
+def _flag_rows(used, sigma, chi2, slip, limit, slip_limit, bits, mask):  # type: ignore[no-untyped-def]
+    """Mask planes of some rows; ``bits`` are those of NO_DATA, LOW_SIGNAL, SLIP and SUSPECT."""
+    for r in range(used.shape[0]):
+        for x in range(used.shape[1]):
+            number = used[r, x]
+            flags = bits[0] if number == 0 else np.int32(0)
+            flags |= bits[1] if number < FEWEST_WAVELENGTHS or not np.isfinite(sigma[r, x]) else np.int32(0)
+            flags |= bits[2] if slip[r, x] > slip_limit else np.int32(0)
+            flags |= bits[3] if chi2[r, x] > limit[number] else np.int32(0)
+            mask[r, x] = flags

@@ -136,10 +136,9 @@ def global_fit(
     rough = spread_to_pixels(cells, ~surface.smooth)
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
     pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)
-    pixels, lone_slip = rescue_pixels(
-        fringes, state.templates, pixels, order, range_um=state.range_um, threads=threads
+    pixels = rescue_pixels(
+        fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
-    border_slip = np.maximum(border_slip, lone_slip)
     if smoothing_px > 0.0:
         edges = (cells.y_edges, cells.x_edges)
         pixels = smooth_likelihood(
@@ -348,8 +347,9 @@ def choose_cell_size(data: Amplitudes) -> int:
     _, ny, nx = data.shape
     least = int(np.ceil(np.sqrt(ny * nx / MOST_CELLS)))
     rows = np.unique(np.linspace(0, max(ny - 2 * LARGEST_CELL_PX, 0), 16).astype(int))
-    strips = [_strip(data, int(row), min(2 * LARGEST_CELL_PX, ny)) for row in rows]
-    image, variance = (np.concatenate(parts, axis=1) for parts in zip(*strips, strict=True))
+    height = min(2 * LARGEST_CELL_PX, ny)
+    lines = [_strip(data, slice(None), int(row), height, every=4) for row in rows]
+    image, variance = (np.concatenate(parts, axis=1) for parts in zip(*lines, strict=True))
     seen = np.flatnonzero(np.isfinite(image).any(axis=(1, 2)))
     if seen.size == 0:
         return max(LARGEST_CELL_PX, least)
@@ -359,21 +359,21 @@ def choose_cell_size(data: Amplitudes) -> int:
     band, signal = int(seen[best]), float(excess[best])
     if not signal > 0.0:
         return max(LARGEST_CELL_PX, least)
+    strips = [_strip(data, slice(band, band + 1), int(row), height)[0][0] for row in rows]
     for size in (8, 4, 2):
         if size <= least:
             break
-        if (
-            size < max(ny, nx)
-            and _structure(strips, band, size, float(noise[best]), signal) < _STEEPEST_STRUCTURE
-        ):
+        if size < max(ny, nx) and _structure(strips, size, float(noise[best]), signal) < _STEEPEST_STRUCTURE:
             return max(size, least)
     return max(least, 1)
 
 
-def _strip(data: Amplitudes, row: int, height: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Amplitude and variance of some rows, NaN where not to be used."""
-    image, variance, bad = data.rows(row, row + height)
-    scale = data.scale.astype(np.float32)[:, None, None]
+def _strip(
+    data: Amplitudes, bands: slice, row: int, height: int, every: int = 1
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Amplitude and variance of some rows (or every so many of them), NaN where not to be used."""
+    image, variance, bad = (part[bands, ::every] for part in data.rows(row, row + height))
+    scale = data.scale.astype(np.float32)[bands, None, None]
     good = (bad == 0) & np.isfinite(image) & (variance > 0) & np.isfinite(variance)
     return (
         np.where(good, image * scale - np.float32(1), np.float32(np.nan)),
@@ -382,16 +382,14 @@ def _strip(data: Amplitudes, row: int, height: int) -> tuple[NDArray[np.float32]
 
 
 def _structure(
-    strips: list[tuple[NDArray[np.float32], NDArray[np.float32]]],
-    band: int,
+    strips: list[NDArray[np.float32]],
     lag: int,
     noise: float,
     signal: float,
 ) -> float:
     """Ninth decile over blocks of the structure function at one distance."""
     values = []
-    for strip, _ in strips:
-        image = strip[band]
+    for image in strips:
         width = max(image.shape[1] // 16, 2 * lag)
         for left in range(0, image.shape[1], width):
             block = image[:, left : left + width]

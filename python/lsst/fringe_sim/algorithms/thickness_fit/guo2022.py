@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, OutOfRangeError
-from .amplitudes import Amplitudes, native
+from .amplitudes import Amplitudes
 from .cells import run_threaded
 from .pixels import PixelFit
 from .templates import FringeTemplates
@@ -71,8 +71,7 @@ def walk_fit(
     if not 0 <= low < high < len(templates.response):
         allowed = f"inside {templates.start_um:g} to {templates.stop_um:g}"
         raise OutOfRangeError("search range [um]", range_um, allowed)
-    image, variance = native(data.image, np.float32), native(data.variance, np.float32)
-    bad = native(data.bad, np.int32)
+    image, variance, bad = data.rows(0, ny)
     table = np.ascontiguousarray(templates.amplitude().T.astype(np.float32))
     scale = data.scale.astype(np.float32)
     forward, backward = _paths(ny, nx, row, column)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-__all__ = ["gauss_newton", "newton_inline", "score"]
+__all__ = ["gauss_newton", "newton_block", "score"]
 
 _MATH = {"reassoc", "contract", "arcp", "nsz"}
 _TINY = np.float32(1e-30)
@@ -72,22 +72,30 @@ def _go_on(table, place, value, weight, item, step, steps, limit):  # type: igno
     return place, information, chi2
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
-def newton_inline(table, place, value, weight, item, steps, longest):  # type: ignore[no-untyped-def]
-    """Like `gauss_newton`, written out where it is called: a call costs more than the two usual steps."""
+@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+def newton_block(table, place, value, weight, count, steps, longest, information, chi2, move):  # type: ignore[no-untyped-def]
+    """Like `gauss_newton` for the first ``count`` items, in place.
+
+    All of them take a step before any takes the next: one step waits for the other, but those of different items
+    do not, and the processor works on several at a time. ``move`` is room for as many numbers.
+    """
     top = table.shape[0] - 1.0
     limit = np.float32(longest)
-    gain, information, chi2 = _score(table, place, value, weight, item)
-    step = gain / max(information, _TINY)
-    place = min(max(place + min(max(step, -limit), limit), 0.0), top)
-    gain, information, chi2 = _score(table, place, value, weight, item)
-    step = gain / max(information, _TINY)
-    if abs(step) > _CLOSE:
-        place, information, chi2 = _go_on(table, place, value, weight, item, step, steps, limit)
-    else:
-        place = min(max(place + step, 0.0), top)
-        chi2 -= gain * step
-    return place, information, chi2
+    for k in range(count):
+        gain, seen, _ = _score(table, place[k], value, weight, k)
+        step = gain / max(seen, _TINY)
+        place[k] = min(max(place[k] + min(max(step, -limit), limit), 0.0), top)
+    for k in range(count):
+        gain, seen, misfit = _score(table, place[k], value, weight, k)
+        step = gain / max(seen, _TINY)
+        move[k], information[k], chi2[k] = step, seen, misfit - gain * step
+    for k in range(count):
+        if abs(move[k]) > _CLOSE:
+            place[k], information[k], chi2[k] = _go_on(
+                table, place[k], value, weight, k, move[k], steps, limit
+            )
+        else:
+            place[k] = min(max(place[k] + move[k], 0.0), top)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH)
@@ -110,4 +118,16 @@ def gauss_newton(table, place, value, weight, item, steps, longest):  # type: ig
     place, information, chi2 : `float`
         Where it ended, information there, and chi-square after the last (quadratic) step.
     """
-    return newton_inline(table, place, value, weight, item, steps, longest)
+    top = table.shape[0] - 1.0
+    limit = np.float32(longest)
+    gain, information, chi2 = _score(table, place, value, weight, item)
+    step = gain / max(information, _TINY)
+    place = min(max(place + min(max(step, -limit), limit), 0.0), top)
+    gain, information, chi2 = _score(table, place, value, weight, item)
+    step = gain / max(information, _TINY)
+    if abs(step) > _CLOSE:
+        place, information, chi2 = _go_on(table, place, value, weight, item, step, steps, limit)
+    else:
+        place = min(max(place + step, 0.0), top)
+        chi2 -= gain * step
+    return place, information, chi2

@@ -133,7 +133,7 @@ def first_nuisances(cells: Cells, templates: FringeTemplates, free: Nuisances) -
     pattern = _patterns(cells, free)
     offset = np.zeros((wavelengths, *cells.shape)) if pattern.shape[-1] else np.zeros((0, *cells.shape))
     contrast = np.ones(wavelengths)
-    for band in range(wavelengths):
+    for band in range(wavelengths if free.any else 0):
         weight, value = cells.weight[..., band].astype(float), cells.value[..., band].astype(float)
         seen = weight > 0
         if not seen.any():

@@ -78,7 +78,10 @@ def solve_orders(cells: Cells, found: OrderEvidence) -> OrderSolution:
     evidence = found.evidence.reshape(ny * nx, -1).copy()
     root, offset = _join(evidence, first[ranked], second[ranked], turn[ranked], SURE)
     valid = np.isfinite(found.phase_um.ravel())
-    order = np.argmin(evidence, axis=1)[root] + offset
+    roots = np.flatnonzero(root == np.arange(len(root)))
+    best = np.zeros(len(root), np.int64)
+    best[roots] = np.argmin(evidence[roots], axis=1)
+    order = best[root] + offset
     thickness = np.where(valid, found.phase_um.ravel() + found.order_um * order, np.nan).astype(np.float32)
     roots, member = np.unique(root[valid], return_inverse=True)
     rank = np.argsort(-np.bincount(member, minlength=len(roots)), kind="stable")
@@ -172,15 +175,15 @@ def _find(parent, shift, node):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _gap(evidence):  # type: ignore[no-untyped-def]
     """Best order of a region, and by how much it is better than the next."""
-    best = 0
+    best, least, second = 0, evidence[0], np.float32(np.inf)
     for m in range(1, evidence.shape[0]):
-        if evidence[m] < evidence[best]:
-            best = m
-    gap = np.inf
-    for m in range(evidence.shape[0]):
-        if m != best:
-            gap = min(gap, evidence[m] - evidence[best])
-    return best, gap
+        value = evidence[m]
+        if value < second:
+            if value < least:
+                best, least, second = m, value, least
+            else:
+                second = value
+    return best, float(second) - float(least)
 
 
 @numba.njit(cache=True, nogil=True)

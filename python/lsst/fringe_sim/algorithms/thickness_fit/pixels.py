@@ -17,7 +17,7 @@ from scipy.ndimage import binary_dilation
 from .amplitudes import Amplitudes
 from .cells import core, load_row, run_threaded
 from .medians import middle_of
-from .newton import gauss_newton, newton_inline
+from .newton import gauss_newton, newton_block
 from .templates import FringeTemplates
 
 __all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels", "subtract_row"]
@@ -32,7 +32,7 @@ _SAME_SURFACE = 0.25
 _LONE_CELL_PENALTY = 12.0
 """Chi-square by which a surface shown by a single cell must be better than one that several show."""
 _BAND_ROWS = 16
-_BLOCK = 16
+_BLOCK = 32
 _KEEP_APART = 80
 
 
@@ -179,7 +179,7 @@ def fit_pixels(
         Number of threads; has no influence on the result.
     """
     _, ny, nx = data.shape
-    value, sigma, chi2 = (np.full((ny, nx), np.nan, np.float32) for _ in range(3))
+    value, sigma, chi2 = (np.empty((ny, nx), np.float32) for _ in range(3))
     used = np.zeros((ny, nx), np.int32)
     table = templates.table()
     scale = data.scale.astype(np.float32)
@@ -227,6 +227,9 @@ def _fit_band(  # type: ignore[no-untyped-def]
     # Amplitudes lie far apart in a cube; blocks of pixels bring those of one pixel together.
     y, w = np.zeros((_BLOCK, padded), np.float32), np.zeros((_BLOCK, padded), np.float32)
     begin, flat = np.empty(columns, np.float32), np.empty(columns, np.bool_)
+    place, move = np.empty(_BLOCK, np.float64), np.empty(_BLOCK, np.float32)
+    information, misfit = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
+    top = table.shape[0] - 1.0
     upright = np.empty(thickness.shape[1], np.float32)
     for r in range(rows):
         for band in range(bands):
@@ -257,22 +260,21 @@ def _fit_band(  # type: ignore[no-untyped-def]
                     y[b, band] = amplitude[band, first + b]
                     w[b, band] = weight[band, first + b]
             for b in range(size):
+                place[b] = min(max((begin[first + b] - start) / step, 0.0), top)
+            newton_block(table, place, y, w, size, _STEPS, longest, information, misfit, move)
+            for b in range(size):
                 x = first + b
-                if used_out[r, x] == 0:
-                    continue
-                if flat[x]:
-                    place = min(max((begin[x] - start) / step, 0.0), table.shape[0] - 1.0)
-                    place, information, chi2 = newton_inline(table, place, y, w, b, _STEPS, longest)
-                else:
+                if not flat[x] and used_out[r, x] > 0:
                     own_x = below_x[x] if share_x[x] < 0.5 else min(below_x[x] + 1, thickness.shape[1] - 1)
-                    place, information, chi2 = _try_surfaces(
+                    place[b], information[b], misfit[b] = _try_surfaces(
                         table, start, step, order, y, w, b, thickness, slope_y, slope_x, known,
                         y_centre, x_centre, first_row + r, x, own_y, own_x, longest,
                     )  # fmt: skip
-                value[r, x] = start + step * place
-                sigma[r, x] = information
-                chi2_out[r, x] = chi2
-        _finish_row(sigma[r], chi2_out[r], used_out[r], np.float32(step))
+            for b in range(size):
+                value[r, first + b] = start + step * place[b]
+                sigma[r, first + b] = information[b]
+                chi2_out[r, first + b] = misfit[b]
+        _finish_row(value[r], sigma[r], chi2_out[r], used_out[r], np.float32(step))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -308,14 +310,15 @@ def _start_row(thickness, smooth, below, share, below_x, share_x, upright, begin
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH)
-def _finish_row(sigma, chi2, used, step):  # type: ignore[no-untyped-def]
-    """Information to standard uncertainty, chi-square to reduced chi-square, for a whole row at once."""
+def _finish_row(value, sigma, chi2, used, step):  # type: ignore[no-untyped-def]
+    """Information to standard uncertainty, chi-square to reduced chi-square; NaN where there was nothing to fit."""
     for x in range(sigma.shape[0]):
         information = sigma[x]
         safe = information if information > 0.0 else np.float32(1.0)
         sigma[x] = step / np.sqrt(safe) if information > 0.0 else np.float32(np.inf)
         chi2[x] = max(chi2[x], np.float32(0.0)) / np.float32(max(used[x] - 1, 1))
         if used[x] == 0:
+            value[x] = np.float32(np.nan)
             sigma[x] = np.float32(np.nan)
             chi2[x] = np.float32(np.nan)
 

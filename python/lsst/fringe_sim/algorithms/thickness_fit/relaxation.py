@@ -159,7 +159,11 @@ def settle_orders(
     thickness = lone.thickness_um
     segment_slip[lone.surface] = lone.slip
     cell_slip = np.zeros(thickness.shape, np.float32)
-    _cell_slip(cost, shifted, label, rise_y, rise_x, order_um, cell_slip)
+    run_threaded(
+        lambda row: _cell_slip(cost, shifted, label, rise_y, rise_x, order_um, row, cell_slip[row]),
+        len(cell_slip),
+        threads,
+    )
     return SettledCells(thickness, segment, segment_slip, cell_slip)
 
 
@@ -550,23 +554,23 @@ def _far_odds(
 
 
 @numba.njit(cache=True, nogil=True)
-def _cell_slip(cost, shifted, label, rise_y, rise_x, order, out):  # type: ignore[no-untyped-def]
-    ny, nx, shifts = cost.shape
+def _cell_slip(cost, shifted, label, rise_y, rise_x, order, y, out):  # type: ignore[no-untyped-def]
+    """Probability that a cell of one row has another order, its neighbours staying."""
+    _, nx, shifts = cost.shape
     middle = shifts // 2
-    for y in range(ny):
-        for x in range(nx):
-            if not np.isfinite(shifted[y, x, middle]):
+    for x in range(nx):
+        if not np.isfinite(shifted[y, x, middle]):
+            continue
+        total, own = 0.0, 0.0
+        for k in range(shifts):
+            at = label[y, x] + k
+            if not 0 <= at < shifts:
                 continue
-            total, own = 0.0, 0.0
-            for k in range(shifts):
-                at = label[y, x] + k
-                if not 0 <= at < shifts:
-                    continue
-                price = cost[y, x, at] + _border_price(
-                    shifted, label, rise_y, rise_x, order, y, x, k - middle, y, y + 1, x, x + 1
-                )
-                weight = np.exp(-0.5 * price)
-                total += weight
-                if k == middle:
-                    own = weight
-            out[y, x] = 1.0 - own / total if total > 0.0 else 1.0
+            price = cost[y, x, at] + _border_price(
+                shifted, label, rise_y, rise_x, order, y, x, k - middle, y, y + 1, x, x + 1
+            )
+            weight = np.exp(-0.5 * price)
+            total += weight
+            if k == middle:
+                own = weight
+        out[x] = 1.0 - own / total if total > 0.0 else 1.0

@@ -6,8 +6,6 @@ the pixel lies far from the surface on which its search began.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +30,10 @@ _FEWEST_TO_SPARE = 6
 _COMPACT = 0.5
 """Fraction of its 5 by 5 neighbours that fit badly too, from which a pixel may lie in a void: columns have less."""
 _MOST_SEARCHED = 200_000
+_ROWS = 32
+"""Rows at a time, so that what is between fits into the cache."""
+_SAMPLE = 400_000
+"""Pixels from which the typical misfit is taken."""
 
 
 def chi2_limits(most: int) -> NDArray[np.float32]:
@@ -44,11 +46,12 @@ def rescue_pixels(
     data: Amplitudes,
     templates: FringeTemplates,
     pixels: PixelFit,
+    slip: NDArray[np.float32],
     order_um: float,
     *,
     range_um: tuple[float, float],
     threads: int = 2,
-) -> tuple[PixelFit, NDArray[np.float32]]:
+) -> PixelFit:
     """Fit again the pixels whose chi-square is improbable.
 
     Parameters
@@ -58,7 +61,9 @@ def rescue_pixels(
     templates : `FringeTemplates`
         The model, normalised to the sensor.
     pixels : `PixelFit`
-        The fit so far.
+        The fit so far; its arrays are revised in place, as a full sensor leaves no room for copies.
+    slip : `numpy.ndarray`, float32, shape of ``pixels.value``
+        Probability that the order of a pixel is wrong; raised in place where a pixel had to be looked for by itself.
     order_um : `float`
         Thickness of one fringe order [µm].
     range_um : `tuple` [`float`, `float`]
@@ -70,26 +75,22 @@ def rescue_pixels(
     -------
     pixels : `PixelFit`
         With better values where there are; ``n_wavelengths`` is one less where one was left out.
-    slip : `numpy.ndarray`, float32, shape of ``pixels.value``
-        Probability that the order of a pixel is wrong which had to be looked for by itself; 0 for all others.
     """
-    slip = np.zeros(pixels.value.shape, np.float32)
-    used = pixels.n_wavelengths
-    limit = typical_misfit(pixels) * chi2_limits(int(used.max(initial=0)))
-    bad = pixels.chi2 > limit[used]
+    limit = typical_misfit(pixels) * chi2_limits(int(pixels.n_wavelengths.max(initial=0)))
+    bad = _exceeds(pixels.chi2, limit, pixels.n_wavelengths)
     rows, columns = np.nonzero(bad)
     if rows.size == 0:
-        return pixels, slip
-    fields = {name: np.array(getattr(pixels, name)) for name in ("value", "sigma", "chi2", "n_wavelengths")}
+        return pixels
+    fields = {name: getattr(pixels, name) for name in ("value", "sigma", "chi2", "n_wavelengths")}
     table = templates.table()
     for low in range(0, rows.size, _MOST_SEARCHED):
         part = slice(low, low + _MOST_SEARCHED)
         value, weight = gather_pixels(data, rows[part], columns[part])
         _leave_one_out(
             value, weight, rows[part], columns[part], table, templates.start_um, templates.step_um, order_um,
-            pixels.value, bad, limit, fields["value"], fields["sigma"], fields["chi2"], fields["n_wavelengths"],
+            bad, limit, fields["value"], fields["sigma"], fields["chi2"], fields["n_wavelengths"],
         )  # fmt: skip
-    still = fields["chi2"] > limit[fields["n_wavelengths"]]
+    still = _exceeds(pixels.chi2, limit, pixels.n_wavelengths)
     compact = still & (uniform_filter(still.astype(np.float32), 5, mode="nearest") > _COMPACT)
     rows, columns = (index[:_MOST_SEARCHED] for index in np.nonzero(compact))
     if rows.size:
@@ -97,17 +98,32 @@ def rescue_pixels(
         _search_range(
             value, weight, rows, columns, templates, order_um, range_um, limit, fields, slip, threads
         )
-    return replace(pixels, **fields), slip
+    return pixels
+
+
+def _exceeds(
+    chi2: NDArray[np.float32], limit: NDArray[np.float32], used: NDArray[np.int32]
+) -> NDArray[np.bool_]:
+    """Where chi-square is above the limit for its number of wavelengths."""
+    out = np.empty(chi2.shape, bool)
+    for low in range(0, len(chi2), _ROWS):
+        part = slice(low, low + _ROWS)
+        np.greater(chi2[part], limit[used[part]], out=out[part])
+    return out
 
 
 def typical_misfit(pixels: PixelFit) -> float:
     """Median reduced chi-square over its expectation, at least 1: how far the model itself falls short."""
     most = int(pixels.n_wavelengths.max(initial=0))
-    sample = pixels.n_wavelengths == most
-    if most < 2 or not sample.any():
+    if most < 2:
         return 1.0
+    # An odd stride does not fall on the same columns in every row.
+    for stride in (pixels.chi2.size // _SAMPLE | 1, 1):
+        chi2 = pixels.chi2.ravel()[::stride][pixels.n_wavelengths.ravel()[::stride] == most]
+        if chi2.size > 0:
+            break
     expected = chi2_distribution.median(most - 1) / (most - 1)
-    return max(float(np.median(pixels.chi2[sample][:: max(1, sample.sum() // 200_000)])) / expected, 1.0)
+    return max(float(np.median(chi2)) / expected, 1.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -120,7 +136,6 @@ def _leave_one_out(  # type: ignore[no-untyped-def]
     start,
     step,
     order,
-    before,
     bad,
     limit,
     thickness,
@@ -128,8 +143,11 @@ def _leave_one_out(  # type: ignore[no-untyped-def]
     reduced,
     used,
 ):
-    """Begin on the surface of the good neighbours, drop the worst wavelength, keep the result if it fits."""
-    ny, nx = before.shape
+    """Begin on the surface of the good neighbours, drop the worst wavelength, keep the result if it fits.
+
+    Only bad pixels change, and only good ones are looked at as neighbours: the order does not matter.
+    """
+    ny, nx = thickness.shape
     guess = np.empty(49, np.float64)
     for k in range(rows.shape[0]):
         y, x = rows[k], columns[k]
@@ -138,8 +156,8 @@ def _leave_one_out(  # type: ignore[no-untyped-def]
         number = 0
         for b in range(max(y - 3, 0), min(y + 4, ny)):
             for a in range(max(x - 3, 0), min(x + 4, nx)):
-                if not bad[b, a] and np.isfinite(before[b, a]):
-                    guess[number] = before[b, a]
+                if not bad[b, a] and np.isfinite(thickness[b, a]):
+                    guess[number] = thickness[b, a]
                     number += 1
         if number < 4:
             continue

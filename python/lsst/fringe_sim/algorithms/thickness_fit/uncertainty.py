@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from .amplitudes import Amplitudes
 from .cells import core, load_row, run_threaded
-from .global_fit import GlobalFit, spread_to_pixels
+from .global_fit import GlobalFit
 from .newton import gauss_newton
 from .templates import FringeTemplates
 
@@ -38,10 +38,16 @@ def slip_probability(found: GlobalFit) -> NDArray[np.float32]:
     """
     settled = found.settled
     by_segment = np.append(settled.segment_slip, 1.0)[settled.segment]
-    by_cell = 1.0 - (1.0 - by_segment) * (1.0 - settled.cell_slip)
-    by_pixel = spread_to_pixels(found.cells, by_cell.astype(np.float32))
-    stays = (1.0 - found.common_slip) * (1.0 - by_pixel) * (1.0 - found.border_slip)
-    return np.asarray(1.0 - stays, dtype=np.float32)
+    stays = (1.0 - found.common_slip) * (1.0 - by_segment) * (1.0 - settled.cell_slip)
+    lines = np.repeat(stays.astype(np.float32), np.diff(found.cells.x_edges), axis=1)
+    slip = np.empty_like(found.border_slip)
+    for line, low, high in zip(lines, found.cells.y_edges[:-1], found.cells.y_edges[1:], strict=True):
+        # A few rows at a time stay in the cache of the processor.
+        part = slip[low:high]
+        np.subtract(np.float32(1), found.border_slip[low:high], out=part)
+        part *= line
+        np.subtract(np.float32(1), part, out=part)
+    return slip
 
 
 def lone_slip_probability(
