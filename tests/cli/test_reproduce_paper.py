@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from astropy.table import Table
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.paper import published_numbers
+from lsst.fringe_sim.paper.section import Curve, Graph, Picture, Section
+from lsst.fringe_sim.report.paper_page import section_figures
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("FRINGE_SIM_SHARED", CHECKOUT.parent / "shared"))
@@ -78,6 +81,40 @@ def test_dry_run_writes_nothing(tmp_path, capsys) -> None:
 def test_sizes_are_checked_before_work(size, tmp_path, capsys) -> None:
     assert run(["reproduce-paper", "--out", str(tmp_path / "paper"), "--size", size]) == 1
     assert "--size" in capsys.readouterr().err
+
+
+def test_curves_are_taken_from_the_first_folder_that_has_some(tmp_path, monkeypatch, capsys) -> None:
+    (tmp_path / "shared" / "measured").mkdir(parents=True)
+    (tmp_path / "elsewhere" / "measured").mkdir(parents=True)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    monkeypatch.delenv("FRINGE_SIM_SHARED", raising=False)
+    arguments = ["reproduce-paper", "--out", str(tmp_path / "paper"), "--dry-run"]
+    assert run(arguments) == 0
+    assert "compared with curves in ../shared" in capsys.readouterr().out
+    monkeypatch.setenv("FRINGE_SIM_SHARED", str(tmp_path / "elsewhere"))
+    assert run(arguments) == 0
+    assert "elsewhere" in capsys.readouterr().out
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FRINGE_SIM_SHARED", str(tmp_path / "work"))
+    assert run(arguments) == 0
+    assert "without published curves" in capsys.readouterr().out
+
+
+def test_logarithmic_graphs_leave_out_what_cannot_be_drawn() -> None:
+    x = np.arange(4.0)
+    faint = Curve(x, np.array([1.0, 1e-9, -1.0, 2.0]), "faint")
+    section = Section("s", "", {}, (Graph("g", "x [px]", "y [1]", (faint, faint), True, 1e-6),))
+    (made,) = section_figures(section)
+    drawn = np.asarray(made.axes[0].lines[0].get_ydata(), dtype=float)
+    assert np.array_equal(np.isnan(drawn), [False, True, True, False])
+    assert made.axes[0].get_ylim()[1] > 2.2, "the legend has room above the curves"
+
+
+def test_pictures_of_a_thinned_sensor_have_its_pixels_on_their_axes() -> None:
+    section = Section("s", "", {}, (Picture("map", "µm", np.ones((50, 40)), step_px=4.0),))
+    (made,) = section_figures(section)
+    assert made.axes[0].images[0].get_extent() == [-0.5, 159.5, -0.5, 199.5]
 
 
 def test_a_folder_without_curves_is_refused(tmp_path, capsys) -> None:

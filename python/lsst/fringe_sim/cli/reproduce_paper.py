@@ -19,6 +19,8 @@ from .progress import progress
 __all__ = ["reproduce_paper"]
 
 ENVIRONMENT = "FRINGE_SIM_SHARED"
+BESIDE = Path("../shared")
+"""Where the published curves lie beside a development checkout."""
 DETAIL_PX = 1000
 DETAIL_CORNER = (1500, 1500)
 LEAST_SIDE = 64
@@ -38,7 +40,8 @@ LEAST_SIDE = 64
     "--published",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     default=None,
-    help=f"Folder with curves read off the published figures (measured/); by default ${ENVIRONMENT}, if set.",
+    help="Folder with curves read off the published figures (measured/); "
+    f"by default ${ENVIRONMENT}, then {BESIDE}, where they are there.",
 )
 @click.option(
     "--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of noise and rotations."
@@ -62,9 +65,10 @@ def reproduce_paper(
         raise InputError(
             "--size", f"{columns}x{rows}", f"{LEAST_SIDE} px a side to {E2V_SHAPE[1]}x{E2V_SHAPE[0]}"
         )
-    folder = published or _from_environment()
+    folder = published or _found()
     if dry_run:
-        click.echo(f"would recompute {len(SECTIONS)} sections into {out}")
+        compared = f"compared with curves in {folder}" if folder else "without published curves"
+        click.echo(f"would recompute {len(SECTIONS)} sections into {out}, {compared}")
         return
     context = Context(
         e2v_321((rows, columns)),
@@ -75,6 +79,8 @@ def reproduce_paper(
     )
     target = prepare_folder(out)
     notices = []
+    if folder is not None:
+        click.echo(f"published curves: {folder}", err=True)
     if folder is None:
         notices.append(
             "Curves and maps read off the published figures are not at hand: comparisons with them are skipped "
@@ -99,7 +105,10 @@ def reproduce_paper(
         click.echo(str(target / name))
 
 
-def _from_environment() -> Path | None:
-    """Folder that the environment names, if there are curves in it."""
-    path = Path(os.environ[ENVIRONMENT]) if os.environ.get(ENVIRONMENT) else None
-    return path if path is not None and (path / "measured").is_dir() else None
+def _found() -> Path | None:
+    """The first of the usual folders with curves in it."""
+    named = os.environ.get(ENVIRONMENT)
+    for path in ([Path(named)] if named else []) + [BESIDE]:
+        if (path / "measured").is_dir():
+            return path
+    return None

@@ -44,11 +44,7 @@ def components(context: Context) -> Section:
                 "scree",
                 "component",
                 "share of the variance",
-                (
-                    Curve(
-                        number, np.maximum(found.explained_variance_ratio, 1e-16), "night of the paper", "o"
-                    ),
-                ),
+                (Curve(number, np.asarray(found.explained_variance_ratio), "night of the paper", "o"),),
                 logarithmic=True,
             ),
             Graph("through the night", "local time [h]", "score [% of the largest]", scores),
@@ -74,15 +70,14 @@ def coadd(context: Context) -> Section:
     null = result.null[-1].xi[close]
     excess = float((result.coadd[-1].xi[close].mean() - null.mean()) / null.std(ddof=1))
     curves = [
-        Curve(found.separation_px, np.maximum(found.xi, 1e-13), f"{count} exposures")
+        Curve(found.separation_px, found.xi, "1 exposure" if count == 1 else f"{count} exposures")
         for count, found in zip(result.counts, result.coadd, strict=True)
     ]
     last = result.null[-1]
+    curves.append(Curve(last.separation_px, np.abs(last.xi), f"|noise|, {counts[-1]}", "--"))
     curves.append(
-        Curve(last.separation_px, np.maximum(np.abs(last.xi), 1e-13), f"|noise|, {counts[-1]}", "--")
+        Curve(last.separation_px, result.model[-1], f"ξ₁/N + (1 − 1/N) ξ_floor, N = {counts[-1]}", ".")
     )
-    law = np.maximum(result.model[-1], 1e-13)
-    curves.append(Curve(last.separation_px, law, f"ξ₁/N + (1 − 1/N) ξ_floor, N = {counts[-1]}", "."))
     rms = PERCENT * fringe_amplitudes(frame).rms
     return Section(
         "Coadds: Fig. 16",
@@ -90,5 +85,6 @@ def coadd(context: Context) -> Section:
         "photon noise. The paper takes nine sensors of one raft; the maps of the others are not shipped.",
         {"coadd_800": excess},
         (Graph("correlation of coadds", "separation [px]", "ξ [sky²]", tuple(curves), logarithmic=True),),
-        "Correlation of more and more exposures against that of as many exposures of noise.",
+        "Correlation of more and more exposures against that of as many exposures of noise; a line ends where the "
+        "correlation turns negative.",
     )

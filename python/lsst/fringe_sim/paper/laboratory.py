@@ -9,6 +9,7 @@ from scipy.ndimage import median_filter
 
 from ..algorithms.single_pixel import fit_single_pixel, published_pixel
 from ..algorithms.thickness_fit import fit_thickness
+from ..mock.thickness import E2V_SHAPE
 from ..model import FringeModel, Setup
 from ..products import FlatExposures, FringeCube
 from .section import Context, Curve, Graph, Picture, Section, missing
@@ -134,9 +135,13 @@ def flat_contrast(context: Context) -> Section:
         (
             Graph("one fringe order", "thickness / fringe order", "fringe amplitude [%]", tuple(curves)),
             Picture(
-                "detection layer", "flat / mean − 1 [%]", PERCENT * (picture / picture.mean() - 1.0), True
+                "detection layer",
+                "flat / mean − 1 [%]",
+                PERCENT * (picture / picture.mean() - 1.0),
+                True,
+                context.step_px,
             ),
-            Picture("adhesive", "thickness [µm]", context.thickness_um),
+            Picture("adhesive", "thickness [µm]", context.thickness_um, step_px=context.step_px),
         ),
         "Fringe profile at 960 nm, the flat of the whole sensor, and the thickness that makes it.",
     )
@@ -189,7 +194,7 @@ def raft(context: Context) -> Section:
         table = model.table((float(np.nanmin(layer)), float(np.nanmax(layer))), [WAVELENGTH_NM])
         image = table.lookup(layer)[0]
         flat = PERCENT * (image / image.mean() - 1.0)
-        pictures.append(Picture(title, "flat / mean − 1 [%]", flat, True))
+        pictures.append(Picture(title, "flat / mean − 1 [%]", flat, True, E2V_SHAPE[0] / len(flat)))
     values = {"row_jumps": float(jumping)}
     return Section("Raft: Fig. 7", text, values, tuple(pictures), "The nine sensors of RTM-020.")
 

@@ -28,6 +28,9 @@ EDGE_DEG = 1.44
 BINS = (10, 20, 50, 100)
 BEAM_NODES = 192
 
+FAINTEST = 1e-6
+"""Weight below which lines are not drawn."""
+
 
 def oh_lines(context: Context) -> Section:
     """Section 4.1, Figure 8, Eq. 4."""
@@ -39,7 +42,7 @@ def oh_lines(context: Context) -> Section:
     light = Illumination.spectrum(wavelength, photons, Beam.collimated())
     named = sum(item.photons.sum() for item in bands if item.name in NAMED_BANDS)
     curves = tuple(
-        Curve(item.wavelength_nm, np.maximum(item.photons / photons.sum(), 1e-6), item.name, ".")
+        Curve(item.wavelength_nm, item.photons / photons.sum(), item.name, ".")
         for item in bands
         if item.name in NAMED_BANDS
     )
@@ -53,8 +56,8 @@ def oh_lines(context: Context) -> Section:
             "line_weights": float(light.weight.sum()),
             "six_bands": float(named / photons.sum()),
         },
-        (Graph("LSST y band", "wavelength [nm]", "weight of a line", curves, logarithmic=True),),
-        "Normalised weight of every OH line, by vibrational band.",
+        (Graph("LSST y band", "wavelength [nm]", "weight of a line [1]", curves, True, FAINTEST),),
+        f"Normalised weight of every OH line above {FAINTEST:g}, by vibrational band.",
     )
 
 

@@ -12,6 +12,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..mock.thickness import E2V_SHAPE
 
 __all__ = ["Context", "Curve", "Graph", "Picture", "Section"]
 
@@ -30,23 +31,25 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Curves over one axis."""
+    """Curves over one axis; a logarithmic one leaves out what is not positive, and what is below ``lowest``."""
 
     title: str
     xlabel: str
     ylabel: str
     curves: tuple[Curve, ...]
     logarithmic: bool = False
+    lowest: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image ``[y, x]``; diverging colours for values of both signs."""
+    """An image ``[y, x]``; diverging colours for values of both signs; ``step_px`` pixels between samples."""
 
     title: str
     label: str
     values: NDArray[np.floating]
     diverging: bool = False
+    step_px: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,11 @@ class Context:
             raise InputError("exposures in a coadd", self.coadds, "2 or more")
         if self.shared is not None and not (self.shared / "measured").is_dir():
             raise InputError("published curves", str(self.shared), "a folder with a folder 'measured' in it")
+
+    @property
+    def step_px(self) -> float:
+        """Pixels of the sensor between samples of ``thickness_um``."""
+        return E2V_SHAPE[0] / len(self.thickness_um)
 
     def rng(self, section: str) -> np.random.Generator:
         """Generator of one section, so that sections do not depend on each other."""

@@ -74,8 +74,10 @@ def monocam(context: Context) -> Section:
         "OH lines through the LSST y band at f/4 and −120 °C, with the adhesive of E2V-CCD250-321.",
         values,
         (
-            Picture("MonoCam sky", "sky / mean − 1 [%]", PERCENT * (frame / frame.mean() - 1.0), True),
-            Graph("diagonal", "position along the diagonal", "sky / mean − 1 [%]", tuple(curves)),
+            Picture("MonoCam sky", *_relative(frame), True, context.step_px),
+            Graph(
+                "diagonal", "position along the diagonal [its length]", "sky / mean − 1 [%]", tuple(curves)
+            ),
         ),
         "Simulated, noiseless sky frame and its diagonal.",
     )
@@ -101,8 +103,10 @@ def hsc(context: Context) -> Section:
         "A random relief of 1.74 µm in 200 µm of silicon, HSC optics and filter. Only amplitudes can be compared.",
         {"hsc": half, "hsc_observed": half},
         (
-            Picture("HSC sky", "sky / mean − 1 [%]", PERCENT * (frame / frame.mean() - 1.0), True),
-            Graph("diagonal", "position along the diagonal", "sky / mean − 1 [%]", tuple(curves)),
+            Picture("HSC sky", *_relative(frame), True),
+            Graph(
+                "diagonal", "position along the diagonal [its length]", "sky / mean − 1 [%]", tuple(curves)
+            ),
         ),
         "Simulated fringes of a piece of an HSC sensor, and the diagonal of a measured one.",
     )
@@ -131,7 +135,7 @@ def lsst(context: Context) -> Section:
         values["lsst_edge_half"] = at_edge.half_peak_to_peak
         curves = theirs.curves
     pictures = tuple(
-        Picture(name, "sky / mean − 1 [%]", PERCENT * (frame / frame.mean() - 1.0), True)
+        Picture(name, *_relative(frame), True, context.step_px)
         for name, frame in (("field centre", centre), (f"{EDGE_DEG}° off axis", edge))
     )
     return Section(
@@ -141,7 +145,9 @@ def lsst(context: Context) -> Section:
         values,
         (
             *pictures,
-            Graph("diagonal", "position along the diagonal", "sky / mean − 1 [%]", tuple(curves)),
+            Graph(
+                "diagonal", "position along the diagonal [its length]", "sky / mean − 1 [%]", tuple(curves)
+            ),
         ),
         "Simulated, noiseless sky frames and their diagonals.",
     )
@@ -190,6 +196,11 @@ def surface_brightness(context: Context) -> Section:
         ),
         "What the smoothed image of the paper consists of, for a part of the sensor.",
     )
+
+
+def _relative(frame: FloatArray) -> tuple[str, FloatArray]:
+    """Label and values of a frame over its mean."""
+    return "sky / mean − 1 [%]", PERCENT * (frame / frame.mean() - 1.0)
 
 
 def _places(frame: FloatArray) -> FloatArray:

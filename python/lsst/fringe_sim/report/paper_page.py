@@ -86,7 +86,12 @@ def section_figures(section: Section) -> Iterator[Figure]:
         for panel, place in zip(section.panels, axes, strict=False):
             if isinstance(panel, Picture):
                 show_image(
-                    place, panel.values, label=panel.label, title=panel.title, diverging=panel.diverging
+                    place,
+                    panel.values,
+                    label=panel.label,
+                    title=panel.title,
+                    diverging=panel.diverging,
+                    step_px=panel.step_px,
                 )
             else:
                 _draw_graph(place, panel)
@@ -99,14 +104,27 @@ def _draw_graph(axes: Axes, graph: Graph) -> None:
     for curve in graph.curves:
         thick = {"o": {"ms": 4}, ".": {"ms": 3}}.get(curve.style, {"lw": 1.0})
         style = "o-" if curve.style == "o" and len(curve.x) > 2 and curve.label != "measured" else curve.style
-        axes.plot(curve.x, curve.y, style, label=curve.label, **thick)  # type: ignore[arg-type]
+        y = np.asarray(curve.y, dtype=float)
+        if graph.logarithmic:
+            y = np.where(y > graph.lowest, y, np.nan)
+        axes.plot(curve.x, y, style, label=curve.label, **thick)  # type: ignore[arg-type]
     axes.set_title(graph.title)
     axes.set_xlabel(graph.xlabel)
     axes.set_ylabel(graph.ylabel)
     if graph.logarithmic:
         axes.set_yscale("log")
     if len(graph.curves) > 1:
-        axes.legend(fontsize=7)
+        columns = 1 + len(graph.curves) // MANY
+        _leave_room(axes, -(-len(graph.curves) // columns))
+        axes.legend(fontsize=7, loc="upper right", ncols=columns)
+
+
+def _leave_room(axes: Axes, lines: int) -> None:
+    """Extend the vertical axis so that a legend of so many lines covers no curve."""
+    transform = axes.yaxis.get_transform()
+    low, high = transform.transform(np.array(axes.get_ylim()))
+    share = min(0.06 * lines + 0.02, 0.5)
+    axes.set_ylim(top=float(transform.inverted().transform(low + (high - low) / (1.0 - share))))
 
 
 def _add_table(report: Report, findings: Sequence[Finding], name: str, download: Table) -> None:

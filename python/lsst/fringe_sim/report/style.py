@@ -83,15 +83,19 @@ def show_image(
     diverging: bool = False,
     limits: tuple[float, float] | None = None,
     colorbar: bool = True,
+    step_px: float = 1.0,
 ) -> AxesImage:
-    """Draw an image in detector coordinates, thinned if it is large; masked pixels are grey."""
+    """Draw an image in detector coordinates, thinned if it is large; masked pixels are grey.
+
+    ``step_px`` is the number of pixels of the sensor between samples of the image.
+    """
     values = np.asarray(image, dtype=float)
     if mask is not None:
         values = np.where(np.asarray(mask) == 0, values, np.nan)
     thin = _thin(values)
     low, high = limits or finite_range(thin, symmetric=diverging)
     cmap = matplotlib.colormaps[DIVERGING if diverging else SEQUENTIAL].with_extremes(bad="0.75")
-    ny, nx = values.shape
+    ny, nx = (size * step_px for size in values.shape)
     drawn = axes.imshow(
         thin, cmap=cmap, vmin=low, vmax=high, extent=(-0.5, nx - 0.5, -0.5, ny - 0.5), aspect="equal"
     )
