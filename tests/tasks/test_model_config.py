@@ -5,8 +5,15 @@ import pytest
 from lsst.pex.config import FieldValidationError
 
 from lsst.fringe_sim.effects import EFFECTS, Effect
+from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.tasks import EpoxyFitConfig, FringeModelConfig, IsrFlatPrepConfig, RaftConfig
+from lsst.fringe_sim.tasks import (
+    EpoxyFitConfig,
+    FringeModelConfig,
+    IsrFlatPrepConfig,
+    RaftConfig,
+    SensorConfig,
+)
 from lsst.fringe_sim.tasks.model_config import ModelChoice
 
 
@@ -67,6 +74,17 @@ def test_a_raft_adds_to_and_wins_over_the_task() -> None:
         (lambda c: c.effects.update({"bandwidth.fwhm": -2.0}), "bandwidth.fwhm"),
         (lambda c: c.effects.update({"bandwidth": 2.0}), "name.parameter"),
         (lambda c: c.rafts.update({"R11": RaftConfig(setup="nowhere")}), "raft R11"),
+        (lambda c: c.rafts.update({"R1": RaftConfig()}), "raft is 'R1'; allowed: did you mean R"),
+        (lambda c: c.rafts.update({"RTM-20": RaftConfig()}), "did you mean RTM-020"),
+        (
+            lambda c: c.sensors.update({"R11_S1": SensorConfig()}),
+            "detector is 'R11_S1'; allowed: did you mean",
+        ),
+        (
+            lambda c: c.sensors.update({"R11_S01": SensorConfig(effects={"tilt": 1})}),
+            "sensor R11_S01: .*tilt",
+        ),
+        (lambda c: setattr(c, "camera", "lsstcam"), "did you mean lsstCam"),
     ],
 )
 def test_a_wrong_name_or_value_is_found_before_anything_runs(spoil, message: str) -> None:  # type: ignore[no-untyped-def]
@@ -74,6 +92,42 @@ def test_a_wrong_name_or_value_is_found_before_anything_runs(spoil, message: str
     spoil(made)
     with pytest.raises(FieldValidationError, match=message):
         made.validate()
+
+
+def test_names_are_those_of_the_camera_of_the_pipeline() -> None:
+    for camera, raft, other in (("lsstCam", "R11", "RTM-020"), ("ts8", "RTM-020", "R11")):
+        for kind, field in ((EpoxyFitConfig, "rafts"), (IsrFlatPrepConfig, "raft_setups")):
+            made = kind(camera=camera)
+            getattr(made, field)[raft] = RaftConfig() if field == "rafts" else "ts8_e2v"
+            made.validate()
+            getattr(made, field)[other] = RaftConfig() if field == "rafts" else "ts8_e2v"
+            with pytest.raises(
+                FieldValidationError, match=f"{camera}: raft is '{other}'; allowed: {raft}, its name"
+            ):
+                made.validate()
+
+
+def test_a_sensor_wins_over_its_raft_and_the_raft_over_the_task() -> None:
+    made = config(bandwidth__fwhm=2.4)
+    made.rafts["R11"] = RaftConfig(setup="bnl_ts8_e2v", effects={"bandwidth.fwhm": 0.7, "tilt.deg": 1.0})
+    made.sensors["R11_S01"] = SensorConfig(effects={"bandwidth.fwhm": 0.9})
+    camera = Camera.from_name("lsstCam")
+    assert made.choice_of(camera.detector("R11_S01")) == ModelChoice(
+        "bnl_ts8_e2v", {"bandwidth.fwhm": 0.9, "tilt.deg": 1.0}
+    )
+    assert made.choice_of(camera.detector("R11_S02")) == made.choice("R11")
+    assert made.choice_of(camera.detector("R22_S01")) == made.choice()
+
+
+def test_agreements_look_at_every_sensor() -> None:
+    lab, sky = config("ts8_e2v", bandwidth__fwhm=2.4), config("lsst_e2v", bandwidth__fwhm=2.4)
+    lab.sensors["R11_S01"] = SensorConfig(effects={"bandwidth.fwhm": 2.4})
+    assert lab.effects_by_raft == sky.effects_by_raft
+    lab.rafts["R11"] = RaftConfig(effects={"bandwidth.fwhm": 2.5})
+    sky.rafts["R11"] = RaftConfig(effects={"bandwidth.fwhm": 2.5})
+    assert lab.effects_by_raft != sky.effects_by_raft
+    sky.sensors["R11_S01"] = SensorConfig(effects={"bandwidth.fwhm": 2.4})
+    assert lab.effects_by_raft == sky.effects_by_raft
 
 
 def test_header_says_what_was_modelled() -> None:

@@ -13,10 +13,23 @@ from lsst.utils import doImportType
 
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.middleware import LsstCamFringe, Ts8Fringe
-from lsst.fringe_sim.tasks import EpoxyFitConfig, IsrFlatPrepConfig
+from lsst.fringe_sim.tasks import (
+    EffectDiscoveryConfig,
+    EpoxyFitConfig,
+    FringeForecastConfig,
+    IsrFlatPrepConfig,
+    SkyFringeSimConfig,
+)
 
 PIPELINES = resources.files("lsst.fringe_sim") / "pipelines"
 FILES = sorted(str(path.relative_to(Path(str(PIPELINES)))) for path in Path(str(PIPELINES)).rglob("*.yaml"))
+TASKS: dict[str, Any] = {
+    config.task_name: config
+    for config in (
+        *(EffectDiscoveryConfig, EpoxyFitConfig, FringeForecastConfig),
+        *(IsrFlatPrepConfig, SkyFringeSimConfig),
+    )
+}
 CONFIG = Path(str(resources.files("lsst.fringe_sim") / "config"))
 
 
@@ -172,3 +185,14 @@ def test_a_rafts_own_file_starts_from_that_of_its_camera(path: str, instrument: 
         for field in ("setup", "raft_setups", "rafts"):
             own, cameras = (getattr(item, field, {}) for item in (config, of_camera))
             assert (own if field == "setup" else set(own)) == (cameras if field == "setup" else set(cameras))
+
+
+@pytest.mark.parametrize(
+    "label", ["isrFlatPrep", "epoxyFit", "skyFringeSim", "effectDiscovery", "fringeForecast"]
+)
+def test_the_instrument_tells_every_task_with_rafts_its_camera(label: str) -> None:
+    for instrument in (LsstCamFringe, Ts8Fringe):
+        config = TASKS[label]()
+        instrument().applyConfigOverrides(label, config)
+        assert config.camera == instrument.camera_name
+        config.validate()

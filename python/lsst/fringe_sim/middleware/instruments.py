@@ -79,6 +79,12 @@ class FringeInstrument(Instrument):
         """Return the physical filter of the y band; `None` on a test stand."""
         return next((name for name, band in cls.sky_filters.items() if band == "y"), None)
 
+    def applyConfigOverrides(self, name: str, config: Any) -> None:
+        """Apply what the package knows of this instrument: its camera, and the files of `configPaths`."""
+        if "camera" in config:
+            config.camera = self.camera_name
+        super().applyConfigOverrides(name, config)
+
     def getRawFormatter(self, dataId: DataId) -> type[FormatterV2]:
         """Formatter of raw frames."""
         from .formatters import RawFrameFormatter

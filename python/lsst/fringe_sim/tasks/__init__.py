@@ -29,6 +29,7 @@ _LAZY = {
     "IsrFlatPrepConfig": ".isr_flat_prep",
     "IsrFlatPrepTask": ".isr_flat_prep",
     "RaftConfig": ".model_config",
+    "SensorConfig": ".model_config",
     "SkyFringeSimConfig": ".sky_fringe_sim",
     "SkyFringeSimTask": ".sky_fringe_sim",
     "UnusableDataError": ".quantum",

@@ -125,7 +125,7 @@ class EffectDiscoveryTask(PipelineTask):
         InputError
             Flats that do not belong together, or a set-up that contradicts them.
         """
-        choice = self.config.choice(detector.raft)
+        choice = self.config.choice_of(detector)
         cube = FringeCube.from_flats(flats, number=number)
         options = SearchOptions(most_cells=self.config.most_cells, significance=self.config.significance)
         rng = np.random.default_rng([self.config.seed, detector.id])

@@ -163,7 +163,7 @@ class EpoxyFitTask(PipelineTask):
         InputError
             Too few wavelengths, or flats that do not belong together.
         """
-        choice = self.config.choice(detector.raft)
+        choice = self.config.choice_of(detector)
         cube = FringeCube.from_flats(flats, number=number)
         setup = Setup.from_name(choice.setup)
         missing = self._check_wavelengths(cube.wavelength_nm, setup, detector)

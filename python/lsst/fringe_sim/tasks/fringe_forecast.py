@@ -183,7 +183,7 @@ class FringeForecastTask(PipelineTask):
             options=self.config.options(),
         )
         table = forecast.to_table()
-        header: dict[str, Any] = {**common_header(), **self.config.choice(detector.raft).header()}
+        header: dict[str, Any] = {**common_header(), **self.config.choice_of(detector).header()}
         table.meta.update(header, LINELIST=LINE_LIST)
         self.log.info(
             "%s: fringe rms %.4f %%, %.2f times the shot noise; after correction with %d templates %.3f times",

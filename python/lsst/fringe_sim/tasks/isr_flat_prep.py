@@ -25,6 +25,7 @@ from ..instrument.detector import Detector
 from ..instrument.raw_frame import RawFrame
 from ..model import Setup
 from ..products import CombinedBias, describe_mask
+from .camera_config import CameraConfig
 from .flat_prep_config import FlatPrepConfig
 from .model_config import by_raft
 from .quantum import common_header, data_id_of, sensor_of, unusable
@@ -76,7 +77,9 @@ class IsrFlatPrepConnections(PipelineTaskConnections, dimensions=("instrument", 
         return bool(self.config.min_wavelength_nm <= float(match[1]) <= self.config.max_wavelength_nm)
 
 
-class IsrFlatPrepConfig(FlatPrepConfig, PipelineTaskConfig, pipelineConnections=IsrFlatPrepConnections):
+class IsrFlatPrepConfig(
+    CameraConfig, FlatPrepConfig, PipelineTaskConfig, pipelineConnections=IsrFlatPrepConnections
+):
     """Configuration of `IsrFlatPrepTask`."""
 
     task_name: ClassVar[str] = "isrFlatPrep"
@@ -99,8 +102,9 @@ class IsrFlatPrepConfig(FlatPrepConfig, PipelineTaskConfig, pipelineConnections=
     )
 
     def validate(self) -> None:
-        """Refuse set-ups that do not exist or have no monochromator."""
+        """Refuse rafts and set-ups that do not exist, and set-ups that have no monochromator."""
         super().validate()
+        self.check_rafts(type(self).raft_setups, self.raft_setups)
         for field, name in (
             (type(self).setup, self.setup),
             *((type(self).raft_setups, name) for name in self.raft_setups.values()),

@@ -14,9 +14,11 @@ from lsst.pex.config import Config, ConfigDictField, DictField, Field, FieldVali
 
 from ..effects import EFFECTS, activate_effects
 from ..errors import InputError
+from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
+from .camera_config import CameraConfig
 
-__all__ = ["FringeModelConfig", "ModelChoice", "RaftConfig", "by_raft"]
+__all__ = ["FringeModelConfig", "ModelChoice", "RaftConfig", "SensorConfig", "by_raft"]
 
 Value = TypeVar("Value")
 
@@ -82,8 +84,19 @@ class RaftConfig(Config):
     )
 
 
-class FringeModelConfig(Config):
-    """Set-up and effects, with overrides for single rafts."""
+class SensorConfig(Config):
+    """What one sensor has of its own; its set-up is that of its raft, whose sensors come from one vendor."""
+
+    effects: DictField[str, float] = DictField(
+        keytype=str,
+        itemtype=float,
+        default={},
+        doc="Effects of this sensor by 'name.parameter'; they win over those of raft and task.",
+    )
+
+
+class FringeModelConfig(CameraConfig):
+    """Set-up and effects, with overrides for single rafts and sensors."""
 
     task_name: ClassVar[str] = ""
     """Name of the task; by it a raft's override file finds the file of its camera."""
@@ -101,9 +114,15 @@ class FringeModelConfig(Config):
     rafts: ConfigDictField = ConfigDictField(
         keytype=str, itemtype=RaftConfig, default={}, doc="What single rafts have of their own, by raft."
     )
+    sensors: ConfigDictField = ConfigDictField(
+        keytype=str,
+        itemtype=SensorConfig,
+        default={},
+        doc="What single sensors have of their own, by name, as 'R11_S01'.",
+    )
 
     def validate(self) -> None:
-        """Refuse set-ups and effects that do not exist.
+        """Refuse rafts, sensors, set-ups and effects that do not exist.
 
         Raises
         ------
@@ -111,26 +130,45 @@ class FringeModelConfig(Config):
             The field and what would be allowed are named.
         """
         super().validate()
-        for raft in ("", *self.rafts):
-            try:
-                self.choice(raft).model()
-            except InputError as error:
-                own = type(self).rafts if raft else type(self).effects
-                prefix = f"raft {raft}: " if raft else ""
-                raise FieldValidationError(own, self, f"{prefix}{error}") from error
+        kind = type(self)
+        self.check_rafts(kind.rafts, self.rafts)
+        self.check_sensors(kind.sensors, self.sensors)
+        self._check_model(kind.effects, "")
+        for raft in self.rafts:
+            self._check_model(kind.rafts, f"raft {raft}: ", raft)
+        for sensor in self.sensors:
+            self._check_model(kind.sensors, f"sensor {sensor}: ", _raft_of(sensor), sensor)
 
-    def choice(self, raft: str = "") -> ModelChoice:
-        """Set-up and effects of a sensor in the given raft."""
-        effects = dict(self.effects)
-        if raft not in self.rafts:
-            return ModelChoice(self.setup, effects)
-        own = self.rafts[raft]
-        return ModelChoice(own.setup or self.setup, {**effects, **own.effects})
+    def _check_model(self, field: Any, prefix: str, raft: str = "", sensor: str = "") -> None:
+        try:
+            self.choice(raft, sensor).model()
+        except InputError as error:
+            raise FieldValidationError(field, self, f"{prefix}{error}") from error
+
+    def choice(self, raft: str = "", sensor: str = "") -> ModelChoice:
+        """Set-up and effects of the task, of a raft, or of a sensor in it."""
+        setup, effects = self.setup, dict(self.effects)
+        if raft in self.rafts:
+            setup = self.rafts[raft].setup or setup
+            effects |= dict(self.rafts[raft].effects)
+        if sensor in self.sensors:
+            effects |= dict(self.sensors[sensor].effects)
+        return ModelChoice(setup, effects)
+
+    def choice_of(self, detector: Detector) -> ModelChoice:
+        """Set-up and effects of a sensor."""
+        return self.choice(detector.raft, detector.name)
 
     @property
     def effects_by_raft(self) -> dict[str, dict[str, float]]:
-        """Effects of the task under ``""``, and those of rafts that differ; for the contracts of pipelines."""
-        return by_raft({raft: dict(self.choice(raft).effects) for raft in ("", *self.rafts)})
+        """Effects of the task under ``""``, and those of rafts, and of sensors, that differ; for contracts."""
+        by_name = by_raft({raft: dict(self.choice(raft).effects) for raft in ("", *self.rafts)})
+        for sensor in self.sensors:
+            raft = _raft_of(sensor)
+            own = dict(self.choice(raft, sensor).effects)
+            if own != dict(self.choice(raft).effects):
+                by_name[sensor] = own
+        return by_name
 
     @property
     def setup_by_raft(self) -> dict[str, str]:
@@ -146,6 +184,11 @@ class FringeModelConfig(Config):
 def by_raft(values: Mapping[str, Value]) -> dict[str, Value]:
     """Drop the rafts that differ in nothing, so that two tasks agree if and only if their mappings are equal."""
     return {raft: value for raft, value in values.items() if not raft or value != values[""]}
+
+
+def _raft_of(sensor: str) -> str:
+    """Raft in the name of a sensor, as R11 in R11_S01."""
+    return sensor.rpartition("_")[0]
 
 
 def _sensor(setup: str) -> tuple[str, str]:

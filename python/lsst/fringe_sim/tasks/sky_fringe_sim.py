@@ -176,7 +176,7 @@ class SkyFringeSimTask(PipelineTask):
         detector = sensor_of(data_id)
         record: Any = data_id.records["exposure"]
         with unusable(f"{detector.name}, exposure {record.id}"):
-            setup = Setup.from_name(self.config.choice(detector.raft).setup)
+            setup = Setup.from_name(self.config.choice_of(detector).setup)
             exposure = SkyExposure(
                 exposure_id=record.id,
                 day_obs=record.day_obs,
@@ -213,7 +213,7 @@ class SkyFringeSimTask(PipelineTask):
         OutOfRangeError
             An hour outside the tabulated night.
         """
-        choice = self.config.choice(detector.raft)
+        choice = self.config.choice_of(detector)
         layer = self.config.map_of(thickness, detector)
         if choice.left_out:
             self.log.info("%s: on the sky without %s", detector.name, ", ".join(choice.left_out))

@@ -169,7 +169,7 @@ class SkyModelConfig(FringeModelConfig):
             There is none and stand-ins are not wanted; or the map is of another layer, or was fitted with other
             effects than those configured here.
         """
-        choice = self.choice(detector.raft)
+        choice = self.choice_of(detector)
         if thickness is not None:
             _check_map(thickness, choice)
             return thickness
@@ -180,7 +180,7 @@ class SkyModelConfig(FringeModelConfig):
 
     def sky_model(self, detector: Detector, airmass: float, thickness_um: NDArray[np.float32]) -> SkyModel:
         """What the response of a sensor depends on."""
-        choice = self.choice(detector.raft)
+        choice = self.choice_of(detector)
         setup = Setup.from_name(choice.setup)
         return SkyModel(
             choice=(choice.setup, tuple(sorted(choice.applied_effects.items()))),
