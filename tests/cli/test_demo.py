@@ -85,8 +85,11 @@ def test_report_shows_every_section(done) -> None:
         "Night sky",
         "Templates",
         "One measured pixel",
+        "Search for a missing effect",
     ):
         assert title in text
+    evidence = (done[0] / "discovery" / "report.html").read_text(encoding="utf-8")
+    assert "Data minus model" in evidence
     assert len(list((done[0] / "figures").glob("*.png"))) >= 7
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,13 @@ from astropy.table import Table
 
 from lsst.daf.butler import Butler
 
+from ..algorithms.discovery import Verdict
+from ..algorithms.flat_residual import relative_flats
 from ..algorithms.single_pixel import fit_single_pixel, published_pixel
 from ..model import FringeModel
 from ..products import FringeComponents, FringeCube, FringeFrame, SkyFringe, ThicknessMap
+from ..report.discovery_figures import candidates_figure, where_figure
+from ..report.discovery_page import headline
 from ..report.figures import (
     components_figure,
     flats_figure,
@@ -27,7 +30,7 @@ from ..report.figures import (
 )
 from ..report.page import Report
 from ..report.style import save_figure
-from .fit import phase_folded, relative
+from .fit import phase_folded
 
 __all__ = ["DemoDatasets", "write_demo_report"]
 
@@ -88,7 +91,9 @@ def write_demo_report(folder: Path, datasets: DemoDatasets) -> None:
         "Twelve monochromatic flats after overscan, bias and gain, divided by their mean. Contrast grows with "
         "wavelength as the silicon turns transparent and more light reaches the adhesive behind it.",
     )
-    gallery = flats_figure(relative(datasets.cube), datasets.cube.mask, wavelength, title="prepared flats")
+    gallery = flats_figure(
+        relative_flats(datasets.cube), datasets.cube.mask, wavelength, title="prepared flats"
+    )
     add("flats", gallery, "Fringe amplitude of all flats on one scale.")
     report.section("Thickness of the adhesive", "One contour is one fringe order at 960 nm, 0.3 µm.")
     order = float(model.fringe_order_um(960.0))
@@ -97,7 +102,7 @@ def write_demo_report(folder: Path, datasets: DemoDatasets) -> None:
     add("phase", phase_figure(phase, data, modelled, wavelength), "Flats and model folded on fringe phase.")
     _sky_section(report, add, datasets)
     _pixel_section(report, add, model)
-    _discovery_section(report, folder)
+    _discovery_section(report, add, folder)
     report.write(folder / "report.html")
 
 
@@ -164,25 +169,28 @@ def _pixel_section(report: Report, add: Any, model: FringeModel) -> None:
     )
 
 
-def _discovery_section(report: Report, folder: Path) -> None:
+def _discovery_section(report: Report, add: Any, folder: Path) -> None:
     path = folder / "discovery" / "discovery.json"
     if not path.is_file():
         return
-    verdict = json.loads(path.read_text(encoding="utf-8"))
-    gap = verdict.get("gap", {})
-    words = {
-        "no_discrepancy": "The flats agree with the model within their noise: no effect is missing.",
-        "named": "An effect is missing: "
-        + ", ".join(f"{item['name']} (probability {item['probability']:.2f})" for item in verdict["effects"]),
-        "unexplained": "The flats disagree with the model in a way that no known effect explains.",
-    }
-    report.section("Search for a missing effect", words[verdict["verdict"]])
-    if gap:
-        rows = [(key, value) for key, value in gap.items() if isinstance(value, int | float)]
-        report.table(
-            Table(rows=rows, names=["gap between data and model", "value"]) if rows else Table(),
-            "discovery_gap",
-        )
+    verdict = Verdict.from_json(path.read_text(encoding="utf-8"))
+    report.section(
+        "Search for a missing effect",
+        f"{headline(verdict)}. The whole evidence is in discovery/report.html.",
+    )
+    if verdict.where.channels:
+        add("discovery_where", where_figure(verdict), "Where the flats and the unchanged model disagree.")
+    if verdict.candidates:
+        add("discovery_candidates", candidates_figure(verdict), "What could explain it.")
+    gap = verdict.gap
+    rows = [
+        ("all data", gap.before, gap.after, gap.noise_floor),
+        ("held out", gap.heldout_before, gap.heldout_after, gap.noise_floor),
+    ]
+    table = Table(rows=rows, names=("rms of data minus model", "before", "after", "noise floor"))
+    for name in ("before", "after", "noise floor"):
+        table[name].info.format = ".6f"
+    report.table(table, "discovery_gap")
 
 
 def _refs(butler: Butler, name: str, collection: str) -> list[Any]:

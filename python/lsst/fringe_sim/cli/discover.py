@@ -14,6 +14,8 @@ from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..errors import InputError
 from ..model import FringeModel, Setup
 from ..products import FringeCube
+from ..report import discovery_page
+from ..report.discovery_page import residual_pair
 from .inputs import prepare_folder, read_settings
 from .lab_frames import find_series, read_cube
 from .parameters import EFFECT, effect_settings
@@ -81,8 +83,9 @@ def discover(
         report=lambda line: click.echo(line, err=True),
     )
     path = verdict.write(folder)
+    discovery_page(verdict, residual_pair(cube, model, verdict)).write(folder / "report.html")
     _say(verdict)
-    for name in (path.name, "discovery.ecsv", "effects.py"):
+    for name in (path.name, "discovery.ecsv", "effects.py", "report.html"):
         click.echo(str(folder / name))
 
 

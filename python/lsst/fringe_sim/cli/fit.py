@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..algorithms.flat_prep_options import FlatPrepOptions
+from ..algorithms.flat_residual import relative_flats
 from ..algorithms.thickness_fit import FIT_METHODS, fit_thickness
 from ..errors import InputError
 from ..model import FringeModel, Setup
@@ -135,7 +136,7 @@ def write_report(
     )
     report.section("Flats", "Counts over their mean, minus one.")
     report.figure(
-        flats_figure(relative(cube), cube.mask, wavelength, title="prepared flats"), "All flats on one scale."
+        flats_figure(relative_flats(cube), cube.mask, wavelength, title="prepared flats"), "All flats on one scale."
     )
     report.section(
         "Data and model", "Folded on the fitted thickness, modulo one fringe order of each wavelength."
@@ -145,13 +146,6 @@ def write_report(
         phase_figure(phase, data, modelled, wavelength), "Mean of all pixels of equal fringe phase."
     )
     return report.write(folder / "report.html")
-
-
-def relative(cube: FringeCube) -> NDArray[np.float64]:
-    """Counts over mean, minus one, whatever the unit of the cube."""
-    image = np.where(cube.mask == 0, np.asarray(cube.image, dtype=float), np.nan)
-    mean = np.nanmean(image, axis=(1, 2), keepdims=True)
-    return image / mean - 1.0
 
 
 def phase_folded(
@@ -170,7 +164,7 @@ def phase_folded(
     place = (thickness - low) / step
     index = np.minimum(place.astype(int), count - 2)
     fraction = place - index
-    data = relative(cube)
+    data = relative_flats(cube)
     measured = np.empty((len(table), PHASE_BINS))
     modelled = np.empty_like(measured)
     orders = model.fringe_order_um(cube.wavelength_nm)

@@ -18,7 +18,7 @@ from ..algorithms.focal_plane import DES_CRITERION
 from ..algorithms.single_pixel import SinglePixelFit
 from ..errors import InputError
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
-from .style import DIVERGING, LINES, SEQUENTIAL, figure, finite_range, show_image
+from .style import DIVERGING, LINES, MOST_PIXELS, SEQUENTIAL, figure, finite_range, show_image
 
 __all__ = [
     "components_figure",
@@ -87,15 +87,31 @@ def flats_figure(
     *,
     title: str,
     unit: str = "fringe amplitude [%]",
+    limits: tuple[float, float] | None = None,
+    most_px: int = MOST_PIXELS,
 ) -> Figure:
-    """Gallery of frames ``[wavelength, y, x]`` on one colour scale."""
+    """Gallery of frames ``[wavelength, y, x]`` on one colour scale.
+
+    Parameters
+    ----------
+    amplitude, mask : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Frames as fractions, and where they are not to be shown.
+    wavelength_nm : sequence of `float`
+        Wavelengths [nm].
+    title, unit : `str`
+        Title, and label of the colour scale.
+    limits : `tuple` [`float`, `float`], optional
+        Ends of the colour scale [%]; from the frames if not given.
+    most_px : `int`, optional
+        Frames are averaged down to about this many pixels a side.
+    """
     count = len(wavelength_nm)
     columns = min(6, count)
     rows = -(-count // columns)
     with figure(2.1 * columns + 0.6, 2.15 * rows + 0.5) as made:
         panels = np.atleast_1d(made.subplots(rows, columns, sharex=True, sharey=True)).ravel()
         values = PERCENT * np.where(np.asarray(mask) == 0, amplitude, np.nan)
-        limits = finite_range(values[:, ::7, ::7], symmetric=True)
+        limits = limits or finite_range(values[:, ::7, ::7], symmetric=True)
         for panel, image, wavelength in zip(panels, values, wavelength_nm, strict=False):
             drawn = show_image(
                 panel,
@@ -105,12 +121,15 @@ def flats_figure(
                 diverging=True,
                 limits=limits,
                 colorbar=False,
+                most_px=most_px,
             )
             panel.set_xlabel("")
             panel.set_ylabel("")
             panel.tick_params(labelsize=6)
         for panel in panels[count:]:
             panel.set_visible(False)
+        made.supxlabel("column [px]", fontsize=8)
+        made.supylabel("row [px]", fontsize=8)
         made.colorbar(drawn, ax=list(panels), label=unit, shrink=0.8)
         made.suptitle(title)
         return made

@@ -27,6 +27,7 @@ img { box-sizing: border-box; max-width: 100%; height: auto; border: 1px solid #
 .zoom input { position: absolute; opacity: 0; } .zoom { display: block; overflow-x: auto; cursor: zoom-in; }
 .zoom input:checked + img { max-width: none; cursor: zoom-out; }
 .zoom input:focus-visible + img { outline: 3px solid #0072b2; }
+pre { overflow-x: auto; background: #f5f5f5; padding: .6rem; font-size: .85rem; }
 .tables { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .92rem; }
 th, td { padding: .25rem .7rem; border-bottom: 1px solid #ddd; text-align: right; white-space: nowrap; }
@@ -73,6 +74,10 @@ class Report:
         if items:
             lines = "".join(f"<li><b>{html.escape(one)}</b>: {html.escape(two)}</li>" for one, two in items)
             self._body.append(f'<ul class="small">{lines}</ul>')
+
+    def code(self, text: str) -> None:
+        """Add lines to be typed."""
+        self._body.append(f"<pre>{html.escape(text)}</pre>")
 
     def figure(self, made: Figure, caption: str) -> None:
         """Add a figure; a click enlarges it."""

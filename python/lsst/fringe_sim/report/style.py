@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 __all__ = [
     "DIVERGING",
     "LINES",
+    "MOST_PIXELS",
     "SEQUENTIAL",
     "figure",
     "finite_range",
@@ -84,15 +85,17 @@ def show_image(
     limits: tuple[float, float] | None = None,
     colorbar: bool = True,
     step_px: float = 1.0,
+    most_px: int = MOST_PIXELS,
 ) -> AxesImage:
     """Draw an image in detector coordinates, thinned if it is large; masked pixels are grey.
 
-    ``step_px`` is the number of pixels of the sensor between samples of the image.
+    ``step_px`` is the number of pixels of the sensor between samples of the image; it is averaged down to about
+    ``most_px`` pixels a side.
     """
     values = np.asarray(image, dtype=float)
     if mask is not None:
         values = np.where(np.asarray(mask) == 0, values, np.nan)
-    thin = _thin(values)
+    thin = _thin(values, most_px)
     low, high = limits or finite_range(thin, symmetric=diverging)
     cmap = matplotlib.colormaps[DIVERGING if diverging else SEQUENTIAL].with_extremes(bad="0.75")
     ny, nx = (size * step_px for size in values.shape)
@@ -123,9 +126,9 @@ def save_figure(made: Figure, path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def _thin(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _thin(values: NDArray[np.float64], most_px: int) -> NDArray[np.float64]:
     """Mean over square blocks, so that fringes do not alias when a large image is drawn small."""
-    block = max(1, min(values.shape) // MOST_PIXELS)
+    block = max(1, min(values.shape) // most_px)
     if block == 1:
         return values
     ny, nx = (size // block * block for size in values.shape)

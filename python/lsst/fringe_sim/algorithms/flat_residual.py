@@ -1,0 +1,144 @@
+"""What a model leaves of the flats of a sensor: images of data minus model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..effects import ImageGeometry, apply_to_image
+from ..errors import InputError
+from ..model import FringeModel
+from ..products import FringeCube, ThicknessMap
+from .thickness_fit import fit_thickness
+
+__all__ = ["FlatResidual", "fit_and_compare", "flat_residual", "relative_flats"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FlatResidual:
+    """Flats of a sensor beside a model at its best thickness.
+
+    Attributes
+    ----------
+    wavelength_nm : `numpy.ndarray`, shape ``(W,)``
+        Wavelengths [nm].
+    residual : `numpy.ndarray`, float32, shape ``(W, ny, nx)``
+        Data minus model, each over its mean; NaN where a pixel is masked.
+    thickness : `ThicknessMap`
+        Thickness at which the model was taken.
+    """
+
+    wavelength_nm: FloatArray
+    residual: NDArray[np.float32]
+    thickness: ThicknessMap
+
+    @property
+    def rms(self) -> FloatArray:
+        """Root mean square of each plane, shape ``(W,)``; NaN for a plane without a good pixel."""
+        squares = [np.square(plane[np.isfinite(plane)], dtype=float) for plane in self.residual]
+        return np.array([np.sqrt(values.mean()) if values.size else np.nan for values in squares])
+
+
+def relative_flats(cube: FringeCube) -> FloatArray:
+    """Counts over their mean, minus one, whatever the unit of the cube; NaN where a pixel is masked.
+
+    Parameters
+    ----------
+    cube : `FringeCube`
+        Flats.
+
+    Returns
+    -------
+    relative : `numpy.ndarray`, shape ``(W, ny, nx)``
+    """
+    image = np.where(cube.mask == 0, np.asarray(cube.image, dtype=float), np.nan)
+    return image / _plane_mean(image) - 1.0
+
+
+def flat_residual(
+    cube: FringeCube, model: FringeModel, thickness_um: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """Flats minus model at a given thickness, each plane over its mean.
+
+    Parameters
+    ----------
+    cube : `FringeCube`
+        Flats; masked pixels become NaN.
+    model : `FringeModel`
+        Its effects on light, response and image are all applied.
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness of the varying layer [µm]; NaN where it is not known.
+
+    Returns
+    -------
+    residual : `numpy.ndarray`, float32, shape ``(W, ny, nx)``
+
+    Raises
+    ------
+    InputError
+        The map does not fit the cube, or no thickness is known.
+    """
+    thickness = np.asarray(thickness_um, dtype=float)
+    if thickness.shape != cube.shape[1:]:
+        raise InputError("shape of the thickness map", thickness.shape, f"{cube.shape[1:]}")
+    known = np.isfinite(thickness)
+    if not known.any():
+        raise InputError("known pixels of the thickness map", 0, "one or more")
+    filled = np.where(known, thickness, thickness[known].mean())
+    wavelength = np.asarray(cube.wavelength_nm, dtype=float)
+    table = model.table((float(filled.min()), float(filled.max()) + 1e-6), wavelength)
+    image: NDArray[np.floating] = np.stack([table.frame(filled, row) for row in range(len(wavelength))])
+    if any(active.effect.acts_on == "image" for active in model.effects):
+        level = image.mean(axis=(1, 2), keepdims=True, dtype=float)
+        geometry = ImageGeometry.of_pixels((filled.shape[0], filled.shape[1]), wavelength, _levels(cube))
+        image = apply_to_image(model.effects, model.base_system, image / level, geometry)
+    residual = np.full(cube.shape, np.nan, dtype=np.float32)
+    for plane, modelled in enumerate(image):
+        # Both over the mean of the same pixels.
+        good = known & (cube.mask[plane] == 0)
+        if good.any():
+            data = np.asarray(cube.image[plane], dtype=float)[good]
+            residual[plane][good] = data / data.mean() - modelled[good] / modelled[good].mean(dtype=float)
+    return residual
+
+
+def fit_and_compare(cube: FringeCube, model: FringeModel) -> FlatResidual:
+    """Fit the thickness, and subtract the model at it.
+
+    Pixels whose fit is bad are kept: they are what is looked for. The fit knows the effects on light, stack and
+    response, not those on the image.
+
+    Parameters
+    ----------
+    cube : `FringeCube`
+        Flats at four wavelengths or more.
+    model : `FringeModel`
+        The model.
+
+    Raises
+    ------
+    InputError
+        No good pixel.
+    """
+    fitted = fit_thickness(cube, model)
+    residual = flat_residual(cube, model, fitted.value)
+    return FlatResidual(np.asarray(cube.wavelength_nm, dtype=float), residual, fitted)
+
+
+def _plane_mean(image: FloatArray) -> FloatArray:
+    """Mean of each plane over its numbers, shape ``(W, 1, 1)``; NaN for a plane without any."""
+    count = np.isfinite(image).sum(axis=(1, 2), keepdims=True)
+    total = np.nansum(image, axis=(1, 2), keepdims=True)
+    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+
+
+def _levels(cube: FringeCube) -> FloatArray | float:
+    """Mean electrons of each plane; 0 where the cube does not tell."""
+    if cube.unit != "electron":
+        return 0.0
+    image = np.where(cube.mask == 0, np.asarray(cube.image, dtype=float), np.nan)
+    return np.nan_to_num(_plane_mean(image)[:, 0, 0])

@@ -1,0 +1,217 @@
+"""Figures of a search for missing effects: where data and model disagree, who could explain it, what is left."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..algorithms.discovery import Verdict
+from .style import DIVERGING, LINES, figure
+
+__all__ = ["candidates_figure", "gap_figure", "leftover_figure", "where_figure"]
+
+PERCENT = 100.0
+SMALLEST = 1e-300
+"""Probabilities below this are drawn at it."""
+
+CHANCE_LIMIT = 1e-3
+"""Chance below which a test says that there is a disagreement."""
+
+MOST_CANDIDATES = 15
+HALVES = ("C1", "C0")
+"""Rows of amplifiers, the upper one first."""
+
+CHANNELS_PER_HALF = 8
+
+
+def where_figure(verdict: Verdict) -> Figure:
+    """Disagreement before anything is added: by wavelength, fringe phase, amplifier and test."""
+    where = verdict.where
+    with figure(10.5, 7.2) as made:
+        (colour, phase), (amplifier, tests) = made.subplots(2, 2)
+        _draw_wavelengths(colour, where.wavelength)
+        _draw_phase(phase, where.thickness_phase)
+        _draw_amplifiers(amplifier, where.amplifier)
+        _draw_tests(tests, where.channels)
+        return made
+
+
+def candidates_figure(verdict: Verdict) -> Figure:
+    """Fall of χ² that each effect promises, the most promising first; those that were found stand out."""
+    found = {effect.name for effect in verdict.effects}
+    alike = {other for effect in verdict.effects for other in effect.ambiguous_with} - found
+    shown = [item for item in verdict.candidates if item["score"] > 0.0][:MOST_CANDIDATES]
+    with figure(8.0, 1.2 + 0.27 * max(len(shown), 3)) as made:
+        axes = made.subplots()
+        kinds = [
+            ("named", LINES[1], "", found),
+            ("in the same class", LINES[5], "//", alike),
+            ("not chosen", LINES[4], "", {item["name"] for item in shown} - found - alike),
+        ]
+        place = np.arange(len(shown))
+        for label, color, hatch, names in kinds:
+            chosen = [k for k, item in enumerate(shown) if item["name"] in names]
+            if chosen:
+                axes.barh(
+                    place[chosen],
+                    [shown[k]["score"] for k in chosen],
+                    color=color,
+                    hatch=hatch,
+                    edgecolor="white",
+                    label=label,
+                )
+        axes.set_yticks(place, [item["name"] for item in shown])
+        axes.invert_yaxis()
+        axes.set_xlabel("fall of χ² promised by the score test [1]")
+        axes.set_title("candidates")
+        if shown:
+            axes.legend(loc="lower right", fontsize=8, frameon=True)
+        return made
+
+
+def gap_figure(verdict: Verdict) -> Figure:
+    """Rms of data minus model before and after, for all data and for those held out, above the noise floor."""
+    gap = verdict.gap
+    with figure(9.0, 3.6) as made:
+        left, right = made.subplots(1, 2, width_ratios=(2, 3))
+        pairs = (("all data", gap.before, gap.after), ("held out", gap.heldout_before, gap.heldout_after))
+        for place, (_, before, after) in enumerate(pairs):
+            for offset, value, color, label in (
+                (-0.2, before, LINES[4], "without the effects"),
+                (0.2, after, LINES[1], "with the effects"),
+            ):
+                left.bar(
+                    place + offset, PERCENT * value, 0.36, color=color, label=label if place == 0 else None
+                )
+        left.axhline(PERCENT * gap.noise_floor, color="black", ls="--", lw=1, label="noise floor")
+        left.set_xticks(range(len(pairs)), [name for name, _, _ in pairs])
+        left.set_ylabel("rms of data − model [%]")
+        finite = [value for _, *values in pairs for value in values if math.isfinite(value)]
+        if finite:
+            left.set_ylim(0.0, PERCENT * max(*finite, gap.noise_floor) * 1.45)
+        left.legend(fontsize=7, loc="upper right")
+        left.set_title("gap")
+        values = [step.gap_before for step in verdict.steps[:1]] + [step.gap_after for step in verdict.steps]
+        labels = ["before"] + ["+ " + " + ".join(step.added) for step in verdict.steps]
+        if values:
+            right.plot(range(len(values)), [PERCENT * value for value in values], "o-", color=LINES[0])
+            right.axhline(PERCENT * gap.noise_floor, color="black", ls="--", lw=1)
+            right.set_xticks(range(len(values)), labels)
+            right.set_xlim(-0.4, len(values) - 0.6)
+            right.set_ylabel("rms of data − model [%]")
+            right.set_title("step by step, on the data of the selection")
+        else:
+            right.set_visible(False)
+        return made
+
+
+def leftover_figure(unexplained: Mapping[str, Any]) -> Figure:
+    """What is left over: waveform over the fringe phase, wavelengths, spatial scales."""
+    with figure(13.0, 3.6) as made:
+        phase, colour, scale = made.subplots(1, 3)
+        _draw_phase(phase, unexplained.get("thickness_phase_waveform", ()))
+        rows = unexplained.get("wavelength", ())
+        colour.plot(
+            [row["wavelength_nm"] for row in rows],
+            [PERCENT * row["variance_beyond_noise"] for row in rows],
+            "o-",
+        )
+        colour.axhline(0.0, color="0.6", lw=0.8)
+        colour.set_xlabel("wavelength [nm]")
+        colour.set_ylabel("variance beyond noise [% of the noise]")
+        colour.set_title("by wavelength")
+        power = unexplained.get("spatial_power", ())
+        scale.semilogx([row["scale_px"] for row in power], [row["power"] for row in power], "o-")
+        scale.axhline(1.0, color="black", ls="--", lw=1, label="noise")
+        scale.set_xlabel("spatial scale [px]")
+        scale.set_ylabel("power over that of noise [1]")
+        scale.set_title("by scale")
+        scale.legend()
+        return made
+
+
+def _draw_wavelengths(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
+    axes.bar(
+        [row["wavelength_nm"] for row in rows],
+        [row["chi2"] / row["degrees"] for row in rows],
+        width=0.7 * _step([row["wavelength_nm"] for row in rows]),
+        color=LINES[0],
+    )
+    axes.axhline(1.0, color="black", ls="--", lw=1, label="noise alone")
+    axes.set_yscale("symlog", linthresh=1.0)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("wavelength [nm]")
+    axes.set_ylabel("χ² of the fringe pattern / degrees [1]")
+    axes.set_title("by wavelength")
+    axes.legend(fontsize=7, loc="upper left", frameon=True)
+
+
+def _draw_phase(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
+    axes.errorbar(
+        [row["phase"] for row in rows],
+        [PERCENT * row["residual"] for row in rows],
+        [PERCENT * row["sigma"] for row in rows],
+        fmt="o",
+        ms=4,
+        capsize=2,
+        color=LINES[0],
+    )
+    axes.axhline(0.0, color="0.6", lw=0.8)
+    axes.set_xlim(0.0, 1.0)
+    axes.set_xlabel("thickness over one fringe order [1]")
+    axes.set_ylabel("mean of data − model [%]")
+    axes.set_title("by fringe phase, all wavelengths")
+
+
+def _draw_amplifiers(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    found = {row["amplifier"]: row["offset"] / row["sigma"] for row in rows if row["sigma"] > 0.0}
+    pulls = np.array(
+        [[found.get(f"{half}{k}", np.nan) for k in range(CHANNELS_PER_HALF)] for half in HALVES], dtype=float
+    )
+    reach = max(3.0, float(np.nanmax(np.abs(pulls)))) if np.isfinite(pulls).any() else 3.0
+    drawn = axes.imshow(pulls, cmap=DIVERGING, vmin=-reach, vmax=reach, aspect="auto", origin="upper")
+    for (row, column), pull in np.ndenumerate(pulls):
+        if np.isfinite(pull):
+            axes.text(
+                column,
+                row,
+                f"{HALVES[row]}{column}\n{pull:+.1f}",
+                ha="center",
+                va="center",
+                fontsize=7,
+                color="white" if abs(pull) > 0.6 * reach else "black",
+            )
+    axes.set_xticks([])
+    axes.set_yticks([0, 1], ["upper half", "lower half"])
+    axes.spines[:].set_visible(False)
+    axes.figure.colorbar(drawn, ax=axes, label="offset of the amplifier [σ]", shrink=0.85)
+    axes.set_title("by amplifier, as they lie on the sensor")
+
+
+def _draw_tests(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    place = np.arange(len(rows))
+    chance = [max(_number(row["probability"]), SMALLEST) for row in rows]
+    color = [LINES[1] if value < CHANCE_LIMIT else LINES[4] for value in chance]
+    axes.barh(place, [-math.log10(value) for value in chance], color=color)
+    axes.axvline(-math.log10(CHANCE_LIMIT), color="black", ls="--", lw=1)
+    axes.set_yticks(place, [row["name"] for row in rows])
+    axes.invert_yaxis()
+    axes.set_xscale("symlog", linthresh=3.0)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("−log₁₀ of the chance under noise (dashed: 10⁻³) [1]")
+    axes.set_title("tests, each on its own")
+
+
+def _step(values: Sequence[float]) -> float:
+    """Smallest distance of neighbours."""
+    steps = np.diff(np.unique(np.asarray(values, dtype=float)))
+    return float(steps.min()) if steps.size else 1.0
+
+
+def _number(value: float | None) -> float:
+    return 1.0 if value is None or math.isnan(value) else float(value)

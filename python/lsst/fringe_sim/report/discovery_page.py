@@ -1,0 +1,402 @@
+"""The page of a search for missing effects, as a scientist reads it: verdict, evidence, rest, what to do next."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from ..algorithms.discovery import Verdict
+from ..algorithms.flat_residual import FlatResidual, fit_and_compare
+from ..errors import InputError
+from ..model import FringeModel
+from ..products import FringeCube
+from .discovery_figures import candidates_figure, gap_figure, leftover_figure, where_figure
+from .figures import flats_figure, thickness_figure
+from .page import Report
+from .style import finite_range
+
+__all__ = ["ResidualPair", "discovery_page", "headline", "residual_pair"]
+
+PERCENT = 100.0
+GALLERY_PX = 128
+"""Frames of a gallery are averaged to about this size, so that patterns stand out from the noise of pixels."""
+
+LEAST_CHANCE = 1e-300
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualPair:
+    """Flats minus model, with the unchanged model and with what was found.
+
+    Attributes
+    ----------
+    before : `FlatResidual`
+        Of the model without the effects found.
+    after : `FlatResidual` or `None`
+        Of the model with them; none where nothing was named.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    """
+
+    before: FlatResidual
+    after: FlatResidual | None
+    order_um: float
+
+
+def discovery_page(verdict: Verdict, residuals: ResidualPair | None = None) -> Report:
+    """Page that shows a verdict; ``.write(path)`` puts it on disk.
+
+    Parameters
+    ----------
+    verdict : `Verdict`
+        What the search found.
+    residuals : `ResidualPair`, optional
+        Images of data minus model; without them the page has curves and tables only.
+
+    Returns
+    -------
+    page : `Report`
+        Self-contained: no script, nothing fetched.
+    """
+    report = Report(headline(verdict), _lead(verdict))
+    _answer(report, verdict)
+    _where(report, verdict)
+    if residuals is not None:
+        _maps(report, residuals)
+    _candidates(report, verdict)
+    _gap(report, verdict)
+    _unexplained(report, verdict)
+    _next(report, verdict)
+    _use(report, verdict)
+    _data(report, verdict)
+    return report
+
+
+def residual_pair(cube: FringeCube, model: FringeModel, verdict: Verdict) -> ResidualPair | None:
+    """Images of data minus model for the page.
+
+    Parameters
+    ----------
+    cube : `FringeCube`
+        The flats that were searched.
+    model : `FringeModel`
+        The model before the search.
+    verdict : `Verdict`
+        What was found.
+
+    Returns
+    -------
+    residuals : `ResidualPair` or `None`
+        None where the thickness cannot be fitted pixel by pixel, as with a single wavelength.
+    """
+    try:
+        before = fit_and_compare(cube, model)
+        after = None
+        if verdict.effects:
+            after = fit_and_compare(cube, model.with_effects({**model.effect_settings, **verdict.settings}))
+    except InputError:
+        return None
+    return ResidualPair(before, after, float(model.fringe_order_um(float(np.median(cube.wavelength_nm)))))
+
+
+def headline(verdict: Verdict) -> str:
+    """The verdict in one line."""
+    if verdict.verdict == "no_discrepancy":
+        return "Model and data agree within the noise"
+    if verdict.verdict == "unexplained":
+        return "Model and data disagree, and no known effect explains it"
+    names = " and ".join(
+        f"{effect.name} or one of {len(effect.ambiguous_with)} like it"
+        if effect.ambiguous_with
+        else effect.name
+        for effect in verdict.effects
+    )
+    return f"Missing from the model: {names}"
+
+
+def _lead(verdict: Verdict) -> str:
+    data = verdict.data
+    if not data:
+        return f"Set-up {verdict.setup}."
+    planes, rows, columns = data["shape"]
+    cells = "pixels" if data["cell_px"] == 1 else f"cells of {data['cell_px']} × {data['cell_px']} px"
+    low, high = min(data["wavelength_nm"]), max(data["wavelength_nm"])
+    return (
+        f"{planes} flats from {low:g} to {high:g} nm, {columns} × {rows} {cells}, against the model of set-up "
+        f"{verdict.setup}."
+    )
+
+
+def _answer(report: Report, verdict: Verdict) -> None:
+    chance = _chance(verdict.global_probability)
+    report.section(
+        "Verdict", f"The chance that noise alone disagrees as much with the unchanged model: {chance}."
+    )
+    if verdict.unexplained.get("reason"):
+        report.paragraph(f"Why there is no name: {verdict.unexplained['reason']}.")
+    if not verdict.effects:
+        return
+    rows = [
+        (
+            effect.name,
+            name,
+            f"{value.value:.6g}",
+            f"{value.sigma:.2g}",
+            value.unit or "1",
+            f"{effect.probability:.3f}",
+            ", ".join(effect.ambiguous_with) or "nothing",
+        )
+        for effect in verdict.effects
+        for name, value in effect.parameters.items()
+    ]
+    names = ("effect", "parameter", "value", "σ", "unit", "probability of the class", "cannot be told from")
+    report.table(Table(rows=rows, names=names), "discovery_effects", download=verdict.table())
+    report.paragraph(
+        "The probability is that of the class: the effect, or one of those that these data cannot tell from it. The "
+        "value is right only if the effect is."
+    )
+
+
+def _chance(chance: float | None) -> str:
+    if chance is None or math.isnan(chance):
+        return "unknown"
+    return f"{chance:.2g}" if chance > LEAST_CHANCE else f"below {LEAST_CHANCE:g}"
+
+
+def _where(report: Report, verdict: Verdict) -> None:
+    where = verdict.where
+    if not where.channels:
+        return
+    report.section(
+        "Where they disagree",
+        "Before anything is added. The model has been fitted with a free thickness and a free level for each "
+        "wavelength; what these can absorb does not show.",
+    )
+    report.figure(
+        where_figure(verdict),
+        "Strength by wavelength, mean residual over the fringe phase, offsets of the amplifiers, and the tests.",
+    )
+    if where.scale_px > 0.0:
+        report.paragraph(f"The excess is largest in patterns with a period of about {where.scale_px:.3g} px.")
+    rows = [(row["name"], row["statistic"], row["degrees"], row["probability"]) for row in where.channels]
+    table = Table(rows=rows, names=("test", "statistic", "degrees of freedom", "chance under noise"))
+    _format(table, statistic=".4g", **{"degrees of freedom": ".4g"})
+    report.table(table, "discovery_tests")
+    report.table(_curve_table(where.wavelength), "discovery_wavelengths")
+
+
+def _maps(report: Report, residuals: ResidualPair) -> None:
+    report.section(
+        "Data minus model",
+        "Each wavelength over its mean, at the thickness that fits best; one colour scale before and after. What is "
+        "seen before and gone after is the effect; what is seen in both is not explained by it.",
+    )
+    before, after = residuals.before, residuals.after
+    shown = PERCENT * before.residual[:, ::3, ::3]
+    limits = finite_range(shown, symmetric=True)
+    pairs = [("unchanged model", before)] + ([("with what was found", after)] if after is not None else [])
+    for title, one in pairs:
+        report.figure(
+            flats_figure(
+                one.residual,
+                np.isnan(one.residual),
+                one.wavelength_nm.tolist(),
+                title=title,
+                unit="data − model [%]",
+                limits=limits,
+                most_px=GALLERY_PX,
+            ),
+            f"Data minus model by wavelength: {title}.",
+        )
+    table = Table({"wavelength": before.wavelength_nm, "before": PERCENT * before.rms})
+    table["wavelength"].unit, table["before"].unit = "nm", "percent"
+    if after is not None:
+        table["after"] = PERCENT * after.rms
+        table["after"].unit = "percent"
+    _format(table, wavelength="g", before=".4f", after=".4f")
+    report.table(table, "discovery_residual_rms")
+    best = before if after is None else after
+    report.figure(
+        thickness_figure(best.thickness, residuals.order_um),
+        "Thickness with a contour for each fringe order, its uncertainty, and the chance of a slip.",
+    )
+
+
+def _candidates(report: Report, verdict: Verdict) -> None:
+    if not verdict.candidates:
+        return
+    report.section(
+        "Candidates",
+        "Every effect of the catalogue with the fall of χ² that its score test promises once all nuisances have had "
+        "their share. The best are then fitted; a score is no verdict, and rivals with large scores are rivals only "
+        "until the fit.",
+    )
+    report.figure(candidates_figure(verdict), "The most promising effects.")
+    rows = [(item["name"], item["score"], item["degrees"]) for item in verdict.candidates]
+    table = Table(rows=rows, names=("effect", "fall of χ²", "parameters"))
+    _format(table, **{"fall of χ²": ".4g"})
+    report.table(table, "discovery_candidates")
+
+
+def _gap(report: Report, verdict: Verdict) -> None:
+    gap = verdict.gap
+    if math.isnan(gap.before):
+        return
+    report.section(
+        "Gap between data and model",
+        f"{gap.metric[0].upper()}{gap.metric[1:]}. Held-out data (blocks of the sensor) were not used to choose or "
+        "fit the effects. The noise floor is what a perfect model leaves.",
+    )
+    report.figure(gap_figure(verdict), "Before and after, on all data and on data held out.")
+    closed = _closed(gap.heldout_before, gap.heldout_after, gap.noise_floor)
+    if verdict.effects and math.isfinite(closed):
+        report.paragraph(
+            f"On held-out data {PERCENT * closed:.0f} % of the variance above the noise is gone."
+        )
+    rows = [
+        ("all data", gap.before, gap.after, gap.noise_floor),
+        ("held out", gap.heldout_before, gap.heldout_after, gap.noise_floor),
+    ]
+    table = Table(rows=rows, names=("data", "before", "after", "noise floor"))
+    _format(table, before=".6f", after=".6f", **{"noise floor": ".6f"})
+    report.table(table, "discovery_gap")
+    if verdict.steps:
+        steps = Table(
+            rows=[
+                (
+                    " + ".join(step.added),
+                    step.delta_chi2,
+                    step.log_evidence,
+                    step.gap_before,
+                    step.gap_after,
+                    "yes" if step.consistent else "no",
+                )
+                for step in verdict.steps
+            ],
+            names=("added", "fall of χ²", "log evidence", "gap before", "gap after", "only noise left"),
+        )
+        _format(
+            steps, **{"fall of χ²": ".5g", "log evidence": ".5g", "gap before": ".6f", "gap after": ".6f"}
+        )
+        report.table(steps, "discovery_steps")
+
+
+def _closed(before: float, after: float, floor: float) -> float:
+    """Share of the variance above the noise that is gone; NaN where there was none."""
+    above = before**2 - floor**2
+    return min(1.0, (before**2 - after**2) / above) if above > 0.0 else math.nan
+
+
+def _unexplained(report: Report, verdict: Verdict) -> None:
+    left = verdict.unexplained
+    if not left:
+        words = "Nothing beyond noise in any test." if verdict.where.channels else "Not known."
+        report.section("What stays unexplained", words)
+        return
+    report.section(
+        "What stays unexplained",
+        "Described without a name, so that a person can write the next effect: its shape over the fringe phase, its "
+        "colour, its scales.",
+    )
+    if left.get("channels"):
+        report.paragraph(f"Tests that still fail: {', '.join(left['channels'])}.")
+    for item in left.get("partial", ()):
+        report.paragraph(
+            f"{item['name']} explains a part (probability {item['probability']:.2f}), and leaves more than noise."
+        )
+    if left.get("thickness_phase_waveform"):
+        report.figure(leftover_figure(left), "What the best model leaves.")
+        report.table(_curve_table(left["wavelength"]), "discovery_left_by_wavelength")
+    if left.get("harmonics"):
+        report.table(_curve_table(left["harmonics"]), "discovery_left_harmonics")
+    modes = left.get("principal_modes")
+    if modes:
+        listed = ", ".join(f"{value:.3g}" for value in modes)
+        report.paragraph(f"Strength of the principal modes over the wavelengths (noise: 1): {listed}.")
+
+
+def _next(report: Report, verdict: Verdict) -> None:
+    undecided = [effect for effect in verdict.effects if effect.ambiguous_with]
+    rows = verdict.next_measurements
+    if not undecided and not rows:
+        words = {
+            "no_discrepancy": "None is needed for this question.",
+            "named": "The data decide between the effects of the catalogue; none is needed for this question.",
+            "unexplained": "Write the missing effect from the description above, then search again.",
+        }
+        report.section("Next measurement", words[verdict.verdict])
+        return
+    report.section("Next measurement", "What would tell the members of a class apart, best first.")
+    report.remarks([(effect.name, effect.break_ambiguity) for effect in undecided if effect.break_ambiguity])
+    if rows:
+        table = Table(
+            rows=[
+                (
+                    row["effect"],
+                    row["title"],
+                    _separation(row["separation_sigma"]),
+                    "yes" if row["decides"] else "no",
+                )
+                for row in rows
+            ],
+            names=("effect", "measurement", "separation [σ]", "decides"),
+        )
+        report.table(table, "discovery_next_measurements")
+
+
+def _separation(value: float | None) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:.3g}"
+
+
+def _use(report: Report, verdict: Verdict) -> None:
+    if not verdict.effects:
+        return
+    report.section(
+        "To use it",
+        "effects.py beside this page puts the effects into any task (-C label:effects.py); on the command line:",
+    )
+    options = " ".join(f"--effect {key}={value:.6g}" for key, value in verdict.settings.items())
+    report.code(
+        f"fringe-sim fit RAWS --setup {verdict.setup} {options} --out fit\n"
+        f"fringe-sim sky --thickness fit/thickness.fits {options} --out sky"
+    )
+
+
+def _data(report: Report, verdict: Verdict) -> None:
+    data = verdict.data
+    report.section("Data and notes")
+    if data:
+        table = Table(
+            {"wavelength": data["wavelength_nm"], "noise over the stated noise": data["noise_factor"]}
+        )
+        table["wavelength"].unit = "nm"
+        _format(table, wavelength="g", **{"noise over the stated noise": ".3f"})
+        report.table(table, "discovery_noise")
+        low, high = data["thickness_um"]
+        report.paragraph(
+            f"Thickness from {low:.2f} to {high:.2f} µm; scatter of the pixel response "
+            f"{PERCENT * data['response_scatter']:.3g} %."
+        )
+    report.remarks([("Note", note) for note in verdict.notes])
+
+
+def _curve_table(rows: Any) -> Table:
+    """Rows of a curve as a table, units taken out of the names of the columns."""
+    table = Table(rows=[dict(row) for row in rows])
+    for name in list(table.colnames):
+        if name.endswith("_nm"):
+            table.rename_column(name, name.removesuffix("_nm"))
+            table[name.removesuffix("_nm")].unit = "nm"
+    for column in table.itercols():
+        column.info.format = ".5g"
+    return table
+
+
+def _format(table: Table, **formats: str) -> None:
+    for name, text in formats.items():
+        if name in table.colnames:
+            table[name].info.format = text

@@ -1,0 +1,202 @@
+"""The page of a search: every kind of verdict is told, with its evidence, and nothing is fetched."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from lsst.fringe_sim.algorithms.discovery import Verdict
+from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Step, Where
+from lsst.fringe_sim.report import discovery_page
+from lsst.fringe_sim.report.discovery_figures import candidates_figure, gap_figure, where_figure
+
+WAVELENGTHS = [880.0 + 10.0 * k for k in range(12)]
+
+PHASE = tuple({"phase": (k + 0.5) / 16, "residual": 1e-3 * math.sin(k), "sigma": 1e-4} for k in range(16))
+
+WHERE = Where(
+    tuple(
+        {"wavelength_nm": w, "chi2": 7.0 * k, "degrees": 7.0, "rms": 6e-3} for k, w in enumerate(WAVELENGTHS)
+    ),
+    tuple({"amplifier": f"C{k:02d}", "offset": 1e-4 * k, "sigma": 1e-4} for k in (0, 1, 7, 10, 17)),
+    28.1,
+    PHASE,
+    (
+        {"name": "thickness phase", "statistic": 14872.2, "degrees": 120, "probability": 0.0},
+        {"name": "amplifiers", "statistic": 51.0, "degrees": 30, "probability": 0.0098},
+    ),
+)
+
+NAMED = Verdict(
+    "named",
+    (
+        NamedEffect(
+            "dark_pedestal",
+            {"electrons": ParameterValue(64.0, 8.0, "electron")},
+            0.993,
+            ("ghost_pedestal", "contrast_loss"),
+            "12 flats of 80000 electrons",
+            0.4,
+        ),
+    ),
+    WHERE,
+    Gap("rms of data minus model", 0.0078, 0.00707, 0.00778, 0.00703, 0.0070),
+    (Step(("dark_pedestal",), 5005.2, 10021.3, 0.0078, 0.00708, True),),
+    {},
+    "ts8_e2v",
+    0.0,
+    (
+        {"name": "dark_pedestal", "score": 63.8, "degrees": 1},
+        {"name": "ghost_pedestal", "score": 63.7, "degrees": 1},
+        {"name": "tilt", "score": 2.0, "degrees": 1},
+        {"name": "air_gap", "score": 0.0, "degrees": 1},
+    ),
+    (
+        {
+            "effect": "dark_pedestal",
+            "measurement": "level",
+            "title": "12 flats of 80000 electrons",
+            "separation_sigma": 5.7,
+            "decides": True,
+            "pairs": [],
+        },
+    ),
+    ("held out: chi2 of blocks falls by 4707.6",),
+    {
+        "shape": [12, 96, 96],
+        "cell_px": 1,
+        "wavelength_nm": WAVELENGTHS,
+        "noise_factor": [1.0] * 12,
+        "response_scatter": 0.0,
+        "thickness_um": [14.8, 17.2],
+    },
+)
+
+UNEXPLAINED = replace(
+    NAMED,
+    verdict="unexplained",
+    effects=(),
+    steps=(),
+    next_measurements=(),
+    unexplained={
+        "reason": "no effect <of the catalogue> predicts held-out data better",
+        "too_poor": False,
+        "partial": [{"name": "roughness", "probability": 0.4, "parameters": {"sigma": [20.0, 1.0]}}],
+        "channels": ["texture"],
+        "wavelength": [{"wavelength_nm": w, "variance_beyond_noise": 0.1} for w in WAVELENGTHS],
+        "thickness_phase_waveform": list(PHASE),
+        "harmonics": [{"harmonic": 1, "cos": 1e-3, "sin": 2e-3, "sigma": 1e-4}],
+        "spatial_power": [{"scale_px": 10.0, "power": 1.2, "probability": 0.1}],
+        "amplifiers": [],
+        "principal_modes": [3.0, 1.1, 1.0],
+    },
+)
+
+AGREES = replace(
+    NAMED, verdict="no_discrepancy", effects=(), steps=(), next_measurements=(), global_probability=0.43
+)
+
+TOO_POOR = Verdict(
+    "unexplained",
+    (),
+    Where(),
+    Gap("rms of data minus model", *([math.nan] * 5)),
+    (),
+    {"reason": "one flat and no thickness", "too_poor": True},
+    "ts8_e2v",
+    math.nan,
+)
+
+
+def downloads(text: str) -> dict[str, Table]:
+    found = re.findall(r'download="(\w+)\.ecsv" href="data:text/plain;base64,([^"]+)"', text)
+    return {name: Table.read(base64.b64decode(data).decode(), format="ascii.ecsv") for name, data in found}
+
+
+def words(text: str) -> str:
+    """What a reader sees."""
+    return re.sub(r"<[^>]+>", " ", re.sub(r"<style>.*?</style>|base64,[^\"]+", "", text, flags=re.DOTALL))
+
+
+@pytest.mark.parametrize("verdict", [NAMED, UNEXPLAINED, AGREES, TOO_POOR], ids=lambda v: v.verdict)
+def test_every_page_is_whole_and_fetches_nothing(verdict: Verdict, tmp_path) -> None:
+    page = discovery_page(verdict)
+    text = page.write(tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<script" not in text
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', text)
+    titles = re.findall(r'<h2 id="\w+">([^<]+)</h2>', text)
+    assert titles[0] == "Verdict"
+    assert {"What stays unexplained", "Next measurement", "Data and notes"} <= set(titles)
+
+
+def test_a_named_effect_has_its_value_its_rivals_and_what_would_decide() -> None:
+    text = discovery_page(NAMED).to_html()
+    seen = words(text)
+    assert "Missing from the model: dark_pedestal or one of 2 like it" in seen
+    assert "64" in seen
+    assert "ghost_pedestal, contrast_loss" in seen
+    assert "12 flats of 80000 electrons" in seen
+    assert "--effect dark_pedestal.electrons=64 --out fit" in seen
+    share = (0.00778**2 - 0.00703**2) / (0.00778**2 - 0.0070**2)
+    assert f"{100 * share:.0f} % of the variance above the noise is gone" in seen
+
+
+def test_numbers_come_back_from_the_page() -> None:
+    tables = downloads(discovery_page(NAMED).to_html())
+    assert tables["discovery_effects"]["value"][0] == 64.0
+    assert str(tables["discovery_wavelengths"]["wavelength"].unit) == "nm"
+    assert list(tables["discovery_wavelengths"]["wavelength"]) == WAVELENGTHS
+    assert list(tables["discovery_gap"]["after"]) == [0.00707, 0.00703]
+    assert tables["discovery_candidates"]["effect"][0] == "dark_pedestal"
+
+
+def test_what_is_unexplained_is_described() -> None:
+    text = discovery_page(UNEXPLAINED).to_html()
+    assert "&lt;of the catalogue&gt;" in text
+    seen = words(text)
+    assert "Tests that still fail: texture" in seen
+    assert "roughness explains a part (probability 0.40)" in seen
+    assert "Write the missing effect" in seen
+    assert "To use it" not in seen
+
+
+def test_agreement_asks_for_nothing() -> None:
+    seen = words(discovery_page(AGREES).to_html())
+    assert "Model and data agree within the noise" in seen
+    assert "0.43" in seen
+    assert "Nothing beyond noise in any test" in seen
+
+
+def test_data_that_are_too_poor_are_said_to_be() -> None:
+    seen = words(discovery_page(TOO_POOR).to_html())
+    assert "one flat and no thickness" in seen
+    assert "nan" not in seen
+
+
+@pytest.mark.parametrize("draw", [where_figure, candidates_figure, gap_figure])
+def test_every_axis_has_a_label_with_a_unit_or_names(draw) -> None:
+    for axes in draw(NAMED).axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            ticks = [label.get_text() for label in axis.get_ticklabels()]
+            named = any(re.search("[a-z]{3}", text) for text in ticks)
+            assert (
+                "[" in axis.get_label_text()
+                or named
+                or not axis.get_visible()
+                or not len(axis.get_ticklocs())
+            ), axes.get_title()
+
+
+def test_bars_are_the_numbers_of_the_verdict() -> None:
+    bars = candidates_figure(NAMED).axes[0].patches
+    assert sorted(bar.get_width() for bar in bars) == [2.0, 63.7, 63.8], (
+        "an effect without promise is left out"
+    )
+    heights = [bar.get_height() for bar in gap_figure(NAMED).axes[0].patches]
+    assert np.allclose(heights, [0.78, 0.707, 0.778, 0.703])
