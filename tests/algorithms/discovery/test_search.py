@@ -27,6 +27,14 @@ def test_banded_normal_matrix_is_the_dense_one() -> None:
     )
 
 
+def test_splines_of_any_number_of_cells() -> None:
+    """They sum to 1 at every cell, also where rounding puts the last knot before the last cell."""
+    for rows in range(1, 130):
+        for spacing in (2.0, 4.0, 8.0):
+            along = SplineBasis.of_grid((rows, 2), spacing).along_y
+            np.testing.assert_allclose(along.sum(axis=1), 1.0, rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
     for seed in (11, 12):

@@ -150,7 +150,8 @@ def _uniform_splines(size: int, spacing: float) -> FloatArray:
     inner = np.linspace(0.0, size - 1.0, intervals + 1)
     step = inner[1] - inner[0]
     knots = inner[0] + step * np.arange(-degree, intervals + degree + 1)
-    at = np.clip(np.arange(size, dtype=float), inner[0], inner[-1])
+    # Rounding may leave the last knot of the interior a little before the last cell.
+    at = np.clip(np.arange(size, dtype=float), knots[degree], knots[-degree - 1])
     return np.asarray(BSpline.design_matrix(at, knots, degree).toarray())
 
 

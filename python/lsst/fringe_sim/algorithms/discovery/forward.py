@@ -27,8 +27,11 @@ LINE_STEP_NM = 0.1
 MARGIN_UM = 0.45
 """Thickness beyond the field that a table covers [µm]: a step of a fit may not leave it."""
 
-MOST_TABLES = 600
-"""Tables kept for reuse."""
+MOST_TABLE_BYTES = 100e6
+"""Memory of the tables kept for reuse."""
+
+FARTHEST_UM = 3.0
+"""Thickness by which a field may leave the first range [µm]: ten fringe orders. What goes farther does not fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,7 @@ class Forward:
     cell_px : `int`
         Side of a cell [px].
     range_um : `tuple` [`float`, `float`]
-        Thicknesses that the tables cover [µm]; grows on demand.
+        Thicknesses that the tables cover [µm]; grows on demand, by `FARTHEST_UM` at most.
     centroid : `numpy.ndarray`, shape ``(2, W, ny, nx)``, optional
         See `CellData`.
     """
@@ -75,6 +78,11 @@ class Forward:
     centroid: FloatArray | None = None
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
     _scale: FloatArray | None = field(default=None, repr=False)
+    _limits_um: tuple[float, float] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        low, high = self.range_um
+        self._limits_um = (max(low - FARTHEST_UM, 0.05), high + FARTHEST_UM)
 
     @classmethod
     def of_cells(
@@ -88,8 +96,6 @@ class Forward:
         known = {**self.model.effect_settings, **self._optical(settings)}
         key = tuple(sorted(known.items()))
         if key not in self._tables:
-            if len(self._tables) >= MOST_TABLES:
-                self._tables.pop(next(iter(self._tables)))
             low, high = self.range_um
             count = int(np.ceil((high - low) / TABLE_STEP_UM)) + 1
             model = self.model.with_effects(known, self.catalogue)
@@ -98,17 +104,22 @@ class Forward:
             response = model.respond_on_grid(light, low, TABLE_STEP_UM, count, wavelength)
             if self._scale is None:
                 self._scale = response.mean(axis=1)
-            self._tables[key] = response / self._scale[:, np.newaxis]
+            self._tables[key] = table = response / self._scale[:, np.newaxis]
+            while len(self._tables) * table.nbytes > MOST_TABLE_BYTES and len(self._tables) > 2:
+                self._tables.pop(next(iter(self._tables)))
         return self._tables[key]
 
     def cover(self, thickness_um: FloatArray) -> None:
-        """Extend the tables so that they cover a thickness field with a margin."""
+        """Extend the tables so that they cover a thickness field with a margin, as far as it may go."""
         low, high = self.range_um
-        wanted_low = max(float(thickness_um.min()) - MARGIN_UM, 0.05)
-        wanted_high = float(thickness_um.max()) + MARGIN_UM
+        lowest, highest = self._limits_um
+        wanted_low = max(float(thickness_um.min()) - MARGIN_UM, lowest)
+        wanted_high = min(float(thickness_um.max()) + MARGIN_UM, highest)
         if wanted_low < low or wanted_high > high:
-            self.range_um = (min(wanted_low - MARGIN_UM, low), max(wanted_high + MARGIN_UM, high))
-            self.range_um = (max(self.range_um[0], 0.05), self.range_um[1])
+            self.range_um = (
+                max(min(wanted_low - MARGIN_UM, low), lowest),
+                min(max(wanted_high + MARGIN_UM, high), highest),
+            )
             self._tables.clear()
 
     def predict(self, settings: Settings, thickness_um: FloatArray) -> Prediction:

@@ -18,14 +18,18 @@ SEARCH_STEP_UM = 0.01
 HALF_WINDOW_UM = 0.12
 """Reach of the search around a neighbour's thickness [µm]; below half a fringe order."""
 
+FEWEST_ROWS = 12
+"""Rows and columns of cells from which on they are looked at together."""
+
 
 def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     """Thickness of every cell, with the fringe order decided by all cells together.
 
     Each cell is compared with the model's fringes at every thickness of the set-up's range by correlation, in which
-    the contrast is free. The field grows from the clearest cell to its neighbours, each within less than half a
-    fringe order of what they predict; then the whole field is moved by whole orders to where the sum of all
-    correlations is best. Cells without data take the value of a neighbour.
+    the contrast is free; once with the colour of the contrast as in the model, once as in the data. The field grows
+    from the clearest cell to its neighbours, each within less than half a fringe order of what they predict; then the
+    whole field is moved by whole orders to where the sum of all correlations is best. Cells without data take the
+    value of a neighbour.
 
     Parameters
     ----------
@@ -42,12 +46,38 @@ def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     count = round((high - low) / SEARCH_STEP_UM) + 1
     response = model.response_on_grid(cells.wavelength_nm, low, SEARCH_STEP_UM, count)
     template = response / _running_mean(response, model, cells) - 1.0
-    score = _correlate(template, cells)
     order = _order_steps(model, cells)
+    templates = [template]
+    if min(cells.shape[1:]) >= FEWEST_ROWS:
+        templates.append(template * _contrast(template, cells))
+    best, _ = max((_follow(each, cells, order) for each in templates), key=lambda item: item[1])
+    return low + SEARCH_STEP_UM * best.reshape(cells.shape[1:]).astype(float)
+
+
+def _follow(template: FloatArray, cells: CellData, order: float) -> tuple[NDArray[np.int64], float]:
+    """Steps of all cells, and the mean square of their correlations."""
+    score = _correlate(template, cells)
+    count = template.shape[1]
     best = _grow(score, cells.shape[1], cells.shape[2], int(HALF_WINDOW_UM / SEARCH_STEP_UM))
     best = best + _common_shift(score, best, order, count)
     best = _mend_orders(score, best, cells.shape[1:], order)
-    return low + SEARCH_STEP_UM * best.reshape(cells.shape[1:]).astype(float)
+    reached = score[np.arange(len(best)), np.clip(best, 0, count - 1)]
+    return best, float((reached.astype(float) ** 2).mean())
+
+
+def _contrast(template: FloatArray, cells: CellData) -> FloatArray:
+    """Strength of the fringes over that of the model, from the variances alone: a column of mean 1."""
+    used = cells.weight > 0
+    number = np.maximum(used.sum(axis=(1, 2)), 1)
+    amplitude = np.where(used, cells.value - 1.0, 0.0)
+    # What all wavelengths share is no fringe: pixel response, illumination.
+    common = amplitude.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
+    amplitude = np.where(used, amplitude - common, 0.0)
+    noise = np.divide(1.0, cells.weight, out=np.zeros_like(amplitude), where=used).sum(axis=(1, 2)) / number
+    power = (amplitude**2).sum(axis=(1, 2)) / number
+    signal = np.maximum(power - noise, 0.1 * power)
+    contrast = np.sqrt(signal) / np.maximum((template - template.mean(axis=0)).std(axis=1), 1e-12)
+    return np.asarray(contrast / contrast.mean())[:, np.newaxis]
 
 
 def _running_mean(response: FloatArray, model: FringeModel, cells: CellData) -> FloatArray:
@@ -105,7 +135,7 @@ def _mend_orders(
     score: NDArray[np.float32], best: NDArray[np.int64], shape: tuple[int, int], order: float
 ) -> NDArray[np.int64]:
     """Move patches that grew across a fringe into the wrong order, if that is likelier or leaves fewer cliffs."""
-    if min(shape) < 12:
+    if min(shape) < FEWEST_ROWS:
         return best
     cells, count = np.arange(len(best)), score.shape[1]
     current = best
