@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import json
 import shutil
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from astropy.io import fits
 from lsst.daf.butler import Butler
 from task_commands import WAVELENGTHS_NM, Command, Outcome
 
+from lsst.fringe_sim.cli.main import run as run_short
 from lsst.fringe_sim.middleware.night import NightPlan, define_night
 from lsst.fringe_sim.mock.raw_frames import MockRun
 
@@ -115,6 +117,24 @@ def test_headers_tell_what_entered(first_run: tuple[Path, Outcome]) -> None:
     assert (found["SETUP"], found["METHOD"], found["NFLATS"]) == ("ts8_e2v", "global", number)
     assert found["MISSING"] == ""
     assert found["FSIMVER"]
+    assert 0.0 < found["QUADERR"] < found["INTERR"] < 1e-4
+
+
+def test_one_command_tells_what_a_dataset_was_made_from(
+    first_run: tuple[Path, Outcome], capsys: pytest.CaptureFixture[str]
+) -> None:
+    repo, _ = first_run
+    arguments = ["--dataset-type", "epoxyThickness", "--collections", "u/lab", "--json"]
+    assert run_short(["provenance", str(repo), *arguments]) == 0
+    (record,) = json.loads(capsys.readouterr().out)
+    assert record["setup"] == "ts8_e2v"
+    assert record["effects"] == {"bandwidth.fwhm": 2.01}
+    assert len(record["configuration"]["this task"]) == 16
+    assert len(record["inputs"]) == len(WAVELENGTHS_NM)
+    for item in record["inputs"]:
+        assert (item["datasettype"], item["run"][:6]) == ("fringeFlat", "u/lab/")
+        assert f"'detector': {DETECTORS[GOOD]}" in item["data id"]
+    assert {item["here"] for item in record["tables"]} == {"same"}
 
 
 def test_only_what_failed_runs_again(

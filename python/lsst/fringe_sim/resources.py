@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import Any
@@ -12,9 +13,11 @@ from astropy.table import Table
 
 from .errors import ResourceError, UnknownNameError
 
-__all__ = ["list_resources", "read_table", "read_yaml", "resource_path"]
+__all__ = ["list_resources", "read_table", "read_yaml", "resource_path", "revision"]
 
 REQUIRED_PROVENANCE = ("source", "doi", "licence")
+
+REVISION_LENGTH = 12
 
 
 def resource_path(folder: str, name: str) -> Traversable:
@@ -41,6 +44,18 @@ def list_resources(folder: str, suffix: str = ".yaml") -> tuple[str, ...]:
     for part in folder.split("/"):
         base = base / part
     return tuple(sorted(entry.name for entry in base.iterdir() if entry.name.endswith(suffix)))
+
+
+@functools.lru_cache(maxsize=256)
+def revision(folder: str, name: str) -> str:
+    """Beginning of the SHA-256 of a shipped file: what a header states about the numbers it was made with.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such file.
+    """
+    return hashlib.sha256(resource_path(folder, name).read_bytes()).hexdigest()[:REVISION_LENGTH]
 
 
 @functools.lru_cache(maxsize=64)

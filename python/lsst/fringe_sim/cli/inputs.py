@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError
 from ..model import FringeModel
+from ..model.provenance import model_cards, software_cards
 
 __all__ = ["effect_cards", "prepare_folder", "read_settings", "read_thickness"]
 
@@ -99,8 +100,5 @@ def prepare_folder(path: str | os.PathLike[str]) -> Path:
 
 
 def effect_cards(model: FringeModel) -> dict[str, str | float]:
-    """Header keywords that state the effects of a model, ``EFFECTn`` and ``EFFVALn``."""
-    cards: dict[str, str | float] = {}
-    for number, (name, value) in enumerate(sorted(model.effect_settings.items())):
-        cards[f"EFFECT{number}"], cards[f"EFFVAL{number}"] = name, value
-    return cards
+    """Header keywords of a product: software, set-up, effects, revisions of tables."""
+    return {**software_cards(), **model_cards(model.setup, model.effect_settings)}

@@ -35,6 +35,7 @@ _COMMANDS = {
     "amplitudes": ("amplitudes", "Tabulate the fringe amplitudes of every set-up of the paper."),
     "discover": ("discover", "Find the effect that the model lacks."),
     "reproduce-paper": ("reproduce_paper", "Recompute the paper, number by number."),
+    "provenance": ("provenance", "Say what a product was made with and from."),
     "challenge": ("challenge", "Hide effects in simulated sensors and count what the search finds."),
 }
 

@@ -25,7 +25,7 @@ from ..algorithms.discovery import SearchOptions, Verdict
 from ..instrument.detector import Detector
 from ..products import FringeCube, FringeFlat
 from .model_config import FringeModelConfig, ModelChoice
-from .quantum import data_id_of, sensor_of, unusable
+from .quantum import common_header, data_id_of, sensor_of, unusable
 
 __all__ = ["EffectDiscoveryConfig", "EffectDiscoveryConnections", "EffectDiscoveryTask"]
 
@@ -131,8 +131,10 @@ class EffectDiscoveryTask(PipelineTask):
         rng = np.random.default_rng([self.config.seed, detector.id])
         verdict = discover(cube, choice.model(), rng=rng, options=options, report=self._say)
         self.log.info("%s: %s", detector.name, verdict.summary())
+        stated = {**common_header(self.config), **choice.header(), "SEED": self.config.seed}
+        content = verdict.as_mapping(model_override=self.config.connections.override)
         return Struct(
-            verdict=verdict.as_mapping(model_override=self.config.connections.override),
+            verdict={**content, "provenance": stated},
             override=_override(choice, verdict, detector),
         )
 

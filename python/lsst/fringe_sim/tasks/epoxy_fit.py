@@ -24,6 +24,7 @@ from lsst.pipe.base.connectionTypes import Input, Output
 from lsst.utils.logging import getLogger
 
 from ..algorithms import fit_thickness
+from ..algorithms.template_errors import template_errors
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import Setup
@@ -167,11 +168,15 @@ class EpoxyFitTask(PipelineTask):
         cube = FringeCube.from_flats(flats, number=number)
         setup = Setup.from_name(choice.setup)
         missing = self._check_wavelengths(cube.wavelength_nm, setup, detector)
-        fitted = fit_thickness(cube, choice.model(), self.config.method, **self._options())
+        model, options = choice.model(), self._options()
+        fitted = fit_thickness(cube, model, self.config.method, **options)
+        errors = template_errors(model, cube.wavelength_nm, options["range_um"], self.config.observable)
         metadata = {
-            **common_header(),
+            **common_header(self.config),
             **choice.header(),
             **fitted.metadata,
+            "QUADERR": errors[0],
+            "INTERR": errors[1],
             "NFLATS": number,
             "MISSING": missing,
         }

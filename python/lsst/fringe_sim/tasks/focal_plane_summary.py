@@ -90,7 +90,7 @@ class FocalPlaneSummaryTask(PipelineTask):
             ``summary``, an `astropy.table.Table` with one row per sensor.
         """
         summary = summary_table([table.meta for table in forecasts])
-        summary.meta.update(common_header())
+        summary.meta.update(common_header(self.config))
         rms = np.asarray(summary["rms"])
         self.log.info("%d sensors: fringe rms %.4f to %.4f %%", len(summary), rms.min(), rms.max())
         return Struct(summary=summary)

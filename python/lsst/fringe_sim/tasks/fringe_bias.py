@@ -113,5 +113,5 @@ class FringeBiasTask(PipelineTask):
         """
         bias: CombinedBias = combine_biases(raws, self.config.options())
         self.log.info("%s: %d bias frames combined", detector, bias.n_frames)
-        metadata = {**common_header(), **bias.metadata}
+        metadata = {**common_header(self.config), **bias.metadata}
         return Struct(bias=dataclasses.replace(bias, detector=detector, metadata=metadata))

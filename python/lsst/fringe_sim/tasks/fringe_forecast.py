@@ -183,8 +183,10 @@ class FringeForecastTask(PipelineTask):
             options=self.config.options(),
         )
         table = forecast.to_table()
-        header: dict[str, Any] = {**common_header(), **self.config.choice_of(detector).header()}
-        table.meta.update(header, LINELIST=LINE_LIST)
+        header: dict[str, Any] = {**common_header(self.config), **self.config.choice_of(detector).header()}
+        table.meta.update(header, LINELIST=LINE_LIST, NIGHTSD=self.config.nights_seed)
+        if thickness is None:
+            table.meta["STANDSD"] = self.config.stand_in_seed
         self.log.info(
             "%s: fringe rms %.4f %%, %.2f times the shot noise; after correction with %d templates %.3f times",
             *(detector.name, 100.0 * forecast.amplitudes.rms, forecast.over_noise.max()),

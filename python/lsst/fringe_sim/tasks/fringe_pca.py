@@ -136,7 +136,10 @@ class FringePcaTask(PipelineTask):
             Too few frames, frames of different sensors or sizes, or all alike.
         """
         first = frames[0]
-        metadata = {**common_header(), **_shared_metadata(frames)}
+        shared = _shared_metadata(frames)
+        metadata = {**shared, **common_header(self.config), **_numerical_errors(frames)}
+        if "CFGHASH" in shared:
+            metadata["SKYCFG"] = shared["CFGHASH"]
         components = fit_pca(
             frames,
             n_components=self.config.n_components,
@@ -178,6 +181,13 @@ def _first(components: FringeComponents, number: int) -> FringeComponents:
         explained_variance_ratio=components.explained_variance_ratio[:number],
         scores=components.scores[:, :number],
     )
+
+
+def _numerical_errors(frames: Sequence[SkyFringe]) -> dict[str, float]:
+    """The largest errors of the frames, as fractions of the sky."""
+    errors = {"QUADERR": max(frame.quadrature_error for frame in frames)}
+    interpolation = [float(frame.metadata["INTERR"]) for frame in frames if "INTERR" in frame.metadata]
+    return errors | ({"INTERR": max(interpolation)} if interpolation else {})
 
 
 def _shared_metadata(frames: Sequence[SkyFringe]) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from ..errors import InputError
 from ..instrument.detector import Detector
 from ..instrument.raw_frame import RawFrame
 from ..model import Setup
+from ..model.provenance import table_cards
 from ..products import CombinedBias, describe_mask
 from .camera_config import CameraConfig
 from .flat_prep_config import FlatPrepConfig
@@ -184,5 +185,6 @@ class IsrFlatPrepTask(PipelineTask):
             flat.level_e,
             describe_mask(flat.mask),
         )
-        metadata = {**common_header(), "SETUP": setup.name, **flat.metadata}
+        tables = table_cards((("setups", f"{setup.name}.yaml"), ("instrument", "lsstcam_amps.ecsv")))
+        metadata = {**common_header(self.config), "SETUP": setup.name, **tables, **flat.metadata}
         return Struct(flat=dataclasses.replace(flat, detector=detector.name, metadata=metadata))

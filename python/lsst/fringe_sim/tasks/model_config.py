@@ -16,6 +16,7 @@ from ..effects import EFFECTS, activate_effects
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
+from ..model.provenance import model_cards
 from .camera_config import CameraConfig
 
 __all__ = ["FringeModelConfig", "ModelChoice", "RaftConfig", "SensorConfig", "by_raft"]
@@ -64,12 +65,8 @@ class ModelChoice:
         return FringeModel.from_setup(self.setup, self.applied_effects, **kwargs)
 
     def header(self) -> dict[str, Any]:
-        """Header keywords that say what was modelled."""
-        cards: dict[str, Any] = {"SETUP": self.setup}
-        for number, (name, value) in enumerate(sorted(self.applied_effects.items())):
-            cards[f"EFFECT{number}"] = name
-            cards[f"EFFVAL{number}"] = value
-        return cards
+        """Header keywords that say what was modelled: set-up, effects, revisions of tables."""
+        return dict(model_cards(self.setup, self.applied_effects))
 
 
 class RaftConfig(Config):

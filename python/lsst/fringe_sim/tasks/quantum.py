@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import hashlib
+import json
 import re
 from collections.abc import Iterator
 from typing import Any
 
 from lsst.daf.butler import DataCoordinate
+from lsst.pex.config import Config
 from lsst.pipe.base import AlgorithmError, QuantumContext
 
-from .. import __version__
 from ..errors import FringeSimError, InputError, UnknownNameError
 from ..instrument.detector import Detector
 from ..middleware.instruments import INSTRUMENTS
+from ..model.provenance import software_cards
 
-__all__ = ["UnusableDataError", "common_header", "data_id_of", "run_datetime", "sensor_of", "unusable"]
+__all__ = [
+    "UnusableDataError",
+    "common_header",
+    "config_digest",
+    "data_id_of",
+    "run_datetime",
+    "sensor_of",
+    "unusable",
+]
 
 _TIMESTAMP = re.compile(r"(\d{8}T\d{6})Z?$")
 
@@ -88,9 +99,21 @@ def sensor_of(data_id: DataCoordinate) -> Detector:
     return by_name[name].camera().detector(int(data_id["detector"]))
 
 
-def common_header() -> dict[str, Any]:
-    """Header keywords that every product of the tasks has."""
-    return {"ORIGIN": "lsst.fringe_sim", "FSIMVER": __version__}
+def common_header(config: Config) -> dict[str, Any]:
+    """Header keywords that every product of the tasks has.
+
+    Parameters
+    ----------
+    config : `lsst.pex.config.Config`
+        Configuration of the task; its digest goes into the header, itself is the dataset ``<label>_config``.
+    """
+    return {**software_cards(), "CFGHASH": config_digest(config)}
+
+
+def config_digest(config: Config) -> str:
+    """Beginning of the SHA-256 of all values of a configuration, whatever files they came from."""
+    text = json.dumps(config.toDict(), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def run_datetime(run: str, otherwise: datetime.datetime) -> str:

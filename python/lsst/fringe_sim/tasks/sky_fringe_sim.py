@@ -236,8 +236,10 @@ class SkyFringeSimTask(PipelineTask):
             physical_filter=exposure.physical_filter,
         )
         metadata = {
-            **common_header(),
+            **common_header(self.config),
             **choice.header(),
+            **{key: layer.metadata[key] for key in ("STANDSD",) if key in layer.metadata},
+            **({"NIGHTSD": self.config.seed} if self.config.night == "random" else {}),
             "LINELIST": LINE_LIST,
             "NIGHT": self.config.night,
             "LEVEL": self.config.level,

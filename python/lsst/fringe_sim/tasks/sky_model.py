@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from ..errors import InputError
 from ..instrument.detector import Detector
 from ..instrument.sky import EmissionLines, SkySpectrum
 from ..model import FringeModel, Setup
+from ..model.provenance import effects_of_header
 from ..products import ThicknessMap, mask_bits
 from .model_config import FringeModelConfig, ModelChoice
 
@@ -240,7 +240,7 @@ def _check_map(thickness: ThicknessMap, choice: ModelChoice) -> None:
         raise InputError("layer of the thickness map", thickness.layer, varying)
     if "SETUP" not in thickness.metadata:
         return  # not fitted here
-    fitted = _effects_in(thickness.metadata)
+    fitted = effects_of_header(thickness.metadata)
     on_sky = ModelChoice(choice.setup, fitted).applied_effects
     if on_sky != choice.applied_effects:
         raise InputError(
@@ -249,8 +249,3 @@ def _check_map(thickness: ThicknessMap, choice: ModelChoice) -> None:
             f"{on_sky}, with which the thickness was fitted",
             source=thickness.detector or None,
         )
-
-
-def _effects_in(header: Mapping[str, Any]) -> dict[str, float]:
-    numbers = [key.removeprefix("EFFECT") for key in header if key.startswith("EFFECT")]
-    return {str(header[f"EFFECT{number}"]): float(header[f"EFFVAL{number}"]) for number in numbers}

@@ -1,0 +1,257 @@
+"""``fringe-sim provenance``."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+import click
+from astropy.io import fits
+from astropy.table import Table
+
+from ..errors import FrameFormatError, InputError, UnknownNameError
+from ..model.provenance import effects_of_header
+from ..resources import revision
+
+__all__ = ["describe", "provenance", "read_header"]
+
+BUTLER = "LSST BUTLER "
+
+_ERRORS = {"QUADERR": "quadrature", "INTERR": "interpolation"}
+_SEEDS = {"SEED": "noise or search", "NIGHTSD": "random nights", "STANDSD": "stand-in thickness"}
+_DIGESTS = {"CFGHASH": "this task", "SKYCFG": "the sky frames"}
+_FORMAT = re.compile(
+    r"SIMPLE|BITPIX|NAXIS\d*|EXTEND|CHECKSUM|DATASUM|NEXTEND|COMMENT|HISTORY|INHERIT|EXPINFO_V|__.*"
+)
+_INPUT = re.compile(BUTLER + r"INPUT (\d+) (\w+)")
+
+
+@click.command()
+@click.argument("targets", nargs=-1, required=True, metavar="FILE|REPO...")
+@click.option("--dataset-type", metavar="NAME", help="Of a repository: which datasets, as epoxyThickness.")
+@click.option("--collections", default="*", show_default=True, help="Of a repository: where they are.")
+@click.option("--where", default="", help='Of a repository: a condition on the data ids, as "detector=37".')
+@click.option("--json", "as_json", is_flag=True, help="One JSON document, for programs.")
+def provenance(
+    targets: tuple[str, ...], dataset_type: str | None, collections: str, where: str, as_json: bool
+) -> None:
+    """Say what products were made with and from.
+
+    FILE is a FITS, ECSV or JSON file of this package. REPO is a Butler repository; the inputs of its datasets are
+    looked up there. Tables whose numbers differ from those installed here are marked.
+
+    \b
+    Examples:
+      fringe-sim provenance fit/thickness.fits
+      fringe-sim provenance REPO --dataset-type fringe --collections u/me/sky --where "instrument='LSSTCam'"
+    """
+    records: list[dict[str, Any]] = []
+    for target in targets:
+        if Path(target).is_dir() or dataset_type:
+            if not dataset_type:
+                raise InputError("--dataset-type", None, "a dataset type, as epoxyThickness", source=target)
+            records += _in_repository(target, dataset_type, collections, where)
+        else:
+            records.append({"file": target, **describe(read_header(target))})
+    if as_json:
+        click.echo(json.dumps(records, indent=2, ensure_ascii=False))
+        return
+    click.echo("\n\n".join(_as_text(record) for record in records))
+
+
+def read_header(path: str) -> dict[str, Any]:
+    """Keywords of a product and their values.
+
+    Parameters
+    ----------
+    path : `str`
+        FITS file, ECSV table, or JSON document with an entry ``provenance``.
+
+    Raises
+    ------
+    InputError
+        There is no such file, or it is damaged or of another kind; it is named.
+    """
+    if not Path(path).is_file():
+        raise InputError("file", path, "an existing file, or a repository with --dataset-type")
+    suffix = Path(path).suffix
+    readers = {".ecsv": _table_header, ".json": _document_header}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return readers.get(suffix, _fits_header)(path)
+    except InputError:
+        raise
+    except (OSError, ValueError, TypeError, KeyError, IndexError, fits.VerifyError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise FrameFormatError(
+            "file", reason, "an undamaged FITS, ECSV or JSON product", source=path
+        ) from None
+
+
+def _fits_header(path: str) -> dict[str, Any]:
+    with fits.open(path, memmap=True, lazy_load_hdus=True) as hdus:
+        header = hdus[0].header
+        return {
+            key: header[key] for key in header if key and not isinstance(header[key], fits.card.Undefined)
+        }
+
+
+def _table_header(path: str) -> dict[str, Any]:
+    return {str(key): value for key, value in Table.read(path, format="ascii.ecsv").meta.items()}
+
+
+def _document_header(path: str) -> dict[str, Any]:
+    content = json.loads(Path(path).read_text(encoding="utf-8"))
+    if not isinstance(content, dict) or not isinstance(content.get("provenance"), dict):
+        raise FrameFormatError(
+            "JSON document", "no provenance", "one with an entry 'provenance'", source=path
+        )
+    return dict(content["provenance"])
+
+
+def describe(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Sort the keywords of a product by what they say.
+
+    Parameters
+    ----------
+    header : mapping
+        Keywords and values.
+
+    Returns
+    -------
+    record : `dict`
+        ``product``, ``software``, ``configuration``, ``setup``, ``effects``, ``tables``, ``seeds``, ``errors``,
+        ``dataset``, ``inputs``, and under ``other`` what is left. Plain values, ready for JSON.
+    """
+    software = {
+        key.removeprefix("VERSION ").lower(): value
+        for key, value in header.items()
+        if key.startswith("VERSION ")
+    }
+    effects = effects_of_header(header)
+    tables = _tables(header)
+    inputs = _inputs(header)
+    dataset = {
+        key.removeprefix(BUTLER).lower(): value
+        for key, value in header.items()
+        if key.startswith(BUTLER) and not _INPUT.fullmatch(key) and not key.startswith(f"{BUTLER}INPUT ")
+    }
+    known = {"PRODUCT", "ORIGIN", "FSIMVER", "SETUP", *_ERRORS, *_SEEDS, *_DIGESTS}
+    numbered = re.compile(r"(EFFECT|EFFVAL|TABLE)\d+|VERSION .*|LSST BUTLER .*")
+    return {
+        "product": header.get("PRODUCT"),
+        "software": {str(header.get("ORIGIN", "unknown")): header.get("FSIMVER"), **software},
+        "configuration": {text: header[key] for key, text in _DIGESTS.items() if key in header},
+        "setup": header.get("SETUP"),
+        "effects": effects,
+        "tables": tables,
+        "seeds": {text: header[key] for key, text in _SEEDS.items() if key in header},
+        "errors": {text: header[key] for key, text in _ERRORS.items() if key in header},
+        "dataset": dataset,
+        "inputs": inputs,
+        "other": {
+            key: _plain(value)
+            for key, value in header.items()
+            if key not in known and not numbered.fullmatch(key) and not _FORMAT.fullmatch(key)
+        },
+    }
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, bool | int | float | str | None) else str(value)
+
+
+def _tables(header: Mapping[str, Any]) -> list[dict[str, str]]:
+    found = []
+    number = 0
+    while f"TABLE{number}" in header:
+        name, _, stated = str(header[f"TABLE{number}"]).rpartition(" ")
+        found.append({"table": name, "revision": stated, "here": _compared(name, stated)})
+        number += 1
+    return found
+
+
+def _compared(name: str, stated: str) -> str:
+    folder, _, file = name.rpartition("/")
+    try:
+        return "same" if revision(folder, file) == stated else "differs"
+    except (UnknownNameError, OSError):
+        return "absent"
+
+
+def _inputs(header: Mapping[str, Any]) -> list[dict[str, str]]:
+    found: dict[int, dict[str, str]] = {}
+    for key, value in header.items():
+        match = _INPUT.fullmatch(key)
+        if match:
+            found.setdefault(int(match[1]), {})[match[2].lower()] = str(value)
+    return [found[number] for number in sorted(found)]
+
+
+def _in_repository(repo: str, dataset_type: str, collections: str, where: str) -> Iterator[dict[str, Any]]:
+    from lsst.daf.butler import Butler, ButlerUserError
+    from lsst.daf.butler.registry import RegistryError
+
+    try:
+        butler = Butler.from_config(repo)
+    except (FileNotFoundError, ValueError, RuntimeError) as error:
+        raise InputError("repository", repo, f"a butler repository ({error})") from error
+    with butler:
+        try:
+            refs = sorted(
+                set(
+                    butler.registry.queryDatasets(
+                        dataset_type, collections=collections.split(","), where=where
+                    )
+                )
+            )
+        except (ButlerUserError, RegistryError, LookupError) as error:
+            asked = " ".join((dataset_type, collections, where))
+            raise InputError("datasets", asked, f"what {repo} knows ({error})") from error
+        if not refs:
+            raise InputError(
+                "datasets", 0, f"at least one {dataset_type} in {collections} where {where or 'all'}"
+            )
+        for ref in refs:
+            record = describe(read_header(butler.getURI(ref).ospath))
+            for item in record["inputs"]:
+                item["data id"] = _data_id(butler, item.get("id", ""))
+            yield {"file": f"{dataset_type} {ref.dataId.required} in {ref.run}", **record}
+
+
+def _data_id(butler: Any, text: str) -> str:
+    """Data id of an input, as long as the repository has it."""
+    try:
+        ref = butler.get_dataset(UUID(text))
+    except ValueError:
+        ref = None
+    return "not in this repository" if ref is None else str(dict(ref.dataId.required))
+
+
+def _as_text(record: Mapping[str, Any]) -> str:
+    lines = [str(record["file"])]
+    for name in ("product", "setup"):
+        if record[name] is not None:
+            lines.append(f"  {name}: {record[name]}")
+    for name in ("software", "configuration", "effects", "seeds", "errors", "dataset", "other"):
+        content = record[name]
+        if content:
+            lines.append(f"  {name}:")
+            lines += [f"    {key}: {value}" for key, value in content.items()]
+    if record["tables"]:
+        lines.append("  tables:")
+        lines += [
+            f"    {item['table']} {item['revision']}"
+            + ("" if item["here"] == "same" else f" ({item['here']} here)")
+            for item in record["tables"]
+        ]
+    if record["inputs"]:
+        lines.append(f"  inputs: {len(record['inputs'])}")
+        lines += [f"    {' '.join(item.values())}" for item in record["inputs"]]
+    return "\n".join(lines)

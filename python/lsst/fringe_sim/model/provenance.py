@@ -1,0 +1,164 @@
+"""What a product was made with, as header keywords: software, set-up, effects, tables.
+
+The keywords are the same in every product, so that one reader understands all (``fringe-sim provenance``):
+
+========================  ==============================================================================
+``ORIGIN``, ``FSIMVER``   this package and its version
+``VERSION <package>``     versions of the packages that compute
+``SETUP``                 name of the set-up
+``EFFECTn``, ``EFFVALn``  effects by ``name.parameter``, and their values
+``TABLEn``                a shipped table or description and the beginning of its SHA-256
+========================  ==============================================================================
+"""
+
+from __future__ import annotations
+
+import functools
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from importlib import metadata
+from typing import Any
+
+from .. import __version__
+from ..effects import EFFECTS, activate_effects, apply_to_system
+from ..errors import UnknownNameError
+from ..optics.stack import LayerStack
+from ..optics.system import OpticalSystem
+from ..resources import read_yaml, revision
+from .setup import Setup, setup_names
+
+__all__ = [
+    "SKY_TABLES",
+    "effect_cards",
+    "effects_of_header",
+    "model_cards",
+    "software_cards",
+    "table_cards",
+    "tables_of",
+]
+
+PACKAGES = {
+    "NUMPY": "numpy",
+    "SCIPY": "scipy",
+    "ASTROPY": "astropy",
+    "NUMBA": "numba",
+    "SKLEARN": "scikit-learn",
+    "BATOID": "batoid",
+    "GALSIM": "galsim",
+    "DAF_BUTLER": "lsst-daf-butler",
+}
+"""Distributions whose versions can change a result, by the word in their keyword."""
+
+SKY_TABLES = (
+    ("sky", "oh_lines_palace_yband.ecsv"),
+    ("sky", "oh_levels_palace.ecsv"),
+    ("sky", "oh_temporal_guo2022_noll2015.ecsv"),
+    ("sky", "sky_airglow_continuum_eso_sm01.ecsv"),
+    ("sky", "sky_zodiacal_leinert1998.ecsv"),
+)
+"""Line list, populations, their history and the continuum: what every simulated sky is made of."""
+
+
+@functools.cache
+def _software() -> dict[str, str]:
+    cards = {"ORIGIN": "lsst.fringe_sim", "FSIMVER": __version__, "VERSION PYTHON": platform.python_version()}
+    for word, package in PACKAGES.items():
+        try:
+            cards[f"VERSION {word}"] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return cards
+
+
+def software_cards() -> dict[str, str]:
+    """Keywords of package, Python and the packages that compute."""
+    return dict(_software())
+
+
+def effect_cards(effects: Mapping[str, float]) -> dict[str, str | float]:
+    """Keywords ``EFFECTn`` and ``EFFVALn`` of effects by ``name.parameter``."""
+    cards: dict[str, str | float] = {}
+    for number, (name, value) in enumerate(sorted(effects.items())):
+        cards[f"EFFECT{number}"], cards[f"EFFVAL{number}"] = name, value
+    return cards
+
+
+def effects_of_header(header: Mapping[str, Any]) -> dict[str, float]:
+    """Effects by ``name.parameter`` that a header states; the inverse of `effect_cards`."""
+    found: dict[str, float] = {}
+    number = 0
+    while f"EFFECT{number}" in header:
+        found[str(header[f"EFFECT{number}"])] = float(header[f"EFFVAL{number}"])
+        number += 1
+    return found
+
+
+def tables_of(setup: Setup, stack: LayerStack | None = None) -> tuple[tuple[str, str], ...]:
+    """Shipped files, as (folder, name), that a set-up takes its numbers from.
+
+    Parameters
+    ----------
+    setup : `Setup`
+        The set-up.
+    stack : `LayerStack`, optional
+        Layers with the effects in them, which may bring media of their own; by default those of the set-up.
+    """
+    shipped = [("setups", f"{setup.name}.yaml")] if setup.name in setup_names() else []
+    shipped += [("stacks", f"{setup.stack.name}.yaml"), ("media", "media.yaml")]
+    shipped += _media(layer.medium.name for layer in (stack or setup.stack).layers)
+    if setup.telescope:
+        shipped.append(("telescopes", f"{setup.telescope.lower()}.yaml"))
+    if setup.bandpass:
+        description = f"{setup.bandpass}.yaml"
+        shipped += [("bandpasses", description), ("sky", str(read_yaml("bandpasses", description)["table"]))]
+        shipped += SKY_TABLES
+    return tuple(item for item in shipped if _exists(*item))
+
+
+def _media(names: Iterable[str]) -> list[tuple[str, str]]:
+    entries = read_yaml("media", "media.yaml")
+    return [
+        ("media", str(entries[name]["table"])) for name in sorted(set(names)) if _has_table(entries, name)
+    ]
+
+
+def _has_table(entries: Mapping[str, Any], name: str) -> bool:
+    return name in entries and "table" in entries[name]
+
+
+def _exists(folder: str, name: str) -> bool:
+    """Whether a file is shipped: a set-up of the user may name a stack or a telescope of the user."""
+    try:
+        revision(folder, name)
+    except UnknownNameError:
+        return False
+    return True
+
+
+def table_cards(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Keywords ``TABLEn``: ``folder/name revision``."""
+    return {
+        f"TABLE{number}": f"{folder}/{name} {revision(folder, name)}"
+        for number, (folder, name) in enumerate(tables)
+    }
+
+
+def model_cards(setup: str | Setup, effects: Mapping[str, float]) -> dict[str, str | float]:
+    """Keywords of a fringe model: set-up, effects, tables.
+
+    Parameters
+    ----------
+    setup : `str` or `Setup`
+        The set-up.
+    effects : mapping of `str` to `float`
+        Values by ``name.parameter``.
+    """
+    chosen = Setup.from_name(setup) if isinstance(setup, str) else setup
+    stack = apply_to_system(activate_effects(effects, EFFECTS), _plain_light(chosen)).stack
+    return {"SETUP": chosen.name, **effect_cards(effects), **table_cards(tables_of(chosen, stack))}
+
+
+def _plain_light(setup: Setup) -> OpticalSystem:
+    """The layers of a set-up under a parallel beam: no telescope is traced to learn of what the layers are."""
+    return replace(setup, beam_kind="collimated").optical_system()
