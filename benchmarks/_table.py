@@ -7,17 +7,24 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event, Thread
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Row:
     """One line of the table.
 
-    ``seconds`` is the median wall time of the whole work; ``evaluations`` turns it into a time per evaluation and
-    ``beside`` (seconds per evaluation, or per work without ``evaluations``) into a ratio.
+    ``seconds`` is the wall time of the whole work, ``cpu`` its processor time over all threads; ``evaluations``
+    turns them into times per evaluation and ``beside`` (seconds per evaluation, or per work without
+    ``evaluations``) into a ratio. Where the processor time is given, it is what is compared: it hardly depends on
+    what else the machine does.
     """
 
     work: str
@@ -26,10 +33,12 @@ class Row:
     evaluations: float = 1.0
     beside: float | None = None
     note: str = ""
+    cpu: float | None = None
 
     @property
     def per_evaluation(self) -> float:
-        return self.seconds / self.evaluations
+        """Seconds per evaluation, of processor time where it is known."""
+        return (self.seconds if self.cpu is None else self.cpu) / self.evaluations
 
     @property
     def ratio(self) -> float | None:
@@ -47,6 +56,52 @@ def median_time(function: Callable[[], object], repeat: int = 5, *, cpu: bool = 
         function()
         times.append(clock() - start)
     return statistics.median(times)
+
+
+def timed(function: Callable[[], T]) -> tuple[T, float, float]:
+    """Result, wall time and processor time of all threads [s] of one call."""
+    cpu, wall = time.process_time(), time.perf_counter()
+    result = function()
+    return result, time.perf_counter() - wall, time.process_time() - cpu
+
+
+def best_of(function: Callable[[], object], repeat: int = 3) -> tuple[float, float]:
+    """Least wall and least processor time [s]; the first call, which may compile, is not counted."""
+    function()
+    times = [timed(function)[1:] for _ in range(repeat)]
+    return min(wall for wall, _ in times), min(cpu for _, cpu in times)
+
+
+@contextmanager
+def memory_watch(every_s: float = 0.01) -> Iterator[list[float]]:
+    """Append to the list the largest memory of this process [GiB] while the block ran: without files, and with.
+
+    The first is what a process needs (anonymous memory); the second has the pages of mapped files in it, which the
+    system takes back when it wants them.
+    """
+    largest = [0.0, 0.0]
+    done = Event()
+
+    def look() -> None:
+        while not done.wait(every_s):
+            for k, amount in enumerate(_resident()):
+                largest[k] = max(largest[k], amount)
+
+    watcher = Thread(target=look, daemon=True)
+    watcher.start()
+    found: list[float] = []
+    try:
+        yield found
+    finally:
+        done.set()
+        watcher.join()
+        found.extend(largest)
+
+
+def _resident() -> tuple[float, float]:
+    """Anonymous and whole resident memory [GiB]."""
+    fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return tuple(int(fields[name].split()[0]) / 2**20 for name in ("RssAnon", "VmRSS"))  # type: ignore[return-value]
 
 
 def machine() -> str:
@@ -77,13 +132,17 @@ def seconds(value: float) -> str:
 
 def markdown(rows: list[Row]) -> str:
     """Rows as a Markdown table."""
-    lines = ["| work | method | time | per evaluation | times faster | note |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| work | method | time | processor | per evaluation | times faster | note |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for row in rows:
         ratio = (
             "" if row.ratio is None else f"{row.ratio:,.3g}×" if row.ratio < 1000 else f"{row.ratio:,.0f}×"
         )
+        cpu = "" if row.cpu is None else seconds(row.cpu)
         each = "" if row.evaluations == 1.0 else seconds(row.per_evaluation)
         lines.append(
-            f"| {row.work} | {row.method} | {seconds(row.seconds)} | {each} | {ratio} | {row.note} |"
+            f"| {row.work} | {row.method} | {seconds(row.seconds)} | {cpu} | {each} | {ratio} | {row.note} |"
         )
     return "\n".join(lines)

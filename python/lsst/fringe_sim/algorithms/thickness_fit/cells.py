@@ -292,6 +292,16 @@ def core(array: NDArray[Any]) -> NDArray[Any]:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
+def _usable(image, variance, bad, scale, square):  # type: ignore[no-untyped-def]
+    """Amplitude and variance of one sample, zeros if it cannot be used; without a branch."""
+    amplitude = image * scale - np.float32(1.0)
+    spread = variance * square
+    # NaN fails every comparison.
+    good = (abs(amplitude) < _HUGE) & (spread > np.float32(0.0)) & (spread < _HUGE) & (bad == 0)
+    return (amplitude if good else np.float32(0.0)), (spread if good else np.float32(0.0))
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
 def load_row(image, variance, bad, scale, value, spread):  # type: ignore[no-untyped-def]
     """Amplitude and variance of one row; variance 0 marks what cannot be used.
 
@@ -299,26 +309,18 @@ def load_row(image, variance, bad, scale, value, spread):  # type: ignore[no-unt
     """
     columns = image.shape[0]
     square = scale * scale
-    if variance.shape[0] == 1:
-        same = variance[0] * square
+    if variance.shape[0] > 1 and bad.shape[0] > 1:
         for x in range(columns):
-            spread[x] = same
+            value[x], spread[x] = _usable(image[x], variance[x], bad[x], scale, square)
+    elif variance.shape[0] > 1:
+        for x in range(columns):
+            value[x], spread[x] = _usable(image[x], variance[x], bad[0], scale, square)
+    elif bad.shape[0] > 1:
+        for x in range(columns):
+            value[x], spread[x] = _usable(image[x], variance[0], bad[x], scale, square)
     else:
         for x in range(columns):
-            spread[x] = variance[x] * square
-    if bad.shape[0] == 1:
-        if bad[0] != 0:
-            for x in range(columns):
-                spread[x] = np.float32(0.0)
-    else:
-        for x in range(columns):
-            spread[x] = spread[x] if bad[x] == 0 else np.float32(0.0)
-    for x in range(columns):
-        amplitude = image[x] * scale - np.float32(1.0)
-        # NaN fails every comparison.
-        good = (abs(amplitude) < _HUGE) and (spread[x] > 0.0) and (spread[x] < _HUGE)
-        value[x] = amplitude if good else np.float32(0.0)
-        spread[x] = spread[x] if good else np.float32(0.0)
+            value[x], spread[x] = _usable(image[x], variance[0], bad[0], scale, square)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH)

@@ -285,13 +285,14 @@ def subtract_row(line, offset, x_edges):  # type: ignore[no-untyped-def]
             line[x] -= offset[c]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
 def _invert_row(spread, used):  # type: ignore[no-untyped-def]
     """Variance to weight, and one wavelength more where there is one."""
     for x in range(spread.shape[0]):
-        good = spread[x] > 0.0
-        used[x] += 1 if good else 0
-        spread[x] = np.float32(1.0) / spread[x] if good else np.float32(0.0)
+        variance = spread[x]
+        good = variance > np.float32(0.0)
+        used[x] += np.int32(good)
+        spread[x] = np.float32(1.0) / variance if good else np.float32(0.0)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH)
