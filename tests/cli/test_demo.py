@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import check_page
 from lsst.daf.butler import Butler
 
 from lsst.fringe_sim.cli.main import run
@@ -91,6 +92,14 @@ def test_report_shows_every_section(done) -> None:
     evidence = (done[0] / "discovery" / "report.html").read_text(encoding="utf-8")
     assert "Data minus model" in evidence
     assert len(list((done[0] / "figures").glob("*.png"))) >= 7
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("name", ["report.html", "discovery/report.html"])
+def test_reports_open_in_a_browser(done, name, width, tmp_path) -> None:
+    check_page(
+        done[0] / name, tmp_path, width, f"demo_{name.removesuffix('.html').replace('/', '_')}_{width}"
+    )
 
 
 def test_running_it_again_does_nothing_twice(done) -> None:

@@ -134,7 +134,7 @@ def _amplitude_table(frames: tuple[SkyFringe, ...]) -> Table:
         )
     hour, level, rms, half, trimmed = (np.array(column) for column in zip(*rows, strict=True))
     table = Table()
-    table["local time"] = hour * units.hour
+    table["local time"] = np.round(hour, 3) * units.hour
     table["sky"] = np.round(level, 1) * units.electron
     table["rms"] = np.round(rms, 4) * units.percent
     table["half peak to peak"] = np.round(half, 4) * units.percent

@@ -136,7 +136,8 @@ def write_report(
     )
     report.section("Flats", "Counts over their mean, minus one.")
     report.figure(
-        flats_figure(relative_flats(cube), cube.mask, wavelength, title="prepared flats"), "All flats on one scale."
+        flats_figure(relative_flats(cube), cube.mask, wavelength, title="prepared flats"),
+        "All flats on one scale.",
     )
     report.section(
         "Data and model", "Folded on the fitted thickness, modulo one fringe order of each wavelength."
