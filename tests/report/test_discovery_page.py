@@ -13,8 +13,8 @@ from astropy.table import Table
 
 from lsst.fringe_sim.algorithms.discovery import Verdict
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Step, Where
-from lsst.fringe_sim.report import discovery_page
 from lsst.fringe_sim.report.discovery_figures import candidates_figure, gap_figure, where_figure
+from lsst.fringe_sim.report.discovery_page import discovery_page
 
 WAVELENGTHS = [880.0 + 10.0 * k for k in range(12)]
 
@@ -142,7 +142,7 @@ def test_a_named_effect_has_its_value_its_rivals_and_what_would_decide() -> None
     assert "64" in seen
     assert "ghost_pedestal, contrast_loss" in seen
     assert "12 flats of 80000 electrons" in seen
-    assert "--effect dark_pedestal.electrons=64 --out fit" in seen
+    assert "--effects-file effects.py --out fit" in seen
     share = (0.00778**2 - 0.00703**2) / (0.00778**2 - 0.0070**2)
     assert f"{100 * share:.0f} % of the variance above the noise is gone" in seen
 

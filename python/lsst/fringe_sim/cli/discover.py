@@ -14,11 +14,10 @@ from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..errors import InputError
 from ..model import FringeModel, Setup
 from ..products import FringeCube
-from ..report import discovery_page
-from ..report.discovery_page import residual_pair
+from ..report.discovery_page import discovery_page, residual_pair
 from .inputs import prepare_folder, read_settings
 from .lab_frames import find_series, read_cube
-from .parameters import EFFECT, effect_settings
+from .parameters import EFFECT, LABORATORY, effect_settings
 from .progress import progress
 
 __all__ = ["discover"]
@@ -26,7 +25,9 @@ __all__ = ["discover"]
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
-@click.option("--setup", default="ts8_e2v", show_default=True, help="Laboratory set-up.")
+@click.option(
+    "--setup", type=LABORATORY, default="ts8_e2v", show_default=True, help="Laboratory set-up: name or file."
+)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the verdict.")
 @click.option(
     "--seed", type=int, default=1, show_default=True, help="Which parts of the sensor are held out."
@@ -46,7 +47,7 @@ __all__ = ["discover"]
 @click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
 def discover(
     paths: tuple[str, ...],
-    setup: str,
+    setup: Setup,
     out: Path,
     seed: int,
     effects: tuple[tuple[str, float], ...],
@@ -65,13 +66,10 @@ def discover(
       fringe-sim discover cube.fits --setup ts8_e2v --effect bandwidth.fwhm=2.3 --out verdict
       fringe-sim discover REPO --collections u/me/flats --detector 37 --out verdict
     """
-    chosen = Setup.from_name(setup)
-    if chosen.kind != "monochromator":
-        raise InputError("set-up", setup, "a laboratory set-up with a monochromator")
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
-    model = FringeModel.from_setup(chosen, settings)
-    cube = _read(paths, chosen, collections, detector, skip_bad, dry_run)
+    model = FringeModel.from_setup(setup, settings)
+    cube = _read(paths, setup, collections, detector, skip_bad, dry_run)
     if cube is None:
         return
     folder = prepare_folder(out)

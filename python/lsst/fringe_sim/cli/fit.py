@@ -18,7 +18,7 @@ from ..report.figures import flats_figure, phase_figure, thickness_figure
 from ..report.page import Report
 from .inputs import effect_cards, prepare_folder, read_settings
 from .lab_frames import find_series, read_cube
-from .parameters import EFFECT, effect_settings
+from .parameters import EFFECT, LABORATORY, effect_settings
 from .progress import progress
 
 __all__ = ["fit", "phase_folded"]
@@ -34,7 +34,9 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
-@click.option("--setup", default="ts8_e2v", show_default=True, help="Laboratory set-up.")
+@click.option(
+    "--setup", type=LABORATORY, default="ts8_e2v", show_default=True, help="Laboratory set-up: name or file."
+)
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="Folder for map, figures, report."
 )
@@ -51,7 +53,7 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 @click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
 def fit(
     paths: tuple[str, ...],
-    setup: str,
+    setup: Setup,
     out: Path,
     method: str,
     smoothing: float | None,
@@ -67,16 +69,13 @@ def fit(
       fringe-sim fit raws --setup ts8_e2v --out fit
       fringe-sim fit 'raws/*flat*.fits' 'raws/*bias*.fits' --method guo2022 --out fit_guo
     """
-    chosen = Setup.from_name(setup)
-    if chosen.kind != "monochromator":
-        raise InputError("set-up", setup, "a laboratory set-up with a monochromator")
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
-    model = FringeModel.from_setup(chosen, settings)
+    model = FringeModel.from_setup(setup, settings)
     cube = read_cube(paths[0]) if len(paths) == 1 else None
     if cube is None:
         kernel_px = SMOOTHING_PX[method] if smoothing is None else smoothing
-        cube = _prepare(paths, chosen, kernel_px, skip_bad, dry_run)
+        cube = _prepare(paths, setup, kernel_px, skip_bad, dry_run)
     if dry_run:
         return
     if cube is None or len(np.unique(cube.wavelength_nm)) < LEAST_WAVELENGTHS:
@@ -85,7 +84,7 @@ def fit(
     folder = prepare_folder(out)
     click.echo("fitting the thickness", err=True)
     fitted = fit_thickness(cube, model, method)
-    fitted.write_fits(folder / "thickness.fits", {"SETUP": setup, **effect_cards(model)})
+    fitted.write_fits(folder / "thickness.fits", {"SETUP": setup.name, **effect_cards(model)})
     write_report(folder, cube, fitted, model, method)
     good = fitted.mask == 0
     if good.any():

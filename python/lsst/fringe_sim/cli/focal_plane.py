@@ -23,7 +23,6 @@ from ..algorithms.field_response import (
 )
 from ..algorithms.focal_plane import DES_CRITERION, SkyLevel, forecast_sensor, summary_table
 from ..algorithms.thickness_stand_in import ThicknessField, stand_in_thickness
-from ..effects import EFFECTS, activate_effects
 from ..errors import InputError
 from ..instrument.camera import Camera
 from ..instrument.detector import Detector
@@ -32,7 +31,7 @@ from ..instrument.sky import SkySpectrum
 from ..model import FringeModel
 from ..report.figures import focal_plane_figure
 from ..report.style import save_figure
-from .inputs import prepare_folder, read_settings, read_thickness
+from .inputs import prepare_folder, read_settings, read_thickness, sky_settings
 from .progress import progress
 
 __all__ = ["focal_plane"]
@@ -106,7 +105,7 @@ def focal_plane(
     chosen = _chosen(sensors)
     measured = {Camera.from_name("lsstCam").detector(item.name).name: item.path for item in maps}
     settings = dict(read_settings(effects_file)) if effects_file else {}
-    activate_effects(settings, EFFECTS)
+    settings = sky_settings(settings)
     for path in measured.values():
         if not path.is_file():
             raise InputError("--thickness", str(path), "an existing FITS file")

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import yaml
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from ..algorithms.discovery import read_effects_override
+from ..effects import EFFECTS, activate_effects
 from ..errors import FrameFormatError, InputError
 from ..model import FringeModel
 from ..model.provenance import model_cards, software_cards
 
-__all__ = ["effect_cards", "prepare_folder", "read_settings", "read_thickness"]
+__all__ = ["effect_cards", "prepare_folder", "read_settings", "read_thickness", "sky_settings"]
 
 
 def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
@@ -59,15 +63,18 @@ def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
 
 
 def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Mapping from a YAML file, read with the safe loader.
+    """Mapping from a YAML file, read with the safe loader, or effects from an override that a search has left.
 
     Raises
     ------
     InputError
-        The file is not YAML or not a mapping.
+        The file is not YAML, not a mapping, or an override with more in it than effects.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        text = Path(path).read_text(encoding="utf-8")
+        if Path(path).suffix == ".py":
+            return _read_override(text, str(path))
+        content = yaml.safe_load(text)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError("settings file", str(error).split("\n")[0], "YAML", source=str(path)) from None
     if content is None:
@@ -75,6 +82,36 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError("settings file", type(content).__name__, "a mapping", source=str(path))
     return content
+
+
+def _read_override(text: str, source: str) -> dict[str, Any]:
+    """Effects of an override file; it is not executed, so that nothing else may be in it."""
+    effects: dict[str, Any] = dict(read_effects_override(text))
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if len(lines) != len(effects):
+        raise InputError("override file", f"{len(lines)} statements", "effects alone", source=source)
+    return effects
+
+
+def sky_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Effects that a sensor takes along to the telescope; those of the laboratory are named and left out.
+
+    Raises
+    ------
+    UnknownNameError, OutOfRangeError, InputError
+        An effect that there is not, or a value that it cannot have.
+    """
+    active = activate_effects(settings, EFFECTS)
+    applied = {
+        f"{item.effect.name}.{name}": value
+        for item in active
+        if not item.effect.laboratory_only
+        for name, value in item.values.items()
+    }
+    left = sorted({item.effect.name for item in active if item.effect.laboratory_only})
+    if left:
+        click.echo(f"effects of the laboratory, not taken to the sky: {', '.join(left)}", err=True)
+    return applied
 
 
 def prepare_folder(path: str | os.PathLike[str]) -> Path:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -36,6 +37,7 @@ _COMMANDS = {
     "discover": ("discover", "Find the effect that the model lacks."),
     "reproduce-paper": ("reproduce_paper", "Recompute the paper, number by number."),
     "provenance": ("provenance", "Say what a product was made with and from."),
+    "completion": ("completion", "Print what makes a shell complete commands, options and names."),
     "challenge": ("challenge", "Hide effects in simulated sensors and count what the search finds."),
 }
 
@@ -81,11 +83,25 @@ class _LazyGroup(click.Group):
 def cli(log_level: str) -> None:
     """CCD fringing: simulate, fit, forecast.
 
-    Lengths are in µm for layers and nm for wavelengths; temperatures in kelvin unless a unit is given.
+    Lengths are in µm for layers and nm for wavelengths, temperatures in kelvin; a number may carry another unit,
+    as 0.96um, 14000nm, -100degC.
+
+    \b
+    Examples:
+      fringe-sim demo
+      fringe-sim --log-level debug fit raws --out fit
+      fringe-sim completion bash
     """
     logging.basicConfig(
         level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr, force=True
     )
+
+
+def _complain(message: str) -> None:
+    """One message on standard error; in colour on a terminal, unless NO_COLOR is set (no-color.org)."""
+    color = False if os.environ.get("NO_COLOR") else None
+    click.secho("fringe-sim:", fg="red", bold=True, nl=False, err=True, color=color)
+    click.echo(f" {message}", err=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -115,14 +131,14 @@ def run(arguments: Sequence[str] | None = None) -> int:
         error.show()
         return EXIT_BAD_INPUT
     except FringeSimError as error:
-        click.echo(f"fringe-sim: {error}", err=True)
+        _complain(str(error))
         return EXIT_BAD_INPUT
     except OSError as error:
         named = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        click.echo(f"fringe-sim: {named}", err=True)
+        _complain(named)
         return EXIT_BAD_INPUT
     except Exception:
-        click.echo("fringe-sim: internal failure; this is a bug of the program.", err=True)
+        _complain("internal failure; this is a bug of the program.")
         click.echo(traceback.format_exc(), err=True)
         return EXIT_INTERNAL
     return result if isinstance(result, int) else 0

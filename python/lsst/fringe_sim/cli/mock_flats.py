@@ -15,7 +15,7 @@ from ..mock.raw_frames import Defects, write_mock_flats
 from ..mock.thickness import e2v_321, fit_to_sensor, random_field
 from ..model import Setup
 from .inputs import prepare_folder, read_settings, read_thickness
-from .parameters import EFFECT, SIZE, WAVELENGTHS, Quantity, effect_settings
+from .parameters import EFFECT, LABORATORY, SIZE, WAVELENGTHS, Quantity, effect_settings
 from .progress import progress
 
 __all__ = ["mock_flats"]
@@ -26,7 +26,14 @@ BLEMISHES = Defects(bad_columns=6, hot_pixels=200, prnu_rms=0.003)
 
 @click.command("mock-flats")
 @click.argument("outdir", type=click.Path(path_type=Path))
-@click.option("--setup", default="ts8_e2v", show_default=True, help="Laboratory set-up.")
+@click.option(
+    "--setup",
+    default="ts8_e2v",
+    metavar=LABORATORY.name,
+    show_default=True,
+    shell_complete=LABORATORY.shell_complete,
+    help="Laboratory set-up: name or file.",
+)
 @click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
 @click.option(
     "--thickness",
@@ -79,9 +86,7 @@ def mock_flats(
       fringe-sim mock-flats raws --setup ts8_e2v --detector R11_S01 --seed 1 --size 512x500
       fringe-sim mock-flats raws --thickness random --effect bandwidth.fwhm=2.6 --seed 2 --size 512x500
     """
-    chosen = Setup.from_name(setup)
-    if chosen.kind != "monochromator":
-        raise InputError("set-up", setup, "a laboratory set-up with a monochromator")
+    chosen = LABORATORY.convert(setup, None, None)
     camera = Camera.from_name(chosen.camera)
     sensor = camera.detector(detector or chosen.detector)
     shape = (size[1], size[0]) if size else sensor.shape

@@ -1,4 +1,4 @@
-"""Types of command-line arguments: quantities with units, ranges, sizes, effect settings."""
+"""Types of command-line arguments: quantities with units, ranges, sizes, set-ups, effect settings."""
 
 from __future__ import annotations
 
@@ -8,8 +8,23 @@ from typing import Any
 import click
 import numpy as np
 from astropy import units
+from click.shell_completion import CompletionItem
 
-__all__ = ["EFFECT", "SIZE", "THICKNESS_RANGE", "WAVELENGTHS", "Quantity", "effect_settings"]
+from ..effects import EFFECTS, Parameter
+from ..errors import InputError
+from ..model import Setup, setup_names
+
+__all__ = [
+    "EFFECT",
+    "LABORATORY",
+    "SIZE",
+    "SKY",
+    "THICKNESS_RANGE",
+    "WAVELENGTHS",
+    "Quantity",
+    "SetupType",
+    "effect_settings",
+]
 
 
 class Quantity(click.ParamType):
@@ -97,8 +112,56 @@ class _Size(click.ParamType):
         return int(match.group(1)), int(match.group(2))
 
 
+class SetupType(click.ParamType):
+    """A set-up by its name, or a YAML file laid out like the shipped ones.
+
+    Parameters
+    ----------
+    kind : {"monochromator", "sky"}
+        Light that the command is for.
+    wanted : `str`
+        The same in words.
+    """
+
+    name = "NAME|FILE.yaml"
+
+    def __init__(self, kind: str, wanted: str) -> None:
+        self.kind = kind
+        self.wanted = wanted
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Setup:
+        """The set-up.
+
+        Raises
+        ------
+        UnknownNameError
+            There is no such set-up; near misses are offered.
+        InputError
+            A file that is not a set-up, or a set-up with light of the other kind.
+        """
+        if isinstance(value, Setup):
+            return value
+        text = str(value)
+        is_file = text.lower().endswith((".yaml", ".yml"))
+        setup = Setup.from_file(text) if is_file else Setup.from_name(text)
+        if setup.kind != self.kind:
+            raise InputError("set-up", text, self.wanted)
+        return setup
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Names of this kind; files where none fits."""
+        fitting = [
+            name
+            for name in setup_names()
+            if name.startswith(incomplete) and Setup.from_name(name).kind == self.kind
+        ]
+        return [CompletionItem(name) for name in fitting] or [CompletionItem(incomplete, type="file")]
+
+
 class _EffectSetting(click.ParamType):
-    """``name.parameter=value``."""
+    """``name.parameter=value``, the value with or without a unit."""
 
     name = "name.parameter=value"
 
@@ -107,19 +170,44 @@ class _EffectSetting(click.ParamType):
     ) -> tuple[str, float]:
         if isinstance(value, tuple):
             return value
-        key, equals, number = str(value).partition("=")
+        key, equals, number = (part.strip() for part in str(value).partition("="))
         if not equals or "." not in key:
             self.fail(f"{value!r} is not name.parameter=value", param, ctx)
         try:
-            return key.strip(), float(number)
+            return key, float(number)
         except ValueError:
+            pass
+        unit = next((parameter.unit for name, parameter in _parameters() if name == key), None)
+        if not unit:
             self.fail(f"the value in {value!r} is not a number", param, ctx)
+        return key, Quantity(unit).convert(number, param, ctx)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Parameters of the catalogue with their units."""
+        return [
+            CompletionItem(f"{name}=", help=f"{parameter.description} [{parameter.unit or 1}]")
+            for name, parameter in _parameters()
+            if name.startswith(incomplete)
+        ]
+
+
+def _parameters() -> list[tuple[str, Parameter]]:
+    """All parameters of the catalogue by ``name.parameter``."""
+    return [
+        (f"{effect.name}.{parameter.name}", parameter)
+        for effect in EFFECTS
+        for parameter in effect.parameters
+    ]
 
 
 WAVELENGTHS = _Wavelengths()
 THICKNESS_RANGE = _ThicknessRange()
 SIZE = _Size()
 EFFECT = _EffectSetting()
+LABORATORY = SetupType("monochromator", "a laboratory set-up with a monochromator")
+SKY = SetupType("sky", "one behind a telescope, as lsst_e2v, monocam or hsc")
 
 
 def effect_settings(settings: tuple[tuple[str, float], ...]) -> dict[str, float]:

@@ -20,10 +20,9 @@ from ..algorithms.flat_plan import (
     rank_flats,
     recommend_flats,
 )
-from ..errors import InputError
 from ..model import FringeModel, Setup
 from .inputs import read_settings
-from .parameters import EFFECT, THICKNESS_RANGE, WAVELENGTHS, Quantity, effect_settings
+from .parameters import EFFECT, LABORATORY, THICKNESS_RANGE, WAVELENGTHS, Quantity, effect_settings
 
 __all__ = ["plan_flats"]
 
@@ -32,7 +31,9 @@ RANKED_ROWS = 5
 
 
 @click.command(name="plan-flats")
-@click.option("--setup", default="ts8_e2v", show_default=True, help="Laboratory set-up.")
+@click.option(
+    "--setup", type=LABORATORY, default="ts8_e2v", show_default=True, help="Laboratory set-up: name or file."
+)
 @click.option("--thickness", type=THICKNESS_RANGE, help="Thicknesses of the layer, µm; those of the set-up.")
 @click.option("--search", type=THICKNESS_RANGE, help="Thicknesses the fit will search, µm; as 'fit' does.")
 @click.option("--wavelengths", type=WAVELENGTHS, help="Flats, nm: 880:990:10 or a list; those of the set-up.")
@@ -72,7 +73,7 @@ RANKED_ROWS = 5
 @click.option("--ecsv", type=click.Path(path_type=Path), help="File for the forecast at every thickness.")
 @click.option("--dry-run", is_flag=True, help="Check everything, say what would be done, write nothing.")
 def plan_flats(
-    setup: str,
+    setup: Setup,
     thickness: tuple[float, float] | None,
     search: tuple[float, float] | None,
     wavelengths: tuple[float, ...] | None,
@@ -100,13 +101,10 @@ def plan_flats(
       fringe-sim plan-flats --thickness 7um:15um --wavelengths 880:990:10
       fringe-sim plan-flats --thickness 7:15 --effect contrast_loss.factor=0.15 --electrons 50000 --region 1024
     """
-    chosen = Setup.from_name(setup)
-    if chosen.kind != "monochromator":
-        raise InputError("set-up", setup, "a laboratory set-up with a monochromator")
     settings = dict(read_settings(effects_file)) if effects_file else {}
-    model = FringeModel.from_setup(chosen, {**settings, **effect_settings(effects)})
-    nominal = wavelengths or chosen.wavelengths_nm
-    width = chosen.bandwidth_fwhm_nm if bandwidth is None else bandwidth
+    model = FringeModel.from_setup(setup, {**settings, **effect_settings(effects)})
+    nominal = wavelengths or setup.wavelengths_nm
+    width = setup.bandwidth_fwhm_nm if bandwidth is None else bandwidth
     flats = [PlannedFlat(value, electrons, bandwidth) for value in nominal]
     pool = [
         PlannedFlat(value, electrons, wide)
@@ -117,7 +115,7 @@ def plan_flats(
         click.echo(f"would forecast {len(flats)} flats and compare {len(pool)} further ones")
         return
     limits: dict[str, Any] = {"search_um": search, "read_noise_e": read_noise, "region_px": region}
-    range_um = thickness or chosen.thickness_range_um
+    range_um = thickness or setup.thickness_range_um
     now = forecast_flats(model, flats, range_um, **limits)
     ranked = rank_flats(model, flats, pool, range_um, slip_limit=slip_limit, **limits)
     goal = math.inf if sigma is None else 1e-3 * sigma

@@ -195,14 +195,12 @@ def _inputs(header: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _in_repository(repo: str, dataset_type: str, collections: str, where: str) -> Iterator[dict[str, Any]]:
-    from lsst.daf.butler import Butler, ButlerUserError
+    from lsst.daf.butler import ButlerUserError
     from lsst.daf.butler.registry import RegistryError
 
-    try:
-        butler = Butler.from_config(repo)
-    except (FileNotFoundError, ValueError, RuntimeError) as error:
-        raise InputError("repository", repo, f"a butler repository ({error})") from error
-    with butler:
+    from ..middleware.repository import open_repository
+
+    with open_repository(repo) as butler:
         try:
             refs = sorted(
                 set(

@@ -9,7 +9,6 @@ import click
 import numpy as np
 
 from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, sky_response
-from ..effects import EFFECTS, activate_effects
 from ..errors import InputError, OutOfRangeError
 from ..instrument.camera import Camera
 from ..instrument.night import NightHistory
@@ -19,8 +18,8 @@ from ..model import FringeModel, Setup
 from ..products import SkyFringe
 from ..report.figures import sky_figure
 from ..report.style import save_figure
-from .inputs import effect_cards, prepare_folder, read_settings, read_thickness
-from .parameters import EFFECT, Quantity, effect_settings
+from .inputs import effect_cards, prepare_folder, read_settings, read_thickness, sky_settings
+from .parameters import EFFECT, SKY, Quantity, effect_settings
 from .progress import progress
 
 __all__ = ["sky"]
@@ -29,7 +28,9 @@ PERCENT = 100.0
 
 
 @click.command()
-@click.option("--setup", default="lsst_e2v", show_default=True, help="Sensor and telescope.")
+@click.option(
+    "--setup", type=SKY, default="lsst_e2v", show_default=True, help="Sensor and telescope: name or file."
+)
 @click.option(
     "--thickness", required=True, help="Map of the varying layer: a FITS file [µm], or 'e2v_321' (built in)."
 )
@@ -44,7 +45,7 @@ PERCENT = 100.0
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for frames and figure.")
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def sky(
-    setup: str,
+    setup: Setup,
     thickness: str,
     detector: str | None,
     exptime: float | None,
@@ -59,37 +60,37 @@ def sky(
 ) -> None:
     """Simulate the fringes of the night sky for one sensor behind a telescope.
 
+    Effects may be those that a search has found (effects.py); those of the laboratory stay there.
+
     \b
     Examples:
       fringe-sim sky --thickness fit/thickness.fits --detector R22_S11 --out sky
       fringe-sim sky --setup monocam --thickness e2v_321 --noise --exptime 60s --out sky
+      fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky
     """
-    chosen = Setup.from_name(setup)
-    if chosen.kind != "sky":
-        raise InputError("set-up", setup, "one behind a telescope, as lsst_e2v, monocam or hsc")
     if night and exptime is not None:
         raise InputError(
             "--exptime", exptime, "nothing beside --night, whose frames have the set-up's exposure"
         )
     if exptime is not None and not exptime > 0.0:
         raise OutOfRangeError("exposure time [s]", exptime, "positive")
-    sensor = Camera.from_name(chosen.camera).detector(detector or chosen.detector)
+    sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
     layer = e2v_321() if thickness == "e2v_321" else read_thickness(thickness)
     frames = 11 if night else 1
-    activate_effects(settings, EFFECTS)
+    settings = sky_settings(settings)
     if dry_run:
         click.echo(
             f"would simulate {frames} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
         )
         return
     model = FringeModel.from_setup(
-        chosen, settings, field_x_deg=_angle(sensor.field_x_deg), field_y_deg=_angle(sensor.field_y_deg)
+        setup, settings, field_x_deg=_angle(sensor.field_x_deg), field_y_deg=_angle(sensor.field_y_deg)
     )
     folder = prepare_folder(out)
     known = layer[np.isfinite(layer)]
-    dark = SkySpectrum.dark(airmass=airmass or chosen.airmass)
+    dark = SkySpectrum.dark(airmass=airmass or setup.airmass)
     click.echo("tabulating the response to the sky", err=True)
     response = sky_response(
         model, dark, thickness_range_um=(float(known.min()) - 1e-6, float(known.max()) + 1e-6)
@@ -98,7 +99,7 @@ def sky(
     common: dict[str, Any] = {
         "read_noise_e": read_noise,
         "detector": sensor.name,
-        "physical_filter": chosen.bandpass,
+        "physical_filter": setup.bandpass,
     }
     if night:
         series = simulate_night(
@@ -121,7 +122,7 @@ def sky(
     with progress("simulating frames", frames) as advance:
         for number, frame in enumerate(series):
             frame.write_fits(
-                folder / f"sky_{sensor.name}_{number:02d}.fits", {"SETUP": setup, **effect_cards(model)}
+                folder / f"sky_{sensor.name}_{number:02d}.fits", {"SETUP": setup.name, **effect_cards(model)}
             )
             made.append(frame)
             advance()

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
@@ -192,7 +193,7 @@ def setup_optics(setup: str) -> tuple[FlatFieldOptics, str]:
     Parameters
     ----------
     setup : `str`
-        Name of a file in ``data/setups``.
+        Name of a file in ``data/setups``, or a YAML file laid out like those.
 
     Raises
     ------
@@ -201,7 +202,7 @@ def setup_optics(setup: str) -> tuple[FlatFieldOptics, str]:
     InputError
         It is not illuminated by a monochromator.
     """
-    content = _read_named("set-up", "setups", setup)
+    content = _read_setup(setup)
     light = content["illumination"]
     if light["kind"] != "monochromator":
         raise InputError("illumination.kind", light["kind"], "monochromator (flats need one)", source=setup)
@@ -327,8 +328,16 @@ def _read_named(what: str, folder: str, name: str) -> dict[str, Any]:
     return read_yaml(folder, f"{name}.yaml")
 
 
+def _read_setup(setup: str) -> dict[str, Any]:
+    """Content of a shipped set-up, or of a YAML file."""
+    if not setup.lower().endswith((".yaml", ".yml")):
+        return _read_named("set-up", "setups", setup)
+    content: dict[str, Any] = yaml.safe_load(Path(setup).read_text(encoding="utf-8"))
+    return content
+
+
 def _nominal_celsius(setup: str) -> float:
-    return round(float(read_yaml("setups", f"{setup}.yaml")["temperature_k"]) - 273.15, 3)
+    return round(float(_read_setup(setup)["temperature_k"]) - 273.15, 3)
 
 
 def _sensor(camera: str, detector: int | str, size: str | None) -> Detector:

@@ -359,11 +359,11 @@ def _use(report: Report, verdict: Verdict) -> None:
         "To use it",
         "effects.py beside this page puts the effects into any task (-C label:effects.py); on the command line:",
     )
-    options = " ".join(f"--effect {key}={value:.6g}" for key, value in verdict.settings.items())
     report.code(
-        f"fringe-sim fit RAWS --setup {verdict.setup} {options} --out fit\n"
-        f"fringe-sim sky --thickness fit/thickness.fits {options} --out sky"
+        f"fringe-sim fit RAWS --setup {verdict.setup} --effects-file effects.py --out fit\n"
+        "fringe-sim sky --thickness fit/thickness.fits --effects-file effects.py --out sky"
     )
+    report.paragraph("Effects of the laboratory, as the width of its line, are not taken to the sky.")
 
 
 def _data(report: Report, verdict: Verdict) -> None:
