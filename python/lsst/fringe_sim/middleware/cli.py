@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import functools
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,7 +14,7 @@ import click
 from lsst.daf.butler.cli.opt import options_file_option, repo_argument, transfer_option, where_option
 from lsst.daf.butler.cli.utils import ButlerCommand
 
-from ..errors import FringeSimError, InputError
+from ..errors import FringeSimError
 
 if TYPE_CHECKING:
     from lsst.daf.butler import Butler
@@ -24,13 +24,20 @@ __all__ = [
     "define_fringe_night",
     "get_cli_subcommands",
     "ingest_fringe_raws",
+    "recover_fringe_repo",
     "write_fringe_handoff",
 ]
 
 
 def get_cli_subcommands() -> list[click.Command]:
     """Return the subcommands; the entry point ``butler.cli`` leads here."""
-    return [ingest_fringe_raws, define_fringe_night, adopt_sensor_datasets, write_fringe_handoff]
+    return [
+        ingest_fringe_raws,
+        define_fringe_night,
+        adopt_sensor_datasets,
+        write_fringe_handoff,
+        recover_fringe_repo,
+    ]
 
 
 def _one_clear_message(command: Callable[..., None]) -> Callable[..., None]:
@@ -46,17 +53,11 @@ def _one_clear_message(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
-@contextlib.contextmanager
-def _butler(repo: str, *, writeable: bool) -> Iterator[Butler]:
+def _butler(repo: str, *, writeable: bool) -> contextlib.AbstractContextManager[Butler]:
     """Open a repository; what is none is refused in one line."""
-    from lsst.daf.butler import Butler
+    from .repository import open_repository
 
-    try:
-        butler = Butler.from_config(repo, writeable=writeable)
-    except (FileNotFoundError, ValueError, RuntimeError) as error:
-        raise InputError("repository", repo, f"a butler repository ({error})") from error
-    with butler:
-        yield butler
+    return open_repository(repo, writeable=writeable)
 
 
 @click.command(short_help="Ingest raw frames in the LSST layout.", cls=ButlerCommand)
@@ -230,3 +231,19 @@ def adopt_sensor_datasets(
         click.echo(f"not in {instrument}: {', '.join(report.homeless)}", err=True)
     verb = "would be adopted" if dry_run else "adopted"
     click.echo(f"{len(report.adopted)} datasets {verb} into {run}; {len(report.present)} were there already")
+
+
+@click.command(short_help="Undo what a killed process left half done.", cls=ButlerCommand)
+@repo_argument(required=True)
+@options_file_option()
+@_one_clear_message
+def recover_fringe_repo(repo: str) -> None:
+    """Undo the transaction that a killed process has left in an SQLite registry.
+
+    Needed where "pipetask" and "butler" stop with "attempt to write a readonly database". Every dataset that was
+    stored before stays; the run can be resumed. Doing it twice, or without need, changes nothing.
+    """
+    from .repository import recover_repository
+
+    recover_repository(repo)
+    click.echo(f"{repo}: the registry is in order")
