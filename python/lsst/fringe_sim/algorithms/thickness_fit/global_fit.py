@@ -11,7 +11,15 @@ from scipy.ndimage import distance_transform_edt
 
 from .amplitudes import Amplitudes
 from .borders import settle_borders
-from .cells import Cells, average_cells, cell_edges, cell_independence, compensate_slopes, effective_number
+from .cells import (
+    Cells,
+    average_cells,
+    cell_edges,
+    cell_independence,
+    compensate_slopes,
+    effective_number,
+    sample_pixels,
+)
 from .evidence import OrderEvidence, order_evidence, refine_cells
 from .narrow_sensor import is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, first_nuisances, fit_nuisances, subtract_offset
@@ -132,6 +140,8 @@ def global_fit(
     surface = _surface(state, order)
     fringes = replace(data, offset=state.nuisance.offset, y_edges=cells.y_edges, x_edges=cells.x_edges)
     calmed = calm_surface(surface, threads)
+    if state.normalisation == "sensor" and not nuisances.patterned:
+        state = replace(state, templates=_normalise_to_pixels(data, state.templates, calmed, threads))
     pixels = fit_pixels(fringes, state.templates, calmed, order, threads=threads)
     rough = spread_to_pixels(cells, ~surface.smooth)
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
@@ -326,6 +336,16 @@ def _surface(state: _State, order: float) -> CellSurface:
         slope_y, slope_x = np.where(empty, 0.0, slope_y), np.where(empty, 0.0, slope_x)
     cells = state.cells
     return CellSurface.from_cells(thickness, slope_y, slope_x, cells.y_centre, cells.x_centre, order, ~empty)
+
+
+def _normalise_to_pixels(
+    data: Amplitudes, templates: FringeTemplates, surface: CellSurface, threads: int
+) -> FringeTemplates:
+    """Renormalise to single pixels: a steep cell spreads over a part of a fringe that its mean does not show."""
+    sample = sample_pixels(data)
+    start = surface.at(sample.y_edges[:-1], sample.x_edges[:-1])
+    start[sample.n_wavelengths == 0] = np.nan
+    return normalise_to_cells(sample, templates, start, threads)[1]
 
 
 def choose_cell_size(data: Amplitudes) -> int:

@@ -112,6 +112,16 @@ class CellSurface:
             known,
         )
 
+    def at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Bilinear surface at some rows and columns of pixels, shape ``(len(rows), len(columns))`` [µm]."""
+        below_y, share_y = (part[rows] for part in bracket(self.y_centre, int(rows.max()) + 1))
+        below_x, share_x = (part[columns] for part in bracket(self.x_centre, int(columns.max()) + 1))
+        above_y = np.minimum(below_y + 1, len(self.y_centre) - 1)
+        above_x = np.minimum(below_x + 1, len(self.x_centre) - 1)
+        cells = self.thickness_um
+        lines = cells[below_y] + share_y[:, None] * (cells[above_y] - cells[below_y])
+        return lines[:, below_x] + share_x * (lines[:, above_x] - lines[:, below_x])
+
 
 def calm_surface(surface: CellSurface, threads: int = 2) -> CellSurface:
     """Replace every smooth cell by the median of what the 5 by 5 cells around it foretell.

@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter
 from .amplitudes import Amplitudes
 from .cells import core, load_row, run_threaded
 from .newton import score
-from .pixels import CellSurface, PixelFit, bracket, calm_surface, subtract_row
+from .pixels import CellSurface, PixelFit, calm_surface, subtract_row
 from .templates import FringeTemplates
 
 __all__ = ["evaluate_pixels", "smooth_likelihood"]
@@ -76,7 +76,7 @@ def smooth_likelihood(
     used = pixels.n_wavelengths
     taken = ~rough & (used > 0)
     surface = calm_surface(_follow_pixels(data, templates, surface, edges, taken, threads), threads)
-    base = _interpolate(surface, used.shape)
+    base = surface.at(*(np.arange(size) for size in used.shape))
     gain, information, _ = evaluate_pixels(data, templates, base, threads)
     gain *= taken * np.float32(1.0 / templates.step_um)
     information *= taken * np.float32(templates.step_um**-2)
@@ -113,7 +113,7 @@ def _follow_pixels(
 
     The mean over a steep cell is biased a little, in step with its fringes; the sum of the scores is not.
     """
-    parts = evaluate_pixels(data, templates, _interpolate(surface, taken.shape), threads)
+    parts = evaluate_pixels(data, templates, surface.at(*(np.arange(size) for size in taken.shape)), threads)
     gain, information = (
         np.add.reduceat(np.add.reduceat(part * taken, edges[0][:-1], axis=0), edges[1][:-1], axis=1)
         for part in parts[:2]
@@ -147,17 +147,6 @@ def _smooth(image: NDArray[np.float32], sigma_px: float, threads: int) -> NDArra
 
     run_threaded(work, -(-len(image) // _SMOOTHED_ROWS), threads)
     return out
-
-
-def _interpolate(surface: CellSurface, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Bilinear surface at every pixel."""
-    below_y, share_y = bracket(surface.y_centre, shape[0])
-    below_x, share_x = bracket(surface.x_centre, shape[1])
-    above_y = np.minimum(below_y + 1, len(surface.y_centre) - 1)
-    above_x = np.minimum(below_x + 1, len(surface.x_centre) - 1)
-    cells = surface.thickness_um
-    lines = cells[below_y] + share_y[:, None] * (cells[above_y] - cells[below_y])
-    return lines[:, below_x] + share_x * (lines[:, above_x] - lines[:, below_x])
 
 
 def evaluate_pixels(
