@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import datetime
 import json
+import os
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +151,59 @@ def test_only_what_failed_runs_again(
     assert outcome.code == 0, outcome.text
     assert "Executed 2 quanta successfully, 0 failed and 0 remain" in outcome.text
     assert fitted(repo, "u/lab") == set(DETECTORS.values())
+
+
+def runs_of(repo: Path, out: str) -> list[str]:
+    with Butler.from_config(str(repo)) as butler:
+        return list(butler.collections.query(f"{out}/*"))
+
+
+def killed_after_one_map(repo: Path, out: str) -> None:
+    """Start the fit of both sensors and kill it, without warning, as soon as one of them is done.
+
+    The metadata of a quantum are written last, and tell that it is complete.
+    """
+    program = Path(sys.executable).with_name("pipetask")
+    arguments = ("-b", repo, "-i", "u/lab", "-o", out, "-p", f"{PIPELINE}#epoxyFit")
+    where = ("-d", "instrument = 'LSST-TS8'", "-j", "1", "--register-dataset-types")
+    fit = subprocess.Popen(
+        [program, "run", *arguments, *where],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+    )
+    try:
+        while fit.poll() is None and not list((repo / out).rglob("epoxyFit_metadata_*")):
+            time.sleep(0.005)
+    finally:
+        fit.kill()
+        fit.wait()
+
+
+def test_a_killed_fit_loses_only_the_sensor_it_was_in(
+    command: Command, first_run: tuple[Path, Outcome]
+) -> None:
+    repo, _ = first_run
+    for number in range(5):
+        out = f"u/killed{number}"
+        killed_after_one_map(repo, out)
+        (run,) = runs_of(repo, out)
+        if len(fitted(repo, run)) < len(DETECTORS):  # else it was faster than the signal
+            break
+    (kept,) = fitted(repo, run)
+    (file,) = (repo / run).rglob("epoxyThickness_*.fits")
+    before = file.stat().st_mtime_ns
+    outcome = command(
+        *("pipetask", "run", "-b", repo, "-i", "u/lab", "-o", out, "-p", f"{PIPELINE}#epoxyFit"),
+        *("-d", "instrument = 'LSST-TS8'", "-j", "1", "--skip-existing-in", run),
+    )
+    assert outcome.code == 0, outcome.text
+    assert "Executed 1 quanta successfully, 0 failed and 0 remain" in outcome.text
+    (later,) = set(runs_of(repo, out)) - {run}
+    assert fitted(repo, later) == set(DETECTORS.values()) - {kept}
+    assert file.stat().st_mtime_ns == before
+    with Butler.from_config(str(repo), collections=run, instrument="LSST-TS8") as butler:
+        assert (butler.get("epoxyThickness", detector=kept).mask == 0).mean() > 0.85
 
 
 def test_override_of_one_raft_within_a_run_of_all(first_run: tuple[Path, Outcome]) -> None:
