@@ -187,7 +187,7 @@ def test_the_forecast_of_the_sky_follows(
     assert np.std((known.fraction() - real)[good]) < 0.05 * fringe
     assert np.std((without.fraction() - real)[good]) > 0.15 * fringe
     assert np.std(known.fraction()[good]) == pytest.approx(fringe, rel=0.03)
-    assert np.std(without.fraction()[good]) != pytest.approx(fringe, rel=0.3)
+    assert np.std(without.fraction()[good]) > 1.1 * fringe
     assert known.metadata["EFFECT0"] == "epoxy_absorption.k"
 
 

@@ -30,7 +30,8 @@ class CellData:
     Attributes
     ----------
     value : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Mean counts of a cell over the mean of its plane; 1 where there are no data.
+        Mean counts of a cell over the mean of its plane, or the relative counts of a relative cube; 1 where there are
+        no data.
     weight : `numpy.ndarray`, shape ``(W, ny, nx)``
         Inverse variance; 0 where there are no data.
     geometry : `ImageGeometry`
@@ -125,7 +126,8 @@ def bin_cube(
         good &= np.isfinite(image) & np.isfinite(variance)
         if not good.any():
             raise InputError(f"good pixels at {cube.wavelength_nm[source]:g} nm", 0, "one or more")
-        mean = float(image[good].mean())
+        # A relative plane is over the mean of its whole sensor, of which there may be only a few pixels here.
+        mean = float(image[good].mean()) if cube.unit == "electron" else 1.0
         if not mean > 0.0:
             raise InputError(f"mean level at {cube.wavelength_nm[source]:g} nm", mean, "above 0")
         count = _block_sum(good.astype(np.float64), cell_px)

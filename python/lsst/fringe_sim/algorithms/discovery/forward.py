@@ -103,7 +103,8 @@ class Forward:
             light = model.system.flat_fields(wavelength, LINE_STEP_NM)
             response = model.respond_on_grid(light, low, TABLE_STEP_UM, count, wavelength)
             if self._scale is None:
-                self._scale = response.mean(axis=1)
+                # Tapered, so that a broken fringe order at an end of the table does not count.
+                self._scale = np.average(response, axis=1, weights=np.hanning(count + 2)[1:-1])
             self._tables[key] = table = response / self._scale[:, np.newaxis]
             while len(self._tables) * table.nbytes > MOST_TABLE_BYTES and len(self._tables) > 2:
                 self._tables.pop(next(iter(self._tables)))

@@ -37,6 +37,11 @@ MIMICKED = 0.05
 DECADES_OF_CHANCE = 200.0
 """Powers of ten by which a residual of signal to noise 30 is improbable."""
 
+ORDERS_TRIED = 6
+"""Fringe orders on both sides of the first one in which a few pixels are fitted."""
+
+STEPS_PER_ORDER = 12
+
 Report = Callable[[str], None]
 
 
@@ -90,6 +95,7 @@ class _Prepared:
     stated: CellData
     notes: tuple[str, ...] = field(default=())
     undistorted_field: FloatArray | None = None
+    shifts_um: tuple[float, ...] = ()
 
 
 def discover(
@@ -298,15 +304,18 @@ def _prepare_few(
     order = float(np.median(cells.wavelength_nm)) * 1e-3 / (2.0 * float(index.mean()))
     spread = cells.scaled_noise(1.0 + STATED_UNCERTAINTY, 0.0)
     problem = Problem(spread, forward, basis, levels)
+    reach = np.arange(-ORDERS_TRIED * STEPS_PER_ORDER, ORDERS_TRIED * STEPS_PER_ORDER + 1)
+    shifts = reach * (order / STEPS_PER_ORDER)
+    shifts = shifts[float(start.min()) + shifts > 0.5]
     fits = [
-        fit_model(problem, (), np.zeros(0), (start + shift * order).ravel())
-        for shift in range(-4, 5)
-        if float(start.min()) + shift * order > 0.5
+        fit_model(problem, (), np.zeros(0), (start + shift).ravel()) for shift in shifts[::STEPS_PER_ORDER]
     ]
     noise = NoiseEstimate(np.ones(cells.shape[0]), 0.0, False, 0.0)
     best = min(fits, key=lambda fit: fit.chi2)
     note = "noise taken as stated plus 20 %; flat levels taken as known up to a common factor"
-    return _Prepared(problem, best, noise, index, False, cells, (note,))
+    return _Prepared(
+        problem, best, noise, index, False, cells, (note,), start.ravel(), tuple(shifts.tolist())
+    )
 
 
 def _measure_noise(problem: Problem, fit: Fit) -> NoiseEstimate:
@@ -364,6 +373,7 @@ class _Search:
             self.prepared.index,
             generic=self.prepared.rich,
             first_field=self.prepared.undistorted_field,
+            shifts_um=self.prepared.shifts_um,
         )
         self.where = self._where(whole)
         chance = self._chance(whole, whole.null)
@@ -422,7 +432,10 @@ class _Search:
         """Refits of the best-scored additions to a set, likeliest first."""
         names = [name for name in selector.coordinates if name not in base.names]
         scores = selector.score(base.fit, names, scan=True)
-        worth = [c for c in scores if c.promise > 9.0][: self.options.refits]
+        if self.prepared.shifts_um:  # a score in the wrong order says nothing
+            worth = scores
+        else:
+            worth = [c for c in scores if c.promise > 9.0][: self.options.refits]
         refitted = [selector.hypothesis((*base.names, c.name), c.start, base.fit) for c in worth]
         for hypothesis in refitted:
             self.say(
@@ -622,9 +635,12 @@ class _Search:
 
     def _validate(self, whole: Selector, final: Hypothesis) -> dict[str, float]:
         """Fall of χ² on blocks and on wavelengths that did not take part in fitting the effects."""
-        gains = {"blocks": math.inf, "wavelengths": 0.0}
+        gains = {"blocks": 0.0, "wavelengths": 0.0}
         null = whole.null.fit
         self.heldout_rms = (_rms(whole.problem, null), _rms(whole.problem, final.fit))
+        if not self.prepared.rich:
+            gains["wavelengths"] = self._validate_single_wavelengths(whole, final)
+            return gains
         if self.heldout.any():
             seen = whole.problem.with_cells(self.cells.restricted(~self.heldout))
             fitted = fit_model(
@@ -652,6 +668,27 @@ class _Search:
             fitted = fit_model(problem, fit.coordinates, fit.position, fit.field, fit.levels, fit.settings)
             total.append(_predicted_chi2(unseen, fitted))
         return total[0] - total[1]
+
+    def _validate_single_wavelengths(self, whole: Selector, final: Hypothesis) -> float:
+        """Fall of χ² at wavelengths that are left out one by one, of a few pixels whose levels are known."""
+        waves = self.cells.shape[0]
+        if waves < 4:
+            return 0.0
+        total, square = np.zeros(2), np.zeros((2, waves))
+        for wave in range(waves):
+            out = np.arange(waves) == wave
+            seen = whole.problem.with_cells(self.cells.restricted(~out[:, None, None]))
+            for side, fit in enumerate((whole.null.fit, final.fit)):
+                fitted = fit_model(seen, fit.coordinates, fit.position, fit.field, fit.levels, fit.settings)
+                value = whole.problem.forward.predict(
+                    fitted.settings, whole.problem.basis.expand(fitted.field)
+                ).value
+                miss = (self.cells.value - whole.problem.expected(fitted.levels, value))[wave]
+                total[side] += float((self.cells.weight[wave] * miss**2).sum())
+                square[side, wave] = float(np.sqrt(np.mean(miss**2)))
+        before, after = np.sqrt((square**2).mean(axis=1))
+        self.heldout_rms = (float(before), float(after))
+        return float(total[0] - total[1])
 
     def _named(
         self, final: Hypothesis, name: str, members: dict[str, float], probability: float
@@ -728,9 +765,9 @@ def _held_out_blocks(
     shape: tuple[int, int], fraction: float, rng: np.random.Generator, rich: bool
 ) -> NDArray[np.bool_]:
     """Blocks of cells that no selection sees, scattered over the sensor; none where there are few cells."""
-    if not rich or min(shape) < 32:
+    if not rich or min(shape) < 12:
         return np.zeros(shape, dtype=bool)
-    side = 8
+    side = min(8, min(shape) // 3)
     blocks = rng.permutation(side * side).reshape(side, side) < round(fraction * side * side)
     rows = np.arange(shape[0]) * side // shape[0]
     columns = np.arange(shape[1]) * side // shape[1]

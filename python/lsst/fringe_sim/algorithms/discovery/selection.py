@@ -36,6 +36,9 @@ SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
 MINIMA_TRIED = 12
 """Neighbouring minima on both sides of the first one found among which the deepest is looked for."""
 
+PLACES_REFITTED = 10
+"""Minima in size and thickness from which a few pixels are fitted."""
+
 STEPS_PER_MINIMUM = 5
 MINIMA_REFITTED = 4
 
@@ -108,6 +111,9 @@ class Selector:
         Whether there are enough cells for the tests without a catalogue.
     first_field : `numpy.ndarray`, optional
         Field from which the first effect is fitted; that of ``null`` by default, which a strong effect distorts.
+    shifts_um : sequence of `float`, optional
+        Moves of the first field [µm] among which every set of effects looks for its own best thickness: the order of
+        a few pixels is open.
     """
 
     def __init__(
@@ -119,9 +125,11 @@ class Selector:
         *,
         generic: bool = True,
         first_field: FloatArray | None = None,
+        shifts_um: Sequence[float] = (),
     ) -> None:
         self.problem, self.index, self.generic = problem, index, generic
         self.first_field = null.field if first_field is None else first_field
+        self.shifts_um = tuple(shifts_um)
         self.null = Hypothesis((), null, 0.0)
         thickness = problem.basis.expand(null.field)
         self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
@@ -262,10 +270,44 @@ class Selector:
             ),
             key=lambda item: item.chi2,
         )
-        fit = self._deepest(fit)
+        fit = self._best_order(self._deepest(fit))
         hypothesis = Hypothesis(ordered, fit, self._evidence(fit))
         self.fitted[key] = hypothesis
         return hypothesis
+
+    def _best_order(self, fit: Fit) -> Fit:
+        """The fit, or a better one with another thickness of all pixels and another size of the last effect."""
+        if not fit.coordinates or not len(self.shifts_um):
+            return fit
+        positions = [fit.position, *self._spread_starts(fit, both_sides=True)]
+        chi2 = np.empty((len(positions), len(self.shifts_um)))
+        for row, position in zip(chi2, positions, strict=True):
+            settings = {c.key: c.value(x) for c, x in zip(fit.coordinates, position, strict=True)}
+            row[:] = [self._shifted_chi2(settings, shift) for shift in self.shifts_um]
+        # Every thickness may have its best size: near the true one no size that was tried need be good.
+        size, least = chi2.argmin(axis=0), chi2.min(axis=0)
+        lowest = np.r_[True, least[1:] <= least[:-1]] & np.r_[least[:-1] <= least[1:], True]
+        best = sorted(np.flatnonzero(lowest), key=lambda place: float(least[place]))[:PLACES_REFITTED]
+        trials = [
+            fit_model(
+                self.problem,
+                fit.coordinates,
+                positions[size[place]],
+                self.first_field + self.shifts_um[place],
+                fit.levels,
+            )
+            for place in best
+        ]
+        return min((fit, *trials), key=lambda item: item.chi2)
+
+    def _shifted_chi2(self, settings: dict[str, float], shift_um: float) -> float:
+        """χ² with the first field moved as a whole and the best common level."""
+        cells = self.problem.cells
+        thickness = self.problem.basis.expand(self.first_field + shift_um)
+        self.problem.forward.cover(thickness)
+        value = self.problem.forward.predict(settings, thickness).value
+        level = float((cells.weight * value * cells.value).sum() / (cells.weight * value**2).sum())
+        return float((cells.weight * (cells.value - level * value) ** 2).sum())
 
     def improved(self, names: Sequence[str], base: Fit, *, scan: bool = False) -> Hypothesis:
         """Fit a set again from what a fit of more effects found, or from a scan; the better fit is remembered.
@@ -295,16 +337,18 @@ class Selector:
         self.fitted[frozenset(names)] = known
         return known
 
-    def _spread_starts(self, fit: Fit) -> list[FloatArray]:
+    def _spread_starts(self, fit: Fit, *, both_sides: bool = False) -> list[FloatArray]:
         """The fit with its last effect moved to other sizes, from near the null to near the bound."""
         last = fit.coordinates[-1]
         if len(fit.coordinates) > 1 and fit.coordinates[-2].effect == last.effect:
             return []
         value = last.value(fit.position[-1])
-        bound = last.high if value >= last.null else last.low
-        sizes = last.null + np.sign(value - last.null) * last.scale * np.array(SCAN)
-        sizes = np.append(sizes, last.null + np.array([0.3, 0.6, 0.9]) * (bound - last.null))
-        inside = [size for size in sizes if last.low <= size <= last.high]
+        bounds = (last.low, last.high) if both_sides else (last.high if value >= last.null else last.low,)
+        sizes: list[float] = []
+        for bound in bounds:
+            sizes += list(last.null + np.sign(bound - last.null) * last.scale * np.array(SCAN))
+            sizes += list(last.null + np.array([0.3, 0.6, 0.9]) * (bound - last.null))
+        inside = sorted({size for size in sizes if last.low <= size <= last.high and size != last.null})
         return [np.append(fit.position[:-1], last.coordinate(size)) for size in inside]
 
     def _starts(self, names: tuple[str, ...], start: FloatArray | None, base: Fit) -> list[FloatArray]:
