@@ -51,7 +51,11 @@ WITH_EXAMPLES = [page for page in PAGES if any(True for _ in blocks(page, "pycon
 def test_there_are_executed_examples() -> None:
     wanted = {"extend/effect.md", "extend/material.md", "extend/ccd.md", "extend/telescope.md"}
     wanted |= {"extend/test_stand.md", "guide/physics.md", "tutorials/flats_to_thickness.md"}
-    wanted |= {"tutorials/thickness_to_sky.md", "tutorials/discovering_an_effect.md", "guide/interoperability.md"}
+    wanted |= {
+        "tutorials/thickness_to_sky.md",
+        "tutorials/discovering_an_effect.md",
+        "guide/interoperability.md",
+    }
     assert wanted <= set(names(WITH_EXAMPLES))
 
 

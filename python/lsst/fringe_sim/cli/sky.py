@@ -16,6 +16,7 @@ from ..instrument.sky import SkySpectrum
 from ..mock.thickness import e2v_321
 from ..model import FringeModel, Setup
 from ..products import SkyFringe
+from ..products.sensor_wcs import add_sensor_wcs
 from ..report.figures import sky_figure
 from ..report.style import save_figure
 from .inputs import effect_cards, prepare_folder, read_settings, read_thickness, sky_settings
@@ -121,9 +122,9 @@ def sky(
     made: list[SkyFringe] = []
     with progress("simulating frames", frames) as advance:
         for number, frame in enumerate(series):
-            frame.write_fits(
-                folder / f"sky_{sensor.name}_{number:02d}.fits", {"SETUP": setup.name, **effect_cards(model)}
-            )
+            path = folder / f"sky_{sensor.name}_{number:02d}.fits"
+            frame.write_fits(path, {"SETUP": setup.name, **effect_cards(model)})
+            add_sensor_wcs(path, sensor)
             made.append(frame)
             advance()
     save_figure(sky_figure(made), folder / "sky.png")
