@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import platform
@@ -96,6 +97,12 @@ def memory_watch(every_s: float = 0.01) -> Iterator[list[float]]:
         done.set()
         watcher.join()
         found.extend(largest)
+
+
+def memory_now() -> float:
+    """Anonymous memory of this process now [GiB]."""
+    gc.collect()
+    return _resident()[0]
 
 
 def _resident() -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """Nine real sensors at full size: pixels off by more than half an order, of the global fit and of the paper's walk.
 
-The maps are those of RTM-020 as published, with their row jumps of whole orders taken out, spread over 4004 × 4096
+The maps are those of RTM-020 as published, with their jumps of whole orders taken out, spread over 4004 × 4096
 pixels. Fringes are as weak as measured (0.15 of what the model shows), and the noise is that at which a pixel by
 itself finds the wrong order once in ten times (0.002) or once in three (0.004). The walk is given the mean response
 of the sensor, which it could not know.
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
+from scipy.ndimage import median_filter
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.algorithms.thickness_fit import walk_fit
@@ -30,24 +31,29 @@ WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 CONTRAST = 0.15
 NOISES = (0.002, 0.004)
 ORDER_UM = 0.3
+LOCAL_CELLS = 9
+"""Cells of the published maps (16.5 pixels) over which a jump of one order cannot be real."""
+LOCAL_ROUNDS = 5
 WALK_STEPS = 3
 """Steps of the fine templates (1 nm) in one of the walk."""
 
 
 def repaired(path: Path) -> np.ndarray:
-    """Published map of a sensor without its row jumps [um above its minimum]."""
+    """Published map of a sensor without jumps of whole orders, in rows and in cells [um above its minimum]."""
     with fits.open(path) as hdus:
         fine = np.asarray(hdus["FINE"].data, dtype=float)
     jumps = ORDER_UM * np.round(np.nanmedian(np.diff(fine, axis=0), axis=1) / ORDER_UM)
     relief = fine - np.concatenate([[0.0], np.cumsum(jumps)])[:, None]
     relief = np.where(np.isfinite(relief), relief, np.nanmedian(relief))
+    for _ in range(LOCAL_ROUNDS):
+        relief -= ORDER_UM * np.round((relief - median_filter(relief, LOCAL_CELLS)) / ORDER_UM)
     return relief - relief.min()
 
 
 def sensor_maps() -> dict[str, Path]:
     """Files of the nine maps by sensor, empty if there are none."""
     folder = Path(os.environ.get("FRINGE_SIM_SHARED", "../shared")) / "measured"
-    return {path.name.split("_")[1]: path for path in sorted(folder.glob("RTM-020_S??_*_epoxy_map.fits"))}
+    return {path.name.split("_")[2]: path for path in sorted(folder.glob("RTM-020_S??_*_epoxy_map.fits"))}
 
 
 def flats(truth: np.ndarray, model: FringeModel, noise: float, rng: np.random.Generator) -> FringeCube:

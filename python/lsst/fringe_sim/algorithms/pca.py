@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from ..errors import InputError, OutOfRangeError
 from ..model import ResponseTable
-from ..products import FringeComponents, FringeFrame, SkyFringe, mask_bits
+from ..products import FringeComponents, FringeFrame, SkyFringe, mask_bits, refuse_corrected
 from .sky_frame import SkyResponse
 
 __all__ = [
@@ -42,6 +43,8 @@ _ROUNDING = 1e-13
 """Share of the variance below which an eigenvalue is rounding of float32 frames."""
 
 _HISTOGRAM_BINS = 32_768
+_PARTS = 8
+"""Parts of a sensor that may be counted at the same time."""
 
 
 def fit_pca(
@@ -83,10 +86,14 @@ def fit_pca(
     Raises
     ------
     InputError
-        Fewer than two frames, shapes that differ, no good pixel, or frames that are all alike.
+        Fewer than two frames, shapes that differ, no good pixel, frames that are all alike, or one from which the
+        fringes were subtracted.
     OutOfRangeError
         A number of components that N frames do not have.
     """
+    for frame in frames:
+        if isinstance(frame, SkyFringe):
+            refuse_corrected(frame.metadata, frame.detector or None)
     reader = _TileReader.of(frames, mask, tile_bytes)
     # Tiles are small: more than one thread of a matrix product would mostly wait.
     with threadpool_limits(limits=1, user_api="blas"):
@@ -169,7 +176,7 @@ def fit_pca_from_thickness(
         raise InputError(
             "frames and pixels", (len(scales), int(good.sum())), "two or more frames, some pixels"
         )
-    count, centre = _thickness_histogram(thickness[good], bins)
+    count, centre = _thickness_histogram(thickness, bins)
     factors = np.stack([response.factors(scale) for scale in scales])
     levels = factors @ (response.level * response.table.lookup(centre))
     background = levels @ count / count.sum()
@@ -193,15 +200,21 @@ def fit_pca_from_thickness(
     table = ResponseTable(
         response.table.start_um, response.table.step_um, rows / unit, np.zeros(len(rows)), math.nan
     )
-    images = np.stack([table.frame(thickness, row) for row in range(len(rows))])
-    images[:, ~good] = 0.0
+    images = np.empty((len(rows), *thickness.shape), np.float32)
+    single = thickness.astype(np.float32, copy=False)
+    for row, image in enumerate(images):
+        table.frame(single, row, image)
+    mask = np.zeros(thickness.shape, np.int32)
+    if not good.all():
+        images[:, ~good] = 0.0
+        mask[~good] = mask_bits("NO_DATA")
     return FringeComponents(
         mean=images[0],
         components=images[1:],
         explained_variance=eigenvalues[:n_components] / (len(scales) - 1),
         explained_variance_ratio=eigenvalues[:n_components] / eigenvalues.sum(),
         scores=vectors[:, :n_components] * root * sign,
-        mask=np.where(good, 0, mask_bits("NO_DATA")).astype(np.int32),
+        mask=mask,
         metadata={**(metadata or {}), "NFRAMES": len(scales), "NOISEVAR": 0.0, "MEANSKY": unit},
         detector=detector,
         physical_filter=physical_filter,
@@ -499,14 +512,44 @@ def _signs(components: FloatArray) -> FloatArray:
 
 
 def _thickness_histogram(thickness: NDArray[np.floating], bins: int) -> tuple[FloatArray, FloatArray]:
-    """Pixels per bin and their mean thickness, empty bins left out."""
-    low, high = float(thickness.min()), float(thickness.max())
-    place = ((thickness.astype(np.float64) - low) * (bins / max(high - low, 1e-12))).astype(np.int64)
-    np.minimum(place, bins - 1, out=place)
-    count = np.bincount(place, minlength=bins).astype(float)
-    total = np.bincount(place, weights=thickness, minlength=bins)
+    """Pixels per bin and their mean thickness, empty bins left out; pixels that are no number do not count."""
+    values = np.ascontiguousarray(thickness).ravel()
+    low, high = (float(each) for each in _finite_range(values, _PARTS))
+    counts, totals = _fill_histogram(values, low, bins / max(high - low, 1e-12), bins, _PARTS)
+    count, total = counts.sum(axis=0), totals.sum(axis=0)
     filled = count > 0
-    return count[filled], np.clip(total[filled] / count[filled], low, high)
+    # Sums are of what is above the lowest thickness, so that nothing is lost to rounding.
+    return count[filled], np.clip(low + total[filled] / count[filled], low, high)
+
+
+@numba.njit(cache=True, parallel=True)
+def _finite_range(values: NDArray, parts: int) -> tuple[float, float]:  # pragma: no cover - compiled
+    lows, highs = np.full(parts, np.inf), np.full(parts, -np.inf)
+    for part in numba.prange(parts):
+        low, high = np.inf, -np.inf
+        for k in range(values.size * part // parts, values.size * (part + 1) // parts):
+            value = float(values[k])
+            if np.isfinite(value):
+                low, high = min(low, value), max(high, value)
+        lows[part], highs[part] = low, high
+    return lows.min(), highs.max()
+
+
+@numba.njit(cache=True, parallel=True)
+def _fill_histogram(
+    values: NDArray, low: float, scale: float, bins: int, parts: int
+) -> tuple[NDArray, NDArray]:  # pragma: no cover - compiled
+    """One histogram for each of a fixed number of parts, so that threads do not change the sums."""
+    counts, totals = np.zeros((parts, bins)), np.zeros((parts, bins))
+    for part in numba.prange(parts):
+        count, total = counts[part], totals[part]
+        for k in range(values.size * part // parts, values.size * (part + 1) // parts):
+            above = float(values[k]) - low
+            if np.isfinite(above):
+                place = min(int(above * scale), bins - 1)
+                count[place] += 1.0
+                total[place] += above
+    return counts, totals
 
 
 def _dot(one: FloatArray, two: FloatArray) -> float:
