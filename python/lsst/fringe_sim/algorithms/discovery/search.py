@@ -23,7 +23,7 @@ from .fit import Fit, Problem, fit_model
 from .forward import Forward
 from .next_step import with_next_measurements
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
-from .selection import Hypothesis, Selector, similarity
+from .selection import Candidate, Hypothesis, Selector, similarity
 from .start import starting_thickness
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
 
@@ -66,7 +66,9 @@ class SearchOptions:
     most_effects : `int`
         Largest number of effects named together.
     refits : `int`
-        Effects that are refitted in each round, best scores first.
+        Effects that are refitted in each round, best scores first; twice as many pairs.
+    parents : `int`
+        Sets of nearly equal evidence from which larger ones are made.
     heldout_fraction : `float`
         Part of the sensor that no selection sees.
     outsider_prior : `float`
@@ -81,6 +83,7 @@ class SearchOptions:
     least_probability: float = 0.95
     most_effects: int = 3
     refits: int = 10
+    parents: int = 5
     heldout_fraction: float = 0.25
     outsider_prior: float = 0.1
 
@@ -438,10 +441,7 @@ class _Search:
             worth = [c for c in scores if c.promise > 9.0][: self.options.refits]
         refitted = [selector.hypothesis((*base.names, c.name), c.start, base.fit) for c in worth]
         for hypothesis in refitted:
-            self.say(
-                f"  with {', '.join(hypothesis.names)}: chi2 falls by {base.fit.chi2 - hypothesis.fit.chi2:.1f}, "
-                f"log evidence {hypothesis.log_evidence:.1f}"
-            )
+            self._say_refit(base, hypothesis)
         return sorted(refitted, key=lambda item: -item.log_evidence)
 
     def _refined(self, whole: Selector, best: Hypothesis) -> _Prepared | None:
@@ -484,17 +484,67 @@ class _Search:
         steps.append(self._step(selector, current, best))
         current = best
         while not steps[-1].consistent and len(current.names) < self.options.most_effects:
-            parents = selector.known(len(current.names))[:3]
-            larger = [item for parent in parents for item in self._refit(selector, parent)[:4]]
+            larger = self._enlarged(selector, current)
             if not larger:
                 break
             best = max(larger, key=lambda item: item.log_evidence)
             if best.log_evidence < current.log_evidence + self.options.least_evidence:
                 break
             best = selector.with_channels(best)
+            if not self._consistent(best):
+                best = self._swapped(selector, best)
             steps.append(self._step(selector, current, best))
             current = best
         return self._pruned(selector, current), steps
+
+    def _enlarged(self, selector: Selector, current: Hypothesis) -> list[Hypothesis]:
+        """Refits of the most promising sets with one effect more.
+
+        The best set need not hold the best smaller one: every set nearly as good is scored, and what all of them
+        promise is compared.
+        """
+        near = 0.3 * max(current.log_evidence, 100.0)
+        parents = [
+            h for h in selector.known(len(current.names)) if h.log_evidence > current.log_evidence - near
+        ]
+        promised: dict[frozenset[str], tuple[float, Hypothesis, Candidate]] = {}
+        for parent in parents[: self.options.parents]:
+            names = [name for name in selector.coordinates if name not in parent.names]
+            for candidate in selector.score(parent.fit, names, scan=True):
+                key = frozenset((*parent.names, candidate.name))
+                left = parent.fit.chi2 - candidate.promise
+                if candidate.promise > 9.0 and left < promised.get(key, (math.inf,))[0]:
+                    promised[key] = (left, parent, candidate)
+        best = sorted(promised.values(), key=lambda item: item[0])[: 2 * self.options.refits]
+        found = []
+        for _, parent, candidate in best:
+            found.append(selector.hypothesis((*parent.names, candidate.name), candidate.start, parent.fit))
+            self._say_refit(parent, found[-1])
+        return found
+
+    def _say_refit(self, before: Hypothesis, after: Hypothesis) -> None:
+        self.say(
+            f"  with {', '.join(after.names)}: chi2 falls by {before.fit.chi2 - after.fit.chi2:.1f}, "
+            f"log evidence {after.log_evidence:.1f}"
+        )
+
+    def _swapped(self, selector: Selector, current: Hypothesis, rounds: int = 3) -> Hypothesis:
+        """Replace members one at a time while that helps: the best set need not hold the best single effect."""
+        for _ in range(rounds):
+            before = current
+            for name in current.names:
+                rest = tuple(other for other in current.names if other != name)
+                best = max(
+                    self._refit(selector, selector.improved(rest, current.fit)),
+                    key=lambda item: item.log_evidence,
+                    default=current,
+                )
+                if best.log_evidence > current.log_evidence + 1.0:
+                    current = best
+                    break
+            if current is before:
+                break
+        return selector.with_channels(current)
 
     def _searched_harder(self, selector: Selector, singles: list[Hypothesis]) -> Hypothesis:
         """Best single effect when the nearly best ones are tried at other sizes too."""

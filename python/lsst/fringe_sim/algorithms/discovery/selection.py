@@ -366,33 +366,44 @@ class Selector:
         return [np.concatenate([known, one]) for one in fresh]
 
     def _deepest(self, fit: Fit) -> Fit:
-        """The fit, or a better one in a neighbouring minimum of a coordinate that has many."""
-        last = fit.coordinates[-1]
-        if not last.neighbour:
-            return fit
-        held = replace(fit, coordinates=(), position=np.zeros(0), information=np.zeros((0, 0)))
+        """The fit, or a better one in neighbouring minima of the coordinates that have many."""
+        for number, item in enumerate(fit.coordinates):
+            if item.neighbour:
+                fit = self._deepest_along(fit, number)
+        return fit
+
+    def _deepest_along(self, fit: Fit, number: int) -> Fit:
+        """The fit, or a better one in a neighbouring minimum of one coordinate; the others follow."""
+        item, others = fit.coordinates[number], np.arange(len(fit.coordinates)) != number
+        held = replace(
+            fit,
+            coordinates=fit.coordinates[:number] + fit.coordinates[number + 1 :],
+            position=fit.position[others],
+            information=fit.information[np.ix_(others, others)],
+        )
         state = self.state(held)
         level = (self.problem.level_basis @ fit.levels)[:, None, None]
         reach = np.arange(-MINIMA_TRIED * STEPS_PER_MINIMUM, MINIMA_TRIED * STEPS_PER_MINIMUM + 1)
-        around = fit.position[-1] + reach * (last.neighbour / STEPS_PER_MINIMUM)
-        places = np.unique([last.clip(x) for x in around])
+        around = fit.position[number] + reach * (item.neighbour / STEPS_PER_MINIMUM)
+        places = np.unique([item.clip(x) for x in around])
         fall = np.zeros(len(places))
-        for number, place in enumerate(places):
-            settings = {**fit.settings, last.key: last.value(place)}
+        for index, place in enumerate(places):
+            settings = {**fit.settings, item.key: item.value(place)}
             changed = level * self.problem.forward.predict(settings, state.thickness_um).value
             column = state.whiten(changed - state.value)[np.newaxis]  # type: ignore[operator]
             score, information = state.design.project(column, state.residual)
-            fall[number] = 2.0 * score[0] - information[0, 0]
+            fall[index] = 2.0 * score[0] - information[0, 0]
         minimum = np.ones(len(places), dtype=bool)
         minimum[1:] &= fall[1:] >= fall[:-1]
         minimum[:-1] &= fall[:-1] >= fall[1:]
-        minimum &= np.abs(places - fit.position[-1]) > 0.5 * last.neighbour
-        best = sorted(np.flatnonzero(minimum), key=lambda number: -fall[number])[:MINIMA_REFITTED]
-        for number in map(int, best):
-            start = np.append(fit.position[:-1], places[number])
-            trial = fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels)
-            fit = min(fit, trial, key=lambda item: item.chi2)
-        return fit
+        minimum &= np.abs(places - fit.position[number]) > 0.5 * item.neighbour
+        best = sorted(np.flatnonzero(minimum), key=lambda index: -fall[index])[:MINIMA_REFITTED]
+        trials = []
+        for index in map(int, best):
+            start = fit.position.copy()
+            start[number] = places[index]
+            trials.append(fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels))
+        return min((fit, *trials), key=lambda trial: trial.chi2)
 
     def _fit_from(
         self, names: tuple[str, ...], coordinates: tuple[Coordinate, ...], first: FloatArray, base: Fit
