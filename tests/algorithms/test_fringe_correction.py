@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from product_makers import sky
 
 from lsst.fringe_sim.algorithms.fringe_correction import (
     CorrectionOptions,
@@ -13,7 +14,7 @@ from lsst.fringe_sim.algorithms.fringe_correction import (
     random_positions,
     residual_fringe,
 )
-from lsst.fringe_sim.algorithms.pca import fit_pca_from_thickness, fringe_templates, project
+from lsst.fringe_sim.algorithms.pca import fit_pca, fit_pca_from_thickness, fringe_templates, project
 from lsst.fringe_sim.algorithms.sky_frame import simulate_sky_frame, sky_response
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.instrument.night import NightHistory, StochasticNight
@@ -84,6 +85,20 @@ def test_noiseless_exposure_is_corrected_exactly(patterns, rng):
     found = correct_fringes(image, [template], rng, options=CorrectionOptions(positions=500))
     assert found.scale[0] == pytest.approx(0.7 * LEVEL, rel=1e-4)
     np.testing.assert_allclose(found.image, LEVEL, rtol=1e-5)
+
+
+def test_a_corrected_exposure_is_refused(patterns, rng):
+    template = as_template(0.01 * patterns[0])
+    scene = LEVEL * (1 + template.image)
+    options = CorrectionOptions(positions=2000, small_px=3, large_px=30)
+    found = correct_fringes(scene, [template], rng, options=options, header={"FRINGRMS": 0.1})
+    assert found.cards["FRINGCOR"] == 1
+    assert found.cards["FRINGSC0"] == pytest.approx(LEVEL, rel=1e-4)
+    with pytest.raises(InputError, match="FRINGCOR is 1; allowed: an exposure with its fringes"):
+        correct_fringes(found.image, [template], rng, options=options, header=found.cards)
+    frames = [sky((60, 60), number, metadata=cards) for number, cards in enumerate(({}, found.cards))]
+    with pytest.raises(InputError, match="R22_S11: FRINGCOR"):
+        fit_pca(frames)
 
 
 def test_inputs_are_left_alone(patterns, rng):

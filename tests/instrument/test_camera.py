@@ -165,7 +165,7 @@ def test_a_further_camera_is_a_file(tmp_path: Path) -> None:
         ("title: a", "titel: a", "entry is 'title'"),
         ("id: 3", "id: three", "the description of a camera"),
         ("detectors:\n", "detectors: 3\nothers:\n", "the description of a camera"),
-        ("title", "[", "the description of a camera"),
+        ("title", "[", "allowed: YAML"),
         (CAMERA, "a list", "content is 'str'; allowed: a mapping"),
         (CAMERA, CAMERA + CAMERA[CAMERA.index("  - {") :], "id of a detector is 3"),
     ],

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from astro_metadata_translator import ObservationInfo
+from astropy.io import fits
 from lsst.daf.butler import Butler, DatasetType
 from lsst.resources import ResourcePath
 from raw_frame_maker import LSSTCAM_HEADER, write_raw
@@ -138,6 +140,26 @@ def test_ingesting_again_changes_nothing(butler: Butler, tmp_path: Path) -> None
     paths.append(write_raw(tmp_path / "raw" / "more.fits", {"DATE-OBS": "2018-07-24T11:00:00.0"}))
     more = ingest_raws(butler, [str(tmp_path / "raw")])
     assert (len(more.ingested), len(more.present)) == (1, 5)
+
+
+@pytest.mark.parametrize("transfer", ["copy", "direct"])
+def test_another_frame_in_the_same_place_is_refused(butler: Butler, tmp_path: Path, transfer: str) -> None:
+    """A second series of the same hour tells the same in its headers: its pixels are others."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    series(first)
+    ingest_raws(butler, [str(first)], transfer=transfer)
+    before = {str(ref) for ref in raws(butler)}
+    shutil.copytree(first, second)
+    changed = second / "raw_0.fits"
+    with fits.open(changed, mode="update") as hdus:
+        for hdu in hdus[1:]:
+            hdu.data += 1
+    report = ingest_raws(butler, [str(second)], transfer=transfer)
+    assert (len(report.ingested), len(report.present), len(report.refused)) == (0, 4, 1)
+    assert str(changed) in report.refused[0]
+    assert "another frame of exposure 201807241028453" in report.refused[0]
+    assert {str(ref) for ref in raws(butler)} == before
+    assert len(ingest_raws(butler, [str(second)], transfer=transfer, run="u/second").ingested) == 5
 
 
 def test_bad_files_stay_out_and_the_others_go_in(butler: Butler, tmp_path: Path) -> None:

@@ -4,20 +4,35 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import os
 from importlib import resources
 from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any
 
 import yaml
 from astropy.table import Table
 
-from .errors import ResourceError, UnknownNameError
+from .errors import InputError, ResourceError, UnknownNameError
 
-__all__ = ["list_resources", "read_table", "read_yaml", "resource_path", "revision"]
+__all__ = [
+    "list_resources",
+    "parse_user_yaml",
+    "read_table",
+    "read_user_yaml",
+    "read_yaml",
+    "resource_path",
+    "revision",
+]
 
 REQUIRED_PROVENANCE = ("source", "doi", "licence")
 
 REVISION_LENGTH = 12
+
+LONGEST_USER_FILE = 1_000_000
+"""Characters of a YAML file that a user gives; descriptions of sensors have a few thousand."""
+
+DEEPEST_NESTING = 20
 
 
 def resource_path(folder: str, name: str) -> Traversable:
@@ -106,3 +121,70 @@ def read_yaml(folder: str, name: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ResourceError(f"data/{folder}/{name} must hold a mapping")
     return content
+
+
+def read_user_yaml(path: str | os.PathLike[str], what: str) -> Any:
+    """Read a YAML file that a user gives, and which may be anything.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    what : `str`
+        What it should be, for the message: ``settings file``.
+
+    Returns
+    -------
+    content : `object`
+        Plain mappings, lists, text, numbers.
+
+    Raises
+    ------
+    InputError
+        There is no such file, or `parse_user_yaml` refuses it.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise InputError(what, str(path), "an existing YAML file")
+    if file.stat().st_size > 4 * LONGEST_USER_FILE:
+        raise InputError(what, f"{file.stat().st_size} bytes", f"up to {LONGEST_USER_FILE}", source=str(path))
+    try:
+        text = file.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(what, str(error), "text in UTF-8", source=str(path)) from None
+    return parse_user_yaml(text, what, source=str(path))
+
+
+def parse_user_yaml(text: str, what: str, *, source: str | None = None) -> Any:
+    """Parse YAML from a user with the safe loader, without references and not deeper than a description is.
+
+    References are refused because a text of a few lines can stand for more values than there is memory.
+
+    Raises
+    ------
+    InputError
+        Not YAML, a reference, too long, or too deep.
+    """
+    if len(text) > LONGEST_USER_FILE:
+        raise InputError(what, f"{len(text)} characters", f"up to {LONGEST_USER_FILE}", source=source)
+    try:
+        _check_events(text, what, source)
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError, KeyError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(what, reason, "YAML", source=source) from None
+
+
+def _check_events(text: str, what: str, source: str | None) -> None:
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise InputError(what, f"reference *{event.anchor}", "YAML without references", source=source)
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > DEEPEST_NESTING:
+            raise InputError(what, f"nested {depth} deep", f"up to {DEEPEST_NESTING}", source=source)

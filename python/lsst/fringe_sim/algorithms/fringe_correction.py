@@ -12,8 +12,9 @@ scales of fringes below the noise too large (by 16 % for a 30 s exposure of LSST
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 
 from ..errors import InputError, OutOfRangeError
-from ..products import FringeFrame
+from ..products import CORRECTED, FringeFrame, refuse_corrected
 from .sky_frame import SkyResponse
 
 __all__ = [
@@ -125,6 +126,14 @@ class FringeCorrection:
         """Whether a solution was found."""
         return math.isfinite(self.residual_rms)
 
+    @property
+    def cards(self) -> dict[str, float]:
+        """Header keywords of the corrected exposure, by which a second correction is refused; none if unsolved."""
+        if not self.solved:
+            return {}
+        scales = {f"FRINGSC{number}": float(scale) for number, scale in enumerate(self.scale)}
+        return {CORRECTED: len(self.scale), **scales, "FRINGRES": self.residual_rms}
+
 
 @dataclass(frozen=True)
 class ResidualFringe:
@@ -156,6 +165,7 @@ def correct_fringes(
     rng: np.random.Generator,
     mask: ArrayLike | None = None,
     options: CorrectionOptions | None = None,
+    header: Mapping[str, Any] | None = None,
 ) -> FringeCorrection:
     """Subtract scaled templates from an exposure.
 
@@ -172,6 +182,8 @@ def correct_fringes(
         are not measured either.
     options : `CorrectionOptions`, optional
         Positions, apertures, clipping.
+    header : mapping, optional
+        Header of the exposure; one that was corrected before is refused (`FringeCorrection.cards`).
 
     Returns
     -------
@@ -180,8 +192,9 @@ def correct_fringes(
     Raises
     ------
     InputError
-        No template, or shapes that do not belong together.
+        An exposure that was corrected already, no template, or shapes that do not belong together.
     """
+    refuse_corrected(header or {})
     chosen = CorrectionOptions() if options is None else options
     exposure = np.asarray(image, dtype=np.float32)
     if exposure.ndim != 2:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
-import yaml
 from astropy.io import fits
 from numpy.typing import NDArray
 
@@ -18,6 +18,8 @@ from ..effects import EFFECTS, activate_effects
 from ..errors import FrameFormatError, InputError
 from ..model import FringeModel
 from ..model.provenance import model_cards, software_cards
+from ..products import DAMAGE
+from ..resources import read_user_yaml
 
 __all__ = ["effect_cards", "prepare_folder", "read_settings", "read_thickness", "sky_settings"]
 
@@ -46,11 +48,16 @@ def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     if not Path(path).is_file():
         raise FileNotFoundError(2, "there is no such file", source)
     try:
-        with fits.open(path, memmap=False) as hdus:
-            image = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
-            mask = hdus["MASK"].data if "MASK" in hdus else None
-    except (OSError, ValueError, TypeError) as error:
-        raise FrameFormatError("file", str(error), "a complete FITS file", source=source) from None
+        # The stream is opened here because astropy leaves its own open when it stumbles.
+        with warnings.catch_warnings(), open(path, "rb") as stream:
+            warnings.simplefilter("ignore")
+            warnings.filterwarnings("error", message=".*truncated.*")
+            with fits.open(stream, memmap=False) as hdus:
+                image = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
+                mask = hdus["MASK"].data if "MASK" in hdus else None
+    except DAMAGE as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise FrameFormatError("file", reason, "a complete FITS file", source=source) from None
     if image is None or image.ndim != 2:
         found = "no image" if image is None else f"shape {image.shape}"
         raise FrameFormatError("thickness map", found, "a two-dimensional image in µm", source=source)
@@ -70,18 +77,21 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
     InputError
         The file is not YAML, not a mapping, or an override with more in it than effects.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-        if Path(path).suffix == ".py":
-            return _read_override(text, str(path))
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError("settings file", str(error).split("\n")[0], "YAML", source=str(path)) from None
+    if Path(path).suffix == ".py":
+        return _read_override(_text_of(path), str(path))
+    content = read_user_yaml(path, "settings file")
     if content is None:
         return {}
     if not isinstance(content, dict):
         raise InputError("settings file", type(content).__name__, "a mapping", source=str(path))
     return content
+
+
+def _text_of(path: str | os.PathLike[str]) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError("override file", str(error), "text in UTF-8", source=str(path)) from None
 
 
 def _read_override(text: str, source: str) -> dict[str, Any]:

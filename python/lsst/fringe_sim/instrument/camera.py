@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
-from ..resources import list_resources, read_table, read_yaml
+from ..resources import list_resources, read_table, read_user_yaml, read_yaml
 from .detector import Amplifier, Detector, RawSegment
 
 __all__ = ["Amplifier", "Camera", "Detector", "RawSegment"]
@@ -70,17 +69,15 @@ class Camera:
             There is no such file, or it does not describe a camera.
         """
         file = Path(path)
-        if not file.is_file():
-            raise InputError("file", str(path), "an existing YAML file")
+        content = read_user_yaml(file, "camera file")
         try:
-            content = yaml.safe_load(file.read_text(encoding="utf-8"))
             if not isinstance(content, dict):
                 raise InputError("content", type(content).__name__, "a mapping")
             return _from_mapping(file.stem, content)
         except InputError as error:
             raise error.in_source(str(path)) from None
-        except (yaml.YAMLError, UnicodeDecodeError, TypeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
+        except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(
                 "content", reason, "the description of a camera in YAML", source=str(path)
             ) from None

@@ -269,8 +269,8 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
             warnings.filterwarnings("error", message=".*truncated.*")
             with fits.open(stream, memmap=False, lazy_load_hdus=False) as hdus:
                 yield hdus
-    except InputError:
-        raise
+    except InputError as error:
+        raise (error if error.source else error.in_source(source)) from None
     except (
         OSError,
         EOFError,
@@ -279,6 +279,8 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
         ValueError,
         KeyError,
         IndexError,
+        AttributeError,
+        OverflowError,
         Warning,
         fits.VerifyError,
     ) as error:

@@ -182,8 +182,17 @@ class RawMetadata:
 
 
 def header_value(header: Mapping[str, Any], keyword: str) -> Any:
-    """Value of a keyword; `None` if it is absent, undefined or blank."""
-    value = header.get(keyword)
+    """Value of a keyword; `None` if it is absent, undefined or blank.
+
+    Raises
+    ------
+    FrameFormatError
+        The card is not FITS; other cards of the header may be.
+    """
+    try:
+        value = header.get(keyword)
+    except fits.VerifyError:
+        raise FrameFormatError(keyword, "a card that cannot be parsed", "a value as FITS has it") from None
     if isinstance(value, fits.card.Undefined) or (isinstance(value, str) and not value.strip()):
         return None
     return value.strip() if isinstance(value, str) else value
@@ -197,7 +206,10 @@ class _Header:
     source: str
 
     def value(self, keyword: str) -> Any:
-        return header_value(self.cards, keyword)
+        try:
+            return header_value(self.cards, keyword)
+        except FrameFormatError as error:
+            raise error.in_source(self.source) from None
 
     def text(self, keyword: str) -> str:
         value = self.value(keyword)

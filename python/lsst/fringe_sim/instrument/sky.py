@@ -82,8 +82,13 @@ class EmissionLines:
         }
         if len(shapes) != 1 or len(next(iter(shapes))) != 1:
             raise InputError("shapes of the line list", shapes, "one common shape (lines,)")
+        for name in ("wavelength_nm", "photon_radiance", "transmission"):
+            if not np.all(np.isfinite(getattr(self, name))):
+                raise InputError(f"{name} of the line list", "not finite", "finite numbers")
         if not np.all(self.photon_radiance >= 0.0):
             raise InputError("photon radiance", float(np.min(self.photon_radiance)), "not negative")
+        if not np.all(self.wavelength_nm > 0.0):
+            raise InputError("wavelengths of the lines", float(np.min(self.wavelength_nm)), "positive")
         if not np.all(np.diff(self.wavelength_nm) >= 0.0):
             raise InputError("wavelengths of the lines", "unordered", "ascending")
 

@@ -1,13 +1,15 @@
 """Raw frames into a repository: exposure records from the headers, files by `Butler.ingest`.
 
 Every file is looked at before anything is stored. A file that cannot be used is set aside with one message; the
-others go in. What is already there stays as it is, so that ingesting again changes nothing.
+others go in. What is already there stays as it is, so that ingesting again changes nothing; another file with the
+data id of one that is there, as a second mock series of the same hour has it, is refused.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import glob
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from lsst.daf.butler import (
     Timespan,
 )
 from lsst.daf.butler.registry import ConflictingDefinitionError
+from lsst.resources import ResourcePath
 
 from ..errors import FrameFormatError, InputError
 from ..instrument.raw_frame import RawMetadata, read_raw_header
@@ -39,6 +42,9 @@ RAW = "raw"
 
 SUFFIXES = (".fits", ".fits.fz", ".fits.gz", ".fz")
 """Endings of the files that are taken from a directory."""
+
+COMPARED_BLOCKS, COMPARED_BYTES = 64, 8192
+"""Blocks in which a file is compared with that in the repository, and their length."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +84,7 @@ class IngestReport:
     Attributes
     ----------
     ingested, present : `tuple` [`RawExposure`, ...]
-        Files that are new in the repository (or would be), and files whose data id was there before.
+        Files that are new in the repository (or would be), and files that were there before.
     refused : `tuple` [`str`, ...]
         One message for each file that could not be used.
     run : `dict` [`str`, `str`]
@@ -185,7 +191,8 @@ def ingest_raws(
     usable, contradicting = _agreeing(usable)
     refused += contradicting
     runs = {name: run or cls().makeDefaultRawIngestRunName() for name, cls in registered.items()}
-    new, present = _split_by_presence(butler, usable, runs)
+    new, present, others = _split_by_presence(butler, usable, runs)
+    refused += others
     if not dry_run:
         new, conflicting = _store(butler, new, registered, runs, transfer)
         refused += conflicting
@@ -303,20 +310,53 @@ def _seconds(duration: u.Quantity | None) -> float | None:
 
 def _split_by_presence(
     butler: Butler, exposures: Sequence[RawExposure], runs: Mapping[str, str]
-) -> tuple[list[RawExposure], list[RawExposure]]:
-    """Files that are new, and files whose data id the run has already."""
-    there: set[tuple[Any, ...]] = set()
+) -> tuple[list[RawExposure], list[RawExposure], list[str]]:
+    """Files that are new, files that the run has already, and a message for each whose place another file has."""
+    there: dict[tuple[Any, ...], DatasetRef] = {}
     for instrument in {exposure.instrument for exposure in exposures}:
         if _has_run(butler, runs[instrument]):
             refs = butler.query_datasets(
                 RAW, collections=runs[instrument], instrument=instrument, explain=False, limit=None
             )
             there |= {
-                tuple(ref.dataId[name] for name in ("instrument", "exposure", "detector")) for ref in refs
+                tuple(ref.dataId[name] for name in ("instrument", "exposure", "detector")): ref
+                for ref in refs
             }
-    new = [exposure for exposure in exposures if tuple(exposure.data_id.values()) not in there]
-    present = [exposure for exposure in exposures if tuple(exposure.data_id.values()) in there]
-    return new, present
+    new: list[RawExposure] = []
+    present: list[RawExposure] = []
+    others: list[str] = []
+    for exposure in exposures:
+        ref = there.get(tuple(exposure.data_id.values()))
+        if ref is None:
+            new.append(exposure)
+        elif _same_content(exposure.path, butler.getURI(ref)):
+            present.append(exposure)
+        else:
+            others.append(
+                f"{exposure.path}: the repository has another frame of exposure {exposure.data_id['exposure']}, "
+                f"detector {exposure.data_id['detector']}; allowed: a DATE-OBS or SEQNUM of its own, or another run"
+            )
+    return new, present, others
+
+
+def _same_content(path: str, stored: ResourcePath) -> bool:
+    """Whether a file is the one that is stored, by its length and by blocks from its beginning to its end.
+
+    A frame of a camera has noise in every block; to compare all of a night would take as long as to ingest it.
+    """
+    if not stored.isLocal or not Path(stored.ospath).is_file() or os.path.samefile(path, stored.ospath):
+        return True  # elsewhere, gone (which is not mended by a second ingest), or linked
+    length = os.path.getsize(path)
+    if length != os.path.getsize(stored.ospath):
+        return False
+    with open(path, "rb") as one, open(stored.ospath, "rb") as other:
+        for number in range(COMPARED_BLOCKS):
+            place = max(length - COMPARED_BYTES, 0) * number // (COMPARED_BLOCKS - 1)
+            one.seek(place)
+            other.seek(place)
+            if one.read(COMPARED_BYTES) != other.read(COMPARED_BYTES):
+                return False
+    return True
 
 
 def _has_run(butler: Butler, run: str) -> bool:

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from ..errors import InputError, UnknownNameError
 from ..optics.illumination import (
     Beam,
@@ -20,7 +18,7 @@ from ..optics.illumination import (
 )
 from ..optics.stack import LayerStack
 from ..optics.system import OpticalSystem
-from ..resources import list_resources, read_yaml
+from ..resources import list_resources, read_user_yaml, read_yaml
 
 __all__ = ["Setup", "setup_names"]
 
@@ -112,10 +110,7 @@ class Setup:
             The file is not such a description; the key at fault is named.
         """
         path = Path(path)
-        try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise InputError("set-up file", str(error).split("\n")[0], "YAML", source=str(path)) from None
+        content = read_user_yaml(path, "set-up file")
         return cls.from_mapping(path.stem, content, source_file=str(path))
 
     @classmethod

@@ -4,17 +4,20 @@ Each product has ``write_fits(path, metadata=None)`` and ``read_fits(path)``. Fi
 at all, carry checksums, and two writes of one product agree to the byte.
 """
 
+from ._fits import DAMAGE
 from .combined_bias import CombinedBias
 from .fringe_components import FringeComponents
 from .fringe_cube import CUBE_UNITS, FlatExposures, FringeCube
 from .fringe_flat import FringeFlat
 from .fringe_frame import FringeFrame
 from .mask import MASK_PLANES, describe_mask, mask_bits
-from .sky_frame import SKY_UNITS, SkyFringe
+from .sky_frame import CORRECTED, SKY_UNITS, SkyFringe, refuse_corrected
 from .thickness_map import ThicknessMap
 
 __all__ = [
+    "CORRECTED",
     "CUBE_UNITS",
+    "DAMAGE",
     "MASK_PLANES",
     "SKY_UNITS",
     "CombinedBias",
@@ -27,4 +30,5 @@ __all__ = [
     "ThicknessMap",
     "describe_mask",
     "mask_bits",
+    "refuse_corrected",
 ]

@@ -12,6 +12,7 @@ import os
 import re
 import uuid
 import warnings
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -47,6 +48,22 @@ PRODUCT_KEY = "PRODUCT"
 VERSION_KEY = "PRODVER"
 PRODUCT_VERSION = 1
 EXTENSIONS_KEY = "NEXTEND"
+
+DAMAGE = (
+    *(
+        OSError,
+        EOFError,
+        ValueError,
+        TypeError,
+        IndexError,
+        KeyError,
+        AttributeError,
+        OverflowError,
+        zlib.error,
+    ),
+    *(UserWarning, fits.VerifyError),
+)
+"""What astropy raises when a file is not as its headers say."""
 
 # Keywords that describe the bytes of the file rather than the product.
 _STRUCTURAL = re.compile(
@@ -252,7 +269,7 @@ def open_fits(
                 yield hdus
     except InputError as error:
         raise (error if error.source else error.in_source(source)) from None
-    except (OSError, ValueError, TypeError, IndexError, KeyError, UserWarning) as error:
+    except DAMAGE as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise FrameFormatError("FITS file", reason, "an undamaged FITS file", source=source) from error
 

@@ -10,11 +10,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import UnknownNameError
+from ..errors import InputError, UnknownNameError
 from . import _check as check
 from . import _fits as io
 
-__all__ = ["SKY_UNITS", "SkyFringe"]
+__all__ = ["CORRECTED", "SKY_UNITS", "SkyFringe", "refuse_corrected"]
+
+CORRECTED = "FRINGCOR"
+"""Keyword of an exposure from which fringes were subtracted; its value is the number of templates."""
 
 SKY_UNITS = ("electron", "fraction")
 """Units of a sky frame: electrons in the exposure, or (sky - mean) / mean."""
@@ -160,3 +163,15 @@ class SkyFringe:
                 physical_filter=header.get("FILTER", ""),
                 metadata=io.read_metadata(header, _OWN),
             )
+
+
+def refuse_corrected(header: Mapping[str, Any], source: str | None = None) -> None:
+    """Refuse an exposure from which the fringes were taken already.
+
+    Raises
+    ------
+    InputError
+        The header says so.
+    """
+    if header.get(CORRECTED):
+        raise InputError(CORRECTED, header[CORRECTED], "an exposure with its fringes", source=source)
