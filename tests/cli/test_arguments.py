@@ -42,6 +42,12 @@ def test_what_writes_can_be_tried_first(name: str) -> None:
         assert "--dry-run" in options(name)
 
 
+@pytest.mark.parametrize("name", sorted(_COMMANDS))
+def test_every_option_is_explained(name: str) -> None:
+    silent = [item.opts for item in command(name).params if isinstance(item, click.Option) and not item.help]
+    assert silent == []
+
+
 @pytest.mark.parametrize("name", sorted(name for name in _COMMANDS if "--setup" in options(name)))
 def test_a_set_up_may_be_a_file(name: str) -> None:
     (option,) = (item for item in command(name).params if item.name == "setup")
@@ -69,7 +75,7 @@ def test_set_ups_by_name_and_by_file(own_setup: Path) -> None:
         LABORATORY.convert("lsst_e2v", None, None)
     with pytest.raises(InputError, match="telescope"):
         SKY.convert(str(own_setup), None, None)
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises((InputError, FileNotFoundError), match=r"none\.yaml"):
         SKY.convert("none.yaml", None, None)
 
 

@@ -139,9 +139,11 @@ class DemoRun:
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True)
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder."
+)
 @click.option("--size", type=SIZE, default="1024x1000", show_default=True, help="Pixels of the sensor.")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the raw frames.")
 @click.option("--fresh", is_flag=True, help="Throw away what a former demo left in the folder.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done.")
 def demo(out: Path, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool) -> None:

@@ -40,7 +40,13 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="Folder for map, figures, report."
 )
-@click.option("--method", type=click.Choice(FIT_METHODS), default="global", show_default=True)
+@click.option(
+    "--method",
+    type=click.Choice(FIT_METHODS),
+    default="global",
+    show_default=True,
+    help="All pixels at once, or the walk of the paper.",
+)
 @click.option(
     "--smoothing",
     type=click.FloatRange(0.0, 100.0),

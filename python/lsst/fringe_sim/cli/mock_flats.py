@@ -51,7 +51,9 @@ BLEMISHES = Defects(bad_columns=6, hot_pixels=200, prnu_rms=0.003)
 @click.option(
     "--size", type=SIZE, default=None, help="Cut-down sensor, columns x rows; full size if not given."
 )
-@click.option("--bias-frames", type=click.IntRange(1, 200), default=5, show_default=True)
+@click.option(
+    "--bias-frames", type=click.IntRange(1, 200), default=5, show_default=True, help="How many of them."
+)
 @click.option(
     "--level", type=click.FloatRange(10.0, 1e5), default=20000.0, show_default=True, help="Electrons."
 )
