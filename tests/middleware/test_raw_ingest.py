@@ -157,7 +157,7 @@ def test_another_frame_in_the_same_place_is_refused(butler: Butler, tmp_path: Pa
     report = ingest_raws(butler, [str(second)], transfer=transfer)
     assert (len(report.ingested), len(report.present), len(report.refused)) == (0, 4, 1)
     assert str(changed) in report.refused[0]
-    assert "another frame of exposure 201807241028453" in report.refused[0]
+    assert "another frame of exposure 201807241000453" in report.refused[0]
     assert {str(ref) for ref in raws(butler)} == before
     assert len(ingest_raws(butler, [str(second)], transfer=transfer, run="u/second").ingested) == 5
 
