@@ -59,10 +59,10 @@ def frames_like_a_night(count: int, shape: tuple[int, int], noise_e: float = 1e-
     return frames
 
 
-def components_of_a_night() -> list[Row]:
+def components_of_a_night(shape: tuple[int, int] = SENSOR) -> list[Row]:
     """11 frames of a whole sensor beside the full decomposition."""
-    frames = frames_like_a_night(11, SENSOR)
-    work = "principal components of 11 frames of 16.4 Mpix"
+    frames = frames_like_a_night(11, shape)
+    work = f"principal components of 11 frames of {1e-6 * frames[0].size:.3g} Mpix"
     flat = frames.reshape(len(frames), -1)
     with memory_watch() as memory:
         before = memory_now()
@@ -97,11 +97,11 @@ def _exact_ratio(flat: np.ndarray) -> np.ndarray:
     return values[: count - 1] / values.sum()
 
 
-def components_of_many_frames() -> list[Row]:
+def components_of_many_frames(shape: tuple[int, int] = (1000, 1000)) -> list[Row]:
     """400 frames of a megapixel, in half and in whole, beside what scikit-learn has for many frames."""
-    frames = frames_like_a_night(400, (1000, 1000))
+    frames = frames_like_a_night(400, shape)
     flat = frames.reshape(len(frames), -1)
-    work = "principal components of 400 frames of 1 Mpix, 5 of them"
+    work = f"5 principal components of 400 frames of {1e-6 * frames[0].size:.3g} Mpix"
     _, wall, incremental = timed(lambda: IncrementalPCA(n_components=5, batch_size=50).fit(flat))
     rows = [Row(work, "scikit-learn, incremental, batches of 50", wall, cpu=incremental)]
     _, wall, randomized = timed(
