@@ -1,0 +1,444 @@
+"""Files and settings as they should not be: every one is used or refused, never a traceback, a hang or a leak.
+
+    python tests/faults/fuzz.py --cases 10000
+
+runs all targets with new random cases and prints how many were used and how many refused. A case fails if it raises
+anything but `FringeSimError`, takes longer than `LONGEST_S`, needs more than `MOST_BYTES` of memory beyond what the
+process had, or opens a file outside the folder of the case and the installed program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import contextlib
+import os
+import resource
+import signal
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import seed as with_seed
+from hypothesis import strategies as st
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
+
+import product_makers
+from fuzz_files import alter_fits, plain_header
+from raw_frame_maker import random_image, raw_hdus, small_detector
+
+from lsst.fringe_sim.algorithms.flat_prep import prepare_flat
+from lsst.fringe_sim.algorithms.thickness_fit import fit_thickness
+from lsst.fringe_sim.cli.inputs import read_settings, read_thickness
+from lsst.fringe_sim.cli.provenance import describe, read_header
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.errors import FringeSimError
+from lsst.fringe_sim.instrument.bandpass import Bandpass
+from lsst.fringe_sim.instrument.camera import Camera
+from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_metadata
+from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
+from lsst.fringe_sim.model import FringeModel, Setup
+from lsst.fringe_sim.resources import resource_path
+
+LONGEST_S = 20.0
+MOST_BYTES = 1 << 30
+"""Memory that one case may need beyond what the process had; the files have less than a megabyte."""
+
+
+@dataclass
+class Tally:
+    """What became of the cases of each target."""
+
+    used: collections.Counter[str] = field(default_factory=collections.Counter)
+    refused: collections.Counter[str] = field(default_factory=collections.Counter)
+    slowest_s: float = 0.0
+
+
+TALLY = Tally()
+
+_OFFENCES: list[str] = []
+
+
+# What may happen -------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def guarded(target: str, folder: Path) -> Iterator[None]:
+    """Let a case run under limits, and count how it ends."""
+    started = time.monotonic()
+    with _limited_time(), _limited_memory(), _limited_paths(folder), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield
+        except FringeSimError as error:
+            if _OFFENCES:
+                # What was raised to stop the case may have been taken for a fault of the file.
+                raise AssertionError(f"{target}: {_OFFENCES.pop()}") from error
+            text = str(error)
+            if len(text) > 20_000:
+                raise AssertionError(f"{target}: a message of {len(text)} characters") from error
+            TALLY.refused[target] += 1
+        else:
+            TALLY.used[target] += 1
+    TALLY.slowest_s = max(TALLY.slowest_s, time.monotonic() - started)
+
+
+@contextlib.contextmanager
+def _limited_time() -> Iterator[None]:
+    def stop(number: int, frame: Any) -> None:
+        _OFFENCES.append(f"longer than {LONGEST_S} s")
+        raise TimeoutError(_OFFENCES[-1])
+
+    former = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, former)
+
+
+@contextlib.contextmanager
+def _limited_memory() -> Iterator[None]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + MOST_BYTES
+    resource.setrlimit(
+        resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard)
+    )
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+_ALLOWED: list[str] = []
+_PROGRAM = tuple(
+    str(Path(path).resolve())
+    for path in (
+        sys.prefix,
+        sys.base_prefix,
+        Path(__file__).parents[2],
+        "/dev/null",
+        "/usr/share/zoneinfo",
+        "/proc/self",
+    )
+)
+
+
+def _watch(event: str, arguments: tuple[Any, ...]) -> None:
+    if not _ALLOWED or event != "open" or not isinstance(arguments[0], str | bytes | os.PathLike):
+        return
+    path = os.path.realpath(os.fsdecode(arguments[0]))
+    if not path.startswith((*_PROGRAM, *_ALLOWED)):
+        _OFFENCES.append(f"opened {path}")
+        raise AssertionError(_OFFENCES[-1])
+
+
+sys.addaudithook(_watch)
+
+
+@contextlib.contextmanager
+def _limited_paths(folder: Path) -> Iterator[None]:
+    _ALLOWED.append(str(folder.resolve()))
+    try:
+        yield
+    finally:
+        _ALLOWED.pop()
+
+
+# Cases ---------------------------------------------------------------------------------------------------------
+
+RAW = raw_hdus(random_image(small_detector()), small_detector())
+RAW_BYTES = plain_header(RAW)
+PRODUCTS = {
+    name: plain_header(product_makers.MAKERS[name]((6, 8)), product=name)
+    for name in sorted(product_makers.MAKERS)
+}
+"""Every product, once with checksums and once as a file from elsewhere, which has none."""
+
+
+def _file(folder: Path, content: bytes, name: str = "case.fits") -> Path:
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+def raw_frame(data: st.DataObject, folder: Path) -> None:
+    """A raw frame, and the flat that is made of it."""
+    path = _file(folder, alter_fits(data, RAW_BYTES))
+    with guarded("raw frames", folder):
+        read_raw_metadata(path)
+        frame = RawFrame.read(path)
+        prepare_flat(frame, None, small_detector(), bandwidth_fwhm_nm=2.0, f_number=float("inf"))
+
+
+def product(data: st.DataObject, folder: Path) -> None:
+    """A product from disk, also without the checksums that would show the damage; provenance of the same file."""
+    name = data.draw(st.sampled_from(sorted(PRODUCTS)))
+    content = data.draw(st.sampled_from(PRODUCTS[name]))
+    path = _file(folder, alter_fits(data, content))
+    with guarded(f"product {name}", folder):
+        product_makers.p.__dict__[name].read_fits(path)
+    with guarded("provenance", folder):
+        describe(read_header(str(path)))
+
+
+def thickness_file(data: st.DataObject, folder: Path) -> None:
+    """A thickness map from anywhere."""
+    path = _file(folder, alter_fits(data, PRODUCTS["ThicknessMap"][-1]))
+    with guarded("thickness maps", folder):
+        read_thickness(path)
+
+
+FINITE = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+def cube(data: st.DataObject, folder: Path) -> None:
+    """A cube of few pixels with any numbers in it, fitted."""
+    shape = (data.draw(st.integers(1, 6)), data.draw(st.integers(1, 4)), data.draw(st.integers(1, 6)))
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+    wavelength = np.array(data.draw(st.lists(_numbers(700.0, 1200.0), min_size=shape[0], max_size=shape[0])))
+    with guarded("fringe cubes", folder):
+        image = (20000.0 * (1.0 + 0.05 * rng.standard_normal(shape))).astype(np.float32)
+        for place, value in data.draw(
+            st.lists(st.tuples(st.integers(0, image.size - 1), FINITE), max_size=4)
+        ):
+            image.flat[place] = value
+        made = product_makers.p.FringeCube(
+            image=image,
+            variance=np.full(shape, data.draw(_numbers(0.0, 1e6)), np.float32),
+            mask=(rng.random(shape) < data.draw(st.floats(0, 1))).astype(np.int32),
+            exposures=product_makers.p.FlatExposures(
+                wavelength,
+                np.array(data.draw(_numbers(0.0, 5.0))),
+                np.array(data.draw(_numbers(150.0, 310.0))),
+            ),
+            unit=data.draw(st.sampled_from(["electron", "relative", "adu"])),
+        )
+        path = folder / "cube.fits"
+        made.write_fits(path)
+        method = data.draw(st.sampled_from(["global", "guo2022"]))
+        fit_thickness(product_makers.p.FringeCube.read_fits(path), MODEL, method, range_um=(12.0, 14.0))
+
+
+MODEL = FringeModel.from_setup("ts8_e2v")
+
+
+def _numbers(low: float, high: float) -> st.SearchStrategy[float]:
+    """Mostly sensible numbers, now and then one that is not."""
+    sensible = st.floats(low, high)
+    odd = st.sampled_from([0.0, -1.0, float("nan"), float("inf"), -float("inf"), 1e308, 1e-308, 2**63])
+    return st.one_of(sensible, sensible, sensible, sensible, odd)
+
+
+def _yaml_values() -> st.SearchStrategy[Any]:
+    leaves = st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(),
+        st.floats(),
+        st.text(max_size=12),
+        st.dates(),
+        st.binary(max_size=8),
+        st.sampled_from(["ts8", "e2v_ccd250", "../../../etc/passwd", "/etc/passwd", "sky", "LSST", 10**400]),
+    )
+    return st.recursive(
+        leaves,
+        lambda inner: st.one_of(
+            st.lists(inner, max_size=4),
+            st.dictionaries(st.one_of(st.text(max_size=8), st.integers()), inner, max_size=4),
+        ),
+        max_leaves=8,
+    )
+
+
+HOSTILE = (
+    "!!python/object/apply:os.system ['touch /tmp/fuzzed']",
+    "a: &a [1, 1]\nb: &b [*a, *a, *a]\nc: [*b, *b, *b]",
+    "a: &a [*a]",
+    "[" * 5000,
+    "{" * 300 + "}" * 300,
+    "2021-13-45",
+    "a: 2021-99-99 99:99:99",
+    "? [1, 2]\n: 3",
+    "{1: 2, [3]: 4}",
+    "0x",
+    "a: 0b",
+    "\x00",
+    "- \t- a",
+    "%YAML 9.9\n---\na: 1",
+    "--- a\n--- b",
+    "<<: 3",
+    "=: =",
+    "190:20:30.15",
+    "+._",
+)
+
+
+def _alter_text(data: st.DataObject, text: str) -> str:
+    for _ in range(data.draw(st.integers(0, 4))):
+        place = data.draw(st.integers(0, len(text)))
+        length = data.draw(st.integers(0, 12))
+        text = text[:place] + data.draw(st.text(max_size=6)) + text[place + length :]
+    return text
+
+
+def _alter_mapping(data: st.DataObject, content: Any) -> Any:
+    """Replace one entry, at some depth, by anything."""
+    if isinstance(content, dict) and content and data.draw(st.integers(0, 4)):
+        key = data.draw(st.sampled_from(sorted(content, key=str)))
+        if not data.draw(st.integers(0, 5)):
+            return {other: value for other, value in content.items() if other != key}
+        return {**content, key: _alter_mapping(data, content[key])}
+    if isinstance(content, list) and content and data.draw(st.integers(0, 2)):
+        place = data.draw(st.integers(0, len(content) - 1))
+        return [*content[:place], _alter_mapping(data, content[place]), *content[place + 1 :]]
+    return data.draw(_yaml_values())
+
+
+def _yaml_text(data: st.DataObject, valid: str) -> bytes:
+    kind = data.draw(st.integers(0, 5))
+    if kind == 0:
+        return data.draw(st.sampled_from(HOSTILE)).encode()
+    if kind == 1:
+        return data.draw(st.binary(max_size=200))
+    if kind == 2:
+        return _alter_text(data, valid).encode("utf-8", "surrogatepass")
+    content = yaml.safe_load(valid)
+    for _ in range(data.draw(st.integers(1, 3))):
+        content = _alter_mapping(data, content)
+    return yaml.safe_dump(content, allow_unicode=True).encode("utf-8", "surrogatepass")
+
+
+NAMES = [f"{effect.name}.{parameter.name}" for effect in EFFECTS for parameter in effect.parameters]
+
+
+def effects_file(data: st.DataObject, folder: Path) -> None:
+    """A file of effects, and the model with them."""
+    keys = data.draw(st.lists(st.one_of(st.sampled_from(NAMES), st.text(max_size=20)), max_size=3))
+    valid = yaml.safe_dump(
+        {key: data.draw(_numbers(0.0, 3.0)) for key in keys} or {"bandwidth": {"fwhm": 2.4}}
+    )
+    path = _file(folder, _yaml_text(data, valid), "effects.yaml")
+    setup = data.draw(st.sampled_from(["ts8_e2v", "ts8_itl"]))
+    with guarded("effects files", folder):
+        model = FringeModel.from_setup(setup, read_settings(path))
+        model.response([13.0, 13.1], [900.0, 960.0])
+
+
+def setup_file(data: st.DataObject, folder: Path) -> None:
+    """A set-up of the user, and the response of its sensor."""
+    name = data.draw(st.sampled_from(["ts8_e2v", "ts8_itl", "bnl_ts8_e2v", "lsst_e2v"]))
+    path = _file(folder, _yaml_text(data, resource_path("setups", f"{name}.yaml").read_text()), "own.yaml")
+    with guarded("set-up files", folder):
+        found = Setup.from_file(path)
+        if found.kind == "monochromator":
+            FringeModel.from_setup(found).response([13.0], found.wavelengths_nm[:3] or [960.0])
+
+
+def camera_file(data: st.DataObject, folder: Path) -> None:
+    """A camera of the user."""
+    name = data.draw(st.sampled_from(["monocam", "hsc"]))
+    path = _file(
+        folder, _yaml_text(data, resource_path("instrument", f"{name}.yaml").read_text()), "own.yaml"
+    )
+    with guarded("camera files", folder):
+        Camera.from_file(path)
+
+
+def line_list(data: st.DataObject, folder: Path) -> None:
+    """Emission lines of the user, alone and in a sky."""
+    count = data.draw(st.integers(0, 5))
+    columns = [
+        data.draw(
+            st.lists(_numbers(low, high), min_size=count, max_size=count + data.draw(st.integers(0, 1)) // 1)
+        )
+        for low, high in ((880.0, 1100.0), (0.0, 10.0), (0.0, 1.0))
+    ]
+    if data.draw(st.booleans()):
+        columns[0] = sorted(columns[0])
+    with guarded("line lists", folder):
+        lines = EmissionLines(*(np.array(column) for column in columns), np.array(["8-4"] * count, dtype=str))
+        for component in SkySpectrum.dark(lines).components(Bandpass.from_name("lsst_y")):
+            if not np.all(np.isfinite(component.weight if hasattr(component, "weight") else [0.0])):
+                raise AssertionError("a sky that is not finite")
+
+
+def any_document(data: st.DataObject, folder: Path) -> None:
+    """Tables and documents whose provenance is asked for."""
+    suffix = data.draw(st.sampled_from([".json", ".ecsv", ".fits"]))
+    valid = '{"provenance": {"TABLE0": "media/x.ecsv 1", "EFFECT0": "a", "EFFVAL0": 1}}'
+    if suffix == ".ecsv":
+        valid = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\n# meta: {SETUP: x}\na\n1\n"
+    text = _alter_text(data, valid) if data.draw(st.booleans()) else data.draw(st.sampled_from(HOSTILE))
+    path = _file(folder, text.encode("utf-8", "surrogatepass"), f"case{suffix}")
+    with guarded("documents", folder):
+        describe(read_header(str(path)))
+
+
+TARGETS: dict[Callable[[st.DataObject, Path], None], int] = {
+    raw_frame: 5,
+    product: 5,
+    thickness_file: 1,
+    cube: 2,
+    effects_file: 2,
+    setup_file: 2,
+    camera_file: 2,
+    line_list: 1,
+    any_document: 1,
+}
+"""Targets and their share of the cases."""
+
+
+def run_target(target: Callable[[st.DataObject, Path], None], cases: int, seed: int | None = None) -> None:
+    """Run so many cases of a target; a failing one is reduced and raised."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+
+        @settings(
+            max_examples=cases,
+            deadline=None,
+            database=None,
+            derandomize=False,
+            suppress_health_check=list(HealthCheck),
+            phases=(Phase.generate, Phase.shrink),
+        )
+        @given(data=st.data())
+        def case(data: st.DataObject) -> None:
+            target(data, folder)
+
+        (case if seed is None else with_seed(seed)(case))()
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cases", type=int, default=10_000)
+    parser.add_argument("--only", help="one target, by the name of its function")
+    parser.add_argument("--seed", type=int, default=None)
+    arguments = parser.parse_args()
+    chosen = {target: share for target, share in TARGETS.items() if arguments.only in (None, target.__name__)}
+    for target, share in chosen.items():
+        started = time.monotonic()
+        run_target(target, -(-arguments.cases * share // sum(chosen.values())), arguments.seed)
+        print(f"{target.__name__}: {time.monotonic() - started:.0f} s", flush=True)
+    for name in sorted(TALLY.used | TALLY.refused):
+        print(f"{name:28s} {TALLY.used[name]:6d} used {TALLY.refused[name]:6d} refused")
+    total = TALLY.used.total() + TALLY.refused.total()
+    print(f"{total} cases, slowest {TALLY.slowest_s:.2f} s; no traceback, no hang, no file outside")
+
+
+if __name__ == "__main__":
+    main()
