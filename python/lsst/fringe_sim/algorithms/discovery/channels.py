@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import dctn
+from scipy.fft import dctn, irfft2, next_fast_len, rfft2
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import f as f_distribution
 
@@ -27,6 +27,12 @@ SPATIAL_ORDER = 4
 """Cosine patterns up to this order along both axes together."""
 
 RANK_TOLERANCE = 1e-7
+
+NEAREST_ECHO = 4
+"""Cells below which a moved copy of the image is no echo: diffusion and thickness do that as well."""
+
+LEAST_OVERLAP = 0.1
+"""Part of the image that a copy must share with the sensor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +116,7 @@ def measure_channels(state: State, geometry: object, index: FloatArray) -> tuple
         channels.append(_feature_channel("amplifiers", amplifier_features(state, geometry), state))
     if min(state.thickness_um.shape) >= 24:
         channels.extend(texture_channels(state))
+        channels.append(echo_channel(state))
     return tuple(channels)
 
 
@@ -215,6 +222,38 @@ def _band_channel(name: str, power: FloatArray, planes: int, filled: float) -> C
     return Channel(
         name, statistic, degrees, float(-np.expm1((BANDS - 1) * np.log1p(-min(smallest, 1 - 1e-16))))
     )
+
+
+def echo_channel(state: State) -> Channel:
+    """Copies of the image in the residual: moved (cross-talk) or mirrored (reflections), at any distance.
+
+    The residual is correlated with the whitened pattern, and each sum is over its standard deviation.
+    """
+    weight = state.whiten(np.ones(state.value.shape))  # type: ignore[operator]
+    pattern = state.value - state.value.mean(axis=(1, 2), keepdims=True)
+    scale = np.abs(weight).max(axis=(1, 2), keepdims=True)
+    used = (weight != 0.0).astype(float)
+    shape = tuple(next_fast_len(2 * size - 1, real=True) for size in pattern.shape[1:])
+    seen = rfft2(state.residual * used, shape), rfft2(used, shape)
+    largest, looks = 0.0, 0
+    for rows, columns in itertools.product((1, -1), (1, -1)):
+        copy = (scale * pattern)[:, ::rows, ::columns]
+        score = irfft2((seen[0] * rfft2(copy, shape).conj()).sum(axis=0), shape)
+        variance = irfft2((seen[1] * rfft2(copy**2, shape).conj()).sum(axis=0), shape)
+        enough = variance > LEAST_OVERLAP * float((copy**2).sum())
+        if rows == columns == 1:
+            enough &= _is_far(shape, NEAREST_ECHO)
+        if enough.any():
+            largest = max(largest, float((score[enough] ** 2 / variance[enough]).max()))
+            looks += int(enough.sum())
+    single = float(chi2_distribution.sf(largest, 1))
+    return Channel("echoes", largest, 1.0, float(-np.expm1(looks * np.log1p(-min(single, 1.0 - 1e-16)))))
+
+
+def _is_far(shape: tuple[int, ...], nearest: int) -> NDArray[np.bool_]:
+    """Shifts in the order of a Fourier transform that are at least so many cells long."""
+    along = [np.minimum(np.arange(size), size - np.arange(size)) for size in shape]
+    return np.hypot(along[0][:, None], along[1][None, :]) >= nearest
 
 
 def _colour(wavelength_nm: FloatArray) -> FloatArray:

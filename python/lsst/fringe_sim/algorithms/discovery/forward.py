@@ -153,6 +153,13 @@ class Forward:
         beside = apply_to_image(active, self.model.base_system, value + nudge * slope, self.geometry)
         return Prediction(changed, (beside - changed) / nudge)
 
+    def sampled(self, settings: Settings, thickness_um: FloatArray) -> FloatArray:
+        """Response at any thicknesses within the tables, without effects on the image; shape ``(W, ...)``."""
+        table = self.table(settings)
+        flat, nothing = thickness_um.ravel(), np.zeros(thickness_um.size)
+        value, _ = _interpolate(table, self.range_um[0], TABLE_STEP_UM, flat, nothing, nothing)
+        return value.reshape(len(table), *thickness_um.shape)
+
     def _at_centroids(
         self, thickness_um: FloatArray, gradient: FloatArray
     ) -> tuple[FloatArray, FloatArray | None]:

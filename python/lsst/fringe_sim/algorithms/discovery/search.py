@@ -47,7 +47,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """Thresholds and sizes of a search; the defaults were fixed before any challenge was run.
+    """Thresholds and sizes of a search; the defaults were chosen on other seeds than those of the recorded challenge.
 
     Attributes
     ----------
@@ -67,6 +67,8 @@ class SearchOptions:
         Largest number of effects named together.
     refits : `int`
         Effects that are refitted in each round, best scores first; twice as many pairs.
+    credit : `float`
+        Log evidence that a set may lack if what it leaves is noise and what the other leaves is not.
     parents : `int`
         Sets of nearly equal evidence from which larger ones are made.
     heldout_fraction : `float`
@@ -83,6 +85,7 @@ class SearchOptions:
     least_probability: float = 0.95
     most_effects: int = 3
     refits: int = 10
+    credit: float = 20.0
     parents: int = 5
     heldout_fraction: float = 0.25
     outsider_prior: float = 0.1
@@ -478,19 +481,18 @@ class _Search:
         steps: list[Step] = []
         if not singles or singles[0].log_evidence < self.options.least_evidence:
             return current, []
-        best = selector.with_channels(singles[0])
+        best = self._most_credible(selector, singles)
         if not self._consistent(best):
-            best = selector.with_channels(self._searched_harder(selector, singles))
+            best = self._most_credible(selector, self._searched_harder(selector, singles))
         steps.append(self._step(selector, current, best))
         current = best
         while not steps[-1].consistent and len(current.names) < self.options.most_effects:
             larger = self._enlarged(selector, current)
             if not larger:
                 break
-            best = max(larger, key=lambda item: item.log_evidence)
+            best = self._most_credible(selector, larger)
             if best.log_evidence < current.log_evidence + self.options.least_evidence:
                 break
-            best = selector.with_channels(best)
             if not self._consistent(best):
                 best = self._swapped(selector, best)
             steps.append(self._step(selector, current, best))
@@ -546,11 +548,23 @@ class _Search:
                 break
         return selector.with_channels(current)
 
-    def _searched_harder(self, selector: Selector, singles: list[Hypothesis]) -> Hypothesis:
-        """Best single effect when the nearly best ones are tried at other sizes too."""
+    def _searched_harder(self, selector: Selector, singles: list[Hypothesis]) -> list[Hypothesis]:
+        """The nearly best single effects, tried at other sizes too."""
         near = [h for h in singles if h.log_evidence > 0.7 * singles[0].log_evidence][:4]
-        again = [selector.improved(h.names, selector.null.fit, scan=True) for h in near]
-        return max(again, key=lambda item: item.log_evidence)
+        return [selector.improved(h.names, selector.null.fit, scan=True) for h in near]
+
+    def _most_credible(self, selector: Selector, found: Sequence[Hypothesis]) -> Hypothesis:
+        """Best of some sets by their evidence and by what they leave: a residual that is no noise speaks against."""
+        top = max(item.log_evidence for item in found)
+        near = [
+            selector.with_channels(item) for item in found if item.log_evidence > top - self.options.credit
+        ]
+
+        def credibility(item: Hypothesis) -> float:
+            chance = max(item.probability_of_noise, 1e-300) / self.options.consistency
+            return item.log_evidence + max(min(math.log(chance), 0.0), -self.options.credit)
+
+        return max(near, key=credibility)
 
     def _pruned(self, selector: Selector, hypothesis: Hypothesis) -> Hypothesis:
         """Leave out members that bring nothing."""
@@ -614,7 +628,7 @@ class _Search:
             {name: group.significance for name, group in classes.items()},
             self.model,
             self.cells,
-            (float(thickness.min()), float(thickness.max())),
+            (float(thickness.min()) - 1e-3, float(thickness.max()) + 1e-3),
             self.effects,
             self.say,
         )

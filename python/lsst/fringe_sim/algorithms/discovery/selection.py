@@ -39,6 +39,11 @@ MINIMA_TRIED = 12
 PLACES_REFITTED = 10
 """Minima in size and thickness from which a few pixels are fitted."""
 
+SAMPLED_CELLS = 1500
+ORDERS_MOVED = 4
+ORDERS_REFITTED = 4
+"""Cells, fringe orders and fits with which a strong effect on the phase is looked for."""
+
 STEPS_PER_MINIMUM = 5
 MINIMA_REFITTED = 4
 
@@ -327,15 +332,65 @@ class Selector:
         first = np.array([item.coordinate(base.settings.get(item.key, known.fit.settings[item.key]))
                           for item in coordinates])  # fmt: skip
         starts = [first] if any(item.key in base.settings for item in coordinates) else []
+        trials = [(start, base.field) for start in starts]
         if scan:
-            starts += self._spread_starts(known.fit)
-        for start in starts:
-            trial = fit_model(self.problem, coordinates, start, base.field, base.levels)
+            trials += [(start, base.field) for start in self._spread_starts(known.fit)]
+            trials += self._other_orders(known.fit)
+        for start, thickness in trials:
+            trial = fit_model(self.problem, coordinates, start, thickness, base.levels)
             if trial.chi2 < known.fit.chi2 - 1.0:
                 trial = self._deepest(trial)
                 known = Hypothesis(known.names, trial, self._evidence(trial))
         self.fitted[frozenset(names)] = known
         return known
+
+    def _other_orders(self, fit: Fit) -> list[tuple[FloatArray, FloatArray]]:
+        """Places worth a fit: sizes of the last effect with fields moved by up to some fringe orders.
+
+        A strong effect on the phase is taken for thickness at first, in the order that suits it best; from there no
+        fit finds back. A sample of cells is compared with the model, levels free.
+        """
+        forward, problem = self.problem.forward, self.problem
+        if forward.is_image_effect(fit.coordinates[-1].effect) or not self.generic:
+            return []
+        whole = problem.basis.expand(self.first_field)
+        stride = max(1, math.isqrt(whole.size // SAMPLED_CELLS))
+        part = (slice(None), slice(None, None, stride), slice(None, None, stride))
+        value, weight = problem.cells.value[part], problem.cells.weight[part]
+        thickness, middle = whole[part[1:]], float(whole.mean())
+        order = 1e-3 * float(np.median(problem.cells.wavelength_nm)) / (2.0 * float(self.index.mean()))
+        shifts = np.arange(-ORDERS_MOVED * 12, ORDERS_MOVED * 12 + 1) * (order / 12.0)
+        shifts = shifts[(middle + shifts) * thickness.min() / middle > 0.5]
+        for edge in (shifts[0], shifts[-1]):
+            forward.cover(whole * (1.0 + edge / middle))
+        places = []
+        for position in self._single_steps(fit):
+            settings = {c.key: c.value(x) for c, x in zip(fit.coordinates, position, strict=True)}
+            chi2 = np.array([
+                _chi2_with_free_levels(forward.sampled(settings, thickness * (1.0 + shift / middle)), value, weight)
+                for shift in shifts
+            ])  # fmt: skip
+            places.append((float(chi2.min()), position, float(shifts[int(chi2.argmin())])))
+        best = sorted(places, key=lambda place: place[0])[:ORDERS_REFITTED]
+        used = (problem.cells.weight > 0).any(axis=0).astype(float)
+        return [
+            (position, problem.basis.fit(whole * (1.0 + shift / middle), used)) for _, position, shift in best
+        ]
+
+    def _single_steps(self, fit: Fit) -> list[FloatArray]:
+        """Positions in which one coordinate of the last effect has another size, the others of it none."""
+        own = np.array([item.effect == fit.coordinates[-1].effect for item in fit.coordinates])
+        found = [fit.position]
+        for number in np.flatnonzero(own):
+            item = fit.coordinates[number]
+            for bound in (item.low, item.high):
+                sizes = item.null + np.sign(bound - item.null) * item.scale * np.array(SCAN)
+                for size in (*sizes, *(item.null + np.array([0.3, 0.6, 0.9]) * (bound - item.null))):
+                    if item.low <= size <= item.high and size != item.null:
+                        position = np.where(own, 0.0, fit.position)
+                        position[number] = item.coordinate(float(size))
+                        found.append(position)
+        return found
 
     def _spread_starts(self, fit: Fit, *, both_sides: bool = False) -> list[FloatArray]:
         """The fit with its last effect moved to other sizes, from near the null to near the bound."""
@@ -453,6 +508,13 @@ class Selector:
             if item.quadratic:  # the prior is one of the parameter, the fit one of its square
                 total -= math.log(max(2.0 * departure, 0.05))
         return float(total)
+
+
+def _chi2_with_free_levels(model: FloatArray, value: FloatArray, weight: FloatArray) -> float:
+    """χ² with the best level at each wavelength."""
+    cross, square = (weight * model * value).sum(axis=(1, 2)), (weight * model**2).sum(axis=(1, 2))
+    taken = np.divide(cross**2, square, out=np.zeros_like(cross), where=square > 0.0)
+    return float((weight * value**2).sum() - taken.sum())
 
 
 def _bounded_minimum(
