@@ -132,7 +132,11 @@ def test_agreements_look_at_every_sensor() -> None:
 
 def test_header_says_what_was_modelled() -> None:
     made = config(bandwidth__fwhm=2.4)
-    assert made.choice().header() == {"SETUP": "ts8_e2v", "EFFECT0": "bandwidth.fwhm", "EFFVAL0": 2.4}
+    header = made.choice().header()
+    tables = [value for key, value in header.items() if key.startswith("TABLE")]
+    rest = {key: value for key, value in header.items() if not key.startswith("TABLE")}
+    assert rest == {"SETUP": "ts8_e2v", "EFFECT0": "bandwidth.fwhm", "EFFVAL0": 2.4}
+    assert [table.split()[0] for table in tables[:2]] == ["setups/ts8_e2v.yaml", "stacks/e2v_ccd250.yaml"]
 
 
 def test_agreements_look_at_every_raft() -> None:
