@@ -130,7 +130,9 @@ class Report:
             for row, mark in zip(cells, marks or [""] * len(table), strict=True)
         )
         text = io.StringIO()
-        (table if download is None else download).write(text, format="ascii.ecsv")
+        plain = (table if download is None else download).copy(copy_data=False)
+        plain.meta.clear()  # the page says it; some readers stumble over it
+        plain.write(text, format="ascii.ecsv")
         data = base64.b64encode(text.getvalue().encode()).decode("ascii")
         self._body.append(
             f'<div class="tables"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
