@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.wcs import WCS
 
 from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.products import SkyFringe
 
@@ -70,3 +72,31 @@ def test_a_map_that_is_no_map_is_refused(tmp_path, capsys) -> None:
     arguments = ["sky", "--thickness", str(tmp_path / "cube.fits"), "--out", str(tmp_path / "a")]
     assert run(arguments) == 1
     assert "two-dimensional" in capsys.readouterr().err
+
+
+def test_world_coordinates_where_the_place_is_known(thickness, tmp_path) -> None:
+    """A map that does not say what it shows has none; a window says so, and its frame is where it was."""
+    arguments = ["sky", "--detector", "R22_S11", "--out", str(tmp_path / "a")]
+    assert run([*arguments, "--thickness", thickness]) == 0
+    assert "WCSNAMEF" not in fits.getheader(tmp_path / "a" / "sky_R22_S11_00.fits", "IMAGE")
+    window = fits.PrimaryHDU(fits.getdata(thickness))
+    window.header["DETSEC"] = "[1001:1208,2001:2200]"
+    window.writeto(tmp_path / "window.fits")
+    assert run([*arguments, "--thickness", str(tmp_path / "window.fits")]) == 0
+    with fits.open(tmp_path / "a" / "sky_R22_S11_00.fits") as hdus:
+        assert WCS(hdus["IMAGE"].header, key="D").pixel_to_world_values(0, 0) == pytest.approx((1000, 2000))
+        sensor = Camera.from_name("lsstCam").detector("R22_S11")
+        x_mm, _ = WCS(hdus["MASK"].header, key="F").pixel_to_world_values((sensor.shape[1] - 1) / 2 - 1000, 0)
+        assert x_mm == pytest.approx(sensor.x_mm, abs=1e-9)
+
+
+def test_a_section_outside_the_sensor_is_refused_before_the_work(thickness, tmp_path, capsys) -> None:
+    window = fits.PrimaryHDU(fits.getdata(thickness))
+    window.header["DETSEC"] = "[4001:4208,1:200]"
+    window.writeto(tmp_path / "window.fits")
+    out = tmp_path / "a"
+    assert run(["sky", "--thickness", str(tmp_path / "window.fits"), "--out", str(out)]) == 1
+    message = capsys.readouterr().err
+    assert "window.fits" in message
+    assert "of the section" in message
+    assert not out.exists()

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.wcs import WCS
 from lsst.daf.butler import Butler, DatasetProvenance, DatasetRef, DatasetType, StorageClassFactory
 from product_makers import MAKERS
 from raw_frame_maker import write_raw
 
 import lsst.fringe_sim.products as products
 from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_metadata
 from lsst.fringe_sim.middleware import register_storage_classes
 from lsst.fringe_sim.middleware.afw import frame_from_exposure
@@ -278,3 +280,15 @@ def test_repository_of_exposures_can_be_written_without_afw(butler: Butler) -> N
     assert fits.getheader(path)["OBSTYPE"] == "fringe"
     with pytest.raises(ValueError, match=r"storage class is 'ExposureF'; allowed: FringeFrame; .*lsst\.afw"):
         butler.get(ref)
+
+
+def test_images_of_a_whole_sensor_have_world_coordinates(butler: Butler) -> None:
+    """Of the sensor of the data id; an image of another size does not say where it is."""
+    sensor = Camera.from_name("lsstCam").detector(37)
+    flat = MAKERS["FringeFlat"](shape=sensor.shape)
+    header = fits.getheader(butler.getURI(put(butler, flat, "whole", "FringeFlat")).ospath, "IMAGE")
+    ny, nx = sensor.shape
+    centre = WCS(header, key="F").pixel_to_world_values((nx - 1) / 2, (ny - 1) / 2)
+    assert centre == pytest.approx((sensor.x_mm, sensor.y_mm))
+    small = put(butler, MAKERS["FringeFlat"](), "small", "FringeFlat")
+    assert "WCSNAMEF" not in fits.getheader(butler.getURI(small).ospath, "IMAGE")

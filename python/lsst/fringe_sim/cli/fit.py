@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..algorithms.flat_residual import relative_flats
 from ..algorithms.thickness_fit import FIT_METHODS, fit_thickness
-from ..errors import InputError
+from ..errors import InputError, UnknownNameError
+from ..instrument.camera import Camera
 from ..model import FringeModel, Setup
-from ..products import FringeCube, ThicknessMap
+from ..model.provenance import input_cards
+from ..products import FringeCube, SensorSection, ThicknessMap
 from ..report.figures import flats_figure, phase_figure, thickness_figure
 from ..report.page import Report
 from .inputs import effect_cards, prepare_folder, read_settings
@@ -21,7 +23,7 @@ from .lab_frames import find_series, read_cube
 from .parameters import EFFECT, LABORATORY, effect_settings
 from .progress import progress
 
-__all__ = ["fit", "phase_folded"]
+__all__ = ["fit", "phase_folded", "section_of_cube"]
 
 LEAST_WAVELENGTHS = 4
 """Below this the order of the fringe cannot be told."""
@@ -78,19 +80,22 @@ def fit(
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
     model = FringeModel.from_setup(setup, settings)
+    used = paths
     cube = read_cube(paths[0]) if len(paths) == 1 else None
     if cube is None:
         kernel_px = SMOOTHING_PX[method] if smoothing is None else smoothing
-        cube = _prepare(paths, setup, kernel_px, skip_bad, dry_run)
+        cube, used = _prepare(paths, setup, kernel_px, skip_bad, dry_run)
     if dry_run:
         return
     if cube is None or len(np.unique(cube.wavelength_nm)) < LEAST_WAVELENGTHS:
         found = 0 if cube is None else len(np.unique(cube.wavelength_nm))
         raise InputError("number of wavelengths", found, f"{LEAST_WAVELENGTHS} or more")
+    section = section_of_cube(cube, setup)
     folder = prepare_folder(out)
+    cards = {**effect_cards(model), **input_cards([*used, *([effects_file] if effects_file else [])])}
     click.echo("fitting the thickness", err=True)
     fitted = fit_thickness(cube, model, method)
-    fitted.write_fits(folder / "thickness.fits", {"SETUP": setup.name, **effect_cards(model)})
+    fitted.write_fits(folder / "thickness.fits", {"SETUP": setup.name, **cards}, section=section)
     write_report(folder, cube, fitted, model, method)
     good = fitted.mask == 0
     if good.any():
@@ -105,7 +110,8 @@ def fit(
 
 def _prepare(
     paths: tuple[str, ...], setup: Setup, smoothing: float, skip_bad: bool, dry_run: bool
-) -> FringeCube | None:
+) -> tuple[FringeCube | None, tuple[str, ...]]:
+    """The cube, `None` in a dry run, and the files that it is made of."""
     series = find_series(paths, skip_bad=skip_bad)
     found = ", ".join(f"{w:g}" for w in series.wavelengths_nm)
     click.echo(
@@ -120,9 +126,20 @@ def _prepare(
         raise InputError("number of wavelengths", len(series.wavelengths_nm), f"{LEAST_WAVELENGTHS} or more")
     if dry_run:
         click.echo(f"would prepare {series.steps} frames and fit the layer {setup.varying}")
-        return None
+        return None, series.paths
     with progress("preparing frames", series.steps) as advance:
-        return series.read(setup, FlatPrepOptions(smoothing_sigma_px=smoothing), advance)
+        return series.read(setup, FlatPrepOptions(smoothing_sigma_px=smoothing), advance), series.paths
+
+
+def section_of_cube(cube: FringeCube, setup: Setup) -> SensorSection | None:
+    """Pixels of a sensor of the set-up's camera that a cube shows; `None` if sensor or place are not known."""
+    camera = Camera.from_name(setup.camera)
+    name = str(cube.metadata.get("SERIAL") or cube.detector)
+    try:
+        detector = camera.detector(name)
+    except UnknownNameError:
+        return None
+    return SensorSection.of_image(detector, cube.shape[1:], cube.metadata)
 
 
 def write_report(

@@ -16,12 +16,21 @@ from numpy.typing import NDArray
 from ..algorithms.discovery import read_effects_override
 from ..effects import EFFECTS, activate_effects
 from ..errors import FrameFormatError, InputError
+from ..instrument.detector import Detector
 from ..model import FringeModel
 from ..model.provenance import model_cards, software_cards
-from ..products import DAMAGE
+from ..products import DAMAGE, SensorSection
+from ..products.sensor_section import SECTION_KEYWORDS
 from ..resources import read_user_yaml
 
-__all__ = ["effect_cards", "prepare_folder", "read_settings", "read_thickness", "sky_settings"]
+__all__ = [
+    "effect_cards",
+    "prepare_folder",
+    "read_section",
+    "read_settings",
+    "read_thickness",
+    "sky_settings",
+]
 
 
 def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
@@ -67,6 +76,27 @@ def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     if not np.any(np.isfinite(thickness)):
         raise FrameFormatError("thickness map", "no finite pixel", "a thickness in µm", source=source)
     return thickness
+
+
+def read_section(
+    path: str | os.PathLike[str], detector: Detector, shape: tuple[int, int]
+) -> SensorSection | None:
+    """Pixels of a sensor that a map shows, by what its headers say or by its size; `None` if neither tells.
+
+    Raises
+    ------
+    FrameFormatError, OutOfRangeError
+        A header with a malformed section, or with pixels that the sensor does not have.
+    """
+    with warnings.catch_warnings(), open(path, "rb") as stream:
+        warnings.simplefilter("ignore")
+        with fits.open(stream, memmap=False) as hdus:
+            headers = [hdus[0].header, *(hdu.header for hdu in hdus[1:2])]
+    known = {key: header[key] for header in headers for key in SECTION_KEYWORDS if key in header}
+    try:
+        return SensorSection.of_image(detector, shape, known)
+    except InputError as error:
+        raise error.in_source(str(path)) from None
 
 
 def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -15,11 +15,11 @@ from ..instrument.night import NightHistory
 from ..instrument.sky import SkySpectrum
 from ..mock.thickness import e2v_321
 from ..model import FringeModel, Setup
-from ..products import SkyFringe
-from ..products.sensor_wcs import add_sensor_wcs
+from ..model.provenance import input_cards
+from ..products import SensorSection, SkyFringe
 from ..report.figures import sky_figure
 from ..report.style import save_figure
-from .inputs import effect_cards, prepare_folder, read_settings, read_thickness, sky_settings
+from .inputs import effect_cards, prepare_folder, read_section, read_settings, read_thickness, sky_settings
 from .parameters import EFFECT, SKY, Quantity, effect_settings
 from .progress import progress
 
@@ -79,6 +79,12 @@ def sky(
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
     layer = e2v_321() if thickness == "e2v_321" else read_thickness(thickness)
+    shape = (layer.shape[0], layer.shape[1])
+    section = (
+        SensorSection.of_image(sensor, shape, {})
+        if thickness == "e2v_321"
+        else read_section(thickness, sensor, shape)
+    )
     frames = 11 if night else 1
     settings = sky_settings(settings)
     if dry_run:
@@ -89,6 +95,8 @@ def sky(
     model = FringeModel.from_setup(
         setup, settings, field_x_deg=_angle(sensor.field_x_deg), field_y_deg=_angle(sensor.field_y_deg)
     )
+    given = [thickness] if thickness != "e2v_321" else []
+    cards = {**effect_cards(model), **input_cards([*given, *([effects_file] if effects_file else [])])}
     folder = prepare_folder(out)
     known = layer[np.isfinite(layer)]
     dark = SkySpectrum.dark(airmass=airmass or setup.airmass)
@@ -123,8 +131,7 @@ def sky(
     with progress("simulating frames", frames) as advance:
         for number, frame in enumerate(series):
             path = folder / f"sky_{sensor.name}_{number:02d}.fits"
-            frame.write_fits(path, {"SETUP": setup.name, **effect_cards(model)})
-            add_sensor_wcs(path, sensor)
+            frame.write_fits(path, {"SETUP": setup.name, **cards}, section=section)
             made.append(frame)
             advance()
     save_figure(sky_figure(made), folder / "sky.png")

@@ -7,13 +7,14 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from lsst.daf.butler import DatasetProvenance, FormatterV2
+from lsst.daf.butler import DataCoordinate, DatasetProvenance, FormatterV2
 from lsst.resources import ResourcePath
 
-from ..errors import InputError
+from ..errors import InputError, UnknownNameError
 from ..instrument.raw_frame import RawFrame, read_raw_metadata
-from ..products import FringeFrame
+from ..products import FringeFrame, SensorSection
 from .afw import read_exposure
+from .instruments import sensor_of
 
 __all__ = [
     "ConfigOverrideFormatter",
@@ -51,8 +52,9 @@ class FitsProductFormatter(FormatterV2):
         return product.read_fits(path)
 
     def write_local_file(self, in_memory_dataset: Any, uri: ResourcePath) -> None:
-        """Write the product, with the provenance in its header."""
-        in_memory_dataset.write_fits(uri.ospath, metadata=self._provenance)
+        """Write the product, with the provenance and the world coordinates of its sensor in the headers."""
+        section = _section_of(in_memory_dataset, self.data_id)
+        in_memory_dataset.write_fits(uri.ospath, metadata=self._provenance, section=section)
 
     def add_provenance(
         self, in_memory_dataset: Any, /, *, provenance: DatasetProvenance | None = None
@@ -64,6 +66,16 @@ class FitsProductFormatter(FormatterV2):
         if len(own) == len(metadata):
             return in_memory_dataset
         return dataclasses.replace(in_memory_dataset, metadata=own)
+
+
+def _section_of(product: Any, data_id: DataCoordinate) -> SensorSection | None:
+    """Pixels of the sensor that a product shows; `None` where its sensor or its place there are not known."""
+    try:
+        detector = sensor_of(data_id)
+    except (UnknownNameError, KeyError):
+        return None
+    shape = product.mask.shape[-2:]
+    return SensorSection.of_image(detector, shape, product.metadata)
 
 
 def _provenance_cards(provenance: DatasetProvenance, ref: Any) -> dict[str, Any]:

@@ -7,15 +7,16 @@ here has the data id under which a repository of real images will look for it.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-from lsst.daf.butler import DataId, FormatterV2
+from lsst.daf.butler import DataCoordinate, DataId, FormatterV2
 from lsst.daf.butler.registry import ConflictingDefinitionError
 from lsst.pipe.base import Instrument
 
-from ..errors import InputError
+from ..errors import InputError, UnknownNameError
 from ..instrument.camera import Camera
+from ..instrument.detector import Detector
 
 __all__ = [
     "INSTRUMENTS",
@@ -24,6 +25,7 @@ __all__ = [
     "LsstCamFringe",
     "MonoCamFringe",
     "Ts8Fringe",
+    "sensor_of",
 ]
 
 NO_FILTER = "none"
@@ -203,3 +205,25 @@ INSTRUMENTS: dict[str, type[FringeInstrument]] = {
     cls.camera_name: cls for cls in (LsstCamFringe, Ts8Fringe, MonoCamFringe, HscFringe)
 }
 """Instrument by the name of its camera."""
+
+
+def sensor_of(data_id: DataCoordinate | Mapping[str, Any]) -> Detector:
+    """Sensor of a data id, as the camera of its instrument knows it.
+
+    By the name of the instrument, not by its class: a repository may have it from Rubin's own package.
+
+    Parameters
+    ----------
+    data_id : `lsst.daf.butler.DataCoordinate` or `Mapping`
+        With ``instrument`` and ``detector``.
+
+    Raises
+    ------
+    UnknownNameError
+        An instrument that this package does not know.
+    """
+    by_name = {cls.getName(): cls for cls in INSTRUMENTS.values()}
+    name = str(data_id["instrument"])
+    if name not in by_name:
+        raise UnknownNameError("instrument", name, by_name)
+    return by_name[name].camera().detector(int(data_id["detector"]))

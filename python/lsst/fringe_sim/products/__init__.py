@@ -11,6 +11,7 @@ from .fringe_cube import CUBE_UNITS, FlatExposures, FringeCube
 from .fringe_flat import FringeFlat
 from .fringe_frame import FringeFrame
 from .mask import MASK_PLANES, describe_mask, mask_bits
+from .sensor_section import SensorSection
 from .sky_frame import CORRECTED, SKY_UNITS, SkyFringe, refuse_corrected
 from .thickness_map import ThicknessMap
 
@@ -26,6 +27,7 @@ __all__ = [
     "FringeCube",
     "FringeFlat",
     "FringeFrame",
+    "SensorSection",
     "SkyFringe",
     "ThicknessMap",
     "describe_mask",

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from ..errors import FrameFormatError, InputError
 from ._check import check_mapping
 from .mask import mask_plane_cards, planes_from_header, remap_mask
+from .sensor_section import SECTION_KEYWORDS, SensorSection
 
 __all__ = [
     "Scalar",
@@ -208,8 +209,20 @@ def bintable_hdu(name: str, columns: Sequence[tuple[str, NDArray[Any], str | Non
     )
 
 
-def write_hdus(path: str | os.PathLike[str], hdus: Sequence[Any]) -> None:
+def write_hdus(
+    path: str | os.PathLike[str], hdus: Sequence[Any], section: SensorSection | None = None
+) -> None:
     """Write HDUs to ``path``: checksummed, repeatable to the byte, and all or nothing.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write; an existing one is replaced when the new one is complete.
+    hdus : `~collections.abc.Sequence`
+        The primary HDU and its extensions.
+    section : `SensorSection`, optional
+        Pixels of the sensor that the first image shows, and every other of its size: their world coordinates are
+        added, and the section itself to the primary header.
 
     Raises
     ------
@@ -220,6 +233,8 @@ def write_hdus(path: str | os.PathLike[str], hdus: Sequence[Any]) -> None:
     if not target.parent.is_dir():
         raise InputError("folder", str(target.parent), "an existing folder", source=str(target))
     hdus[0].header[EXTENSIONS_KEY] = (len(hdus) - 1, "number of extensions")
+    if section is not None:
+        _add_world_coordinates(hdus, section)
     for hdu in hdus:
         hdu.add_datasum(when="data unit checksum")
         hdu.add_checksum(when="HDU checksum", override_datasum=True)
@@ -230,6 +245,14 @@ def write_hdus(path: str | os.PathLike[str], hdus: Sequence[Any]) -> None:
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _add_world_coordinates(hdus: Sequence[Any], section: SensorSection) -> None:
+    hdus[0].header[SECTION_KEYWORDS[0]] = (section.keyword, "pixels of the sensor, from 1")
+    images = [hdu for hdu in hdus[1:] if hdu.is_image and len(hdu.shape) >= 2]
+    for hdu in images:
+        if hdu.shape[-2:] == images[0].shape[-2:]:
+            hdu.header.update(section.cards(hdu.shape))
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..errors import FrameFormatError, InputError
 from . import _check as check
 from . import _fits as io
+from .sensor_section import SensorSection
 
 __all__ = ["CombinedBias"]
 
@@ -86,7 +87,13 @@ class CombinedBias:
         """Rows and columns of the sensor."""
         return (self.image.shape[0], self.image.shape[1])
 
-    def write_fits(self, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
+    def write_fits(
+        self,
+        path: str | os.PathLike[str],
+        metadata: Mapping[str, Any] | None = None,
+        *,
+        section: SensorSection | None = None,
+    ) -> None:
         """Write IMAGE and MASK extensions and the table NOISE.
 
         Parameters
@@ -95,6 +102,8 @@ class CombinedBias:
             File to write; an existing one is replaced when the new one is complete.
         metadata : `Mapping`, optional
             Further header keywords, which win over those of the product.
+        section : `SensorSection`, optional
+            Pixels of the sensor that the images show; their world coordinates are written with them.
         """
         own: list[tuple[str, io.Scalar, str]] = [
             ("DETNAME", self.detector, "sensor"),
@@ -107,7 +116,7 @@ class CombinedBias:
             io.mask_hdu(self.mask),
             self._noise_hdu(),
         ]
-        io.write_hdus(path, hdus)
+        io.write_hdus(path, hdus, section)
 
     def _noise_hdu(self) -> fits.BinTableHDU:
         names, noise = np.array(list(self.noise_adu)), np.array(list(self.noise_adu.values()))

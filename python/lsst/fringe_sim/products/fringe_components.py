@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..errors import FrameFormatError, OutOfRangeError
 from . import _check as check
 from . import _fits as io
+from .sensor_section import SensorSection
 
 __all__ = ["FringeComponents"]
 
@@ -99,7 +100,13 @@ class FringeComponents:
         """Number of components kept."""
         return int(self.components.shape[0])
 
-    def write_fits(self, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
+    def write_fits(
+        self,
+        path: str | os.PathLike[str],
+        metadata: Mapping[str, Any] | None = None,
+        *,
+        section: SensorSection | None = None,
+    ) -> None:
         """Write MEAN, COMPONENTS, MASK, the table SPECTRUM and the image SCORES.
 
         Parameters
@@ -108,6 +115,8 @@ class FringeComponents:
             File to write; an existing one is replaced when the new one is complete.
         metadata : `Mapping`, optional
             Further header keywords, which win over those of the product.
+        section : `SensorSection`, optional
+            Pixels of the sensor that the images show; their world coordinates are written with them.
         """
         own: list[tuple[str, io.Scalar, str]] = [
             ("DETNAME", self.detector, "sensor"),
@@ -125,7 +134,7 @@ class FringeComponents:
             io.bintable_hdu("SPECTRUM", spectrum),
             io.image_hdu("SCORES", self.scores, unit=""),
         ]
-        io.write_hdus(path, hdus)
+        io.write_hdus(path, hdus, section)
 
     @classmethod
     def read_fits(cls, path: str | os.PathLike[str]) -> Self:

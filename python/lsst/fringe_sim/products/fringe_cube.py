@@ -16,6 +16,7 @@ from . import _check as check
 from . import _fits as io
 from .fringe_flat import FringeFlat
 from .mask import mask_bits
+from .sensor_section import SensorSection
 
 __all__ = ["CUBE_UNITS", "FlatExposures", "FringeCube"]
 
@@ -236,7 +237,13 @@ class FringeCube:
             metadata={**stack.metadata, **({} if metadata is None else metadata)},
         )
 
-    def write_fits(self, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
+    def write_fits(
+        self,
+        path: str | os.PathLike[str],
+        metadata: Mapping[str, Any] | None = None,
+        *,
+        section: SensorSection | None = None,
+    ) -> None:
         """Write IMAGE, VARIANCE, MASK, EXPOSURES, and THICKNESS, THICKNESS_SIGMA if they are known.
 
         Parameters
@@ -245,6 +252,8 @@ class FringeCube:
             File to write; an existing one is replaced when the new one is complete.
         metadata : `Mapping`, optional
             Further header keywords, which win over those of the product.
+        section : `SensorSection`, optional
+            Pixels of the sensor that the images show; their world coordinates are written with them.
         """
         own: list[tuple[str, io.Scalar, str]] = [("DETNAME", self.detector, "sensor")]
         if self.layer:
@@ -261,7 +270,7 @@ class FringeCube:
         for name, data in (("THICKNESS", self.thickness), ("THICKNESS_SIGMA", self.thickness_sigma)):
             if data is not None:
                 hdus.append(io.image_hdu(name, data, unit="um", cards=[("LAYER", self.layer, "layer")]))
-        io.write_hdus(path, hdus)
+        io.write_hdus(path, hdus, section)
 
     def _exposures_hdu(self) -> fits.BinTableHDU:
         rows = self.exposures

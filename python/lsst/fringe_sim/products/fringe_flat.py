@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from . import _check as check
 from . import _fits as io
+from .sensor_section import SensorSection
 
 __all__ = ["FringeFlat"]
 
@@ -92,7 +93,13 @@ class FringeFlat:
         """Rows and columns of the sensor."""
         return (self.image.shape[0], self.image.shape[1])
 
-    def write_fits(self, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
+    def write_fits(
+        self,
+        path: str | os.PathLike[str],
+        metadata: Mapping[str, Any] | None = None,
+        *,
+        section: SensorSection | None = None,
+    ) -> None:
         """Write IMAGE, MASK and VARIANCE extensions.
 
         Parameters
@@ -101,6 +108,8 @@ class FringeFlat:
             File to write; an existing one is replaced when the new one is complete.
         metadata : `Mapping`, optional
             Further header keywords, which win over those of the product.
+        section : `SensorSection`, optional
+            Pixels of the sensor that the images show; their world coordinates are written with them.
         """
         own: list[tuple[str, io.Scalar, str]] = [
             ("DETNAME", self.detector, "sensor"),
@@ -117,7 +126,7 @@ class FringeFlat:
             io.mask_hdu(self.mask),
             io.image_hdu("VARIANCE", self.variance, unit=""),
         ]
-        io.write_hdus(path, hdus)
+        io.write_hdus(path, hdus, section)
 
     @classmethod
     def read_fits(cls, path: str | os.PathLike[str]) -> Self:

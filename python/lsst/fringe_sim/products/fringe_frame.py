@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, OutOfRangeError
 from . import _check as check
 from . import _fits as io
+from .sensor_section import SensorSection
 
 __all__ = ["FringeFrame"]
 
@@ -97,7 +98,13 @@ class FringeFrame:
         """Rows and columns of the sensor."""
         return (self.image.shape[0], self.image.shape[1])
 
-    def write_fits(self, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
+    def write_fits(
+        self,
+        path: str | os.PathLike[str],
+        metadata: Mapping[str, Any] | None = None,
+        *,
+        section: SensorSection | None = None,
+    ) -> None:
         """Write the layout of an afw exposure: empty primary HDU, then IMAGE, MASK, VARIANCE.
 
         Parameters
@@ -106,6 +113,8 @@ class FringeFrame:
             File to write; an existing one is replaced when the new one is complete.
         metadata : `Mapping`, optional
             Further header keywords, which win over those of the product.
+        section : `SensorSection`, optional
+            Pixels of the sensor that the images show; their world coordinates are written with them.
         """
         hdus = [
             self._primary_hdu(io.merge_metadata(self.metadata, metadata, _OWN)),
@@ -113,7 +122,7 @@ class FringeFrame:
             io.mask_hdu(self.mask, cards=self._extension_cards("MASK")),
             io.image_hdu("VARIANCE", self.variance, cards=self._extension_cards("VARIANCE")),
         ]
-        io.write_hdus(path, hdus)
+        io.write_hdus(path, hdus, section)
 
     def _primary_hdu(self, metadata: Mapping[str, io.Scalar]) -> fits.PrimaryHDU:
         match = _DATETIME.fullmatch(self.creation_datetime)

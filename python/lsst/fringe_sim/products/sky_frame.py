@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, UnknownNameError
 from . import _check as check
 from . import _fits as io
+from .sensor_section import SensorSection
 
 __all__ = ["CORRECTED", "SKY_UNITS", "SkyFringe", "refuse_corrected"]
 
@@ -109,7 +110,13 @@ class SkyFringe:
             return self.image
         return (self.image / np.float32(self.mean_electrons) - np.float32(1)).astype(np.float32)
 
-    def write_fits(self, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
+    def write_fits(
+        self,
+        path: str | os.PathLike[str],
+        metadata: Mapping[str, Any] | None = None,
+        *,
+        section: SensorSection | None = None,
+    ) -> None:
         """Write IMAGE and MASK extensions.
 
         Parameters
@@ -118,6 +125,8 @@ class SkyFringe:
             File to write; an existing one is replaced when the new one is complete.
         metadata : `Mapping`, optional
             Further header keywords, which win over those of the product.
+        section : `SensorSection`, optional
+            Pixels of the sensor that the images show; their world coordinates are written with them.
         """
         own: list[tuple[str, io.Scalar, str]] = [
             ("DETNAME", self.detector, "sensor"),
@@ -135,7 +144,7 @@ class SkyFringe:
             io.image_hdu("IMAGE", self.image, unit=self.unit),
             io.mask_hdu(self.mask),
         ]
-        io.write_hdus(path, hdus)
+        io.write_hdus(path, hdus, section)
 
     @classmethod
     def read_fits(cls, path: str | os.PathLike[str]) -> Self:

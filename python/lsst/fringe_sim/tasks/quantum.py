@@ -14,9 +14,8 @@ from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import Config
 from lsst.pipe.base import AlgorithmError, QuantumContext
 
-from ..errors import FringeSimError, InputError, UnknownNameError
-from ..instrument.detector import Detector
-from ..middleware.instruments import INSTRUMENTS
+from ..errors import FringeSimError, InputError
+from ..middleware.instruments import sensor_of
 from ..model.provenance import software_cards
 
 __all__ = [
@@ -80,23 +79,6 @@ def data_id_of(butlerQC: QuantumContext) -> DataCoordinate:
     if data_id is None:
         raise AssertionError("a quantum that runs has a data id")
     return data_id
-
-
-def sensor_of(data_id: DataCoordinate) -> Detector:
-    """Sensor of a data id, as the camera of its instrument knows it.
-
-    By the name of the instrument, not by its class: a repository may have it from Rubin's own package.
-
-    Raises
-    ------
-    UnknownNameError
-        An instrument that this package does not know.
-    """
-    by_name = {cls.getName(): cls for cls in INSTRUMENTS.values()}
-    name = str(data_id["instrument"])
-    if name not in by_name:
-        raise UnknownNameError("instrument", name, by_name)
-    return by_name[name].camera().detector(int(data_id["detector"]))
 
 
 def common_header(config: Config) -> dict[str, Any]:
