@@ -52,6 +52,11 @@ class LabSeries:
         """Number of frames that are read."""
         return len(self.biases) + len(self.flats)
 
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """Files of all frames."""
+        return tuple(frame.source for frame in (*self.biases, *self.flats))
+
     def missing_nm(self, setup: Setup, tolerance_nm: float = 1.0) -> tuple[float, ...]:
         """Usual wavelengths of a set-up of which there is no flat [nm]."""
         found = np.array(self.wavelengths_nm)

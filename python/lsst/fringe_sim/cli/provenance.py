@@ -15,7 +15,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from ..errors import FrameFormatError, InputError, UnknownNameError
-from ..model.provenance import effects_of_header
+from ..model.provenance import effects_of_header, inputs_of_header
 from ..resources import revision
 
 __all__ = ["describe", "provenance", "read_header"]
@@ -143,7 +143,7 @@ def describe(header: Mapping[str, Any]) -> dict[str, Any]:
         if key.startswith(BUTLER) and not _INPUT.fullmatch(key) and not key.startswith(f"{BUTLER}INPUT ")
     }
     known = {"PRODUCT", "ORIGIN", "FSIMVER", "SETUP", *_ERRORS, *_SEEDS, *_DIGESTS}
-    numbered = re.compile(r"(EFFECT|EFFVAL|TABLE)\d+|VERSION .*|LSST BUTLER .*")
+    numbered = re.compile(r"(EFFECT|EFFVAL|TABLE|INPUT)\d+|VERSION .*|LSST BUTLER .*")
     return {
         "product": header.get("PRODUCT"),
         "software": {str(header.get("ORIGIN", "unknown")): header.get("FSIMVER"), **software},
@@ -191,7 +191,8 @@ def _inputs(header: Mapping[str, Any]) -> list[dict[str, str]]:
         match = _INPUT.fullmatch(key)
         if match:
             found.setdefault(int(match[1]), {})[match[2].lower()] = str(value)
-    return [found[number] for number in sorted(found)]
+    files = [{"file": name, "sha256": content} for name, content in inputs_of_header(header)]
+    return [found[number] for number in sorted(found)] + files
 
 
 def _in_repository(repo: str, dataset_type: str, collections: str, where: str) -> Iterator[dict[str, Any]]:
@@ -219,6 +220,8 @@ def _in_repository(repo: str, dataset_type: str, collections: str, where: str) -
         for ref in refs:
             record = describe(read_header(butler.getURI(ref).ospath))
             for item in record["inputs"]:
+                if "file" in item:
+                    continue
                 item["data id"] = _data_id(butler, item.get("id", ""))
             yield {"file": f"{dataset_type} {ref.dataId.required} in {ref.run}", **record}
 

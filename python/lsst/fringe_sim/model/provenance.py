@@ -8,16 +8,20 @@ The keywords are the same in every product, so that one reader understands all (
 ``SETUP``                 name of the set-up
 ``EFFECTn``, ``EFFVALn``  effects by ``name.parameter``, and their values
 ``TABLEn``                a shipped table or description and the beginning of its SHA-256
+``INPUTn``                a file that a command was given, and the beginning of its SHA-256
 ========================  ==============================================================================
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
+import os
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from .. import __version__
@@ -25,13 +29,15 @@ from ..effects import EFFECTS, activate_effects, apply_to_system
 from ..errors import UnknownNameError
 from ..optics.stack import LayerStack
 from ..optics.system import OpticalSystem
-from ..resources import read_yaml, revision
+from ..resources import REVISION_LENGTH, read_yaml, revision
 from .setup import Setup, setup_names
 
 __all__ = [
     "SKY_TABLES",
     "effect_cards",
     "effects_of_header",
+    "input_cards",
+    "inputs_of_header",
     "model_cards",
     "software_cards",
     "table_cards",
@@ -92,6 +98,42 @@ def effects_of_header(header: Mapping[str, Any]) -> dict[str, float]:
         found[str(header[f"EFFECT{number}"])] = float(header[f"EFFVAL{number}"])
         number += 1
     return found
+
+
+def input_cards(paths: Iterable[str | os.PathLike[str]]) -> dict[str, str]:
+    """Keywords ``INPUTn`` of files that a product is made from: name, without its folders, and content.
+
+    Parameters
+    ----------
+    paths : iterable of path-like
+        The files. One that is named twice is stated once.
+
+    Raises
+    ------
+    OSError
+        A file cannot be read.
+    """
+    stated = dict.fromkeys(f"{_printable(Path(path).name)} {_content(path)}" for path in paths)
+    return {f"INPUT{number}": text for number, text in enumerate(stated)}
+
+
+def inputs_of_header(header: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Names and contents of the files that a header states; the inverse of `input_cards`."""
+    found: list[tuple[str, str]] = []
+    while f"INPUT{len(found)}" in header:
+        name, _, content = str(header[f"INPUT{len(found)}"]).rpartition(" ")
+        found.append((name, content))
+    return found
+
+
+def _content(path: str | os.PathLike[str]) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()[:REVISION_LENGTH]
+
+
+def _printable(name: str) -> str:
+    """A file name as a FITS header can hold it."""
+    return "".join(letter if " " <= letter <= "~" else ascii(letter)[1:-1] for letter in name)
 
 
 def tables_of(setup: Setup, stack: LayerStack | None = None) -> tuple[tuple[str, str], ...]:
