@@ -15,6 +15,7 @@ __all__ = [
     "FrameFormatError",
     "FringeSimError",
     "InputError",
+    "MissingPackageError",
     "OutOfRangeError",
     "ResourceError",
     "StackError",
@@ -96,6 +97,30 @@ class UnknownNameError(InputError):
         else:
             allowed = _shorten(names)
         super().__init__(field, value, allowed, source=source)
+
+
+class MissingPackageError(FringeSimError, ImportError):
+    """Something was asked for that needs a package which is not installed; the package does without it otherwise.
+
+    Parameters
+    ----------
+    wanted : `str`
+        What was asked for.
+    package : `str`
+        What it needs.
+    extra : `str`
+        Extra of this distribution that installs it.
+    """
+
+    def __init__(self, wanted: str, package: str, extra: str) -> None:
+        super().__init__(wanted, package, extra)
+        self.wanted, self.package, self.extra = wanted, package, extra
+
+    def __str__(self) -> str:
+        return (
+            f"{self.wanted} needs {self.package}, which is not installed here: "
+            f"pip install 'lsst-fringe-sim[{self.extra}]'"
+        )
 
 
 class ResourceError(FringeSimError):

@@ -36,6 +36,7 @@ _COMMANDS = {
     "amplitudes": ("amplitudes", "Tabulate the fringe amplitudes of every set-up of the paper."),
     "discover": ("discover", "Find the effect that the model lacks."),
     "reproduce-paper": ("reproduce_paper", "Recompute the paper, number by number."),
+    "export": ("export", "Write products as NetCDF, for xarray."),
     "provenance": ("provenance", "Say what a product was made with and from."),
     "completion": ("completion", "Print what makes a shell complete commands, options and names."),
     "challenge": ("challenge", "Hide effects in simulated sensors and count what the search finds."),

@@ -1,0 +1,47 @@
+"""``fringe-sim export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ..errors import InputError
+from ..products.xarray_export import read_exported, to_xarray, write_netcdf
+from .inputs import prepare_folder
+from .progress import progress
+
+__all__ = ["export"]
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the NetCDF files.")
+@click.option("--dry-run", is_flag=True, help="Read everything, write nothing.")
+def export(files: tuple[Path, ...], out: Path, dry_run: bool) -> None:
+    """Write thickness maps, fringe cubes and sky frames as NetCDF, for xarray.
+
+    Axes are named, coordinates and images have units, header keywords become attributes. Needs the extra:
+    pip install 'lsst-fringe-sim[xarray]'.
+
+    \b
+    Examples:
+      fringe-sim export fit/thickness.fits --out nc
+      fringe-sim export sky/*.fits --out nc
+      python -c 'import xarray; print(xarray.open_dataset("nc/thickness.nc"))'
+    """
+    targets = [out / f"{file.stem}.nc" for file in files]
+    for number, target in enumerate(targets):
+        if target in targets[:number]:
+            other = files[targets.index(target)]
+            raise InputError("files", f"{other} and {files[number]}", "files of different names")
+    if not dry_run:
+        prepare_folder(out)
+    with progress("exporting", len(files)) as advance:
+        for file, target in zip(files, targets, strict=True):
+            dataset = to_xarray(read_exported(file))
+            if not dry_run:
+                write_netcdf(dataset, target)
+            advance()
+    for target in targets:
+        click.echo(f"would write {target}" if dry_run else str(target))
