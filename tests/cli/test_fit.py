@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.mock.thickness import e2v_321
@@ -46,7 +49,11 @@ def test_thickness_is_recovered(raws, tmp_path, capsys) -> None:
     assert np.all(np.abs(error[good]) < HALF_ORDER_UM)
     pull = error[good] / fitted.sigma[good]
     assert pull.std() == pytest.approx(1.0, abs=0.1)
-    assert (tmp_path / "fit" / "report.html").is_file()
+    page = (tmp_path / "fit" / "report.html").read_text(encoding="utf-8")
+    data = re.search(r'download="flat_residuals.ecsv" href="data:text/plain;base64,([^"]+)"', page)
+    residuals = Table.read(base64.b64decode(data.group(1)).decode(), format="ascii.ecsv")
+    assert len(residuals) == 12
+    assert np.all(np.abs(residuals["ratio"] - 1.0) < 0.1), "what is left is the noise"
 
 
 def test_the_walk_of_the_paper_agrees_on_the_demo_sensor(raws, tmp_path) -> None:

@@ -31,6 +31,7 @@ def test_two_sensors_of_a_focal_plane(tmp_path, capsys) -> None:
     assert np.all(sensors["residual_2"] < 0.1)
     assert len(Table.read(out / "cells.ecsv")) == 128
     assert (out / "focal_plane.png").read_bytes().startswith(b"\x89PNG")
+    assert "focal_plane.ecsv" in (out / "report.html").read_text(encoding="utf-8")
     said = capsys.readouterr().out
     assert "e2v: 2 sensors" in said
     assert "2 templates" in said

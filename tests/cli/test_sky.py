@@ -29,6 +29,7 @@ def test_one_frame_is_written_with_its_errors(thickness, tmp_path, capsys) -> No
     assert np.all(frame.mask[:5, :5] != 0)
     assert 0.0 < frame.quadrature_error < 1e-4
     assert (tmp_path / "sky.png").read_bytes().startswith(b"\x89PNG")
+    assert "Coadds" in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "rms" in capsys.readouterr().out
 
 

@@ -6,28 +6,31 @@ from pathlib import Path
 
 import click
 import numpy as np
+from astropy import units
+from astropy.table import Table
 from numpy.typing import NDArray
 
 from ..algorithms.flat_prep_options import FlatPrepOptions
-from ..algorithms.flat_residual import relative_flats
+from ..algorithms.flat_residual import flat_residual, relative_flats
 from ..algorithms.thickness_fit import FIT_METHODS, fit_thickness
 from ..errors import InputError, UnknownNameError
 from ..instrument.camera import Camera
 from ..model import FringeModel, Setup
 from ..model.provenance import input_cards
 from ..products import FringeCube, SensorSection, ThicknessMap
-from ..report.figures import flats_figure, phase_figure, thickness_figure
+from ..report.figures import flats_figure, phase_figure, residuals_figure, thickness_figure
 from ..report.page import Report
 from .inputs import effect_cards, prepare_folder, read_settings
 from .lab_frames import find_series, read_cube
 from .parameters import EFFECT, LABORATORY, effect_settings
 from .progress import progress
 
-__all__ = ["fit", "phase_folded", "section_of_cube"]
+__all__ = ["fit", "phase_folded", "residual_of_fit", "residual_table", "section_of_cube"]
 
 LEAST_WAVELENGTHS = 4
 """Below this the order of the fringe cannot be told."""
 
+PERCENT = 100.0
 PHASE_BINS = 32
 
 SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
@@ -168,7 +171,39 @@ def write_report(
     report.figure(
         phase_figure(phase, data, modelled, wavelength), "Mean of all pixels of equal fringe phase."
     )
+    left = residual_of_fit(cube, model, fitted)
+    report.section("Residuals", "Flats minus the model at the fitted thickness, where the fit is good.")
+    report.figure(residuals_figure(left, wavelength), "All wavelengths on one scale.")
+    report.table(residual_table(left, cube), "flat_residuals")
     return report.write(folder / "report.html")
+
+
+def residual_of_fit(cube: FringeCube, model: FringeModel, fitted: ThicknessMap) -> NDArray[np.float32]:
+    """Flats minus model, shape ``(W, ny, nx)``; NaN where flat or thickness are masked."""
+    if not (fitted.mask == 0).any():
+        return np.full(cube.shape, np.nan, np.float32)
+    return flat_residual(cube, model, np.where(fitted.mask == 0, fitted.value, np.nan))
+
+
+def residual_table(residual: NDArray[np.float32], cube: FringeCube) -> Table:
+    """Rms of data minus model at each wavelength, beside the noise that the variances foretell."""
+    rows = []
+    for plane, left in enumerate(residual):
+        good = np.isfinite(left)
+        level = float(cube.image[plane][good].mean(dtype=float)) if good.any() else np.nan
+        noise = float(np.sqrt(cube.variance[plane][good].mean(dtype=float))) / level if good.any() else np.nan
+        rms = float(np.sqrt(np.mean(np.square(left[good], dtype=float)))) if good.any() else np.nan
+        rows.append((float(cube.wavelength_nm[plane]), PERCENT * rms, PERCENT * noise, rms / noise))
+    table = Table(rows=rows, names=("wavelength", "rms of flat − model", "noise", "ratio"))
+    for name, unit in (
+        ("wavelength", units.nm),
+        ("rms of flat − model", units.percent),
+        ("noise", units.percent),
+    ):
+        table[name].unit = unit
+    for name in table.colnames[1:]:
+        table[name].info.format = ".4f"
+    return table
 
 
 def phase_folded(

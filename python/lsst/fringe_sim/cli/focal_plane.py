@@ -30,6 +30,7 @@ from ..instrument.night import NightHistory, StochasticNight, join_nights
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel
 from ..report.figures import focal_plane_figure
+from ..report.page import Report
 from ..report.style import save_figure
 from .inputs import prepare_folder, read_settings, read_thickness, sky_settings
 from .progress import progress
@@ -80,7 +81,9 @@ class _SensorMapType(click.ParamType):
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of stand-ins and nights.")
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and figure.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for tables, figure and report."
+)
 @click.option("--dry-run", is_flag=True, help="Check everything, state the cost, write nothing.")
 def focal_plane(
     sensors: tuple[str, ...],
@@ -137,10 +140,35 @@ def focal_plane(
     cells, summary = _gather(tables)
     cells.write(folder / "cells.ecsv", format="ascii.ecsv", overwrite=True)
     summary.write(folder / "focal_plane.ecsv", format="ascii.ecsv", overwrite=True)
-    save_figure(focal_plane_figure(cells, summary), folder / "focal_plane.png")
-    for line in _describe(summary):
+    drawn = focal_plane_figure(cells, summary)
+    save_figure(drawn, folder / "focal_plane.png")
+    lines = list(_describe(summary))
+    page = Report(
+        "Fringes over the focal plane",
+        f"{len(summary)} sensors of the LSST Camera in the y band at airmass {airmass:g}; templates from the "
+        f"published night, {nights} random nights corrected. Of {len(measured)} sensors the thickness was given; the "
+        "others have a random field like the measured ones.",
+    )
+    page.section("Focal plane")
+    for line in lines:
+        page.paragraph(line)
+    page.figure(drawn, "Strength, ratio to the shot noise, what a correction leaves, and field radius.")
+    page.section("Sensors")
+    page.table(_shown(summary), "focal_plane", download=summary)
+    page.write(folder / "report.html")
+    for line in lines:
         click.echo(line)
     click.echo(str(folder))
+    click.echo(str(folder / "report.html"))
+
+
+def _shown(summary: Table) -> Table:
+    """Columns of the summary that fit on a page."""
+    names = ("detector", "vendor", "field_radius", "rms", "over_noise")
+    table = summary[[*names, *(name for name in summary.colnames if name.startswith("residual_"))]].copy()
+    for name in table.colnames[2:]:
+        table[name].info.format = ".4f"
+    return table
 
 
 def _chosen(names: Iterable[str]) -> list[Detector]:

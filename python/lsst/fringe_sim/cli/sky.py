@@ -18,6 +18,7 @@ from ..model import FringeModel, Setup
 from ..model.provenance import input_cards
 from ..products import SensorSection, SkyFringe
 from ..report.figures import sky_figure
+from ..report.sky_page import write_sky_report
 from ..report.style import save_figure
 from .inputs import effect_cards, prepare_folder, read_section, read_settings, read_thickness, sky_settings
 from .parameters import EFFECT, SKY, Quantity, effect_settings
@@ -43,7 +44,9 @@ PERCENT = 100.0
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the noise.")
 @click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for frames and figure.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for frames, figure and report."
+)
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def sky(
     setup: Setup,
@@ -135,9 +138,11 @@ def sky(
             made.append(frame)
             advance()
     save_figure(sky_figure(made), folder / "sky.png")
+    page = write_sky_report(folder / "report.html", made, setup.name, seed)
     for frame in made:
         click.echo(_describe(frame))
     click.echo(str(folder))
+    click.echo(str(page))
 
 
 def _describe(frame: SkyFringe) -> str:

@@ -22,6 +22,9 @@ SMALLEST = 1e-300
 CHANCE_LIMIT = 1e-3
 """Chance below which a test says that there is a disagreement."""
 
+LARGEST_LINEAR = 30.0
+"""Axes that reach beyond this are logarithmic."""
+
 MOST_CANDIDATES = 15
 HALVES = ("C1", "C0")
 """Rows of amplifiers, the upper one first."""
@@ -143,8 +146,10 @@ def _draw_wavelengths(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
         color=LINES[0],
     )
     axes.axhline(1.0, color="black", ls="--", lw=1, label="noise alone")
-    axes.set_yscale("symlog", linthresh=1.0)
-    axes.set_ylim(bottom=0.0)
+    highest = max((row["chi2"] / row["degrees"] for row in rows), default=1.0)
+    if highest > LARGEST_LINEAR:
+        axes.set_yscale("symlog", linthresh=1.0)
+    axes.set_ylim(0.0, max(1.2, 1.25 * highest))
     axes.set_xlabel("wavelength [nm]")
     axes.set_ylabel("χ² of the fringe pattern / degrees [1]")
     axes.set_title("by wavelength")
@@ -201,7 +206,8 @@ def _draw_tests(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.axvline(-math.log10(CHANCE_LIMIT), color="black", ls="--", lw=1)
     axes.set_yticks(place, [row["name"] for row in rows])
     axes.invert_yaxis()
-    axes.set_xscale("symlog", linthresh=3.0)
+    if max(-math.log10(value) for value in [*chance, 1.0]) > LARGEST_LINEAR:
+        axes.set_xscale("symlog", linthresh=3.0)
     axes.set_xlim(left=0.0)
     axes.set_xlabel("−log₁₀ of the chance under noise (dashed: 10⁻³) [1]")
     axes.set_title("tests, each on its own")

@@ -15,16 +15,28 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from ..algorithms.focal_plane import DES_CRITERION
+from ..algorithms.image_correlation import CoaddCorrelation
 from ..algorithms.single_pixel import SinglePixelFit
 from ..errors import InputError
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
-from .style import DIVERGING, LINES, MOST_PIXELS, SEQUENTIAL, figure, finite_range, show_image
+from .style import (
+    DIVERGING,
+    LINES,
+    MOST_PIXELS,
+    SEQUENTIAL,
+    block_mean,
+    figure,
+    finite_range,
+    show_image,
+)
 
 __all__ = [
     "components_figure",
+    "correlation_figure",
     "flats_figure",
     "focal_plane_figure",
     "phase_figure",
+    "residuals_figure",
     "single_pixel_figure",
     "sky_figure",
     "template_figure",
@@ -32,6 +44,9 @@ __all__ = [
 ]
 
 PERCENT = 100.0
+
+RESIDUAL_CELLS = 100
+"""Residuals are averaged down to about this many cells a side."""
 
 
 def thickness_figure(thickness: ThicknessMap, order_um: float) -> Figure:
@@ -89,6 +104,7 @@ def flats_figure(
     unit: str = "fringe amplitude [%]",
     limits: tuple[float, float] | None = None,
     most_px: int = MOST_PIXELS,
+    step_px: float = 1.0,
 ) -> Figure:
     """Gallery of frames ``[wavelength, y, x]`` on one colour scale.
 
@@ -104,6 +120,8 @@ def flats_figure(
         Ends of the colour scale [%]; from the frames if not given.
     most_px : `int`, optional
         Frames are averaged down to about this many pixels a side.
+    step_px : `float`, optional
+        Pixels of the sensor between samples of the frames.
     """
     count = len(wavelength_nm)
     columns = min(6, count)
@@ -122,6 +140,7 @@ def flats_figure(
                 limits=limits,
                 colorbar=False,
                 most_px=most_px,
+                step_px=step_px,
             )
             panel.set_xlabel("")
             panel.set_ylabel("")
@@ -133,6 +152,29 @@ def flats_figure(
         made.colorbar(drawn, ax=list(panels), label=unit, shrink=0.8)
         made.suptitle(title)
         return made
+
+
+def residuals_figure(residual: NDArray[np.floating], wavelength_nm: Sequence[float]) -> Figure:
+    """Gallery of what a model leaves of the flats, averaged until noise does not hide it.
+
+    Parameters
+    ----------
+    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Flats minus model, as fractions; NaN where a pixel is not to be shown.
+    wavelength_nm : sequence of `float`
+        Wavelengths [nm].
+    """
+    block = max(1, min(residual.shape[1:]) // RESIDUAL_CELLS)
+    coarse = np.stack([block_mean(np.asarray(plane, dtype=float), block) for plane in residual])
+    size = f", means over {block} × {block} px" if block > 1 else ""
+    return flats_figure(
+        coarse,
+        np.zeros(coarse.shape, np.int32),
+        wavelength_nm,
+        title=f"flats minus model{size}",
+        unit="flat − model [%]",
+        step_px=block,
+    )
 
 
 def phase_figure(
@@ -166,7 +208,7 @@ def phase_figure(
         panels[0].legend(fontsize=7)
         for panel in panels[count:]:
             panel.set_visible(False)
-        made.supxlabel("thickness over one fringe order")
+        made.supxlabel("thickness over one fringe order [1]")
         made.supylabel("fringe amplitude [%]")
         return made
 
@@ -229,6 +271,31 @@ def components_figure(components: FringeComponents) -> Figure:
         for panel in panels[len(images) : -1]:
             panel.set_visible(False)
         return made
+
+
+def correlation_figure(found: CoaddCorrelation) -> Figure:
+    """Correlation of coadds of more and more exposures, that of as many of noise, and the law they follow."""
+    with figure(7.5, 4.2) as made:
+        axes = made.subplots()
+        sets = zip(found.counts, found.coadd, found.null, found.model, strict=True)
+        for (count, coadd, null, model), color in zip(sets, LINES, strict=False):
+            label = f"{count} exposure{'s' if count > 1 else ''}"
+            axes.loglog(coadd.separation_px, _positive(coadd.xi), "o-", ms=3, color=color, label=label)
+            axes.loglog(null.separation_px, np.abs(null.xi), ":", lw=1, color=color)
+            axes.loglog(coadd.separation_px, _positive(model), "--", lw=1, color=color)
+        axes.plot([], [], ":", color="0.4", label="noise alone, absolute")
+        axes.plot([], [], "--", color="0.4", label="ξ₁/N + (1 − 1/N) ξ_floor")
+        axes.set_xlabel("separation [px]")
+        axes.set_ylabel("ξ [sky²]")
+        axes.set_title("correlation of coadds")
+        axes.legend(fontsize=7)
+        return made
+
+
+def _positive(values: ArrayLike) -> NDArray[np.float64]:
+    """Values for a logarithmic axis; NaN where they are not positive."""
+    given = np.asarray(values, dtype=float)
+    return np.where(given > 0.0, given, np.nan)
 
 
 def template_figure(template: FringeFrame) -> Figure:

@@ -23,6 +23,7 @@ __all__ = [
     "LINES",
     "MOST_PIXELS",
     "SEQUENTIAL",
+    "block_mean",
     "figure",
     "finite_range",
     "save_figure",
@@ -128,7 +129,11 @@ def save_figure(made: Figure, path: str | os.PathLike[str]) -> Path:
 
 def _thin(values: NDArray[np.float64], most_px: int) -> NDArray[np.float64]:
     """Mean over square blocks, so that fringes do not alias when a large image is drawn small."""
-    block = max(1, min(values.shape) // most_px)
+    return block_mean(values, max(1, min(values.shape) // most_px))
+
+
+def block_mean(values: NDArray[np.float64], block: int) -> NDArray[np.float64]:
+    """Mean over square blocks of pixels that are numbers; rows and columns that fill no block are left out."""
     if block == 1:
         return values
     ny, nx = (size // block * block for size in values.shape)

@@ -1,0 +1,129 @@
+"""Page of simulated sky frames: frames, amplitudes, components of a night, what coadds keep."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from astropy import units
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from ..algorithms.image_correlation import CoaddCorrelation, coadd_correlation
+from ..algorithms.pca import fit_pca
+from ..products import SkyFringe
+from .figures import components_figure, correlation_figure, sky_figure
+from .page import Report
+
+__all__ = ["coadds_of_frames", "sky_amplitudes", "write_sky_report"]
+
+PERCENT = 100.0
+COADDS = (1, 10, 100)
+"""Exposures in the coadds of the page."""
+
+LARGEST_REGION_PX = 240
+"""Side of the region that is coadded [px]; that of the paper's figure is 200."""
+
+SMALLEST_REGION_PX = 16
+
+
+def sky_amplitudes(frames: Sequence[SkyFringe]) -> Table:
+    """Level and fringe amplitudes of sky frames, one row per frame."""
+    rows = []
+    for frame in frames:
+        values = PERCENT * frame.fraction()[frame.mask == 0].astype(float)
+        low, high = np.percentile(values, [1.0, 99.0])
+        rows.append(
+            (frame.hour % 24.0, frame.mean_electrons, values.std(), 0.5 * np.ptp(values), 0.5 * (high - low))
+        )
+    hour, level, rms, half, trimmed = (np.array(column) for column in zip(*rows, strict=True))
+    table = Table()
+    table["local time"] = np.round(hour, 3) * units.hour
+    table["sky"] = np.round(level, 1) * units.electron
+    table["rms"] = np.round(rms, 4) * units.percent
+    table["half peak to peak"] = np.round(half, 4) * units.percent
+    table["half range 1-99"] = np.round(trimmed, 4) * units.percent
+    return table
+
+
+def coadds_of_frames(frames: Sequence[SkyFringe], rng: np.random.Generator) -> CoaddCorrelation | None:
+    """Correlation left in coadds of randomly placed and rotated pieces of the frames.
+
+    Parameters
+    ----------
+    frames : `~collections.abc.Sequence` [`SkyFringe`]
+        Frames without noise, of one sensor.
+    rng : `numpy.random.Generator`
+        Places, angles, and the photon noise of each exposure.
+
+    Returns
+    -------
+    result : `CoaddCorrelation` or `None`
+        `None` for frames too small to be rotated.
+    """
+    # A region that is rotated by any angle needs its diagonal, and the spline a few pixels more.
+    region = min(LARGEST_REGION_PX, int((min(frames[0].shape) - 8) / np.sqrt(2.0)) - 1)
+    if region < SMALLEST_REGION_PX:
+        return None
+    patterns = [_filled(frame) for frame in frames]
+    noise = 1.0 / np.sqrt(np.mean([frame.mean_electrons for frame in frames]))
+    return coadd_correlation(patterns, COADDS, float(noise), rng, region_px=region)
+
+
+def write_sky_report(path: Path, frames: Sequence[SkyFringe], setup: str, seed: int) -> Path:
+    """Write the page.
+
+    Parameters
+    ----------
+    path : `pathlib.Path`
+        The page.
+    frames : `~collections.abc.Sequence` [`SkyFringe`]
+        Frames of one sensor.
+    setup : `str`
+        Name of the set-up.
+    seed : `int`
+        Of places, angles and noise of the coadds.
+    """
+    first = frames[0]
+    report = Report(
+        f"Night sky on {first.detector or 'one sensor'}",
+        f"Set-up {setup}, filter {first.physical_filter or 'not named'}, "
+        f"{len(frames)} exposure{'s' if len(frames) > 1 else ''} of {first.exposure_s:g} s at airmass "
+        f"{first.airmass:g}, {'with' if first.seed is not None else 'without'} noise.",
+    )
+    report.section(
+        "Fringes", "Departure from the mean sky. Three numbers are called amplitude; all are given."
+    )
+    report.figure(sky_figure(frames), "A frame, the distribution over its pixels, and the strength by time.")
+    report.table(sky_amplitudes(frames), "sky_fringe_amplitudes")
+    if len(frames) > 1:
+        report.section("Components", "Principal components of the frames: the templates of a correction.")
+        report.figure(components_figure(fit_pca(frames)), "Mean, first components, explained variance.")
+    found = None if first.seed is not None else coadds_of_frames(frames, np.random.default_rng(seed))
+    if found is not None:
+        report.section(
+            "Coadds",
+            "What stays of uncorrected fringes in coadds of randomly placed and rotated pieces of these frames with "
+            "photon noise, beside the noise of as many exposures.",
+        )
+        report.figure(correlation_figure(found), "Correlation against separation; a line ends below zero.")
+        report.table(_correlation_table(found), "coadd_correlation")
+    return report.write(path)
+
+
+def _filled(frame: SkyFringe) -> NDArray[np.float64]:
+    """Pattern with the mean sky where it is not known."""
+    values = frame.fraction().astype(float)
+    return np.where((frame.mask == 0) & np.isfinite(values), values, 0.0)
+
+
+def _correlation_table(found: CoaddCorrelation) -> Table:
+    table = Table({"separation": found.single.separation_px * units.pixel})
+    for count, coadd, null in zip(found.counts, found.coadd, found.null, strict=True):
+        table[f"fringes, {count}"] = coadd.xi
+        table[f"noise, {count}"] = null.xi
+    table["separation"].info.format = ".2f"
+    for name in table.colnames[1:]:
+        table[name].info.format = ".2e"
+    return table

@@ -1,0 +1,73 @@
+"""The page of simulated sky frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from browser import check_page
+
+from lsst.fringe_sim.algorithms.sky_frame import fringe_amplitudes
+from lsst.fringe_sim.products import SkyFringe
+from lsst.fringe_sim.report.figures import residuals_figure
+from lsst.fringe_sim.report.sky_page import coadds_of_frames, sky_amplitudes, write_sky_report
+from lsst.fringe_sim.report.style import block_mean
+
+
+def night(shape: tuple[int, int] = (150, 160), hours: int = 3) -> list[SkyFringe]:
+    """Frames whose fringes are two patterns in changing proportion."""
+    y, x = np.indices(shape, dtype=float)
+    patterns = np.sin(2 * np.pi * (x + 0.3 * y) / 22.0), np.cos(2 * np.pi * (y - 0.2 * x) / 31.0)
+    mask = np.zeros(shape, np.int32)
+    mask[:4] = 1
+    made = []
+    for hour in range(hours):
+        image = 2700.0 * (1.0 + 2e-3 * patterns[0] + 1e-3 * (1 + hour) * patterns[1])
+        image[0, 0] = np.nan
+        mean = float(image[4:].mean())
+        made.append(
+            SkyFringe(image.astype(np.float32), mask, "electron", mean, 30.0, 1.2, 20.0 + hour, None, 1e-8)
+        )
+    return made
+
+
+def test_amplitudes_are_those_of_the_frames() -> None:
+    frames = night()
+    table = sky_amplitudes(frames)
+    assert list(table["local time"]) == [20.0, 21.0, 22.0]
+    for row, frame in zip(table, frames, strict=True):
+        expected = fringe_amplitudes(np.asarray(frame.image[4:], dtype=float))
+        assert row["rms"] == pytest.approx(100 * expected.rms, abs=1e-4)
+        assert row["half peak to peak"] == pytest.approx(100 * expected.half_peak_to_peak, abs=1e-4)
+
+
+def test_coadds_keep_less_than_one_exposure() -> None:
+    found = coadds_of_frames(night(), np.random.default_rng(3))
+    assert found is not None
+    assert found.counts == (1, 10, 100)
+    first, _, last = (curve.xi[0] for curve in found.coadd)
+    assert 0.0 < last < 0.2 * first
+    assert coadds_of_frames(night((20, 20)), np.random.default_rng(3)) is None
+
+
+def test_page_of_a_night_in_a_browser(tmp_path) -> None:
+    """With components and coadds; a single frame with noise has neither."""
+    path = write_sky_report(tmp_path / "night.html", night(), "lsst_e2v", 1)
+    text = path.read_text(encoding="utf-8")
+    for words in ("Components", "Coadds", "coadd_correlation.ecsv", "sky_fringe_amplitudes.ecsv"):
+        assert words in text
+    alone = write_sky_report(tmp_path / "one.html", night(hours=1), "lsst_e2v", 1).read_text(encoding="utf-8")
+    assert "Components" not in alone
+    assert "Coadds" in alone
+    check_page(path, tmp_path, 390, "sky_390")
+
+
+def test_residuals_are_averaged_without_the_masked(tmp_path) -> None:
+    plane = np.full((4, 6), 2.0)
+    plane[0, 0], plane[2:, 4:] = np.nan, np.nan
+    assert np.array_equal(block_mean(plane, 2), [[2, 2, 2], [2, 2, np.nan]], equal_nan=True)
+    left = np.random.default_rng(0).normal(0, 0.01, (3, 220, 240)).astype(np.float32)
+    left[:, :, 100:120] = np.nan
+    made = residuals_figure(left, [880.0, 930.0, 980.0])
+    panels = [axes for axes in made.axes if axes.images]
+    assert [axes.get_title() for axes in panels] == ["880 nm", "930 nm", "980 nm"]
+    assert panels[0].images[0].get_extent() == [-0.5, 239.5, -0.5, 219.5]
