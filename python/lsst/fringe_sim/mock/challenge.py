@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import permutations
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -44,6 +45,9 @@ Draw = Callable[[np.random.Generator], dict[str, float]]
 CASE_KINDS = ("none", "one", "two", "outsider")
 STATED_FWHM_NM, STATED_KELVIN = 2.0, 183.15
 READ_NOISE_E = 6.0
+
+VISIBLE = 10.0
+"""Signal to noise from which an effect is asked for by name."""
 
 
 def _signed(rng: np.random.Generator, low: float, high: float) -> float:
@@ -190,11 +194,14 @@ class CaseResult:
     truth, found : `tuple` [`str`, ...]
         Effects that were in, and those that were named.
     right_class : `bool`
-        Every effect that is in was named or is in the class of a named one, and nothing else was named.
+        Every effect that is in was named or is in the class of a named one, and nothing else was named. A second
+        effect below `VISIBLE` need not be named.
     exact : `bool`
         The named effects are those that are in.
     signal_to_noise : `float`
         Square root of what the oracle takes off χ².
+    weakest : `float`
+        Signal to noise of the weakest of several effects beside the others, as the oracle finds it.
     probability : `float`
         Smallest probability that was stated; 0 if nothing was named.
     pulls : `dict`
@@ -213,6 +220,7 @@ class CaseResult:
     right_class: bool
     exact: bool
     signal_to_noise: float
+    weakest: float
     probability: float
     pulls: dict[str, float]
     shrinkage: float
@@ -245,13 +253,13 @@ class ChallengeResult:
         """One row per case."""
         rows = [
             (c.seed, c.kind, "+".join(c.truth), c.verdict, "+".join(c.found),
-             " ".join("|".join(a) for a in c.ambiguous), c.right_class, c.exact, c.signal_to_noise, c.probability,
-             c.shrinkage, c.seconds)
+             " ".join("|".join(a) for a in c.ambiguous), c.right_class, c.exact, c.signal_to_noise, c.weakest,
+             c.probability, c.shrinkage, c.seconds)
             for c in self.cases
         ]  # fmt: skip
         names = ("seed", "kind", "truth", "verdict", "found", "ambiguous_with", "right_class", "exact",
-                 "signal_to_noise", "probability", "shrinkage", "seconds")  # fmt: skip
-        kinds = (int, str, str, str, str, str, bool, bool, float, float, float, float)
+                 "signal_to_noise", "weakest", "probability", "shrinkage", "seconds")  # fmt: skip
+        kinds = (int, str, str, str, str, str, bool, bool, float, float, float, float, float)
         return Table(rows=rows or None, names=names, dtype=kinds)
 
     def pulls(self) -> FloatArray:
@@ -262,7 +270,9 @@ class ChallengeResult:
         """The numbers of the protocol."""
         null, one = self.of_kind("none"), self.of_kind("one")
         two, outside = self.of_kind("two"), self.of_kind("outsider")
-        strong = [case for case in one if case.signal_to_noise >= 10.0]
+        strong = [case for case in one if case.signal_to_noise >= VISIBLE]
+        both = [case for case in two if case.weakest >= VISIBLE]
+        faint = [case for case in two if not case.weakest >= VISIBLE]
         pulls = self.pulls()
         shrink = [case.shrinkage for case in strong if case.right_class and math.isfinite(case.shrinkage)]
         named = [case for case in self.cases if case.verdict == "named"]
@@ -271,7 +281,8 @@ class ChallengeResult:
             "no_discrepancy": [sum(case.verdict == "no_discrepancy" for case in null), len(null)],
             "one_right_class": [sum(case.right_class for case in strong), len(strong)],
             "one_exact": [sum(case.exact for case in strong), len(strong)],
-            "two_right_class": [sum(case.right_class for case in two), len(two)],
+            "two_right_class": [sum(case.right_class for case in both), len(both)],
+            "one_of_two_faint_right": [sum(case.right_class for case in faint), len(faint)],
             "outsiders_named": [sum(case.verdict == "named" for case in outside), len(outside)],
             "pull_mean": float(pulls.mean()) if pulls.size else math.nan,
             "pull_median": float(np.median(pulls)) if pulls.size else math.nan,
@@ -504,14 +515,17 @@ def judge(
     """Compare a verdict with the truth."""
     found = tuple(effect.name for effect in verdict.effects)
     classes = [{effect.name, *effect.ambiguous_with} for effect in verdict.effects]
+    own_significance = {effect.name: effect.significance for effect in oracle.effects} if oracle else {}
+    if oracle and not own_significance:
+        own_significance = {
+            item["name"]: item["significance"] for item in oracle.unexplained.get("partial", ())
+        }
+    seen = [name for name in case.names if own_significance.get(name, 0.0) >= VISIBLE]
+    wanted = {case.names} if len(case.names) < 2 else {case.names, tuple(seen)}
     right = (
         case.kind in ("one", "two")
         and verdict.verdict == "named"
-        and len(classes) == len(case.names)
-        and any(
-            all(name in group for name, group in zip(order, classes, strict=True))
-            for order in _orders(case.names)
-        )
+        and any(_matches(order, classes) for names in wanted for order in permutations(names))
     )
     exact = right and sorted(found) == sorted(case.names)
     pulls = {}
@@ -538,6 +552,7 @@ def judge(
         right,
         exact,
         strength,
+        min((own_significance.get(name, 0.0) for name in case.names), default=math.nan),
         min((effect.probability for effect in verdict.effects), default=0.0),
         pulls,
         shrinkage,
@@ -545,5 +560,6 @@ def judge(
     )
 
 
-def _orders(names: tuple[str, ...]) -> list[tuple[str, ...]]:
-    return [names] if len(names) < 2 else [names, names[::-1]]
+def _matches(names: tuple[str, ...], classes: Sequence[set[str]]) -> bool:
+    """Whether there is one class for each name, in this order, and no other."""
+    return len(names) == len(classes) and all(n in group for n, group in zip(names, classes, strict=True))

@@ -74,6 +74,32 @@ class CellData:
         """Same data with weight 0 where ``keep`` (broadcast to the values) is false."""
         return replace(self, weight=np.where(keep, self.weight, 0.0))
 
+    def with_noise_of(self, expected: FloatArray) -> CellData:
+        """Same data with the variance that goes with what is expected of a cell, not with what it happened to get.
+
+        A variance taken from the counts themselves gives cells that got too few the larger weight, and draws every
+        fit towards them. How far the variance follows the counts is measured, wavelength by wavelength; whatever
+        else it depends on stays.
+
+        Parameters
+        ----------
+        expected : `numpy.ndarray`, shape ``(W, ny, nx)``
+            Values of the cells by a fit.
+        """
+        used = self.weight > 0.0
+        variance = np.divide(1.0, self.weight, out=np.zeros(self.shape), where=used)
+        miss = np.where(used, self.value - expected, 0.0)
+        for plane in range(self.shape[0]):
+            inside = used[plane]
+            own = miss[plane][inside] - miss[plane][inside].mean()
+            square = float((own**2).sum())
+            if square == 0.0:
+                continue
+            rate = float((own * variance[plane][inside]).sum()) / square
+            level = variance[plane][inside]
+            variance[plane][inside] = np.clip(level - rate * miss[plane][inside], 0.5 * level, 2.0 * level)
+        return replace(self, weight=np.divide(1.0, variance, out=np.zeros(self.shape), where=used))
+
     def scaled_noise(self, factor: FloatArray | float, response_scatter: float) -> CellData:
         """Same data with the noise (standard deviation) of each wavelength times a factor."""
         square = np.broadcast_to(np.asarray(factor, dtype=float) ** 2, self.shape[:1])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -409,6 +410,8 @@ class Fit:
         Whitened sum of squares.
     information : `numpy.ndarray`
         Curvature in the free coordinates, nuisances profiled out, without prior.
+    spread : `numpy.ndarray`
+        Rms distance of other minima that the data allow, by coordinate.
     """
 
     settings: dict[str, float]
@@ -420,14 +423,20 @@ class Fit:
     information: FloatArray
     iterations: int = 0
     converged: bool = True
+    spread: FloatArray = dataclass_field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if self.spread.size != len(self.coordinates):
+            object.__setattr__(self, "spread", np.zeros(len(self.coordinates)))
 
     @property
     def sigma(self) -> FloatArray:
-        """Uncertainty of the coordinates, weak prior included."""
+        """Uncertainty of the coordinates, weak prior and neighbouring minima included."""
         if not self.coordinates:
             return np.zeros(0)
         total = self.information + np.diag(_ridge(self.coordinates))
-        return np.sqrt(np.maximum(np.diag(np.linalg.pinv(total, hermitian=True)), 0.0))
+        variance = np.maximum(np.diag(np.linalg.pinv(total, hermitian=True)), 0.0)
+        return np.asarray(np.sqrt(variance + self.spread**2))
 
 
 def _ridge(coordinates: Sequence[Coordinate]) -> FloatArray:
@@ -441,9 +450,9 @@ class _Point:
     position: FloatArray
     levels: FloatArray
     coefficients: FloatArray
-    prediction: Prediction = field(init=False)
-    residual: FloatArray = field(init=False)
-    chi2: float = field(init=False)
+    prediction: Prediction = dataclass_field(init=False)
+    residual: FloatArray = dataclass_field(init=False)
+    chi2: float = dataclass_field(init=False)
 
 
 def fit_model(

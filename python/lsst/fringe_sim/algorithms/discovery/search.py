@@ -24,7 +24,7 @@ from .forward import Forward
 from .next_step import with_next_measurements
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
 from .selection import Candidate, Hypothesis, Selector, similarity
-from .start import starting_thickness
+from .start import mended_thickness, starting_thickness
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
 
 __all__ = ["SearchOptions", "discover"]
@@ -41,6 +41,10 @@ ORDERS_TRIED = 6
 """Fringe orders on both sides of the first one in which a few pixels are fitted."""
 
 STEPS_PER_ORDER = 12
+
+MANY_PARAMETERS = 8
+CONTAINED = 0.9
+"""Parameters from which on an effect may hide another, and the cosine from which on one may be hidden in it."""
 
 Report = Callable[[str], None]
 
@@ -262,8 +266,10 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
 
 def _settle(problem: Problem, fit: Fit, stated: CellData, index: FloatArray) -> _Prepared:
     """Measure the noise at a fit with free contrast, and fit the unchanged model with it."""
-    noise = _measure_noise(replace(problem, cells=stated), fit)
-    cells = stated.scaled_noise(noise.factor, noise.response_scatter)
+    value = problem.forward.predict(fit.settings, problem.basis.expand(fit.field)).value
+    even = stated.with_noise_of(problem.expected(fit.levels, value))
+    noise = _measure_noise(replace(problem, cells=even), fit)
+    cells = even.scaled_noise(noise.factor, noise.response_scatter)
     problem = replace(problem, cells=cells, free_contrast=False)
     levels = fit.levels[: problem.n_levels]
     settled = fit_model(problem, (), np.zeros(0), fit.field, levels)
@@ -452,13 +458,27 @@ class _Search:
         prepared = self.prepared
         if not prepared.rich or prepared.problem.field_prior:
             return None
-        start = self._whole_field(whole, best.fit)
+        found = self._whole_field(whole, best.fit)
+        optical = {
+            k: v
+            for k, v in best.fit.settings.items()
+            if not whole.problem.forward.is_image_effect(k.split(".")[0])
+        }
+        start = mended_thickness(
+            self.model.with_effects({**self.model.effect_settings, **optical}, self.effects),
+            self.cells,
+            found,
+        )
+        mended = int(np.count_nonzero(start != found))
+        if mended:
+            self.say(f"{mended} cells change their fringe order")
         problem, fit = _choose_field(whole.problem, start, best.fit.settings)
         refined = _settle(problem, fit, prepared.stated, prepared.index)
         change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
         scatter = abs(refined.noise.response_scatter - prepared.noise.response_scatter)
         typical = _noise_rms(self.cells)
-        if problem.basis.size <= prepared.problem.basis.size and change < 0.02 and scatter < 0.05 * typical:
+        same = problem.basis.size <= prepared.problem.basis.size and not mended
+        if same and change < 0.02 and scatter < 0.05 * typical:
             return None
         return refined
 
@@ -497,7 +517,36 @@ class _Search:
                 best = self._swapped(selector, best)
             steps.append(self._step(selector, current, best))
             current = best
-        return self._pruned(selector, current), steps
+        complete = selector.with_channels(self._completed(selector, current))
+        if complete.names != current.names:
+            steps.append(self._step(selector, current, complete))
+        return self._pruned(selector, complete), steps
+
+    def _completed(self, selector: Selector, current: Hypothesis) -> Hypothesis:
+        """The set with an effect beside one of many parameters that can play its part, where that is likelier.
+
+        Sixteen offsets of the amplifiers take in a pedestal, and the residual is noise without it; that all of them
+        lie far on one side of zero is likelier with both.
+        """
+        best = current
+        for name in current.names:
+            if len(selector.coordinates[name]) < MANY_PARAMETERS:
+                continue
+            rest = selector.hypothesis(tuple(n for n in current.names if n != name), None, current.fit)
+            state = selector.state(rest.fit)
+            own = selector.features(state, rest.fit, name)
+            for candidate in selector.score(
+                rest.fit, [n for n in selector.coordinates if n not in current.names]
+            ):
+                if candidate.promise < 9.0:
+                    continue
+                features = selector.features(state, rest.fit, candidate.name)
+                if len(features) < len(own) and similarity(state.design, own, features) > CONTAINED:
+                    start = candidate.start if len(candidate.start) else None
+                    larger = selector.hypothesis((*current.names, candidate.name), start, current.fit)
+                    self._say_refit(current, larger)
+                    best = max(best, larger, key=lambda item: item.log_evidence)
+        return best if best.log_evidence > current.log_evidence + self.options.least_evidence else current
 
     def _enlarged(self, selector: Selector, current: Hypothesis) -> list[Hypothesis]:
         """Refits of the most promising sets with one effect more.
@@ -599,7 +648,7 @@ class _Search:
             return self._unexplained(
                 whole, whole.null, chance, steps, "no effect of the catalogue explains it"
             )
-        final = whole.with_channels(self._transfer(whole, chosen))
+        final = whole.with_channels(whole.settled(self._transfer(whole, chosen)))
         classes = self._classes(training, chosen)
         gains = self._validate(whole, final)
         reasons = []
@@ -616,7 +665,7 @@ class _Search:
             probability = classes[name].probability * (1.0 - outsider)
             if probability < self.options.least_probability:
                 reasons.append(f"the class of {name} has probability {probability:.2f} only")
-            named.append(self._named(final, name, classes[name].members, probability))
+            named.append(self._named(final, name, classes[name], probability))
         self.notes.append(f"held out: chi2 of blocks falls by {gains['blocks']:.1f}, of wavelengths by "
                           f"{gains['wavelengths']:.1f}")  # fmt: skip
         if reasons:
@@ -754,9 +803,7 @@ class _Search:
         self.heldout_rms = (float(before), float(after))
         return float(total[0] - total[1])
 
-    def _named(
-        self, final: Hypothesis, name: str, members: dict[str, float], probability: float
-    ) -> NamedEffect:
+    def _named(self, final: Hypothesis, name: str, group: _Class, probability: float) -> NamedEffect:
         parameters = {}
         for item, position, sigma in zip(
             final.fit.coordinates, final.fit.position, final.fit.sigma, strict=True
@@ -764,9 +811,16 @@ class _Search:
             if item.effect == name:
                 value, error = item.value(position), item.value_sigma(position, sigma)
                 parameters[item.parameter] = ParameterValue(value, float(error), item.unit)
+                if item.neighbour and error > 0.1 * item.neighbour:
+                    self.notes.append(
+                        f"{item.key}: minima {item.neighbour:g} {item.unit} apart are nearly as good"
+                    )
+        members = group.members
         others = tuple(sorted((n for n in members if n != name), key=lambda n: -members[n]))
         share = members.get(name, 0.0) / max(sum(members.values()), 1e-300)
-        return NamedEffect(name, parameters, float(probability), others, "", float(share))
+        return NamedEffect(
+            name, parameters, float(probability), others, "", float(share), float(group.significance)
+        )
 
     def _unexplained(
         self,
@@ -783,7 +837,7 @@ class _Search:
             "reason": reason,
             "too_poor": False,
             "partial": [
-                {"name": e.name, "probability": e.probability,
+                {"name": e.name, "probability": e.probability, "significance": e.significance,
                  "parameters": {k: [p.value, p.sigma] for k, p in e.parameters.items()}}
                 for e in partial
             ],

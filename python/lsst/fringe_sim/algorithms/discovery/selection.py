@@ -46,6 +46,9 @@ ORDERS_REFITTED = 4
 
 STEPS_PER_MINIMUM = 5
 MINIMA_REFITTED = 4
+MINIMA_WALKED = 8
+HOPELESS = 25.0
+"""Minima that are followed on each side of the last fit, and the rise of χ² at which they are given up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -459,6 +462,47 @@ class Selector:
             start[number] = places[index]
             trials.append(fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels))
         return min((fit, *trials), key=lambda trial: trial.chi2)
+
+    def settled(self, hypothesis: Hypothesis) -> Hypothesis:
+        """The hypothesis in the deepest of its neighbouring minima; how far the others reach is in its uncertainty.
+
+        Where fringes repeat, a parameter may be known to a hundredth of the distance of two minima, and yet not
+        which of them is the right one.
+        """
+        fit = hypothesis.fit
+        for number, item in enumerate(fit.coordinates):
+            if item.neighbour:
+                fit = self._among_minima(fit, number)
+        if fit is hypothesis.fit:
+            return hypothesis
+        best = replace(hypothesis, fit=fit, log_evidence=self._evidence(fit))
+        self.fitted[frozenset(hypothesis.names)] = best
+        return best
+
+    def _among_minima(self, fit: Fit, number: int) -> Fit:
+        """The deepest minimum along one coordinate with the mean square distance of the others that data allow."""
+        found = [fit]
+        for side in (-1.0, 1.0):
+            last = fit
+            for _ in range(MINIMA_WALKED):
+                start = last.position.copy()
+                start[number] = last.coordinates[number].clip(
+                    start[number] + side * last.coordinates[number].neighbour
+                )
+                trial = fit_model(self.problem, fit.coordinates, start, last.field, last.levels)
+                least = 0.5 * fit.coordinates[number].neighbour
+                if side * (trial.position[number] - last.position[number]) < least:
+                    break
+                found.append(trial)
+                last = trial
+                if trial.chi2 > min(item.chi2 for item in found) + HOPELESS:
+                    break
+        best = min(found, key=lambda item: item.chi2)
+        weight = np.exp(-0.5 * np.array([item.chi2 - best.chi2 for item in found]))
+        away = np.array([item.position[number] - best.position[number] for item in found])
+        spread = best.spread.copy()
+        spread[number] = math.sqrt(float((weight * away**2).sum() / weight.sum()))
+        return replace(best, spread=spread)
 
     def _fit_from(
         self, names: tuple[str, ...], coordinates: tuple[Coordinate, ...], first: FloatArray, base: Fit

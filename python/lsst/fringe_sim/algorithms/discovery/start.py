@@ -6,11 +6,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ...model import FringeModel
 from .cells import CellData
 
-__all__ = ["starting_thickness"]
+__all__ = ["mended_thickness", "starting_thickness"]
 
 FloatArray = NDArray[np.float64]
 
@@ -20,6 +22,11 @@ HALF_WINDOW_UM = 0.12
 
 FEWEST_ROWS = 12
 """Rows and columns of cells from which on they are looked at together."""
+
+PATCH_ROUNDS = 6
+LARGEST_PATCH = 0.1
+PATCH_LOSS = 0.9
+"""How often patches are taken back, the largest part of the cells that is one, and the clarity it may lose."""
 
 
 def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
@@ -42,16 +49,47 @@ def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     -------
     thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
     """
-    low, high = model.setup.thickness_range_um
-    count = round((high - low) / SEARCH_STEP_UM) + 1
-    response = model.response_on_grid(cells.wavelength_nm, low, SEARCH_STEP_UM, count)
-    template = response / _running_mean(response, model, cells) - 1.0
+    low, template = _template(model, cells)
     order = _order_steps(model, cells)
     templates = [template]
     if min(cells.shape[1:]) >= FEWEST_ROWS:
         templates.append(template * _contrast(template, cells))
     best, _ = max((_follow(each, cells, order) for each in templates), key=lambda item: item[1])
     return low + SEARCH_STEP_UM * best.reshape(cells.shape[1:]).astype(float)
+
+
+def mended_thickness(model: FringeModel, cells: CellData, thickness_um: FloatArray) -> FloatArray:
+    """Thickness with patches in a wrong fringe order taken back, as a better model than the first one shows them.
+
+    Parameters
+    ----------
+    model : `FringeModel`
+        The model with the effects that are known by now.
+    cells : `CellData`
+        The data.
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness so far; returned where no order changes.
+
+    Returns
+    -------
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+    """
+    low, template = _template(model, cells)
+    order, count = _order_steps(model, cells), template.shape[1]
+    score = _correlate(template, cells)
+    first = np.clip(np.rint((thickness_um.ravel() - low) / SEARCH_STEP_UM).astype(np.int64), 0, count - 1)
+    best = _mend_patches(score, _mend_orders(score, first, cells.shape[1:], order), cells.shape[1:], order)
+    turned = np.abs(best - first) > 0.4 * order
+    mended = np.where(turned, low + SEARCH_STEP_UM * best, thickness_um.ravel())
+    return mended.reshape(thickness_um.shape)
+
+
+def _template(model: FringeModel, cells: CellData) -> tuple[float, FloatArray]:
+    """First thickness [µm] and fringes on the grid of the search, ``(W, D)``."""
+    low, high = model.setup.thickness_range_um
+    count = round((high - low) / SEARCH_STEP_UM) + 1
+    response = model.response_on_grid(cells.wavelength_nm, low, SEARCH_STEP_UM, count)
+    return low, response / _running_mean(response, model, cells) - 1.0
 
 
 def _follow(template: FloatArray, cells: CellData, order: float) -> tuple[NDArray[np.int64], float]:
@@ -61,6 +99,7 @@ def _follow(template: FloatArray, cells: CellData, order: float) -> tuple[NDArra
     best = _grow(score, cells.shape[1], cells.shape[2], int(HALF_WINDOW_UM / SEARCH_STEP_UM))
     best = best + _common_shift(score, best, order, count)
     best = _mend_orders(score, best, cells.shape[1:], order)
+    best = _mend_patches(score, best, cells.shape[1:], order)
     reached = score[np.arange(len(best)), np.clip(best, 0, count - 1)]
     return best, float((reached.astype(float) ** 2).mean())
 
@@ -153,6 +192,58 @@ def _mend_orders(
         if cliffs[1] < cliffs[0] or (gain[1] > 1.003 * gain[0] and cliffs[1] < 3 * cliffs[0] + 10):
             current = mended
     return current
+
+
+def _mend_patches(
+    score: NDArray[np.float32], best: NDArray[np.int64], shape: tuple[int, int], order: float
+) -> NDArray[np.int64]:
+    """Take back small patches, single cells among them, that stand whole orders off what surrounds them.
+
+    A patch is what hangs together without a cliff. It is moved by the orders that its border shows, if it then fits
+    the data nearly as well as before.
+    """
+    if min(shape) < FEWEST_ROWS:
+        return best
+    cells, count = np.arange(len(best)), score.shape[1]
+    places = cells.reshape(shape)
+    pairs = np.concatenate([
+        np.stack([places[:, :-1].ravel(), places[:, 1:].ravel()], axis=1),
+        np.stack([places[:-1].ravel(), places[1:].ravel()], axis=1),
+    ])  # fmt: skip
+    current = best
+    for _ in range(PATCH_ROUNDS):
+        flat = np.abs(current[pairs[:, 0]] - current[pairs[:, 1]]) < 0.5 * order
+        links = coo_array((np.ones(int(flat.sum())), pairs[flat].T), shape=(len(best), len(best)))
+        number, patch = connected_components(links, directed=False)
+        if number == 1:
+            break
+        size = np.bincount(patch)
+        turns = _turns_of_patches(current, patch, pairs[~flat], size, order)
+        moved = np.clip(current - np.rint(turns[patch] * order).astype(np.int64), 0, count - 1)
+        moved = np.where(turns[patch] != 0, _nearby_peak(score, moved, round(0.3 * order)), current)
+        power = [np.bincount(patch, score[cells, field].astype(float) ** 2) for field in (current, moved)]
+        better = (turns != 0) & (size < LARGEST_PATCH * len(best)) & (power[1] > PATCH_LOSS * power[0])
+        if not better.any():
+            break
+        current = np.where(better[patch], moved, current)
+    return current
+
+
+def _turns_of_patches(
+    best: NDArray[np.int64], patch: NDArray[np.int32], border: NDArray[np.int64], size: NDArray[np.int64],
+    order: float,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Orders by which each patch stands above the largest of its neighbours."""
+    turns = np.zeros(size.size, dtype=np.int64)
+    both = np.concatenate([border, border[:, ::-1]])
+    own, other = patch[both[:, 0]], patch[both[:, 1]]
+    jump = best[both[:, 0]] - best[both[:, 1]]
+    use = size[other] > size[own]
+    for number in np.unique(own[use]):
+        mine = use & (own == number)
+        largest = other[mine][np.argmax(size[other[mine]])]
+        turns[number] = round(float(np.median(jump[mine & (other == largest)])) / order)
+    return turns
 
 
 def _nearby_peak(score: NDArray[np.float32], best: NDArray[np.int64], reach: int = 4) -> NDArray[np.int64]:

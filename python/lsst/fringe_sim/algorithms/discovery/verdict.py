@@ -43,6 +43,8 @@ class NamedEffect:
         Which data would decide.
     share : `float`
         Probability of this member within the class.
+    significance : `float`
+        Signal to noise of the effect beside the others: root of what it takes off χ².
     """
 
     name: str
@@ -51,6 +53,7 @@ class NamedEffect:
     ambiguous_with: tuple[str, ...] = ()
     break_ambiguity: str = ""
     share: float = 1.0
+    significance: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -194,6 +197,7 @@ class Verdict:
                 tuple(entry["ambiguous_with"]),
                 entry["break_ambiguity"],
                 entry["share"],
+                _number(entry.get("significance")),
             )
             for entry in content["effects"]
         )
