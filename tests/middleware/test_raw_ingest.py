@@ -18,8 +18,9 @@ from lsst.resources import ResourcePath
 from raw_frame_maker import LSSTCAM_HEADER, write_raw
 from toy_repository import Invoke
 
+from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_header
-from lsst.fringe_sim.middleware import get_cli_subcommands
+from lsst.fringe_sim.middleware import get_cli_subcommands, raw_ingest
 from lsst.fringe_sim.middleware.raw_ingest import IngestReport, find_raw_files, ingest_raws
 from lsst.fringe_sim.middleware.translators import TRANSLATORS
 
@@ -140,6 +141,37 @@ def test_ingesting_again_changes_nothing(butler: Butler, tmp_path: Path) -> None
     paths.append(write_raw(tmp_path / "raw" / "more.fits", {"DATE-OBS": "2018-07-24T11:00:00.0"}))
     more = ingest_raws(butler, [str(tmp_path / "raw")])
     assert (len(more.ingested), len(more.present)) == (1, 5)
+
+
+@pytest.mark.parametrize("overtaken", [1, 9])
+def test_frames_that_another_process_stores_meanwhile(
+    overtaken: int, repo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the look at what is there and the storing: found in the second look, however many are new."""
+    series(tmp_path / "raw")
+    look = raw_ingest._split_by_presence
+    looks = 0
+
+    def overtake(butler: Butler, exposures: Any, runs: Any) -> Any:
+        nonlocal looks
+        looks += 1
+        found = look(butler, exposures, runs)
+        if looks <= overtaken and found[0]:
+            with monkeypatch.context() as other, Butler.from_config(str(repo), writeable=True) as process:
+                other.setattr(raw_ingest, "_split_by_presence", look)
+                ingest_raws(process, [found[0][0].path, found[0][-1].path], transfer="copy")
+        return found
+
+    monkeypatch.setattr(raw_ingest, "_split_by_presence", overtake)
+    with Butler.from_config(str(repo), writeable=True) as butler:
+        if overtaken == 1:
+            report = ingest_raws(butler, [str(tmp_path / "raw")], transfer="copy")
+            assert (len(report.ingested), len(report.present), report.refused) == (3, 2, ())
+            assert all(Path(butler.getURI(ref).ospath).is_file() for ref in raws(butler))
+        else:
+            monkeypatch.setattr(raw_ingest, "ATTEMPTS", 2)
+            with pytest.raises(InputError, match="that no other process ingests at the same time"):
+                ingest_raws(butler, [str(tmp_path / "raw")], transfer="copy")
 
 
 @pytest.mark.parametrize("transfer", ["copy", "direct"])

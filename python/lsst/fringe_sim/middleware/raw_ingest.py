@@ -108,6 +108,10 @@ def raw_dataset_type(butler: Butler) -> DatasetType:
     )
 
 
+ATTEMPTS = 3
+"""How often frames are looked for and stored, if other processes store them at the same time."""
+
+
 def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[str]]:
     """Find the files that are meant.
 
@@ -178,7 +182,7 @@ def ingest_raws(
     Raises
     ------
     InputError
-        The repository holds raw frames of another kind.
+        The repository holds raw frames of another kind, or other processes ingest the same frames over and over.
     """
     files, refused = find_raw_files(paths)
     registered = _registered_instruments(butler)
@@ -192,10 +196,21 @@ def ingest_raws(
     refused += contradicting
     runs = {name: run or cls().makeDefaultRawIngestRunName() for name, cls in registered.items()}
     new, present, others = _split_by_presence(butler, usable, runs)
+    for attempt in range(0 if dry_run else ATTEMPTS):
+        try:
+            new, conflicting = _store(butler, new, registered, runs, transfer)
+        except ConflictingDefinitionError as error:
+            # Another process has stored some of the frames since they were looked for.
+            if attempt == ATTEMPTS - 1:
+                raise InputError(
+                    "raw frames", _one_line(error), "frames that no other process ingests at the same time"
+                ) from error
+            butler.registry.refresh()
+            new, present, others = _split_by_presence(butler, usable, runs)
+            continue
+        others += conflicting
+        break
     refused += others
-    if not dry_run:
-        new, conflicting = _store(butler, new, registered, runs, transfer)
-        refused += conflicting
     used = {exposure.instrument for exposure in (*new, *present)}
     return IngestReport(
         tuple(new), tuple(present), tuple(refused), {name: runs[name] for name in sorted(used)}
