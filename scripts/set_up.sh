@@ -25,7 +25,7 @@ if [ ! -x "$venv/bin/python" ]; then
     "$python" -m venv "$venv"
 fi
 extra=""
-[ "$flavour" = test ] && extra="[test,docs]"
+[ "$flavour" = test ] && extra="[test,docs,postgres]"
 echo "Installing lsst-fringe-sim$extra into $venv (about 500 MB the first time)"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c "$constraints" --editable ".$extra"
 touch "$venv/.ready-run"

@@ -192,13 +192,16 @@ def main() -> None:
             return Chain(template, Path(tempfile.mkdtemp(dir=root)))
 
         undisturbed = new_chain()
-        undisturbed.run()
+        first = undisturbed.run()
+        if first.code != 0:
+            raise AssertionError(f"the undisturbed run ended with {first.code}:\n{first.text[-4000:]}")
         reference = undisturbed.results()
         part = new_chain().run(subset=Way(False, False).subset)
         again = new_chain()
         ended = again.run()
         if ended.code != 0 or again.results() != reference:
-            raise AssertionError(f"two undisturbed runs differ:\n{ended.text[-2000:]}")
+            differing = sorted(set(reference.items()) ^ set(again.results().items()))
+            raise AssertionError(f"two undisturbed runs differ in {differing}:\n{ended.text[-2000:]}")
         seconds = {True: ended.seconds, False: part.seconds}
         print(f"undisturbed: {seconds} s, {len(reference)} products", flush=True)
         rng = np.random.default_rng(seed)

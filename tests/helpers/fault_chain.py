@@ -53,7 +53,7 @@ class Ended:
     seconds: float
 
 
-def make_template(root: Path) -> Path:
+def make_template(root: Path, seed_config: str = SEED_CONFIG) -> Path:
     """Repository with the raw frames of one small sensor; not to be changed, copied for each test."""
     y, x = np.mgrid[:ROWS, :COLUMNS]
     made = write_mock_flats(
@@ -66,7 +66,7 @@ def make_template(root: Path) -> Path:
         size=f"{COLUMNS}x{ROWS}",
         n_bias=2,
     )
-    Butler.makeRepo(str(root / "repo"), config=Config(SEED_CONFIG))
+    Butler.makeRepo(str(root / "repo"), config=Config(seed_config))
     with Butler.from_config(str(root / "repo"), writeable=True) as butler:
         Ts8Fringe().register(butler.registry)
         report = ingest_raws(butler, [str(made.paths[0].parent)], transfer="copy")
