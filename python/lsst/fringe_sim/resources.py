@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import bz2
 import functools
+import gzip
 import hashlib
+import lzma
 import os
+import re
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import yaml
 from astropy.table import Table
 
-from .errors import InputError, ResourceError, UnknownNameError
+from .errors import FrameFormatError, InputError, ResourceError, UnknownNameError
 
 __all__ = [
+    "check_axes",
     "list_resources",
     "parse_user_yaml",
     "read_table",
@@ -33,6 +38,11 @@ LONGEST_USER_FILE = 1_000_000
 """Characters of a YAML file that a user gives; descriptions of sensors have a few thousand."""
 
 DEEPEST_NESTING = 20
+
+_CARD, _CHUNK = 80, 1 << 22
+_COUNTS = (b"NAXIS   =", b"TFIELDS =")
+_ENDLESS = re.compile(rb" *[-+]?0*[1-9]\d{3}")
+_COMPRESSED = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
 
 
 def resource_path(folder: str, name: str) -> Traversable:
@@ -188,3 +198,41 @@ def _check_events(text: str, what: str, source: str | None) -> None:
             depth -= 1
         if depth > DEEPEST_NESTING:
             raise InputError(what, f"nested {depth} deep", f"up to {DEEPEST_NESTING}", source=source)
+
+
+def check_axes(stream: IO[bytes], source: str) -> None:
+    """Refuse a FITS file with a header that claims a thousand axes or columns; the format has at most 999.
+
+    astropy asks the header for each of them, and would be busy for hours.
+
+    Parameters
+    ----------
+    stream : binary file
+        The file, compressed or not. It is read, and stands at its beginning afterwards.
+    source : `str`
+        Its name.
+
+    Raises
+    ------
+    FrameFormatError
+        There is such a header.
+    OSError, EOFError
+        The file cannot be read, or cannot be decompressed.
+    """
+    stream.seek(0)
+    opener = _COMPRESSED.get(stream.read(2))
+    stream.seek(0)
+    content: IO[bytes] = opener(stream) if opener else stream  # type: ignore[operator]
+    # Cards begin at multiples of their length, and so do pieces of the file.
+    rest = b""
+    while piece := content.read(_CHUNK):
+        piece = rest + piece
+        for keyword in _COUNTS:
+            place = piece.find(keyword)
+            while place >= 0:
+                if place % _CARD == 0 and _ENDLESS.match(piece, place + len(keyword)):
+                    claimed = " ".join(piece[place : place + 30].decode("ascii", "replace").split())
+                    raise FrameFormatError("header", claimed, "at most 999 axes or columns", source=source)
+                place = piece.find(keyword, place + 1)
+        rest = piece[len(piece) // _CARD * _CARD - _CARD :] if len(piece) >= _CARD else piece
+    stream.seek(0)

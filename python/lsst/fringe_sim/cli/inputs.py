@@ -21,7 +21,7 @@ from ..model import FringeModel
 from ..model.provenance import model_cards, software_cards
 from ..products import DAMAGE, SensorSection
 from ..products.sensor_section import SECTION_KEYWORDS
-from ..resources import read_user_yaml
+from ..resources import check_axes, read_user_yaml
 
 __all__ = [
     "effect_cards",
@@ -61,9 +61,12 @@ def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
         with warnings.catch_warnings(), open(path, "rb") as stream:
             warnings.simplefilter("ignore")
             warnings.filterwarnings("error", message=".*truncated.*")
+            check_axes(stream, source)
             with fits.open(stream, memmap=False) as hdus:
                 image = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
                 mask = hdus["MASK"].data if "MASK" in hdus else None
+    except InputError:
+        raise
     except DAMAGE as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise FrameFormatError("file", reason, "a complete FITS file", source=source) from None

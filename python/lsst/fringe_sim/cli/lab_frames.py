@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,8 @@ from ..instrument.camera import Camera, Detector
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..middleware.raw_ingest import find_raw_files
 from ..model import Setup
-from ..products import FringeCube
+from ..products import DAMAGE, FringeCube
+from ..resources import check_axes
 
 __all__ = ["LabSeries", "find_series", "read_cube"]
 
@@ -156,15 +158,28 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
 
 
 def read_cube(path: str) -> FringeCube | None:
-    """The fringe cube in a file, or `None` if the path is something else."""
+    """The fringe cube in a file, or `None` if the path is something else.
+
+    Raises
+    ------
+    FrameFormatError
+        The file is not FITS, or damaged.
+    """
     if not Path(path).is_file():
         return None
     try:
-        with fits.open(path, memmap=False) as hdus:
-            if "EXPOSURES" not in hdus or "IMAGE" not in hdus:
-                return None
-    except OSError as error:
-        raise FrameFormatError("file", str(error), "a complete FITS file", source=path) from None
+        # The stream is opened here because astropy leaves its own open when it stumbles.
+        with warnings.catch_warnings(), open(path, "rb") as stream:
+            warnings.simplefilter("ignore")
+            check_axes(stream, path)
+            with fits.open(stream, memmap=False) as hdus:
+                if "EXPOSURES" not in hdus or "IMAGE" not in hdus:
+                    return None
+    except InputError:
+        raise
+    except DAMAGE as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise FrameFormatError("file", reason, "a complete FITS file", source=path) from None
     return FringeCube.read_fits(path)
 
 

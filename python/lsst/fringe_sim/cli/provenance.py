@@ -16,7 +16,7 @@ from astropy.table import Table
 
 from ..errors import FrameFormatError, InputError, UnknownNameError
 from ..model.provenance import effects_of_header, inputs_of_header
-from ..resources import revision
+from ..resources import check_axes, revision
 
 __all__ = ["describe", "provenance", "read_header"]
 
@@ -95,6 +95,8 @@ def read_header(path: str) -> dict[str, Any]:
 
 
 def _fits_header(path: str) -> dict[str, Any]:
+    with open(path, "rb") as stream:
+        check_axes(stream, path)
     with fits.open(path, memmap=True, lazy_load_hdus=True) as hdus:
         header = hdus[0].header
         return {

@@ -26,6 +26,7 @@ import numpy.typing as npt
 from astropy.io import fits
 
 from ..errors import FrameFormatError, InputError, UnknownNameError
+from ..resources import check_axes
 from .raw_metadata import OBSERVATION_TYPES, RawMetadata, header_value
 
 __all__ = [
@@ -267,6 +268,7 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
             # astropy warns of a file that is too short, and goes on.
             warnings.simplefilter("ignore")
             warnings.filterwarnings("error", message=".*truncated.*")
+            check_axes(stream, source)
             with fits.open(stream, memmap=False, lazy_load_hdus=False) as hdus:
                 yield hdus
     except InputError as error:

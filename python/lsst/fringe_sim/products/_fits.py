@@ -23,6 +23,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError
+from ..resources import check_axes
 from ._check import check_mapping
 from .mask import mask_plane_cards, planes_from_header, remap_mask
 from .sensor_section import SECTION_KEYWORDS, SensorSection
@@ -286,6 +287,7 @@ def open_fits(
         # The stream is opened here because astropy leaves its own open when it stumbles.
         with warnings.catch_warnings(), open(path, "rb") as stream:
             warnings.simplefilter("error")
+            check_axes(stream, source)
             with fits.open(stream, memmap=memmap, checksum=verify, lazy_load_hdus=False) as hdus:
                 _check_product(hdus[0].header, product, source)
                 _check_complete(hdus, source)

@@ -1,0 +1,107 @@
+"""Headers that a FITS library stumbles over, or never comes back from, found by ``tests/faults/fuzz.py``."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import time
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from product_makers import MAKERS
+from raw_frame_maker import random_image, raw_hdus, small_detector
+
+from lsst.fringe_sim.cli.inputs import read_thickness
+from lsst.fringe_sim.cli.lab_frames import read_cube
+from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.cli.provenance import read_header
+from lsst.fringe_sim.errors import FrameFormatError
+from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_metadata
+from lsst.fringe_sim.products import FringeCube, ThicknessMap
+from lsst.fringe_sim.resources import check_axes
+
+CARD = 80
+
+
+def replaced(content: bytes, keyword: str, value: str, number: int = 0) -> bytes:
+    """The file with another value in one of its cards."""
+    prefix = f"{keyword:8s}= ".encode()
+    place = -1
+    for _ in range(number + 1):
+        place = content.index(prefix, place + 1)
+    return content[:place] + (prefix + value.rjust(20).encode()).ljust(CARD) + content[place + CARD :]
+
+
+def raw() -> bytes:
+    stream = BytesIO()
+    raw_hdus(random_image(small_detector()), small_detector()).writeto(stream)
+    return stream.getvalue()
+
+
+def product(name: str, folder: Path) -> bytes:
+    path = folder / "sound.fits"
+    MAKERS[name]((6, 8)).write_fits(path)
+    return path.read_bytes()
+
+
+READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
+    "raw frame": ("raw", RawFrame.read),
+    "raw header": ("raw", read_raw_metadata),
+    "map": ("ThicknessMap", ThicknessMap.read_fits),
+    "map of anybody": ("ThicknessMap", read_thickness),
+    "cube": ("FringeCube", FringeCube.read_fits),
+    "cube of a command": ("FringeCube", read_cube),
+    "provenance": ("FringeCube", read_header),
+}
+
+
+@pytest.mark.parametrize("number", [0, 1, 3], ids=["first", "second", "later"])
+@pytest.mark.parametrize("reader", sorted(READERS))
+def test_a_header_with_endless_axes_is_refused_at_once(reader: str, number: int, tmp_path: Path) -> None:
+    kind, read = READERS[reader]
+    sound = raw() if kind == "raw" else product(kind, tmp_path)
+    path = tmp_path / "endless.fits"
+    path.write_bytes(replaced(sound, "NAXIS", "1234567890", number))
+    started = time.process_time()
+    with pytest.raises(FrameFormatError, match=r"NAXIS = 1234567890'?; allowed: at most 999 axes"):
+        read(str(path))
+    assert time.process_time() - started < 5.0
+
+
+@pytest.mark.parametrize("value", ["1", "0.0", "-1", "'text'", "T"])
+def test_a_cube_with_other_axes_than_it_has_is_refused(value: str, tmp_path: Path) -> None:
+    path = tmp_path / "cube.fits"
+    path.write_bytes(replaced(product("FringeCube", tmp_path), "NAXIS", value))
+    with pytest.raises(FrameFormatError):
+        read_cube(str(path))
+    assert run(["fit", str(path), "--out", str(tmp_path / "out")]) == 1
+
+
+@pytest.mark.parametrize("compress", [bytes, gzip.compress, bz2.compress, lzma.compress])
+@pytest.mark.parametrize("card", [("NAXIS", "1000"), ("TFIELDS", "+0012345")])
+def test_what_is_endless_is_seen_wherever_it_stands(
+    compress: Callable[[bytes], bytes], card: tuple[str, str]
+) -> None:
+    """Also across the pieces in which a file is read; text like it that is no card is none."""
+    keyword, value = card
+    line = f"{keyword:8s}= {value:>20s}".ljust(CARD).encode()
+    long = b" " * (CARD * 52_428)  # what fits into one piece and a little more
+    for before in (b"", long[:-CARD], long, long + long):
+        stream = BytesIO(compress(before + line + b" " * 100))
+        with pytest.raises(FrameFormatError, match=f"{keyword}"):
+            check_axes(stream, "somewhere")
+    harmless = BytesIO(compress(long + b"x" + line + f"{keyword:8s}= {999:20d}".encode()))
+    check_axes(harmless, "somewhere")
+    assert harmless.tell() == 0
+
+
+def test_sound_files_pass(tmp_path: Path) -> None:
+    path = tmp_path / "sound.fits.gz"
+    fits.PrimaryHDU(np.ones((5, 7), np.float32)).writeto(path)
+    assert read_thickness(path).shape == (5, 7)
