@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from sklearn.decomposition import PCA
@@ -76,6 +78,62 @@ def test_a_small_pattern_on_a_large_level_is_not_lost(rng):
     np.testing.assert_allclose(
         found.explained_variance_ratio, expected.explained_variance_ratio_[:5], atol=1e-12
     )
+
+
+@pytest.mark.parametrize("count", [64, 65, 230])
+def test_many_frames_equal_the_full_svd_of_scikit_learn(count, rng):
+    """On both sides of the number from which products of a tile are in single precision."""
+    patterns = rng.standard_normal((5, 1500))
+    weights = rng.standard_normal((count, 5)) * np.array([30.0, 10.0, 3.0, 1.0, 0.3])
+    frames = (weights @ patterns + 7.0 + 0.05 * rng.standard_normal((count, 1500))).astype(np.float32)
+    frames[3, 700] = np.nan
+    good = np.arange(1500) != 700
+    expected = PCA(svd_solver="full").fit(frames[:, good].astype(np.float64))
+    found = fit_pca(list(frames.reshape(count, 50, 30)), n_components=5, tile_bytes=2**17)
+    np.testing.assert_allclose(
+        found.explained_variance_ratio, expected.explained_variance_ratio_[:5], atol=1e-7, rtol=1e-5
+    )
+    components = found.components.reshape(5, -1)
+    np.testing.assert_allclose(components[:, good], expected.components_[:5], atol=2e-6)
+    np.testing.assert_allclose(found.mean.ravel()[good], expected.mean_, atol=2e-5)
+    assert not components[:, 700].any()
+
+
+def test_rounding_is_not_taken_for_a_component(rng):
+    """Two patterns without noise, in few frames and in many: none but the two stands above the rounding."""
+    patterns = rng.standard_normal((2, 3000))
+    for count in (20, 150):
+        frames = (rng.standard_normal((count, 2)) @ patterns).astype(np.float32)
+        assert len(fit_pca(list(frames.reshape(count, 60, 50))).components) == 2
+
+
+def test_number_formats_of_files_are_read(frames):
+    expected = fit_pca(list(frames.astype(np.float32)), n_components=3)
+    for form in (">f4", ">f8", "f8"):
+        found = fit_pca(list(frames.astype(np.float32).astype(form)), n_components=3)
+        np.testing.assert_allclose(found.explained_variance, expected.explained_variance, rtol=1e-9)
+        np.testing.assert_allclose(found.components, expected.components, atol=2e-6)
+    whole = fit_pca(list(np.round(1000 * frames).astype(np.int32)), n_components=3)
+    np.testing.assert_allclose(whole.explained_variance_ratio, expected.explained_variance_ratio, rtol=1e-3)
+
+
+def test_levels_of_exposures_do_not_hide_their_fringes(night, rng):
+    """Exposures of very different length: their fringes in units of the common sky are what is decomposed."""
+    scales = np.linspace(0.2, 5.0, len(night))
+    exposures = [
+        dataclasses.replace(frame, image=frame.image * np.float32(scale))
+        for frame, scale in zip(night, scales, strict=True)
+    ]
+    found = fit_pca(exposures, n_components=2)
+    images = np.stack([frame.image.astype(np.float64) for frame in exposures])
+    level = images.mean(axis=(1, 2))
+    expected = PCA(svd_solver="full").fit(
+        ((images - level[:, None, None]) / level.mean()).reshape(len(night), -1)
+    )
+    np.testing.assert_allclose(
+        found.explained_variance_ratio, expected.explained_variance_ratio_[:2], atol=1e-9
+    )
+    np.testing.assert_allclose(found.mean.ravel(), expected.mean_, atol=1e-9)
 
 
 def test_masked_pixels_do_not_count(frames, rng):

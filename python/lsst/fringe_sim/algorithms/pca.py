@@ -9,7 +9,7 @@ decomposition (scikit-learn's ``PCA(svd_solver="full")``), sign convention inclu
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,11 +17,11 @@ import numba
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import threadpool_limits
 
 from ..errors import InputError, OutOfRangeError
 from ..model import ResponseTable
 from ..products import FringeComponents, FringeFrame, SkyFringe, mask_bits, refuse_corrected
+from .frame_stack import TILE_BYTES, FrameStack
 from .sky_frame import SkyResponse
 
 __all__ = [
@@ -35,9 +35,6 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-
-TILE_BYTES = 4 * 2**20
-"""Memory of one tile of all frames."""
 
 _ROUNDING = 1e-13
 """Share of the variance below which an eigenvalue is rounding of float32 frames."""
@@ -90,39 +87,43 @@ def fit_pca(
         fringes were subtracted.
     OutOfRangeError
         A number of components that N frames do not have.
+
+    Notes
+    -----
+    Products of more than 64 frames are in single precision, summed in double precision; components with less than
+    1e-7 of the variance cannot be told from rounding there.
     """
     for frame in frames:
         if isinstance(frame, SkyFringe):
             refuse_corrected(frame.metadata, frame.detector or None)
-    reader = _TileReader.of(frames, mask, tile_bytes)
-    # Tiles are small: more than one thread of a matrix product would mostly wait.
-    with threadpool_limits(limits=1, user_api="blas"):
-        gram, pixels = reader.gram()
+    stack = FrameStack.of(frames, mask, tile_bytes)
+    gram = stack.gram()
     total = float(np.trace(gram))
     if not total > 0.0:
         raise InputError("frames", "no differences between them", "frames that vary")
     eigenvalues, vectors = _descending(gram)
     if noise_variance is None:
-        noise_variance = reader.noise_variance
+        noise_variance = stack.noise_variance
     if n_components is None:
-        n_components = significant_components(eigenvalues, pixels, noise_variance)
+        n_components = significant_components(
+            eigenvalues, stack.pixels, noise_variance, rounding=stack.rounding
+        )
     if not 1 <= n_components <= len(frames):
         raise OutOfRangeError("number of components", n_components, f"1 to {len(frames)}")
     kept = np.maximum(eigenvalues[:n_components], np.finfo(float).tiny)
-    with threadpool_limits(limits=1, user_api="blas"):
-        mean, components, sign = reader.components(vectors[:, :n_components] / np.sqrt(kept))
+    mean, components, sign = stack.components(vectors[:, :n_components] / np.sqrt(kept))
     return FringeComponents(
         mean=mean,
         components=components,
         explained_variance=eigenvalues[:n_components] / (len(frames) - 1),
         explained_variance_ratio=eigenvalues[:n_components] / total,
         scores=vectors[:, :n_components] * np.sqrt(kept) * sign,
-        mask=np.where(reader.good, 0, mask_bits("NO_DATA")).astype(np.int32),
+        mask=np.where(stack.good, 0, mask_bits("NO_DATA")).astype(np.int32),
         metadata={
             **(metadata or {}),
             "NFRAMES": len(frames),
             "NOISEVAR": noise_variance,
-            "MEANSKY": reader.unit,
+            "MEANSKY": stack.unit,
         },
         detector=detector,
         physical_filter=physical_filter,
@@ -229,7 +230,9 @@ def noise_eigenvalue(frames: int, pixels: int, noise_variance: float) -> float:
     return pixels * noise_variance * (1.0 + math.sqrt(frames / pixels)) ** 2
 
 
-def significant_components(eigenvalues: ArrayLike, pixels: int, noise_variance: float) -> int:
+def significant_components(
+    eigenvalues: ArrayLike, pixels: int, noise_variance: float, *, rounding: float = _ROUNDING
+) -> int:
     """Number of components that stand above the noise, at least one.
 
     Parameters
@@ -240,6 +243,8 @@ def significant_components(eigenvalues: ArrayLike, pixels: int, noise_variance: 
         Good pixels in a frame.
     noise_variance : `float`
         Variance of the noise of a pixel of a frame.
+    rounding : `float`, optional
+        Share of the variance below which an eigenvalue is rounding.
 
     Notes
     -----
@@ -251,7 +256,7 @@ def significant_components(eigenvalues: ArrayLike, pixels: int, noise_variance: 
         raise OutOfRangeError("noise variance", noise_variance, "finite and not negative")
     edge = noise_eigenvalue(values.size, pixels, noise_variance)
     edge += 5.0 * noise_variance * math.sqrt(2.0 * pixels)
-    return max(1, int(np.count_nonzero(values > max(edge, _ROUNDING * values.sum()))))
+    return max(1, int(np.count_nonzero(values > max(edge, rounding * values.sum()))))
 
 
 def fringe_templates(
@@ -401,103 +406,6 @@ def project(
         float(solution[0]),
         max(square - float(solution @ moment), 0.0) / used,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _TileReader:
-    """Frames as ``(frame - offset) / unit`` in double precision, a few rows of all of them at a time."""
-
-    frames: tuple[Any, ...]
-    good: NDArray[np.bool_]
-    offset: FloatArray
-    unit: float
-    noise_variance: float
-    rows: int
-
-    @classmethod
-    def of(cls, frames: Sequence[Any], mask: ArrayLike | None, tile_bytes: int) -> _TileReader:
-        if len(frames) < 2:
-            raise InputError("number of frames", len(frames), "two or more")
-        images = tuple(each.image if isinstance(each, SkyFringe) else each for each in frames)
-        shape = tuple(np.shape(images[0]))
-        for number, image in enumerate(images):
-            if tuple(np.shape(image)) != shape or len(shape) != 2:
-                raise InputError(f"shape of frame {number}", np.shape(image), f"{shape}, two axes")
-        # A tile of all frames in double precision, once as read and once as used.
-        rows = max(1, min(shape[0], tile_bytes // (16 * len(images) * shape[1])))
-        good = np.ones(shape, dtype=bool) if mask is None else np.asarray(mask) == 0
-        if good.shape != shape:
-            raise InputError("shape of the mask", good.shape, f"{shape}")
-        offset, unit, noise = np.zeros(len(images)), 1.0, 0.0
-        if all(isinstance(each, SkyFringe) for each in frames):
-            skies = [each for each in frames if isinstance(each, SkyFringe)]
-            for sky in skies:
-                good &= sky.mask == 0
-        for start in range(0, shape[0], rows):
-            part = slice(start, start + rows)
-            for image in images:
-                good[part] &= np.isfinite(np.asarray(image[part]))
-        if not good.any():
-            raise InputError("good pixels", 0, "at least one in which all frames have a value")
-        if all(isinstance(each, SkyFringe) and each.unit == "electron" for each in frames):
-            offset = np.array([image.mean(dtype=np.float64, where=good) for image in images])
-            unit = float(offset.mean())
-            noise = float(np.mean([_noise_of(each) for each in skies])) / unit**2
-        return cls(images, good, offset, unit, noise, rows)
-
-    def tiles(self) -> Iterator[tuple[slice, NDArray[np.bool_], FloatArray]]:
-        """Rows, their good pixels, and the values ``[N, good pixels]``."""
-        for start in range(0, self.good.shape[0], self.rows):
-            part = slice(start, start + self.rows)
-            good = self.good[part]
-            tile = np.empty((len(self.frames), int(good.sum())))
-            whole = bool(good.all())
-            for number, image in enumerate(self.frames):
-                values = np.asarray(image[part])
-                chosen = values.ravel() if whole else values[good]
-                np.subtract(chosen, self.offset[number], out=tile[number], dtype=np.float64)
-            if self.unit != 1.0:
-                tile *= 1.0 / self.unit
-            yield part, good, tile
-
-    def gram(self) -> tuple[FloatArray, int]:
-        """Gram matrix of the frames less their mean over frames, and the number of good pixels."""
-        total = np.zeros((len(self.frames), len(self.frames)))
-        for _, _, tile in self.tiles():
-            tile -= tile.mean(axis=0)
-            total += tile @ tile.T
-        return total, int(self.good.sum())
-
-    def components(
-        self, combination: FloatArray
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], FloatArray]:
-        """Mean frame, components ``combination.T @ (frames - mean)`` and the signs that were given to them."""
-        frames, number = combination.shape
-        # Weights of zero sum need no frames less their mean.
-        weights = np.vstack([np.full(frames, 1.0 / frames), (combination - combination.mean(axis=0)).T])
-        images = np.zeros((1 + number, *self.good.shape), dtype=np.float32)
-        largest = np.zeros(number)
-        for part, good, tile in self.tiles():
-            values = weights @ tile
-            for image, row in zip(images, values, strict=True):
-                if row.size == good.size:
-                    image[part] = row.reshape(good.shape)
-                else:
-                    image[part][good] = row
-            if values.shape[1]:
-                extreme = values[np.arange(1, 1 + number), np.abs(values[1:]).argmax(axis=1)]
-                largest = np.where(np.abs(extreme) > np.abs(largest), extreme, largest)
-        sign = np.where(largest < 0.0, -1.0, 1.0)
-        for index in np.flatnonzero(sign < 0.0):
-            np.negative(images[1 + index], out=images[1 + index])
-        return images[0], images[1:], sign
-
-
-def _noise_of(frame: SkyFringe) -> float:
-    """Variance of the noise of a simulated exposure [e⁻²]; 0 without noise."""
-    if frame.seed is None:
-        return 0.0
-    return frame.mean_electrons + float(frame.metadata.get("RDNOISE", 0.0)) ** 2
 
 
 def _descending(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
