@@ -83,6 +83,19 @@ def test_a_cube_with_other_axes_than_it_has_is_refused(value: str, tmp_path: Pat
     assert run(["fit", str(path), "--out", str(tmp_path / "out")]) == 1
 
 
+@pytest.mark.parametrize("reader", sorted(READERS))
+def test_more_pixels_than_any_memory_holds_are_a_damage(reader: str, tmp_path: Path) -> None:
+    kind, read = READERS[reader]
+    sound = raw() if kind == "raw" else product(kind, tmp_path)
+    path = tmp_path / "huge.fits"
+    path.write_bytes(replaced(sound, "NAXIS1", "9999999999999999"))
+    if reader == "provenance":
+        read(str(path))  # the header alone
+        return
+    with pytest.raises(FrameFormatError):
+        read(str(path))
+
+
 @pytest.mark.parametrize("compress", [bytes, gzip.compress, bz2.compress, lzma.compress])
 @pytest.mark.parametrize("card", [("NAXIS", "1000"), ("TFIELDS", "+0012345")])
 def test_what_is_endless_is_seen_wherever_it_stands(

@@ -1,10 +1,12 @@
 """Files and settings as they should not be: every one is used or refused, never a traceback, a hang or a leak.
 
     python tests/faults/fuzz.py --cases 10000
+    python tests/faults/fuzz.py --seconds 60
 
-runs all targets with new random cases and prints how many were used and how many refused. A case fails if it raises
-anything but `FringeSimError`, takes longer than `LONGEST_S`, needs more than `MOST_BYTES` of memory beyond what the
-process had, or opens a file outside the folder of the case and the installed program.
+runs all targets with new random cases, so many or for so much processor time, and prints the seeds and how many cases
+were used and how many refused. A case fails if it raises anything but `FringeSimError`, takes more than `LONGEST_S`,
+needs more than `MOST_BYTES` of memory beyond what the process had, opens a file outside the folder of the case and
+the installed program, or makes a map or a flat with good pixels that are no numbers.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import collections
 import contextlib
 import os
 import resource
+import secrets
 import signal
 import sys
 import tempfile
@@ -38,7 +41,9 @@ from raw_frame_maker import random_image, raw_hdus, small_detector
 
 from lsst.fringe_sim.algorithms.flat_prep import prepare_flat
 from lsst.fringe_sim.algorithms.thickness_fit import fit_thickness
+from lsst.fringe_sim.cli.amplitudes import read_line_list
 from lsst.fringe_sim.cli.inputs import read_settings, read_thickness
+from lsst.fringe_sim.cli.lab_frames import read_cube
 from lsst.fringe_sim.cli.provenance import describe, read_header
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.errors import FringeSimError
@@ -179,13 +184,14 @@ def raw_frame(data: st.DataObject, folder: Path) -> None:
     with guarded("raw frames", folder):
         read_raw_metadata(path)
         frame = RawFrame.read(path)
-        prepare_flat(frame, None, small_detector(), bandwidth_fwhm_nm=2.0, f_number=float("inf"))
+        flat = prepare_flat(frame, None, small_detector(), bandwidth_fwhm_nm=2.0, f_number=float("inf"))
+        _honest(flat.image, flat.mask)
 
 
 def product(data: st.DataObject, folder: Path) -> None:
     """A product from disk, also without the checksums that would show the damage; provenance of the same file."""
     name = data.draw(st.sampled_from(sorted(PRODUCTS)))
-    content = data.draw(st.sampled_from(PRODUCTS[name]))
+    content = PRODUCTS[name][data.draw(st.integers(0, 1))]
     path = _file(folder, alter_fits(data, content))
     with guarded(f"product {name}", folder):
         product_makers.p.__dict__[name].read_fits(path)
@@ -200,16 +206,29 @@ def thickness_file(data: st.DataObject, folder: Path) -> None:
         read_thickness(path)
 
 
+def _honest(image: Any, mask: Any) -> None:
+    """A pixel that is not masked holds a number: nothing wrong is passed on in silence."""
+    if not np.all(np.isfinite(np.asarray(image)[np.asarray(mask) == 0])):
+        raise AssertionError("a good pixel that is not a number")
+
+
 FINITE = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+RANGE_UM = (12.5, 13.5)
+"""Where a thickness is looked for: two fringe orders, so that a case costs little."""
 
 
 def cube(data: st.DataObject, folder: Path) -> None:
-    """A cube of few pixels with any numbers in it, fitted."""
+    """A cube of few pixels with any numbers in it, through its file, fitted."""
     shape = (data.draw(st.integers(1, 6)), data.draw(st.integers(1, 4)), data.draw(st.integers(1, 6)))
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
-    wavelength = np.array(data.draw(st.lists(_numbers(700.0, 1200.0), min_size=shape[0], max_size=shape[0])))
+    wavelength = np.linspace(880.0, 990.0, shape[0])
+    if not data.draw(st.integers(0, 2)):
+        wavelength = np.array([data.draw(_numbers(700.0, 1200.0)) for _ in range(shape[0])])
+    thickness = 13.0 + 0.2 * rng.random(shape[1:])
     with guarded("fringe cubes", folder):
-        image = (20000.0 * (1.0 + 0.05 * rng.standard_normal(shape))).astype(np.float32)
+        response = MODEL.response(thickness.ravel(), np.linspace(880.0, 990.0, shape[0])).reshape(shape)
+        image = (20000.0 * response * (1.0 + 0.003 * rng.standard_normal(shape))).astype(np.float32)
         for place, value in data.draw(
             st.lists(st.tuples(st.integers(0, image.size - 1), FINITE), max_size=4)
         ):
@@ -217,18 +236,36 @@ def cube(data: st.DataObject, folder: Path) -> None:
         made = product_makers.p.FringeCube(
             image=image,
             variance=np.full(shape, data.draw(_numbers(0.0, 1e6)), np.float32),
-            mask=(rng.random(shape) < data.draw(st.floats(0, 1))).astype(np.int32),
+            mask=(rng.random(shape) < data.draw(st.sampled_from([0.0, 0.1, 0.5, 1.0]))).astype(np.int32),
             exposures=product_makers.p.FlatExposures(
                 wavelength,
                 np.array(data.draw(_numbers(0.0, 5.0))),
                 np.array(data.draw(_numbers(150.0, 310.0))),
             ),
-            unit=data.draw(st.sampled_from(["electron", "relative", "adu"])),
+            unit=data.draw(st.sampled_from(["electron", "electron", "relative", "adu"])),
         )
         path = folder / "cube.fits"
         made.write_fits(path)
-        method = data.draw(st.sampled_from(["global", "guo2022"]))
-        fit_thickness(product_makers.p.FringeCube.read_fits(path), MODEL, method, range_um=(12.0, 14.0))
+        _fit(path, data.draw(st.sampled_from(["global", "guo2022"])))
+
+
+def cube_file(data: st.DataObject, folder: Path) -> None:
+    """The file of a cube, spoiled, as the commands read it, and fitted if it is still one."""
+    path = _file(folder, alter_fits(data, PRODUCTS["FringeCube"][data.draw(st.integers(0, 1))]))
+    with guarded("files of fringe cubes", folder):
+        _fit(path, "global")
+
+
+def _fit(path: Path, method: str) -> None:
+    found = read_cube(str(path))
+    if found is None:
+        return
+    fitted = fit_thickness(found, MODEL, method, range_um=RANGE_UM)
+    _honest(fitted.value, fitted.mask)
+    _honest(fitted.sigma, fitted.mask)
+    value = np.asarray(fitted.value)[np.asarray(fitted.mask) == 0]
+    if value.size and not (value.min() > RANGE_UM[0] - 0.1 and value.max() < RANGE_UM[1] + 0.1):
+        raise AssertionError("a thickness that was not allowed")
 
 
 MODEL = FringeModel.from_setup("ts8_e2v")
@@ -374,6 +411,50 @@ def line_list(data: st.DataObject, folder: Path) -> None:
                 raise AssertionError("a sky that is not finite")
 
 
+LINES = """\
+# %ECSV 1.0
+# ---
+# datatype:
+# - {name: wavelength, unit: nm, datatype: float64}
+# - {name: intensity, datatype: float64}
+wavelength intensity
+930.1 1.0
+951.2 2.5
+977.7 0.3
+"""
+
+
+def line_file(data: st.DataObject, folder: Path) -> None:
+    """A line list as a file of the user."""
+    text = _alter_text(data, LINES) if data.draw(st.integers(0, 5)) else data.draw(st.sampled_from(HOSTILE))
+    path = _file(folder, text.encode("utf-8", "surrogatepass"), "lines.ecsv")
+    with guarded("files of line lists", folder):
+        read_line_list(path)
+
+
+def effects_override(data: st.DataObject, folder: Path) -> None:
+    """A Python override as a search leaves it: read, never executed."""
+    valid = "# found\nconfig.effects['roughness.sigma'] = 4.0\nconfig.effects['bandwidth.fwhm'] = 2.1\n"
+    text = _alter_text(data, valid)
+    if not data.draw(st.integers(0, 3)):
+        text += data.draw(st.sampled_from(CODE)).format(folder)
+    path = _file(folder, text.encode("utf-8", "surrogatepass"), "effects.py")
+    with guarded("effects overrides", folder):
+        FringeModel.from_setup("ts8_e2v", read_settings(path))
+    if (folder / "executed").exists():
+        raise AssertionError("an override was executed")
+
+
+CODE = (
+    "open('{0}/executed', 'w')\n",
+    "import os; os.system('touch {0}/executed')\n",
+    "config.effects['roughness.sigma'] = open('{0}/executed', 'w').fileno()\n",
+    "config.effects[open('{0}/executed', 'w').name] = 1.0\n",
+    "config.load('/etc/passwd')\n",
+    "raise SystemExit\n",
+)
+
+
 def any_document(data: st.DataObject, folder: Path) -> None:
     """Tables and documents whose provenance is asked for."""
     suffix = data.draw(st.sampled_from([".json", ".ecsv", ".fits"]))
@@ -390,14 +471,20 @@ TARGETS: dict[Callable[[st.DataObject, Path], None], int] = {
     raw_frame: 5,
     product: 5,
     thickness_file: 1,
-    cube: 2,
+    cube: 4,
+    cube_file: 2,
     effects_file: 2,
     setup_file: 2,
     camera_file: 2,
-    line_list: 1,
+    line_list: 2,
+    line_file: 2,
+    effects_override: 1,
     any_document: 1,
 }
 """Targets and their share of the cases."""
+
+ROUND = 10 * sum(TARGETS.values())
+"""Cases between two looks at the clock."""
 
 
 def run_target(target: Callable[[st.DataObject, Path], None], cases: int, seed: int | None = None) -> None:
@@ -412,6 +499,7 @@ def run_target(target: Callable[[st.DataObject, Path], None], cases: int, seed: 
             derandomize=False,
             suppress_health_check=list(HealthCheck),
             phases=(Phase.generate, Phase.shrink),
+            report_multiple_bugs=False,
         )
         @given(data=st.data())
         def case(data: st.DataObject) -> None:
@@ -420,20 +508,38 @@ def run_target(target: Callable[[st.DataObject, Path], None], cases: int, seed: 
         (case if seed is None else with_seed(seed)(case))()
 
 
+def run_cases(
+    chosen: dict[Callable[[st.DataObject, Path], None], int], cases: int, rng: np.random.Generator
+) -> None:
+    """Run so many cases in all, each target with its share and a seed of its own, which is printed."""
+    for target, share in chosen.items():
+        seed = int(rng.integers(2**62))
+        started, used = time.monotonic(), time.process_time()
+        print(f"{target.__name__} --seed {seed}", end="", flush=True)
+        run_target(target, -(-cases * share // sum(chosen.values())), seed)
+        print(f": {time.process_time() - used:.1f} s of processor time, {time.monotonic() - started:.0f} s")
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--cases", type=int, default=10_000)
+    parser.add_argument("--seconds", type=float, help="processor time, in place of a number of cases")
     parser.add_argument("--only", help="one target, by the name of its function")
-    parser.add_argument("--seed", type=int, default=None)
+    parser.add_argument("--seed", type=int, help="of one target, as it was printed; by default new ones")
     arguments = parser.parse_args()
     chosen = {target: share for target, share in TARGETS.items() if arguments.only in (None, target.__name__)}
-    for target, share in chosen.items():
-        started = time.monotonic()
-        run_target(target, -(-arguments.cases * share // sum(chosen.values())), arguments.seed)
-        print(f"{target.__name__}: {time.monotonic() - started:.0f} s", flush=True)
+    if arguments.seed is not None:
+        (target,) = chosen
+        run_target(target, arguments.cases, arguments.seed)
+    else:
+        rng = np.random.default_rng(secrets.randbits(128))
+        while True:
+            run_cases(chosen, arguments.cases if arguments.seconds is None else ROUND, rng)
+            if arguments.seconds is None or time.process_time() >= arguments.seconds:
+                break
     for name in sorted(TALLY.used | TALLY.refused):
         print(f"{name:28s} {TALLY.used[name]:6d} used {TALLY.refused[name]:6d} refused")
     total = TALLY.used.total() + TALLY.refused.total()

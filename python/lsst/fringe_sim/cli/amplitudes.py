@@ -13,7 +13,7 @@ from ..mock.thickness import e2v_321
 from .inputs import prepare_folder, read_settings, read_thickness
 from .parameters import EFFECT, effect_settings
 
-__all__ = ["amplitudes"]
+__all__ = ["amplitudes", "read_line_list"]
 
 STEP_PX = 16
 
@@ -59,7 +59,7 @@ def amplitudes(
     """
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
-    skies = [_line_list(path) for path in lines] + list(SkyCase.palace())
+    skies = [read_line_list(path) for path in lines] + list(SkyCase.palace())
     adhesive = e2v_321()[::STEP_PX, ::STEP_PX] if thickness == "e2v_321" else read_thickness(thickness)
     if dry_run:
         click.echo(f"would compute every set-up with {', '.join(sky.name for sky in skies)}")
@@ -78,7 +78,16 @@ def amplitudes(
         click.echo(str(folder / "amplitudes.ecsv"))
 
 
-def _line_list(path: Path) -> SkyCase:
+def read_line_list(path: Path) -> SkyCase:
+    """Line list of the user, named like its file.
+
+    Raises
+    ------
+    FrameFormatError
+        The file is no ECSV table.
+    InputError
+        The table is no line list.
+    """
     try:
         table = Table.read(path, format="ascii.ecsv")
     except Exception as error:

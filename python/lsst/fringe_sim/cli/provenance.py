@@ -16,6 +16,7 @@ from astropy.table import Table
 
 from ..errors import FrameFormatError, InputError, UnknownNameError
 from ..model.provenance import effects_of_header, inputs_of_header
+from ..products import DAMAGE
 from ..resources import check_axes, revision
 
 __all__ = ["describe", "provenance", "read_header"]
@@ -87,7 +88,7 @@ def read_header(path: str) -> dict[str, Any]:
             return readers.get(suffix, _fits_header)(path)
     except InputError:
         raise
-    except (OSError, ValueError, TypeError, KeyError, IndexError, fits.VerifyError) as error:
+    except DAMAGE as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise FrameFormatError(
             "file", reason, "an undamaged FITS, ECSV or JSON product", source=path

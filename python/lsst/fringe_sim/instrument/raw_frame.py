@@ -283,6 +283,7 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
         IndexError,
         AttributeError,
         OverflowError,
+        MemoryError,
         Warning,
         fits.VerifyError,
     ) as error:

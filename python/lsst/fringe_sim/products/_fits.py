@@ -61,6 +61,7 @@ DAMAGE = (
         KeyError,
         AttributeError,
         OverflowError,
+        MemoryError,
         zlib.error,
     ),
     *(UserWarning, fits.VerifyError),
