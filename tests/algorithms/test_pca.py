@@ -9,6 +9,7 @@ import pytest
 from sklearn.decomposition import PCA
 
 from lsst.fringe_sim.algorithms.pca import (
+    decompose_thickness,
     fit_pca,
     fit_pca_from_thickness,
     fringe_templates,
@@ -204,6 +205,39 @@ def test_components_from_the_histogram_of_thickness(thickness, model, response, 
     for number in range(2):
         one, two = shortcut.components[number].ravel(), from_images.components[number].ravel()
         assert abs(one @ two) / np.linalg.norm(one) / np.linalg.norm(two) > 1 - 1e-5
+
+
+def test_histogram_of_thickness_needs_no_images(thickness, response):
+    """Variance fractions and scores without an image are those of the frames, each pixel taken by itself."""
+    history = NightHistory.guo2022()
+    scales = [history.band_scale(hour, response.bands) for hour in range(11)]
+    spoiled = thickness.copy()
+    spoiled[3, 4] = np.nan
+    found = decompose_thickness(spoiled, response, scales, n_components=3)
+    levels = np.stack([response.sky(scale).lookup(spoiled[np.isfinite(spoiled)])[0] for scale in scales])
+    levels -= levels.mean(axis=1, keepdims=True)
+    expected = PCA(svd_solver="full").fit(levels)
+    np.testing.assert_allclose(
+        found.explained_variance_ratio, expected.explained_variance_ratio_[:3], atol=1e-6
+    )
+    images = found.images(spoiled)
+    assert images.mask[3, 4] == mask_bits("NO_DATA")
+    assert images.components[:, 3, 4].tolist() == [0.0, 0.0, 0.0]
+    # Components that are functions of thickness are orthonormal over the pixels.
+    product = np.einsum("iyx,jyx->ij", images.components.astype(float), images.components.astype(float))
+    np.testing.assert_allclose(product[:2, :2], np.eye(2), atol=2e-3)
+
+
+def test_thickness_outside_the_response_is_named(thickness, response):
+    scales = [{}, {"8-4": 2.0}]
+    thick = thickness.copy()
+    thick[5, 6] = 22.6
+    with pytest.raises(OutOfRangeError, match=r"thickness \[um\] is 22.6"):
+        decompose_thickness(thick, response, scales)
+    with pytest.raises(InputError, match="pixels with a thickness"):
+        decompose_thickness(np.full((5, 5), np.nan), response, scales)
+    ends = np.array([[response.table.start_um, response.table.stop_um], [15.0, 16.0]])
+    assert np.isfinite(decompose_thickness(ends, response, scales).explained_variance).all()
 
 
 def test_number_of_components_is_chosen_against_the_noise(frames, rng):

@@ -34,6 +34,9 @@ _MOST_LEVELS = 200_000
 _PIXELS_PER_ENTRY = 4
 """Pixels that every entry of an alias table must serve."""
 
+_SAMPLED_ROWS = 4
+"""One row in so many is looked at for how frequent a whole mean is."""
+
 _REACH = 8.0
 """Standard deviations on either side that a table covers; 1e-15 lies beyond."""
 
@@ -258,7 +261,7 @@ def _alias_tables(
     """
     first = math.floor(max(lowest, FEWEST_ELECTRONS))
     count = min(max(math.floor(highest) - first + 1, 1), _MOST_LEVELS)
-    pixels = _level_counts(image, first, count)
+    pixels = _SAMPLED_ROWS * _level_counts(image[::_SAMPLED_ROWS], first, count)
     mean = first + np.arange(count, dtype=float)
     reach = np.ceil(_REACH * np.sqrt(mean) + _REACH)
     bits = np.ceil(np.log2(2.0 * reach + 1.0)).astype(np.int64)
@@ -316,27 +319,40 @@ def _fill_alias(probability: NDArray, entries: NDArray) -> None:  # pragma: no c
         entries[small[item]] = (full << np.uint64(32)) | np.uint64(small[item])
 
 
-@numba.njit(error_model="numpy", inline="always")
-def _remainder(mean: float, u: float) -> float:  # pragma: no cover - compiled
-    """Poisson number of a mean below 1, by inversion; comparisons are added up, as branches would be mispredicted."""
-    # exp(-mean) as an eighth power, to 1e-8.
-    t = -0.125 * mean
-    none = 1.0 + t * (1.0 + t * (0.5 + t * (1.0 / 6.0 + t * (1.0 / 24.0 + t * (1.0 / 120.0)))))
-    none *= none
-    none *= none
-    none *= none
-    one = none * mean
-    two = one * mean * 0.5
-    three = two * mean * (1.0 / 3.0)
-    below = none + one + two + three
-    count = 1.0 * (int(u >= none) + int(u >= none + one) + int(u >= none + one + two))
-    if u >= below:
-        term = three
-        while u >= below and term > 1e-12:
-            count += 1.0
-            term *= mean / (count + 0.0)
-            below += term
-    return count
+@numba.njit(error_model="numpy", fastmath={"contract"})
+def _remainders(mean: NDArray, u: NDArray, count: NDArray) -> None:  # pragma: no cover - compiled
+    """Poisson numbers of means below 1, by inversion; -1 where there are more than three.
+
+    Comparisons are added up, as branches would be mispredicted, and so that several pixels are worked on at once.
+    """
+    for x in range(mean.size):
+        # exp(-mean) as an eighth power, to 1e-8.
+        t = -0.125 * mean[x]
+        none = 1.0 + t * (1.0 + t * (0.5 + t * (1.0 / 6.0 + t * (1.0 / 24.0 + t * (1.0 / 120.0)))))
+        none *= none
+        none *= none
+        none *= none
+        one = none * mean[x]
+        two = one * mean[x] * 0.5
+        three = two * mean[x] * (1.0 / 3.0)
+        up_to_one = none + one
+        up_to_two = up_to_one + two
+        more = 1.0 if u[x] >= none else 0.0
+        more += 1.0 if u[x] >= up_to_one else 0.0
+        more += 1.0 if u[x] >= up_to_two else 0.0
+        count[x] = -1.0 if u[x] >= up_to_two + three else more
+
+
+@numba.njit(error_model="numpy")
+def _many(mean: float, u: float) -> float:  # pragma: no cover - compiled
+    """Poisson number of a mean below 1 where it exceeds three: one in fifty, at most."""
+    term = math.exp(-mean)
+    below, count = term, 0.0
+    while u >= below and (count < 3.0 or term > 1e-12):
+        count += 1.0
+        term *= mean / count
+        below += term
+    return max(count, 4.0)
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
@@ -367,6 +383,8 @@ def _noise_kernel(
         for k in range(4):
             word += step
             state[k] = _mix(word)
+        # Random numbers in the order of the pixels, then what needs none for a whole row at once.
+        rest, u, more, values = np.zeros(width), np.zeros(width), np.empty(width), np.zeros(width)
         for x in range(width):
             mean = float(image[y, x])
             if mean < least:
@@ -382,11 +400,17 @@ def _noise_kernel(
                 other = np.int64(entry & half)
                 index = other if (draw & half) >= entry >> np.uint64(32) else index
                 middle = np.int64((draw >> np.uint64(32)) & remaining[size])
-                u = (float(middle) + 0.5) * scale[size]
-                value = float(base[level] + index) + _remainder(mean - whole, u)
+                u[x] = (float(middle) + 0.5) * scale[size]
+                rest[x] = mean - whole
+                value = float(base[level] + index)
             else:
                 value = float(_poisson(mean, state))
             if read_noise > 0.0:
                 value += read_noise * _normal(ends, density, state)
-            out[y, x] = value
+            values[x] = value
+        _remainders(rest, u, more)
+        for x in range(width):
+            if more[x] < 0.0:
+                more[x] = _many(rest[x], u[x])
+            out[y, x] = values[x] + more[x]
     return out

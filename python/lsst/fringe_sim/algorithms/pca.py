@@ -26,6 +26,8 @@ from .sky_frame import SkyResponse
 
 __all__ = [
     "Projection",
+    "ThicknessComponents",
+    "decompose_thickness",
     "fit_pca",
     "fit_pca_from_thickness",
     "fringe_templates",
@@ -130,18 +132,80 @@ def fit_pca(
     )
 
 
-def fit_pca_from_thickness(
+@dataclass(frozen=True, eq=False)
+class ThicknessComponents:
+    """Principal components of noiseless model frames, as functions of thickness.
+
+    Attributes
+    ----------
+    table : `ResponseTable`
+        Mean frame in the first row, components in the others, over thickness.
+    explained_variance, explained_variance_ratio : `numpy.ndarray`, shape ``(K,)``
+        Variance of each component, and its share of the whole.
+    scores : `numpy.ndarray`, shape ``(N, K)``
+        Coefficients of the frames.
+    unit : `float`
+        Mean sky of the frames, by which they are divided.
+    """
+
+    table: ResponseTable
+    explained_variance: FloatArray
+    explained_variance_ratio: FloatArray
+    scores: FloatArray
+    unit: float
+
+    def images(
+        self,
+        thickness_um: ArrayLike,
+        *,
+        metadata: Mapping[str, Any] | None = None,
+        detector: str = "",
+        physical_filter: str = "",
+    ) -> FringeComponents:
+        """Components of the pixels of a thickness map [µm], shape ``(ny, nx)``; NaN is masked.
+
+        Raises
+        ------
+        OutOfRangeError
+            A thickness outside the table.
+        """
+        thickness = np.asarray(thickness_um)
+        good = np.isfinite(thickness)
+        images = np.empty((len(self.table.values), *thickness.shape), np.float32)
+        single = thickness.astype(np.float32, copy=False)
+        for row, image in enumerate(images):
+            self.table.frame(single, row, image)
+        mask = np.zeros(thickness.shape, np.int32)
+        if not good.all():
+            images[:, ~good] = 0.0
+            mask[~good] = mask_bits("NO_DATA")
+        return FringeComponents(
+            mean=images[0],
+            components=images[1:],
+            explained_variance=self.explained_variance,
+            explained_variance_ratio=self.explained_variance_ratio,
+            scores=self.scores,
+            mask=mask,
+            metadata={
+                **(metadata or {}),
+                "NFRAMES": len(self.scores),
+                "NOISEVAR": 0.0,
+                "MEANSKY": self.unit,
+            },
+            detector=detector,
+            physical_filter=physical_filter,
+        )
+
+
+def decompose_thickness(
     thickness_um: ArrayLike,
     response: SkyResponse,
     scales: Sequence[Mapping[str, float]],
     *,
     n_components: int | None = None,
     bins: int = _HISTOGRAM_BINS,
-    metadata: Mapping[str, Any] | None = None,
-    detector: str = "",
-    physical_filter: str = "",
-) -> FringeComponents:
-    """Principal components of noiseless model frames, without making the frames.
+) -> ThicknessComponents:
+    """Principal components of noiseless model frames, from the histogram of thickness alone.
 
     A pixel of a model frame depends on its thickness alone, so that the Gram matrix is a sum over the histogram of
     thickness, and a component is a function of thickness.
@@ -149,7 +213,7 @@ def fit_pca_from_thickness(
     Parameters
     ----------
     thickness_um : array_like, shape ``(ny, nx)``
-        Thickness [µm]; NaN is masked.
+        Thickness [µm]; NaN does not count.
     response : `SkyResponse`
         Response of the sensor to the components of the sky.
     scales : sequence of mappings
@@ -157,27 +221,19 @@ def fit_pca_from_thickness(
     n_components : `int`, optional
         Components to keep; by default all that are not rounding.
     bins : `int`, optional
-        Bins of the histogram; the error falls with their square.
-    metadata, detector, physical_filter
-        Go into the product.
-
-    Returns
-    -------
-    components : `FringeComponents`
-        Of frames as `fit_pca` makes them from `SkyFringe`.
+        Bins of the histogram over the range of the response; the error falls with their square.
 
     Raises
     ------
     InputError
-        Fewer than two frames, or no thickness.
+        Fewer than two frames, no thickness, or frames that are all alike.
+    OutOfRangeError
+        A thickness outside the response, or a number of components that N frames do not have.
     """
     thickness = np.asarray(thickness_um)
-    good = np.isfinite(thickness)
-    if len(scales) < 2 or not good.any():
-        raise InputError(
-            "frames and pixels", (len(scales), int(good.sum())), "two or more frames, some pixels"
-        )
-    count, centre = _thickness_histogram(thickness, bins)
+    if len(scales) < 2:
+        raise InputError("number of frames", len(scales), "two or more frames")
+    count, centre = _thickness_histogram(thickness, response.table, bins)
     factors = np.stack([response.factors(scale) for scale in scales])
     levels = factors @ (response.level * response.table.lookup(centre))
     background = levels @ count / count.sum()
@@ -188,7 +244,7 @@ def fit_pca_from_thickness(
     if not eigenvalues.sum() > 0.0:
         raise InputError("scales of the frames", "no differences between frames", "frames that vary")
     if n_components is None:
-        n_components = significant_components(eigenvalues, int(good.sum()), 0.0)
+        n_components = significant_components(eigenvalues, int(count.sum()), 0.0)
     if not 1 <= n_components <= len(scales):
         raise OutOfRangeError("number of components", n_components, f"1 to {len(scales)}")
     root = np.sqrt(np.maximum(eigenvalues[:n_components], np.finfo(float).tiny))
@@ -201,25 +257,32 @@ def fit_pca_from_thickness(
     table = ResponseTable(
         response.table.start_um, response.table.step_um, rows / unit, np.zeros(len(rows)), math.nan
     )
-    images = np.empty((len(rows), *thickness.shape), np.float32)
-    single = thickness.astype(np.float32, copy=False)
-    for row, image in enumerate(images):
-        table.frame(single, row, image)
-    mask = np.zeros(thickness.shape, np.int32)
-    if not good.all():
-        images[:, ~good] = 0.0
-        mask[~good] = mask_bits("NO_DATA")
-    return FringeComponents(
-        mean=images[0],
-        components=images[1:],
-        explained_variance=eigenvalues[:n_components] / (len(scales) - 1),
-        explained_variance_ratio=eigenvalues[:n_components] / eigenvalues.sum(),
-        scores=vectors[:, :n_components] * root * sign,
-        mask=mask,
-        metadata={**(metadata or {}), "NFRAMES": len(scales), "NOISEVAR": 0.0, "MEANSKY": unit},
-        detector=detector,
-        physical_filter=physical_filter,
+    return ThicknessComponents(
+        table,
+        eigenvalues[:n_components] / (len(scales) - 1),
+        eigenvalues[:n_components] / eigenvalues.sum(),
+        vectors[:, :n_components] * root * sign,
+        unit,
     )
+
+
+def fit_pca_from_thickness(
+    thickness_um: ArrayLike,
+    response: SkyResponse,
+    scales: Sequence[Mapping[str, float]],
+    *,
+    n_components: int | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    detector: str = "",
+    physical_filter: str = "",
+) -> FringeComponents:
+    """Principal components of noiseless model frames, without making the frames: those of `fit_pca`, in pixels.
+
+    The decomposition is that of `decompose_thickness`, which see for the arguments and for what is refused; nearly
+    all of the time goes into the images of the components.
+    """
+    found = decompose_thickness(thickness_um, response, scales, n_components=n_components)
+    return found.images(thickness_um, metadata=metadata, detector=detector, physical_filter=physical_filter)
 
 
 def noise_eigenvalue(frames: int, pixels: int, noise_variance: float) -> float:
@@ -419,45 +482,53 @@ def _signs(components: FloatArray) -> FloatArray:
     return np.where(extreme < 0.0, -1.0, 1.0)
 
 
-def _thickness_histogram(thickness: NDArray[np.floating], bins: int) -> tuple[FloatArray, FloatArray]:
-    """Pixels per bin and their mean thickness, empty bins left out; pixels that are no number do not count."""
+def _thickness_histogram(
+    thickness: NDArray[Any], table: ResponseTable, bins: int
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels per bin between the ends of a table, and centres of the bins; empty ones are left out.
+
+    Raises
+    ------
+    InputError
+        No pixel has a thickness.
+    OutOfRangeError
+        A thickness outside the table.
+    """
     values = np.ascontiguousarray(thickness).ravel()
-    low, high = (float(each) for each in _finite_range(values, _PARTS))
-    counts, totals = _fill_histogram(values, low, bins / max(high - low, 1e-12), bins, _PARTS)
-    count, total = counts.sum(axis=0), totals.sum(axis=0)
-    filled = count > 0
-    # Sums are of what is above the lowest thickness, so that nothing is lost to rounding.
-    return count[filled], np.clip(low + total[filled] / count[filled], low, high)
+    low, width = table.start_um, (table.stop_um - table.start_um) / bins
+    counts, outside = _count_thickness(values, low, 1.0 / width, bins, _PARTS)
+    for part in np.flatnonzero(outside):
+        # The table says what is wrong with it; rounding at its ends is not.
+        table.lookup(values[outside[part] - 1])
+    count = counts.sum(axis=0)
+    filled = np.flatnonzero(count)
+    if filled.size == 0:
+        raise InputError("pixels with a thickness", 0, "some pixels")
+    return count[filled].astype(float), low + (filled + 0.5) * width
 
 
 @numba.njit(cache=True, parallel=True)
-def _finite_range(values: NDArray, parts: int) -> tuple[float, float]:  # pragma: no cover - compiled
-    lows, highs = np.full(parts, np.inf), np.full(parts, -np.inf)
-    for part in numba.prange(parts):
-        low, high = np.inf, -np.inf
-        for k in range(values.size * part // parts, values.size * (part + 1) // parts):
-            value = float(values[k])
-            if np.isfinite(value):
-                low, high = min(low, value), max(high, value)
-        lows[part], highs[part] = low, high
-    return lows.min(), highs.max()
-
-
-@numba.njit(cache=True, parallel=True)
-def _fill_histogram(
+def _count_thickness(
     values: NDArray, low: float, scale: float, bins: int, parts: int
 ) -> tuple[NDArray, NDArray]:  # pragma: no cover - compiled
-    """One histogram for each of a fixed number of parts, so that threads do not change the sums."""
-    counts, totals = np.zeros((parts, bins)), np.zeros((parts, bins))
+    """Pixels per bin in each of a fixed number of parts, and one more than the place of some pixel outside.
+
+    Pixels just outside are counted in the bins at the ends; those that are no number do not count.
+    """
+    counts, outside = np.zeros((parts, bins), np.int32), np.zeros(parts, np.int64)
     for part in numba.prange(parts):
-        count, total = counts[part], totals[part]
+        count = counts[part]
+        farthest = 0.0
         for k in range(values.size * part // parts, values.size * (part + 1) // parts):
-            above = float(values[k]) - low
-            if np.isfinite(above):
-                place = min(int(above * scale), bins - 1)
-                count[place] += 1.0
-                total[place] += above
-    return counts, totals
+            place = (float(values[k]) - low) * scale
+            if 0.0 <= place < bins:
+                count[int(place)] += 1
+            elif place == place:
+                beyond = -place if place < 0.0 else place - bins
+                if beyond >= farthest:
+                    farthest, outside[part] = beyond, k + 1
+                count[0 if place < 0.0 else bins - 1] += 1
+    return counts, outside
 
 
 def _dot(one: FloatArray, two: FloatArray) -> float:
