@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..algorithms.flat_residual import flat_residual, relative_flats
-from ..algorithms.thickness_fit import FIT_METHODS, fit_thickness
+from ..algorithms.thickness_fit import FIT_METHODS, SILICON_FIELDS, SiliconSearch, fit_thickness
 from ..errors import InputError, UnknownNameError
 from ..instrument.camera import Camera
 from ..model import FringeModel, Setup
@@ -58,6 +58,13 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
     default=None,
     help="Gaussian smoothing of the flats, σ [px]; 0 for 'global', which needs none, and 3 for 'guo2022'.",
 )
+@click.option(
+    "--silicon",
+    type=click.Choice(["fixed", *SILICON_FIELDS]),
+    default="fixed",
+    show_default=True,
+    help="Thickness of the silicon: as in the model, or fitted too where flats with a narrow line tell it.",
+)
 @click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
@@ -68,6 +75,7 @@ def fit(
     out: Path,
     method: str,
     smoothing: float | None,
+    silicon: str,
     effects: tuple[tuple[str, float], ...],
     effects_file: Path | None,
     skip_bad: bool,
@@ -79,10 +87,14 @@ def fit(
     Examples:
       fringe-sim fit raws --setup ts8_e2v --out fit
       fringe-sim fit 'raws/*flat*.fits' 'raws/*bias*.fits' --method guo2022 --out fit_guo
+      fringe-sim fit broad_and_narrow.fits --silicon plane --out fit_both
     """
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
     model = FringeModel.from_setup(setup, settings)
+    search = None if silicon == "fixed" else SiliconSearch(SILICON_FIELDS[silicon])
+    if search is not None and method != "global":
+        raise InputError("--silicon", silicon, "fixed with method guo2022")
     used = paths
     cube = read_cube(paths[0]) if len(paths) == 1 else None
     if cube is None:
@@ -97,7 +109,7 @@ def fit(
     folder = prepare_folder(out)
     cards = {**effect_cards(model), **input_cards([*used, *([effects_file] if effects_file else [])])}
     click.echo("fitting the thickness", err=True)
-    fitted = fit_thickness(cube, model, method)
+    fitted = fit_thickness(cube, model, method, silicon=search)
     fitted.write_fits(folder / "thickness.fits", {"SETUP": setup.name, **cards}, section=section)
     write_report(folder, cube, fitted, model, method)
     good = fitted.mask == 0
@@ -107,8 +119,22 @@ def fit(
             f"{fitted.layer}: {low:.3f} to {high:.3f} µm (1–99 %), median σ "
             f"{1e3 * np.median(fitted.sigma[good]):.2f} nm, {100 * (1 - good.mean()):.2f} % of the pixels masked"
         )
+    if search is not None:
+        click.echo(_silicon_line(fitted))
     for name in ("thickness.fits", "report.html"):
         click.echo(str(folder / name))
+
+
+def _silicon_line(fitted: ThicknessMap) -> str:
+    """What a joint fit says of the silicon."""
+    found = fitted.metadata
+    if not found["SIFIT"]:
+        return f"silicon not fitted, its fringes counted as noise: {found['SIWHY']}"
+    parts = [
+        f"{1e3 * found[f'SICOEF{k}']:+.2f} ± {1e3 * found[f'SISIGM{k}']:.2f}"
+        for k in range(sum(key.startswith("SICOEF") for key in found))
+    ]
+    return f"silicon minus that of the model, terms 1, x, y, x², xy, y²: {', '.join(parts)} nm"
 
 
 def _prepare(

@@ -25,6 +25,7 @@ from lsst.utils.logging import getLogger
 
 from ..algorithms import fit_thickness
 from ..algorithms.template_errors import template_errors
+from ..algorithms.thickness_fit import SILICON_FIELDS, SiliconSearch
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import Setup
@@ -110,6 +111,17 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
     start_pixel: ListField[int] = ListField(
         dtype=int, optional=True, length=2, doc="Row and column at which the walk of 'guo2022' begins."
     )
+    silicon: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default="fixed",
+        doc="Thickness of the silicon in front of the varying layer.",
+        allowed={
+            "fixed": "as in the model",
+            "sensor": "one for the sensor, fitted where flats with a narrow line tell it",
+            "plane": "a plane over the sensor, fitted likewise",
+            "paraboloid": "a polynomial of second degree over the sensor, fitted likewise",
+        },
+    )
     slip_limit: Field[float] = Field(
         dtype=float,
         default=0.01,
@@ -190,6 +202,7 @@ class EpoxyFitTask(PipelineTask):
             "range_um": None if config.range_um is None else tuple(config.range_um),
             "start_pixel": None if config.start_pixel is None else tuple(config.start_pixel),
             "slip_limit": config.slip_limit,
+            "silicon": None if config.silicon == "fixed" else SiliconSearch(SILICON_FIELDS[config.silicon]),
             "threads": config.threads,
         }
 

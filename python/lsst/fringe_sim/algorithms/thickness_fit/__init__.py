@@ -6,17 +6,33 @@ from .global_fit import GlobalFit, global_fit
 from .guo2022 import walk_fit
 from .nuisances import NuisanceFit, Nuisances
 from .pixels import PixelFit
+from .silicon import (
+    SILICON_FIELDS,
+    SiliconFit,
+    SiliconForecast,
+    SiliconModel,
+    SiliconSearch,
+    find_silicon,
+    forecast_silicon,
+)
 from .templates import FringeTemplates
 
 __all__ = [
     "FIT_METHODS",
+    "SILICON_FIELDS",
     "Amplitudes",
     "FringeTemplates",
     "GlobalFit",
     "NuisanceFit",
     "Nuisances",
     "PixelFit",
+    "SiliconFit",
+    "SiliconForecast",
+    "SiliconModel",
+    "SiliconSearch",
+    "find_silicon",
     "fit_thickness",
+    "forecast_silicon",
     "global_fit",
     "make_templates",
     "walk_fit",

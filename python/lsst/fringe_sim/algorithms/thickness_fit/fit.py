@@ -19,13 +19,15 @@ from .amplitudes import Amplitudes
 from .cells import run_threaded, sample_pixels
 from .global_fit import global_fit, normalise_to_cells, spans_orders
 from .guo2022 import walk_fit
+from .joint import joint_fit
 from .nuisances import Nuisances
 from .pixels import PixelFit
 from .rescue import chi2_limits, typical_misfit
+from .silicon import SiliconModel, SiliconSearch
 from .templates import FringeTemplates
 from .uncertainty import lone_slip_probability, slip_probability
 
-__all__ = ["FIT_METHODS", "amplitudes_from_cube", "fit_thickness", "make_templates"]
+__all__ = ["FIT_METHODS", "amplitudes_from_cube", "fit_thickness", "make_templates", "with_observable"]
 
 FIT_METHODS = ("global", "guo2022")
 
@@ -50,6 +52,7 @@ def fit_thickness(
     nuisances: Nuisances | None = None,
     smoothing_px: float = 0.0,
     slip_limit: float = 0.01,
+    silicon: SiliconSearch | None = None,
     threads: int | None = None,
 ) -> ThicknessMap:
     """Thickness of the varying layer at every pixel of a sensor.
@@ -83,6 +86,10 @@ def fit_thickness(
         for flats that were not smoothed, and only with ``global``. Steep fringes lose nothing by it.
     slip_limit : `float`, optional
         Pixels whose order is wrong with a larger probability are flagged SLIP.
+    silicon : `SiliconSearch`, optional
+        Fit the thickness of the silicon too, which flats with a narrow line tell. Only with ``global``, and without
+        nuisances and smoothing. If the flats cannot tell, the fringes of the silicon count as noise and the
+        keyword ``SIFIT`` of the map is false; ``SIWHY`` says why.
     threads : `int`, optional
         Number of threads; as many as there are processors if not given. Has no influence on the result.
 
@@ -109,6 +116,14 @@ def fit_thickness(
         raise InputError(
             "smoothing [px]", smoothing_px, "0 with method guo2022, which smooths the flats instead"
         )
+    if silicon is not None and (
+        method == "guo2022" or smoothing_px > 0.0 or (nuisances is not None and nuisances.any)
+    ):
+        raise InputError(
+            "silicon",
+            silicon,
+            "fixed with method guo2022, and beside nuisances or smoothing of the likelihood",
+        )
     if not 0.0 < slip_limit <= 1.0:
         raise OutOfRangeError("slip limit", slip_limit, "above 0, at most 1")
     workers = threads if threads is not None else len(os.sched_getaffinity(0))
@@ -124,6 +139,15 @@ def fit_thickness(
         pixels, fitted = _repeated_walk(data, templates, start, (low, high), workers)
         slip = lone_slip_probability(data, fitted, pixels.value, fitted.order_um(), workers)
         notes |= {"STARTROW": start[0], "STARTCOL": start[1]}
+    elif silicon is not None:
+        seen = model if observable is None else with_observable(model, observable)
+        exposures = cube.exposures
+        any_silicon = SiliconModel(seen, exposures.wavelength_nm, exposures.bandwidth_fwhm_nm)
+        joint = joint_fit(
+            data, templates, any_silicon, silicon, range_um=(low, high), cell_px=cell_px, threads=workers
+        )
+        pixels, slip = joint.pixels, joint.slip
+        notes |= {"ORDERUM": round(joint.found.order_um, 6), **joint.silicon.cards()}
     else:
         found = global_fit(
             data,
@@ -200,9 +224,7 @@ def make_templates(
     if not 0.0 < low < high < np.inf:
         raise OutOfRangeError("thickness range [um]", (low, high), "two increasing, positive numbers")
     if observable is not None:
-        if observable not in OBSERVABLES:
-            raise UnknownNameError("observable", observable, OBSERVABLES)
-        model = replace(model, base_system=replace(model.base_system, observable=observable))
+        model = with_observable(model, observable)
     system = model.system
     index = system.stack.indices(wavelength_nm, system.temperature_k)[system.stack.position(system.varying)]
     order = float(np.mean(1e-3 * wavelength_nm / (2.0 * index.real)))
@@ -211,6 +233,19 @@ def make_templates(
     count = int(np.ceil((high + order - start) / step)) + 1
     response = model.response_on_grid(wavelength_nm, start, step, count)
     return FringeTemplates(np.ascontiguousarray(response.T), start, step, wavelength_nm)
+
+
+def with_observable(model: FringeModel, observable: str) -> FringeModel:
+    """The model with another observable.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such observable.
+    """
+    if observable not in OBSERVABLES:
+        raise UnknownNameError("observable", observable, OBSERVABLES)
+    return replace(model, base_system=replace(model.base_system, observable=observable))
 
 
 def _repeated_walk(

@@ -1,0 +1,247 @@
+"""Every pixel of a sensor whose silicon has been fitted beside its adhesive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from .amplitudes import Amplitudes
+from .borders import gather_pixels
+from .cells import core, load_row, run_threaded
+from .global_fit import GlobalFit, global_fit
+from .pixels import PixelFit
+from .silicon import (
+    STEPS_PER_SILICON_ORDER,
+    SiliconFit,
+    SiliconModel,
+    SiliconSearch,
+    SiliconTables,
+    find_silicon,
+    silicon_free,
+)
+from .templates import FringeTemplates
+from .uncertainty import slip_probability
+
+__all__ = ["JointFit", "joint_fit"]
+
+FloatArray = NDArray[np.float64]
+
+_BAND_ROWS = 16
+_STEPS = 3
+_LONGEST = 0.1
+_SURE = 0.01
+"""Probability of a wrong order below which a pixel of the first fit is believed."""
+_MEAN_STRIDE = 4
+"""Every so many pixels of a row and a column enter the mean response."""
+_LEAST_IN_MEAN = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Adhesive of every pixel, and silicon of the sensor.
+
+    Attributes
+    ----------
+    pixels : `PixelFit`
+        The adhesive. Its uncertainty contains that of the silicon.
+    slip : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        Probability that the order of a pixel is wrong.
+    silicon : `SiliconFit`
+        The silicon. If it is not decided, its fringes counted as noise of the flats.
+    found : `GlobalFit`
+        The fit in which the orders of the adhesive were solved.
+    """
+
+    pixels: PixelFit
+    slip: NDArray[np.float32]
+    silicon: SiliconFit
+    found: GlobalFit
+
+
+def joint_fit(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    model: SiliconModel,
+    search: SiliconSearch,
+    *,
+    range_um: tuple[float, float],
+    cell_px: int | None = None,
+    threads: int = 2,
+) -> JointFit:
+    """Fit adhesive and silicon.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    templates : `FringeTemplates`
+        Grid of the adhesive; its response is replaced.
+    model : `SiliconModel`
+        The model, at any silicon.
+    search : `SiliconSearch`
+        What of the silicon is free.
+    range_um : `tuple` [`float`, `float`]
+        Thicknesses of the adhesive that are possible [µm].
+    cell_px : `int`, optional
+        Size of the cells on which orders are solved [px].
+    threads : `int`, optional
+        Number of threads; has no influence on the result.
+    """
+    free, blurred = silicon_free(data, templates, model)
+    found = global_fit(free, blurred, range_um=range_um, cell_px=cell_px, threads=threads)
+    del free
+    slip = slip_probability(found)
+    order = found.order_um
+    silicon = find_silicon(data, _believed(found.pixels, slip), model, search, order)
+    if not silicon.decided:
+        return JointFit(found.pixels, slip, silicon, found)
+    if search.degree == 0:
+        fixed = replace(templates, response=model.templates(templates, float(silicon.coefficients[0])))
+        fixed = replace(fixed, mean_response=fixed.response.mean(axis=0))
+        found = global_fit(data, fixed, range_um=range_um, cell_px=cell_px, threads=threads)
+        slip = slip_probability(found)
+    pixels = _fit_pixels(data, model, silicon, found.pixels, order, threads)
+    return JointFit(pixels, slip, silicon, found)
+
+
+def _believed(pixels: PixelFit, slip: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Thickness where the order is sure; NaN elsewhere."""
+    good = (slip < _SURE) & np.isfinite(pixels.value) & np.isfinite(pixels.sigma)
+    return np.where(good, pixels.value, np.float32(np.nan))
+
+
+def _fit_pixels(
+    data: Amplitudes,
+    model: SiliconModel,
+    silicon: SiliconFit,
+    start: PixelFit,
+    order_um: float,
+    threads: int,
+) -> PixelFit:
+    """Adhesive of every pixel at the silicon of its place."""
+    shape = start.value.shape
+    offset, sigma = (part.astype(np.float32) for part in silicon.offset_um((shape[0], shape[1])))
+    known = start.value[np.isfinite(start.value)]
+    tables = model.tables(
+        (float(offset.min()), float(offset.max())),
+        STEPS_PER_SILICON_ORDER,
+        (max(float(known.min()) - order_um, 1e-3), float(known.max()) + order_um),
+        order_um,
+    )
+    mean = _mean_response(data, tables, start, offset).astype(np.float32)
+    padded = np.ones(tables.response.shape[2], np.float32)
+    padded[: mean.size] = mean
+    scale = data.scale.astype(np.float32)
+    value, spread, chi2 = start.value.copy(), start.sigma.copy(), start.chi2.copy()
+
+    def work(band: int) -> None:
+        rows = slice(band * _BAND_ROWS, (band + 1) * _BAND_ROWS)
+        image, variance, bad = data.rows(rows.start, rows.stop)
+        _joint_band(
+            image, core(variance), core(bad), scale, tables.response, padded, tables.silicon_start_um,
+            tables.silicon_step_um, tables.start_um, tables.step_um, order_um, offset[rows], sigma[rows],
+            start.n_wavelengths[rows], value[rows], spread[rows], chi2[rows],
+        )  # fmt: skip
+
+    run_threaded(work, -(-shape[0] // _BAND_ROWS), threads)
+    return PixelFit(value, spread, chi2, start.n_wavelengths)
+
+
+def _mean_response(
+    data: Amplitudes, tables: SiliconTables, start: PixelFit, offset: NDArray[np.float32]
+) -> FloatArray:
+    """Response by which a flat over its mean is to be multiplied: means of model and flat over the same pixels."""
+    ny, nx = start.value.shape
+    stride = _MEAN_STRIDE if ny * nx > _LEAST_IN_MEAN * _MEAN_STRIDE**2 else 1
+    rows, columns = np.nonzero(np.isfinite(start.value[::stride, ::stride]))
+    rows, columns = rows * stride, columns * stride
+    bands = data.shape[0]
+    value, weight = (array[:, :bands] for array in gather_pixels(data, rows, columns))
+    response, _, _ = tables.at(offset[rows, columns].astype(float), start.value[rows, columns].astype(float))
+    seen = weight > 0.0
+    model = np.where(seen, response, 0.0).sum(axis=0)
+    flat = np.where(seen, 1.0 + value, 0.0).sum(axis=0, dtype=float)
+    return np.asarray(np.divide(model, flat, out=np.ones(bands), where=flat > 0.0))
+
+
+@numba.njit(cache=True, nogil=True)
+def _joint_band(  # type: ignore[no-untyped-def]
+    image, variance, bad, scale, tables, mean, silicon_start, silicon_step, start, step, order, offset, sigma,
+    used, thickness, spread, reduced,
+):  # fmt: skip
+    """Pixels of some rows; those that left out a wavelength in the first fit stay as they are."""
+    bands, rows, columns = image.shape
+    padded = tables.shape[2]
+    amplitude, noise = np.zeros((bands, columns), np.float32), np.zeros((bands, columns), np.float32)
+    value, weight = np.zeros(padded), np.zeros(padded)
+    cubic, slope = np.zeros(4), np.zeros(4)
+    top = tables.shape[1] - 1.001
+    for r in range(rows):
+        for band in range(bands):
+            vb, bb = (band if variance.shape[0] > 1 else 0), (band if bad.shape[0] > 1 else 0)
+            vr, br = (r if variance.shape[1] > 1 else 0), (r if bad.shape[1] > 1 else 0)
+            load_row(image[band, r], variance[vb, vr], bad[bb, br], scale[band], amplitude[band], noise[band])
+        for x in range(columns):
+            if not np.isfinite(thickness[r, x]):
+                continue
+            count = 0
+            for band in range(bands):
+                weight[band] = 0.0
+                if noise[band, x] > 0.0:
+                    count += 1
+                    weight[band] = 1.0 / (noise[band, x] * mean[band] * mean[band])
+                value[band] = (1.0 + amplitude[band, x]) * mean[band]
+            if count != used[r, x] or count < 2:
+                continue
+            place = (offset[r, x] - silicon_start) / silicon_step
+            first = min(max(int(place) - 1, 0), tables.shape[0] - 4)
+            _cubic(place - first, cubic, slope)
+            at = min(max((thickness[r, x] - start) / step, 0.0), top)
+            move, own, mixed, chi2 = 0.0, 0.0, 0.0, 0.0
+            for _ in range(_STEPS):
+                at = min(
+                    max(at + min(max(move, -_LONGEST * order / step), _LONGEST * order / step), 0.0), top
+                )
+                below = int(at)
+                share = at - below
+                gain, own, mixed, chi2 = 0.0, 0.0, 0.0, 0.0
+                for band in range(bands):
+                    here, rise, along = 0.0, 0.0, 0.0
+                    for k in range(4):
+                        low = tables[first + k, below, band]
+                        up = tables[first + k, below + 1, band] - low
+                        here += cubic[k] * (low + share * up)
+                        along += slope[k] * (low + share * up)
+                        rise += cubic[k] * up
+                    left = value[band] - here
+                    gain += weight[band] * rise * left
+                    own += weight[band] * rise * rise
+                    mixed += weight[band] * rise * along
+                    chi2 += weight[band] * left * left
+                move = gain / own if own > 0.0 else 0.0
+            if own <= 0.0:
+                continue
+            found = start + step * (at + move)
+            if abs(found - thickness[r, x]) > 0.25 * order:
+                continue
+            thickness[r, x] = found
+            # The silicon moves the adhesive along the valley of the likelihood.
+            common = step * mixed / own * sigma[r, x] / silicon_step
+            spread[r, x] = np.sqrt(step * step / own + common * common)
+            reduced[r, x] = max(chi2 - gain * move, 0.0) / (count - 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _cubic(place, value, slope):  # type: ignore[no-untyped-def]
+    """Weights of nodes 0 to 3 for the value and the derivative of a cubic at a place between them."""
+    for k in range(4):
+        product, rate, scale = 1.0, 0.0, 1.0
+        for j in range(4):
+            if j != k:
+                rate = rate * (place - j) + product
+                product *= place - j
+                scale *= k - j
+        value[k], slope[k] = product / scale, rate / scale

@@ -1,0 +1,163 @@
+"""Silicon and adhesive fitted together, where flats with a narrow line allow it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from lsst.fringe_sim.algorithms import fit_thickness
+from lsst.fringe_sim.algorithms.thickness_fit import (
+    Nuisances,
+    SiliconModel,
+    SiliconSearch,
+    find_silicon,
+    forecast_silicon,
+)
+from lsst.fringe_sim.algorithms.thickness_fit.fit import amplitudes_from_cube
+from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.errors import FringeSimError, InputError, OutOfRangeError
+from lsst.fringe_sim.mock.thickness import random_field
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube
+
+SHAPE = (96, 104)
+BROAD = np.arange(880.0, 991.0, 10.0)
+NARROW = np.array([925.0, 938.0, 946.0, 957.0, 969.0, 983.0])
+NARROW_NM = 0.3
+NOISE = 0.004
+ORDER_UM = 0.3
+
+
+def places(size: int) -> np.ndarray:
+    """Places of pixels from -1 to 1."""
+    return (2.0 * np.arange(size) + 1.0) / size - 1.0
+
+
+def sensor(
+    coefficients: tuple[float, ...], rng: np.random.Generator, narrow_nm: float | None = NARROW_NM
+) -> tuple[FringeModel, np.ndarray, FringeCube]:
+    """Broad flats, and narrow ones if wanted, of a sensor with tilted silicon.
+
+    The response of every pixel comes from the model with the silicon of its column, not from the tables of the fit:
+    the tilt is along x alone.
+    """
+    model = FringeModel.from_setup("ts8_e2v")
+    truth = random_field(SHAPE, rng, mean=14.0, span=2.0)
+    narrow = NARROW if narrow_nm is not None else NARROW[:0]
+    wavelength = np.concatenate([BROAD, narrow])
+    width = np.concatenate([np.full(BROAD.size, 2.0), np.full(narrow.size, narrow_nm or 0.0)])
+    offset = coefficients[0] + (coefficients[1] if len(coefficients) > 1 else 0.0) * places(SHAPE[1])
+    image = np.empty((wavelength.size, *SHAPE))
+    columns_of = {value: np.flatnonzero(offset == value) for value in np.unique(offset)}
+    for value, columns in columns_of.items():
+        for rows in (slice(0, BROAD.size), slice(BROAD.size, None)):
+            if width[rows].size == 0:
+                continue
+            settings = {"silicon_thickness.offset": float(value), "bandwidth.fwhm": float(width[rows][0])}
+            seen = model.with_effects(settings)
+            found = seen.response(truth[:, columns].ravel(), wavelength[rows])
+            image[rows, :, columns] = found.reshape(-1, SHAPE[0], columns.size)
+    image /= image.mean(axis=(1, 2), keepdims=True)
+    image += NOISE * rng.standard_normal(image.shape)
+    cube = FringeCube(
+        image.astype(np.float32),
+        np.full(image.shape, NOISE**2, np.float32),
+        np.zeros(image.shape, np.int16),
+        FlatExposures(wavelength, width, np.array(model.setup.temperature_k)),
+        "relative",
+    )
+    return model, truth, cube
+
+
+def pulls(fitted, truth: np.ndarray) -> np.ndarray:
+    good = fitted.mask == 0
+    assert good.mean() > 0.98
+    error = (fitted.value - truth)[good]
+    assert np.count_nonzero(np.abs(error) > 0.5 * ORDER_UM) == 0
+    return np.asarray(error / fitted.sigma[good])
+
+
+@pytest.mark.slow
+def test_one_silicon_for_the_sensor(rng, tmp_path, capsys) -> None:
+    """Nearly three of its orders from the model, found with its uncertainty; without it the adhesive is wrong."""
+    model, truth, cube = sensor((0.37,), rng)
+    fitted = fit_thickness(cube, model, silicon=SiliconSearch())
+    found = fitted.metadata
+    assert found["SIFIT"] is True
+    assert found["SICOEF0"] == pytest.approx(0.37, abs=5.0 * found["SISIGM0"] + 1e-6)
+    assert 0.0 < found["SISIGM0"] < 1e-4
+    pull = pulls(fitted, truth)
+    assert pull.mean() == pytest.approx(0.0, abs=0.05)
+    assert pull.std() == pytest.approx(1.0, abs=0.1)
+    ignored = fit_thickness(cube, model)
+    assert ((ignored.value - truth) / ignored.sigma).std() > 2.0
+    cube.write_fits(tmp_path / "cube.fits")
+    out = tmp_path / "fit"
+    assert run(["fit", str(tmp_path / "cube.fits"), "--silicon", "sensor", "--out", str(out)]) == 0
+    assert "silicon minus that of the model" in capsys.readouterr().out
+    assert fits.getheader(out / "thickness.fits")["SICOEF0"] == found["SICOEF0"]
+
+
+@pytest.mark.slow
+def test_tilted_silicon(rng) -> None:
+    """A tilt of almost two orders across the sensor."""
+    model, truth, cube = sensor((-0.52, 0.11), rng)
+    fitted = fit_thickness(cube, model, silicon=SiliconSearch(degree=1))
+    found = fitted.metadata
+    expected = (-0.52, 0.11, 0.0)
+    for number, value in enumerate(expected):
+        assert found[f"SICOEF{number}"] == pytest.approx(value, abs=5.0 * found[f"SISIGM{number}"] + 5e-6)
+    pull = pulls(fitted, truth)
+    assert pull.mean() == pytest.approx(0.0, abs=0.05)
+    assert pull.std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_broad_flats_cannot_tell_and_say_so(rng, tmp_path, capsys) -> None:
+    """The adhesive is found all the same, with the fringes of the silicon as noise."""
+    _, truth, cube = sensor((0.37,), rng, None)
+    cube.write_fits(tmp_path / "cube.fits")
+    out = tmp_path / "fit"
+    assert run(["fit", str(tmp_path / "cube.fits"), "--silicon", "sensor", "--out", str(out)]) == 0
+    assert "silicon not fitted" in capsys.readouterr().out
+    header = fits.getheader(out / "thickness.fits")
+    assert header["SIFIT"] is False
+    assert "SICOEF0" not in header
+    value = fits.getdata(out / "thickness.fits", "VALUE")
+    assert np.mean(np.abs(value - truth) > 0.5 * ORDER_UM) == 0.0
+
+
+def test_the_forecast_holds(rng) -> None:
+    """Narrower lines tell more, noise tells less, and the uncertainty found is the one foretold."""
+    model, truth, cube = sensor((0.1,), rng)
+    data = amplitudes_from_cube(cube)
+    search = SiliconSearch()
+    foretold = {}
+    for width in (0.3, 0.6, 1.0):
+        widths = np.where(cube.exposures.bandwidth_fwhm_nm < 1.0, width, 2.0)
+        flats = SiliconModel(model, cube.wavelength_nm, widths)
+        foretold[width] = forecast_silicon(data, truth, flats, search, ORDER_UM)
+    assert foretold[0.3].sigma_um < 0.5 * foretold[0.6].sigma_um < 0.25 * foretold[1.0].sigma_um
+    flats = SiliconModel(model, cube.wavelength_nm, cube.exposures.bandwidth_fwhm_nm)
+    assert foretold[0.3].fringe[: BROAD.size].max() < 0.05 * foretold[0.3].fringe[BROAD.size :].min()
+    found = find_silicon(data, truth.astype(np.float32), flats, search, ORDER_UM)
+    assert found.decided
+    assert np.sqrt(found.covariance[0, 0]) == pytest.approx(found.forecast.sigma_um, rel=0.3)
+    assert found.chi2 == pytest.approx(1.0, abs=0.05)
+    offset, sigma = found.offset_um((5, 7))
+    assert offset.shape == sigma.shape == (5, 7)
+    assert np.ptp(offset) == 0.0
+
+
+def test_what_cannot_be_combined_is_refused(rng) -> None:
+    model = FringeModel.from_setup("ts8_e2v")
+    _, _, cube = sensor((0.0,), rng, None)
+    for choice in ({"method": "guo2022"}, {"smoothing_px": 2.0}, {"nuisances": Nuisances(level=True)}):
+        with pytest.raises(InputError, match="silicon"):
+            fit_thickness(cube, model, silicon=SiliconSearch(), **choice)
+    with pytest.raises(InputError, match="varying layer"):
+        SiliconModel(FringeModel.from_setup("ts8_itl"), BROAD, np.full(BROAD.size, 2.0))
+    for choice in ({"degree": 3}, {"span_um": 0.0}, {"tilt_um": -1.0}, {"slip_limit": 2.0}):
+        with pytest.raises(OutOfRangeError):
+            SiliconSearch(**choice)
+    assert issubclass(OutOfRangeError, FringeSimError)
