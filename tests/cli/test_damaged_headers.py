@@ -74,6 +74,13 @@ def test_a_header_with_endless_axes_is_refused_at_once(reader: str, number: int,
     assert time.process_time() - started < 5.0
 
 
+def test_a_column_without_a_name_is_a_damage(tmp_path: Path) -> None:
+    path = tmp_path / "column.fits"
+    path.write_bytes(replaced(product("FringeCube", tmp_path), "TTYPE1", "0"))
+    with pytest.raises(FrameFormatError):
+        FringeCube.read_fits(path)
+
+
 @pytest.mark.parametrize("value", ["1", "0.0", "-1", "'text'", "T"])
 def test_a_cube_with_other_axes_than_it_has_is_refused(value: str, tmp_path: Path) -> None:
     path = tmp_path / "cube.fits"

@@ -128,6 +128,23 @@ def test_effects_come_back_exactly() -> None:
     assert effects_of_header({"EFFECTIV": 3.0}) == {}
 
 
+@pytest.mark.parametrize("value", [{}, {"EFFVAL0": "much"}, {"EFFVAL0": None}, {"EFFVAL0": [1]}])
+def test_an_effect_without_a_number_is_refused(
+    value: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "verdict.json"
+    path.write_text(json.dumps({"provenance": {"EFFECT0": "bandwidth.fwhm", **value}}))
+    assert run(["provenance", str(path)]) == 1
+    assert "EFFVAL0 is" in capsys.readouterr().err
+
+
+def test_a_document_nested_too_deeply_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "deep.json"
+    path.write_text("[" * 100_000)
+    assert run(["provenance", str(path)]) == 1
+    assert "an undamaged FITS, ECSV or JSON product" in capsys.readouterr().err
+
+
 def test_tables_are_those_of_stack_effects_and_sky() -> None:
     lab, sky = (set(tables_of(Setup.from_name(name))) for name in ("ts8_e2v", "lsst_e2v"))
     assert ("sky", "oh_lines_palace_yband.ecsv") in sky - lab

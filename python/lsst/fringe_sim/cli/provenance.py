@@ -88,7 +88,7 @@ def read_header(path: str) -> dict[str, Any]:
             return readers.get(suffix, _fits_header)(path)
     except InputError:
         raise
-    except DAMAGE as error:
+    except (*DAMAGE, RecursionError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise FrameFormatError(
             "file", reason, "an undamaged FITS, ECSV or JSON product", source=path

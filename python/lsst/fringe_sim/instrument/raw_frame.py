@@ -284,6 +284,7 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
         AttributeError,
         OverflowError,
         MemoryError,
+        AssertionError,
         Warning,
         fits.VerifyError,
     ) as error:

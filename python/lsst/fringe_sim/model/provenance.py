@@ -26,7 +26,7 @@ from typing import Any
 
 from .. import __version__
 from ..effects import EFFECTS, activate_effects, apply_to_system
-from ..errors import UnknownNameError
+from ..errors import FrameFormatError, UnknownNameError
 from ..optics.stack import LayerStack
 from ..optics.system import OpticalSystem
 from ..resources import REVISION_LENGTH, read_yaml, revision
@@ -91,11 +91,21 @@ def effect_cards(effects: Mapping[str, float]) -> dict[str, str | float]:
 
 
 def effects_of_header(header: Mapping[str, Any]) -> dict[str, float]:
-    """Effects by ``name.parameter`` that a header states; the inverse of `effect_cards`."""
+    """Effects by ``name.parameter`` that a header states; the inverse of `effect_cards`.
+
+    Raises
+    ------
+    FrameFormatError
+        An effect without a value that is a number.
+    """
     found: dict[str, float] = {}
     number = 0
     while f"EFFECT{number}" in header:
-        found[str(header[f"EFFECT{number}"])] = float(header[f"EFFVAL{number}"])
+        name, value = str(header[f"EFFECT{number}"]), header.get(f"EFFVAL{number}")
+        try:
+            found[name] = float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            raise FrameFormatError(f"EFFVAL{number}", value, f"a number, the value of {name}") from None
         number += 1
     return found
 

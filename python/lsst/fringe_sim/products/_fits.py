@@ -62,6 +62,7 @@ DAMAGE = (
         AttributeError,
         OverflowError,
         MemoryError,
+        AssertionError,
         zlib.error,
     ),
     *(UserWarning, fits.VerifyError),
