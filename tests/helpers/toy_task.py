@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from pathlib import Path
 from typing import Any
 
 import lsst.pex.config as pex_config
@@ -28,6 +31,8 @@ class HeaderConnections(pipe_base.PipelineTaskConnections, dimensions=("instrume
 
 class HeaderConfig(pipe_base.PipelineTaskConfig, pipelineConnections=HeaderConnections):
     refused = pex_config.Field[str](doc="sensor at which the task fails", default="")
+    killed = pex_config.Field[str](doc="sensor at which the process dies ...", default="")
+    killed_while = pex_config.Field[str](doc="... as long as this file is there", default="")
 
 
 class HeaderTask(pipe_base.PipelineTask):
@@ -37,4 +42,6 @@ class HeaderTask(pipe_base.PipelineTask):
     def run(self, raw: Any) -> pipe_base.Struct:
         if raw.serial == self.config.refused:
             raise RuntimeError(f"refused: {raw.serial}")
+        if raw.serial == self.config.killed and Path(self.config.killed_while).exists():
+            os.kill(os.getpid(), signal.SIGKILL)
         return pipe_base.Struct(header={"wavelength_nm": raw.wavelength_nm, "serial": raw.serial})

@@ -1,8 +1,8 @@
 """Parsl as a batch service, for environments made from a package index.
 
 Two things differ from `lsst.ctrl.bps.parsl.ParslService`. It works without Rubin's own installation
-(`bps_environment`). And a failed job is not passed over in silence: when all jobs have ended, `bps submit` names
-those that failed and exits with status 1.
+(`bps_environment`). And a failed job is not passed over in silence: when all jobs have ended, `bps submit` and
+`bps restart` name those that failed and exit with status 1.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from lsst.ctrl.bps.parsl import ParslService
+from lsst.ctrl.bps.parsl.workflow import ParslWorkflow
 
 from .bps_environment import accept_resources, point_to_this_environment
 
@@ -44,11 +45,34 @@ class FringeParslService(ParslService):
             Jobs failed. What the others made is in the repository.
         """
         super().submit(workflow, **kwargs)
-        failed = failed_jobs(workflow)
-        if failed:
-            started = sum(job.future is not None for job in workflow.jobs.values())
-            raise click.ClickException(
-                f"{len(failed)} of {started} jobs failed: {', '.join(failed[:8])}"
-                f"{' …' if len(failed) > 8 else ''}; their logs are in {workflow.path}/logs, and "
-                f"pipetask report REPO {workflow.path}/*.qg --force-v2 says which sensors are affected"
-            )
+        _complain_of_failures(workflow)
+
+    def restart(self, out_prefix: str) -> tuple[str, str, str]:
+        """Run what is left of a workflow that was interrupted, or of which jobs failed.
+
+        Parameters
+        ----------
+        out_prefix : `str`
+            The submit directory of the workflow.
+
+        Raises
+        ------
+        click.ClickException
+            Jobs failed again.
+        """
+        workflow = ParslWorkflow.read(out_prefix)
+        workflow.restart()
+        workflow.run()
+        _complain_of_failures(workflow)
+        return workflow.name, workflow.name, ""
+
+
+def _complain_of_failures(workflow: Any) -> None:
+    failed = failed_jobs(workflow)
+    if failed:
+        started = sum(job.future is not None for job in workflow.jobs.values())
+        raise click.ClickException(
+            f"{len(failed)} of {started} jobs failed: {', '.join(failed[:8])}"
+            f"{' …' if len(failed) > 8 else ''}; their logs are in {workflow.path}/logs, and "
+            f"pipetask report REPO {workflow.path}/*.qg --force-v2 says which sensors are affected"
+        )
