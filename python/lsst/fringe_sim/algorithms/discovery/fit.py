@@ -250,6 +250,9 @@ class Problem:
     free_contrast : `bool`
         Whether the fringes of each wavelength have an amplitude of their own: the ``W`` contrasts, relative to
         the model's, follow the levels.
+    reference : `numpy.ndarray`, shape ``(W, ny, nx)``, optional
+        Light of the cells that the scatter of their response multiplies; that of the first guess by default. With
+        it, χ² means the same in all fits.
     """
 
     cells: CellData
@@ -258,6 +261,16 @@ class Problem:
     level_basis: FloatArray
     field_prior: float = 0.0
     free_contrast: bool = False
+    reference: FloatArray | None = None
+
+    def whitener(self, value: FloatArray) -> Whitener:
+        """Whitener for the noise about `reference`, or about the prediction ``value`` if there is none."""
+        if self.reference is not None:
+            return Whitener.of_cells(self.cells, self.reference)
+        weight = self.cells.weight  # where there are no data, the prediction may be anything
+        return Whitener.of_cells(
+            self.cells, value / max(float((weight * value).sum() / weight.sum()), 1e-300)
+        )
 
     @property
     def n_levels(self) -> int:
@@ -531,7 +544,7 @@ class _Solver:
         thickness = problem.basis.expand(field_start)
         problem.forward.cover(thickness)
         reference = problem.forward.predict(self.settings(start), thickness).value
-        self.whiten = Whitener.of_cells(problem.cells, reference / reference.mean())
+        self.whiten = problem.whitener(reference)
         levels = self._first_levels(reference) if levels_start is None else levels_start.copy()
         point = self.evaluate(_Point(start.copy(), levels, field_start.copy()))
         damping, converged, count = 0.0, False, 0
@@ -695,6 +708,6 @@ def linearise_at(problem: Problem, fit: Fit) -> tuple[Design, FloatArray, Predic
     thickness = problem.basis.expand(fit.field)
     problem.forward.cover(thickness)
     reference = problem.forward.predict(fit.settings, thickness).value
-    solver.whiten = Whitener.of_cells(problem.cells, reference / reference.mean())
+    solver.whiten = problem.whitener(reference)
     point = solver.evaluate(_Point(fit.position, fit.levels, fit.field))
     return solver.linearise(point), point.residual, point.prediction, thickness, solver.whiten

@@ -217,8 +217,9 @@ def _interpolate(
     value = np.empty((waves, thickness.size))
     slope = np.empty((waves, thickness.size))
     for i in range(thickness.size):
-        position = (thickness[i] - start) / step
-        k = min(max(int(np.floor(position)), 3), nodes - 5)
+        # Cells without data may be anywhere; beyond the table they stay at its ends.
+        position = min(max((thickness[i] - start) / step, 3.0), nodes - 4.0)
+        k = min(int(np.floor(position)), nodes - 5)
         x = position - k
         half = 0.5 * second[i] / (step * step)
         rest = fourth[i] / 24.0 / (step * step) ** 2

@@ -42,6 +42,9 @@ ORDERS_TRIED = 6
 
 STEPS_PER_ORDER = 12
 
+SHIFTING_SETS = 3
+"""Sets of several effects that are looked for in other fringe orders."""
+
 MANY_PARAMETERS = 8
 CONTAINED = 0.9
 """Parameters from which on an effect may hide another, and the cosine from which on one may be hidden in it."""
@@ -267,10 +270,11 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
 def _settle(problem: Problem, fit: Fit, stated: CellData, index: FloatArray) -> _Prepared:
     """Measure the noise at a fit with free contrast, and fit the unchanged model with it."""
     value = problem.forward.predict(fit.settings, problem.basis.expand(fit.field)).value
-    even = stated.with_noise_of(problem.expected(fit.levels, value))
+    expected = problem.expected(fit.levels, value)
+    even = stated.with_noise_of(expected)
     noise = _measure_noise(replace(problem, cells=even), fit)
     cells = even.scaled_noise(noise.factor, noise.response_scatter)
-    problem = replace(problem, cells=cells, free_contrast=False)
+    problem = replace(problem, cells=cells, free_contrast=False, reference=expected)
     levels = fit.levels[: problem.n_levels]
     settled = fit_model(problem, (), np.zeros(0), fit.field, levels)
     notes = []
@@ -511,6 +515,8 @@ class _Search:
             if not larger:
                 break
             best = self._most_credible(selector, larger)
+            if not self._consistent(best):
+                best = self._most_credible(selector, self._other_orders(selector, larger))
             if best.log_evidence < current.log_evidence + self.options.least_evidence:
                 break
             if not self._consistent(best):
@@ -598,9 +604,16 @@ class _Search:
         return selector.with_channels(current)
 
     def _searched_harder(self, selector: Selector, singles: list[Hypothesis]) -> list[Hypothesis]:
-        """The nearly best single effects, tried at other sizes too."""
+        """The nearly best single effects, and those that shift the phase, tried at other sizes too."""
         near = [h for h in singles if h.log_evidence > 0.7 * singles[0].log_evidence][:4]
+        near += [h for h in singles if h not in near and selector.shifts_phase(h)]
         return [selector.improved(h.names, selector.null.fit, scan=True) for h in near]
+
+    def _other_orders(self, selector: Selector, found: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """The sets, the best of those that shift the phase looked for in other fringe orders too."""
+        ranked = sorted(found, key=lambda h: -h.log_evidence)
+        shifting = [h for h in ranked if selector.shifts_phase(h)][:SHIFTING_SETS]
+        return [selector.improved(h.names, h.fit, scan=True) if h in shifting else h for h in ranked]
 
     def _most_credible(self, selector: Selector, found: Sequence[Hypothesis]) -> Hypothesis:
         """Best of some sets by their evidence and by what they leave: a residual that is no noise speaks against."""

@@ -33,6 +33,10 @@ SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Departures, in prior scales, at which the finite signature of an effect is tried."""
 
 
+FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
+LIKE_THICKNESS = 0.5
+"""Sizes of effects that shift the phase, and the part of a signature that thickness could make at one wavelength."""
+
 MINIMA_TRIED = 12
 """Neighbouring minima on both sides of the first one found among which the deepest is looked for."""
 
@@ -338,7 +342,7 @@ class Selector:
         trials = [(start, base.field) for start in starts]
         if scan:
             trials += [(start, base.field) for start in self._spread_starts(known.fit)]
-            trials += self._other_orders(known.fit)
+            trials += self._settled_alone(known.fit)
         for start, thickness in trials:
             trial = fit_model(self.problem, coordinates, start, thickness, base.levels)
             if trial.chi2 < known.fit.chi2 - 1.0:
@@ -347,11 +351,29 @@ class Selector:
         self.fitted[frozenset(names)] = known
         return known
 
-    def _other_orders(self, fit: Fit) -> list[tuple[FloatArray, FloatArray]]:
+    def _settled_alone(self, fit: Fit) -> list[tuple[FloatArray, FloatArray]]:
+        """Positions and fields in other orders, in which the moved coordinate found its size with the others held.
+
+        A second coordinate that is nearly thickness itself would lead a fit from a rough size astray.
+        """
+        found = []
+        for moved, position, thickness in self._other_orders(fit):
+            others = [n for n in range(len(position)) if n != moved]
+            held = {fit.coordinates[n].key: fit.coordinates[n].value(position[n]) for n in others}
+            alone = fit_model(
+                self.problem, (fit.coordinates[moved],), position[[moved]], thickness, fit.levels, held
+            )
+            settled = position.copy()
+            settled[moved] = alone.position[0]
+            found.append((settled, alone.field, alone.chi2))
+        found.sort(key=lambda place: place[2])
+        return [(position, thickness) for position, thickness, _ in found[:ORDERS_REFITTED]]
+
+    def _other_orders(self, fit: Fit) -> list[tuple[int, FloatArray, FloatArray]]:
         """Places worth a fit: sizes of the last effect with fields moved by up to some fringe orders.
 
         A strong effect on the phase is taken for thickness at first, in the order that suits it best; from there no
-        fit finds back. A sample of cells is compared with the model, levels free.
+        fit finds back. A sample of cells is compared with the model, levels and contrasts free.
         """
         forward, problem = self.problem.forward, self.problem
         if forward.is_image_effect(fit.coordinates[-1].effect) or not self.generic:
@@ -366,34 +388,67 @@ class Selector:
         shifts = shifts[(middle + shifts) * thickness.min() / middle > 0.5]
         for edge in (shifts[0], shifts[-1]):
             forward.cover(whole * (1.0 + edge / middle))
-        places = []
-        for position in self._single_steps(fit):
+        # The best of each parameter and order: sizes lie too far apart for the right one to win at once.
+        places: dict[tuple[int, int], tuple[float, FloatArray, float]] = {}
+        for moved, position in self._single_steps(fit):
             settings = {c.key: c.value(x) for c, x in zip(fit.coordinates, position, strict=True)}
             chi2 = np.array([
-                _chi2_with_free_levels(forward.sampled(settings, thickness * (1.0 + shift / middle)), value, weight)
+                _chi2_with_free_fringes(forward.sampled(settings, thickness * (1.0 + shift / middle)), value, weight)
                 for shift in shifts
             ])  # fmt: skip
-            places.append((float(chi2.min()), position, float(shifts[int(chi2.argmin())])))
-        best = sorted(places, key=lambda place: place[0])[:ORDERS_REFITTED]
+            for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
+                inside = np.flatnonzero(np.abs(shifts - turn * order) <= 0.51 * order)
+                if inside.size:
+                    least = inside[int(chi2[inside].argmin())]
+                    if chi2[least] < places.get((moved, turn), (math.inf,))[0]:
+                        places[moved, turn] = (float(chi2[least]), position, float(shifts[least]))
+        best: list[tuple[int, tuple[float, FloatArray, float]]] = []
+        for number in {moved for moved, _ in places}:
+            own = [place for (moved, _), place in places.items() if moved == number]
+            best += [(number, place) for place in sorted(own, key=lambda place: place[0])[:ORDERS_REFITTED]]
         used = (problem.cells.weight > 0).any(axis=0).astype(float)
         return [
-            (position, problem.basis.fit(whole * (1.0 + shift / middle), used)) for _, position, shift in best
+            (number, position, problem.basis.fit(whole * (1.0 + shift / middle), used))
+            for number, (_, position, shift) in best
         ]
 
-    def _single_steps(self, fit: Fit) -> list[FloatArray]:
-        """Positions in which one coordinate of the last effect has another size, the others of it none."""
+    def _single_steps(self, fit: Fit) -> list[tuple[int, FloatArray]]:
+        """Positions in which one phase-like coordinate of the last effect has another size, its others none."""
         own = np.array([item.effect == fit.coordinates[-1].effect for item in fit.coordinates])
-        found = [fit.position]
-        for number in np.flatnonzero(own):
+        found = []
+        for number in self._shifts_of_phase(fit):
             item = fit.coordinates[number]
             for bound in (item.low, item.high):
-                sizes = item.null + np.sign(bound - item.null) * item.scale * np.array(SCAN)
-                for size in (*sizes, *(item.null + np.array([0.3, 0.6, 0.9]) * (bound - item.null))):
+                for size in item.null + np.sign(bound - item.null) * item.scale * np.array(FINE_SCAN):
                     if item.low <= size <= item.high and size != item.null:
                         position = np.where(own, 0.0, fit.position)
                         position[number] = item.coordinate(float(size))
-                        found.append(position)
+                        found.append((number, position))
         return found
+
+    def shifts_phase(self, hypothesis: Hypothesis) -> bool:
+        """Whether the last effect of a set shifts the phase of the fringes: its fit may be in the wrong order."""
+        optical = not self.problem.forward.is_image_effect(hypothesis.names[-1])
+        return self.generic and optical and bool(self._shifts_of_phase(hypothesis.fit))
+
+    def _shifts_of_phase(self, fit: Fit) -> list[int]:
+        """Coordinates of the last effect that do, at each wavelength by itself, what a change of thickness does."""
+        name = fit.coordinates[-1].effect
+        without = replace(
+            fit,
+            settings={key: value for key, value in fit.settings.items() if key.partition(".")[0] != name},
+            coordinates=(),
+            position=np.zeros(0),
+            information=np.zeros((0, 0)),
+            spread=np.zeros(0),
+        )
+        state = self.state(without)
+        features, slope = self.features(state, without, name), state.design.slope
+        along = np.einsum("kwyx,wyx->kw", features, slope) ** 2 / (slope**2).sum(axis=(1, 2))
+        whole = (features**2).sum(axis=(1, 2, 3))
+        part = np.divide(along.sum(axis=1), whole, out=np.zeros(len(whole)), where=whole > 0.0)
+        first = len(fit.coordinates) - len(features)
+        return [first + int(place) for place in np.flatnonzero(part > LIKE_THICKNESS)]
 
     def _spread_starts(self, fit: Fit, *, both_sides: bool = False) -> list[FloatArray]:
         """The fit with its last effect moved to other sizes, from near the null to near the bound."""
@@ -554,11 +609,14 @@ class Selector:
         return float(total)
 
 
-def _chi2_with_free_levels(model: FloatArray, value: FloatArray, weight: FloatArray) -> float:
-    """χ² with the best level at each wavelength."""
-    cross, square = (weight * model * value).sum(axis=(1, 2)), (weight * model**2).sum(axis=(1, 2))
-    taken = np.divide(cross**2, square, out=np.zeros_like(cross), where=square > 0.0)
-    return float((weight * value**2).sum() - taken.sum())
+def _chi2_with_free_fringes(model: FloatArray, value: FloatArray, weight: FloatArray) -> float:
+    """χ² with the best level and the best contrast, not a negative one, at each wavelength."""
+    total = np.maximum(weight.sum(axis=(1, 2)), 1e-300)[:, None, None]
+    fringe = model - (weight * model).sum(axis=(1, 2), keepdims=True) / total
+    rest = value - (weight * value).sum(axis=(1, 2), keepdims=True) / total
+    cross, square = (weight * fringe * rest).sum(axis=(1, 2)), (weight * fringe**2).sum(axis=(1, 2))
+    taken = np.divide(np.maximum(cross, 0.0) ** 2, square, out=np.zeros_like(cross), where=square > 0.0)
+    return float((weight * rest**2).sum() - taken.sum())
 
 
 def _bounded_minimum(
