@@ -33,6 +33,19 @@ def test_one_frame_is_written_with_its_errors(thickness, tmp_path, capsys) -> No
     assert "rms" in capsys.readouterr().out
 
 
+def test_level_is_that_of_the_measured_quantum_efficiency(thickness, tmp_path) -> None:
+    """2717 electrons in 30 s at the zenith within 10 %, unless the level of the stack is asked for."""
+    frames = {}
+    for level in ("measured", "model"):
+        out = tmp_path / level
+        assert run(["sky", "--thickness", thickness, "--level", level, "--out", str(out)]) == 0
+        frames[level] = SkyFringe.read_fits(out / "sky_R22_S11_00.fits")
+    assert frames["measured"].mean_electrons == pytest.approx(2717, rel=0.1)
+    assert frames["model"].mean_electrons == pytest.approx(1825, rel=0.02)
+    rms = [float(frame.metadata["FRINGRMS"]) for frame in frames.values()]
+    assert rms[0] == pytest.approx(rms[1], rel=1e-5)
+
+
 def test_fringes_fade_towards_the_edge_of_the_field(thickness, tmp_path) -> None:
     rms = {}
     for detector in ("R22_S11", "R11_S01"):

@@ -29,8 +29,9 @@ _FEW_FRAMES = 64
 """Up to so many frames products are made in double precision by the compiled kernel, beyond in single precision by
 a matrix product of each tile, which is four times as fast there; sums over tiles are always in double precision."""
 
-_PRODUCT_FRAMES = 100
-"""Frames along a side of a block of the Gram matrix, of which only one half is computed."""
+_PRODUCT_FRAMES = 200
+"""Frames whose products with all later ones are made at a time; narrower blocks of the Gram matrix would waste less
+of its lower half, but more time on bringing frames into the order that a matrix product wants."""
 
 _SKEW = 40
 """Columns by which the rows of a tile are longer than needed, so that they do not share cache lines of one set."""
@@ -195,9 +196,14 @@ class FrameStack:
         tile = np.zeros((count + -count % 4, self.rows * width + _SKEW), dtype=precision)
         total = np.empty(self.rows * width)
         relative = self.offset - self.offset[0]
+        flats = [_flat(image) for image in self.frames]
         for start in range(0, self.good.shape[0], self.rows):
             part = slice(start, start + self.rows)
-            values = [_native(image[part]) for image in self.frames]
+            pixels = slice(start * width, (start + self.rows) * width)
+            values = [
+                _native(image[part]) if flat is None else flat[pixels]
+                for image, flat in zip(self.frames, flats, strict=True)
+            ]
             used = values[0].size
             total[:used] = 0.0
             for number, each in enumerate(values):
@@ -205,6 +211,13 @@ class FrameStack:
             good = self.good[part]
             _drop(total, good.ravel(), tile)
             yield part, used, tile, total[:used]
+
+
+def _flat(image: Any) -> NDArray[Any] | None:
+    """Pixels of an image that compiled code reads as it is, in one dimension; nothing for any other."""
+    if isinstance(image, np.ndarray) and image.flags.c_contiguous and image.dtype.isnative:
+        return image.reshape(-1) if image.dtype in (np.float32, np.float64) else None
+    return None
 
 
 def _native(rows: Any) -> NDArray[Any]:
@@ -229,10 +242,9 @@ def _no_pixels() -> InputError:
 def _add_block_products(tile: NDArray[np.float32], total: FloatArray) -> None:
     """Add the products of all frames of a tile to the upper half of a Gram matrix."""
     for i in range(0, len(tile), _PRODUCT_FRAMES):
-        one = slice(i, i + _PRODUCT_FRAMES)
-        for j in range(i, len(tile), _PRODUCT_FRAMES):
-            other = slice(j, min(j + _PRODUCT_FRAMES, len(tile)))
-            total[one, other][: len(tile) - i] += tile[one] @ tile[other].T
+        total[i : i + _PRODUCT_FRAMES, i : len(tile)][: len(tile) - i] += (
+            tile[i : i + _PRODUCT_FRAMES] @ tile[i:].T
+        )
 
 
 @numba.njit(cache=True, fastmath={"contract"})

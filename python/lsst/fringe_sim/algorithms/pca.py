@@ -504,7 +504,7 @@ def _thickness_histogram(
     filled = np.flatnonzero(count)
     if filled.size == 0:
         raise InputError("pixels with a thickness", 0, "some pixels")
-    return count[filled].astype(float), low + (filled + 0.5) * width
+    return count[filled].astype(np.float64), np.asarray(low + (filled + 0.5) * width, dtype=np.float64)
 
 
 @numba.njit(cache=True, parallel=True)

@@ -7,7 +7,7 @@ a whole night of frames, is then a weighted sum of table rows and one interpolat
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -401,6 +401,7 @@ def simulate_night(
     night: NightHistory,
     *,
     exposure_s: float | None = None,
+    mean_electrons: Sequence[float] | None = None,
     seed: int | None = None,
     read_noise_e: float = 0.0,
     charge_kernel: ArrayLike | None = None,
@@ -415,13 +416,23 @@ def simulate_night(
         See `simulate_sky_frame`.
     night : `NightHistory`
         Intensity of the OH bands through the night.
+    mean_electrons : sequence of `float`, optional
+        Mean level of each frame [e⁻], such as `throughput_electrons` of the sky at its time; by default what the
+        model itself detects.
     seed : `int`, optional
         Seed of the night; every frame gets its own noise. No noise if not given.
 
     Yields
     ------
     frame : `SkyFringe`
+
+    Raises
+    ------
+    InputError
+        Levels that are not as many as the times of the night.
     """
+    if mean_electrons is not None and len(mean_electrons) != len(night):
+        raise InputError("mean levels", len(mean_electrons), f"one for each of {len(night)} frames")
     children = np.random.SeedSequence(0 if seed is None else seed).generate_state(len(night), np.uint32)
     for time in range(len(night)):
         yield simulate_sky_frame(
@@ -430,6 +441,7 @@ def simulate_night(
             response=response,
             scale=night.band_scale(time, response.bands),
             exposure_s=exposure_s,
+            mean_electrons=None if mean_electrons is None else mean_electrons[time],
             read_noise_e=read_noise_e,
             charge_kernel=charge_kernel,
             seed=None if seed is None else int(children[time]),

@@ -8,8 +8,14 @@ from typing import Any
 import click
 import numpy as np
 
-from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, sky_response
+from ..algorithms.sky_frame import (
+    simulate_night,
+    simulate_sky_frame,
+    sky_response,
+    throughput_electrons,
+)
 from ..errors import InputError, OutOfRangeError
+from ..instrument.bandpass import Bandpass
 from ..instrument.camera import Camera
 from ..instrument.night import NightHistory
 from ..instrument.sky import SkySpectrum
@@ -40,6 +46,13 @@ PERCENT = 100.0
 @click.option("--exptime", type=Quantity("s"), default=None, help="Exposure time; by default the set-up's.")
 @click.option("--airmass", type=click.FloatRange(1.0, 5.0), default=None, help="By default the set-up's.")
 @click.option("--night/--one-frame", default=False, help="Eleven hourly frames of the published night.")
+@click.option(
+    "--level",
+    type=click.Choice(["measured", "model"]),
+    default="measured",
+    show_default=True,
+    help="Mean level: that of the measured quantum efficiency, or what the stack itself detects.",
+)
 @click.option("--noise/--no-noise", default=False, help="Photon and read noise.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the noise.")
 @click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
@@ -55,6 +68,7 @@ def sky(
     exptime: float | None,
     airmass: float | None,
     night: bool,
+    level: str,
     noise: bool,
     seed: int,
     effects: tuple[tuple[str, float], ...],
@@ -113,9 +127,24 @@ def sky(
         "detector": sensor.name,
         "physical_filter": setup.bandpass,
     }
+    history = NightHistory.guo2022()
+    skies = [dark]
+    if night:
+        skies = [
+            dark.with_band_scale(history.band_scale(time, response.bands)) for time in range(len(history))
+        ]
+    band = Bandpass.from_name(setup.bandpass)
+    measured = [throughput_electrons(each, band, model, exptime) for each in skies]
+    levels = measured if level == "measured" else None
     if night:
         series = simulate_night(
-            layer, model, response, NightHistory.guo2022(), seed=seed if noise else None, **common
+            layer,
+            model,
+            response,
+            history,
+            mean_electrons=levels,
+            seed=seed if noise else None,
+            **common,
         )
     else:
         series = iter(
@@ -125,6 +154,7 @@ def sky(
                     model,
                     response=response,
                     exposure_s=exptime,
+                    mean_electrons=None if levels is None else levels[0],
                     seed=seed if noise else None,
                     **common,
                 )
