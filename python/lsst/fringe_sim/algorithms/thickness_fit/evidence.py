@@ -183,7 +183,7 @@ def _distrust_misfits(evidence: NDArray[np.float32], chi2: NDArray[np.float32]) 
     evidence[worse] *= np.where(inside, (limit / chi2[worse])[:, None] ** 2, np.float32(1))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
 def _chi2_line(value, weight, nodes, chi2):  # type: ignore[no-untyped-def]
     count = chi2.shape[0]
     used = 0

@@ -101,7 +101,7 @@ def _paths(ny: int, nx: int, row: int, column: int) -> tuple[NDArray[np.int64], 
     return forward, backward
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
 def _load(image, variance, bad, scale, y, x, value, weight):  # type: ignore[no-untyped-def]
     """Amplitudes and weights of one pixel; returns the number of wavelengths that can be used."""
     used = 0
@@ -118,7 +118,7 @@ def _load(image, variance, bad, scale, y, x, value, weight):  # type: ignore[no-
     return used
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
 def _search(table, value, weight, low, high, chi2):  # type: ignore[no-untyped-def]
     """Row of least chi-square in ``low..high`` (both included); the first of equals."""
     count = high - low + 1

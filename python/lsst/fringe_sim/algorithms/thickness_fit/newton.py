@@ -35,7 +35,7 @@ def _score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
     return gain, information, chi2
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
 def score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
     """Score, information and chi-square at one place of the table, in units of its step.
 
@@ -58,7 +58,7 @@ def score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
     return _score(table, place, value, weight, item)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
 def _go_on(table, place, value, weight, item, step, steps, limit):  # type: ignore[no-untyped-def]
     """Third and further steps."""
     top = table.shape[0] - 1.0
@@ -72,7 +72,7 @@ def _go_on(table, place, value, weight, item, step, steps, limit):  # type: igno
     return place, information, chi2
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
 def newton_block(table, place, value, weight, count, steps, longest, information, chi2, move):  # type: ignore[no-untyped-def]
     """Like `gauss_newton` for the first ``count`` items, in place.
 
@@ -98,7 +98,7 @@ def newton_block(table, place, value, weight, count, steps, longest, information
             place[k] = min(max(place[k] + move[k], 0.0), top)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
 def gauss_newton(table, place, value, weight, item, steps, longest):  # type: ignore[no-untyped-def]
     """Least chi-square near a place of the table.
 

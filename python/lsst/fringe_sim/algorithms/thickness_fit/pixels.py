@@ -305,7 +305,7 @@ def _invert_row(spread, used):  # type: ignore[no-untyped-def]
         spread[x] = np.float32(1.0) / variance if good else np.float32(0.0)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
 def _start_row(thickness, smooth, below, share, below_x, share_x, upright, begin, flat):  # type: ignore[no-untyped-def]
     """Thickness of the surface along one row, and where it is smooth; returns the row of the nearest cells."""
     above = min(below + 1, thickness.shape[0] - 1)
@@ -320,7 +320,7 @@ def _start_row(thickness, smooth, below, share, below_x, share_x, upright, begin
     return own
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
 def _finish_row(value, sigma, chi2, used, step):  # type: ignore[no-untyped-def]
     """Information to standard uncertainty, chi-square to reduced chi-square; NaN where there was nothing to fit."""
     for x in range(sigma.shape[0]):
