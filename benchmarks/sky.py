@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import gc
+import tempfile
+from pathlib import Path
 
 import galsim
 import numpy as np
 import treecorr
 from sklearn.decomposition import PCA, IncrementalPCA
 
+from lsst.fringe_sim.algorithms.field_response import SensorPlacement, sensor_response
 from lsst.fringe_sim.algorithms.image_correlation import LogBins, correlation_function
 from lsst.fringe_sim.algorithms.image_noise import add_exposure_noise
 from lsst.fringe_sim.algorithms.pca import decompose_thickness, fit_pca, fit_pca_from_thickness
 from lsst.fringe_sim.algorithms.sky_frame import simulate_night, sky_response
+from lsst.fringe_sim.algorithms.thickness_stand_in import stand_in_thickness
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.instrument.sky import SkySpectrum
@@ -42,6 +46,7 @@ def run() -> list[Row]:
         components_of_a_quarter,
         components_of_many_frames,
         components_of_model_frames,
+        sensor_night,
         correlations,
         noise,
         beams,
@@ -187,6 +192,32 @@ def components_of_model_frames() -> list[Row]:
     rows.append(
         Row(work, "fit_pca_from_thickness (three images)", wall, beside=frames_cpu, note=note, cpu=own_cpu)
     )
+    return rows
+
+
+def sensor_night() -> list[Row]:
+    """One sensor of the focal plane: eleven exposures of a night with the beam of every pixel, written as FITS."""
+    detector = Camera.from_name("lsstCam").detector("R22_S11")
+    model = FringeModel.from_setup("lsst_e2v")
+    night, sky = NightHistory.guo2022(), SkySpectrum.dark(airmass=1.2)
+    thickness = stand_in_thickness(model.setup, detector, 0, SENSOR).value
+    span = (float(thickness.min()) - 1e-3, float(thickness.max()) + 1e-3)
+    placement = SensorPlacement.of(detector, model.setup.pixel_scale_arcsec)
+    work = f"{len(night)} frames of 16.4 Mpix of {detector.name} with the beam of every pixel"
+    response, wall, cpu = timed(lambda: sensor_response(model, sky, placement, span))
+    rows = [Row(work, "response to the sky", wall, cpu=cpu)]
+    with tempfile.TemporaryDirectory() as folder, memory_watch() as memory:
+        before = memory_now()
+
+        def frames() -> None:
+            for number, frame in enumerate(simulate_night(thickness, model, response, night)):
+                frame.write_fits(Path(folder) / f"{number}.fits")
+
+        _, frames_wall, frames_cpu = timed(frames)
+        size = sum(path.stat().st_size for path in Path(folder).iterdir()) / 2**30
+    note = f"{size:.2f} GiB of FITS; {memory[0] - before:.2f} GiB of memory beyond map and response"
+    rows.append(Row(work, "frames and FITS files", frames_wall, note=note, cpu=frames_cpu))
+    rows.append(Row(work, "together", wall + frames_wall, cpu=cpu + frames_cpu))
     return rows
 
 

@@ -118,6 +118,34 @@ def test_coadds_average_fringes_away_down_to_the_floor(patterns, rng):
     np.testing.assert_allclose(result.coadd[-1].xi, result.model[-1], atol=1e-12)
 
 
+def test_coadds_of_2600_exposures_of_nine_sensors(rng):
+    """The largest coadds of the paper, beside as many exposures of noise, before and after a correction."""
+    bins = LogBins(2.0, 12.0, 4)
+    patterns = []
+    for _ in range(9):
+        field = gaussian_filter(rng.standard_normal((110, 110)), 12.0, mode="wrap")
+        wave = np.sin(2.0 * np.pi * (0.4 * field / field.std() + np.arange(110) / 40.0))
+        patterns.append(1.4e-3 * wave / wave.std())
+    noise = 1.0 / np.sqrt(2893.0)
+    counts = (1, 800, 2600)
+    fringed = coadd_correlation(patterns, counts, noise, rng, region_px=64, bins=bins)
+    assert fringed.single.xi[0] == pytest.approx(1.4e-3**2, rel=0.3)
+    scatter = noise**2 / 2600 / np.sqrt(fringed.null[-1].weight)
+    np.testing.assert_allclose(
+        fringed.model[-1],
+        fringed.single.xi / 2600 + (1.0 - 1.0 / 2600) * fringed.floor.xi,
+        rtol=1e-12,
+    )
+    assert np.all(np.abs(fringed.null[-1].xi) < 5 * scatter + noise**2 / 2600 / 64**2)
+    assert np.all(np.abs(fringed.coadd[-1].xi - fringed.null[-1].xi - fringed.model[-1]) < 8 * scatter)
+    # A correction that leaves a tenth of the pattern leaves a hundredth of its correlation.
+    corrected = coadd_correlation(
+        [0.1 * each for each in patterns], counts, 0.0, np.random.default_rng(8), region_px=64, bins=bins
+    )
+    assert corrected.single.xi[0] == pytest.approx(0.01 * fringed.single.xi[0], rel=0.1)
+    assert abs(corrected.coadd[-1].xi[0]) < 0.1 * abs(fringed.single.xi[0]) / 100
+
+
 def test_floor_is_what_no_rotation_removes(rng):
     """A radial pattern that fills the region the same way each time does not average out."""
     y, x = np.mgrid[:145, :145] - 72.0

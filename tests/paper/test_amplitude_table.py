@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from lsst.fringe_sim.algorithms.amplitude_table import CASES, SkyCase, amplitude_table, contradiction
+from lsst.fringe_sim.algorithms.amplitude_table import (
+    CASES,
+    UNDAMPED,
+    WITH_EFFECTS,
+    SkyCase,
+    amplitude_table,
+    compare_amplitudes,
+    contradiction,
+)
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.instrument.sky import EmissionLines
 from lsst.fringe_sim.mock.thickness import e2v_321
@@ -78,6 +86,22 @@ def test_one_set_of_effects_in_the_laboratory_and_on_the_sky(adhesive, bright):
     for table in (plain, damped):
         assert "no contrast that is common to both" in contradiction(table)
     assert damped.meta["effects"] == settings
+
+
+def test_damped_and_undamped_stand_in_one_table(adhesive, bright):
+    settings = {"contrast_loss.factor": 0.13}
+    table = compare_amplitudes(adhesive, [bright], settings, LAB_AND_MONOCAM)
+    plain, damped = (table[table["model"] == name] for name in (UNDAMPED, WITH_EFFECTS))
+    assert len(plain) == len(damped) == len(LAB_AND_MONOCAM)
+    for case in ("SLAC-TS8, flat", "MonoCam"):
+        assert cell(damped, case, "rms") == pytest.approx(0.13 * cell(plain, case, "rms"), rel=0.01)
+    assert [sentence.partition(":")[0] for sentence in table.meta["contradiction"]] == [
+        UNDAMPED,
+        WITH_EFFECTS,
+    ]
+    alone = compare_amplitudes(adhesive, [bright], cases=LAB_AND_MONOCAM[:1])
+    assert set(alone["model"]) == {UNDAMPED}
+    assert alone.meta["contradiction"] == []
 
 
 def test_contradiction_is_not_stated_where_there_is_none():

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from astropy.table import Table
+from astropy.table import Column, Table, vstack
 from numpy.typing import ArrayLike, NDArray
 
 from ..effects import EFFECTS, activate_effects
@@ -33,7 +33,16 @@ from .sky_frame import (
 )
 from .thickness_stand_in import stand_in_thickness
 
-__all__ = ["CASES", "AmplitudeCase", "SkyCase", "amplitude_table", "contradiction"]
+__all__ = [
+    "CASES",
+    "UNDAMPED",
+    "WITH_EFFECTS",
+    "AmplitudeCase",
+    "SkyCase",
+    "amplitude_table",
+    "compare_amplitudes",
+    "contradiction",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -151,6 +160,13 @@ class SkyCase:
         return SkySpectrum(self.lines, (), airmass)
 
 
+UNDAMPED = "undamped"
+"""Rows of the model without effects, which is that of the paper."""
+
+WITH_EFFECTS = "with effects"
+"""Rows of the model with the effects that were given."""
+
+
 def amplitude_table(
     adhesive_um: ArrayLike,
     skies: Sequence[SkyCase] | None = None,
@@ -206,6 +222,39 @@ def amplitude_table(
         effects={str(name): float(value) for name, value in settings.items()},
         paper="Guo, Walter, Lage & Lupton 2022, Table 2; what is recomputed from its figures in column recomputed",
     )
+    return table
+
+
+def compare_amplitudes(
+    adhesive_um: ArrayLike,
+    skies: Sequence[SkyCase] | None = None,
+    effects: Mapping[str, Any] | None = None,
+    cases: Sequence[AmplitudeCase] = CASES,
+) -> Table:
+    """`amplitude_table` without effects and, if there are any, with them, in one table.
+
+    Returns
+    -------
+    table : `astropy.table.Table`
+        As of `amplitude_table`, with a column ``model`` of `UNDAMPED` and `WITH_EFFECTS`; ``meta["contradiction"]``
+        has a sentence for each model where the rows that it needs are there.
+
+    Raises
+    ------
+    InputError, UnknownNameError, OutOfRangeError
+        As of `amplitude_table`.
+    """
+    settings = dict(effects or {})
+    parts = [amplitude_table(adhesive_um, skies, {}, cases)]
+    if settings:
+        parts.append(amplitude_table(adhesive_um, skies, settings, cases))
+    said = []
+    for part, name in zip(parts, (UNDAMPED, WITH_EFFECTS), strict=False):
+        if {"SLAC-TS8, flat", "MonoCam"} <= set(part["case"]):
+            said.append(f"{name}: {contradiction(part)}")
+        part.add_column(Column([name] * len(part), name="model"), index=1)
+    table = vstack(parts, metadata_conflicts="silent")
+    table.meta = {**parts[-1].meta, "contradiction": said}
     return table
 
 

@@ -113,6 +113,8 @@ def fit_pca(
     if not 1 <= n_components <= len(frames):
         raise OutOfRangeError("number of components", n_components, f"1 to {len(frames)}")
     kept = np.maximum(eigenvalues[:n_components], np.finfo(float).tiny)
+    mask = np.zeros(stack.good.shape, np.int32)
+    mask[~stack.good] = mask_bits("NO_DATA")
     mean, components, sign = stack.components(vectors[:, :n_components] / np.sqrt(kept))
     return FringeComponents(
         mean=mean,
@@ -120,7 +122,7 @@ def fit_pca(
         explained_variance=eigenvalues[:n_components] / (len(frames) - 1),
         explained_variance_ratio=eigenvalues[:n_components] / total,
         scores=vectors[:, :n_components] * np.sqrt(kept) * sign,
-        mask=np.where(stack.good, 0, mask_bits("NO_DATA")).astype(np.int32),
+        mask=mask,
         metadata={
             **(metadata or {}),
             "NFRAMES": len(frames),

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 from astropy.table import Table
 
-from ..algorithms.amplitude_table import CASES, SkyCase, amplitude_table, contradiction
+from ..algorithms.amplitude_table import CASES, SkyCase, compare_amplitudes
 from ..errors import FrameFormatError
 from ..mock.thickness import e2v_321
 from .inputs import prepare_folder, read_settings, read_thickness
@@ -50,7 +50,8 @@ def amplitudes(
 ) -> None:
     """Fringe amplitudes of every set-up of the paper: its Table 2.
 
-    One set of effects is used in the laboratory and, without those of the bench, on the sky.
+    One set of effects is used in the laboratory and, without those of the bench, on the sky; what the set-ups give
+    without any stands beside it.
 
     \b
     Examples:
@@ -66,13 +67,12 @@ def amplitudes(
         return
     folder = prepare_folder(out) if out is not None else None
     rows = [case for case in CASES if not cases or case.name in cases]
-    table = amplitude_table(adhesive, skies, settings, rows)
-    if {"SLAC-TS8, flat", "MonoCam"} <= set(table["case"]):
-        table.meta["contradiction"] = contradiction(table)
+    table = compare_amplitudes(adhesive, skies, settings, rows)
     shown = table.copy(copy_data=False)
     shown.remove_columns(["setup", "temperature", "layer"])
     click.echo("\n".join(shown.pformat(max_lines=-1, max_width=-1, align="<")))
-    click.echo(table.meta.get("contradiction", ""))
+    for sentence in table.meta["contradiction"]:
+        click.echo(sentence)
     if folder is not None:
         table.write(folder / "amplitudes.ecsv", format="ascii.ecsv", overwrite=True)
         click.echo(str(folder / "amplitudes.ecsv"))
