@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms import fit_thickness
+from lsst.fringe_sim.algorithms.thickness_fit.cells import Cells
+from lsst.fringe_sim.algorithms.thickness_fit.narrow_sensor import _Sample
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FlatExposures, FringeCube
@@ -31,6 +33,18 @@ def cube_of(truth: np.ndarray, model: FringeModel, noise: float, rng: np.random.
         FlatExposures(TEN_NM, np.array(2.0), np.array(183.15)),
         "relative",
     )
+
+
+def test_cells_without_a_thickness_are_not_asked() -> None:
+    """Even if they alone have every wavelength; found by ``tests/faults/fuzz.py``."""
+    value = np.arange(12, dtype=np.float32).reshape(1, 3, 4)
+    weight = np.ones_like(value)
+    weight[0, 1:, 3] = 0.0
+    flat = np.zeros_like(value)
+    cells = Cells(value, weight, flat, flat, np.array([0, 8]), np.array([0, 8, 16, 24]))
+    sample, shape = _Sample.of(cells, np.array([[np.nan, 13.0, 13.2]], np.float32), 10)
+    np.testing.assert_array_equal(sample.level[:, 0], [5.0, 9.0])
+    np.testing.assert_allclose(shape, [-0.1, 0.1], atol=1e-6)
 
 
 @pytest.mark.parametrize("span", [0.05, 0.15, 0.3, 0.6, 0.85])

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
+import functools
 import os
 import resource
 import secrets
@@ -55,6 +56,8 @@ from lsst.fringe_sim.model import FringeModel, Setup
 from lsst.fringe_sim.resources import resource_path
 
 LONGEST_S = 20.0
+"""Processor time that one case may take; most take milliseconds."""
+
 MOST_BYTES = 1 << 30
 """Memory that one case may need beyond what the process had; the files have less than a megabyte."""
 
@@ -99,17 +102,26 @@ def guarded(target: str, folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _limited_time() -> Iterator[None]:
+    """Limit the processor time, and, far beyond it, the time on the clock: other programs may have the processor."""
+
     def stop(number: int, frame: Any) -> None:
         _OFFENCES.append(f"longer than {LONGEST_S} s")
         raise TimeoutError(_OFFENCES[-1])
 
-    former = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
+    limits = {
+        signal.ITIMER_PROF: (signal.SIGPROF, LONGEST_S),
+        signal.ITIMER_REAL: (signal.SIGALRM, 20 * LONGEST_S),
+    }
+    former = {number: signal.signal(number, stop) for number, _ in limits.values()}
+    for timer, (_, seconds) in limits.items():
+        signal.setitimer(timer, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, former)
+        for timer in limits:
+            signal.setitimer(timer, 0)
+        for number, handler in former.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -220,29 +232,35 @@ RANGE_UM = (12.5, 13.5)
 
 def cube(data: st.DataObject, folder: Path) -> None:
     """A cube of few pixels with any numbers in it, through its file, fitted."""
-    shape = (data.draw(st.integers(1, 6)), data.draw(st.integers(1, 4)), data.draw(st.integers(1, 6)))
+    shape = (data.draw(st.integers(1, 7)), data.draw(st.integers(1, 5)), data.draw(st.integers(1, 7)))
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+    # At most one of the headers is odd: of two, one would never be asked about.
+    odd = data.draw(st.sampled_from(["wavelength", "variance", "bandwidth", "temperature", *[""] * 6]))
+    unit = data.draw(st.sampled_from(["electron", "electron", "electron", "relative", "relative", "adu"]))
+    level = 1.0 if unit == "relative" else 20000.0
     wavelength = np.linspace(880.0, 990.0, shape[0])
-    if not data.draw(st.integers(0, 2)):
-        wavelength = np.array([data.draw(_numbers(700.0, 1200.0)) for _ in range(shape[0])])
     thickness = 13.0 + 0.2 * rng.random(shape[1:])
     with guarded("fringe cubes", folder):
-        response = MODEL.response(thickness.ravel(), np.linspace(880.0, 990.0, shape[0])).reshape(shape)
-        image = (20000.0 * response * (1.0 + 0.003 * rng.standard_normal(shape))).astype(np.float32)
+        response = MODEL.response(thickness.ravel(), wavelength).reshape(shape)
+        response /= response.mean()
+        if odd == "wavelength":
+            wavelength = np.array([data.draw(_numbers(700.0, 1200.0)) for _ in range(shape[0])])
+        image = (level * response * (1.0 + 0.003 * rng.standard_normal(shape))).astype(np.float32)
         for place, value in data.draw(
             st.lists(st.tuples(st.integers(0, image.size - 1), FINITE), max_size=4)
         ):
             image.flat[place] = value
+        variance = data.draw(_numbers(0.0, 1e6)) if odd == "variance" else level * 1e-4
         made = product_makers.p.FringeCube(
             image=image,
-            variance=np.full(shape, data.draw(_numbers(0.0, 1e6)), np.float32),
-            mask=(rng.random(shape) < data.draw(st.sampled_from([0.0, 0.1, 0.5, 1.0]))).astype(np.int32),
+            variance=np.full(shape, variance, np.float32),
+            mask=(rng.random(shape) < data.draw(st.sampled_from([0.0, 0.0, 0.1, 0.5, 1.0]))).astype(np.int32),
             exposures=product_makers.p.FlatExposures(
                 wavelength,
-                np.array(data.draw(_numbers(0.0, 5.0))),
-                np.array(data.draw(_numbers(150.0, 310.0))),
+                np.array(data.draw(_numbers(0.0, 5.0)) if odd == "bandwidth" else 2.0),
+                np.array(data.draw(_numbers(150.0, 310.0)) if odd == "temperature" else 173.0),
             ),
-            unit=data.draw(st.sampled_from(["electron", "electron", "relative", "adu"])),
+            unit=unit,
         )
         path = folder / "cube.fits"
         made.write_fits(path)
@@ -264,7 +282,12 @@ def _fit(path: Path, method: str) -> None:
     _honest(fitted.value, fitted.mask)
     _honest(fitted.sigma, fitted.mask)
     value = np.asarray(fitted.value)[np.asarray(fitted.mask) == 0]
-    if value.size and not (value.min() > RANGE_UM[0] - 0.1 and value.max() < RANGE_UM[1] + 0.1):
+    # The walk of the paper only begins in the range.
+    if (
+        method == "global"
+        and value.size
+        and not (value.min() > RANGE_UM[0] - 0.1 and value.max() < RANGE_UM[1] + 0.1)
+    ):
         raise AssertionError("a thickness that was not allowed")
 
 
@@ -487,8 +510,27 @@ ROUND = 10 * sum(TARGETS.values())
 """Cases between two looks at the clock."""
 
 
+@functools.cache
+def warm_up() -> None:
+    """Let everything be compiled on sound input: a case has not the time for it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cube.fits"
+        wavelength = np.linspace(880.0, 990.0, 6)
+        thickness = 13.0 + 0.2 * np.random.default_rng(1).random(24)
+        response = MODEL.response(thickness, wavelength).reshape(6, 4, 6)
+        product_makers.p.FringeCube(
+            image=(20000.0 * response / response.mean()).astype(np.float32),
+            variance=np.full(response.shape, 2e4, np.float32),
+            mask=np.zeros(response.shape, np.int32),
+            exposures=product_makers.p.FlatExposures(wavelength, np.array(2.0), np.array(173.0)),
+        ).write_fits(path)
+        for method in ("global", "guo2022"):
+            _fit(path, method)
+
+
 def run_target(target: Callable[[st.DataObject, Path], None], cases: int, seed: int | None = None) -> None:
     """Run so many cases of a target; a failing one is reduced and raised."""
+    warm_up()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
 

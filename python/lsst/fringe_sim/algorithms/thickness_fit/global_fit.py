@@ -46,6 +46,8 @@ _MEAN_TOLERANCE = 2e-6
 _MOST_ROUNDS = 20
 _SENSOR_ORDERS = 3.0
 """Orders of thickness that a sensor must span before its mean is near that of the range, whatever its order."""
+_FEWEST_TO_SETTLE = 4
+"""Wavelengths from which on the mean response of a narrow sensor is sought together with its order."""
 _NARROW_MARGIN = 2.0
 """Orders beyond what a narrow sensor showed in a sample that its other cells may have."""
 
@@ -199,8 +201,10 @@ class _Solver:
         for _ in range(_MOST_SOLUTIONS):
             state = self._state(cells, fitted, nuisance, normalisation, self.range_um)
             if not spans_orders(state.thickness_um, self.order_um):
-                own = not self.free.any and is_own_mean(state.cells, templates)
-                return self._narrow(cells, state) if own else state
+                # Of fewer wavelengths nothing is believed, so there is nothing to settle.
+                enough = templates.n_wavelengths >= _FEWEST_TO_SETTLE
+                own = enough and not self.free.any and is_own_mean(state.cells, templates)
+                return self._narrow(cells, state) if own and np.isfinite(state.thickness_um).any() else state
             before, state = state, self.adjust(replace(state, normalisation="sensor"))
             if _agree(before, state):
                 break

@@ -164,9 +164,10 @@ class _Sample:
 
     @classmethod
     def of(cls, cells: Cells, thickness_um: NDArray[np.float32], most: int) -> tuple[_Sample, FloatArray]:
-        """Cells at equal distances that have every wavelength, and their thickness about its middle."""
-        number = cells.n_wavelengths
-        seen = np.flatnonzero((number == number.max()) & np.isfinite(thickness_um))
+        """Cells at equal distances that have most wavelengths, and their thickness about its middle."""
+        known = np.isfinite(thickness_um)
+        number = np.where(known, cells.n_wavelengths, 0)
+        seen = np.flatnonzero(known & (number == number.max()))
         seen = seen[:: -(-seen.size // most)]
         depth = cells.value.shape[-1]
         value, weight = (part.reshape(-1, depth)[seen] for part in (cells.value, cells.weight))

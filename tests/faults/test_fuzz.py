@@ -1,0 +1,34 @@
+"""New spoiled files and settings in every run of the tests; as many as the processor makes of its time."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+SECONDS = 60
+LEAST = 500
+"""Cases; a free processor makes several thousand."""
+
+
+def test_fresh_cases() -> None:
+    """In a process of its own, which may limit memory and watch every file that is opened."""
+    program = Path(__file__).with_name("fuzz.py")
+    done = subprocess.run(
+        [sys.executable, str(program), "--seconds", str(SECONDS)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    # With the seeds: a failing target is run again with --only NAME --seed SEED.
+    print(done.stdout)
+    assert done.returncode == 0, done.stdout[-8000:]
+    total = re.search(r"^(\d+) cases, slowest", done.stdout, re.MULTILINE)
+    assert total is not None
+    assert int(total[1]) >= LEAST
