@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.fft import dctn, irfft2, next_fast_len, rfft2
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import f as f_distribution
+from scipy.stats import ncx2
 
 from ...effects import AMPLIFIERS
 from .fit import Design
@@ -98,7 +99,9 @@ def fringe_phase(thickness_um: FloatArray, wavelength_nm: FloatArray, index: Flo
     return (4.0 * np.pi * index / (1e-3 * wavelength_nm))[:, None, None] * thickness_um
 
 
-def measure_channels(state: State, geometry: object, index: FloatArray) -> tuple[Channel, ...]:
+def measure_channels(
+    state: State, geometry: object, index: FloatArray, imprecision: float = 0.0
+) -> tuple[Channel, ...]:
     """All tests that need no catalogue.
 
     Parameters
@@ -109,8 +112,12 @@ def measure_channels(state: State, geometry: object, index: FloatArray) -> tuple
         Cells.
     index : `numpy.ndarray`, shape ``(W,)``
         Refractive index of the varying layer.
+    imprecision : `float`, optional
+        χ² by which the shape of the fringes may be off because effects that were found are described only so well.
     """
-    channels = [_feature_channel("thickness phase", phase_features(state, geometry, index), state)]
+    channels = [
+        _feature_channel("thickness phase", phase_features(state, geometry, index), state, imprecision)
+    ]
     if min(state.thickness_um.shape) >= 8:
         channels.append(_feature_channel("large scales", spatial_features(state, geometry), state))
         channels.append(_feature_channel("amplifiers", amplifier_features(state, geometry), state))
@@ -126,9 +133,10 @@ def combined_probability(channels: Sequence[Channel]) -> float:
     return float(-np.expm1(len(channels) * np.log1p(-min(smallest, 1.0 - 1e-16))))
 
 
-def _feature_channel(name: str, features: FloatArray, state: State) -> Channel:
+def _feature_channel(name: str, features: FloatArray, state: State, imprecision: float = 0.0) -> Channel:
     statistic, degrees = project_test(state.design, features, state.residual)
-    return Channel(name, statistic, degrees, float(chi2_distribution.sf(statistic, max(degrees, 1))))
+    noise = ncx2(max(degrees, 1), imprecision) if imprecision > 0.0 else chi2_distribution(max(degrees, 1))
+    return Channel(name, statistic, degrees, float(noise.sf(statistic)))
 
 
 def phase_features(state: State, geometry, index: FloatArray) -> FloatArray:  # type: ignore[no-untyped-def]

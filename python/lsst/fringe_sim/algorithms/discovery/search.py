@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_distribution
 from threadpoolctl import threadpool_limits
 
 from ...effects import EFFECTS, Effect
@@ -23,7 +24,7 @@ from .fit import Fit, Problem, fit_model
 from .forward import Forward
 from .next_step import with_next_measurements
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
-from .selection import Candidate, Hypothesis, Selector, similarity
+from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
 from .start import mended_thickness, starting_thickness
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
 
@@ -41,6 +42,9 @@ ORDERS_TRIED = 6
 """Fringe orders on both sides of the first one in which a few pixels are fitted."""
 
 STEPS_PER_ORDER = 12
+
+SURELY = 1e-7
+"""Chance of noise below which an effect is added to a set that leaves nothing else to see."""
 
 SHIFTING_SETS = 3
 """Sets of several effects that are looked for in other fringe orders."""
@@ -417,8 +421,6 @@ class _Search:
 
     def _chance(self, selector: Selector, hypothesis: Hypothesis) -> float:
         """Chance of noise, over the tests without a catalogue and the score tests of the catalogue together."""
-        from scipy.stats import chi2 as chi2_distribution
-
         names = [name for name in selector.coordinates if name not in hypothesis.names]
         scores = selector.score(hypothesis.fit, names)
         smallest = min((float(chi2_distribution.sf(c.gain, c.degrees)) for c in scores), default=1.0)
@@ -523,10 +525,39 @@ class _Search:
                 best = self._swapped(selector, best)
             steps.append(self._step(selector, current, best))
             current = best
+        while self._consistent(current) and len(current.names) < self.options.most_effects:
+            better = self._surely_better(selector, current)
+            if better is None:
+                break
+            steps.append(self._step(selector, current, better))
+            current = better
         complete = selector.with_channels(self._completed(selector, current))
         if complete.names != current.names:
             steps.append(self._step(selector, current, complete))
         return self._pruned(selector, complete), steps
+
+    def _surely_better(self, selector: Selector, current: Hypothesis) -> Hypothesis | None:
+        """The set with one effect more that no noise explains, though the tests without a catalogue see only noise.
+
+        Those tests share their power among many patterns; one effect has a single one.
+        """
+        explained = selector.null.fit.chi2 - current.fit.chi2
+        least = IMPRECISION**2 * explained
+        names = [name for name in selector.coordinates if name not in current.names]
+        worth = [
+            candidate
+            for candidate in selector.score(current.fit, names)
+            if candidate.gain > least
+            and float(chi2_distribution.sf(candidate.gain - least, candidate.degrees)) < SURELY
+        ]
+        found = []
+        for candidate in sorted(worth, key=lambda item: -item.gain)[: self.options.parents]:
+            found.append(selector.hypothesis((*current.names, candidate.name), candidate.start, current.fit))
+            self._say_refit(current, found[-1])
+        best = max(found, key=lambda item: item.log_evidence, default=None)
+        if best is None or best.log_evidence < current.log_evidence + self.options.least_evidence:
+            return None
+        return selector.with_channels(best)
 
     def _completed(self, selector: Selector, current: Hypothesis) -> Hypothesis:
         """The set with an effect beside one of many parameters that can play its part, where that is likelier.

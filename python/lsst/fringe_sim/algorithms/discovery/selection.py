@@ -33,6 +33,9 @@ SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Departures, in prior scales, at which the finite signature of an effect is tried."""
 
 
+IMPRECISION = 0.01
+"""Part of what an effect does to the fringes in which our description of it may be wrong, and not the effect."""
+
 FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
 LIKE_THICKNESS = 0.5
 """Sizes of effects that shift the phase, and the part of a signature that thickness could make at one wavelength."""
@@ -171,7 +174,10 @@ class Selector:
         """Tests without a catalogue."""
         if not self.generic:
             return (self._total(fit),)
-        return measure_channels(self.state(fit), self.problem.cells.geometry, self.index)
+        explained = max(self.null.fit.chi2 - fit.chi2, 0.0)
+        return measure_channels(
+            self.state(fit), self.problem.cells.geometry, self.index, IMPRECISION**2 * explained
+        )
 
     def _total(self, fit: Fit) -> Channel:
         """χ² of all values, where there are too few for anything else."""
