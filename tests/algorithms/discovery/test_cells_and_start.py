@@ -1,0 +1,138 @@
+"""Noise of cells, fringe orders of the first thickness, and neighbouring minima."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
+from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube
+from lsst.fringe_sim.algorithms.discovery.channels import measure_channels
+from lsst.fringe_sim.algorithms.discovery.fit import Problem, fit_model
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
+from lsst.fringe_sim.algorithms.discovery.selection import Selector
+from lsst.fringe_sim.algorithms.discovery.start import mended_thickness, starting_thickness
+from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
+from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
+
+WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
+ORDER_UM = 0.30
+
+
+def _smooth_field(rows: int, columns: int) -> np.ndarray:
+    v, u = np.mgrid[-1.0 : 1.0 : rows * 1j, -1.0 : 1.0 : columns * 1j]
+    field: np.ndarray = 15.0 + 0.9 * u - 0.7 * v + 0.5 * u * v + 0.3 * np.sin(3.0 * u)
+    return field
+
+
+def _cube(thickness: np.ndarray, settings: dict[str, float], level: float, seed: int) -> FringeCube:
+    response = FringeModel.from_setup("ts8_e2v", settings).response(thickness, WAVELENGTHS)
+    light = level * response / response.mean(axis=(1, 2), keepdims=True)
+    counts = np.random.default_rng(seed).poisson(light).astype(np.float32)
+    exposures = FlatExposures(WAVELENGTHS, np.array(2.0), np.array(183.15))
+    return FringeCube(
+        counts, np.maximum(counts, 1.0), np.zeros(counts.shape, np.int32), exposures, "electron"
+    )
+
+
+def test_variance_from_the_counts_no_longer_draws_a_mean_down() -> None:
+    """Few electrons: weights from the counts themselves put a weighted mean one electron low."""
+    level, shape = 60.0, (3, 200, 200)
+    counts = np.random.default_rng(8).poisson(level, shape).astype(float)
+    geometry = ImageGeometry.of_pixels(shape[1:], np.array([900.0, 930.0, 960.0]), level)
+    cells = CellData(counts / level, level**2 / np.maximum(counts, 1.0), geometry, 1)
+    even = cells.with_noise_of(np.ones(shape))
+
+    def bias(data: CellData) -> float:
+        return level * (float((data.weight * data.value).sum() / data.weight.sum()) - 1.0)
+
+    assert bias(cells) == pytest.approx(-1.0, abs=0.15)
+    assert abs(bias(even)) < 0.15
+    assert 1.0 / even.weight.mean() == pytest.approx(1.0 / level, rel=0.03)
+
+
+def test_variance_that_does_not_follow_the_counts_stays() -> None:
+    shape = (2, 60, 60)
+    rng = np.random.default_rng(3)
+    variance = np.broadcast_to(np.linspace(0.5e-4, 2e-4, 60), shape)
+    geometry = ImageGeometry.of_pixels(shape[1:], np.array([900.0, 960.0]), 1e4)
+    cells = CellData(1.0 + np.sqrt(variance) * rng.standard_normal(shape), 1.0 / variance, geometry, 1)
+    np.testing.assert_allclose(cells.with_noise_of(np.ones(shape)).weight, cells.weight, rtol=0.2)
+
+
+def test_cells_without_data_stay_without() -> None:
+    cells = bin_cube(_cube(_smooth_field(16, 16), {}, 2e4, 1), 1)
+    holes = cells.restricted(np.arange(16) % 5 != 0)
+    np.testing.assert_array_equal(holes.with_noise_of(holes.value).weight == 0.0, holes.weight == 0.0)
+
+
+def test_patches_in_a_wrong_order_are_taken_back() -> None:
+    """An edge, a corner, an island and single cells, by one order and by two."""
+    truth = _smooth_field(48, 40)
+    cells = bin_cube(_cube(truth, {}, 2e4, 5), 1)
+    spoiled = truth.copy()
+    spoiled[:4, 10:26] += ORDER_UM
+    spoiled[:3, 13:20] += ORDER_UM
+    spoiled[-5:, -6:] -= ORDER_UM
+    spoiled[20:25, 18:22] -= ORDER_UM
+    spoiled[33, 7] += ORDER_UM
+    mended = mended_thickness(FringeModel.from_setup("ts8_e2v"), cells, spoiled)
+    assert np.abs(mended - truth).max() < 0.5 * ORDER_UM
+
+
+def test_thickness_in_the_right_order_is_left_alone() -> None:
+    truth = _smooth_field(40, 40)
+    cells = bin_cube(_cube(truth, {}, 2e4, 6), 1)
+    model = FringeModel.from_setup("ts8_e2v")
+    np.testing.assert_array_equal(mended_thickness(model, cells, truth), truth)
+    assert np.abs(starting_thickness(model, cells) - truth).max() < 0.5 * ORDER_UM
+
+
+@pytest.mark.slow
+def test_neighbouring_minima_are_in_the_uncertainty() -> None:
+    """With a bandpass of 2 nm the silicon is known to 0.01 µm but for whole fringes of 0.13 µm."""
+    case = draw_case("one", np.random.default_rng(5), size=(48, 48), only=["silicon_thickness"])
+    model = FringeModel.from_setup(case.setup)
+    catalogue = [effect for effect in EFFECTS if effect.name == "silicon_thickness"]
+    cells = bin_cube(case.cube, 1).scaled_noise(math.sqrt(case.noise_factor), 0.0)
+    truth = case.thickness_um
+    basis = SplineBasis.of_grid(truth.shape, 4.0)
+    forward = Forward.of_cells(model, catalogue, cells, (float(truth.min()) - 0.5, float(truth.max()) + 0.5))
+    problem = Problem(cells, forward, basis, np.eye(len(cells.value)))
+    start = basis.fit(truth, np.ones(truth.shape))
+    null = fit_model(problem, (), np.zeros(0), start)
+    selector = Selector(problem, catalogue, null, np.full(len(cells.value), 1.6))
+    hidden = case.values["silicon_thickness.offset"]
+    (coordinate,) = selector.coordinates["silicon_thickness"]
+    fit = fit_model(problem, (coordinate,), np.array([hidden]), start, null.levels)
+    first = replace(selector.null, names=("silicon_thickness",), fit=fit)
+    settled = selector.settled(first)
+    assert settled.fit.chi2 <= fit.chi2
+    assert fit.sigma[0] < 0.05
+    assert settled.fit.sigma[0] >= math.hypot(*fit.spread, 0.9 * fit.sigma[0])
+    assert abs(settled.fit.position[0] - hidden) < 4.0 * settled.fit.sigma[0]
+
+
+def test_a_residual_of_known_size_is_not_called_noise_by_mistake() -> None:
+    """What the description of an effect may be wrong by raises the chance of a residual, and nothing else."""
+    cells = bin_cube(_cube(_smooth_field(20, 20), {"contrast_loss.factor": 0.97}, 2e4, 9), 1)
+    model = FringeModel.from_setup("ts8_e2v")
+    start = _smooth_field(20, 20)
+    forward = Forward.of_cells(model, EFFECTS, cells, (12.0, 18.0))
+    basis = SplineBasis.of_grid(start.shape, 4.0)
+    problem = Problem(cells, forward, basis, np.eye(len(WAVELENGTHS)))
+    null = fit_model(problem, (), np.zeros(0), basis.fit(start, np.ones(start.shape)))
+    selector = Selector(problem, EFFECTS[:1], null, np.full(len(WAVELENGTHS), 1.6))
+    state = selector.state(null)
+    strict, lenient = (
+        {c.name: c.probability for c in measure_channels(state, cells.geometry, selector.index, size)}
+        for size in (0.0, 1e5)
+    )
+    assert strict["thickness phase"] < 1e-6
+    assert lenient.pop("thickness phase") > 0.99
+    assert lenient == {name: chance for name, chance in strict.items() if name != "thickness phase"}

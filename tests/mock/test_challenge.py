@@ -1,0 +1,74 @@
+"""Sealed cases and how answers to them are judged."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery import Verdict
+from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, Where
+from lsst.fringe_sim.errors import UnknownNameError
+from lsst.fringe_sim.mock.challenge import VISIBLE, SealedCase, draw_case, judge, run_challenge
+
+
+def _verdict(*effects: NamedEffect) -> Verdict:
+    gap = Gap("rms", 2.0, 1.0, 2.0, 1.0, 1.0)
+    return Verdict("named" if effects else "unexplained", effects, Where(), gap, (), {}, "ts8_e2v", 0.0)
+
+
+def _effect(name: str, *others: str, significance: float = 50.0) -> NamedEffect:
+    return NamedEffect(name, {}, 0.99, others, "", 1.0, significance)
+
+
+@pytest.fixture(scope="module")
+def pair() -> SealedCase:
+    case = draw_case("one", np.random.default_rng(4), size=(16, 16), only=["vignetting"])
+    return replace(case, kind="two", names=("vignetting", "roughness"))
+
+
+def test_a_pair_is_right_in_any_order_and_within_classes(pair: SealedCase) -> None:
+    oracle = _verdict(_effect("vignetting"), _effect("roughness"))
+    for named in (
+        (_effect("roughness"), _effect("vignetting")),
+        (_effect("epoxy_absorption", "roughness"), _effect("vignetting")),
+    ):
+        assert judge(pair, _verdict(*named), 0, 1.0, oracle).right_class
+    wrong = (_effect("bandwidth"), _effect("vignetting")), (_effect("vignetting"),), ()
+    for named in wrong:
+        assert not judge(pair, _verdict(*named), 0, 1.0, oracle).right_class
+    more = _effect("roughness"), _effect("vignetting"), _effect("tilt")
+    assert not judge(pair, _verdict(*more), 0, 1.0, oracle).right_class
+
+
+def test_a_faint_second_effect_need_not_be_named_but_no_other_may(pair: SealedCase) -> None:
+    oracle = _verdict(_effect("vignetting"), _effect("roughness", significance=0.5 * VISIBLE))
+    result = judge(pair, _verdict(_effect("vignetting")), 0, 1.0, oracle)
+    assert result.right_class
+    assert not result.exact
+    assert result.weakest == 0.5 * VISIBLE
+    assert not judge(pair, _verdict(_effect("roughness")), 0, 1.0, oracle).right_class
+    assert not judge(pair, _verdict(_effect("vignetting"), _effect("tilt")), 0, 1.0, oracle).right_class
+
+
+def test_unknown_kind_is_refused() -> None:
+    with pytest.raises(UnknownNameError, match="kind of case"):
+        draw_case("three", np.random.default_rng(1))
+
+
+@pytest.mark.slow
+def test_a_challenge_of_this_very_moment() -> None:
+    """Fresh seed: nothing is named where nothing is hidden, and names are right where something is."""
+    seed = secrets.randbelow(2**32)
+    clean = ("illumination", "midline_step", "contrast_loss", "amplifier_gain", "epoxy_absorption")
+    hidden = run_challenge({"one": 4}, seed, size=(64, 64), only=clean)
+    sealed = run_challenge({"none": 4}, seed, size=(64, 64))
+    summary = {**hidden.summary(), "false_discoveries": sealed.summary()["false_discoveries"]}
+    told = f"seed {seed}: {hidden.confusion()}"
+    assert summary["false_discoveries"][0] == 0, f"seed {seed}"
+    right, visible = summary["one_right_class"]
+    assert right >= visible - 1, told
+    named_right, named = summary["named_right"]
+    assert named_right >= named - 1, told
