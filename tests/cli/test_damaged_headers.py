@@ -90,6 +90,18 @@ def test_a_cube_with_other_axes_than_it_has_is_refused(value: str, tmp_path: Pat
     assert run(["fit", str(path), "--out", str(tmp_path / "out")]) == 1
 
 
+@pytest.mark.parametrize(("keyword", "value"), [("PCOUNT", "-9999"), ("GCOUNT", "-1"), ("NAXIS2", "-12")])
+@pytest.mark.parametrize("reader", sorted(READERS))
+def test_data_of_a_negative_size_lead_nowhere(reader: str, keyword: str, value: str, tmp_path: Path) -> None:
+    """The next header would be in front of them, and again."""
+    kind, read = READERS[reader]
+    path = tmp_path / "negative.fits"
+    sound = raw() if kind == "raw" else product(kind, tmp_path)
+    path.write_bytes(replaced(sound, keyword, value))
+    with pytest.raises(FrameFormatError, match=f"{keyword} = {value}"):
+        read(str(path))
+
+
 @pytest.mark.parametrize("reader", sorted(READERS))
 def test_more_pixels_than_any_memory_holds_are_a_damage(reader: str, tmp_path: Path) -> None:
     kind, read = READERS[reader]

@@ -40,8 +40,10 @@ LONGEST_USER_FILE = 1_000_000
 DEEPEST_NESTING = 20
 
 _CARD, _CHUNK = 80, 1 << 22
-_COUNTS = (b"NAXIS   =", b"TFIELDS =")
-_ENDLESS = re.compile(rb" *[-+]?0*[1-9]\d{3}")
+_COUNTS = (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT")
+_ENDLESS = re.compile(
+    rb"(?:NAXIS  |TFIELDS) = *[-+]?0*[1-9]\d{3}|(?:NAXIS[1-9 ][\d ]{2}|TFIELDS |[PG]COUNT  )= *-"
+)
 _COMPRESSED = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
 
 
@@ -201,9 +203,10 @@ def _check_events(text: str, what: str, source: str | None) -> None:
 
 
 def check_axes(stream: IO[bytes], source: str) -> None:
-    """Refuse a FITS file with a header that claims a thousand axes or columns; the format has at most 999.
+    """Refuse a FITS file over which astropy would be busy for hours, or for ever.
 
-    astropy asks the header for each of them, and would be busy for hours.
+    It asks a header for each of the axes and columns that it claims; the format has at most 999. And behind data of a
+    negative size it looks for the next header further in front, again and again.
 
     Parameters
     ----------
@@ -230,9 +233,10 @@ def check_axes(stream: IO[bytes], source: str) -> None:
         for keyword in _COUNTS:
             place = piece.find(keyword)
             while place >= 0:
-                if place % _CARD == 0 and _ENDLESS.match(piece, place + len(keyword)):
+                if place % _CARD == 0 and _ENDLESS.match(piece, place):
                     claimed = " ".join(piece[place : place + 30].decode("ascii", "replace").split())
-                    raise FrameFormatError("header", claimed, "at most 999 axes or columns", source=source)
+                    allowed = "at most 999 axes or columns, and no negative size"
+                    raise FrameFormatError("header", claimed, allowed, source=source)
                 place = piece.find(keyword, place + 1)
         rest = piece[len(piece) // _CARD * _CARD - _CARD :] if len(piece) >= _CARD else piece
     stream.seek(0)
