@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
-__all__ = ["FocalPlaneCost"]
+__all__ = ["QUANTUM_COSTS", "FocalPlaneCost", "QuantumCost"]
 
 PIXELS = 4004 * 4096
 """Pixels of an e2v sensor."""
@@ -24,8 +26,40 @@ FORECAST_S = 6.0
 SAMPLED_S = 0.9
 """The same with one sampled pixel per arcsecond, beside a response that all sensors share [s]."""
 
-PEAK_BYTES = 1.9e9
-"""Most memory of the process of one sensor-night."""
+MIB = 2.0**20
+
+
+@dataclass(frozen=True)
+class QuantumCost:
+    """What one quantum of a full e2v sensor costs.
+
+    Attributes
+    ----------
+    processor_s : `float`
+        Processor time of all threads [s], that of the most expensive quantum; the start of the process is not in it.
+    peak_bytes : `float`
+        Most memory of the process.
+    """
+
+    processor_s: float
+    peak_bytes: float
+
+
+QUANTUM_COSTS: Mapping[str, QuantumCost] = MappingProxyType(
+    {
+        "fringeBias": QuantumCost(2.5, 883 * MIB),
+        "isrFlatPrep": QuantumCost(2.5, 1031 * MIB),
+        "epoxyFit": QuantumCost(20.6, 2878 * MIB),
+        "skyFringeSim": QuantumCost(16.3, 1262 * MIB),
+        "fringePca": QuantumCost(10.7, 3428 * MIB),
+        "fringeForecast": QuantumCost(21.4, 1255 * MIB),
+        "focalPlaneSummary": QuantumCost(0.1, 339 * MIB),
+    }
+)
+"""By task, as ``python tests/bps/measure_quanta.py`` has measured them: twelve flats, three biases, eleven hours.
+
+The search for effects has not been measured on a full sensor.
+"""
 
 
 @dataclass(frozen=True)
@@ -45,6 +79,18 @@ class FocalPlaneCost:
     def quanta(self) -> int:
         """Quanta of pipelines/lsstCam/focalPlane.yaml: frames, components and forecasts, and their summary."""
         return self.sensors * (self.exposures + 2) + 1
+
+    @property
+    def jobs(self) -> int:
+        """Jobs of bps: the frames of one sensor, the forecast of one sensor, and the summary."""
+        return 2 * self.sensors + 1
+
+    @property
+    def peak_bytes(self) -> float:
+        """Most memory of a job."""
+        return max(
+            QUANTUM_COSTS[label].peak_bytes for label in ("skyFringeSim", "fringePca", "fringeForecast")
+        )
 
     @property
     def frame_bytes(self) -> int:
@@ -79,8 +125,9 @@ class FocalPlaneCost:
                 f"{self.sensors} sensors; forecast from one pixel per arcsecond, no frames: "
                 f"{self.sampled_s / 60.0:.1f} min of processor time",
                 f"the same as a pipeline with the frames of {self.exposures} exposures: {self.quanta} quanta "
-                f"(cluster them by sensor), {self.pipeline_s / 3600.0:.1f} h of processor time, "
-                f"{self.sensor_night_s:.0f} s per sensor-night, {PEAK_BYTES / 2**30:.1f} GiB of memory per process, "
+                f"in {self.jobs} jobs of bps, {self.pipeline_s / 3600.0:.1f} h of processor time, "
+                f"{self.sensor_night_s:.0f} s per sensor-night, {self.peak_bytes / 2**30:.1f} GiB of memory per job, "
                 f"{self.disk_bytes / 2**30:.0f} GiB on disk",
+                f"on 32 cores: {self.pipeline_s / 32.0 / 60.0:.0f} min, and the time to start {self.jobs} processes",
             )
         )
