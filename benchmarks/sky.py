@@ -110,7 +110,7 @@ def components_of_a_night(shape: tuple[int, int] = SENSOR) -> list[Row]:
 
 
 def components_of_a_quarter(shape: tuple[int, int] = (1001, 4096)) -> list[Row]:
-    """The same on a quarter of a sensor with scikit-learn in double precision, which needs 15 GiB for a whole one."""
+    """The same on a quarter of a sensor with scikit-learn in double precision, too large for a whole one."""
     frames = frames_like_a_night(11, shape)
     work = f"principal components of 11 frames of {1e-6 * frames[0].size:.3g} Mpix"
     double = frames.reshape(len(frames), -1).astype(np.float64)
