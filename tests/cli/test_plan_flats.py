@@ -59,3 +59,17 @@ def test_bad_arguments(capsys) -> None:
     assert run(["plan-flats", "--setup", "lsst_e2v"]) == 1
     assert "monochromator" in capsys.readouterr().err
     assert run(["plan-flats", "--setup", "ts8_e2v", "--thickness", "9:10", "--search", "9.5:11"]) == 1
+
+
+def test_nyquist_thickness_of_the_paper_is_stated(capsys) -> None:
+    """Steps of 10 nm are too wide beyond about 14 um of adhesive."""
+    ten = ["--wavelengths", "880:990:10", "--candidates", "890:990:50"]
+    assert run(["plan-flats", "--thickness", "13:15um", "--search", "12:16um", *ten, "--json"]) == 0
+    limit = json.loads(capsys.readouterr().out)["nyquist_um"]
+    assert len(limit) == 11
+    assert limit[0] == pytest.approx(1e-3 / (4 * 1.6 * (1 / 880 - 1 / 890)), rel=1e-6)
+    assert np.mean(limit) == pytest.approx(14.0, abs=0.5)
+    assert run(["plan-flats", "--thickness", "13:15um", "--search", "12:16um", *ten]) == 0
+    assert "below the Nyquist rate for layers thicker than 12.2 to 15.2 µm" in capsys.readouterr().out
+    assert run(["plan-flats", *SHORT]) == 0
+    assert "Nyquist" in capsys.readouterr().out

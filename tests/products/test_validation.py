@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from product_makers import MAKERS, components, cube, flat, frame, pixels, sky, thickness
+from product_makers import MAKERS, components, cube, flat, frame, masks, pixels, sky, thickness
 
 from lsst.fringe_sim.errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.products import FlatExposures, FringeCube
@@ -189,6 +189,27 @@ def test_flats_are_sorted_by_wavelength_and_shifted_to_relative_counts() -> None
     np.testing.assert_array_equal(stacked.image[2][good], (flats[0].image + np.float32(1))[good])
     np.testing.assert_array_equal(stacked.variance[2][good], flats[0].variance[good])
     assert np.isfinite(stacked.image).all()
+
+
+def test_one_mask_is_kept_while_all_flats_share_it() -> None:
+    """A fifth of the memory of a cube; other masks, and another order of the wavelengths, change nothing else."""
+    shared, other = masks((3, 4), 1), masks((3, 4), 2)
+    assert not np.array_equal(shared, other)
+    wavelengths = [990.0, 880.0, 930.0]
+    same = FringeCube.from_flats(
+        [flat(number=k, wavelength_nm=w, mask=shared) for k, w in enumerate(wavelengths)]
+    )
+    assert same.mask.strides[0] == 0
+    np.testing.assert_array_equal(same.mask, np.stack([shared] * 3))
+    for place in range(3):
+        chosen = [other if k == place else shared for k in range(3)]
+        mixed = FringeCube.from_flats(
+            [
+                flat(number=k, wavelength_nm=w, mask=m)
+                for k, (w, m) in enumerate(zip(wavelengths, chosen, strict=True))
+            ]
+        )
+        np.testing.assert_array_equal(mixed.mask, np.stack([chosen[1], chosen[2], chosen[0]]))
 
 
 def test_flats_may_come_one_by_one_and_pass_on_what_they_share() -> None:

@@ -31,7 +31,15 @@ from scipy.special import log_ndtr, ndtr
 from ..errors import InputError, OutOfRangeError
 from ..model import FringeModel
 
-__all__ = ["FlatForecast", "PlannedFlat", "RankedFlat", "forecast_flats", "rank_flats", "recommend_flats"]
+__all__ = [
+    "FlatForecast",
+    "PlannedFlat",
+    "RankedFlat",
+    "forecast_flats",
+    "nyquist_thickness_um",
+    "rank_flats",
+    "recommend_flats",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -185,6 +193,30 @@ def forecast_flats(
         raise InputError("flats", 0, "one or more")
     curves = _Curves.of_model(model, flats, range_um, search_um, read_noise_e)
     return _forecast(curves, _checked_region(region_px))
+
+
+def nyquist_thickness_um(model: FringeModel, wavelength_nm: Sequence[float]) -> FloatArray:
+    """Thickness at which the fringe turns by half a period from one flat to the next.
+
+    A thicker layer is sampled below the Nyquist rate there: only the chirp of the fringe over all flats tells it from
+    its mirror image.
+
+    Parameters
+    ----------
+    model : `FringeModel`
+        The model.
+    wavelength_nm : `~collections.abc.Sequence` [`float`]
+        Wavelengths [nm], in any order; equal ones count once.
+
+    Returns
+    -------
+    thickness_um : `numpy.ndarray`, shape ``(n_different - 1,)``
+        ``1 / (4 |n / lambda - n' / lambda'|)`` for each pair of neighbours, from short to long wavelengths [µm].
+    """
+    wavelength = np.unique(np.asarray(wavelength_nm, dtype=float))
+    # One order is half a wavelength in the layer.
+    orders_per_um = 1.0 / np.asarray(model.fringe_order_um(wavelength), dtype=float)
+    return np.asarray(0.5 / np.abs(np.diff(orders_per_um)))
 
 
 def rank_flats(

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..algorithms.flat_residual import flat_residual, relative_flats
-from ..algorithms.thickness_fit import FIT_METHODS, SILICON_FIELDS, SiliconSearch, fit_thickness
+from ..algorithms.thickness_fit import (
+    FIT_METHODS,
+    SILICON_FIELDS,
+    Nuisances,
+    SiliconSearch,
+    fit_thickness,
+)
+from ..algorithms.thickness_fit.nuisances import CONTRASTS, ZONES
 from ..errors import InputError, UnknownNameError
 from ..instrument.camera import Camera
 from ..model import FringeModel, Setup
@@ -65,6 +72,26 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
     show_default=True,
     help="Thickness of the silicon: as in the model, or fitted too where flats with a narrow line tell it.",
 )
+@click.option(
+    "--zones",
+    type=click.Choice(ZONES),
+    default=None,
+    help="Parts of the sensor with a level of their own at each wavelength; by default levels are as they are.",
+)
+@click.option(
+    "--illumination-degree",
+    type=click.IntRange(0, 8),
+    default=0,
+    show_default=True,
+    help="Degree of a slow illumination, free at each wavelength.",
+)
+@click.option(
+    "--contrast",
+    type=click.Choice(CONTRASTS),
+    default="fixed",
+    show_default=True,
+    help="Contrast of the fringes: that of the model, or one free factor, or one at each wavelength.",
+)
 @click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
@@ -76,6 +103,9 @@ def fit(
     method: str,
     smoothing: float | None,
     silicon: str,
+    zones: str | None,
+    illumination_degree: int,
+    contrast: str,
     effects: tuple[tuple[str, float], ...],
     effects_file: Path | None,
     skip_bad: bool,
@@ -95,6 +125,11 @@ def fit(
     search = None if silicon == "fixed" else SiliconSearch(SILICON_FIELDS[silicon])
     if search is not None and method != "global":
         raise InputError("--silicon", silicon, "fixed with method guo2022")
+    free = Nuisances(zones is not None, zones or "sensor", illumination_degree, contrast)
+    if free.any and (search is not None or method != "global"):
+        raise InputError(
+            "--zones, --illumination-degree, --contrast", "given", "nothing with method guo2022 or --silicon"
+        )
     used = paths
     cube = read_cube(paths[0]) if len(paths) == 1 else None
     if cube is None:
@@ -109,7 +144,7 @@ def fit(
     folder = prepare_folder(out)
     cards = {**effect_cards(model), **input_cards([*used, *([effects_file] if effects_file else [])])}
     click.echo("fitting the thickness", err=True)
-    fitted = fit_thickness(cube, model, method, silicon=search)
+    fitted = fit_thickness(cube, model, method, nuisances=free, silicon=search)
     fitted.write_fits(folder / "thickness.fits", {"SETUP": setup.name, **cards}, section=section)
     write_report(folder, cube, fitted, model, method)
     good = fitted.mask == 0

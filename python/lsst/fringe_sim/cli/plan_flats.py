@@ -11,12 +11,14 @@ import click
 import numpy as np
 from astropy import units
 from astropy.table import QTable
+from numpy.typing import NDArray
 
 from ..algorithms.flat_plan import (
     FlatForecast,
     PlannedFlat,
     RankedFlat,
     forecast_flats,
+    nyquist_thickness_um,
     rank_flats,
     recommend_flats,
 )
@@ -123,9 +125,12 @@ def plan_flats(
     if ecsv is not None:
         forecast_table(now).write(ecsv, format="ascii.ecsv", overwrite=True)
     if as_json:
-        click.echo(json.dumps(_as_mapping(now, ranked, short, slip_limit), indent=2))
+        found = _as_mapping(now, ranked, short, slip_limit)
+        found["nyquist_um"] = nyquist_thickness_um(model, nominal).tolist()
+        click.echo(json.dumps(found, indent=2))
     else:
         _print(now, ranked, short, slip_limit, width)
+        _print_nyquist(nyquist_thickness_um(model, nominal), range_um)
         if ecsv is not None:
             click.echo(str(ecsv))
 
@@ -188,6 +193,21 @@ def _print(
             f"the candidates do not reach the goal; the best {len(short.flats)} of them: "
             f"{_listed(short, width_nm)}, slip of a region {short.region_slip.max():.1e}"
         )
+
+
+def _print_nyquist(limit_um: NDArray[np.float64], range_um: tuple[float, float]) -> None:
+    """Up to which thickness neighbouring flats sample the fringe, if there are two of them."""
+    if limit_um.size == 0:
+        return
+    low, high = limit_um.min(), limit_um.max()
+    where = f"{low:.1f} µm" if high - low < 0.05 else f"{low:.1f} to {high:.1f} µm"
+    if range_um[1] > low:
+        click.echo(
+            f"steps are below the Nyquist rate for layers thicker than {where}, by wavelength: there only the chirp "
+            "over all flats tells a thickness from its mirror image"
+        )
+    else:
+        click.echo(f"steps are above the Nyquist rate up to {where}")
 
 
 def _named(flat: PlannedFlat, width_nm: float) -> str:

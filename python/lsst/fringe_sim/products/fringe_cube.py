@@ -230,7 +230,7 @@ class FringeCube:
         return cls(
             stack.image[planes],
             stack.variance[planes],
-            stack.mask[planes],
+            stack.mask if stack.one_mask else stack.mask[planes],
             FlatExposures(*np.array(stack.rows)[order].T),
             "relative",
             detector=stack.detector,
@@ -350,7 +350,7 @@ class _Stack:
                     raise InputError("number", None, "the number of flats, for an iterable without length")
                 cube = (number, *flat.shape)
                 image, variance = np.empty(cube, np.float32), np.empty(cube, np.float32)
-                mask = np.empty(cube, CUBE_MASK)
+                mask = np.broadcast_to(flat.mask.astype(CUBE_MASK), cube)
                 stack = cls(image, variance, mask, flat.detector, dict(flat.metadata))
             stack.add(flat)
         if stack is None:
@@ -362,6 +362,11 @@ class _Stack:
     @property
     def wavelength_nm(self) -> NDArray[np.float64]:
         return np.array([row[0] for row in self.rows])
+
+    @property
+    def one_mask(self) -> bool:
+        """Whether all flats so far have the same mask."""
+        return self.mask.strides[0] == 0
 
     def add(self, flat: FringeFlat) -> None:
         name, shape = f"flat at {flat.wavelength_nm:g} nm", self.image.shape[1:]
@@ -376,7 +381,7 @@ class _Stack:
             raise InputError("flats", f"more than {plane}", f"{plane}, as announced")
         self.image[plane] = np.nan_to_num(flat.image + np.float32(1), nan=1, posinf=1, neginf=1)
         self.variance[plane] = np.nan_to_num(flat.variance, nan=0, posinf=0, neginf=0)
-        self.mask[plane] = flat.mask
+        self._add_mask(plane, flat.mask)
         self.metadata = {
             keyword: value
             for keyword, value in self.metadata.items()
@@ -385,6 +390,14 @@ class _Stack:
         self.rows.append(
             (flat.wavelength_nm, flat.bandwidth_fwhm_nm, flat.temperature_k, flat.f_number, flat.level_e)
         )
+
+    def _add_mask(self, plane: int, mask: NDArray[Any]) -> None:
+        """Keep one mask for all wavelengths until one has another: the fifth part of a cube."""
+        if np.array_equal(self.mask[plane], mask):
+            return
+        if self.one_mask:
+            self.mask = np.array(self.mask)
+        self.mask[plane] = mask
 
 
 def _map(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32] | None:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lsst.pex.config import ChoiceField, Field, ListField
+from lsst.pex.config import ChoiceField, Field, ListField, RangeField
 from lsst.pipe.base import (
     InputQuantizedConnection,
     NoWorkFound,
@@ -25,7 +25,7 @@ from lsst.utils.logging import getLogger
 
 from ..algorithms import fit_thickness
 from ..algorithms.template_errors import template_errors
-from ..algorithms.thickness_fit import SILICON_FIELDS, SiliconSearch
+from ..algorithms.thickness_fit import SILICON_FIELDS, Nuisances, SiliconSearch
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import Setup
@@ -122,6 +122,35 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
             "paraboloid": "a polynomial of second degree over the sensor, fitted likewise",
         },
     )
+    level_zones: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default="none",
+        doc="Parts of the sensor whose level is free at each wavelength.",
+        allowed={
+            "none": "levels are as they are",
+            "sensor": "one level for the sensor",
+            "halves": "one for the upper and one for the lower half",
+            "amplifiers": "one for each amplifier",
+        },
+    )
+    illumination_degree: Any = RangeField(
+        dtype=int,
+        default=0,
+        min=0,
+        max=8,
+        inclusiveMax=True,
+        doc="Degree of a slow illumination that is free at each wavelength; 0 for none.",
+    )
+    contrast: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default="fixed",
+        doc="Contrast of the fringes.",
+        allowed={
+            "fixed": "that of the model",
+            "common": "times one free factor",
+            "wavelength": "times a free factor at each wavelength",
+        },
+    )
     slip_limit: Field[float] = Field(
         dtype=float,
         default=0.01,
@@ -202,6 +231,12 @@ class EpoxyFitTask(PipelineTask):
             "range_um": None if config.range_um is None else tuple(config.range_um),
             "start_pixel": None if config.start_pixel is None else tuple(config.start_pixel),
             "slip_limit": config.slip_limit,
+            "nuisances": Nuisances(
+                level=config.level_zones != "none",
+                zones="sensor" if config.level_zones == "none" else config.level_zones,
+                illumination_degree=config.illumination_degree,
+                contrast=config.contrast,
+            ),
             "silicon": None if config.silicon == "fixed" else SiliconSearch(SILICON_FIELDS[config.silicon]),
             "threads": config.threads,
         }

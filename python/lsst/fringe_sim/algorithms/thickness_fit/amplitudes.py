@@ -34,7 +34,7 @@ class Amplitudes:
         Standard deviation of the Gaussian kernel that was applied to the images [px]. The variance is that
         of the smoothed image; this number says how far its noise is correlated.
     offset : `numpy.ndarray`, float32, shape ``(n_wavelengths, ncy, ncx)``, optional
-        What is to be subtracted from the amplitudes, for each cell of a grid.
+        Light on each cell of a grid, less one; flats are to be divided by it.
     y_edges, x_edges : `numpy.ndarray` of `int`, optional
         Edges of the cells of ``offset`` [px].
 

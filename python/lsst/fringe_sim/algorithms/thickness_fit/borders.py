@@ -91,9 +91,8 @@ def gather_pixels(
         )
         amplitude = image * scale[band] - 1
         if len(data.offset):
-            amplitude -= data.offset[band][
-                cell_of_row[rows], np.searchsorted(data.x_edges, columns, "right") - 1
-            ]
+            light = data.offset[band][cell_of_row[rows], np.searchsorted(data.x_edges, columns, "right") - 1]
+            amplitude = (amplitude - light) / (1 + light)
         value[:, band] = np.where(good, amplitude, 0)
         weight[:, band] = np.where(good, 1 / np.where(good, variance, 1), 0)
     return value, weight

@@ -159,7 +159,7 @@ def fit_thickness(
             threads=workers,
         )
         pixels = found.pixels
-        slip = slip_probability(found)
+        slip = slip_probability(found, out=found.border_slip)
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
         notes["CONTRAST"] = round(float(np.mean(found.nuisance.contrast)), 6)

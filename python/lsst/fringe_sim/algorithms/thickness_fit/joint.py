@@ -93,7 +93,7 @@ def joint_fit(
     free, blurred = silicon_free(data, templates, model)
     found = global_fit(free, blurred, range_um=range_um, cell_px=cell_px, threads=threads)
     del free
-    slip = slip_probability(found)
+    slip = slip_probability(found, out=found.border_slip)
     order = found.order_um
     silicon = find_silicon(data, _believed(found.pixels, slip), model, search, order)
     if not silicon.decided:
@@ -102,7 +102,7 @@ def joint_fit(
         fixed = replace(templates, response=model.templates(templates, float(silicon.coefficients[0])))
         fixed = replace(fixed, mean_response=fixed.response.mean(axis=0))
         found = global_fit(data, fixed, range_um=range_um, cell_px=cell_px, threads=threads)
-        slip = slip_probability(found)
+        slip = slip_probability(found, out=found.border_slip)
     pixels = _fit_pixels(data, model, silicon, found.pixels, order, threads)
     return JointFit(pixels, slip, silicon, found)
 

@@ -1,10 +1,12 @@
 """What flats hold besides fringes: free levels, steps between zones, slow illumination, another contrast.
 
-The flats are modelled as ``c f(d) + sum_j a_j b_j(x, y)`` for each wavelength, with the fringe amplitude ``f`` of
-the templates, a contrast ``c`` and coefficients ``a`` of known patterns ``b``: ones over each zone of the sensor,
-and low polynomials over the whole of it. With the orders known this is a linear problem once the thickness of
-every cell is eliminated: a small change of it moves the amplitudes along their slope, so that direction is
-projected out (variable projection, Golub & Pereyra 1973, Inverse Problems 19, R1 (2003) for a review).
+The flats over their mean are modelled as ``(1 + c f(d)) (1 + g(x, y))`` for each wavelength, with the fringe
+amplitude ``f`` of the templates, a contrast ``c`` and a light ``g`` of known patterns: ones over each zone of the
+sensor, and low polynomials over the whole of it. Light and gain multiply the fringes; at a light of 4 % and fringes
+of 13 % their product is larger than the noise of a flat. With the orders known this is a linear problem, step by
+step, once the thickness of every cell is eliminated: a small change of it moves the amplitudes along their slope, so
+that direction is projected out (variable projection, Golub & Pereyra 1973, Inverse Problems 19, R1 (2003) for a
+review).
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ class Nuisances:
     zones : {"sensor", "halves", "amplifiers"}, optional
         Zones with a level of their own; other than ``sensor`` implies ``level``.
     illumination_degree : `int`, optional
-        Degree of a polynomial in x and y, free at each wavelength; 0 for none.
+        Degree of a polynomial in x and y, free at each wavelength, and the level with it; 0 for none.
     contrast : {"fixed", "common", "wavelength"}, optional
         Factor on the fringe amplitude of the model.
 
@@ -82,7 +84,7 @@ class Nuisances:
 
     @property
     def patterned(self) -> bool:
-        """Whether anything is added to the fringes."""
+        """Whether light or level are free."""
         return self.level or self.zones != "sensor" or self.illumination_degree > 0
 
     def breaks(self, ny: int, nx: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -108,7 +110,7 @@ class NuisanceFit:
     Attributes
     ----------
     offset : `numpy.ndarray`, float32, shape ``(n_wavelengths, ncy, ncx)``
-        What is added to the fringes in each cell; no wavelengths if nothing is.
+        Light of each cell, less one; no wavelengths if it is even.
     contrast : `numpy.ndarray`, shape ``(n_wavelengths,)``
         Factor on the fringe amplitude.
     """
@@ -202,7 +204,7 @@ def fit_nuisances(
         contrast = contrast * factor
         if pattern.shape[-1]:
             step = np.moveaxis(pattern @ added.T, -1, 0)
-            offset = offset + step
+            offset = offset + step * (1.0 + offset)
             change = max(change, float(np.abs(step).max()))
         if change < _TOLERANCE:
             break
@@ -214,24 +216,31 @@ def fit_nuisances(
 
 
 def subtract_offset(cells: Cells, fit: NuisanceFit) -> Cells:
-    """Cells without what is added to their fringes."""
-    if fit.offset.size == 0:
-        return cells
-    value = cells.value.copy()
-    value[..., : len(fit.offset)] -= np.moveaxis(fit.offset, 0, -1)
-    return replace(cells, value=value)
+    """Cells under even light."""
+    return _under_light(cells, 1.0 / (1.0 + fit.offset))
 
 
 def add_offset(cells: Cells, fit: NuisanceFit) -> Cells:
-    """Cells with what is added to their fringes."""
-    return subtract_offset(cells, replace(fit, offset=-fit.offset))
+    """Cells under the light that was taken from them."""
+    return _under_light(cells, 1.0 + fit.offset)
+
+
+def _under_light(cells: Cells, light: NDArray[np.float32]) -> Cells:
+    """Cells whose counts are multiplied by a light of shape ``(n_wavelengths, ncy, ncx)``."""
+    if light.size == 0:
+        return cells
+    value = cells.value.copy()
+    seen = value[..., : len(light)]
+    seen += (1.0 + seen) * (np.moveaxis(light, 0, -1) - np.float32(1))
+    return replace(cells, value=value)
 
 
 def _patterns(cells: Cells, free: Nuisances) -> FloatArray:
     """Known patterns at the centres of the cells, shape ``(ncy, ncx, n_patterns)``."""
     ny, nx = int(cells.y_edges[-1]), int(cells.x_edges[-1])
     columns = []
-    if free.level or free.zones != "sensor":
+    if free.patterned:
+        # The mean of a flat is that of light times fringe: where the light is free, so is the level.
         rows_at, columns_at = free.breaks(ny, nx)
         zone_y = np.searchsorted(rows_at, cells.y_edges[:-1], side="right")
         zone_x = np.searchsorted(columns_at, cells.x_edges[:-1], side="right")

@@ -289,10 +289,11 @@ def _fit_band(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def subtract_row(line, offset, x_edges):  # type: ignore[no-untyped-def]
-    """Take what is added to the fringes in each cell from one row of amplitudes."""
+    """Divide one row of flats by the light of each cell; amplitudes are flats less one, and so is the light."""
     for c in range(offset.shape[0]):
+        per_light = np.float32(1.0) / (np.float32(1.0) + offset[c])
         for x in range(x_edges[c], x_edges[c + 1]):
-            line[x] -= offset[c]
+            line[x] = (line[x] - offset[c]) * per_light
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 from scipy.stats import chi2 as chi2_distribution
 
 from .amplitudes import Amplitudes
@@ -29,9 +28,8 @@ _FEWEST_TO_SPARE = 6
 """A wavelength is left out only of so many or more."""
 _COMPACT = 0.5
 """Fraction of its 5 by 5 neighbours that fit badly too, from which a pixel may lie in a void: columns have less."""
+_NEIGHBOURS = 25
 _MOST_SEARCHED = 200_000
-_ROWS = 32
-"""Rows at a time, so that what is between fits into the cache."""
 _SAMPLE = 400_000
 """Pixels from which the typical misfit is taken."""
 
@@ -77,7 +75,8 @@ def rescue_pixels(
         With better values where there are; ``n_wavelengths`` is one less where one was left out.
     """
     limit = typical_misfit(pixels) * chi2_limits(int(pixels.n_wavelengths.max(initial=0)))
-    bad = _exceeds(pixels.chi2, limit, pixels.n_wavelengths)
+    bad = np.empty(pixels.chi2.shape, np.bool_)
+    _exceeds(pixels.chi2, limit, pixels.n_wavelengths, bad)
     rows, columns = np.nonzero(bad)
     if rows.size == 0:
         return pixels
@@ -90,9 +89,10 @@ def rescue_pixels(
             value, weight, rows[part], columns[part], table, templates.start_um, templates.step_um, order_um,
             bad, limit, fields["value"], fields["sigma"], fields["chi2"], fields["n_wavelengths"],
         )  # fmt: skip
-    still = _exceeds(pixels.chi2, limit, pixels.n_wavelengths)
-    compact = still & (uniform_filter(still.astype(np.float32), 5, mode="nearest") > _COMPACT)
-    rows, columns = (index[:_MOST_SEARCHED] for index in np.nonzero(compact))
+    # Only bad pixels were changed, and only they can still be.
+    bad[rows, columns] = pixels.chi2[rows, columns] > limit[pixels.n_wavelengths[rows, columns]]
+    compact = bad[rows, columns] & (_bad_neighbours(bad, rows, columns) > _COMPACT * _NEIGHBOURS)
+    rows, columns = (index[compact][:_MOST_SEARCHED] for index in (rows, columns))
     if rows.size:
         value, weight = gather_pixels(data, rows, columns)
         _search_range(
@@ -101,15 +101,24 @@ def rescue_pixels(
     return pixels
 
 
-def _exceeds(
-    chi2: NDArray[np.float32], limit: NDArray[np.float32], used: NDArray[np.int32]
-) -> NDArray[np.bool_]:
+@numba.njit(cache=True, nogil=True)
+def _exceeds(chi2, limit, used, out):  # type: ignore[no-untyped-def]
     """Where chi-square is above the limit for its number of wavelengths."""
-    out = np.empty(chi2.shape, bool)
-    for low in range(0, len(chi2), _ROWS):
-        part = slice(low, low + _ROWS)
-        np.greater(chi2[part], limit[used[part]], out=out[part])
-    return out
+    for y in range(chi2.shape[0]):
+        for x in range(chi2.shape[1]):
+            out[y, x] = chi2[y, x] > limit[used[y, x]]
+
+
+@numba.njit(cache=True, nogil=True)
+def _bad_neighbours(bad, rows, columns):  # type: ignore[no-untyped-def]
+    """Bad pixels among the 5 by 5 around some; the edge of the sensor counts as often as it is met."""
+    ny, nx = bad.shape
+    found = np.zeros(rows.shape[0], np.int64)
+    for k in range(rows.shape[0]):
+        for b in range(rows[k] - 2, rows[k] + 3):
+            for a in range(columns[k] - 2, columns[k] + 3):
+                found[k] += bad[min(max(b, 0), ny - 1), min(max(a, 0), nx - 1)]
+    return found
 
 
 def typical_misfit(pixels: PixelFit) -> float:

@@ -20,7 +20,7 @@ _SHIFTS = 4
 """Orders on both sides that a lone pixel is compared with."""
 
 
-def slip_probability(found: GlobalFit) -> NDArray[np.float32]:
+def slip_probability(found: GlobalFit, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
     """Probability that the order of a pixel is wrong, all evidence of a global fit taken together.
 
     Either the whole surface is off, on the summed evidence of its cells; or its cell is, against the neighbours;
@@ -30,6 +30,8 @@ def slip_probability(found: GlobalFit) -> NDArray[np.float32]:
     ----------
     found : `GlobalFit`
         Result of the global fit.
+    out : `numpy.ndarray`, float32, shape ``(ny, nx)``, optional
+        Where to write; may be ``found.border_slip``, which is then lost.
 
     Returns
     -------
@@ -40,7 +42,7 @@ def slip_probability(found: GlobalFit) -> NDArray[np.float32]:
     by_segment = np.append(settled.segment_slip, 1.0)[settled.segment]
     stays = (1.0 - found.common_slip) * (1.0 - by_segment) * (1.0 - settled.cell_slip)
     lines = np.repeat(stays.astype(np.float32), np.diff(found.cells.x_edges), axis=1)
-    slip = np.empty_like(found.border_slip)
+    slip = np.empty_like(found.border_slip) if out is None else out
     for line, low, high in zip(lines, found.cells.y_edges[:-1], found.cells.y_edges[1:], strict=True):
         # A few rows at a time stay in the cache of the processor.
         part = slip[low:high]
