@@ -284,14 +284,15 @@ def _task_of(ref: DatasetRef) -> str | None:
 
 
 def content_digest(path: str) -> str:
-    """Digest of all pixels and keywords of a FITS file but checksums, run, and ids."""
+    """Digest of all pixels and keywords of a FITS file but checksums, run, ids, and the time of the run."""
     digest = hashlib.sha256()
     with fits.open(path) as hdus:
         for hdu in hdus:
             cards = {
                 key: repr(hdu.header[key])
                 for key in hdu.header
-                if not key.startswith("LSST BUTLER") and key not in ("CHECKSUM", "DATASUM", "COMMENT", "")
+                if not key.startswith(("LSST BUTLER", "CALIB_CREATION"))
+                and key not in ("CHECKSUM", "DATASUM", "COMMENT", "")
             }
             digest.update(json.dumps(cards, sort_keys=True).encode())
             if hdu.data is not None:
