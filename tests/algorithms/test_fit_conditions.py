@@ -1,0 +1,157 @@
+"""What real flats have: steps, illumination, another contrast, gaps, unequal noise, thin and thick adhesive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scipy.ndimage import uniform_filter
+
+from lsst.fringe_sim.algorithms import fit_thickness
+from lsst.fringe_sim.algorithms.thickness_fit import Nuisances
+from lsst.fringe_sim.algorithms.thickness_fit.rescue import _bad_neighbours
+from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.mock.thickness import random_field
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube, mask_bits
+
+WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
+HALF_ORDER_UM = 0.15
+SHAPE = (160, 180)
+NOISE = 0.002
+SPAN_UM = 1.2
+"""Four orders in 160 pixels: 7 nm per pixel, near the steepest of real sensors (9 nm)."""
+
+
+@pytest.fixture(scope="module")
+def model() -> FringeModel:
+    return FringeModel.from_setup("ts8_e2v")
+
+
+def cube_of(
+    thickness: np.ndarray,
+    model: FringeModel,
+    rng: np.random.Generator,
+    wavelengths: np.ndarray = WAVELENGTHS,
+    light: np.ndarray | float = 1.0,
+    noise: float = NOISE,
+) -> FringeCube:
+    """Relative flats of a map, times the light that falls on it, with Gaussian noise."""
+    table = model.table((float(thickness.min()) - 0.01, float(thickness.max()) + 0.01), wavelengths)
+    image = np.stack([table.frame(thickness, row) for row in range(len(wavelengths))]) * light
+    image = image / image.mean(axis=(1, 2), keepdims=True)
+    image = image + noise * rng.standard_normal(image.shape)
+    return FringeCube(
+        image.astype(np.float32),
+        np.full(image.shape, noise**2, np.float32),
+        np.zeros(image.shape, np.int16),
+        FlatExposures(wavelengths, np.array(2.0), np.array(183.15)),
+        "relative",
+    )
+
+
+def places() -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns from -1 to 1."""
+    y, x = np.indices(SHAPE, dtype=float)
+    return 2.0 * y / (SHAPE[0] - 1) - 1.0, 2.0 * x / (SHAPE[1] - 1) - 1.0
+
+
+def pulls_of(fitted, truth: np.ndarray, least: float = 0.95) -> np.ndarray:
+    """Pulls of the good pixels, none of which may have another order."""
+    good = fitted.mask == 0
+    assert good.mean() > least
+    error = (fitted.value - truth)[good]
+    assert np.count_nonzero(np.abs(error) > HALF_ORDER_UM) == 0
+    return np.asarray(error / fitted.sigma[good])
+
+
+def test_a_step_between_the_halves(model, rng, tmp_path) -> None:
+    """As measured: -1.1 % at the midline, a little different at each wavelength."""
+    y, _ = places()
+    truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
+    steps = -0.011 * (1.0 + 0.2 * rng.standard_normal(WAVELENGTHS.size))
+    light = 1.0 + steps[:, None, None] * (y > 0)
+    cube = cube_of(truth, model, rng, light=light)
+    free = fit_thickness(cube, model, nuisances=Nuisances(zones="halves"))
+    pull = pulls_of(free, truth)
+    assert pull.mean() == pytest.approx(0.0, abs=0.05)
+    assert pull.std() == pytest.approx(1.0, abs=0.1)
+    held = fit_thickness(cube, model)
+    assert ((held.value - truth) / held.sigma).std() > 1.3
+    cube.write_fits(tmp_path / "cube.fits")
+    arguments = ["fit", str(tmp_path / "cube.fits"), "--zones", "halves", "--out", str(tmp_path / "fit")]
+    assert run(arguments) == 0
+    value = fits.getdata(tmp_path / "fit" / "thickness.fits", "VALUE")
+    np.testing.assert_array_equal(value, free.value)
+
+
+def test_slow_illumination(model, rng) -> None:
+    """A gradient and a bowl of a few per cent, free at each wavelength."""
+    y, x = places()
+    truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
+    size = 0.02 * rng.standard_normal((WAVELENGTHS.size, 3))
+    light = 1.0 + np.einsum("wk,kyx->wyx", size, np.stack([x, y, x * x + y * y]))
+    cube = cube_of(truth, model, rng, light=light)
+    # The light is even within a cell: on 160 pixels it changes as much from cell to cell as on 4000 over 25 cells.
+    fitted = fit_thickness(cube, model, nuisances=Nuisances(illumination_degree=2), cell_px=2)
+    pull = pulls_of(fitted, truth)
+    assert pull.mean() == pytest.approx(0.0, abs=0.05)
+    assert pull.std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_contrast_that_the_model_does_not_know(model, rng) -> None:
+    truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
+    weak = model.with_effects({"contrast_loss.factor": 0.4})
+    fitted = fit_thickness(cube_of(truth, weak, rng), model, nuisances=Nuisances(contrast="common"))
+    assert fitted.metadata["CONTRAST"] == pytest.approx(0.4, rel=0.01)
+    assert pulls_of(fitted, truth).std() == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("mean", [6.5, 28.0])
+def test_thin_and_thick_adhesive(mean: float, model, rng) -> None:
+    """Both ends of 5 to 30 µm."""
+    truth = random_field(SHAPE, rng, mean=mean, span=SPAN_UM)
+    pull = pulls_of(fit_thickness(cube_of(truth, model, rng), model), truth)
+    assert pull.std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_sensor_cut_in_two(model, rng) -> None:
+    """Masked rows that no path crosses: both parts find their order, by themselves or together."""
+    truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
+    cube = cube_of(truth, model, rng)
+    mask = cube.mask.copy()
+    mask[:, 75:87] = mask_bits("BAD")
+    cut = FringeCube(cube.image, cube.variance, mask, cube.exposures, "relative")
+    fitted = fit_thickness(cut, model)
+    good = fitted.mask == 0
+    assert not good[75:87].any()
+    assert good[:75].mean() > 0.95
+    assert good[87:].mean() > 0.95
+    assert np.count_nonzero(np.abs(fitted.value - truth)[good] > HALF_ORDER_UM) == 0
+
+
+def test_unequal_noise_counts(model, rng) -> None:
+    """A quarter of the sensor and half of the wavelengths are three times noisier; the pulls stay 1 everywhere."""
+    truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
+    cube = cube_of(truth, model, rng, noise=1e-6)
+    noise = np.full(cube.shape, NOISE)
+    noise[::2] *= 3.0
+    noise[:, :80, :90] *= 3.0
+    image = cube.image + noise * rng.standard_normal(cube.shape)
+    uneven = FringeCube(
+        image.astype(np.float32), (noise**2).astype(np.float32), cube.mask, cube.exposures, "relative"
+    )
+    fitted = fit_thickness(uneven, model)
+    pulls_of(fitted, truth)
+    pull = (fitted.value - truth) / fitted.sigma
+    assert pull[:80, :90].std() == pytest.approx(1.0, abs=0.1)
+    assert pull[80:].std() == pytest.approx(1.0, abs=0.1)
+    assert np.median(fitted.sigma[:80, :90]) > 2.0 * np.median(fitted.sigma[80:])
+
+
+def test_neighbours_that_fit_badly_are_counted(rng) -> None:
+    """Like a filter over the whole image, but only where it is asked."""
+    bad = rng.random((23, 31)) < 0.4
+    rows, columns = np.nonzero(bad)
+    expected = 25.0 * uniform_filter(bad.astype(float), 5, mode="nearest")
+    np.testing.assert_allclose(_bad_neighbours(bad, rows, columns), expected[bad], atol=1e-9)
