@@ -578,9 +578,11 @@ def main() -> None:
         run_target(target, arguments.cases, arguments.seed)
     else:
         rng = np.random.default_rng(secrets.randbits(128))
+        warm_up()
+        began = time.process_time()
         while True:
             run_cases(chosen, arguments.cases if arguments.seconds is None else ROUND, rng)
-            if arguments.seconds is None or time.process_time() >= arguments.seconds:
+            if arguments.seconds is None or time.process_time() - began >= arguments.seconds:
                 break
     for name in sorted(TALLY.used | TALLY.refused):
         print(f"{name:28s} {TALLY.used[name]:6d} used {TALLY.refused[name]:6d} refused")
