@@ -16,10 +16,12 @@ from .base import (
     apply_to_system,
 )
 from .black_coating import BlackCoating
+from .brighter_fatter import BrighterFatter
 from .charge_diffusion import ChargeDiffusion
 from .chromatic_illumination import ChromaticIllumination
 from .contrast_loss import ContrastLoss
 from .converging_beam import ConvergingBeam
+from .crosstalk import Crosstalk
 from .dark_pedestal import DarkPedestal
 from .epoxy_absorption import EpoxyAbsorption
 from .epoxy_index import EpoxyIndex
@@ -94,7 +96,9 @@ EFFECTS: tuple[Effect, ...] = (
     MidlineStep(),
     DarkPedestal(),
     ChargeDiffusion(),
+    BrighterFatter(),
     NonLinearity(),
+    Crosstalk(),
     AmplifierGain(),
     AmplifierOffset(),
 )

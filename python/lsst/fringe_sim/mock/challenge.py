@@ -83,6 +83,7 @@ SIZES: Mapping[str, Draw] = MappingProxyType(
         },
         "vignetting": lambda r: {"vignetting.corner": _decades(r, -3.3, -0.7)},
         "midline_step": lambda r: {"midline_step.fraction": _signed(r, -3.5, -1.7)},
+        "crosstalk": lambda r: {"crosstalk.from_left": _decades(r, -3.7, -2.0)},
         "amplifier_gain": lambda r: {"amplifier_gain.rms": _decades(r, -3.3, -1.7)},
         "amplifier_offset": lambda r: {"amplifier_offset.rms": _decades(r, 1.0, 2.5)},
         "dark_pedestal": lambda r: {"dark_pedestal.electrons": _decades(r, 2.0, 4.0)},
@@ -110,16 +111,6 @@ def _ghost_image(image: FloatArray, wavelength: float, scene: Mapping[str, Any])
     return image + scene["size"] * gaussian_filter(image[::-1, ::-1], 1.0)
 
 
-def _crosstalk(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
-    """Every amplifier echoes in its neighbour."""
-    width = image.shape[1] // 8
-    echo = np.zeros(image.shape)
-    for column in range(7):
-        source = image[:, column * width : (column + 1) * width]
-        echo[:, (column + 1) * width : (column + 2) * width] = source
-    return image + scene["size"] * echo
-
-
 def _stains(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
     """A few round stains that absorb the more the shorter the wavelength."""
     y, x = np.indices(image.shape)
@@ -145,7 +136,6 @@ OUTSIDERS: Mapping[str, tuple[Callable[..., FloatArray], float, float]] = Mappin
         "second_film": (_second_film, -3.5, -2.3),
         "tree_rings": (_tree_rings, -3.5, -2.3),
         "ghost_image": (_ghost_image, -2.5, -1.3),
-        "crosstalk": (_crosstalk, -3.0, -2.0),
         "stains": (_stains, -3.0, -1.7),
         "columns": (_columns, -3.5, -2.5),
         "wandering_light": (_jitter, -3.5, -2.0),

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, laplace
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from .optics import FlatFieldOptics
@@ -294,6 +294,22 @@ def _non_linearity(electrons: FloatArray, values: Values) -> FloatArray:
     return electrons * (1.0 - values["quadratic"] * electrons / REFERENCE_CHARGE_E)
 
 
+def _brighter_fatter(electrons: FloatArray, values: Values) -> FloatArray:
+    """Every electron of a pixel pushes a few of those that follow into the four neighbours, both ways."""
+    return electrons + 0.25 * values["variance"] / REFERENCE_CHARGE_E * laplace(electrons**2, mode="reflect")
+
+
+def _crosstalk(electrons: FloatArray, values: Values) -> FloatArray:
+    """Segments of one row of amplifiers are read side by side, pixel by pixel."""
+    width = electrons.shape[1] // 8
+    result = electrons.copy()
+    if width and values["from_left"]:
+        result[:, width : 8 * width] += values["from_left"] * electrons[:, : 7 * width]
+    if width and values["from_right"]:
+        result[:, : 7 * width] += values["from_right"] * electrons[:, width : 8 * width]
+    return result
+
+
 def _dark_pedestal(state: AmplifierState, values: Values, deviate: float) -> AmplifierState:
     return replace(state, dark_e=state.dark_e + values["electrons"])
 
@@ -476,10 +492,29 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
         on_amplifier=_dark_pedestal,
     ),
     HiddenEffect(
+        "brighter_fatter",
+        "brighter-fatter effect",
+        (
+            HiddenParameter(
+                "variance", "px2", 0.0, (0.0, 0.5), "spread along one axis behind 100 000 electrons"
+            ),
+        ),
+        on_charge=_brighter_fatter,
+    ),
+    HiddenEffect(
         "non_linearity",
         "non-linear response to charge",
         (HiddenParameter("quadratic", "", 0.0, (-0.2, 0.2), "relative loss at 100 000 electrons"),),
         on_charge=_non_linearity,
+    ),
+    HiddenEffect(
+        "crosstalk",
+        "crosstalk between neighbouring amplifiers",
+        (
+            HiddenParameter("from_left", "", 0.0, (-0.05, 0.05), "part of the amplifier at lower x"),
+            HiddenParameter("from_right", "", 0.0, (-0.05, 0.05), "part of the amplifier at higher x"),
+        ),
+        on_charge=_crosstalk,
     ),
     HiddenEffect(
         "amplifier_gain",

@@ -1,0 +1,68 @@
+"""Effects in which a pixel hears of others: crosstalk and brighter-fatter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.effects import EFFECTS, ImageGeometry, activate_effects, apply_to_image
+from lsst.fringe_sim.model import FringeModel
+
+LEVEL = 30_000.0
+
+
+def _changed(image: np.ndarray, geometry: ImageGeometry, settings: dict[str, float]) -> np.ndarray:
+    system = FringeModel.from_setup("ts8_e2v").base_system
+    return apply_to_image(activate_effects(settings, EFFECTS), system, image, geometry)
+
+
+def test_crosstalk_moves_a_star_by_one_amplifier() -> None:
+    image = np.ones((1, 8, 80))
+    image[0, 3, 34] = 50.0  # fourth amplifier, fifth column
+    geometry = ImageGeometry.of_pixels((8, 80), np.array([960.0]), LEVEL)
+    left = _changed(image, geometry, {"crosstalk.from_left": 0.01})[0] - image[0]
+    assert left[3, 44] == pytest.approx(0.5)
+    assert np.all(left[:, :10] == 0.0)
+    right = _changed(image, geometry, {"crosstalk.from_right": 0.02})[0] - image[0]
+    assert right[3, 24] == pytest.approx(1.0)
+    assert np.all(right[:, 70:] == 0.0)
+    assert np.count_nonzero(np.isclose(right, 0.02)) == 8 * 70 - 1
+
+
+def test_crosstalk_of_cells_is_the_mean_of_that_of_pixels() -> None:
+    """Amplifiers of 20 pixels, cells of 4: five cells each."""
+    y, x = np.mgrid[:16, :160]
+    image = (1.0 + 0.2 * np.sin(0.08 * x + 0.05 * y))[np.newaxis]
+    pixels = ImageGeometry.of_pixels((16, 160), np.array([960.0]), LEVEL)
+    places = 4 * np.arange(40) + 1.5
+    cells = ImageGeometry((16, 160), places[:4], places, np.array([960.0]), np.array([LEVEL]))
+
+    def averaged(cube: np.ndarray) -> np.ndarray:
+        return cube.reshape(1, 4, 4, 40, 4).mean(axis=(2, 4))
+
+    settings = {"crosstalk.from_left": 0.01, "crosstalk.from_right": -0.004}
+    fine, coarse = _changed(image, pixels, settings), _changed(averaged(image), cells, settings)
+    np.testing.assert_allclose(coarse, averaged(fine), atol=1e-12)
+
+
+def test_brighter_fatter_widens_and_keeps_the_charge() -> None:
+    """Second moments of a spot on a dark sky grow by the variance its own charge stands for."""
+    y, x = np.mgrid[-20:21, -20:21].astype(float)
+    spot = np.exp(-0.5 * (x**2 + y**2) / 9.0)
+    geometry = ImageGeometry.of_pixels((41, 41), np.array([960.0]), LEVEL)
+    changed = _changed(spot[np.newaxis], geometry, {"brighter_fatter.variance": 0.2})[0]
+    assert changed.sum() == pytest.approx(spot.sum(), rel=1e-12)
+    before, after = ((x**2 * image).sum() / image.sum() for image in (spot, changed))
+    # A quarter of the Laplacian of q²: x² gains half of the mean of q, weighted by q; a Gaussian's is half its peak.
+    assert after - before == pytest.approx(0.5 * 0.2 * LEVEL / 1e5 * 0.5, rel=1e-3)
+
+
+def test_brighter_fatter_grows_with_the_level() -> None:
+    x = np.arange(64)
+    fringes = np.broadcast_to(1.0 + 0.3 * np.cos(2.0 * np.pi * x / 16.0), (1, 64, 64))
+    contrast = []
+    for level in (1e4, 4e4):
+        geometry = ImageGeometry.of_pixels((64, 64), np.array([960.0]), level)
+        contrast.append(1.0 - np.ptp(_changed(fringes, geometry, {"brighter_fatter.variance": 0.1})) / 0.6)
+    assert contrast[1] == pytest.approx(4.0 * contrast[0], rel=0.02)
+    assert contrast[0] > 0.0
