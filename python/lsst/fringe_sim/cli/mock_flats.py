@@ -20,6 +20,9 @@ from .progress import progress
 
 __all__ = ["mock_flats"]
 
+STEEPEST_UM = 0.03
+"""Range of a random map over the pixels of its shorter side: slopes of 0.05 µm per pixel, a sixth of a fringe."""
+
 BLEMISHES = Defects(bad_columns=6, hot_pixels=200, prnu_rms=0.003)
 """What ``--blemishes`` puts on the sensor: about what a science-grade sensor shows."""
 
@@ -133,7 +136,8 @@ def thickness_map(
         low, high = setup.thickness_range_um
         if setup.varying == "adhesive":
             # What the nine sensors of RTM-020 show: 7 to 14 um of range on a mean between 13 and 22 um.
-            span = float(rng.uniform(6.0, 10.0))
+            # A small part of a sensor does not have the range of the whole: neighbours stay well within a fringe.
+            span = min(float(rng.uniform(6.0, 10.0)), STEEPEST_UM * min(shape))
             mean = float(rng.uniform(max(low, 10.0) + span / 2, min(high, 26.0) - span / 2))
         else:
             span = 0.2 * (high - low)

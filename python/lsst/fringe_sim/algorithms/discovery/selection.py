@@ -392,6 +392,8 @@ class Selector:
         order = 1e-3 * float(np.median(problem.cells.wavelength_nm)) / (2.0 * float(self.index.mean()))
         shifts = np.arange(-ORDERS_MOVED * 12, ORDERS_MOVED * 12 + 1) * (order / 12.0)
         shifts = shifts[(middle + shifts) * thickness.min() / middle > 0.5]
+        if not shifts.size:
+            return []
         for edge in (shifts[0], shifts[-1]):
             forward.cover(whole * (1.0 + edge / middle))
         # The best of each parameter and order: sizes lie too far apart for the right one to win at once.
