@@ -12,7 +12,6 @@ import click
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.wcs import WCS
 from click.shell_completion import BashComplete
 
 import lsst.fringe_sim
@@ -154,7 +153,7 @@ def test_what_a_search_has_found_goes_into_fit_and_sky(tmp_path: Path, capsys) -
     assert header["EFFECT0"] == "roughness.sigma"
     assert "EFFECT1" not in header
     image = fits.getheader(frame, 1)
-    assert WCS(image, key="F").wcs.name == "FOCAL PLANE"
+    assert not [key for key in image if key.startswith("WCSNAME")]  # nobody says where 64 by 64 pixels lie
 
 
 @pytest.mark.parametrize("line", ["import os", 'config.effects["bandwidth.fwhm"] = 2.0; import os', "x = 1"])
