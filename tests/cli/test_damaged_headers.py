@@ -17,13 +17,14 @@ from astropy.io import fits
 from product_makers import MAKERS
 from raw_frame_maker import random_image, raw_hdus, small_detector
 
-from lsst.fringe_sim.cli.inputs import read_thickness
+from lsst.fringe_sim.cli.inputs import read_section, read_thickness
 from lsst.fringe_sim.cli.lab_frames import read_cube
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.cli.provenance import read_header
 from lsst.fringe_sim.errors import FrameFormatError
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_metadata
 from lsst.fringe_sim.products import FringeCube, ThicknessMap
+from lsst.fringe_sim.products.xarray_export import read_exported
 from lsst.fringe_sim.resources import check_axes
 
 CARD = 80
@@ -58,6 +59,8 @@ READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "cube": ("FringeCube", FringeCube.read_fits),
     "cube of a command": ("FringeCube", read_cube),
     "provenance": ("FringeCube", read_header),
+    "export": ("FringeCube", read_exported),
+    "place of a map": ("ThicknessMap", lambda path: read_section(path, small_detector(), (6, 8))),
 }
 
 

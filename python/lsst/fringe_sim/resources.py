@@ -9,19 +9,27 @@ import hashlib
 import lzma
 import os
 import re
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import yaml
+from astropy.io import fits
 from astropy.table import Table
 
 from .errors import FrameFormatError, InputError, ResourceError, UnknownNameError
 
 __all__ = [
+    "DAMAGE",
     "check_axes",
+    "first_line",
     "list_resources",
+    "open_user_fits",
     "parse_user_yaml",
     "read_table",
     "read_user_yaml",
@@ -38,6 +46,24 @@ LONGEST_USER_FILE = 1_000_000
 """Characters of a YAML file that a user gives; descriptions of sensors have a few thousand."""
 
 DEEPEST_NESTING = 20
+
+DAMAGE = (
+    *(
+        OSError,
+        EOFError,
+        ValueError,
+        TypeError,
+        IndexError,
+        KeyError,
+        AttributeError,
+        OverflowError,
+        MemoryError,
+        AssertionError,
+        zlib.error,
+    ),
+    *(UserWarning, fits.VerifyError),
+)
+"""What astropy raises when a file is not as its headers say."""
 
 _CARD, _CHUNK = 80, 1 << 22
 _COUNTS = (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT")
@@ -185,7 +211,7 @@ def parse_user_yaml(text: str, what: str, *, source: str | None = None) -> Any:
     except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError, KeyError) as error:
         if isinstance(error, InputError):
             raise
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise InputError(what, reason, "YAML", source=source) from None
 
 
@@ -200,6 +226,46 @@ def _check_events(text: str, what: str, source: str | None) -> None:
             depth -= 1
         if depth > DEEPEST_NESTING:
             raise InputError(what, f"nested {depth} deep", f"up to {DEEPEST_NESTING}", source=source)
+
+
+def first_line(error: Exception) -> str:
+    """What an error says, in one line; its kind if it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+@contextmanager
+def open_user_fits(
+    path: str | os.PathLike[str],
+    *,
+    warning: Literal["ignored", "truncated", "error"] = "ignored",
+    **options: Any,
+) -> Iterator[fits.HDUList]:
+    """Open a FITS file from outside, which may be anything.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    warning : {"ignored", "truncated", "error"}, optional
+        Which warnings of astropy are errors: none, that the file is too short, or all. Elsewhere they stay silent.
+    **options
+        For `astropy.io.fits.open`.
+
+    Raises
+    ------
+    FrameFormatError
+        See `check_axes`.
+    Exception
+        One of `DAMAGE`.
+    """
+    # The stream is opened here because astropy leaves its own open when it stumbles.
+    with warnings.catch_warnings(), open(path, "rb") as stream:
+        warnings.simplefilter("error" if warning == "error" else "ignore")
+        if warning == "truncated":  # of which astropy warns, and goes on
+            warnings.filterwarnings("error", message=".*truncated.*")
+        check_axes(stream, str(path))
+        with fits.open(stream, **options) as hdus:
+            yield hdus
 
 
 def check_axes(stream: IO[bytes], source: str) -> None:

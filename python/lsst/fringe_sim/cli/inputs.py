@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
-from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..algorithms.discovery import read_effects_override
@@ -19,9 +17,9 @@ from ..errors import FrameFormatError, InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel
 from ..model.provenance import model_cards, software_cards
-from ..products import DAMAGE, SensorSection
+from ..products import SensorSection
 from ..products.sensor_section import SECTION_KEYWORDS
-from ..resources import check_axes, read_user_yaml
+from ..resources import DAMAGE, first_line, open_user_fits, read_user_yaml
 
 __all__ = [
     "effect_cards",
@@ -57,19 +55,13 @@ def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     if not Path(path).is_file():
         raise FileNotFoundError(2, "there is no such file", source)
     try:
-        # The stream is opened here because astropy leaves its own open when it stumbles.
-        with warnings.catch_warnings(), open(path, "rb") as stream:
-            warnings.simplefilter("ignore")
-            warnings.filterwarnings("error", message=".*truncated.*")
-            check_axes(stream, source)
-            with fits.open(stream, memmap=False) as hdus:
-                image = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
-                mask = hdus["MASK"].data if "MASK" in hdus else None
+        with open_user_fits(path, warning="truncated", memmap=False) as hdus:
+            image = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
+            mask = hdus["MASK"].data if "MASK" in hdus else None
     except InputError:
         raise
     except DAMAGE as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise FrameFormatError("file", reason, "a complete FITS file", source=source) from None
+        raise FrameFormatError("file", first_line(error), "a complete FITS file", source=source) from None
     if image is None or image.ndim != 2:
         found = "no image" if image is None else f"shape {image.shape}"
         raise FrameFormatError("thickness map", found, "a two-dimensional image in µm", source=source)
@@ -91,10 +83,8 @@ def read_section(
     FrameFormatError, OutOfRangeError
         A header with a malformed section, or with pixels that the sensor does not have.
     """
-    with warnings.catch_warnings(), open(path, "rb") as stream:
-        warnings.simplefilter("ignore")
-        with fits.open(stream, memmap=False) as hdus:
-            headers = [hdus[0].header, *(hdu.header for hdu in hdus[1:2])]
+    with open_user_fits(path, memmap=False) as hdus:
+        headers = [hdus[0].header, *(hdu.header for hdu in hdus[1:2])]
     known = {key: header[key] for header in headers for key in SECTION_KEYWORDS if key in header}
     try:
         return SensorSection.of_image(detector, shape, known)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 import click
 import numpy as np
-from astropy.io import fits
 
 from ..algorithms.flat_prep import combine_biases, prepare_flat
 from ..algorithms.flat_prep_options import FlatPrepOptions
@@ -19,8 +17,8 @@ from ..instrument.camera import Camera, Detector
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..middleware.raw_ingest import find_raw_files
 from ..model import Setup
-from ..products import DAMAGE, FringeCube
-from ..resources import check_axes
+from ..products import FringeCube
+from ..resources import DAMAGE, first_line, open_user_fits
 
 __all__ = ["LabSeries", "find_series", "read_cube"]
 
@@ -168,18 +166,13 @@ def read_cube(path: str) -> FringeCube | None:
     if not Path(path).is_file():
         return None
     try:
-        # The stream is opened here because astropy leaves its own open when it stumbles.
-        with warnings.catch_warnings(), open(path, "rb") as stream:
-            warnings.simplefilter("ignore")
-            check_axes(stream, path)
-            with fits.open(stream, memmap=False) as hdus:
-                if "EXPOSURES" not in hdus or "IMAGE" not in hdus:
-                    return None
+        with open_user_fits(path, memmap=False) as hdus:
+            if "EXPOSURES" not in hdus or "IMAGE" not in hdus:
+                return None
     except InputError:
         raise
     except DAMAGE as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise FrameFormatError("file", reason, "a complete FITS file", source=path) from None
+        raise FrameFormatError("file", first_line(error), "a complete FITS file", source=path) from None
     return FringeCube.read_fits(path)
 
 

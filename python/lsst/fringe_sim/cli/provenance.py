@@ -16,8 +16,7 @@ from astropy.table import Table
 
 from ..errors import FrameFormatError, InputError, UnknownNameError
 from ..model.provenance import effects_of_header, inputs_of_header
-from ..products import DAMAGE
-from ..resources import check_axes, revision
+from ..resources import DAMAGE, first_line, open_user_fits, revision
 
 __all__ = ["describe", "provenance", "read_header"]
 
@@ -89,16 +88,13 @@ def read_header(path: str) -> dict[str, Any]:
     except InputError:
         raise
     except (*DAMAGE, RecursionError) as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise FrameFormatError(
-            "file", reason, "an undamaged FITS, ECSV or JSON product", source=path
+            "file", first_line(error), "an undamaged FITS, ECSV or JSON product", source=path
         ) from None
 
 
 def _fits_header(path: str) -> dict[str, Any]:
-    with open(path, "rb") as stream:
-        check_axes(stream, path)
-    with fits.open(path, memmap=True, lazy_load_hdus=True) as hdus:
+    with open_user_fits(path, memmap=True, lazy_load_hdus=True) as hdus:
         header = hdus[0].header
         return {
             key: header[key] for key in header if key and not isinstance(header[key], fits.card.Undefined)

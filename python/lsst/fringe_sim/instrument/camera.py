@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
-from ..resources import list_resources, read_table, read_user_yaml, read_yaml
+from ..resources import first_line, list_resources, read_table, read_user_yaml, read_yaml
 from .detector import Amplifier, Detector, RawSegment
 
 __all__ = ["Amplifier", "Camera", "Detector", "RawSegment"]
@@ -77,7 +77,7 @@ class Camera:
         except InputError as error:
             raise error.in_source(str(path)) from None
         except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            reason = first_line(error)
             raise InputError(
                 "content", reason, "the description of a camera in YAML", source=str(path)
             ) from None

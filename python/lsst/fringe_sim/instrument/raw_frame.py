@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import warnings
-import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,7 +24,7 @@ import numpy.typing as npt
 from astropy.io import fits
 
 from ..errors import FrameFormatError, InputError, UnknownNameError
-from ..resources import check_axes
+from ..resources import DAMAGE, first_line, open_user_fits
 from .raw_metadata import OBSERVATION_TYPES, RawMetadata, header_value
 
 __all__ = [
@@ -263,34 +261,13 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
     if not Path(source).is_file():
         raise FrameFormatError("file", source, "an existing FITS file")
     try:
-        # The stream is opened here because astropy leaves its own open when it stumbles.
-        with warnings.catch_warnings(), open(source, "rb") as stream:
-            # astropy warns of a file that is too short, and goes on.
-            warnings.simplefilter("ignore")
-            warnings.filterwarnings("error", message=".*truncated.*")
-            check_axes(stream, source)
-            with fits.open(stream, memmap=False, lazy_load_hdus=False) as hdus:
-                yield hdus
+        with open_user_fits(source, warning="truncated", memmap=False, lazy_load_hdus=False) as hdus:
+            yield hdus
     except InputError as error:
         raise (error if error.source else error.in_source(source)) from None
-    except (
-        OSError,
-        EOFError,
-        zlib.error,
-        TypeError,
-        ValueError,
-        KeyError,
-        IndexError,
-        AttributeError,
-        OverflowError,
-        MemoryError,
-        AssertionError,
-        Warning,
-        fits.VerifyError,
-    ) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except (*DAMAGE, Warning) as error:
         raise FrameFormatError(
-            "file", Path(source).name, f"a complete FITS file ({reason})", source=source
+            "file", Path(source).name, f"a complete FITS file ({first_line(error)})", source=source
         ) from error
 
 

@@ -4,7 +4,7 @@ Each product has ``write_fits(path, metadata=None)`` and ``read_fits(path)``. Fi
 at all, carry checksums, and two writes of one product agree to the byte.
 """
 
-from ._fits import DAMAGE
+from ..resources import DAMAGE
 from .combined_bias import CombinedBias
 from .fringe_components import FringeComponents
 from .fringe_cube import CUBE_UNITS, FlatExposures, FringeCube

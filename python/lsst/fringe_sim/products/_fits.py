@@ -11,8 +11,6 @@ import math
 import os
 import re
 import uuid
-import warnings
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -23,7 +21,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError
-from ..resources import check_axes
+from ..resources import DAMAGE, first_line, open_user_fits
 from ._check import check_mapping
 from .mask import mask_plane_cards, planes_from_header, remap_mask
 from .sensor_section import SECTION_KEYWORDS, SensorSection
@@ -50,24 +48,6 @@ PRODUCT_KEY = "PRODUCT"
 VERSION_KEY = "PRODVER"
 PRODUCT_VERSION = 1
 EXTENSIONS_KEY = "NEXTEND"
-
-DAMAGE = (
-    *(
-        OSError,
-        EOFError,
-        ValueError,
-        TypeError,
-        IndexError,
-        KeyError,
-        AttributeError,
-        OverflowError,
-        MemoryError,
-        AssertionError,
-        zlib.error,
-    ),
-    *(UserWarning, fits.VerifyError),
-)
-"""What astropy raises when a file is not as its headers say."""
 
 # Keywords that describe the bytes of the file rather than the product.
 _STRUCTURAL = re.compile(
@@ -286,19 +266,18 @@ def open_fits(
     if not Path(path).is_file():
         raise InputError("file", source, "an existing FITS file")
     try:
-        # The stream is opened here because astropy leaves its own open when it stumbles.
-        with warnings.catch_warnings(), open(path, "rb") as stream:
-            warnings.simplefilter("error")
-            check_axes(stream, source)
-            with fits.open(stream, memmap=memmap, checksum=verify, lazy_load_hdus=False) as hdus:
-                _check_product(hdus[0].header, product, source)
-                _check_complete(hdus, source)
-                yield hdus
+        with open_user_fits(
+            path, warning="error", memmap=memmap, checksum=verify, lazy_load_hdus=False
+        ) as hdus:
+            _check_product(hdus[0].header, product, source)
+            _check_complete(hdus, source)
+            yield hdus
     except InputError as error:
         raise (error if error.source else error.in_source(source)) from None
     except DAMAGE as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise FrameFormatError("FITS file", reason, "an undamaged FITS file", source=source) from error
+        raise FrameFormatError(
+            "FITS file", first_line(error), "an undamaged FITS file", source=source
+        ) from error
 
 
 def _check_product(header: fits.Header, product: str, source: str) -> None:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FrameFormatError, InputError, MissingPackageError, UnknownNameError
+from ..resources import DAMAGE, first_line, open_user_fits
+from ._fits import PRODUCT_KEY
 from .fringe_cube import FringeCube
 from .mask import MASK_PLANES
 from .sensor_section import section_pixels
@@ -113,21 +115,20 @@ def read_exported(path: str | os.PathLike[str]) -> ThicknessMap | FringeCube | S
     UnknownNameError
         Another product; the file is named.
     """
-    from astropy.io import fits
-
-    from ._fits import DAMAGE, PRODUCT_KEY
-
     source = str(path)
     if not Path(path).is_file():
         raise InputError("file", source, "an existing FITS file")
     try:
-        with open(path, "rb") as stream, fits.open(stream, lazy_load_hdus=True) as hdus:
+        with open_user_fits(path, lazy_load_hdus=True) as hdus:
             header = hdus[0].header
             # A cube from elsewhere does not say what it is.
             name = header.get(PRODUCT_KEY) or ("FringeCube" if "EXPOSURES" in hdus else "")
+    except InputError:
+        raise
     except DAMAGE as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise FrameFormatError("FITS file", reason, "an undamaged FITS file", source=source) from None
+        raise FrameFormatError(
+            "FITS file", first_line(error), "an undamaged FITS file", source=source
+        ) from None
     if name not in EXPORTED:
         raise UnknownNameError(PRODUCT_KEY, name, EXPORTED, source=source)
     found: ThicknessMap | FringeCube | SkyFringe = EXPORTED[name].read_fits(path)
