@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 import numpy as np
+from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..algorithms.discovery import read_effects_override
@@ -22,6 +24,7 @@ from ..products.sensor_section import SECTION_KEYWORDS
 from ..resources import DAMAGE, first_line, open_user_fits, read_user_yaml
 
 __all__ = [
+    "complete_fits",
     "effect_cards",
     "prepare_folder",
     "read_section",
@@ -29,6 +32,26 @@ __all__ = [
     "read_thickness",
     "sky_settings",
 ]
+
+
+@contextmanager
+def complete_fits(
+    path: str | os.PathLike[str], warning: Literal["ignored", "truncated"] = "ignored"
+) -> Iterator[fits.HDUList]:
+    """Open a FITS file of the user; see `open_user_fits`.
+
+    Raises
+    ------
+    FrameFormatError
+        The file is not FITS, or damaged.
+    """
+    try:
+        with open_user_fits(path, warning=warning, memmap=False) as hdus:
+            yield hdus
+    except InputError:
+        raise
+    except DAMAGE as error:
+        raise FrameFormatError("file", first_line(error), "a complete FITS file", source=str(path)) from None
 
 
 def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
@@ -54,14 +77,9 @@ def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     source = str(path)
     if not Path(path).is_file():
         raise FileNotFoundError(2, "there is no such file", source)
-    try:
-        with open_user_fits(path, warning="truncated", memmap=False) as hdus:
-            image = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
-            mask = hdus["MASK"].data if "MASK" in hdus else None
-    except InputError:
-        raise
-    except DAMAGE as error:
-        raise FrameFormatError("file", first_line(error), "a complete FITS file", source=source) from None
+    with complete_fits(path, warning="truncated") as hdus:
+        image = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
+        mask = hdus["MASK"].data if "MASK" in hdus else None
     if image is None or image.ndim != 2:
         found = "no image" if image is None else f"shape {image.shape}"
         raise FrameFormatError("thickness map", found, "a two-dimensional image in µm", source=source)
@@ -83,7 +101,7 @@ def read_section(
     FrameFormatError, OutOfRangeError
         A header with a malformed section, or with pixels that the sensor does not have.
     """
-    with open_user_fits(path, memmap=False) as hdus:
+    with complete_fits(path) as hdus:
         headers = [hdus[0].header, *(hdu.header for hdu in hdus[1:2])]
     known = {key: header[key] for header in headers for key in SECTION_KEYWORDS if key in header}
     try:

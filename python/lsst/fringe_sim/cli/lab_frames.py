@@ -18,7 +18,7 @@ from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..middleware.raw_ingest import find_raw_files
 from ..model import Setup
 from ..products import FringeCube
-from ..resources import DAMAGE, first_line, open_user_fits
+from .inputs import complete_fits
 
 __all__ = ["LabSeries", "find_series", "read_cube"]
 
@@ -165,14 +165,9 @@ def read_cube(path: str) -> FringeCube | None:
     """
     if not Path(path).is_file():
         return None
-    try:
-        with open_user_fits(path, memmap=False) as hdus:
-            if "EXPOSURES" not in hdus or "IMAGE" not in hdus:
-                return None
-    except InputError:
-        raise
-    except DAMAGE as error:
-        raise FrameFormatError("file", first_line(error), "a complete FITS file", source=path) from None
+    with complete_fits(path) as hdus:
+        if "EXPOSURES" not in hdus or "IMAGE" not in hdus:
+            return None
     return FringeCube.read_fits(path)
 
 
