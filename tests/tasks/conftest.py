@@ -66,7 +66,7 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> dict[str, MockRun]:
 
 @pytest.fixture(scope="session")
 def empty_repo(tmp_path_factory: pytest.TempPathFactory, command: Command) -> Path:
-    """A repository with both instruments."""
+    """A repository with both instruments: for all modules, which work on copies of it."""
     root = tmp_path_factory.mktemp("tasks") / "repo"
     assert command("butler", "create", root, "--seed-config", SEED_CONFIG).code == 0
     with Butler.from_config(str(root), writeable=True) as butler:

@@ -71,12 +71,17 @@ def spoiled(raws: dict[str, MockRun], tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture(scope="module")
 def first_run(
-    command: Command, empty_repo: Path, spoiled: tuple[Path, Path, Path], rafts_file: Path
+    command: Command,
+    empty_repo: Path,
+    spoiled: tuple[Path, Path, Path],
+    rafts_file: Path,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Path, Outcome]:
     """Repository after a run in which one flat could not be used."""
-    ingested = command("butler", "ingest-fringe-raws", empty_repo, spoiled[0], "--transfer", "direct")
+    repo = Path(shutil.copytree(empty_repo, tmp_path_factory.mktemp("lab") / "repo"))
+    ingested = command("butler", "ingest-fringe-raws", repo, spoiled[0], "--transfer", "direct")
     assert ingested.code == 0, ingested.text
-    return empty_repo, run_lab(command, empty_repo, "u/lab", "-C", f"epoxyFit:{rafts_file}")
+    return repo, run_lab(command, repo, "u/lab", "-C", f"epoxyFit:{rafts_file}")
 
 
 def fitted(repo: Path, collection: str) -> set[int]:
