@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.fft import dct, idct
 
+from .band_limited import filtered
 from .base import FloatArray, Parameter, PlainNullEffect
 from .image_geometry import ImageGeometry
 
@@ -42,11 +42,7 @@ class BrighterFatter(PlainNullEffect):
 def _laplacian(image: FloatArray, geometry: ImageGeometry) -> FloatArray:
     """Second derivatives along both axes [1/px²], exact for the band-limited image that the samples define."""
     result = np.zeros(image.shape)
-    for axis, step in zip((-2, -1), geometry.cell_px, strict=True):
-        size = image.shape[axis]
-        if size == 1:
-            continue
-        square = (np.arange(size) * np.pi / size / step) ** 2
-        factor = square.reshape((size, 1) if axis == -2 else (size,))
-        result -= idct(factor * dct(image, type=2, axis=axis), type=2, axis=axis)
+    for axis in (-2, -1):
+        if image.shape[axis] > 1:
+            result -= filtered(image, geometry, axis, np.square)
     return result

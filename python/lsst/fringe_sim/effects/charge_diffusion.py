@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.fft import dct, idct
 
+from .band_limited import filtered
 from .base import FloatArray, Parameter, PlainNullEffect
 from .image_geometry import ImageGeometry
 
@@ -27,12 +27,9 @@ class ChargeDiffusion(PlainNullEffect):
         self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
     ) -> FloatArray:
         """Blur along both axes; exact for the band-limited image that the samples define, mirrored at the edges."""
-        for axis, step in zip((-2, -1), geometry.cell_px, strict=True):
-            size = image.shape[axis]
-            if size == 1:
-                continue
-            frequency = np.arange(size) * np.pi / size / step
-            damping = np.exp(-0.5 * (values["sigma"] * frequency) ** 2)
-            shape = (size, 1) if axis == -2 else (size,)
-            image = idct(dct(image, type=2, axis=axis) * damping.reshape(shape), type=2, axis=axis)
+        for axis in (-2, -1):
+            if image.shape[axis] > 1:
+                image = filtered(
+                    image, geometry, axis, lambda frequency: np.exp(-0.5 * (values["sigma"] * frequency) ** 2)
+                )
         return image

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .base import FloatArray, Parameter, PlainNullEffect
 from .image_geometry import ImageGeometry
@@ -44,7 +43,7 @@ class Crosstalk(PlainNullEffect):
 def _neighbour(image: FloatArray, geometry: ImageGeometry, side: int) -> FloatArray:
     """What the amplifier next in x holds at the same place; 0 where there is none."""
     edges, x = np.array(geometry.x_edges, dtype=float), geometry.x_px
-    own: NDArray[np.int64] = np.clip(np.searchsorted(edges - 0.5, x, side="right") - 1, 0, len(edges) - 2)
+    own = geometry.amplifier_column
     other = own + side
     there = (other >= 0) & (other <= len(edges) - 2)
     source = x + np.where(there, edges[np.clip(other, 0, len(edges) - 2)] - edges[own], 0.0)

@@ -100,9 +100,16 @@ class ImageGeometry:
     def amplifier(self) -> NDArray[np.int64]:
         """Position in `AMPLIFIERS` of the amplifier that reads each sample, shape ``(ny, nx)``."""
         row = np.clip(np.searchsorted(np.array(self.y_edges) - 0.5, self.y_px, side="right") - 1, 0, 1)
-        column = np.clip(np.searchsorted(np.array(self.x_edges) - 0.5, self.x_px, side="right") - 1, 0, 7)
-        place: NDArray[np.int64] = 8 * row[:, np.newaxis] + column[np.newaxis, :]
+        place: NDArray[np.int64] = 8 * row[:, np.newaxis] + self.amplifier_column[np.newaxis, :]
         return place
+
+    @property
+    def amplifier_column(self) -> NDArray[np.int64]:
+        """Column of amplifiers, 0 to 7, that each column of samples lies in, shape ``(nx,)``."""
+        column: NDArray[np.int64] = np.clip(
+            np.searchsorted(np.array(self.x_edges) - 0.5, self.x_px, side="right") - 1, 0, 7
+        )
+        return column
 
     def require_levels(self, effect: str) -> FloatArray:
         """Levels [electrons] as ``(W, 1, 1)``.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -69,6 +70,14 @@ class CellData:
     def n_values(self) -> int:
         """Number of measured values."""
         return int(np.count_nonzero(self.weight))
+
+    @property
+    def noise_rms(self) -> float:
+        """Rms of the noise of the cells, response scatter included; NaN if no cell has data."""
+        used = self.weight > 0
+        if not used.any():
+            return math.nan
+        return float(np.sqrt((1.0 / self.weight[used]).mean() + self.response_scatter**2))
 
     def restricted(self, keep: NDArray[np.bool_]) -> CellData:
         """Same data with weight 0 where ``keep`` (broadcast to the values) is false."""

@@ -290,6 +290,11 @@ class Problem:
         level, fringes = self.amplitudes(levels)
         return level + fringes * (value - 1.0) if self.free_contrast else level * value
 
+    def expected_of(self, fit: Fit) -> FloatArray:
+        """Data that a fit says."""
+        value = self.forward.predict(fit.settings, self.basis.expand(fit.field)).value
+        return self.expected(fit.levels, value)
+
     def level_columns(self, value: FloatArray, whiten: Whitener) -> LevelColumns:
         """Derivatives of the expected data with respect to the levels."""
         planes = np.arange(self.cells.shape[0])

@@ -93,12 +93,11 @@ class Forward:
 
     def table(self, settings: Settings) -> FloatArray:
         """Response ``(W, D)`` on the grid of thickness, relative to the mean of the unchanged model."""
-        known = {**self.model.effect_settings, **self._optical(settings)}
-        key = tuple(sorted(known.items()))
+        key = tuple(sorted({**self.model.effect_settings, **self._optical(settings)}.items()))
         if key not in self._tables:
             low, high = self.range_um
             count = int(np.ceil((high - low) / TABLE_STEP_UM)) + 1
-            model = self.model.with_effects(known, self.catalogue)
+            model = self.model_with(settings)
             wavelength = self.geometry.wavelength_nm
             light = model.system.flat_fields(wavelength, LINE_STEP_NM)
             response = model.respond_on_grid(light, low, TABLE_STEP_UM, count, wavelength)
@@ -109,6 +108,11 @@ class Forward:
             while len(self._tables) * table.nbytes > MOST_TABLE_BYTES and len(self._tables) > 2:
                 self._tables.pop(next(iter(self._tables)))
         return self._tables[key]
+
+    def model_with(self, settings: Settings) -> FringeModel:
+        """The model with those of some effects that act on the response."""
+        known = {**self.model.effect_settings, **self._optical(settings)}
+        return self.model.with_effects(known, self.catalogue)
 
     def cover(self, thickness_um: FloatArray) -> None:
         """Extend the tables so that they cover a thickness field with a margin, as far as it may go."""

@@ -191,6 +191,10 @@ class Selector:
         chance = float(chi2_distribution.sf(fit.chi2, max(degrees, 1))) if degrees > 0 else 1.0
         return Channel("all values", fit.chi2, float(max(degrees, 0)), chance)
 
+    def others(self, hypothesis: Hypothesis) -> list[str]:
+        """Effects that a set does not hold."""
+        return [name for name in self.coordinates if name not in hypothesis.names]
+
     def score(self, fit: Fit, names: Sequence[str], *, scan: bool = False) -> list[Candidate]:
         """Score test of every effect at a fit, most promising first.
 
@@ -381,9 +385,10 @@ class Selector:
         A strong effect on the phase is taken for thickness at first, in the order that suits it best; from there no
         fit finds back. A sample of cells is compared with the model, levels and contrasts free.
         """
-        forward, problem = self.problem.forward, self.problem
-        if forward.is_image_effect(fit.coordinates[-1].effect) or not self.generic:
+        steps = self._single_steps(fit)
+        if not steps:
             return []
+        forward, problem = self.problem.forward, self.problem
         whole = problem.basis.expand(self.first_field)
         stride = max(1, math.isqrt(whole.size // SAMPLED_CELLS))
         part = (slice(None), slice(None, None, stride), slice(None, None, stride))
@@ -398,7 +403,7 @@ class Selector:
             forward.cover(whole * (1.0 + edge / middle))
         # The best of each parameter and order: sizes lie too far apart for the right one to win at once.
         places: dict[tuple[int, int], tuple[float, FloatArray, float]] = {}
-        for moved, position in self._single_steps(fit):
+        for moved, position in steps:
             settings = {c.key: c.value(x) for c, x in zip(fit.coordinates, position, strict=True)}
             chi2 = np.array([
                 _chi2_with_free_fringes(forward.sampled(settings, thickness * (1.0 + shift / middle)), value, weight)
@@ -436,12 +441,13 @@ class Selector:
 
     def shifts_phase(self, hypothesis: Hypothesis) -> bool:
         """Whether the last effect of a set shifts the phase of the fringes: its fit may be in the wrong order."""
-        optical = not self.problem.forward.is_image_effect(hypothesis.names[-1])
-        return self.generic and optical and bool(self._shifts_of_phase(hypothesis.fit))
+        return bool(self._shifts_of_phase(hypothesis.fit))
 
     def _shifts_of_phase(self, fit: Fit) -> list[int]:
         """Coordinates of the last effect that do, at each wavelength by itself, what a change of thickness does."""
         name = fit.coordinates[-1].effect
+        if not self.generic or self.problem.forward.is_image_effect(name):
+            return []
         without = replace(
             fit,
             settings={key: value for key, value in fit.settings.items() if key.partition(".")[0] != name},
@@ -544,25 +550,22 @@ class Selector:
 
     def _among_minima(self, fit: Fit, number: int) -> Fit:
         """The deepest minimum along one coordinate with the mean square distance of the others that data allow."""
-        found = [fit]
+        found, item = [fit], fit.coordinates[number]
         for side in (-1.0, 1.0):
             last = fit
             for _ in range(MINIMA_WALKED):
                 start = last.position.copy()
-                start[number] = last.coordinates[number].clip(
-                    start[number] + side * last.coordinates[number].neighbour
-                )
+                start[number] = item.clip(start[number] + side * item.neighbour)
                 trial = fit_model(self.problem, fit.coordinates, start, last.field, last.levels)
-                least = 0.5 * fit.coordinates[number].neighbour
-                if side * (trial.position[number] - last.position[number]) < least:
+                if side * (trial.position[number] - last.position[number]) < 0.5 * item.neighbour:
                     break
                 found.append(trial)
                 last = trial
-                if trial.chi2 > min(item.chi2 for item in found) + HOPELESS:
+                if trial.chi2 > min(other.chi2 for other in found) + HOPELESS:
                     break
-        best = min(found, key=lambda item: item.chi2)
-        weight = np.exp(-0.5 * np.array([item.chi2 - best.chi2 for item in found]))
-        away = np.array([item.position[number] - best.position[number] for item in found])
+        best = min(found, key=lambda other: other.chi2)
+        weight = np.exp(-0.5 * np.array([other.chi2 - best.chi2 for other in found]))
+        away = np.array([other.position[number] - best.position[number] for other in found])
         spread = best.spread.copy()
         spread[number] = math.sqrt(float((weight * away**2).sum() / weight.sum()))
         return replace(best, spread=spread)

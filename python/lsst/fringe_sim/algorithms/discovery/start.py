@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import median, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -239,10 +239,13 @@ def _turns_of_patches(
     own, other = patch[both[:, 0]], patch[both[:, 1]]
     jump = best[both[:, 0]] - best[both[:, 1]]
     use = size[other] > size[own]
-    for number in np.unique(own[use]):
-        mine = use & (own == number)
-        largest = other[mine][np.argmax(size[other[mine]])]
-        turns[number] = round(float(np.median(jump[mine & (other == largest)])) / order)
+    own, other, jump = own[use], other[use], jump[use]
+    largest = np.full(size.size, -1)
+    by_size = np.lexsort((-other, size[other]))
+    largest[own[by_size]] = other[by_size]  # the last one written is the largest
+    use = other == largest[own]
+    patches = np.unique(own[use])
+    turns[patches] = np.rint(median(jump[use], own[use], patches) / order).astype(np.int64)
     return turns
 
 

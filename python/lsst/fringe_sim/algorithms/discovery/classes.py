@@ -1,0 +1,127 @@
+"""Effects that explain the same data about as well, and how likely it is that one of them is the cause."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .fit import Fit
+from .selection import Hypothesis, Selector, similarity
+
+__all__ = ["EffectClass", "classes_of", "outsider_probability"]
+
+MIMICKED = 0.05
+"""Part of the causes outside the catalogue that effects in it can mimic."""
+
+DECADES_OF_CHANCE = 200.0
+"""Powers of ten by which a residual of signal to noise 30 is improbable."""
+
+LEAST_PROMISE = 4.0
+ALIKE = 0.8
+"""Fall of χ² and cosine of signatures from which on a replacement is fitted."""
+
+CHI2_PER_PARAMETER = 6.0
+"""Fall of χ² that a further parameter must bring, for a fit to be as good as another."""
+
+
+@dataclass(frozen=True)
+class EffectClass:
+    """Effects any of which may be the one that was found.
+
+    Attributes
+    ----------
+    members : `dict`
+        Share of each effect among all replacements, by name.
+    probability : `float`
+        Sum of the shares.
+    values : `dict`
+        Fitted parameters of each member.
+    significance : `float`
+        Signal to noise of what the effect explains.
+    """
+
+    members: dict[str, float]
+    probability: float
+    values: dict[str, dict[str, float]]
+    significance: float
+
+
+def classes_of(selector: Selector, chosen: Hypothesis, width: float) -> dict[str, EffectClass]:
+    """Class of each effect of a set.
+
+    Parameters
+    ----------
+    selector : `Selector`
+        Fits replacements.
+    chosen : `Hypothesis`
+        The set.
+    width : `float`
+        Difference in log evidence within which effects are one class.
+
+    Returns
+    -------
+    classes : `dict` [`str`, `EffectClass`]
+    """
+    return {name: _class_of(selector, chosen, name, width) for name in chosen.names}
+
+
+def _class_of(selector: Selector, chosen: Hypothesis, name: str, width: float) -> EffectClass:
+    rest = tuple(other for other in chosen.names if other != name)
+    without = selector.hypothesis(rest, None, chosen.fit)
+    found = {name: chosen, **_replacements(selector, chosen, name, without)}
+    top = max(other.log_evidence for other in found.values())
+    weight = {n: math.exp(max(other.log_evidence - top, -700.0)) for n, other in found.items()}
+    total = sum(weight.values())
+    members = {n: weight[n] / total for n, other in found.items() if _is_alike(other, chosen, top, width)}
+    values = {n: _values_of(n, found[n].fit) for n in members}
+    significance = math.sqrt(max(without.fit.chi2 - chosen.fit.chi2, 0.0))
+    return EffectClass(members, sum(members.values()), values, significance)
+
+
+def _replacements(
+    selector: Selector, chosen: Hypothesis, name: str, without: Hypothesis
+) -> dict[str, Hypothesis]:
+    """Sets with another effect in the place of one, where they were fitted before or look like it."""
+    own = selector.features(selector.state(chosen.fit), chosen.fit, name)
+    bare = selector.state(without.fit)
+    found = {}
+    for candidate in selector.score(without.fit, selector.others(chosen), scan=True):
+        alike = 0.0
+        if candidate.promise > LEAST_PROMISE:
+            features = selector.features(bare, without.fit, candidate.name)
+            alike = similarity(bare.design, own, features)
+        names = (*without.names, candidate.name)
+        if frozenset(names) in selector.fitted or alike > ALIKE:
+            found[candidate.name] = selector.hypothesis(names, candidate.start, without.fit)
+    return found
+
+
+def _is_alike(other: Hypothesis, chosen: Hypothesis, top: float, width: float) -> bool:
+    """Whether a replacement explains the data about as well, by evidence or by likelihood.
+
+    The evidence of weak effects leans on the scales of the priors; a fit as good with no more parameters is an
+    alternative whatever those are.
+    """
+    if other.log_evidence > top - width:
+        return True
+    extra = max(len(other.fit.coordinates) - len(chosen.fit.coordinates), 0)
+    return 0.5 * (other.fit.chi2 - chosen.fit.chi2 + CHI2_PER_PARAMETER * extra) < width
+
+
+def _values_of(name: str, fit: Fit) -> dict[str, float]:
+    return {
+        key.partition(".")[2]: value for key, value in fit.settings.items() if key.partition(".")[0] == name
+    }
+
+
+def outsider_probability(hypothesis: Hypothesis, prior: float) -> float:
+    """Probability of a cause outside the catalogue, from the chance of noise in what is left.
+
+    An effect of the catalogue leaves noise: any chance is as likely as any other. A cause outside it either is
+    mimicked, and leaves noise as well, or leaves a residual whose chance may lie anywhere down to that of a signal to
+    noise of 30, each power of ten as likely as the other.
+    """
+    p = min(max(hypothesis.probability_of_noise, 1e-100), 1.0)
+    density = MIMICKED + (1.0 - MIMICKED) / (p * math.log(10.0) * DECADES_OF_CHANCE)
+    odds = prior / (1.0 - prior) * density
+    return odds / (1.0 + odds)

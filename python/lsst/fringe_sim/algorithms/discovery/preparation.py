@@ -1,0 +1,273 @@
+"""From a cube to a fitted problem: cells, first thickness, freedom of the field, noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...effects import Effect
+from ...errors import InputError
+from ...model import FringeModel
+from ...products.fringe_cube import FringeCube
+from .basis import CellBasis, FieldBasis, SplineBasis
+from .cells import CellData, bin_cube, finest_useful_cell
+from .fit import Fit, Problem, fit_model
+from .forward import Forward
+from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
+from .start import mended_thickness, starting_thickness
+
+__all__ = ["Prepared", "check_setup", "prepare", "prepare_again", "why_too_poor"]
+
+FloatArray = NDArray[np.float64]
+
+FEWEST_ROWS = 6
+"""Rows and columns of cells from which on noise and levels can be measured."""
+
+ORDERS_TRIED = 6
+"""Fringe orders on both sides of the first one in which a few pixels are fitted."""
+
+STEPS_PER_ORDER = 12
+
+NOISE_CHANGE = 0.02
+SCATTER_CHANGE = 0.05
+"""Parts by which noise and response scatter may change before the search is done again with them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Data and model, ready for the search.
+
+    Attributes
+    ----------
+    problem : `Problem`
+        Data with their measured noise, model and nuisances.
+    null : `Fit`
+        Fit of the unchanged model.
+    noise : `NoiseEstimate`
+        What was measured of the noise.
+    index : `numpy.ndarray`, shape ``(W,)``
+        Refractive index of the varying layer.
+    rich : `bool`
+        Whether there are enough cells to measure noise and levels, and for the tests without a catalogue.
+    stated : `CellData`
+        The data with their stated noise.
+    notes : `tuple` [`str`, ...]
+        For the verdict.
+    undistorted_field : `numpy.ndarray`, optional
+        Field that was fitted with free contrasts.
+    shifts_um : `tuple` [`float`, ...]
+        Moves of the whole field [µm] among which the order of a few pixels is looked for.
+    """
+
+    problem: Problem
+    null: Fit
+    noise: NoiseEstimate
+    index: FloatArray
+    rich: bool
+    stated: CellData
+    notes: tuple[str, ...] = field(default=())
+    undistorted_field: FloatArray | None = None
+    shifts_um: tuple[float, ...] = ()
+
+
+def check_setup(cube: FringeCube, model: FringeModel) -> None:
+    """Refuse data that contradict the set-up.
+
+    Raises
+    ------
+    InputError
+        Not a set-up of a laboratory; temperature, bandpass or focal ratio are not those of the flats.
+    """
+    if model.setup.kind != "monochromator":
+        raise InputError("set-up", model.setup.name, "a laboratory set-up with a monochromator")
+    rows = cube.exposures
+    known = {item.effect.name for item in model.effects}
+    stated = model.base_system.temperature_k
+    if np.any(np.abs(rows.temperature_k - stated) > 5.0) and "temperature" not in known:
+        raise InputError(
+            "temperature [K]", rows.temperature_k.tolist(), f"within 5 of the set-up's {stated:g}"
+        )
+    width = model.setup.bandwidth_fwhm_nm
+    measured = rows.bandwidth_fwhm_nm[rows.bandwidth_fwhm_nm > 0.0]
+    if np.any(np.abs(measured - width) > 0.02 * width) and "bandwidth" not in known:
+        raise InputError("bandwidth FWHM [nm]", rows.bandwidth_fwhm_nm.tolist(), f"the set-up's {width:g}")
+    single = model.base_system.beam.theta.size == 1
+    if single and np.any(np.isfinite(rows.f_number)) and "converging_beam" not in known:
+        raise InputError("f_number", rows.f_number.tolist(), "infinite: the set-up's light is parallel")
+
+
+def why_too_poor(cube: FringeCube, model: FringeModel) -> str:
+    """Why these data cannot answer, or nothing."""
+    good = (np.asarray(cube.mask) == 0).reshape(cube.shape[0], -1)
+    pixels = int(good.any(axis=0).sum())
+    if pixels == 0:
+        return "no good pixel"
+    dark = [f"{cube.wavelength_nm[k]:g} nm" for k in range(cube.shape[0]) if not good[k].any()]
+    if dark:
+        return f"no good pixel at {', '.join(dark)}"
+    constant = [
+        f"{cube.wavelength_nm[k]:g} nm"
+        for k in range(cube.shape[0])
+        if pixels > 1 and float(np.ptp(np.asarray(cube.image[k]).reshape(-1)[good[k]])) == 0.0
+    ]
+    if constant:
+        return f"the frame is constant at {', '.join(constant)}: no fringes and no noise, so not data"
+    waves = int(np.unique(cube.wavelength_nm).size)
+    if cube.thickness is None:
+        if waves < 3:
+            return (
+                f"{waves} wavelength(s) without a thickness map: thickness and effects cannot be told apart"
+            )
+        if pixels < 8 and waves < 6:
+            return f"{pixels} pixel(s) at {waves} wavelengths: fewer data than free parameters"
+    elif pixels < 16 and waves < 4:
+        return f"{pixels} pixel(s) at {waves} wavelength(s): fewer data than free parameters"
+    return ""
+
+
+def prepare(cube: FringeCube, model: FringeModel, effects: Sequence[Effect], most_cells: int) -> Prepared:
+    """Average a cube to cells, find their thickness, measure their noise, fit the unchanged model."""
+    size = finest_useful_cell(cube, most_cells=most_cells)
+    cells = bin_cube(cube, size)
+    stack = model.system.stack
+    medium = stack.layers[stack.position(model.system.varying)].medium
+    index = np.real(medium.index(cells.wavelength_nm, model.system.temperature_k))
+    if cells.thickness_um is not None:
+        return _prepare_known(cells, model, effects, index)
+    start = starting_thickness(model, cells)
+    forward = Forward.of_cells(model, effects, cells, (float(start.min()) - 0.5, float(start.max()) + 0.5))
+    if not _is_rich(cells):
+        return _prepare_few(cells, forward, start, index)
+    problem = Problem(cells, forward, CellBasis(start.shape), _free_levels(cells))
+    return _settle(*_choose_field(problem, start, {}), cells, index)
+
+
+def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tuple[Prepared | None, int]:
+    """Field and noise as judged with an effect in the model.
+
+    Parameters
+    ----------
+    prepared : `Prepared`
+        What they were judged to be without.
+    fit : `Fit`
+        Fit with the effect.
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness of all cells in that fit.
+
+    Returns
+    -------
+    prepared : `Prepared` or `None`
+        `None` if the judgement is about the same.
+    mended : `int`
+        Cells that are in another fringe order now.
+    """
+    problem = prepared.problem
+    if not prepared.rich or problem.field_prior:
+        return None, 0
+    model = problem.forward.model_with(fit.settings)
+    start = mended_thickness(model, problem.cells, thickness_um)
+    mended = int(np.count_nonzero(start != thickness_um))
+    refined = _settle(*_choose_field(problem, start, fit.settings), prepared.stated, prepared.index)
+    change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
+    scatter = abs(refined.noise.response_scatter - prepared.noise.response_scatter)
+    same_field = refined.problem.basis.size <= problem.basis.size and not mended
+    if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
+        return None, mended
+    return refined, mended
+
+
+def _is_rich(cells: CellData) -> bool:
+    return min(cells.shape[1:]) >= FEWEST_ROWS
+
+
+def _free_levels(cells: CellData) -> FloatArray:
+    """One level for each wavelength; one for all where there are too few cells to tell it from the fringes."""
+    return np.eye(cells.shape[0]) if _is_rich(cells) else np.ones((cells.shape[0], 1))
+
+
+def _prepare_known(
+    cells: CellData, model: FringeModel, effects: Sequence[Effect], index: FloatArray
+) -> Prepared:
+    """Data with a thickness map: the field may move only within its uncertainty."""
+    assert cells.thickness_um is not None
+    known = np.where(np.isfinite(cells.thickness_um), cells.thickness_um, np.nanmedian(cells.thickness_um))
+    sigma = 0.01 if cells.thickness_sigma_um is None else float(np.nanmedian(cells.thickness_sigma_um))
+    forward = Forward.of_cells(model, effects, cells, (float(known.min()) - 0.5, float(known.max()) + 0.5))
+    basis = CellBasis(known.shape)
+    problem = Problem(cells, forward, basis, _free_levels(cells), 1.0 / max(sigma, 1e-4) ** 2)
+    return _settle(problem, fit_model(problem, (), np.zeros(0), known.ravel()), cells, index)
+
+
+def _prepare_few(cells: CellData, forward: Forward, start: FloatArray, index: FloatArray) -> Prepared:
+    """A few pixels with many wavelengths: every fringe order is tried, the stated noise is believed."""
+    basis = CellBasis(start.shape)
+    order = float(np.median(cells.wavelength_nm)) * 1e-3 / (2.0 * float(index.mean()))
+    spread = cells.scaled_noise(1.0 + STATED_UNCERTAINTY, 0.0)
+    problem = Problem(spread, forward, basis, _free_levels(cells))
+    reach = np.arange(-ORDERS_TRIED * STEPS_PER_ORDER, ORDERS_TRIED * STEPS_PER_ORDER + 1)
+    shifts = reach * (order / STEPS_PER_ORDER)
+    shifts = shifts[float(start.min()) + shifts > 0.5]
+    fits = [
+        fit_model(problem, (), np.zeros(0), (start + shift).ravel()) for shift in shifts[::STEPS_PER_ORDER]
+    ]
+    noise = NoiseEstimate(np.ones(cells.shape[0]), 0.0, False, 0.0)
+    best = min(fits, key=lambda fit: fit.chi2)
+    note = "noise taken as stated plus 20 %; flat levels taken as known up to a common factor"
+    return Prepared(problem, best, noise, index, False, cells, (note,), start.ravel(), tuple(shifts.tolist()))
+
+
+def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, float]) -> tuple[Problem, Fit]:
+    """Coarsest parametrisation of the field that the data do not want finer, and its fit.
+
+    The contrast of each wavelength is free: a field that had to make up for a wrong contrast would be drawn into
+    ever finer coefficients.
+    """
+    cells = problem.cells
+    weight = (cells.weight > 0).any(axis=0).astype(float)
+    best: tuple[Problem, Fit] | None = None
+    for spacing in (8.0, 4.0, 2.0, 0.0):
+        basis: FieldBasis = SplineBasis.of_grid(start.shape, spacing) if spacing else CellBasis(start.shape)
+        if spacing and basis.size > start.size:
+            continue
+        trial = replace(problem, basis=basis, free_contrast=True)
+        field_map = start if best is None else best[0].basis.expand(best[1].field)
+        levels = None if best is None else best[1].levels
+        fit = fit_model(trial, (), np.zeros(0), basis.fit(field_map, weight), levels, settings)
+        if best is not None and not _finer_is_better(best, (trial, fit)):
+            break
+        best = (trial, fit)
+    assert best is not None
+    return best
+
+
+def _settle(problem: Problem, fit: Fit, stated: CellData, index: FloatArray) -> Prepared:
+    """Measure the noise at a first fit, and fit the unchanged model with it."""
+    expected = problem.expected_of(fit)
+    even = stated.with_noise_of(expected)
+    noise = estimate_noise(even, _residual(replace(problem, cells=even), expected))
+    cells = even.scaled_noise(noise.factor, noise.response_scatter)
+    problem = replace(problem, cells=cells, free_contrast=False, reference=expected)
+    levels = fit.levels[: problem.n_levels]
+    settled = fit_model(problem, (), np.zeros(0), fit.field, levels)
+    notes = []
+    if abs(noise.neighbour_correlation) > 0.1:
+        notes.append(f"noise of neighbouring cells is correlated ({noise.neighbour_correlation:.2f})")
+    if not noise.measured:
+        notes.append("noise level taken as stated: too few cells to measure it")
+    return Prepared(problem, settled, noise, index, _is_rich(stated), stated, tuple(notes), fit.field)
+
+
+def _finer_is_better(coarse: tuple[Problem, Fit], fine: tuple[Problem, Fit]) -> bool:
+    """Whether more coefficients of the field lower χ² beyond what noise (or misfit) lets them."""
+    extra = fine[0].basis.size - coarse[0].basis.size
+    degrees = max(fine[0].cells.n_values - fine[0].basis.size - fine[0].cells.shape[0], 1)
+    unit = fine[1].chi2 / degrees
+    return coarse[1].chi2 - fine[1].chi2 > unit * (extra + 5.0 * math.sqrt(2.0 * max(extra, 1)))
+
+
+def _residual(problem: Problem, expected: FloatArray) -> FloatArray:
+    return np.where(problem.cells.weight > 0, problem.cells.value - expected, 0.0)

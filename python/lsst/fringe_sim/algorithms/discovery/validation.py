@@ -1,0 +1,188 @@
+"""How well data are predicted that took no part in the search, and how far from the model data are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .fit import Fit, Problem, fit_model
+
+__all__ = ["HeldOut", "held_out_blocks", "misfit_rms", "validate", "whole_thickness"]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+BLOCKS_ACROSS = 8
+FEWEST_ROWS = 12
+"""Blocks along a side of the sensor that are held out or not, and the rows of cells from which on there are any."""
+
+FEWEST_WAVELENGTHS = 8
+"""Wavelengths from which on every fourth is left out at once."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Unchanged model against effects, on data that took no part in fitting them.
+
+    Attributes
+    ----------
+    blocks, wavelengths : `float`
+        Fall of χ² on parts of the sensor, and on wavelengths; 0 where there are too few.
+    before_rms, after_rms : `float`
+        Rms of data minus model without and with the effects.
+    """
+
+    blocks: float
+    wavelengths: float
+    before_rms: float
+    after_rms: float
+
+    @property
+    def better(self) -> bool:
+        """Whether the data held out are predicted better, and nowhere much worse."""
+        return self.blocks + self.wavelengths > 0.0 and min(self.blocks, self.wavelengths) >= -9.0
+
+
+def held_out_blocks(shape: tuple[int, int], fraction: float, rng: np.random.Generator) -> BoolArray:
+    """Blocks of cells that no selection sees, scattered over the sensor; none where there are few cells.
+
+    Parameters
+    ----------
+    shape : `tuple` [`int`, `int`]
+        Rows and columns of cells.
+    fraction : `float`
+        Part of the sensor that is held out.
+    rng : `numpy.random.Generator`
+        Decides which.
+
+    Returns
+    -------
+    held_out : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
+    """
+    if min(shape) < FEWEST_ROWS:
+        return np.zeros(shape, dtype=bool)
+    side = min(BLOCKS_ACROSS, min(shape) // 3)
+    blocks = rng.permutation(side * side).reshape(side, side) < round(fraction * side * side)
+    rows = np.arange(shape[0]) * side // shape[0]
+    columns = np.arange(shape[1]) * side // shape[1]
+    return blocks[np.ix_(rows, columns)]
+
+
+def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) -> FloatArray:
+    """Thickness of all cells from a fit to a part: what the part moved by, as a function of thickness."""
+    moved = problem.basis.expand(fit.field)
+    if not held_out.any():
+        return moved
+    before = problem.basis.expand(null.field)
+    seen = ~held_out & (problem.cells.weight > 0).any(axis=0)
+    middle, half = before.mean(), max(0.5 * float(np.ptp(before)), 1e-6)
+    depth = (before - middle) / half
+    columns = np.stack([depth**power for power in range(3)], axis=-1)
+    solution = np.linalg.lstsq(columns[seen], (moved - before)[seen], rcond=None)[0]
+    return before + columns @ solution
+
+
+def validate(problem: Problem, null: Fit, final: Fit, held_out: BoolArray, *, rich: bool) -> HeldOut:
+    """Fit the effects without a part of the data, and compare what is predicted for that part.
+
+    Parameters
+    ----------
+    problem : `Problem`
+        All data.
+    null, final : `Fit`
+        Fits of the unchanged model and of the effects to all data.
+    held_out : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
+        Cells that are left out.
+    rich : `bool`
+        Whether there are enough cells for levels to be free; if not, wavelengths are left out one by one.
+
+    Returns
+    -------
+    result : `HeldOut`
+    """
+    if not rich:
+        return _without_single_wavelengths(problem, null, final)
+    blocks, before, after = _without_blocks(problem, null, final, held_out)
+    return HeldOut(blocks, _without_wavelengths(problem, null, final), before, after)
+
+
+def _without_blocks(
+    problem: Problem, null: Fit, final: Fit, held_out: BoolArray
+) -> tuple[float, float, float]:
+    if not held_out.any():
+        return 0.0, misfit_rms(problem, null), misfit_rms(problem, final)
+    seen = problem.with_cells(problem.cells.restricted(~held_out))
+    fitted = fit_model(seen, final.coordinates, final.position, final.field, final.levels)
+    unseen = problem.with_cells(problem.cells.restricted(held_out))
+    before = fit_model(unseen, (), np.zeros(0), null.field, null.levels)
+    thickness = whole_thickness(problem, null, fitted, held_out)
+    start = problem.basis.fit(thickness, np.ones(held_out.shape))
+    after = fit_model(unseen, (), np.zeros(0), start, fitted.levels, fitted.settings)
+    return before.chi2 - after.chi2, misfit_rms(unseen, before), misfit_rms(unseen, after)
+
+
+def _without_wavelengths(problem: Problem, null: Fit, final: Fit) -> float:
+    """Fall of χ² at every fourth wavelength, which takes no part in the fit."""
+    waves = problem.cells.shape[0]
+    if waves < FEWEST_WAVELENGTHS:
+        return 0.0
+    out = np.zeros((waves, 1, 1), dtype=bool)
+    out[2::4] = True
+    seen = problem.with_cells(problem.cells.restricted(~out))
+    unseen = problem.with_cells(problem.cells.restricted(out))
+    before, after = (
+        _predicted_chi2(
+            unseen, fit_model(seen, fit.coordinates, fit.position, fit.field, fit.levels, fit.settings)
+        )
+        for fit in (null, final)
+    )
+    return before - after
+
+
+def _without_single_wavelengths(problem: Problem, null: Fit, final: Fit) -> HeldOut:
+    """Fall of χ² at wavelengths that are left out one by one, of a few pixels whose levels are known."""
+    cells, waves = problem.cells, problem.cells.shape[0]
+    if waves < 4:
+        return HeldOut(0.0, 0.0, misfit_rms(problem, null), misfit_rms(problem, final))
+    total, square = np.zeros(2), np.zeros((2, waves))
+    for wave in range(waves):
+        out = (np.arange(waves) == wave)[:, None, None]
+        seen = problem.with_cells(cells.restricted(~out))
+        for side, fit in enumerate((null, final)):
+            fitted = fit_model(seen, fit.coordinates, fit.position, fit.field, fit.levels, fit.settings)
+            miss = (cells.value - problem.expected_of(fitted))[wave]
+            total[side] += float((cells.weight[wave] * miss**2).sum())
+            square[side, wave] = float(np.mean(miss**2))
+    before, after = np.sqrt(square.mean(axis=1))
+    return HeldOut(0.0, float(total[0] - total[1]), float(before), float(after))
+
+
+def misfit_rms(problem: Problem, fit: Fit) -> float:
+    """Rms of data minus model, corrected for the freedom of the nuisances."""
+    free = _field_freedom(problem) + problem.level_basis.shape[1] + len(fit.coordinates)
+    return problem.cells.noise_rms * math.sqrt(fit.chi2 / max(problem.cells.n_values - free, 1))
+
+
+def _field_freedom(problem: Problem) -> int:
+    """Coefficients of the field that the data reach."""
+    if problem.field_prior:
+        return 0
+    seen = (problem.cells.weight > 0).any(axis=0).astype(float)
+    return int((problem.basis.gather(seen[np.newaxis])[:, 0] > 1e-3).sum())
+
+
+def _predicted_chi2(problem: Problem, fit: Fit) -> float:
+    """χ² of data that took no part in a fit, with their levels adjusted."""
+    value = problem.forward.predict(fit.settings, problem.basis.expand(fit.field)).value
+    weight = problem.cells.weight
+    square = (weight * value**2).sum(axis=(1, 2))
+    level = np.divide(
+        (weight * value * problem.cells.value).sum(axis=(1, 2)),
+        square,
+        out=np.ones(len(square)),
+        where=square > 0,
+    )
+    return float((weight * (problem.cells.value - level[:, None, None] * value) ** 2).sum())
