@@ -16,10 +16,10 @@ from lsst.fringe_sim.algorithms.field_response import (
     field_response,
     sensor_response,
 )
+from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
 from lsst.fringe_sim.algorithms.sky_frame import (
     SkyQuadrature,
     SkyResponse,
-    fringe_amplitudes,
     simulate_sky_frame,
     sky_response,
     white_light,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms import simulate_sky_frame
+from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
 from lsst.fringe_sim.algorithms.imsim_fringing import CCDFringing
-from lsst.fringe_sim.algorithms.sky_frame import fringe_amplitudes
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.instrument.night import AirglowField
 from lsst.fringe_sim.instrument.sky import SkySpectrum

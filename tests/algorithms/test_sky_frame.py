@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
 from lsst.fringe_sim.algorithms.sky_frame import (
     SkyQuadrature,
-    fringe_amplitudes,
     simulate_night,
     simulate_sky_frame,
     sky_response,

@@ -11,7 +11,8 @@ from astropy.table import Table
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 
-from lsst.fringe_sim.algorithms.sky_frame import fringe_amplitudes, sky_response
+from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
+from lsst.fringe_sim.algorithms.sky_frame import sky_response
 from lsst.fringe_sim.instrument.bandpass import Bandpass
 from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
 from lsst.fringe_sim.mock.thickness import e2v_321

@@ -24,13 +24,8 @@ from ..instrument.sky import EmissionLines, SkySpectrum
 from ..instrument.telescope import reduce_beam
 from ..model import FringeModel, ResponseTable
 from ..optics import Illumination
-from .sky_frame import (
-    FringeAmplitudes,
-    SkyQuadrature,
-    fringe_amplitudes,
-    tabulate_components,
-    white_light,
-)
+from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
+from .sky_frame import SkyQuadrature, tabulate_components, white_light
 from .thickness_stand_in import stand_in_thickness
 
 __all__ = [

@@ -24,7 +24,8 @@ from ..instrument.readout import electrons_to_microjansky, zero_point
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel
 from .field_response import SensorResponse
-from .sky_frame import FringeAmplitudes, component_electrons, fringe_amplitudes
+from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
+from .sky_frame import component_electrons
 
 __all__ = [
     "DES_CRITERION",

@@ -24,14 +24,13 @@ from ..model import FringeModel, ResponseTable, tabulate
 from ..optics import Beam, Illumination
 from ..optics.phase_response import PhaseResponse
 from ..products import SkyFringe, mask_bits
+from .fringe_amplitudes import fringe_amplitudes
 from .image_noise import add_exposure_noise
 from .photon_migration import spread_charge
 
 __all__ = [
-    "FringeAmplitudes",
     "SkyQuadrature",
     "SkyResponse",
-    "fringe_amplitudes",
     "is_band",
     "simulate_night",
     "simulate_sky_frame",
@@ -49,21 +48,6 @@ _BOUND_ANGLES = 6
 
 _BASELINE_HOUR = 19.0
 """Local time of hour 0 of a night [h]."""
-
-
-@dataclass(frozen=True)
-class FringeAmplitudes:
-    """The three numbers that are all called "amplitude", as fractions of the mean.
-
-    Attributes
-    ----------
-    rms, half_peak_to_peak, half_range_1_99 : `float`
-        Standard deviation, half of maximum minus minimum, half of the 99th minus the 1st percentile.
-    """
-
-    rms: float
-    half_peak_to_peak: float
-    half_range_1_99: float
 
 
 @dataclass(frozen=True)
@@ -364,7 +348,7 @@ def simulate_sky_frame(
         image = _spread(image, known, charge_kernel)
     image = _with_image_effects(model, image, known, float(level.wavelength_nm[0]), to_electrons)
     amplitudes = fringe_amplitudes(image, ~known)
-    mean = float(image.mean(dtype=np.float64, where=known))
+    mean = amplitudes.mean
     wanted = mean * to_electrons if mean_electrons is None else mean_electrons
     if not 0.0 < wanted < math.inf:
         raise OutOfRangeError("mean level [e]", wanted, "positive")
@@ -374,7 +358,7 @@ def simulate_sky_frame(
         image = add_exposure_noise(image, np.random.default_rng(seed), read_noise_e)
     return SkyFringe(
         image,
-        np.where(known, 0, mask_bits("NO_DATA")).astype(np.int32),
+        np.where(known, np.int32(0), np.int32(mask_bits("NO_DATA"))),
         "electron",
         mean_electrons=wanted,
         exposure_s=exposure,
@@ -468,31 +452,6 @@ def component_electrons(
         item.name: to_electrons * float(item.photons @ bandpass.quantum_efficiency(item.wavelength_nm))
         for item in sky.components(bandpass)
     }
-
-
-def fringe_amplitudes(image: ArrayLike, mask: ArrayLike | None = None) -> FringeAmplitudes:
-    """Amplitudes of a frame relative to its mean.
-
-    Parameters
-    ----------
-    image : array_like
-        Sky in any positive unit.
-    mask : array_like, optional
-        Non-zero where a pixel is not to be used.
-
-    Raises
-    ------
-    InputError
-        No pixel is left, or their mean is not positive.
-    """
-    values = np.asarray(image)
-    good = np.isfinite(values) if mask is None else np.isfinite(values) & (np.asarray(mask) == 0)
-    chosen = values[good].astype(np.float64)
-    if chosen.size == 0 or not chosen.mean() > 0.0:
-        raise InputError("image", "no good pixels" if chosen.size == 0 else chosen.mean(), "a positive mean")
-    chosen /= chosen.mean()
-    low, high = np.percentile(chosen, [1.0, 99.0])
-    return FringeAmplitudes(float(chosen.std()), 0.5 * float(np.ptp(chosen)), 0.5 * float(high - low))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from ..effects import (
     apply_to_system,
 )
 from ..errors import InputError
+from ..optics.harmonics import ROUNDING
 from ..optics.illumination import DEFAULT_STEP_NM, Illumination
 from ..optics.phase_response import PhaseResponse
 from ..optics.system import OpticalSystem
@@ -177,10 +178,17 @@ class FringeModel:
         step_um: float,
         count: int,
         wavelength_nm: ArrayLike | None = None,
+        *,
+        tolerance: float = ROUNDING,
     ) -> FloatArray:
-        """Like `respond` on ``start + step * arange(count)``, several times faster; shape ``(W, count)``."""
+        """Like `respond` on ``start + step * arange(count)``, several times faster; shape ``(W, count)``.
+
+        ``tolerance`` is that of `PhaseResponse.averaged_on_grid`.
+        """
         reduced = self.system.reduce(illumination)
-        response = reduced.averaged_on_grid(illumination.weight, start_um, step_um, count)
+        response = reduced.averaged_on_grid(
+            illumination.weight, start_um, step_um, count, tolerance=tolerance
+        )
         return self.finish(reduced, illumination, response, wavelength_nm)
 
     def response_on_grid(

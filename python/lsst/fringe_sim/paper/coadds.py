@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..algorithms.fringe_amplitudes import fringe_amplitudes
 from ..algorithms.image_correlation import LogBins, coadd_correlation
 from ..algorithms.pca import fit_pca_from_thickness
-from ..algorithms.sky_frame import fringe_amplitudes
 from ..instrument.night import NightHistory
 from .section import Context, Curve, Graph, Section
 from .sky import lines_only

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..algorithms.fringe_amplitudes import fringe_amplitudes
 from ..algorithms.photon_migration import photon_migration
-from ..algorithms.sky_frame import fringe_amplitudes, is_band
+from ..algorithms.sky_frame import is_band
 from ..instrument.bandpass import Bandpass
 from ..instrument.sky import EmissionLines, SkySpectrum
 from ..instrument.telescope import RayBundle, Telescope

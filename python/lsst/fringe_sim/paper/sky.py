@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 
-from ..algorithms.sky_frame import SkyResponse, fringe_amplitudes, sky_response, throughput_electrons
+from ..algorithms.fringe_amplitudes import fringe_amplitudes
+from ..algorithms.sky_frame import SkyResponse, sky_response, throughput_electrons
 from ..instrument.bandpass import Bandpass
 from ..instrument.readout import (
     electrons_to_microjansky,

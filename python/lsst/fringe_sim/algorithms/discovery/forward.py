@@ -21,6 +21,9 @@ Settings = Mapping[str, float]
 TABLE_STEP_UM = 0.004
 """Spacing of the thickness grid [µm]: 75 per fringe order; cubic interpolation is good to 1e-6."""
 
+TABLE_TOLERANCE = 1e-9
+"""Error of the tables relative to the fringes; derivatives are differences of tables 1e-5 apart."""
+
 LINE_STEP_NM = 0.1
 """Spacing of wavelength nodes [nm]: five per fringe of detection layer and support together."""
 
@@ -100,7 +103,9 @@ class Forward:
             model = self.model_with(settings)
             wavelength = self.geometry.wavelength_nm
             light = model.system.flat_fields(wavelength, LINE_STEP_NM)
-            response = model.respond_on_grid(light, low, TABLE_STEP_UM, count, wavelength)
+            response = model.respond_on_grid(
+                light, low, TABLE_STEP_UM, count, wavelength, tolerance=TABLE_TOLERANCE
+            )
             if self._scale is None:
                 # Tapered, so that a broken fringe order at an end of the table does not count.
                 self._scale = np.average(response, axis=1, weights=np.hanning(count + 2)[1:-1])
