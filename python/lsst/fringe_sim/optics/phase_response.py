@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import ConvergenceError, InputError, OutOfRangeError
 from .coherence import phase_states
 from .harmonics import MOST_RATIO, ROUNDING, series_at, series_on_grid
+from .phase_kernel import reduce_nodes
 from .transfer_matrix import (
     ComplexArray,
     FloatArray,
@@ -43,9 +44,6 @@ _SHORT_GRID = 256
 
 _LARGEST_RATIO = 0.9
 """Ratio of two harmonics above which the series is too long to pay."""
-
-_CACHED_NODES = 4096
-"""Nodes that are reduced at a time."""
 
 _ANCHOR = 64
 """Steps of the phase recurrence between two exact evaluations; keeps its rounding error below 1e-14."""
@@ -339,20 +337,18 @@ def reduce_to_phase(
     spreads = np.zeros(count) if spread is None else np.asarray(spread, dtype=float)
     polarizations = pure_polarizations(polarization, angle)
     shifted = [layer for layer in range(1, count - 1) if layer != varying and spreads[layer] > 0.0]
-    flat = [each.reshape(*each.shape[: each.ndim - len(trailing)], -1) for each in (index, wave, angle)]
-    # Few nodes at a time: what is computed on the way then stays in the cache of the processor.
-    blocks = [slice(low, low + _CACHED_NODES) for low in range(0, max(flat[1].size, 1), _CACHED_NODES)]
+    nodes = [np.ascontiguousarray(each).reshape(-1) for each in (wave, angle)]
+    flat = np.ascontiguousarray(index).reshape(count, -1)
+    rough = np.zeros(count - 1) if heights is None else np.broadcast_to(heights, count - 1).copy()
     parts, shares = [], []
     for each in polarizations:
         for state in phase_states(index, thickness, wave, angle, each, shifted, spreads):
-            reduced = [
-                reduce_polarization(
-                    flat[0][:, part], thickness, flat[1][part], flat[2][part], each, varying, layers, heights,
-                    state.phases,
-                )
-                for part in blocks
-            ]  # fmt: skip
-            parts.append([np.concatenate(column).reshape(trailing) for column in zip(*reduced, strict=True)])
+            phase = np.zeros(count)
+            phase[list(state.phases)] = list(state.phases.values())
+            reduced = reduce_nodes(
+                flat, thickness, *nodes, each == "p", varying, np.array(layers, dtype=np.int64), rough, phase
+            )
+            parts.append([part.reshape(trailing) for part in reduced])
             shares.append(np.broadcast_to(state.share / len(polarizations), trailing))
     a, b, e, c, g, kappa = (np.stack(column) for column in zip(*parts, strict=True))
     return PhaseResponse(a, b, e, c, g, kappa, np.stack(shares), float(spreads[varying]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
@@ -38,6 +39,12 @@ LARGEST_PHASE_STEP_UM = 0.06
 MOST_ITERATIONS = 25
 CONVERGED = 0.02
 """Change of χ² at which a fit stops."""
+
+FAR_BEHIND = 100.0
+CATCHING_UP = 75.0
+FEWEST_ITERATIONS = 4
+"""Distance in χ² from which on a fit may be behind a better one for good, the steps that it would have to catch up,
+and those that it gets in any case."""
 
 
 @dataclass(frozen=True)
@@ -482,6 +489,7 @@ def fit_model(
     fixed: Mapping[str, float] | None = None,
     *,
     iterations: int = MOST_ITERATIONS,
+    rival: float = math.inf,
 ) -> Fit:
     """Minimise χ² in effects, levels and thickness field together (Gauss–Newton with damping).
 
@@ -501,13 +509,15 @@ def fit_model(
         Effects held at a value.
     iterations : `int`, optional
         Largest number of iterations.
+    rival : `float`, optional
+        χ² of another fit to the same data: one that will not come near it need not converge.
 
     Returns
     -------
     fit : `Fit`
     """
     solver = _Solver(problem, tuple(coordinates), dict(fixed or {}), field_start)
-    return solver.run(np.asarray(start, dtype=float), field_start, levels_start, iterations)
+    return solver.run(np.asarray(start, dtype=float), field_start, levels_start, iterations, rival)
 
 
 class _Solver:
@@ -543,7 +553,12 @@ class _Solver:
         return total
 
     def run(
-        self, start: FloatArray, field_start: FloatArray, levels_start: FloatArray | None, iterations: int
+        self,
+        start: FloatArray,
+        field_start: FloatArray,
+        levels_start: FloatArray | None,
+        iterations: int,
+        rival: float,
     ) -> Fit:
         problem = self.problem
         thickness = problem.basis.expand(field_start)
@@ -564,6 +579,8 @@ class _Solver:
             point = trial
             if gain < CONVERGED:
                 converged = True
+                break
+            if count >= FEWEST_ITERATIONS and point.chi2 - rival > max(FAR_BEHIND, CATCHING_UP * gain):
                 break
         design = self.linearise(point)
         number = len(self.coordinates)

@@ -317,6 +317,7 @@ class Selector:
                 positions[size[place]],
                 self.first_field + self.shifts_um[place],
                 fit.levels,
+                rival=fit.chi2,
             )
             for place in best
         ]
@@ -354,7 +355,7 @@ class Selector:
             trials += [(start, base.field) for start in self._spread_starts(known.fit)]
             trials += self._settled_alone(known.fit)
         for start, thickness in trials:
-            trial = fit_model(self.problem, coordinates, start, thickness, base.levels)
+            trial = fit_model(self.problem, coordinates, start, thickness, base.levels, rival=known.fit.chi2)
             if trial.chi2 < known.fit.chi2 - 1.0:
                 trial = self._deepest(trial)
                 known = Hypothesis(known.names, trial, self._evidence(trial))
@@ -366,16 +367,18 @@ class Selector:
 
         A second coordinate that is nearly thickness itself would lead a fit from a rough size astray.
         """
-        found = []
+        found, least = [], math.inf
         for moved, position, thickness in self._other_orders(fit):
             others = [n for n in range(len(position)) if n != moved]
             held = {fit.coordinates[n].key: fit.coordinates[n].value(position[n]) for n in others}
             alone = fit_model(
-                self.problem, (fit.coordinates[moved],), position[[moved]], thickness, fit.levels, held
-            )
+                self.problem, (fit.coordinates[moved],), position[[moved]], thickness, fit.levels, held,
+                rival=least,
+            )  # fmt: skip
             settled = position.copy()
             settled[moved] = alone.position[0]
             found.append((settled, alone.field, alone.chi2))
+            least = min(least, alone.chi2)
         found.sort(key=lambda place: place[2])
         return [(position, thickness) for position, thickness, _ in found[:ORDERS_REFITTED]]
 
@@ -529,7 +532,9 @@ class Selector:
         for index in map(int, best):
             start = fit.position.copy()
             start[number] = places[index]
-            trials.append(fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels))
+            trials.append(
+                fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels, rival=fit.chi2)
+            )
         return min((fit, *trials), key=lambda trial: trial.chi2)
 
     def settled(self, hypothesis: Hypothesis) -> Hypothesis:
@@ -556,7 +561,9 @@ class Selector:
             for _ in range(MINIMA_WALKED):
                 start = last.position.copy()
                 start[number] = item.clip(start[number] + side * item.neighbour)
-                trial = fit_model(self.problem, fit.coordinates, start, last.field, last.levels)
+                trial = fit_model(
+                    self.problem, fit.coordinates, start, last.field, last.levels, rival=fit.chi2
+                )
                 if side * (trial.position[number] - last.position[number]) < 0.5 * item.neighbour:
                     break
                 found.append(trial)
@@ -579,13 +586,14 @@ class Selector:
         nudge = np.array([0.01 * item.unit_step if item.quadratic else 0.0 for item in coordinates])
         position = np.where(position == 0.0, nudge, position)
         field_start = base.field if base.coordinates else self.first_field
-        fit = fit_model(self.problem, coordinates, position, field_start, base.levels)
+        rival = min(item.fit.chi2 for key, item in self.fitted.items() if len(key) <= len(names))
+        fit = fit_model(self.problem, coordinates, position, field_start, base.levels, rival=rival)
         if fit.chi2 > base.chi2:
             small = np.array(
                 [x if item.key in base.settings else 0.03 * item.unit_step
                  for item, x in zip(coordinates, position, strict=True)]
             )  # fmt: skip
-            other = fit_model(self.problem, coordinates, small, base.field, base.levels)
+            other = fit_model(self.problem, coordinates, small, base.field, base.levels, rival=rival)
             fit = min(fit, other, key=lambda item: item.chi2)
         return fit
 
