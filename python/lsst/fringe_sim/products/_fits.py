@@ -212,19 +212,37 @@ def write_hdus(
     InputError
         The folder does not exist.
     """
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise InputError("folder", str(target.parent), "an existing folder", source=str(target))
+    target = existing_folder(path)
     hdus[0].header[EXTENSIONS_KEY] = (len(hdus) - 1, "number of extensions")
     if section is not None:
         _add_world_coordinates(hdus, section)
     for hdu in hdus:
         hdu.add_datasum(when="data unit checksum")
         hdu.add_checksum(when="HDU checksum", override_datasum=True)
+    with all_or_nothing(target) as temporary, open(temporary, "wb") as stream:
+        fits.HDUList(list(hdus)).writeto(stream, output_verify="exception")
+
+
+def existing_folder(path: str | os.PathLike[str]) -> Path:
+    """Path of a file to be written.
+
+    Raises
+    ------
+    InputError
+        Its folder does not exist.
+    """
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise InputError("folder", str(target.parent), "an existing folder", source=str(target))
+    return target
+
+
+@contextlib.contextmanager
+def all_or_nothing(target: Path) -> Iterator[Path]:
+    """Path to write in place of a file; it becomes that file if all goes well, and vanishes if not."""
     temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}.part")
     try:
-        with open(temporary, "wb") as stream:
-            fits.HDUList(list(hdus)).writeto(stream, output_verify="exception")
+        yield temporary
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import FrameFormatError, InputError
 from . import _check as check
 from . import _fits as io
-from .sensor_section import SensorSection
+from .fits_product import FitsProduct
 
 __all__ = ["CombinedBias"]
 
@@ -23,7 +23,7 @@ _OWN = ("NFRAMES", "LSST_NUM", "DETNAME")
 
 
 @dataclass(frozen=True, eq=False)
-class CombinedBias:
+class CombinedBias(FitsProduct):
     """Mean of overscan-corrected bias frames of one sensor, assembled.
 
     Parameters
@@ -87,24 +87,8 @@ class CombinedBias:
         """Rows and columns of the sensor."""
         return (self.image.shape[0], self.image.shape[1])
 
-    def write_fits(
-        self,
-        path: str | os.PathLike[str],
-        metadata: Mapping[str, Any] | None = None,
-        *,
-        section: SensorSection | None = None,
-    ) -> None:
-        """Write IMAGE and MASK extensions and the table NOISE.
-
-        Parameters
-        ----------
-        path : path-like
-            File to write; an existing one is replaced when the new one is complete.
-        metadata : `Mapping`, optional
-            Further header keywords, which win over those of the product.
-        section : `SensorSection`, optional
-            Pixels of the sensor that the images show; their world coordinates are written with them.
-        """
+    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
+        """IMAGE and MASK extensions and the table NOISE."""
         own: list[tuple[str, io.Scalar, str]] = [
             ("DETNAME", self.detector, "sensor"),
             ("LSST_NUM", self.serial, "serial number"),
@@ -116,7 +100,7 @@ class CombinedBias:
             io.mask_hdu(self.mask),
             self._noise_hdu(),
         ]
-        io.write_hdus(path, hdus, section)
+        return hdus
 
     def _noise_hdu(self) -> fits.BinTableHDU:
         names, noise = np.array(list(self.noise_adu)), np.array(list(self.noise_adu.values()))

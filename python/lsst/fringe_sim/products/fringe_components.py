@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import FrameFormatError, OutOfRangeError
 from . import _check as check
 from . import _fits as io
-from .sensor_section import SensorSection
+from .fits_product import FitsProduct
 
 __all__ = ["FringeComponents"]
 
@@ -22,7 +22,7 @@ _OWN = ("DETNAME", "FILTER")
 
 
 @dataclass(frozen=True, eq=False)
-class FringeComponents:
+class FringeComponents(FitsProduct):
     """Mean frame, components, and what each explains.
 
     Frame j of the training set is ``mean + sum_k scores[j, k] * components[k]`` plus what is left over.
@@ -100,24 +100,8 @@ class FringeComponents:
         """Number of components kept."""
         return int(self.components.shape[0])
 
-    def write_fits(
-        self,
-        path: str | os.PathLike[str],
-        metadata: Mapping[str, Any] | None = None,
-        *,
-        section: SensorSection | None = None,
-    ) -> None:
-        """Write MEAN, COMPONENTS, MASK, the table SPECTRUM and the image SCORES.
-
-        Parameters
-        ----------
-        path : path-like
-            File to write; an existing one is replaced when the new one is complete.
-        metadata : `Mapping`, optional
-            Further header keywords, which win over those of the product.
-        section : `SensorSection`, optional
-            Pixels of the sensor that the images show; their world coordinates are written with them.
-        """
+    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
+        """MEAN, COMPONENTS, MASK, the table SPECTRUM and the image SCORES."""
         own: list[tuple[str, io.Scalar, str]] = [
             ("DETNAME", self.detector, "sensor"),
             ("FILTER", self.physical_filter, "physical filter"),
@@ -134,7 +118,7 @@ class FringeComponents:
             io.bintable_hdu("SPECTRUM", spectrum),
             io.image_hdu("SCORES", self.scores, unit=""),
         ]
-        io.write_hdus(path, hdus, section)
+        return hdus
 
     @classmethod
     def read_fits(cls, path: str | os.PathLike[str]) -> Self:

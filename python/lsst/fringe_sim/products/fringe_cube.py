@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError
 from . import _check as check
 from . import _fits as io
+from .fits_product import FitsProduct
 from .fringe_flat import FringeFlat
 from .mask import mask_bits
-from .sensor_section import SensorSection
 
 __all__ = ["CUBE_UNITS", "FlatExposures", "FringeCube"]
 
@@ -93,7 +93,7 @@ def _positive(
 
 
 @dataclass(frozen=True, eq=False)
-class FringeCube:
+class FringeCube(FitsProduct):
     """Flats of one sensor, one plane for each wavelength, in the order given.
 
     Parameters
@@ -237,24 +237,8 @@ class FringeCube:
             metadata={**stack.metadata, **({} if metadata is None else metadata)},
         )
 
-    def write_fits(
-        self,
-        path: str | os.PathLike[str],
-        metadata: Mapping[str, Any] | None = None,
-        *,
-        section: SensorSection | None = None,
-    ) -> None:
-        """Write IMAGE, VARIANCE, MASK, EXPOSURES, and THICKNESS, THICKNESS_SIGMA if they are known.
-
-        Parameters
-        ----------
-        path : path-like
-            File to write; an existing one is replaced when the new one is complete.
-        metadata : `Mapping`, optional
-            Further header keywords, which win over those of the product.
-        section : `SensorSection`, optional
-            Pixels of the sensor that the images show; their world coordinates are written with them.
-        """
+    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
+        """IMAGE, VARIANCE, MASK, EXPOSURES, and THICKNESS, THICKNESS_SIGMA if they are known."""
         own: list[tuple[str, io.Scalar, str]] = [("DETNAME", self.detector, "sensor")]
         if self.layer:
             own.append(("LAYER", self.layer, "layer of THICKNESS"))
@@ -270,7 +254,7 @@ class FringeCube:
         for name, data in (("THICKNESS", self.thickness), ("THICKNESS_SIGMA", self.thickness_sigma)):
             if data is not None:
                 hdus.append(io.image_hdu(name, data, unit="um", cards=[("LAYER", self.layer, "layer")]))
-        io.write_hdus(path, hdus, section)
+        return hdus
 
     def _exposures_hdu(self) -> fits.BinTableHDU:
         rows = self.exposures

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import _check as check
 from . import _fits as io
-from .sensor_section import SensorSection
+from .fits_product import FitsProduct
 
 __all__ = ["FringeFlat"]
 
@@ -21,7 +21,7 @@ _OWN = ("DETNAME", "WAVELEN", "BANDFWHM", "TEMPK", "LEVELE", "FNUMBER")
 
 
 @dataclass(frozen=True, eq=False)
-class FringeFlat:
+class FringeFlat(FitsProduct):
     """Fringe pattern of one sensor under monochromatic light.
 
     Parameters
@@ -93,24 +93,8 @@ class FringeFlat:
         """Rows and columns of the sensor."""
         return (self.image.shape[0], self.image.shape[1])
 
-    def write_fits(
-        self,
-        path: str | os.PathLike[str],
-        metadata: Mapping[str, Any] | None = None,
-        *,
-        section: SensorSection | None = None,
-    ) -> None:
-        """Write IMAGE, MASK and VARIANCE extensions.
-
-        Parameters
-        ----------
-        path : path-like
-            File to write; an existing one is replaced when the new one is complete.
-        metadata : `Mapping`, optional
-            Further header keywords, which win over those of the product.
-        section : `SensorSection`, optional
-            Pixels of the sensor that the images show; their world coordinates are written with them.
-        """
+    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
+        """IMAGE, MASK and VARIANCE extensions."""
         own: list[tuple[str, io.Scalar, str]] = [
             ("DETNAME", self.detector, "sensor"),
             ("WAVELEN", self.wavelength_nm, "[nm] wavelength"),
@@ -126,7 +110,7 @@ class FringeFlat:
             io.mask_hdu(self.mask),
             io.image_hdu("VARIANCE", self.variance, unit=""),
         ]
-        io.write_hdus(path, hdus, section)
+        return hdus
 
     @classmethod
     def read_fits(cls, path: str | os.PathLike[str]) -> Self:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, OutOfRangeError
 from . import _check as check
 from . import _fits as io
-from .sensor_section import SensorSection
+from .fits_product import FitsProduct
 
 __all__ = ["FringeFrame"]
 
@@ -25,7 +25,7 @@ _DATETIME = re.compile(r"(\d{4}-\d{2}-\d{2})T(\d{2}:\d{2}:\d{2}(?:\.\d+)?)")
 
 
 @dataclass(frozen=True, eq=False)
-class FringeFrame:
+class FringeFrame(FitsProduct):
     """Zero-mean fractional fringe pattern of one sensor in one filter.
 
     A sky image with background b and fringe scale s holds ``b * (1 + s * image)``. afw opens the file as an
@@ -98,31 +98,15 @@ class FringeFrame:
         """Rows and columns of the sensor."""
         return (self.image.shape[0], self.image.shape[1])
 
-    def write_fits(
-        self,
-        path: str | os.PathLike[str],
-        metadata: Mapping[str, Any] | None = None,
-        *,
-        section: SensorSection | None = None,
-    ) -> None:
-        """Write the layout of an afw exposure: empty primary HDU, then IMAGE, MASK, VARIANCE.
-
-        Parameters
-        ----------
-        path : path-like
-            File to write; an existing one is replaced when the new one is complete.
-        metadata : `Mapping`, optional
-            Further header keywords, which win over those of the product.
-        section : `SensorSection`, optional
-            Pixels of the sensor that the images show; their world coordinates are written with them.
-        """
+    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
+        """The layout of an afw exposure: empty primary HDU, then IMAGE, MASK, VARIANCE."""
         hdus = [
             self._primary_hdu(io.merge_metadata(self.metadata, metadata, _OWN)),
             io.image_hdu("IMAGE", self.image, cards=self._extension_cards("IMAGE")),
             io.mask_hdu(self.mask, cards=self._extension_cards("MASK")),
             io.image_hdu("VARIANCE", self.variance, cards=self._extension_cards("VARIANCE")),
         ]
-        io.write_hdus(path, hdus, section)
+        return hdus
 
     def _primary_hdu(self, metadata: Mapping[str, io.Scalar]) -> fits.PrimaryHDU:
         match = _DATETIME.fullmatch(self.creation_datetime)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, UnknownNameError
 from . import _check as check
 from . import _fits as io
-from .sensor_section import SensorSection
+from .fits_product import FitsProduct
 
 __all__ = ["CORRECTED", "SKY_UNITS", "SkyFringe", "refuse_corrected"]
 
@@ -27,7 +27,7 @@ _OWN = ("DETNAME", "FILTER", "MEANE", "EXPTIME", "AIRMASS", "HOUR", "SEED", "QUA
 
 
 @dataclass(frozen=True, eq=False)
-class SkyFringe:
+class SkyFringe(FitsProduct):
     """Night sky seen by one sensor in one exposure.
 
     Parameters
@@ -110,24 +110,8 @@ class SkyFringe:
             return self.image
         return (self.image / np.float32(self.mean_electrons) - np.float32(1)).astype(np.float32)
 
-    def write_fits(
-        self,
-        path: str | os.PathLike[str],
-        metadata: Mapping[str, Any] | None = None,
-        *,
-        section: SensorSection | None = None,
-    ) -> None:
-        """Write IMAGE and MASK extensions.
-
-        Parameters
-        ----------
-        path : path-like
-            File to write; an existing one is replaced when the new one is complete.
-        metadata : `Mapping`, optional
-            Further header keywords, which win over those of the product.
-        section : `SensorSection`, optional
-            Pixels of the sensor that the images show; their world coordinates are written with them.
-        """
+    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
+        """IMAGE and MASK extensions."""
         own: list[tuple[str, io.Scalar, str]] = [
             ("DETNAME", self.detector, "sensor"),
             ("FILTER", self.physical_filter, "physical filter"),
@@ -144,7 +128,7 @@ class SkyFringe:
             io.image_hdu("IMAGE", self.image, unit=self.unit),
             io.mask_hdu(self.mask),
         ]
-        io.write_hdus(path, hdus, section)
+        return hdus
 
     @classmethod
     def read_fits(cls, path: str | os.PathLike[str]) -> Self:

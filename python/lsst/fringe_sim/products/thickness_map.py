@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import FrameFormatError, OutOfRangeError
 from . import _check as check
 from . import _fits as io
-from .sensor_section import SensorSection
+from .fits_product import FitsProduct
 
 __all__ = ["ThicknessMap"]
 
@@ -21,7 +21,7 @@ _OWN = ("DETNAME", "LAYER")
 
 
 @dataclass(frozen=True, eq=False)
-class ThicknessMap:
+class ThicknessMap(FitsProduct):
     """Thickness of one layer, pixel by pixel.
 
     Parameters
@@ -96,24 +96,8 @@ class ThicknessMap:
         """Rows and columns of the sensor."""
         return (self.value.shape[0], self.value.shape[1])
 
-    def write_fits(
-        self,
-        path: str | os.PathLike[str],
-        metadata: Mapping[str, Any] | None = None,
-        *,
-        section: SensorSection | None = None,
-    ) -> None:
-        """Write VALUE, SIGMA, CHI2, SLIP_PROBABILITY, MASK and, if known, N_WAVELENGTHS.
-
-        Parameters
-        ----------
-        path : path-like
-            File to write; an existing one is replaced when the new one is complete.
-        metadata : `Mapping`, optional
-            Further header keywords, which win over those of the product.
-        section : `SensorSection`, optional
-            Pixels of the sensor that the images show; their world coordinates are written with them.
-        """
+    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
+        """VALUE, SIGMA, CHI2, SLIP_PROBABILITY, MASK and, if known, N_WAVELENGTHS."""
         own: list[tuple[str, io.Scalar, str]] = [
             ("DETNAME", self.detector, "sensor"),
             ("LAYER", self.layer, "layer"),
@@ -128,7 +112,7 @@ class ThicknessMap:
         ]
         if self.n_wavelengths is not None:
             hdus.append(io.image_hdu("N_WAVELENGTHS", self.n_wavelengths, unit=""))
-        io.write_hdus(path, hdus, section)
+        return hdus
 
     @classmethod
     def read_fits(cls, path: str | os.PathLike[str]) -> Self:

@@ -6,7 +6,6 @@ xarray is an extra of the package (``pip install 'lsst-fringe-sim[xarray]'``); n
 from __future__ import annotations
 
 import os
-import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FrameFormatError, InputError, MissingPackageError, UnknownNameError
 from ..resources import DAMAGE, first_line, open_user_fits
-from ._fits import PRODUCT_KEY
+from ._fits import PRODUCT_KEY, all_or_nothing, existing_folder
 from .fringe_cube import FringeCube
 from .mask import MASK_PLANES
 from .sensor_section import section_pixels
@@ -87,22 +86,16 @@ def write_netcdf(dataset: xarray.Dataset, path: str | os.PathLike[str]) -> None:
     InputError
         The folder does not exist.
     """
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise InputError("folder", str(target.parent), "an existing folder", source=str(target))
+    target = existing_folder(path)
     attributes = {
         key: int(value) if isinstance(value, bool) else value
         for key, value in dataset.attrs.items()
         if value is not None
     }
-    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}.part")
-    try:
-        plain = dataset.copy(deep=False)
-        plain.attrs = attributes
+    plain = dataset.copy(deep=False)
+    plain.attrs = attributes
+    with all_or_nothing(target) as temporary:
         plain.to_netcdf(temporary, engine="scipy", format="NETCDF3_64BIT")
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_exported(path: str | os.PathLike[str]) -> ThicknessMap | FringeCube | SkyFringe:
