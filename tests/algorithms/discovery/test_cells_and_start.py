@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
-from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube
+from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
 from lsst.fringe_sim.algorithms.discovery.channels import measure_channels
-from lsst.fringe_sim.algorithms.discovery.fit import Problem, fit_model
+from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.algorithms.discovery.start import mended_thickness, starting_thickness
@@ -136,3 +137,46 @@ def test_a_residual_of_known_size_is_not_called_noise_by_mistake() -> None:
     assert strict["thickness phase"] < 1e-6
     assert lenient.pop("thickness phase") > 0.99
     assert lenient == {name: chance for name, chance in strict.items() if name != "thickness phase"}
+
+
+def test_a_fit_far_behind_gives_up_and_one_that_is_near_does_not() -> None:
+    """Another support in place of a wide bandpass: hopeless beside the right effect, converged beside its own fit."""
+    truth = _smooth_field(24, 24)
+    cells = bin_cube(_cube(truth, {"bandwidth.fwhm": 4.0}, 2e5, 11), 1)
+    model = FringeModel.from_setup("ts8_e2v")
+    forward = Forward.of_cells(model, EFFECTS, cells, (12.0, 18.0))
+    basis = SplineBasis.of_grid(truth.shape, 4.0)
+    problem = Problem(cells, forward, basis, np.eye(len(WAVELENGTHS)))
+    start = basis.fit(truth, np.ones(truth.shape))
+    right, wrong = (
+        coordinates_of(next(effect for effect in EFFECTS if effect.name == name), forward, truth)
+        for name in ("bandwidth", "support_index")
+    )
+    rival = fit_model(problem, right, np.array([0.1]), start).chi2
+    free = fit_model(problem, wrong, np.array([-0.1]), start)
+    near = fit_model(problem, wrong, np.array([-0.1]), start, rival=free.chi2 - 50.0)
+    behind = fit_model(problem, wrong, np.array([-0.1]), start, rival=rival)
+    assert free.converged
+    assert near.chi2 == free.chi2
+    assert FEWEST_ITERATIONS <= behind.iterations < free.iterations
+    assert not behind.converged
+    assert free.chi2 <= behind.chi2 < free.chi2 + 0.05 * (free.chi2 - rival)
+
+
+def test_cells_of_a_large_sensor_are_found_plane_by_plane() -> None:
+    """The size of the cells and the memory that finding it takes: a few planes, not the whole cube again."""
+    rows, columns = 512, 480
+    v, u = np.mgrid[-1.0 : 1.0 : rows * 1j, -1.0 : 1.0 : columns * 1j]
+    cube = _cube(15.0 + 0.9 * u - 0.7 * v, {}, 2e4, 3)
+    plane = 8 * rows * columns
+    tracemalloc.start()
+    try:
+        size = finest_useful_cell(cube, most_cells=20_000)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert size == 8
+    assert peak < 12 * plane
+    cells = bin_cube(cube, size)
+    expected = cube.image[3].astype(float).reshape(rows // 8, 8, columns // 8, 8).mean(axis=(1, 3))
+    np.testing.assert_allclose(cells.value[3], expected / cube.image[3].mean(dtype=float), rtol=1e-12)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,24 +156,10 @@ def bin_cube(
     centroid = np.zeros((2, *shape))
     level = np.array(cube.exposures.level_e, dtype=float)
     for plane, source in enumerate(spectral_order(cube)):
-        image = np.asarray(cube.image[source], dtype=np.float64)
-        variance = np.asarray(cube.variance[source], dtype=np.float64)
-        good = (np.asarray(cube.mask[source]) & BAD_PLANES) == 0
-        good &= np.isfinite(image) & np.isfinite(variance)
-        if not good.any():
-            raise InputError(f"good pixels at {cube.wavelength_nm[source]:g} nm", 0, "one or more")
-        # A relative plane is over the mean of its whole sensor, of which there may be only a few pixels here.
-        mean = float(image[good].mean()) if cube.unit == "electron" else 1.0
-        if not mean > 0.0:
-            raise InputError(f"mean level at {cube.wavelength_nm[source]:g} nm", mean, "above 0")
-        count = _block_sum(good.astype(np.float64), cell_px)
-        total = _block_sum(np.where(good, image, 0.0), cell_px)
-        spread = _block_sum(np.where(good, variance, 0.0), cell_px)
-        used = count >= max(1.0, LEAST_FILLED * cell_px**2)
-        np.divide(total, count * mean, out=value[plane], where=used)
-        centroid[:, plane] = _centroid(good, count, used, cell_px)
-        floor = 1e-14 * mean**2 * count  # noiseless data are fitted as if they were good to 1e-7
-        np.divide((count * mean) ** 2, np.maximum(spread, floor), out=weight[plane], where=used)
+        pixels, good, mean = _pixels_of(cube, int(source))
+        sums = pixels.summed(cell_px)
+        value[plane], weight[plane] = sums.cells(mean, cell_px)
+        centroid[:, plane] = _centroid(good, sums.number, weight[plane] > 0.0, cell_px)
         if cube.unit == "electron":
             level[source] = mean
     if level_e:
@@ -218,6 +205,9 @@ def _centroid(
 KEPT_PATTERN = 0.88
 """Part of the pattern's variance that cells must keep: a quarter of a fringe in a cell, which the model follows."""
 
+FEWEST_CELLS = 400
+"""Cells that coarser ones must leave."""
+
 
 def finest_useful_cell(cube: FringeCube, *, most_cells: int, largest: int = 64) -> int:
     """Side of the largest cell that does not blur the pattern, or of the smallest that keeps ``most_cells``.
@@ -234,42 +224,92 @@ def finest_useful_cell(cube: FringeCube, *, most_cells: int, largest: int = 64) 
     largest : `int`, optional
         Largest side [px].
     """
-    size = 1
-    reference: FloatArray | None = None
-    while True:
-        cells = bin_cube(cube, size)
-        signal, error = _pattern_variance(cells)
-        reference = signal if reference is None else reference
-        enough = np.count_nonzero(cells.weight[0]) if size > 1 else np.inf
-        blurred = bool(np.any(signal + 3.0 * error < KEPT_PATTERN * reference))
-        if size > 1 and (blurred or enough < 400):
+    sizes = [1]
+    while not _is_coarse(
+        (cube.shape[1] // sizes[-1], cube.shape[2] // sizes[-1]), sizes[-1], most_cells, largest
+    ):
+        sizes.append(2 * sizes[-1])
+    signal, error = np.zeros((2, len(sizes), cube.shape[0]))
+    filled = np.zeros(len(sizes))
+    for plane, source in enumerate(spectral_order(cube)):
+        sums, _, mean = _pixels_of(cube, int(source))
+        for step, size in enumerate(sizes):
+            if step:
+                sums = sums.summed(2)
+            value, weight = sums.cells(mean, size)
+            signal[step, plane], error[step, plane] = _pattern_variance(value, weight)
+            if plane == 0:
+                filled[step] = np.count_nonzero(weight)
+    for step, size in enumerate(sizes[1:], start=1):
+        blurred = np.any(signal[step] + 3.0 * error[step] < KEPT_PATTERN * signal[0])
+        if blurred or filled[step] < FEWEST_CELLS:
             return size // 2
-        few = cells.shape[1] * cells.shape[2] <= most_cells // 4
-        if few or size >= largest or min(cells.shape[1:]) < 32:
-            return size
-        size *= 2
+    return sizes[-1]
 
 
-def _pattern_variance(cells: CellData) -> tuple[FloatArray, FloatArray]:
+def _is_coarse(shape: tuple[int, int], size: int, most_cells: int, largest: int) -> bool:
+    """Whether cells of twice the size are out of the question."""
+    return shape[0] * shape[1] <= most_cells // 4 or size >= largest or min(shape) < 32
+
+
+def _pattern_variance(value: FloatArray, weight: FloatArray) -> tuple[float, float]:
     """Variance of the amplitudes minus that of the noise, which second differences show, and its error."""
-    waves = cells.shape[0]
-    result, error = np.zeros(waves), np.zeros(waves)
-    for plane in range(waves):
-        good = cells.weight[plane] > 0
-        if good.sum() < 2:
-            continue
-        value = cells.value[plane]
-        near = good[2:, 2:] & good[2:, 1:-1] & good[2:, :-2] & good[1:-1, 2:] & good[1:-1, 1:-1]
-        near &= good[1:-1, :-2] & good[:-2, 2:] & good[:-2, 1:-1] & good[:-2, :-2]
-        if near.any():
-            rows = value[2:] - 2.0 * value[1:-1] + value[:-2]
-            both = (rows[:, 2:] - 2.0 * rows[:, 1:-1] + rows[:, :-2]) / 6.0
-            noise = (1.4826 * float(np.median(np.abs(both[near])))) ** 2
-        else:
-            noise = float(np.median(1.0 / cells.weight[plane][good]))
-        result[plane] = max(float(value[good].var()) - noise, 0.0)
-        error[plane] = noise * np.sqrt(2.0 / good.sum())
-    return result, error
+    good = weight > 0
+    number = int(good.sum())
+    if number < 2:
+        return 0.0, 0.0
+    near = good[2:] & good[1:-1] & good[:-2]
+    near = near[:, 2:] & near[:, 1:-1] & near[:, :-2]
+    if near.any():
+        rows = value[2:] - 2.0 * value[1:-1] + value[:-2]
+        both = (rows[:, 2:] - 2.0 * rows[:, 1:-1] + rows[:, :-2]) / 6.0
+        noise = (1.4826 * float(np.median(np.abs(both[near])))) ** 2
+    else:
+        noise = float(np.median(1.0 / weight[good]))
+    return max(float(value[good].var()) - noise, 0.0), noise * math.sqrt(2.0 / number)
+
+
+class _Sums(NamedTuple):
+    """Good pixels, their sum and that of their variances, in every cell of one plane."""
+
+    number: FloatArray
+    total: FloatArray
+    spread: FloatArray
+
+    def summed(self, size: int) -> _Sums:
+        """Sums over blocks of cells."""
+        return _Sums(*(_block_sum(part, size) for part in self))
+
+    def cells(self, mean: float, cell_px: int) -> tuple[FloatArray, FloatArray]:
+        """Values over the mean of the plane, 1 where there are too few pixels, and their weights."""
+        value, weight = np.ones(self.number.shape), np.zeros(self.number.shape)
+        used = self.number >= max(1.0, LEAST_FILLED * cell_px**2)
+        np.divide(self.total, self.number * mean, out=value, where=used)
+        floor = 1e-14 * mean**2 * self.number  # noiseless data are fitted as if they were good to 1e-7
+        np.divide((self.number * mean) ** 2, np.maximum(self.spread, floor), out=weight, where=used)
+        return value, weight
+
+
+def _pixels_of(cube: FringeCube, source: int) -> tuple[_Sums, NDArray[np.bool_], float]:
+    """Pixels of one plane as cells, which of them are good, and their mean.
+
+    Raises
+    ------
+    InputError
+        No good pixel, or a mean that is not positive.
+    """
+    image = np.array(cube.image[source], dtype=np.float64)
+    variance = np.array(cube.variance[source], dtype=np.float64)
+    good = (np.asarray(cube.mask[source]) & BAD_PLANES) == 0
+    good &= np.isfinite(image) & np.isfinite(variance)
+    if not good.any():
+        raise InputError(f"good pixels at {cube.wavelength_nm[source]:g} nm", 0, "one or more")
+    # A relative plane is over the mean of its whole sensor, of which there may be only a few pixels here.
+    mean = float(image[good].mean()) if cube.unit == "electron" else 1.0
+    if not mean > 0.0:
+        raise InputError(f"mean level at {cube.wavelength_nm[source]:g} nm", mean, "above 0")
+    image[~good], variance[~good] = 0.0, 0.0
+    return _Sums(good.astype(np.float64), image, variance), good, mean
 
 
 def _block_sum(image: FloatArray, size: int) -> FloatArray:
