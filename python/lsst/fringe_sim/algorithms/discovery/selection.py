@@ -30,15 +30,16 @@ FloatArray = NDArray[np.float64]
 
 
 SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Departures, in prior scales, at which the finite signature of an effect is tried."""
+FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
+"""Departures, in prior scales, at which the finite signature of an effect is tried; the fine ones where it may grow
+with the fourth power (a beam whose onset is taken for thickness), and where fringe orders change with it."""
 
 
 IMPRECISION = 0.01
 """Part of what an effect does to the fringes in which our description of it may be wrong, and not the effect."""
 
-FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
 LIKE_THICKNESS = 0.5
-"""Sizes of effects that shift the phase, and the part of a signature that thickness could make at one wavelength."""
+"""Part of a signature that thickness could make at one wavelength, in an effect that shifts the phase."""
 
 MINIMA_TRIED = 12
 """Neighbouring minima on both sides of the first one found among which the deepest is looked for."""
@@ -222,7 +223,7 @@ class Selector:
         coordinates = self.coordinates[candidate.name]
         places, columns = [], []
         for number, item in enumerate(coordinates):
-            for size in SCAN:
+            for size in FINE_SCAN if item.quadratic else SCAN:
                 for sign in (1.0,) if item.quadratic else (1.0, -1.0):
                     departure = (size * item.scale) ** 2 if item.quadratic else sign * size * item.scale
                     if abs(item.clip(departure) - departure) > 1e-9 * abs(departure):
