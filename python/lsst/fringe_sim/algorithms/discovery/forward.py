@@ -44,7 +44,7 @@ class Prediction:
     Attributes
     ----------
     value : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Signal relative to the table mean of the unchanged model.
+        Signal relative to its mean over the thicknesses of the tables.
     slope : `numpy.ndarray`, shape ``(W, ny, nx)``
         Its derivative with respect to thickness [1/µm].
     """
@@ -80,7 +80,6 @@ class Forward:
     range_um: tuple[float, float]
     centroid: FloatArray | None = None
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
-    _scale: FloatArray | None = field(default=None, repr=False)
     _limits_um: tuple[float, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -95,7 +94,10 @@ class Forward:
         return cls(model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid)
 
     def table(self, settings: Settings) -> FloatArray:
-        """Response ``(W, D)`` on the grid of thickness, relative to the mean of the unchanged model."""
+        """Response ``(W, D)`` on the grid of thickness, relative to its mean, as flats are.
+
+        Effects on the image are parts of that mean, whatever effects on the response make of it.
+        """
         key = tuple(sorted({**self.model.effect_settings, **self._optical(settings)}.items()))
         if key not in self._tables:
             low, high = self.range_um
@@ -106,10 +108,9 @@ class Forward:
             response = model.respond_on_grid(
                 light, low, TABLE_STEP_UM, count, wavelength, tolerance=TABLE_TOLERANCE
             )
-            if self._scale is None:
-                # Tapered, so that a broken fringe order at an end of the table does not count.
-                self._scale = np.average(response, axis=1, weights=np.hanning(count + 2)[1:-1])
-            self._tables[key] = table = response / self._scale[:, np.newaxis]
+            # Tapered, so that a broken fringe order at an end of the table does not count.
+            mean = np.average(response, axis=1, weights=np.hanning(count + 2)[1:-1])
+            self._tables[key] = table = response / mean[:, np.newaxis]
             while len(self._tables) * table.nbytes > MOST_TABLE_BYTES and len(self._tables) > 2:
                 self._tables.pop(next(iter(self._tables)))
         return self._tables[key]
