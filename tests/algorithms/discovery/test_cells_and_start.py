@@ -17,6 +17,7 @@ from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.algorithms.discovery.start import mended_thickness, starting_thickness
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
+from lsst.fringe_sim.effects.image_geometry import AMPLIFIERS
 from lsst.fringe_sim.mock.challenge import draw_case
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
@@ -180,3 +181,26 @@ def test_cells_of_a_large_sensor_are_found_plane_by_plane() -> None:
     cells = bin_cube(cube, size)
     expected = cube.image[3].astype(float).reshape(rows // 8, 8, columns // 8, 8).mean(axis=(1, 3))
     np.testing.assert_allclose(cells.value[3], expected / cube.image[3].mean(dtype=float), rtol=1e-12)
+
+
+def test_an_offset_is_a_part_of_flats_that_another_effect_has_made_weaker() -> None:
+    """A warm sensor detects more at 990 nm; an offset is then less of the light, but as much of the data."""
+    truth, level = _smooth_field(64, 64), 2e4
+    settings = {"temperature.kelvin": 204.0, "amplifier_offset.C03": 400.0, "amplifier_offset.C12": -600.0}
+    cube = _cube(truth, {}, level, 1)
+    cells = bin_cube(cube, 1)
+    model = FringeModel.from_setup("ts8_e2v")
+    forward = Forward.of_cells(model, EFFECTS, cells, (float(truth.min()) - 0.5, float(truth.max()) + 0.5))
+    light = FringeModel.from_setup("ts8_e2v", {"temperature.kelvin": 204.0}).response(truth, WAVELENGTHS)
+    counts = level * light / light.mean(axis=(1, 2), keepdims=True)
+    amplifier = cells.geometry.amplifier
+    counts += 400.0 * (amplifier == AMPLIFIERS.index("C03")) - 600.0 * (amplifier == AMPLIFIERS.index("C12"))
+    forward.predict({}, truth)  # the search begins with the unchanged model
+    ratio = counts / forward.predict(settings, truth).value
+    ratio /= ratio.mean(axis=(1, 2), keepdims=True)
+    edge = (
+        slice(None),
+        slice(2, -2),
+        slice(2, -2),
+    )  # the thickness within a cell is taken from its neighbours
+    assert np.abs(ratio[edge] - 1.0).max() < 0.03 * 600.0 / level
