@@ -14,6 +14,7 @@ from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, fines
 from lsst.fringe_sim.algorithms.discovery.channels import measure_channels
 from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
+from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.algorithms.discovery.start import mended_thickness, starting_thickness
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
@@ -141,7 +142,7 @@ def test_a_residual_of_known_size_is_not_called_noise_by_mistake() -> None:
 
 
 def test_a_fit_far_behind_gives_up_and_one_that_is_near_does_not() -> None:
-    """Another support in place of a wide bandpass: hopeless beside the right effect, converged beside its own fit."""
+    """Thicker silicon in place of a wide bandpass: hopeless beside the right effect, converged beside its own fit."""
     truth = _smooth_field(24, 24)
     cells = bin_cube(_cube(truth, {"bandwidth.fwhm": 4.0}, 2e5, 11), 1)
     model = FringeModel.from_setup("ts8_e2v")
@@ -151,12 +152,12 @@ def test_a_fit_far_behind_gives_up_and_one_that_is_near_does_not() -> None:
     start = basis.fit(truth, np.ones(truth.shape))
     right, wrong = (
         coordinates_of(next(effect for effect in EFFECTS if effect.name == name), forward, truth)
-        for name in ("bandwidth", "support_index")
+        for name in ("bandwidth", "silicon_thickness")
     )
     rival = fit_model(problem, right, np.array([0.1]), start).chi2
-    free = fit_model(problem, wrong, np.array([-0.1]), start)
-    near = fit_model(problem, wrong, np.array([-0.1]), start, rival=free.chi2 - 50.0)
-    behind = fit_model(problem, wrong, np.array([-0.1]), start, rival=rival)
+    free = fit_model(problem, wrong, np.array([0.3]), start)
+    near = fit_model(problem, wrong, np.array([0.3]), start, rival=free.chi2 - 50.0)
+    behind = fit_model(problem, wrong, np.array([0.3]), start, rival=rival)
     assert free.converged
     assert near.chi2 == free.chi2
     assert FEWEST_ITERATIONS <= behind.iterations < free.iterations
@@ -204,3 +205,27 @@ def test_an_offset_is_a_part_of_flats_that_another_effect_has_made_weaker() -> N
         slice(2, -2),
     )  # the thickness within a cell is taken from its neighbours
     assert np.abs(ratio[edge] - 1.0).max() < 0.03 * 600.0 / level
+
+
+def test_the_second_judgement_starts_where_the_first_ended() -> None:
+    """An index 5 % off moves the thickness by two orders; the unchanged model is not left in the wrong one."""
+    truth = _smooth_field(48, 48)
+    cube = _cube(truth, {"epoxy_index.offset": -0.073}, 5e4, 5)
+    catalogue = [effect for effect in EFFECTS if effect.name == "epoxy_index"]
+    first = prepare(cube, FringeModel.from_setup("ts8_e2v"), catalogue, 20_000)
+    selector = Selector(
+        first.problem, catalogue, first.null, first.index, first_field=first.undistorted_field
+    )
+    found = selector.hypothesis(("epoxy_index",)).fit
+    assert found.settings["epoxy_index.offset"] == pytest.approx(-0.073, abs=0.01)
+    stated = replace(first, noise=replace(first.noise, factor=1.1 * first.noise.factor))
+    second, mended = prepare_again(stated, found, first.problem.basis.expand(found.field))
+    assert second is not None
+    assert mended == 0
+    assert second.null.chi2 < 1.05 * first.null.chi2
+    assert second.guess == found.settings
+    again = Selector(
+        second.problem, catalogue, second.null, second.index, first_field=second.undistorted_field,
+        guess=second.guess,
+    ).hypothesis(("epoxy_index",)).fit  # fmt: skip
+    assert again.settings["epoxy_index.offset"] == pytest.approx(-0.073, abs=0.003)

@@ -61,6 +61,8 @@ class Prepared:
         Field that was fitted with free contrasts.
     shifts_um : `tuple` [`float`, ...]
         Moves of the whole field [µm] among which the order of a few pixels is looked for.
+    guess : `dict`
+        Settings with which ``undistorted_field`` was fitted.
     """
 
     problem: Problem
@@ -72,6 +74,7 @@ class Prepared:
     notes: tuple[str, ...] = field(default=())
     undistorted_field: FloatArray | None = None
     shifts_um: tuple[float, ...] = ()
+    guess: Mapping[str, float] = field(default_factory=dict)
 
 
 def check_setup(cube: FringeCube, model: FringeModel) -> None:
@@ -172,12 +175,22 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     start = mended_thickness(model, problem.cells, thickness_um)
     mended = int(np.count_nonzero(start != thickness_um))
     refined = _settle(*_choose_field(problem, start, fit.settings), prepared.stated, prepared.index)
+    refined = replace(refined, null=_better_null(refined, prepared), guess=dict(fit.settings))
     change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
     scatter = abs(refined.noise.response_scatter - prepared.noise.response_scatter)
     same_field = refined.problem.basis.size <= problem.basis.size and not mended
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended
+
+
+def _better_null(refined: Prepared, before: Prepared) -> Fit:
+    """Fit of the unchanged model, from the thickness with the effect or from that without, whichever is better."""
+    problem, null = refined.problem, refined.null
+    thickness = before.problem.basis.expand(before.null.field)
+    weight = (problem.cells.weight > 0).any(axis=0).astype(float)
+    other = fit_model(problem, (), np.zeros(0), problem.basis.fit(thickness, weight), null.levels)
+    return min(null, other, key=lambda fit: fit.chi2)
 
 
 def _is_rich(cells: CellData) -> bool:

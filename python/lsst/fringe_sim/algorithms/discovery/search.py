@@ -180,6 +180,7 @@ class _Search:
             generic=self.prepared.rich,
             first_field=self.prepared.undistorted_field,
             shifts_um=self.prepared.shifts_um,
+            guess=self.prepared.guess,
         )
         self.where = self._where(whole)
         chance = self._chance(whole, whole.null)
@@ -229,6 +230,7 @@ class _Search:
             self.prepared.index,
             generic=self.prepared.rich,
             first_field=self.prepared.undistorted_field,
+            guess=self.prepared.guess,
         )
 
     def _refit(self, selector: Selector, base: Hypothesis) -> list[Hypothesis]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -130,6 +130,8 @@ class Selector:
     shifts_um : sequence of `float`, optional
         Moves of the first field [µm] among which every set of effects looks for its own best thickness: the order of
         a few pixels is open.
+    guess : mapping, optional
+        Settings with which ``first_field`` was fitted: where to start with those effects, besides.
     """
 
     def __init__(
@@ -142,10 +144,12 @@ class Selector:
         generic: bool = True,
         first_field: FloatArray | None = None,
         shifts_um: Sequence[float] = (),
+        guess: Mapping[str, float] | None = None,
     ) -> None:
         self.problem, self.index, self.generic = problem, index, generic
         self.first_field = null.field if first_field is None else first_field
         self.shifts_um = tuple(shifts_um)
+        self.guess = dict(guess or {})
         self.null = Hypothesis((), null, 0.0)
         thickness = problem.basis.expand(null.field)
         self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
@@ -492,6 +496,8 @@ class Selector:
                 continue
             small = [0.1 * item.unit_step for item in own]
             fresh = [np.array(small) if start is None else np.asarray(start, dtype=float)]
+            if all(item.key in self.guess for item in own) and not base.coordinates:
+                fresh.append(np.array([item.coordinate(self.guess[item.key]) for item in own]))
         if not fresh:
             return [np.array(known)]
         return [np.concatenate([known, one]) for one in fresh]
