@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from astropy.io import fits
+from flat_cubes import TEN_NM, relative_flats
 from scipy.ndimage import uniform_filter
 
 from lsst.fringe_sim.algorithms import fit_thickness
@@ -13,9 +14,8 @@ from lsst.fringe_sim.algorithms.thickness_fit.rescue import _bad_neighbours
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import FlatExposures, FringeCube, mask_bits
+from lsst.fringe_sim.products import FringeCube, mask_bits
 
-WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 HALF_ORDER_UM = 0.15
 SHAPE = (160, 180)
 NOISE = 0.002
@@ -26,28 +26,6 @@ SPAN_UM = 1.2
 @pytest.fixture(scope="module")
 def model() -> FringeModel:
     return FringeModel.from_setup("ts8_e2v")
-
-
-def cube_of(
-    thickness: np.ndarray,
-    model: FringeModel,
-    rng: np.random.Generator,
-    wavelengths: np.ndarray = WAVELENGTHS,
-    light: np.ndarray | float = 1.0,
-    noise: float = NOISE,
-) -> FringeCube:
-    """Relative flats of a map, times the light that falls on it, with Gaussian noise."""
-    table = model.table((float(thickness.min()) - 0.01, float(thickness.max()) + 0.01), wavelengths)
-    image = np.stack([table.frame(thickness, row) for row in range(len(wavelengths))]) * light
-    image = image / image.mean(axis=(1, 2), keepdims=True)
-    image = image + noise * rng.standard_normal(image.shape)
-    return FringeCube(
-        image.astype(np.float32),
-        np.full(image.shape, noise**2, np.float32),
-        np.zeros(image.shape, np.int16),
-        FlatExposures(wavelengths, np.array(2.0), np.array(183.15)),
-        "relative",
-    )
 
 
 def places() -> tuple[np.ndarray, np.ndarray]:
@@ -69,9 +47,9 @@ def test_a_step_between_the_halves(model, rng, tmp_path) -> None:
     """As measured: -1.1 % at the midline, a little different at each wavelength."""
     y, _ = places()
     truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
-    steps = -0.011 * (1.0 + 0.2 * rng.standard_normal(WAVELENGTHS.size))
+    steps = -0.011 * (1.0 + 0.2 * rng.standard_normal(TEN_NM.size))
     light = 1.0 + steps[:, None, None] * (y > 0)
-    cube = cube_of(truth, model, rng, light=light)
+    cube = relative_flats(truth, model, rng, light=light)
     free = fit_thickness(cube, model, nuisances=Nuisances(zones="halves"))
     pull = pulls_of(free, truth)
     assert pull.mean() == pytest.approx(0.0, abs=0.05)
@@ -89,9 +67,9 @@ def test_slow_illumination(model, rng) -> None:
     """A gradient and a bowl of a few per cent, free at each wavelength."""
     y, x = places()
     truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
-    size = 0.02 * rng.standard_normal((WAVELENGTHS.size, 3))
+    size = 0.02 * rng.standard_normal((TEN_NM.size, 3))
     light = 1.0 + np.einsum("wk,kyx->wyx", size, np.stack([x, y, x * x + y * y]))
-    cube = cube_of(truth, model, rng, light=light)
+    cube = relative_flats(truth, model, rng, light=light)
     # The light is even within a cell: on 160 pixels it changes as much from cell to cell as on 4000 over 25 cells.
     fitted = fit_thickness(cube, model, nuisances=Nuisances(illumination_degree=2), cell_px=2)
     pull = pulls_of(fitted, truth)
@@ -102,7 +80,7 @@ def test_slow_illumination(model, rng) -> None:
 def test_contrast_that_the_model_does_not_know(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
     weak = model.with_effects({"contrast_loss.factor": 0.4})
-    fitted = fit_thickness(cube_of(truth, weak, rng), model, nuisances=Nuisances(contrast="common"))
+    fitted = fit_thickness(relative_flats(truth, weak, rng), model, nuisances=Nuisances(contrast="common"))
     assert fitted.metadata["CONTRAST"] == pytest.approx(0.4, rel=0.01)
     assert pulls_of(fitted, truth).std() == pytest.approx(1.0, abs=0.1)
 
@@ -111,14 +89,14 @@ def test_contrast_that_the_model_does_not_know(model, rng) -> None:
 def test_thin_and_thick_adhesive(mean: float, model, rng) -> None:
     """Both ends of 5 to 30 µm."""
     truth = random_field(SHAPE, rng, mean=mean, span=SPAN_UM)
-    pull = pulls_of(fit_thickness(cube_of(truth, model, rng), model), truth)
+    pull = pulls_of(fit_thickness(relative_flats(truth, model, rng), model), truth)
     assert pull.std() == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_sensor_cut_in_two(model, rng) -> None:
     """Masked rows that no path crosses: both parts find their order, by themselves or together."""
     truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
-    cube = cube_of(truth, model, rng)
+    cube = relative_flats(truth, model, rng)
     mask = cube.mask.copy()
     mask[:, 75:87] = mask_bits("BAD")
     cut = FringeCube(cube.image, cube.variance, mask, cube.exposures, "relative")
@@ -133,7 +111,7 @@ def test_a_sensor_cut_in_two(model, rng) -> None:
 def test_unequal_noise_counts(model, rng) -> None:
     """A quarter of the sensor and half of the wavelengths are three times noisier; the pulls stay 1 everywhere."""
     truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
-    cube = cube_of(truth, model, rng, noise=1e-6)
+    cube = relative_flats(truth, model, rng, noise=1e-6)
     noise = np.full(cube.shape, NOISE)
     noise[::2] *= 3.0
     noise[:, :80, :90] *= 3.0

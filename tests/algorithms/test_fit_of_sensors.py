@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from flat_cubes import TEN_NM, relative_flats
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.mock.thickness import HARD_MAPS, random_field
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import FlatExposures, FringeCube, mask_bits
+from lsst.fringe_sim.products import FringeCube, mask_bits
 
-WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 HALF_ORDER_UM = 0.15
 SHAPE = (160, 200)
 
@@ -22,26 +22,6 @@ SHAPE = (160, 200)
 @pytest.fixture(scope="module")
 def model() -> FringeModel:
     return FringeModel.from_setup("ts8_e2v")
-
-
-def cube_of(
-    thickness: np.ndarray,
-    model: FringeModel,
-    rng: np.random.Generator,
-    noise: float = 0.002,
-    wavelengths: np.ndarray = WAVELENGTHS,
-) -> FringeCube:
-    """Relative flats of a map with Gaussian noise of known size."""
-    response = model.response(thickness.ravel(), wavelengths).reshape(len(wavelengths), *thickness.shape)
-    image = response / response.mean(axis=(1, 2), keepdims=True)
-    image = image + noise * rng.standard_normal(image.shape)
-    return FringeCube(
-        image.astype(np.float32),
-        np.full(image.shape, noise**2, np.float32),
-        np.zeros(image.shape, np.int16),
-        FlatExposures(wavelengths, np.array(2.0), np.array(183.15)),
-        "relative",
-    )
 
 
 def slipped(value: np.ndarray, truth: np.ndarray, good: np.ndarray) -> float:
@@ -53,7 +33,7 @@ def slipped(value: np.ndarray, truth: np.ndarray, good: np.ndarray) -> float:
 def test_hard_maps_without_a_slip(name, model, rng) -> None:
     truth = HARD_MAPS[name](SHAPE)
     known = np.isfinite(truth)
-    cube = cube_of(np.where(known, truth, 17.0), model, rng)
+    cube = relative_flats(np.where(known, truth, 17.0), model, rng)
     mask = np.where(known, 0, mask_bits("BAD")).astype(np.int16)
     masked = FringeCube(
         cube.image, cube.variance, np.broadcast_to(mask, cube.shape).copy(), cube.exposures, "relative"
@@ -66,7 +46,7 @@ def test_hard_maps_without_a_slip(name, model, rng) -> None:
 
 def test_uncertainty_holds(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=17.0, span=4.0)
-    fitted = fit_thickness(cube_of(truth, model, rng), model)
+    fitted = fit_thickness(relative_flats(truth, model, rng), model)
     good = fitted.mask == 0
     pull = (fitted.value - truth)[good] / fitted.sigma[good]
     assert abs(pull.mean()) < 0.05
@@ -78,7 +58,7 @@ def test_noise_at_which_single_pixels_slip(model, rng) -> None:
     """Contrast lowered to that of real sensors, noise at which a lone pixel goes wrong every third time."""
     weak = model.with_effects({"contrast_loss.factor": 0.15})
     truth = random_field(SHAPE, rng, mean=17.0, span=4.0)
-    cube = cube_of(truth, weak, rng, noise=0.004)
+    cube = relative_flats(truth, weak, rng, noise=0.004)
     together = fit_thickness(cube, weak)
     good = together.mask == 0
     assert good.mean() > 0.9
@@ -89,7 +69,7 @@ def test_walk_of_the_paper_fails_where_the_path_is_broken(model, rng) -> None:
     """A wall of one and a half orders: the walk carries the error on, the global fit does not."""
     truth = random_field(SHAPE, rng, mean=17.0, span=2.0)
     truth[:, 120:] += 0.47
-    cube = cube_of(truth, model, rng)
+    cube = relative_flats(truth, model, rng)
     walk = fit_thickness(cube, model, method="guo2022", start_pixel=(80, 40))
     whole = fit_thickness(cube, model)
     good = whole.mask == 0
@@ -100,7 +80,7 @@ def test_walk_of_the_paper_fails_where_the_path_is_broken(model, rng) -> None:
 
 def test_walk_of_the_paper_is_right_on_a_smooth_map(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=17.0, span=4.0)
-    cube = cube_of(truth, model, rng)
+    cube = relative_flats(truth, model, rng)
     for start in ((80, 100), (0, 0), (159, 10)):
         walk = fit_thickness(cube, model, method="guo2022", start_pixel=start)
         assert slipped(walk.value, truth, walk.mask == 0) == 0.0
@@ -108,8 +88,8 @@ def test_walk_of_the_paper_is_right_on_a_smooth_map(model, rng) -> None:
 
 def test_any_order_of_wavelengths(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=16.0, span=3.0)
-    cube = cube_of(truth, model, rng)
-    mixed = cube.take(rng.permutation(len(WAVELENGTHS)))
+    cube = relative_flats(truth, model, rng)
+    mixed = cube.take(rng.permutation(len(TEN_NM)))
     np.testing.assert_allclose(
         fit_thickness(mixed, model).value, fit_thickness(cube, model).value, rtol=0.0, atol=1e-5
     )
@@ -117,7 +97,7 @@ def test_any_order_of_wavelengths(model, rng) -> None:
 
 def test_missing_wavelengths_cost_certainty(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=16.0, span=3.0)
-    cube = cube_of(truth, model, rng)
+    cube = relative_flats(truth, model, rng)
     few = fit_thickness(cube.take([0, 2, 3, 5, 8, 10, 11]), model)
     many = fit_thickness(cube, model)
     good = (few.mask == 0) & (many.mask == 0)
@@ -128,7 +108,7 @@ def test_missing_wavelengths_cost_certainty(model, rng) -> None:
 
 def test_bad_columns_and_missing_pixels(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=17.0, span=4.0)
-    cube = cube_of(truth, model, rng)
+    cube = relative_flats(truth, model, rng)
     image, mask = cube.image.copy(), cube.mask.copy()
     image[:, :, 77] = 0.1
     mask[:, :, 77] = mask_bits("BAD")
@@ -144,14 +124,14 @@ def test_bad_columns_and_missing_pixels(model, rng) -> None:
 
 
 def test_threads_do_not_change_the_result(model, rng) -> None:
-    cube = cube_of(random_field(SHAPE, rng, mean=17.0, span=4.0), model, rng)
+    cube = relative_flats(random_field(SHAPE, rng, mean=17.0, span=4.0), model, rng)
     one, two = (fit_thickness(cube, model, threads=number) for number in (1, 2))
     np.testing.assert_array_equal(one.value, two.value)
     np.testing.assert_array_equal(one.sigma, two.sigma)
 
 
 def test_bad_requests(model, rng) -> None:
-    cube = cube_of(np.full((20, 20), 17.0), model, rng)
+    cube = relative_flats(np.full((20, 20), 17.0), model, rng)
     with pytest.raises(UnknownNameError, match="global"):
         fit_thickness(cube, model, method="globl")
     with pytest.raises(InputError):
@@ -186,7 +166,7 @@ def test_real_maps_of_the_raft(sensor, shared_dir, model, rng) -> None:
     relief = repaired(shared_dir / "measured" / f"RTM-020_{sensor}_epoxy_map.fits")
     relief = np.nan_to_num(relief, nan=float(np.nanmedian(relief)))
     truth = relief - relief.min() + rng.uniform(9.0, 13.0)
-    fitted = fit_thickness(cube_of(truth, model, rng, noise=0.001), model)
+    fitted = fit_thickness(relative_flats(truth, model, rng, noise=0.001), model)
     good = fitted.mask == 0
     assert good.mean() > 0.9
     assert slipped(fitted.value, truth, good) < 2e-3

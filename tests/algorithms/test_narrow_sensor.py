@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flat_cubes import relative_flats
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.algorithms.thickness_fit.cells import Cells
 from lsst.fringe_sim.algorithms.thickness_fit.narrow_sensor import _Sample
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import FlatExposures, FringeCube
+from lsst.fringe_sim.products import FringeCube
 
-TEN_NM = np.arange(880.0, 991.0, 10.0)
 SEARCH_UM = (5.0, 20.0)
 HALF_ORDER_UM = 0.15
 
@@ -20,19 +20,6 @@ HALF_ORDER_UM = 0.15
 @pytest.fixture(scope="module")
 def model() -> FringeModel:
     return FringeModel.from_setup("ts8_e2v")
-
-
-def cube_of(truth: np.ndarray, model: FringeModel, noise: float, rng: np.random.Generator) -> FringeCube:
-    """Flats over their own mean."""
-    image = model.response(truth, TEN_NM)
-    image = image / image.mean(axis=(1, 2), keepdims=True) + noise * rng.standard_normal(image.shape)
-    return FringeCube(
-        image.astype(np.float32),
-        np.full(image.shape, noise**2, np.float32),
-        np.zeros(image.shape, np.int16),
-        FlatExposures(TEN_NM, np.array(2.0), np.array(183.15)),
-        "relative",
-    )
 
 
 def test_cells_without_a_thickness_are_not_asked() -> None:
@@ -51,7 +38,7 @@ def test_cells_without_a_thickness_are_not_asked() -> None:
 def test_order_is_found_together_with_the_mean(span, model, rng) -> None:
     for _ in range(2):
         truth = random_field((64, 64), rng, mean=rng.uniform(7.0, 15.0), span=span)
-        fitted = fit_thickness(cube_of(truth, model, 0.007, rng), model, range_um=SEARCH_UM)
+        fitted = fit_thickness(relative_flats(truth, model, rng, 0.007), model, range_um=SEARCH_UM)
         good = fitted.mask == 0
         assert good.mean() > 0.99
         assert np.mean(np.abs(fitted.value - truth)[good] > HALF_ORDER_UM) == 0.0
@@ -64,7 +51,7 @@ def test_uncertainty_of_the_common_thickness(model, rng) -> None:
     pulls, gain = [], []
     for _ in range(10):
         truth = random_field((32, 32), rng, mean=rng.uniform(9.0, 12.0), span=0.01)
-        fitted = fit_thickness(cube_of(truth, model, 0.002, rng), model, range_um=(8.0, 13.0))
+        fitted = fit_thickness(relative_flats(truth, model, rng, 0.002), model, range_um=(8.0, 13.0))
         good = fitted.mask == 0
         if good.mean() > 0.9:
             error = (fitted.value - truth)[good]
@@ -79,7 +66,7 @@ def test_what_cannot_be_told_is_said(model, rng) -> None:
     """Noise that leaves a flat sensor without a fringe: wrong orders are flagged."""
     for span in (0.005, 0.01, 0.02):
         truth = random_field((32, 32), rng, mean=rng.uniform(7.0, 15.0), span=span)
-        fitted = fit_thickness(cube_of(truth, model, 0.01, rng), model, range_um=SEARCH_UM)
+        fitted = fit_thickness(relative_flats(truth, model, rng, 0.01), model, range_um=SEARCH_UM)
         wrong = np.abs(fitted.value - truth) > HALF_ORDER_UM
         assert np.mean(wrong & (fitted.mask == 0)) == 0.0
 
@@ -87,7 +74,7 @@ def test_what_cannot_be_told_is_said(model, rng) -> None:
 def test_a_piece_of_a_larger_sensor_keeps_its_level(model, rng) -> None:
     """Flats over the mean of the whole sensor they were cut from are not forced to a mean of one."""
     truth = random_field((256, 256), rng, mean=12.0, span=5.0)
-    whole = cube_of(truth, model, 0.004, rng)
+    whole = relative_flats(truth, model, rng, 0.004)
     part = (slice(100, 124), slice(100, 124))
     piece = FringeCube(
         whole.image[:, *part], whole.variance[:, *part], whole.mask[:, *part], whole.exposures, "relative"

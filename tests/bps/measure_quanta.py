@@ -2,7 +2,7 @@
 
     python tests/bps/measure_quanta.py --folder /tmp/quanta
 
-runs every task but the search for effects on one e2v sensor of 4096 x 4004 pixels, one process for each task, and
+runs every task on one e2v sensor of 4096 x 4004 pixels, one process for each task, and
 prints what the middleware has recorded of the quanta. The numbers are those of `algorithms.cost_model`; the requests
 in bps/_common.yaml follow from them.
 """
@@ -117,10 +117,10 @@ def main() -> None:
     )
     parser.add_argument("--folder", type=Path, required=True, help="new folder; takes 6 GB")
     parser.add_argument("--size", default="", help="columns x rows of a smaller sensor")
-    parser.add_argument("--only", help="labels, comma-separated; by default all but effectDiscovery")
+    parser.add_argument("--only", help="labels, comma-separated; by default all")
     arguments = parser.parse_args()
     labels = [label for _, label in STEPS]
-    chosen = arguments.only.split(",") if arguments.only else labels[:-1]
+    chosen = arguments.only.split(",") if arguments.only else labels
     if set(chosen) - set(labels):
         parser.error(f"--only takes some of {', '.join(labels)}")
     arguments.folder.mkdir(parents=True)

@@ -46,12 +46,8 @@ def labels() -> set[str]:
     }
 
 
-NOT_MEASURED = {"effectDiscovery"}
-"""On a full sensor; its request is that of the fit, which reads the same flats, and time for many models."""
-
-
 def test_every_task_declares_memory_and_time() -> None:
-    assert set(requests()) == labels() == set(QUANTUM_COSTS) | NOT_MEASURED
+    assert set(requests()) == labels() == set(QUANTUM_COSTS)
     for asked in requests().values():
         assert set(asked) == {"requestMemory", "requestWalltime"}
 

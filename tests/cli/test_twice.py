@@ -18,6 +18,7 @@ from lsst.daf.butler.cli.butler import cli as butler_cli
 from lsst.daf.butler.cli.utils import LogCliRunner
 from product_makers import MAKERS
 from raw_frame_maker import write_raw
+from toy_repository import put_fringe
 
 from lsst.fringe_sim.cli.main import cli, run
 from lsst.fringe_sim.middleware import LsstCamFringe, Ts8Fringe, get_cli_subcommands
@@ -149,17 +150,7 @@ def adopt(repo: Path, folder: Path) -> list[list[str]]:
 
 def hand_off(repo: Path, folder: Path) -> list[list[str]]:
     with Butler.from_config(str(repo), writeable=True) as butler:
-        kind = DatasetType(
-            "fringe",
-            ("instrument", "physical_filter", "detector"),
-            "FringeFrame",
-            universe=butler.dimensions,
-            isCalibration=True,
-        )
-        butler.registry.registerDatasetType(kind)
-        butler.collections.register("u/fringe")
-        frame = MAKERS["FringeFrame"]()
-        butler.put(frame, kind, instrument="LSSTCam", physical_filter="y_10", detector=37, run="u/fringe")
+        put_fringe(butler, "u/fringe", (37,))
     return [["write-fringe-handoff", str(repo), "u/fringe", str(folder / "handoff")]]
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import click.testing
-from lsst.daf.butler import Butler
+from lsst.daf.butler import Butler, DatasetType
+from product_makers import MAKERS
 from raw_frame_maker import write_raw
 
 from lsst.fringe_sim.middleware.raw_ingest import ingest_raws
 
-__all__ = ["PIPELINE", "SENSORS", "Invoke", "fill"]
+__all__ = ["PIPELINE", "SENSORS", "Invoke", "fill", "put_fringe"]
 
 Invoke = Callable[..., click.testing.Result]
 
@@ -26,3 +27,19 @@ def fill(repo: Path, folder: Path) -> None:
         write_raw(folder / f"{serial}.fits", {"LSST_NUM": serial})
     with Butler.from_config(str(repo), writeable=True) as butler:
         assert ingest_raws(butler, [str(folder)]).refused == ()
+
+
+def put_fringe(butler: Butler, run: str, detectors: Iterable[int]) -> None:
+    """A fringe frame of each detector of the LSST Camera, in a run of a writeable repository."""
+    kind = DatasetType(
+        "fringe",
+        ("instrument", "physical_filter", "detector"),
+        "FringeFrame",
+        universe=butler.dimensions,
+        isCalibration=True,
+    )
+    butler.registry.registerDatasetType(kind)
+    butler.collections.register(run)
+    for detector in detectors:
+        frame = MAKERS["FringeFrame"](detector=f"det{detector}")
+        butler.put(frame, kind, instrument="LSSTCam", physical_filter="y_10", detector=detector, run=run)

@@ -10,9 +10,8 @@ import pytest
 import yaml
 from astropy.io import fits
 from astropy.time import Time
-from lsst.daf.butler import Butler, CollectionType, DatasetRef, DatasetType, FormatterV2, Timespan
-from product_makers import MAKERS
-from toy_repository import Invoke
+from lsst.daf.butler import Butler, CollectionType, DatasetRef, FormatterV2, Timespan
+from toy_repository import Invoke, put_fringe
 
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.middleware import LsstCamFringe
@@ -28,20 +27,7 @@ CALIB = "LSSTCam/calib/fringe"
 def certified(repo: Path, invoke: Invoke) -> Path:
     """A repository with two certified fringe frames."""
     with Butler.from_config(str(repo), writeable=True) as butler:
-        dataset_type = DatasetType(
-            "fringe",
-            ("instrument", "physical_filter", "detector"),
-            "FringeFrame",
-            universe=butler.dimensions,
-            isCalibration=True,
-        )
-        butler.registry.registerDatasetType(dataset_type)
-        butler.collections.register(RUN)
-        for detector in (37, 94):
-            frame = MAKERS["FringeFrame"](detector=f"det{detector}")
-            butler.put(
-                frame, dataset_type, instrument="LSSTCam", physical_filter="y_10", detector=detector, run=RUN
-            )
+        put_fringe(butler, RUN, (37, 94))
     result = invoke(
         "certify-calibrations",
         repo,

@@ -154,8 +154,8 @@ def _segment(
         part = slice(first, first + many)
         groups = len(weight[part])
         _gridding_kernel(
-            rule, *(each[part] for each in coefficients), weight[part], spread_um, start_um + step_um * middle,
-            step_um, order, grid, constant,
+            rule, (*(each[part] for each in coefficients), weight[part]), spread_um,
+            start_um + step_um * middle, step_um, order, grid, constant,
         )  # fmt: skip
         wave = scipy.fft.ifft(grid[:groups], axis=-1, workers=numba.get_num_threads())
         for group in range(groups):
@@ -241,13 +241,7 @@ def _harmonic(
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def _gridding_kernel(
     rule: _Gridding,
-    a: NDArray,
-    b: NDArray,
-    e: NDArray,
-    c: NDArray,
-    g: NDArray,
-    kappa: NDArray,
-    w: NDArray,
+    nodes: tuple[NDArray, ...],
     spread: float,
     where: float,
     step: float,
@@ -256,23 +250,16 @@ def _gridding_kernel(
     constant: NDArray,
 ) -> None:  # pragma: no cover - compiled
     """Harmonics of the nodes of each group on its frequency grid, and the constant terms."""
+    a, b, e, c, g, kappa, w = nodes
     for group in numba.prange(len(w)):
-        _grid_group(
-            rule, a[group], b[group], e[group], c[group], g[group], kappa[group], w[group],
-            spread, where, step, order, grid[group], constant[group],
-        )  # fmt: skip
+        own = (a[group], b[group], e[group], c[group], g[group], kappa[group], w[group])
+        _grid_group(rule, own, spread, where, step, order, grid[group], constant[group])
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _grid_group(
     rule: _Gridding,
-    a: NDArray,
-    b: NDArray,
-    e: NDArray,
-    c: NDArray,
-    g: NDArray,
-    kappa: NDArray,
-    w: NDArray,
+    nodes: tuple[NDArray, ...],
     spread: float,
     where: float,
     step: float,
@@ -281,6 +268,7 @@ def _grid_group(
     constant: NDArray,
 ) -> None:  # pragma: no cover - compiled
     """Harmonics of the nodes of one group on its frequency grid, and the constant terms."""
+    a, b, e, c, g, kappa, w = nodes
     powers, size = grid.shape
     reach, width, smallest = rule
     grid[:] = 0.0
