@@ -25,7 +25,7 @@ class FlatPrepOptions:
     overscan_skip : `int`
         Overscan columns and rows next to the imaging section that are left out: deferred charge.
     parallel_overscan : `bool`
-        Whether the median of the parallel overscan is taken off every column.
+        Whether what columns differ from each other in the parallel overscan is taken off.
     clip_sigma : `float`
         Rejection threshold in overscan and bias combination, in standard deviations.
     saturation_fraction : `float`

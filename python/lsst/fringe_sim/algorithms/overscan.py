@@ -42,8 +42,8 @@ def correct_overscan(
 ) -> OverscanCorrected | None:
     """Take the electronic level off one amplifier.
 
-    Row by row with the serial overscan, which follows the drift of the electronics, then column by column with
-    the parallel overscan. Outliers (cosmic rays, bleeding, deferred charge) are rejected.
+    Row by row with the serial overscan, which follows the drift of the electronics; then what columns differ from
+    each other in the parallel overscan. Outliers (cosmic rays, bleeding, deferred charge) are rejected.
 
     Parameters
     ----------
@@ -119,11 +119,17 @@ def _robust_spline(values: NDArray[np.float64], options: FlatPrepOptions) -> NDA
 
 
 def _column_level(parallel: Image, noise: float, options: FlatPrepOptions) -> Image:
-    """Level of every column in the parallel overscan [ADU]; columns into which charge bled take the common one."""
+    """Level of every column in the parallel overscan over that of all [ADU]; 0 where charge bled into it.
+
+    What columns have in common is left to the serial overscan: here it is the noise of a few dozen row levels, and
+    would give every amplifier an offset of its own in every exposure. A lasting one is in the bias frames.
+    """
     median = np.median(parallel, axis=0)
     common = float(np.median(median))
     # The standard error of a median of n Gaussian values is 1.2533 sigma / sqrt(n).
     error = 1.2533 * noise / math.sqrt(parallel.shape[0])
     scatter = max(GAUSSIAN_MAD * float(np.median(np.abs(median - common))), error)
     outlier = np.abs(median - common) > options.clip_sigma * scatter
-    return np.where(outlier, np.float32(common), median)
+    # Medians of integers are halves of integers; only their mean has no step.
+    departure = median - median[~outlier].mean(dtype=np.float64)
+    return np.where(outlier, 0.0, departure).astype(np.float32)

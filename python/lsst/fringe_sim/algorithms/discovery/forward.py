@@ -71,6 +71,8 @@ class Forward:
         Thicknesses that the tables cover [µm]; grows on demand, by `FARTHEST_UM` at most.
     centroid : `numpy.ndarray`, shape ``(2, W, ny, nx)``, optional
         See `CellData`.
+    seen : `numpy.ndarray` of `bool`, shape ``(ny, nx)``, optional
+        Cells with data; by default all. The thickness of others is not known, and slopes do not lean on it.
     """
 
     model: FringeModel
@@ -79,6 +81,7 @@ class Forward:
     cell_px: int
     range_um: tuple[float, float]
     centroid: FloatArray | None = None
+    seen: NDArray[np.bool_] | None = None
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
     _limits_um: tuple[float, float] = field(init=False, repr=False)
 
@@ -91,7 +94,8 @@ class Forward:
         cls, model: FringeModel, catalogue: Sequence[Effect], cells: CellData, range_um: tuple[float, float]
     ) -> Forward:
         """Forward model of the cells of ``cells`` for a thickness range [µm]."""
-        return cls(model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid)
+        seen = np.asarray((cells.weight > 0).any(axis=0))
+        return cls(model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid, seen)
 
     def table(self, settings: Settings) -> FloatArray:
         """Response ``(W, D)`` on the grid of thickness, relative to its mean, as flats are.
@@ -144,7 +148,7 @@ class Forward:
             Thickness at the centres of the cells [µm], within the tables.
         """
         table = self.table(settings)
-        gradient = _gradient(thickness_um)
+        gradient = _gradient(thickness_um, self.seen)
         second, fourth = self._spread_in_cell(gradient)
         place, beside = self._at_centroids(thickness_um, gradient)
         value, slope = _interpolate(
@@ -204,12 +208,24 @@ class Forward:
         return {key: value for key, value in known.items() if self.is_image_effect(key.split(".")[0])}
 
 
-def _gradient(field: FloatArray) -> FloatArray:
-    """Change of a field from cell to cell along rows and columns, ``(2, ny, nx)``."""
+def _gradient(field: FloatArray, seen: NDArray[np.bool_] | None) -> FloatArray:
+    """Change of a field from cell to cell along rows and columns, ``(2, ny, nx)``.
+
+    The mean of the differences to both neighbours, or to the one that is seen.
+    """
+    known = np.ones(field.shape, dtype=bool) if seen is None else seen
     result = np.zeros((2, *field.shape))
     for axis in (0, 1):
-        if field.shape[axis] > 1:
-            result[axis] = np.gradient(field, axis=axis)
+        moved = result[axis].swapaxes(0, axis)
+        own, there = field.swapaxes(0, axis), known.swapaxes(0, axis)
+        both = there[1:] & there[:-1]
+        step = np.where(both, own[1:] - own[:-1], 0.0)
+        number = np.zeros(own.shape)
+        moved[1:] += step
+        moved[:-1] += step
+        number[1:] += both
+        number[:-1] += both
+        moved /= np.maximum(number, 1.0)
     return result
 
 
