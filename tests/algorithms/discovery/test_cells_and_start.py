@@ -15,13 +15,15 @@ from lsst.fringe_sim.algorithms.discovery.channels import measure_channels
 from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
-from lsst.fringe_sim.algorithms.discovery.selection import Selector
+from lsst.fringe_sim.algorithms.discovery.search import _chance_of
+from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector
 from lsst.fringe_sim.algorithms.discovery.start import mended_thickness, starting_thickness
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.effects.image_geometry import AMPLIFIERS
 from lsst.fringe_sim.mock.challenge import draw_case
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
+from lsst.fringe_sim.products.mask import mask_bits
 
 WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 ORDER_UM = 0.30
@@ -229,3 +231,36 @@ def test_the_second_judgement_starts_where_the_first_ended() -> None:
         guess=second.guess,
     ).hypothesis(("epoxy_index",)).fit  # fmt: skip
     assert again.settings["epoxy_index.offset"] == pytest.approx(-0.073, abs=0.003)
+
+
+def test_cells_beside_cells_without_data_do_not_lean_on_them() -> None:
+    """The thickness of cells without data is anything; frames of real sensors have a rim of them."""
+    truth = _smooth_field(24, 24)
+    cube = _cube(np.kron(truth, np.ones((2, 2))), {}, 2e4, 2)
+    mask = np.zeros(cube.shape, np.int32)
+    mask[:, :4] = mask_bits("EDGE")
+    cells = bin_cube(replace(cube, mask=mask), 2)
+    forward = Forward.of_cells(FringeModel.from_setup("ts8_e2v"), EFFECTS, cells, (12.0, 19.0))
+    wild = truth.copy()
+    wild[:2] = 1e30
+    tame, other = (forward.predict({}, field).value[:, 2:] for field in (truth, wild))
+    np.testing.assert_array_equal(tame, other)
+
+
+def test_what_the_description_lacks_counts_on_whole_sensors_alone() -> None:
+    """A gain of 23 in χ² is a discovery of a weak effect in a small image, and none where fringes have S/N 90 000."""
+    assert _chance_of(23.0, 1, 0.05) < 1e-5
+    assert _chance_of(23.0, 1, PRECISION**2 * 9e4**2) > 0.3
+    assert _chance_of(23.0, 1, 0.0) == pytest.approx(1.6e-6, rel=0.1)
+    cells = bin_cube(_cube(_smooth_field(32, 32), {}, 2e4, 4), 1)
+    start = _smooth_field(32, 32)
+    forward = Forward.of_cells(FringeModel.from_setup("ts8_e2v"), EFFECTS[:3], cells, (12.0, 18.0))
+    basis = SplineBasis.of_grid(start.shape, 4.0)
+    problem = Problem(cells, forward, basis, np.eye(len(WAVELENGTHS)))
+    null = fit_model(problem, (), np.zeros(0), basis.fit(start, np.ones(start.shape)))
+    selector = Selector(problem, EFFECTS[:3], null, np.full(len(WAVELENGTHS), 1.6))
+    fringes = cells.value - cells.value.mean(axis=(1, 2), keepdims=True)
+    energy = float((cells.weight * fringes**2).sum())
+    optical = next(name for name in selector.coordinates if not forward.is_image_effect(name))
+    assert selector.undescribed(optical) == pytest.approx(PRECISION**2 * energy, rel=0.2)
+    assert selector.undescribed(optical) < 0.5

@@ -198,7 +198,14 @@ class Forward:
 
     def is_image_effect(self, name: str) -> bool:
         """Whether an effect acts on the image and not on the response."""
-        return next(effect for effect in self.catalogue if effect.name == name).acts_on == "image"
+        return self._effect(name).acts_on == "image"
+
+    def couples_pixels(self, name: str) -> bool:
+        """Whether an effect carries signal from cell to cell."""
+        return self._effect(name).couples_pixels
+
+    def _effect(self, name: str) -> Effect:
+        return next(effect for effect in self.catalogue if effect.name == name)
 
     def _optical(self, settings: Settings) -> dict[str, float]:
         return {key: value for key, value in settings.items() if not self.is_image_effect(key.split(".")[0])}

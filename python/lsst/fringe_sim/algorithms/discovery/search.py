@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import ncx2
 from threadpoolctl import threadpool_limits
 
 from ...effects import EFFECTS, Effect
@@ -209,7 +210,9 @@ class _Search:
     def _chance(self, selector: Selector, hypothesis: Hypothesis) -> float:
         """Chance of noise, over the tests without a catalogue and the score tests of the catalogue together."""
         scores = selector.score(hypothesis.fit, selector.others(hypothesis))
-        smallest = min((float(chi2_distribution.sf(c.gain, c.degrees)) for c in scores), default=1.0)
+        smallest = min(
+            (_chance_of(c.gain, c.degrees, selector.undescribed(c.name)) for c in scores), default=1.0
+        )
         # Effects are alike in groups; counting each as a look of its own errs on the safe side.
         catalogue = float(-np.expm1(len(scores) * np.log1p(-min(smallest, 1 - 1e-16)))) if scores else 1.0
         self.scores = scores
@@ -300,7 +303,8 @@ class _Search:
         worth = [
             candidate
             for candidate in selector.score(current.fit, selector.others(current))
-            if float(chi2_distribution.sf(candidate.gain - least, candidate.degrees)) < SURELY
+            if _chance_of(candidate.gain - least, candidate.degrees, selector.undescribed(candidate.name))
+            < SURELY
         ]
         found = []
         for candidate in worth[: self.options.parents]:
@@ -560,3 +564,9 @@ class _Search:
             verdict, effects, self.where, gap, tuple(steps), unexplained, self.model.setup.name, chance, candidates,
             self.next_measurements, tuple(self.notes), data,
         )  # fmt: skip
+
+
+def _chance_of(gain: float, degrees: int, undescribed: float) -> float:
+    """Chance that noise, and what the description of the fringes lacks, give as large a gain in χ²."""
+    noise = ncx2(degrees, undescribed) if undescribed > 0.0 else chi2_distribution(degrees)
+    return float(noise.sf(gain))

@@ -38,6 +38,10 @@ with the fourth power (a beam whose onset is taken for thickness), and where fri
 IMPRECISION = 0.01
 """Part of what an effect does to the fringes in which our description of it may be wrong, and not the effect."""
 
+PRECISION = 5e-5
+"""Part of the fringes to which cells are described: tables, and what the thickness does within a cell. It is below
+the noise but on whole sensors."""
+
 LIKE_THICKNESS = 0.5
 """Part of a signature that thickness could make at one wavelength, in an effect that shifts the phase."""
 
@@ -163,6 +167,9 @@ class Selector:
                 self.left_out[effect.name] = str(error)
             else:
                 self.coordinates[effect.name] = found
+        state = self.state(null)
+        fringes = state.value - state.value.mean(axis=(1, 2), keepdims=True)
+        self._undescribed = PRECISION**2 * float((state.whiten(fringes) ** 2).sum())  # type: ignore[operator]
         self.null = replace(self.null, channels=self.criticise(null))
         self.fitted: dict[frozenset[str], Hypothesis] = {frozenset(): self.null}
 
@@ -181,8 +188,16 @@ class Selector:
             return (self._total(fit),)
         explained = max(self.null.fit.chi2 - fit.chi2, 0.0)
         return measure_channels(
-            self.state(fit), self.problem.cells.geometry, self.index, IMPRECISION**2 * explained
+            self.state(fit),
+            self.problem.cells.geometry,
+            self.index,
+            IMPRECISION**2 * explained + self._undescribed,
         )
+
+    def undescribed(self, name: str) -> float:
+        """χ² that an effect may gain because the fringes are described only so well."""
+        optical = not self.problem.forward.is_image_effect(name)
+        return self._undescribed if optical or self.problem.forward.couples_pixels(name) else 0.0
 
     def _total(self, fit: Fit) -> Channel:
         """χ² of all values, where there are too few for anything else."""
