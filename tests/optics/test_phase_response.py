@@ -81,6 +81,21 @@ def test_series_is_the_closed_form(ratio: float, loss: float, rng: np.random.Gen
         assert np.abs(series_at(*arrays, spread, 0.0, some, 0) - closed[:, ::101]).max() < 1e-12 * scale
 
 
+@pytest.mark.parametrize("tolerance", [1e-12, 1e-9, 1e-6, 1e-3])
+@pytest.mark.parametrize("loss", [0.0, 0.02])
+@pytest.mark.parametrize("spread_um", [0.0, 0.01])
+def test_a_tolerance_is_kept(
+    tolerance: float, loss: float, spread_um: float, rng: np.random.Generator
+) -> None:
+    reduced, weight = random_response(rng, 0.4, loss)
+    arrays, weights, _ = reduced._grouped(weight)
+    grid = (9.0, 0.004, 700)
+    exact = series_on_grid(arrays, weights, spread_um, *grid)
+    found = series_on_grid(arrays, weights, spread_um, *grid, tolerance=tolerance)
+    assert np.abs(found - exact).max() < tolerance * np.ptp(exact)
+    assert tolerance < 1e-11 or np.any(found != exact)
+
+
 def test_grid_is_the_points(rng: np.random.Generator) -> None:
     response, weight = random_response(rng, 0.4, 0.0)
     for count in (1, 5, 200, 3000):

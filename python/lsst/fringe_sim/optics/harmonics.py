@@ -35,6 +35,9 @@ FloatArray = NDArray[np.float64]
 ROUNDING = 2e-13
 """Error of the sum on a grid that is not told to be less exact, relative to the fringes."""
 
+COARSEST = 1e-3
+"""Largest error that makes sense."""
+
 _SMALLEST = 1e-17
 """Terms below this are left out; the response is of order one."""
 
@@ -122,8 +125,9 @@ class _Gridding(NamedTuple):
     @classmethod
     def of(cls, tolerance: float) -> _Gridding:
         """The rule whose error is at most a tolerance, for twofold oversampling."""
-        reach = math.ceil(-1.5 * math.log(max(tolerance, ROUNDING)) / math.pi)
-        return cls(reach, 2.0 * reach / (4.0 * math.pi * 1.5), _SMALLEST * max(tolerance / ROUNDING, 1.0))
+        error = min(max(tolerance, ROUNDING), COARSEST)
+        reach = math.ceil(-1.5 * math.log(error) / math.pi)
+        return cls(reach, 2.0 * reach / (4.0 * math.pi * 1.5), _SMALLEST * (error / ROUNDING))
 
 
 def _segment(
