@@ -14,11 +14,13 @@ true, and the variance of the common thickness from the Fisher information of al
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from .cells import Cells, run_threaded
 from .evidence import refine_row
@@ -149,7 +151,7 @@ class _Solution:
     mean_response: FloatArray
     chi2: float
 
-    @property
+    @functools.cached_property
     def mean_um(self) -> float:
         """Common thickness [µm]."""
         return float(self.thickness_um.mean())
@@ -275,13 +277,21 @@ class _Together:
         return cls(gradient, fisher, float((weight * miss**2).sum()))
 
 
+def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution with a symmetric matrix, by least squares if rounding makes it singular."""
+    try:
+        return np.asarray(cho_solve(cho_factor(matrix, lower=True, check_finite=False), right))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.lstsq(matrix, right, rcond=1e-14)[0])
+
+
 def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> _Solution:
     """Levenberg-Marquardt steps of all cells at once: refitting and renormalising in turn crawls."""
     thickness, damping = solution.thickness_um.astype(float), 1e-6
     state = _Together.of(sample, thickness, templates)
     for _ in range(_JOINT_STEPS):
         bound = state.fisher + np.diag(damping * np.diag(state.fisher) + np.finfo(float).tiny)
-        step = np.linalg.lstsq(bound, state.gradient, rcond=1e-14)[0]
+        step = _solve(bound, state.gradient)
         tried = thickness + np.clip(step, -_LONGEST_STEP_UM, _LONGEST_STEP_UM)
         after = _Together.of(sample, tried, templates)
         if after.chi2 < state.chi2:
