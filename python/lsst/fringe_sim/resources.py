@@ -34,6 +34,7 @@ __all__ = [
     "read_table",
     "read_user_yaml",
     "read_yaml",
+    "refuse_damage",
     "resource_path",
     "revision",
 ]
@@ -266,6 +267,25 @@ def open_user_fits(
         check_axes(stream, str(path))
         with fits.open(stream, **options) as hdus:
             yield hdus
+
+
+@contextmanager
+def refuse_damage(field: str, allowed: str, source: str) -> Iterator[None]:
+    """Turn what astropy raises over a damaged file into one error that names it.
+
+    Raises
+    ------
+    FrameFormatError
+        In place of any of `DAMAGE`.
+    InputError
+        As it is, with the file.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise (error if error.source else error.in_source(source)) from None
+    except DAMAGE as error:
+        raise FrameFormatError(field, first_line(error), allowed, source=source) from error
 
 
 def check_axes(stream: IO[bytes], source: str) -> None:

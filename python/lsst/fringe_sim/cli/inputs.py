@@ -21,7 +21,7 @@ from ..model import FringeModel
 from ..model.provenance import model_cards, software_cards
 from ..products import SensorSection
 from ..products.sensor_section import SECTION_KEYWORDS
-from ..resources import DAMAGE, first_line, open_user_fits, read_user_yaml
+from ..resources import open_user_fits, read_user_yaml, refuse_damage
 
 __all__ = [
     "complete_fits",
@@ -45,13 +45,11 @@ def complete_fits(
     FrameFormatError
         The file is not FITS, or damaged.
     """
-    try:
-        with open_user_fits(path, warning=warning, memmap=False) as hdus:
-            yield hdus
-    except InputError:
-        raise
-    except DAMAGE as error:
-        raise FrameFormatError("file", first_line(error), "a complete FITS file", source=str(path)) from None
+    with (
+        refuse_damage("file", "a complete FITS file", str(path)),
+        open_user_fits(path, warning=warning, memmap=False) as hdus,
+    ):
+        yield hdus
 
 
 def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError
-from ..resources import DAMAGE, first_line, open_user_fits
+from ..resources import open_user_fits, refuse_damage
 from ._check import check_mapping
 from .mask import mask_plane_cards, planes_from_header, remap_mask
 from .sensor_section import SECTION_KEYWORDS, SensorSection
@@ -283,19 +283,13 @@ def open_fits(
     source = str(path)
     if not Path(path).is_file():
         raise InputError("file", source, "an existing FITS file")
-    try:
-        with open_user_fits(
-            path, warning="error", memmap=memmap, checksum=verify, lazy_load_hdus=False
-        ) as hdus:
-            _check_product(hdus[0].header, product, source)
-            _check_complete(hdus, source)
-            yield hdus
-    except InputError as error:
-        raise (error if error.source else error.in_source(source)) from None
-    except DAMAGE as error:
-        raise FrameFormatError(
-            "FITS file", first_line(error), "an undamaged FITS file", source=source
-        ) from error
+    with (
+        refuse_damage("FITS file", "an undamaged FITS file", source),
+        open_user_fits(path, warning="error", memmap=memmap, checksum=verify, lazy_load_hdus=False) as hdus,
+    ):
+        _check_product(hdus[0].header, product, source)
+        _check_complete(hdus, source)
+        yield hdus
 
 
 def _check_product(header: fits.Header, product: str, source: str) -> None:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FrameFormatError, InputError, MissingPackageError, UnknownNameError
-from ..resources import DAMAGE, first_line, open_user_fits
+from ..errors import InputError, MissingPackageError, UnknownNameError
+from ..resources import open_user_fits, refuse_damage
 from ._fits import PRODUCT_KEY, all_or_nothing, existing_folder
 from .fringe_cube import FringeCube
 from .mask import MASK_PLANES
@@ -111,17 +111,12 @@ def read_exported(path: str | os.PathLike[str]) -> ThicknessMap | FringeCube | S
     source = str(path)
     if not Path(path).is_file():
         raise InputError("file", source, "an existing FITS file")
-    try:
-        with open_user_fits(path, lazy_load_hdus=True) as hdus:
-            header = hdus[0].header
-            # A cube from elsewhere does not say what it is.
-            name = header.get(PRODUCT_KEY) or ("FringeCube" if "EXPOSURES" in hdus else "")
-    except InputError:
-        raise
-    except DAMAGE as error:
-        raise FrameFormatError(
-            "FITS file", first_line(error), "an undamaged FITS file", source=source
-        ) from None
+    with (
+        refuse_damage("FITS file", "an undamaged FITS file", source),
+        open_user_fits(path, lazy_load_hdus=True) as hdus,
+    ):
+        # A cube from elsewhere does not say what it is.
+        name = hdus[0].header.get(PRODUCT_KEY) or ("FringeCube" if "EXPOSURES" in hdus else "")
     if name not in EXPORTED:
         raise UnknownNameError(PRODUCT_KEY, name, EXPORTED, source=source)
     found: ThicknessMap | FringeCube | SkyFringe = EXPORTED[name].read_fits(path)

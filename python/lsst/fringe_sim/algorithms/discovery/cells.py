@@ -73,6 +73,11 @@ class CellData:
         return int(np.count_nonzero(self.weight))
 
     @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Cells with data at some wavelength, shape ``(ny, nx)``."""
+        return np.asarray((self.weight > 0).any(axis=0))
+
+    @property
     def noise_rms(self) -> float:
         """Rms of the noise of the cells, response scatter included; NaN if no cell has data."""
         used = self.weight > 0

@@ -94,8 +94,7 @@ class Forward:
         cls, model: FringeModel, catalogue: Sequence[Effect], cells: CellData, range_um: tuple[float, float]
     ) -> Forward:
         """Forward model of the cells of ``cells`` for a thickness range [µm]."""
-        seen = np.asarray((cells.weight > 0).any(axis=0))
-        return cls(model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid, seen)
+        return cls(model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid, cells.seen)
 
     def table(self, settings: Settings) -> FloatArray:
         """Response ``(W, D)`` on the grid of thickness, relative to its mean, as flats are.

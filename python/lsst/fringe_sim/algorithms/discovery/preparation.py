@@ -188,7 +188,7 @@ def _better_null(refined: Prepared, before: Prepared) -> Fit:
     """Fit of the unchanged model, from the thickness with the effect or from that without, whichever is better."""
     problem, null = refined.problem, refined.null
     thickness = before.problem.basis.expand(before.null.field)
-    weight = (problem.cells.weight > 0).any(axis=0).astype(float)
+    weight = problem.cells.seen.astype(float)
     other = fit_model(problem, (), np.zeros(0), problem.basis.fit(thickness, weight), null.levels)
     return min(null, other, key=lambda fit: fit.chi2)
 
@@ -240,7 +240,7 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
     ever finer coefficients.
     """
     cells = problem.cells
-    weight = (cells.weight > 0).any(axis=0).astype(float)
+    weight = cells.seen.astype(float)
     best: tuple[Problem, Fit] | None = None
     for spacing in (8.0, 4.0, 2.0, 0.0):
         basis: FieldBasis = SplineBasis.of_grid(start.shape, spacing) if spacing else CellBasis(start.shape)

@@ -486,7 +486,7 @@ class _Search:
 
     def _transfer(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
         """The chosen set fitted to all data."""
-        weight = (self.cells.weight > 0).any(axis=0).astype(float)
+        weight = self.cells.seen.astype(float)
         field = whole.problem.basis.fit(self._thickness(whole, chosen.fit), weight)
         return whole.hypothesis(chosen.names, None, replace(chosen.fit, field=field))
 

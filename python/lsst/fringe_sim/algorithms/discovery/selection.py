@@ -442,7 +442,7 @@ class Selector:
         for number in {moved for moved, _ in places}:
             own = [place for (moved, _), place in places.items() if moved == number]
             best += [(number, place) for place in sorted(own, key=lambda place: place[0])[:ORDERS_REFITTED]]
-        used = (problem.cells.weight > 0).any(axis=0).astype(float)
+        used = problem.cells.seen.astype(float)
         return [
             (number, position, problem.basis.fit(whole * (1.0 + shift / middle), used))
             for number, (_, position, shift) in best

@@ -77,7 +77,7 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
     if not held_out.any():
         return moved
     before = problem.basis.expand(null.field)
-    seen = ~held_out & (problem.cells.weight > 0).any(axis=0)
+    seen = ~held_out & problem.cells.seen
     middle, half = before.mean(), max(0.5 * float(np.ptp(before)), 1e-6)
     depth = (before - middle) / half
     columns = np.stack([depth**power for power in range(3)], axis=-1)
@@ -170,7 +170,7 @@ def _field_freedom(problem: Problem) -> int:
     """Coefficients of the field that the data reach."""
     if problem.field_prior:
         return 0
-    seen = (problem.cells.weight > 0).any(axis=0).astype(float)
+    seen = problem.cells.seen.astype(float)
     return int((problem.basis.gather(seen[np.newaxis])[:, 0] > 1e-3).sum())
 
 
