@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.effects import EFFECTS, Effect, ImageGeometry, activate_effects
+from lsst.fringe_sim.effects import EFFECTS, Effect, ImageGeometry, Parameter, activate_effects
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.model import FringeModel
 
@@ -28,10 +28,15 @@ def thickness() -> np.ndarray:
     return np.linspace(14.0, 15.2, 4 * 16).reshape(16, 4).T.copy()
 
 
-def observe(model: FringeModel, thickness: np.ndarray) -> np.ndarray:
+def observe(model: FringeModel, thickness: np.ndarray, wavelengths: np.ndarray = WAVELENGTHS) -> np.ndarray:
     """Response, followed by the image of a flat of 20 000 electrons; a change of either is a change."""
-    geometry = ImageGeometry.of_pixels(thickness.shape, WAVELENGTHS, 20_000.0)
-    return np.concatenate([model.response(thickness, WAVELENGTHS), model.flat_image(thickness, geometry)])
+    geometry = ImageGeometry.of_pixels(thickness.shape, wavelengths, 20_000.0)
+    return np.concatenate([model.response(thickness, wavelengths), model.flat_image(thickness, geometry)])
+
+
+def exposures_of(parameter: Parameter) -> np.ndarray:
+    """Wavelengths of exposures, with the one that the parameter concerns."""
+    return np.array([900.0, parameter.wavelength_nm, 985.0]) if parameter.wavelength_nm > 0.0 else WAVELENGTHS
 
 
 def test_light_and_bench_of_the_laboratory_stay_there() -> None:
@@ -65,44 +70,45 @@ def test_every_effect_is_described(effect: Effect) -> None:
 
 @pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
 def test_null_is_exactly_the_identity(effect, parameter, base, thickness) -> None:
-    null = null_of(effect, parameter.name, base)
+    null, seen = null_of(effect, parameter.name, base), exposures_of(parameter)
     changed = base.with_effects({effect.name: {parameter.name: null}})
     assert changed.system is base.base_system
-    np.testing.assert_array_equal(observe(changed, thickness), observe(base, thickness))
+    np.testing.assert_array_equal(observe(changed, thickness, seen), observe(base, thickness, seen))
 
 
 @pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
 def test_onset_is_monotone_and_smooth(effect, parameter, base, thickness) -> None:
     """Small departures from null change the response, and more the larger they are."""
-    null = null_of(effect, parameter.name, base)
+    null, seen = null_of(effect, parameter.name, base), exposures_of(parameter)
     low, high = parameter.bounds
     direction = 1.0 if null < high else -1.0
-    reference = observe(base, thickness)
+    reference = observe(base, thickness, seen)
     changes = []
     for size in (0.01, 0.02, 0.04):
         value = float(np.clip(null + direction * size * parameter.prior_scale, low, high))
-        response = observe(base.with_effects({effect.name: {parameter.name: value}}), thickness)
+        response = observe(base.with_effects({effect.name: {parameter.name: value}}), thickness, seen)
         changes.append(np.abs(response - reference).max())
     assert 0.0 < changes[0] < changes[1] < changes[2]
 
 
 @pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
 def test_finite_everywhere_in_bounds(effect, parameter, base, thickness) -> None:
+    seen = exposures_of(parameter)
     for value in np.linspace(*parameter.bounds, 5):
-        response = observe(base.with_effects({effect.name: {parameter.name: value}}), thickness)
+        response = observe(base.with_effects({effect.name: {parameter.name: value}}), thickness, seen)
         assert np.all(np.isfinite(response))
         assert np.all(response >= 0.0)
 
 
 @pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
 def test_nothing_is_mutated(effect, parameter, base, thickness) -> None:
-    before = dataclasses.replace(base.base_system)
-    reference = observe(base, thickness)
+    before, seen = dataclasses.replace(base.base_system), exposures_of(parameter)
+    reference = observe(base, thickness, seen)
     null = null_of(effect, parameter.name, base)
     value = float(np.clip(null + parameter.prior_scale, *parameter.bounds))
-    observe(base.with_effects({effect.name: {parameter.name: value}}), thickness)
+    observe(base.with_effects({effect.name: {parameter.name: value}}), thickness, seen)
     assert base.base_system == before
-    np.testing.assert_array_equal(observe(base, thickness), reference)
+    np.testing.assert_array_equal(observe(base, thickness, seen), reference)
 
 
 def test_both_spellings_agree() -> None:

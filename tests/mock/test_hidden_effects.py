@@ -14,13 +14,19 @@ BY_NAME = {effect.name: effect for effect in HIDDEN_EFFECTS}
 STATE = AmplifierState("C03", 1.5, 6.0, 150_000.0)
 
 
+def exposure_of(values: dict[str, float]) -> float:
+    """Wavelength of the exposure [nm] that the first parameter concerns, or of any."""
+    name = next(iter(values), "")
+    return float(name.removeprefix("at_")) if name.startswith("at_") else 970.0
+
+
 def reach(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
     """Everything that an effect can touch, after it acted."""
     complete = effect.complete(values)
     touched: list[object] = []
     if effect.on_optics is not None:
         optics = setup_optics("ts8_e2v")[0]
-        touched.append(effect.on_optics(optics, complete).flat_field([15.0, 15.1, 19.0], 970.0))
+        touched.append(effect.on_optics(optics, complete).flat_field([15.0, 15.1, 19.0], exposure_of(values)))
     light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
     if effect.on_light is not None:
         touched.append(effect.on_light(light, complete))
@@ -31,10 +37,10 @@ def reach(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
     return touched
 
 
-def untouched(effect: HiddenEffect) -> list[object]:
+def untouched(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
     light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
     everything: list[tuple[object, object]] = [
-        (effect.on_optics, setup_optics("ts8_e2v")[0].flat_field([15.0, 15.1, 19.0], 970.0)),
+        (effect.on_optics, setup_optics("ts8_e2v")[0].flat_field([15.0, 15.1, 19.0], exposure_of(values))),
         (effect.on_light, light),
         (effect.on_charge, 20_000.0 * light),
         (effect.on_amplifier, STATE),
@@ -50,7 +56,7 @@ def same(left: object, right: object) -> bool:
 
 @pytest.mark.parametrize("effect", HIDDEN_EFFECTS, ids=lambda effect: effect.name)
 def test_null_is_the_identity(effect: HiddenEffect) -> None:
-    before = untouched(effect)
+    before = untouched(effect, {})
     assert before
     for left, right in zip(reach(effect, {}), before, strict=True):
         assert same(left, right)
@@ -73,7 +79,9 @@ def test_every_parameter_does_something(name: str, parameter: str) -> None:
     if name == "temperature":
         value = 210.0
     changed = reach(effect, {parameter: value})
-    assert not all(same(left, right) for left, right in zip(changed, untouched(effect), strict=True))
+    assert not all(
+        same(left, right) for left, right in zip(changed, untouched(effect, {parameter: value}), strict=True)
+    )
     assert low <= value <= high
 
 

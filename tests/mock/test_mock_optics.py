@@ -156,6 +156,10 @@ EFFECTS_OF_OPTICS = {
     "temperature": ({"temperature_k": 205.0}, {"temperature.kelvin": 205.0}),
     "wavelength offset": ({"wavelength_offset_nm": 0.7}, {"wavelength_offset.offset": 0.7}),
     "wavelength scale": ({"wavelength_stretch": 0.01}, {"wavelength_scale.stretch": 0.01}),
+    "wavelength jitter": (
+        {"wavelength_errors_nm": ((870.0, 0.0), (880.0, 0.4), (890.0, 0.0), (950.0, 0.2), (965.0, -0.7))},
+        {"wavelength_jitter.at_880": 0.4, "wavelength_jitter.at_960": -0.4, "wavelength_jitter.at_990": -0.7},
+    ),
     "roughness": ({"roughness_nm": 45.0}, {"roughness.sigma": 45.0}),
     "tilt": ({"theta": (math.radians(12.0),)}, {"tilt.angle": 12.0}),
 }

@@ -41,6 +41,7 @@ def system(**changes: object) -> OpticalSystem:
         Beam.cone(3.0, 0.3, 4),
         wavelength_offset_nm=0.2,
         wavelength_stretch=1e-3,
+        wavelength_errors_nm=(((880.0, 0.3), (900.0, -0.5), (1000.0, 0.8)),),
     )
     return dataclasses.replace(base, **changes)
 

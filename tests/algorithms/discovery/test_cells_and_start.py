@@ -264,3 +264,39 @@ def test_what_the_description_lacks_counts_on_whole_sensors_alone() -> None:
     optical = next(name for name in selector.coordinates if not forward.is_image_effect(name))
     assert selector.undescribed(optical) == pytest.approx(PRECISION**2 * energy, rel=0.2)
     assert selector.undescribed(optical) < 0.5
+
+
+def test_moved_wavelengths_recompute_only_what_they_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table is that of a fresh model, and exposures that stay where they are cost nothing."""
+    model = FringeModel.from_setup("ts8_e2v")
+    geometry = ImageGeometry.of_pixels((4, 4), WAVELENGTHS, 20_000.0)
+    forward = Forward(model, EFFECTS, geometry, 1, (14.0, 16.0))
+    forward.table({"temperature.kelvin": 190.0})
+    computed = []
+    plain = FringeModel.respond_on_grid
+
+    def counted(self, light, *args, **keywords):  # type: ignore[no-untyped-def]
+        computed.append(len(light.wavelength_nm))
+        return plain(self, light, *args, **keywords)
+
+    monkeypatch.setattr(FringeModel, "respond_on_grid", counted)
+    settings = {"temperature.kelvin": 190.0, "wavelength_jitter.at_930": 0.4}
+    moved = forward.table(settings)
+    assert computed == [1]
+    fresh = Forward(model, EFFECTS, geometry, 1, (14.0, 16.0)).table(settings)
+    np.testing.assert_allclose(moved, fresh, rtol=0.0, atol=1e-9)
+    forward.table({**settings, "temperature.kelvin": 191.0})
+    assert computed == [1, 12, 12]
+
+
+def test_only_parameters_of_exposures_that_there_are_are_free() -> None:
+    effect = next(effect for effect in EFFECTS if effect.name == "wavelength_jitter")
+    thickness = np.full((4, 4), 15.0)
+    for waves, names in (
+        ([890.0, 930.0], ["at_890", "at_930"]),
+        ([884.0], ["at_880", "at_890"]),
+        ([780.0, 1100.0], ["at_800", "at_1050"]),
+    ):
+        geometry = ImageGeometry.of_pixels((4, 4), np.array(waves), 20_000.0)
+        forward = Forward(FringeModel.from_setup("ts8_e2v"), EFFECTS, geometry, 1, (14.0, 16.0))
+        assert [item.parameter for item in coordinates_of(effect, forward, thickness)] == names

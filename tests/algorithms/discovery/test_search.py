@@ -45,7 +45,7 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["illumination", "amplifier_gain"])
+@pytest.mark.parametrize("name", ["illumination", "amplifier_gain", "wavelength_jitter"])
 def test_a_hidden_effect_is_named(name: str, tmp_path) -> None:
     case = draw_case("one", np.random.default_rng(21), size=SIZE, only=[name])
     verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0))

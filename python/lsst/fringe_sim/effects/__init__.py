@@ -44,6 +44,7 @@ from .temperature import Temperature
 from .thickness_spread import ThicknessSpread
 from .tilt import Tilt
 from .vignetting import Vignetting
+from .wavelength_jitter import WavelengthJitter
 from .wavelength_offset import WavelengthOffset
 from .wavelength_scale import WavelengthScale
 
@@ -84,6 +85,7 @@ EFFECTS: tuple[Effect, ...] = (
     LampLines(),
     WavelengthOffset(),
     WavelengthScale(),
+    WavelengthJitter(),
     ConvergingBeam(),
     Tilt(),
     # response

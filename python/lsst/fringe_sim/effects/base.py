@@ -6,6 +6,7 @@ exactly the identity: the object that it was given is returned unchanged.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -48,6 +49,8 @@ class Parameter:
         Typical departure from null in a real laboratory, in the same unit.
     repeats_after : `float`
         Distance after which the fringes look nearly the same again: neighbouring minima of a fit; 0 if they do not.
+    wavelength_nm : `float`
+        Nominal wavelength of the exposures that it concerns [nm]; NaN if it concerns all.
     """
 
     name: str
@@ -57,6 +60,7 @@ class Parameter:
     prior_scale: float
     description: str
     repeats_after: float = 0.0
+    wavelength_nm: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,8 @@ class Effect(ABC):
     """Whether it belongs to lamp, bench or cryostat, which a sensor does not take along to the telescope."""
     couples_pixels: ClassVar[bool] = False
     """Whether the signal of a pixel depends on other pixels, so that scattered samples of an image cannot show it."""
+    moves_wavelengths: ClassVar[bool] = False
+    """Whether all that it does is to move the wavelengths of exposures."""
     parameters: ClassVar[tuple[Parameter, ...]]
     reference: ClassVar[str]
 

@@ -18,6 +18,7 @@ class WavelengthOffset(PlainNullEffect):
     title = "wavelength zero"
     acts_on = "illumination"
     laboratory_only = True
+    moves_wavelengths = True
     reference = "effect of a grating angle offset; MONOCH-WAVELENG against MONOWL in TS8 headers"
     parameters = (Parameter("offset", "nm", 0.0, (-10.0, 10.0), 0.5, "true minus nominal wavelength"),)
 

@@ -18,6 +18,7 @@ class WavelengthScale(PlainNullEffect):
     title = "wavelength scale"
     acts_on = "illumination"
     laboratory_only = True
+    moves_wavelengths = True
     reference = "linear part of a grating calibration error"
     parameters = (
         Parameter("stretch", "nm/nm", 0.0, (-0.1, 0.1), 0.005, "relative error of wavelength differences"),

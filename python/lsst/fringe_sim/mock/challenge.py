@@ -59,11 +59,19 @@ def _decades(rng: np.random.Generator, low: float, high: float) -> float:
     return float(10.0 ** rng.uniform(low, high))
 
 
+def _errors(rng: np.random.Generator, rms: float) -> list[tuple[int, float]]:
+    """Independent errors of the twelve exposures, with at most three times their rms."""
+    return [(node, rms * float(np.clip(rng.normal(), -3.0, 3.0))) for node in range(880, 991, 10)]
+
+
 SIZES: Mapping[str, Draw] = MappingProxyType(
     {
         "bandwidth": lambda r: {"bandwidth.fwhm": STATED_FWHM_NM + _signed(r, -1.3, 0.0) * 0.9},
         "wavelength_offset": lambda r: {"wavelength_offset.offset": _signed(r, -0.7, 0.5)},
         "wavelength_scale": lambda r: {"wavelength_scale.stretch": _signed(r, -3.0, -1.5)},
+        "wavelength_jitter": lambda r: {
+            f"wavelength_jitter.at_{node}": error for node, error in _errors(r, _decades(r, -1.3, 0.0))
+        },
         "temperature": lambda r: {"temperature.kelvin": STATED_KELVIN + _signed(r, 0.3, 1.4)},
         "epoxy_index": lambda r: {"epoxy_index.offset": _signed(r, -2.3, -1.0)},
         "epoxy_dispersion": lambda r: {"epoxy_index.cauchy": _signed(r, -3.3, -2.0)},

@@ -183,6 +183,15 @@ def _wavelength_offset(optics: FlatFieldOptics, values: Values) -> FlatFieldOpti
     return replace(optics, wavelength_offset_nm=optics.wavelength_offset_nm + values["offset"])
 
 
+def _wavelength_jitter(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(
+        optics,
+        wavelength_errors_nm=tuple(
+            (float(name.removeprefix("at_")), error) for name, error in values.items()
+        ),
+    )
+
+
 def _wavelength_scale(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     return replace(optics, wavelength_stretch=optics.wavelength_stretch + values["stretch"])
 
@@ -354,6 +363,17 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
         "wavelength scale",
         (HiddenParameter("stretch", "nm/nm", 0.0, (-0.1, 0.1), "relative error of wavelength differences"),),
         on_optics=_wavelength_scale,
+    ),
+    HiddenEffect(
+        "wavelength_jitter",
+        "wavelength error of single exposures",
+        tuple(
+            HiddenParameter(
+                f"at_{nominal}", "nm", 0.0, (-5.0, 5.0), f"true minus nominal wavelength at {nominal} nm"
+            )
+            for nominal in range(800, 1060, 10)
+        ),
+        on_optics=_wavelength_jitter,
     ),
     HiddenEffect(
         "temperature",

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -112,6 +113,8 @@ class FlatFieldOptics:
         True minus nominal wavelength [nm].
     wavelength_stretch : `float`
         Further error per nm of distance from 935 nm.
+    wavelength_errors_nm : `tuple` [`tuple` [`float`, `float`], ...]
+        Nominal wavelengths, increasing, and the errors there [nm]; those between are interpolated.
     theta, theta_weight : `tuple` [`float`, ...]
         Angles of incidence [rad] and their weights, which sum to 1.
     varying, detection : `str`
@@ -141,6 +144,7 @@ class FlatFieldOptics:
     line_shape: str = "gaussian"
     wavelength_offset_nm: float = 0.0
     wavelength_stretch: float = 0.0
+    wavelength_errors_nm: tuple[tuple[float, float], ...] = ()
     theta: tuple[float, ...] = (0.0,)
     theta_weight: tuple[float, ...] = (1.0,)
     varying: str = "adhesive"
@@ -192,7 +196,17 @@ class FlatFieldOptics:
     def true_wavelength(self, nominal_nm: float) -> float:
         """Wavelength that the monochromator delivers when it is set to ``nominal_nm`` [nm]."""
         error = self.wavelength_offset_nm + self.wavelength_stretch * (nominal_nm - SCALE_PIVOT_NM)
-        return nominal_nm + error
+        return nominal_nm + error + self._single_error(nominal_nm)
+
+    def _single_error(self, nominal_nm: float) -> float:
+        """Error of this exposure alone [nm]: each node reaches as far as its neighbours."""
+        places = [place for place, _ in self.wavelength_errors_nm]
+        if not places:
+            return 0.0
+        inside = min(max(nominal_nm, places[0]), places[-1])
+        above = min(max(bisect_left(places, inside), 1), len(places) - 1)
+        (low, first), (high, second) = self.wavelength_errors_nm[above - 1 : above + 1]
+        return first + (second - first) * (inside - low) / (high - low)
 
     def absorbed_fraction(
         self, thickness_um: ArrayLike, wavelength_nm: float, theta: float = 0.0, polarization: str = "mixed"

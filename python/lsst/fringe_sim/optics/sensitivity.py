@@ -211,11 +211,7 @@ def _wavelength_shift(system: OpticalSystem, illumination: Illumination, name: s
         return np.ones(wavelength.shape)
     centre = illumination.mean_wavelength_nm[:, None]
     if name == "wavelength_stretch":
-        true_centre = (
-            centre - system.wavelength_offset_nm + system.wavelength_stretch * system.stretch_pivot_nm
-        )
-        nominal = true_centre / (1.0 + system.wavelength_stretch)
-        return np.broadcast_to(nominal - system.stretch_pivot_nm, wavelength.shape)
+        return np.broadcast_to(system.nominal_wavelength(centre) - system.stretch_pivot_nm, wavelength.shape)
     fwhm = getattr(system.profile, "fwhm_nm", None)
     if fwhm is None:
         raise InputError("derivative with respect to", name, "a line profile with a FWHM")

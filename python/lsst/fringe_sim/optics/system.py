@@ -15,6 +15,9 @@ from .two_phase_response import TwoPhaseResponse, reduce_to_two_phases
 
 __all__ = ["OBSERVABLES", "OpticalSystem"]
 
+INVERSIONS = 40
+"""Fixed-point steps from a true wavelength to the nominal one; each leaves a part of the slope of the errors."""
+
 OBSERVABLES = ("detection", "total")
 """``detection``: absorbed in the detection layer. ``total``: 1 - R - T of the stack, as the paper's fit used."""
 
@@ -45,6 +48,9 @@ class OpticalSystem:
         Relative error of the wavelength scale, zero at `stretch_pivot_nm`.
     stretch_pivot_nm : `float`
         Wavelength at which the scale error vanishes [nm].
+    wavelength_errors_nm : `tuple`
+        Further errors, which add up: pairs of nominal wavelength and error [nm], in a straight line between them and
+        constant beyond.
     lamp : `LampSpectrum`, optional
         Spectrum of the lamp behind the monochromator; white if not given.
     """
@@ -60,6 +66,7 @@ class OpticalSystem:
     wavelength_offset_nm: float = 0.0
     wavelength_stretch: float = 0.0
     stretch_pivot_nm: float = 935.0
+    wavelength_errors_nm: tuple[tuple[tuple[float, float], ...], ...] = ()
     lamp: LampSpectrum | None = None
 
     def __post_init__(self) -> None:
@@ -75,9 +82,23 @@ class OpticalSystem:
     def true_wavelength(self, nominal_nm: ArrayLike) -> np.ndarray:
         """Wavelength that the monochromator really delivers [nm]."""
         nominal = np.asarray(nominal_nm, dtype=float)
-        return (
-            nominal + self.wavelength_offset_nm + self.wavelength_stretch * (nominal - self.stretch_pivot_nm)
-        )
+        stretched = self.wavelength_stretch * (nominal - self.stretch_pivot_nm)
+        return nominal + self.wavelength_offset_nm + stretched + self._single_errors(nominal)
+
+    def nominal_wavelength(self, true_nm: ArrayLike) -> np.ndarray:
+        """Wavelength to which the monochromator is set where it delivers ``true_nm`` [nm]."""
+        true = np.asarray(true_nm, dtype=float)
+        without = true - self.wavelength_offset_nm + self.wavelength_stretch * self.stretch_pivot_nm
+        nominal = without / (1.0 + self.wavelength_stretch)
+        for _ in range(INVERSIONS if self.wavelength_errors_nm else 0):
+            nominal = (without - self._single_errors(nominal)) / (1.0 + self.wavelength_stretch)
+        return nominal
+
+    def _single_errors(self, nominal_nm: np.ndarray) -> np.ndarray:
+        total = np.zeros(nominal_nm.shape)
+        for errors in self.wavelength_errors_nm:
+            total += np.interp(nominal_nm, *np.transpose(errors))
+        return total
 
     def flat_fields(self, wavelength_nm: ArrayLike, step_nm: float = DEFAULT_STEP_NM) -> Illumination:
         """Illumination of monochromator flats at nominal wavelengths [nm]."""

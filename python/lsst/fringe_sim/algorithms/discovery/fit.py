@@ -66,6 +66,8 @@ class Coordinate:
         Unit of the parameter.
     neighbour : `float`
         Distance of neighbouring minima of the misfit in the coordinate; 0 if there is only one.
+    of_one_exposure : `bool`
+        Whether it concerns the exposures at one wavelength only.
     """
 
     effect: str
@@ -77,6 +79,7 @@ class Coordinate:
     quadratic: bool
     unit: str = ""
     neighbour: float = 0.0
+    of_one_exposure: bool = False
 
     @property
     def key(self) -> str:
@@ -102,6 +105,10 @@ class Coordinate:
             departure = coordinate
         return float(np.clip(self.null + departure, self.low, self.high))
 
+    def departure(self, coordinate: float) -> float:
+        """Distance of a value from null in prior scales."""
+        return abs(self.value(coordinate) - self.null) / self.scale
+
     def coordinate(self, value: float) -> float:
         """Coordinate of a value."""
         departure = value - self.null
@@ -124,17 +131,30 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
     """Coordinates of an effect; how it starts is found by trying."""
     nulls = effect.null_values(forward.model.base_system)
     found = []
-    for parameter in effect.parameters:
+    for parameter in _seen_parameters(effect, forward.geometry.wavelength_nm):
         null, (low, high) = nulls[parameter.name], parameter.bounds
         one_sided = null <= low or null >= high
         quadratic = one_sided and _starts_quadratically(effect.name, parameter, null, forward, thickness_um)
         found.append(
             Coordinate(
                 effect.name, parameter.name, null, low, high, parameter.prior_scale, quadratic, parameter.unit,
-                parameter.repeats_after,
+                parameter.repeats_after, parameter.wavelength_nm > 0.0,
             )
         )  # fmt: skip
     return tuple(found)
+
+
+def _seen_parameters(effect: Effect, wavelength_nm: FloatArray) -> list[Parameter]:
+    """Parameters of an effect that concern some exposure."""
+    places = np.array([parameter.wavelength_nm for parameter in effect.parameters])
+    if np.isnan(places).any():
+        return list(effect.parameters)
+    reach = np.clip(wavelength_nm, places.min(), places.max())
+    # The influence of a node ends at its neighbours.
+    above = np.clip(np.searchsorted(places, reach), 1, len(places) - 1)
+    share = (reach - places[above - 1]) / (places[above] - places[above - 1])
+    near = np.concatenate([above[share > 0.0], above[share < 1.0] - 1])
+    return [effect.parameters[place] for place in np.unique(near)]
 
 
 def _starts_quadratically(

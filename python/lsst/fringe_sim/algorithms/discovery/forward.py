@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
 from ...model import FringeModel
+from ...optics.illumination import Illumination
 from .cells import CellData
 
 __all__ = ["Forward", "Prediction"]
@@ -32,6 +33,9 @@ MARGIN_UM = 0.45
 
 MOST_TABLE_BYTES = 100e6
 """Memory of the tables kept for reuse."""
+
+MOST_ROWS = 8
+"""Rows kept for each exposure while wavelengths are moved."""
 
 FARTHEST_UM = 3.0
 """Thickness by which a field may leave the first range [µm]: ten fringe orders. What goes farther does not fit."""
@@ -83,6 +87,8 @@ class Forward:
     centroid: FloatArray | None = None
     seen: NDArray[np.bool_] | None = None
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
+    _rows: dict[tuple[int, float], FloatArray] = field(default_factory=dict, repr=False)
+    _rows_of: tuple[tuple[str, float], ...] | None = field(default=None, repr=False)
     _limits_um: tuple[float, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -105,18 +111,39 @@ class Forward:
         if key not in self._tables:
             low, high = self.range_um
             count = int(np.ceil((high - low) / TABLE_STEP_UM)) + 1
-            model = self.model_with(settings)
-            wavelength = self.geometry.wavelength_nm
-            light = model.system.flat_fields(wavelength, LINE_STEP_NM)
-            response = model.respond_on_grid(
-                light, low, TABLE_STEP_UM, count, wavelength, tolerance=TABLE_TOLERANCE
-            )
+            response = self._response(settings, low, count)
             # Tapered, so that a broken fringe order at an end of the table does not count.
             mean = np.average(response, axis=1, weights=np.hanning(count + 2)[1:-1])
             self._tables[key] = table = response / mean[:, np.newaxis]
             while len(self._tables) * table.nbytes > MOST_TABLE_BYTES and len(self._tables) > 2:
                 self._tables.pop(next(iter(self._tables)))
         return self._tables[key]
+
+    def _response(self, settings: Settings, low_um: float, count: int) -> FloatArray:
+        """Response ``(W, count)`` on the grid; what an exposure sees is kept while only others are moved."""
+        model, wavelength = self.model_with(settings), self.geometry.wavelength_nm
+        light = model.system.flat_fields(wavelength, LINE_STEP_NM)
+        rest = tuple(
+            sorted((key, value) for key, value in settings.items() if not self._moves_wavelengths(key))
+        )
+        if rest != self._rows_of:
+            self._rows_of = rest
+            self._rows.clear()
+        keys = [(row, float(place)) for row, place in enumerate(light.wavelength_nm[:, 0])]
+        fresh = [key for key in keys if key not in self._rows]
+        if fresh:
+            rows = [row for row, _ in fresh]
+            part = Illumination(light.wavelength_nm[rows], light.theta[rows], light.weight[rows])
+            response = model.respond_on_grid(
+                part, low_um, TABLE_STEP_UM, count, wavelength[rows], tolerance=TABLE_TOLERANCE
+            )
+            while len(self._rows) > MOST_ROWS * len(keys):
+                self._rows.pop(next(iter(self._rows)))
+            self._rows.update(zip(fresh, response, strict=True))
+        return np.stack([self._rows[key] for key in keys])
+
+    def _moves_wavelengths(self, key: str) -> bool:
+        return self._effect(key.partition(".")[0]).moves_wavelengths
 
     def model_with(self, settings: Settings) -> FringeModel:
         """The model with those of some effects that act on the response."""
@@ -135,6 +162,7 @@ class Forward:
                 min(max(wanted_high + MARGIN_UM, high), highest),
             )
             self._tables.clear()
+            self._rows.clear()
 
     def predict(self, settings: Settings, thickness_um: FloatArray) -> Prediction:
         """Model of the cells.

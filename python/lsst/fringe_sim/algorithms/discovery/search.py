@@ -22,7 +22,7 @@ from .describe import describe_residual, disagreement
 from .fit import Fit, fit_model
 from .next_step import with_next_measurements
 from .preparation import Prepared, check_setup, prepare, prepare_again, why_too_poor
-from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
+from .selection import IMPRECISION, MANY_PARAMETERS, Candidate, Hypothesis, Selector, similarity
 from .validation import HeldOut, held_out_blocks, misfit_rms, validate, whole_thickness
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
 
@@ -36,9 +36,8 @@ SURELY = 1e-7
 SHIFTING_SETS = 3
 """Sets of several effects that are looked for in other fringe orders."""
 
-MANY_PARAMETERS = 8
 CONTAINED = 0.9
-"""Parameters from which on an effect may hide another, and the cosine from which on one may be hidden in it."""
+"""Cosine of the signatures from which on an effect may be hidden in another of many parameters."""
 
 _METRIC = "rms of data minus model, relative counts"
 
@@ -323,18 +322,22 @@ class _Search:
         """
         best = current
         for name in current.names:
-            if len(selector.coordinates[name]) < MANY_PARAMETERS:
+            few = len(selector.coordinates[name]) < MANY_PARAMETERS
+            if few or selector.prior_cost(current, name) < self.options.least_evidence:
                 continue
             rest = selector.hypothesis(tuple(n for n in current.names if n != name), None, current.fit)
             state = selector.state(rest.fit)
             own = selector.features(state, rest.fit, name)
+            alike = []
             for candidate in selector.score(rest.fit, selector.others(current)):
-                if candidate.promise < 9.0:
-                    continue
                 features = selector.features(state, rest.fit, candidate.name)
-                if len(features) < len(own) and similarity(state.design, own, features) > CONTAINED:
-                    names = (*current.names, candidate.name)
-                    larger = selector.hypothesis(names, candidate.start, current.fit)
+                if candidate.promise > 9.0 and len(features) < len(own):
+                    alike.append((similarity(state.design, own, features), candidate))
+            for cosine, candidate in sorted(alike, key=lambda pair: -pair[0])[: self.options.parents]:
+                if cosine > CONTAINED:
+                    larger = selector.hypothesis(
+                        (*current.names, candidate.name), candidate.start, current.fit
+                    )
                     self._say_refit(current, larger)
                     best = max(best, larger, key=lambda item: item.log_evidence)
         return best if best.log_evidence > current.log_evidence + self.options.least_evidence else current

@@ -45,6 +45,9 @@ the noise but on whole sensors."""
 LIKE_THICKNESS = 0.5
 """Part of a signature that thickness could make at one wavelength, in an effect that shifts the phase."""
 
+MANY_PARAMETERS = 8
+"""Parameters from which on an effect may hide another; one at a time of so many is not tried at other sizes."""
+
 MINIMA_TRIED = 12
 """Neighbouring minima on both sides of the first one found among which the deepest is looked for."""
 
@@ -231,7 +234,8 @@ class Selector:
             score, information = state.design.project(features, state.residual)
             start, gain, degrees = _bounded_minimum(score, information, coordinates)
             candidate = Candidate(name, gain, degrees, start, gain)
-            if scan and not self.problem.forward.is_image_effect(name):
+            few = len(coordinates) < MANY_PARAMETERS
+            if scan and few and not self.problem.forward.is_image_effect(name):
                 candidate = self._scanned(state, fit, candidate)
             found.append(candidate)
         return sorted(found, key=lambda item: -item.promise)
@@ -469,7 +473,8 @@ class Selector:
     def _shifts_of_phase(self, fit: Fit) -> list[int]:
         """Coordinates of the last effect that do, at each wavelength by itself, what a change of thickness does."""
         name = fit.coordinates[-1].effect
-        if not self.generic or self.problem.forward.is_image_effect(name):
+        many = len(self.coordinates[name]) >= MANY_PARAMETERS
+        if not self.generic or many or self.problem.forward.is_image_effect(name):
             return []
         without = replace(
             fit,
@@ -643,11 +648,23 @@ class Selector:
         sign, log_determinant = np.linalg.slogdet(information + np.eye(len(scale)))
         total -= 0.5 * (log_determinant if sign > 0 else 0.0)
         for item, position in zip(fit.coordinates, fit.position, strict=True):
-            departure = abs(item.value(position) - item.null) / item.scale
-            total -= math.log1p(departure**2)
+            total -= _prior_cost(item, position)
             if item.quadratic:  # the prior is one of the parameter, the fit one of its square
-                total -= math.log(max(2.0 * departure, 0.05))
+                total -= math.log(max(2.0 * item.departure(position), 0.05))
         return float(total)
+
+    def prior_cost(self, hypothesis: Hypothesis, name: str) -> float:
+        """Log evidence that the sizes of one effect cost a set, over what sizes near zero would."""
+        fit = hypothesis.fit
+        return sum(
+            _prior_cost(item, position)
+            for item, position in zip(fit.coordinates, fit.position, strict=True)
+            if item.effect == name
+        )
+
+
+def _prior_cost(item: Coordinate, position: float) -> float:
+    return math.log1p(item.departure(position) ** 2)
 
 
 def _chi2_with_free_fringes(model: FloatArray, value: FloatArray, weight: FloatArray) -> float:

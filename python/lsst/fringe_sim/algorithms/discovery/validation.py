@@ -125,9 +125,12 @@ def _without_blocks(
 
 
 def _without_wavelengths(problem: Problem, null: Fit, final: Fit) -> float:
-    """Fall of χ² at every fourth wavelength, which takes no part in the fit."""
+    """Fall of χ² at every fourth wavelength, which takes no part in the fit.
+
+    0 where other exposures say nothing of those left out.
+    """
     waves = problem.cells.shape[0]
-    if waves < FEWEST_WAVELENGTHS:
+    if waves < FEWEST_WAVELENGTHS or any(item.of_one_exposure for item in final.coordinates):
         return 0.0
     out = np.zeros((waves, 1, 1), dtype=bool)
     out[2::4] = True
