@@ -11,7 +11,8 @@ import pytest
 from lsst.fringe_sim.algorithms.discovery import Verdict
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, Where
 from lsst.fringe_sim.errors import UnknownNameError
-from lsst.fringe_sim.mock.challenge import VISIBLE, SealedCase, draw_case, judge, run_challenge
+from lsst.fringe_sim.mock.challenge import SealedCase, draw_case, judge, run_challenge
+from lsst.fringe_sim.products.challenge_result import VISIBLE, CaseResult
 
 
 def _verdict(*effects: NamedEffect) -> Verdict:
@@ -56,6 +57,37 @@ def test_a_faint_second_effect_need_not_be_named_but_no_other_may(pair: SealedCa
 def test_unknown_kind_is_refused() -> None:
     with pytest.raises(UnknownNameError, match="kind of case"):
         draw_case("three", np.random.default_rng(1))
+
+
+def test_probability_of_a_name_is_that_of_its_class_and_its_share(pair: SealedCase) -> None:
+    first = replace(_effect("roughness", "bandwidth"), probability=0.9, share=0.6)
+    second = replace(_effect("vignetting"), probability=0.8)
+    assert judge(pair, _verdict(first, second), 0, 1.0, None).name_probability == pytest.approx(
+        0.9 * 0.6 * 0.8
+    )
+    assert judge(pair, _verdict(), 0, 1.0, None).name_probability == 0.0
+
+
+@pytest.mark.slow
+def test_cases_do_not_depend_on_what_else_runs() -> None:
+    """Number of cases, processes and what is known already change nothing."""
+    told: list[tuple[str, int]] = []
+
+    def tell(result: CaseResult) -> None:
+        told.append((result.kind, result.number))
+
+    few = run_challenge({"none": 1}, 5, size=(32, 32), progress=tell)
+    more = run_challenge({"none": 3, "one": 0}, 5, size=(32, 32), known=few.cases, jobs=2, progress=tell)
+    assert told[0] == ("none", 0)
+    assert sorted(told[1:]) == [("none", 1), ("none", 2)]
+    assert more.cases[0] == few.cases[0]
+    assert [case.number for case in more.cases] == [0, 1, 2]
+    alone = run_challenge({"none": 3}, 5, size=(32, 32), known=few.cases + more.cases[1:2])
+    assert _comparable(alone.cases[2]) == _comparable(more.cases[2])
+
+
+def _comparable(result: CaseResult) -> str:
+    return replace(result, seconds=0.0).to_json()
 
 
 @pytest.mark.slow

@@ -7,16 +7,23 @@ from pathlib import Path
 
 import click
 
-from ..mock.challenge import CASE_KINDS, CaseResult, run_challenge
+from ..errors import InputError
+from ..mock.challenge import run_challenge
+from ..products.challenge_result import CASE_KINDS, CaseResult
+from ..report.challenge_page import write_challenge_report
 from .inputs import prepare_folder
 from .parameters import SIZE
 
 __all__ = ["challenge"]
 
+RECORD = "cases.jsonl"
+
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the tables.")
-@click.option("--seed", type=int, required=True, help="Seed of all cases.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for results, tables and page."
+)
+@click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all cases.")
 @click.option(
     "--none", "none", type=click.IntRange(0), default=200, show_default=True, help="Cases without effect."
 )
@@ -34,11 +41,23 @@ __all__ = ["challenge"]
     help="Cases with a cause that the catalogue lacks.",
 )
 @click.option("--size", type=SIZE, default="96x96", show_default=True, help="Columns x rows of the sensors.")
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Cases at the same time.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done, write nothing.")
 def challenge(
-    out: Path, seed: int, none: int, one: int, two: int, outsider: int, size: tuple[int, int], dry_run: bool
+    out: Path,
+    seed: int,
+    none: int,
+    one: int,
+    two: int,
+    outsider: int,
+    size: tuple[int, int],
+    jobs: int,
+    dry_run: bool,
 ) -> None:
     """Hide random effects in simulated sensors, search each, and count how often the search is right.
+
+    Every case is written as soon as it ends: started again with the same seed and size, the command goes on where it
+    was. Hundreds of cases take hours.
 
     \b
     Example:
@@ -49,16 +68,45 @@ def challenge(
     if dry_run:
         click.echo(f"would run {total} cases of {size[0]} x {size[1]} pixels: {counts}")
         return
-    folder = prepare_folder(out)
-    done = 0
+    record = prepare_folder(out) / RECORD
+    known = _earlier_cases(record, {"seed": seed, "columns": size[0], "rows": size[1]})
+    done = sum(case.number < counts[case.kind] for case in known)
+    if done:
+        click.echo(f"{done} of {total} cases are there from before", err=True)
 
-    def say(result: CaseResult) -> None:
+    def keep(result: CaseResult) -> None:
         nonlocal done
         done += 1
+        with record.open("a") as stream:
+            stream.write(result.to_json() + "\n")
         truth, found = "+".join(result.truth) or "none", "+".join(result.found) or result.verdict
         click.echo(f"{done} of {total}: {truth} -> {found} ({result.seconds:.0f} s)", err=True)
 
-    result = run_challenge(counts, seed, size=(size[1], size[0]), progress=say)
-    path = result.write(folder)
+    result = run_challenge(counts, seed, size=(size[1], size[0]), known=known, jobs=jobs, progress=keep)
+    path = result.write(out)
+    write_challenge_report(out / "challenge.html", result)
     click.echo(json.dumps(result.summary(), indent=2))
     click.echo(str(path))
+
+
+def _earlier_cases(record: Path, identity: dict[str, int]) -> list[CaseResult]:
+    """Cases that ran before; a new record starts with what they have in common.
+
+    Raises
+    ------
+    InputError
+        The record is one of another challenge.
+    """
+    lines = record.read_text().splitlines() if record.exists() else []
+    if not lines:
+        record.write_text(json.dumps(identity) + "\n")
+        return []
+    if lines[0] != json.dumps(identity):
+        raise InputError(
+            f"challenge in {record.parent}", lines[0][:100], f"{json.dumps(identity)}, or another folder"
+        )
+    # A line that a killed run left unfinished is not a case.
+    complete = [line for line in lines[1:] if line.endswith("}")]
+    if len(complete) < len(lines) - 1:
+        record.write_text("\n".join([lines[0], *complete]) + "\n")
+    return [CaseResult.from_json(line) for line in complete]

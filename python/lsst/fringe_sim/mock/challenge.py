@@ -8,21 +8,24 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import permutations
-from pathlib import Path
+from multiprocessing import get_context
 from types import MappingProxyType
 from typing import Any
 
+import numba
 import numpy as np
-from astropy.table import Table
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from ..algorithms.discovery import SearchOptions, Verdict, discover
 from ..effects import EFFECTS
 from ..errors import UnknownNameError
+from ..products.challenge_result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
 from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
 from .hidden_effects import AmplifierState, HiddenEffect, validate_effects
@@ -42,12 +45,8 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 Draw = Callable[[np.random.Generator], dict[str, float]]
 
-CASE_KINDS = ("none", "one", "two", "outsider")
 STATED_FWHM_NM, STATED_KELVIN = 2.0, 183.15
 READ_NOISE_E = 6.0
-
-VISIBLE = 10.0
-"""Signal to noise from which an effect is asked for by name."""
 
 
 def _signed(rng: np.random.Generator, low: float, high: float) -> float:
@@ -181,151 +180,6 @@ class SealedCase:
     values: dict[str, float]
     thickness_um: FloatArray
     noise_factor: float
-
-
-@dataclass(frozen=True)
-class CaseResult:
-    """What became of a case.
-
-    Attributes
-    ----------
-    truth, found : `tuple` [`str`, ...]
-        Effects that were in, and those that were named.
-    right_class : `bool`
-        Every effect that is in was named or is in the class of a named one, and nothing else was named. A second
-        effect below `VISIBLE` need not be named.
-    exact : `bool`
-        The named effects are those that are in.
-    signal_to_noise : `float`
-        Square root of what the oracle takes off χ².
-    weakest : `float`
-        Signal to noise of the weakest of several effects beside the others, as the oracle finds it.
-    probability : `float`
-        Smallest probability that was stated; 0 if nothing was named.
-    pulls : `dict`
-        (found - true) / σ by ``name.parameter``, for exact names.
-    shrinkage : `float`
-        Part of the oracle's fall of the variance on held-out data that the search reached.
-    """
-
-    seed: int
-    kind: str
-    truth: tuple[str, ...]
-    values: dict[str, float]
-    verdict: str
-    found: tuple[str, ...]
-    ambiguous: tuple[tuple[str, ...], ...]
-    right_class: bool
-    exact: bool
-    signal_to_noise: float
-    weakest: float
-    probability: float
-    pulls: dict[str, float]
-    shrinkage: float
-    seconds: float
-
-
-@dataclass(frozen=True)
-class ChallengeResult:
-    """All cases of a challenge with the numbers that sum them up."""
-
-    seed: int
-    cases: tuple[CaseResult, ...]
-    options: dict[str, Any] = field(default_factory=dict)
-
-    def of_kind(self, kind: str) -> list[CaseResult]:
-        """Cases of a kind."""
-        return [case for case in self.cases if case.kind == kind]
-
-    def confusion(self) -> Table:
-        """How often each truth led to each verdict."""
-        counts: dict[tuple[str, str], int] = {}
-        for case in self.cases:
-            row = "+".join(case.truth) or "none"
-            column = "+".join(sorted(case.found)) if case.found else case.verdict
-            counts[row, column] = counts.get((row, column), 0) + 1
-        rows = [(truth, found, number) for (truth, found), number in sorted(counts.items())]
-        return Table(rows=rows or None, names=("truth", "found", "cases"), dtype=(str, str, int))
-
-    def table(self) -> Table:
-        """One row per case."""
-        rows = [
-            (c.seed, c.kind, "+".join(c.truth), c.verdict, "+".join(c.found),
-             " ".join("|".join(a) for a in c.ambiguous), c.right_class, c.exact, c.signal_to_noise, c.weakest,
-             c.probability, c.shrinkage, c.seconds)
-            for c in self.cases
-        ]  # fmt: skip
-        names = ("seed", "kind", "truth", "verdict", "found", "ambiguous_with", "right_class", "exact",
-                 "signal_to_noise", "weakest", "probability", "shrinkage", "seconds")  # fmt: skip
-        kinds = (int, str, str, str, str, str, bool, bool, float, float, float, float, float)
-        return Table(rows=rows or None, names=names, dtype=kinds)
-
-    def pulls(self) -> FloatArray:
-        """All pulls of exactly named effects."""
-        return np.array([pull for case in self.cases for pull in case.pulls.values()])
-
-    def summary(self) -> dict[str, Any]:
-        """The numbers of the protocol."""
-        null, one = self.of_kind("none"), self.of_kind("one")
-        two, outside = self.of_kind("two"), self.of_kind("outsider")
-        strong = [case for case in one if case.signal_to_noise >= VISIBLE]
-        both = [case for case in two if case.weakest >= VISIBLE]
-        faint = [case for case in two if not case.weakest >= VISIBLE]
-        pulls = self.pulls()
-        shrink = [case.shrinkage for case in strong if case.right_class and math.isfinite(case.shrinkage)]
-        named = [case for case in self.cases if case.verdict == "named"]
-        return {
-            "false_discoveries": [sum(case.verdict == "named" for case in null), len(null)],
-            "no_discrepancy": [sum(case.verdict == "no_discrepancy" for case in null), len(null)],
-            "one_right_class": [sum(case.right_class for case in strong), len(strong)],
-            "one_exact": [sum(case.exact for case in strong), len(strong)],
-            "two_right_class": [sum(case.right_class for case in both), len(both)],
-            "one_of_two_faint_right": [sum(case.right_class for case in faint), len(faint)],
-            "outsiders_named": [sum(case.verdict == "named" for case in outside), len(outside)],
-            "pull_mean": float(pulls.mean()) if pulls.size else math.nan,
-            "pull_median": float(np.median(pulls)) if pulls.size else math.nan,
-            "pull_width": float(1.4826 * np.median(np.abs(pulls - np.median(pulls))))
-            if pulls.size
-            else math.nan,
-            "pull_std": float(pulls.std()) if pulls.size else math.nan,
-            "shrinkage_median": float(np.median(shrink)) if shrink else math.nan,
-            "stated_probability": float(np.mean([case.probability for case in named])) if named else math.nan,
-            "named_right": [sum(case.right_class for case in named), len(named)],
-            "median_seconds": float(np.median([case.seconds for case in self.cases]))
-            if self.cases
-            else math.nan,
-        }
-
-    def accuracy(self) -> Table:
-        """Part of single effects in the right class, and exactly named, against signal to noise."""
-        rows = []
-        for low, high in (
-            (0.0, 3.0),
-            (3.0, 5.0),
-            (5.0, 10.0),
-            (10.0, 30.0),
-            (30.0, 100.0),
-            (100.0, math.inf),
-        ):
-            inside = [c for c in self.of_kind("one") if low <= c.signal_to_noise < high]
-            if inside:
-                right, exact = (
-                    np.mean([getattr(c, name) for c in inside]) for name in ("right_class", "exact")
-                )
-                rows.append((low, high, len(inside), float(right), float(exact)))
-        names = ("signal_to_noise_from", "signal_to_noise_to", "cases", "right_class", "exact")
-        return Table(rows=rows or None, names=names, dtype=(float, float, int, float, float))
-
-    def write(self, out_dir: str | Path) -> Path:
-        """Write the tables of the challenge; returns the path of the table of cases."""
-        folder = Path(out_dir)
-        folder.mkdir(parents=True, exist_ok=True)
-        table = self.table()
-        table.meta.update({"seed": self.seed, **dict(self.summary().items())})
-        table.write(folder / "challenge.ecsv", format="ascii.ecsv", overwrite=True)
-        self.confusion().write(folder / "confusion.ecsv", format="ascii.ecsv", overwrite=True)
-        self.accuracy().write(folder / "accuracy.ecsv", format="ascii.ecsv", overwrite=True)
-        return folder / "challenge.ecsv"
 
 
 def draw_case(
@@ -464,6 +318,8 @@ def run_challenge(
     size: tuple[int, int] = (96, 96),
     options: SearchOptions | None = None,
     only: Sequence[str] = (),
+    known: Sequence[CaseResult] = (),
+    jobs: int = 1,
     progress: Callable[[CaseResult], None] | None = None,
 ) -> ChallengeResult:
     """Draw cases, search each, and judge the answers.
@@ -473,29 +329,63 @@ def run_challenge(
     counts : mapping
         How many cases of each of `CASE_KINDS`.
     seed : `int`
-        Seed of the whole challenge; every case has a stream of its own.
+        Seed of the whole challenge. Every case has a stream of its own, whatever else is asked for.
     size : `tuple` [`int`, `int`], optional
         Rows and columns of the sensors.
     options : `SearchOptions`, optional
         Thresholds of the search.
     only : sequence of `str`, optional
         Effects from which to draw.
+    known : sequence of `CaseResult`, optional
+        Results of cases that ran before with the same seed, size, options and effects; they are not run again.
+    jobs : `int`, optional
+        Cases that run at the same time, each in a process of its own.
     progress : callable, optional
-        Called with each result.
+        Called with each result that is new.
     """
-    results: list[CaseResult] = []
-    kinds = [kind for kind in CASE_KINDS for _ in range(counts.get(kind, 0))]
-    for number, kind in enumerate(kinds):
-        case_rng, search_rng = np.random.default_rng([seed, number]).spawn(2)
-        case = draw_case(kind, case_rng, size=size, only=only if kind in ("one", "two") else ())
-        began = time.process_time()
-        verdict = discover(case.cube, case.setup, rng=search_rng, options=options)
-        seconds = time.process_time() - began
-        result = judge(case, verdict, number, seconds, _ask_oracle(case, options))
-        results.append(result)
+    ready = {(result.kind, result.number): result for result in known}
+    wanted = [(kind, number) for number in range(max(counts.values(), default=0)) for kind in CASE_KINDS
+              if number < counts.get(kind, 0)]  # fmt: skip
+    work = partial(_run_case, seed=seed, size=size, options=options, only=tuple(only))
+    for result in _results(work, [case for case in wanted if case not in ready], jobs):
+        ready[result.kind, result.number] = result
         if progress is not None:
             progress(result)
+    results = sorted((ready[case] for case in wanted), key=lambda r: (CASE_KINDS.index(r.kind), r.number))
     return ChallengeResult(seed, tuple(results), asdict(options or SearchOptions()))
+
+
+def _results(
+    work: Callable[[str, int], CaseResult], cases: Sequence[tuple[str, int]], jobs: int
+) -> Iterator[CaseResult]:
+    """Results as they come."""
+    if jobs == 1 or len(cases) < 2:
+        yield from (work(*case) for case in cases)
+        return
+    threads = max(1, numba.config.NUMBA_NUM_THREADS // jobs)
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), numba.set_num_threads, (threads,))
+    try:
+        for done in as_completed([pool.submit(work, *case) for case in cases]):
+            yield done.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _run_case(
+    kind: str,
+    number: int,
+    *,
+    seed: int,
+    size: tuple[int, int],
+    options: SearchOptions | None,
+    only: Sequence[str],
+) -> CaseResult:
+    streams = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)
+    case = draw_case(kind, streams[0], size=size, only=only if kind in ("one", "two") else ())
+    began = time.process_time()
+    verdict = discover(case.cube, case.setup, rng=streams[1], options=options)
+    seconds = time.process_time() - began
+    return judge(case, verdict, number, seconds, _ask_oracle(case, options))
 
 
 def _ask_oracle(case: SealedCase, options: SearchOptions | None) -> Verdict | None:
@@ -508,7 +398,7 @@ def _ask_oracle(case: SealedCase, options: SearchOptions | None) -> Verdict | No
 
 
 def judge(
-    case: SealedCase, verdict: Verdict, seed: int, seconds: float, oracle: Verdict | None
+    case: SealedCase, verdict: Verdict, number: int, seconds: float, oracle: Verdict | None
 ) -> CaseResult:
     """Compare a verdict with the truth."""
     found = tuple(effect.name for effect in verdict.effects)
@@ -540,7 +430,7 @@ def judge(
         own = verdict.gap.heldout_before**2 - verdict.gap.heldout_after**2
         shrinkage = own / whole if whole > 0.0 else math.nan
     return CaseResult(
-        seed,
+        number,
         case.kind,
         case.names,
         case.values,
@@ -552,6 +442,7 @@ def judge(
         strength,
         min((own_significance.get(name, 0.0) for name in case.names), default=math.nan),
         min((effect.probability for effect in verdict.effects), default=0.0),
+        math.prod(e.probability * e.share for e in verdict.effects) if verdict.effects else 0.0,
         pulls,
         shrinkage,
         seconds,

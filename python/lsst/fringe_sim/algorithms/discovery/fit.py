@@ -633,7 +633,7 @@ class _Solver:
         """Derivative of the prediction with respect to one coordinate, by a difference."""
         return coordinate_derivative(
             self.problem.forward, self.coordinates[number], point.position[number], self.settings(point.position),
-            thickness, point.prediction.value,
+            thickness,
         )  # fmt: skip
 
     def _relax(self, point: _Point) -> _Point:
@@ -701,7 +701,6 @@ def coordinate_derivative(
     at: float,
     settings: Mapping[str, float],
     thickness_um: FloatArray,
-    value: FloatArray,
 ) -> FloatArray:
     """Derivative of the prediction with respect to a coordinate, by a central difference where the bounds allow.
 
@@ -716,13 +715,8 @@ def coordinate_derivative(
         points[0] = at
     elif coordinate.clip(points[1]) != points[1]:
         points[1] = at
-    low, high = (
-        value
-        if point == at
-        else forward.predict({**settings, coordinate.key: coordinate.value(point)}, thickness_um).value
-        for point in points
-    )
-    return (high - low) / (points[1] - points[0])
+    low, high = ({**settings, coordinate.key: coordinate.value(point)} for point in points)
+    return forward.change(low, high, thickness_um) / (points[1] - points[0])
 
 
 def _profile(curvature: FloatArray, number: int) -> FloatArray:

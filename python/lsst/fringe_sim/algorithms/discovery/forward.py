@@ -174,17 +174,7 @@ class Forward:
         thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
             Thickness at the centres of the cells [µm], within the tables.
         """
-        table = self.table(settings)
-        gradient = _gradient(thickness_um, self.seen)
-        second, fourth = self._spread_in_cell(gradient)
-        place, beside = self._at_centroids(thickness_um, gradient)
-        value, slope = _interpolate(
-            table, self.range_um[0], TABLE_STEP_UM, place.ravel(), second.ravel(), fourth.ravel()
-        )
-        shape = (len(table), *thickness_um.shape)
-        value, slope = value.reshape(shape), slope.reshape(shape)
-        if beside is not None:
-            value += slope * beside
+        value, slope = self._at_cells(self.table(settings), thickness_um)
         image_settings = self._image(settings)
         if not image_settings:
             return Prediction(value, slope)
@@ -193,6 +183,46 @@ class Forward:
         nudge = 1e-3  # µm; effects on the image are nearly linear in the signal
         beside = apply_to_image(active, self.model.base_system, value + nudge * slope, self.geometry)
         return Prediction(changed, (beside - changed) / nudge)
+
+    def change(self, before: Settings, after: Settings, thickness_um: FloatArray) -> FloatArray:
+        """What other settings do to the cells, ``(W, ny, nx)``: the difference of two predictions."""
+        tables = self.table(before), self.table(after)
+        images = self._image(before), self._image(after)
+        if any(images):
+            first, _ = self._at_cells(tables[0], thickness_um)
+            second = first if tables[1] is tables[0] else self._at_cells(tables[1], thickness_um)[0]
+            old, new = (
+                apply_to_image(
+                    activate_effects(settings, self.catalogue), self.model.base_system, value, self.geometry
+                )
+                for settings, value in zip(images, (first, second), strict=True)
+            )
+            return new - old
+        table = tables[1] - tables[0]
+        # Effects on single exposures leave most planes as they are.
+        rows = np.flatnonzero(table.any(axis=1))
+        result = np.zeros((len(table), *thickness_um.shape))
+        if rows.size:
+            result[rows] = self._at_cells(table, thickness_um, rows)[0]
+        return result
+
+    def _at_cells(
+        self, table: FloatArray, thickness_um: FloatArray, rows: NDArray[np.intp] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Value and slope of some rows of a table, averaged over the cells; shape ``(R, ny, nx)``."""
+        gradient = _gradient(thickness_um, self.seen)
+        second, fourth = self._spread_in_cell(gradient)
+        place, beside = self._at_centroids(thickness_um, gradient)
+        used = table if rows is None else table[rows]
+        value, slope = (
+            part.reshape(len(used), *thickness_um.shape)
+            for part in _interpolate(
+                used, self.range_um[0], TABLE_STEP_UM, place.ravel(), second.ravel(), fourth.ravel()
+            )
+        )
+        if beside is not None:
+            value += slope * (beside if rows is None else beside[rows])
+        return value, slope
 
     def sampled(self, settings: Settings, thickness_um: FloatArray) -> FloatArray:
         """Response at any thicknesses within the tables, without effects on the image; shape ``(W, ...)``."""

@@ -281,11 +281,10 @@ class Selector:
         coordinates = self.coordinates[name]
         forward = self.problem.forward
         level = (self.problem.level_basis @ fit.levels)[:, None, None]
-        value = state.value / level
         columns = []
         for item in coordinates:
             at = item.coordinate(fit.settings.get(item.key, item.null))
-            slope = coordinate_derivative(forward, item, at, fit.settings, state.thickness_um, value)
+            slope = coordinate_derivative(forward, item, at, fit.settings, state.thickness_um)
             columns.append(state.whiten(level * slope))  # type: ignore[operator]
         return np.stack(columns)
 
