@@ -2,28 +2,43 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+from pathlib import Path
+
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from browser import check_page
 
 from lsst.fringe_sim.algorithms.cost_model import FocalPlaneCost
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.mock.thickness import e2v_321
 
 
-@pytest.mark.slow
-def test_two_sensors_of_a_focal_plane(tmp_path, capsys) -> None:
-    path = tmp_path / "thickness.fits"
+@pytest.fixture(scope="module")
+def two_sensors(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Folder of a forecast of two sensors, one of them measured, and what was said."""
+    folder = tmp_path_factory.mktemp("focal_plane")
+    path, out = folder / "thickness.fits", folder / "out"
     fits.PrimaryHDU(e2v_321((800, 819)).astype(np.float32)).writeto(path)
-    out = tmp_path / "out"
-    status = run(
-        [
-            *("focal-plane", "--sensor", "R22_S11", "--sensor", "R22_S12", "--thickness", f"R22_S11={path}"),
-            *("--nights", "2", "--airmass", "1.0", "--out", str(out)),
-        ]
-    )
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        status = run(
+            [
+                *("focal-plane", "--sensor", "R22_S11", "--sensor", "R22_S12"),
+                *("--thickness", f"R22_S11={path}"),
+                *("--nights", "2", "--airmass", "1.0", "--out", str(out)),
+            ]
+        )
     assert status == 0
+    return out, said.getvalue()
+
+
+@pytest.mark.slow
+def test_two_sensors_of_a_focal_plane(two_sensors) -> None:
+    out, said = two_sensors
     sensors = Table.read(out / "focal_plane.ecsv")
     assert list(sensors["detector"]) == ["R22_S11", "R22_S12"]
     assert list(sensors["stand_in"]) == [False, True]
@@ -32,9 +47,14 @@ def test_two_sensors_of_a_focal_plane(tmp_path, capsys) -> None:
     assert len(Table.read(out / "cells.ecsv")) == 128
     assert (out / "focal_plane.png").read_bytes().startswith(b"\x89PNG")
     assert "focal_plane.ecsv" in (out / "report.html").read_text(encoding="utf-8")
-    said = capsys.readouterr().out
     assert "e2v: 2 sensors" in said
     assert "2 templates" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1280, 390])
+def test_page_of_the_focal_plane_in_a_browser(two_sensors, width, tmp_path) -> None:
+    check_page(two_sensors[0] / "report.html", tmp_path, width, f"focal_plane_{width}")
 
 
 def test_cost_is_stated_and_nothing_is_written(tmp_path, capsys) -> None:

@@ -146,8 +146,8 @@ def focal_plane(
     page = Report(
         "Fringes over the focal plane",
         f"{len(summary)} sensors of the LSST Camera in the y band at airmass {airmass:g}; templates from the "
-        f"published night, {nights} random nights corrected. Of {len(measured)} sensors the thickness was given; the "
-        "others have a random field like the measured ones.",
+        f"published night, {nights} random night{'s' if nights > 1 else ''} corrected. Sensors with a thickness map "
+        f"that was given: {len(measured)}; the others have a random field like the measured ones.",
     )
     page.section("Focal plane")
     for line in lines:
@@ -257,6 +257,6 @@ def _describe(summary: Table) -> Iterable[str]:
             left = np.asarray(rows[f"residual_{number}"])
             good = int(np.count_nonzero(left < DES_CRITERION))
             yield (
-                f"  {number} template{'s' if number > 1 else ''}: at most {left.max():.3f} times the noise; "
-                f"{good} of {len(rows)} sensors below {DES_CRITERION}"
+                f"{vendor} with {number} template{'s' if number > 1 else ''}: at most {left.max():.3f} times "
+                f"the noise; {good} of {len(rows)} sensors below {DES_CRITERION}"
             )
