@@ -20,7 +20,7 @@ from lsst.fringe_sim.algorithms.thickness_stand_in import stand_in_thickness
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.instrument.sky import SkySpectrum
-from lsst.fringe_sim.instrument.telescope import BeamField, Telescope
+from lsst.fringe_sim.instrument.telescope import TRACED_RADII, BeamField, Telescope
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeComponents
@@ -301,5 +301,6 @@ def beams() -> list[Row]:
         return [field.beam(*place) for place in fields]
 
     _, wall, own = timed(interpolated)
-    rows.append(Row(work, "BeamField: 8 radii traced, rays interpolated", wall, beside=cpu * share, cpu=own))
+    method = f"BeamField: {TRACED_RADII} radii traced, rays interpolated"
+    rows.append(Row(work, method, wall, beside=cpu * share, cpu=own))
     return rows

@@ -211,6 +211,13 @@ def coherence(beam: Beam, index: float, thickness_um: float) -> complex:
     return complex(beam.weight @ np.exp(1j * phase))
 
 
+def test_a_ray_is_stored_only_for_the_apertures_that_can_cut_it_off(coarse, coarse_field):
+    """Most rays miss all edges by far; those that are stored really pass close to them."""
+    assert coarse_field.edge_ray.size < 6 * coarse_field.sin_squared.shape[1]
+    with pytest.raises(OutOfRangeError, match="number of traced radii"):
+        BeamField.trace(coarse, 4)
+
+
 def test_beam_field_needs_symmetry_and_stays_inside(coarse_field):
     for name in ("hsc", "monocam"):
         with pytest.raises(InputError, match="axisymmetric"):
