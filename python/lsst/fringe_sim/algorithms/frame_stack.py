@@ -29,10 +29,6 @@ _FEW_FRAMES = 64
 """Up to so many frames products are made in double precision by the compiled kernel, beyond in single precision by
 a matrix product of each tile, which is four times as fast there; sums over tiles are always in double precision."""
 
-_PRODUCT_FRAMES = 200
-"""Frames whose products with all later ones are made at a time; narrower blocks of the Gram matrix would waste less
-of its lower half, but more time on bringing frames into the order that a matrix product wants."""
-
 _SKEW = 40
 """Columns by which the rows of a tile are longer than needed, so that they do not share cache lines of one set."""
 
@@ -111,8 +107,8 @@ class FrameStack:
         """Good pixels."""
         return int(np.count_nonzero(self.good))
 
-    def gram(self) -> FloatArray:
-        """Gram matrix of the frames less their mean over frames.
+    def gram_and_mean(self) -> tuple[FloatArray, NDArray[np.float32]]:
+        """Gram matrix of the frames less their mean over frames, and that mean frame; 0 where there is none.
 
         Raises
         ------
@@ -122,30 +118,33 @@ class FrameStack:
         count = len(self.frames)
         few = count <= _FEW_FRAMES
         total = np.zeros((count + -count % 4,) * 2)
+        mean = np.empty(self.good.shape, dtype=np.float32)
         # Tiles are small: more than one thread of a matrix product would mostly wait.
         with threadpool_limits(limits=1, user_api="blas"):
-            for _, used, tile, sums in self._tiles(np.float64 if few else np.float32):
+            for part, used, tile, sums in self._tiles(np.float64 if few else np.float32):
+                first, good = _native(self.frames[0][part]), self.good[part].reshape(-1)
+                _add_first(sums, count, first, self.offset[0], self.unit, good, mean[part].reshape(-1))
                 if few:
                     _add_products(tile, used, total)
                 else:
                     # Without this the first frame would be in all rows, and its rounding in the result.
                     tile[:count, :used] -= (sums / count).astype(np.float32)
-                    _add_block_products(tile[:count, :used], total)
+                    own = tile[:count, :used]
+                    # BLAS makes one half of a product with its own transpose.
+                    total[:count, :count] += own @ own.T
         if not self.good.any():
             raise _no_pixels()
         upper = np.triu(total[:count, :count])
         whole = upper + np.triu(upper, 1).T
         whole -= whole.mean(axis=0)
         whole -= whole.mean(axis=1)[:, None]
-        return 0.5 * (whole + whole.T) / self.unit**2
+        return 0.5 * (whole + whole.T) / self.unit**2, mean
 
-    def components(
-        self, combination: FloatArray
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], FloatArray]:
-        """Mean frame, components ``combination.T @ (frames - mean)`` and the signs that were given to them.
+    def components(self, combination: FloatArray) -> tuple[NDArray[np.float32], FloatArray]:
+        """Components ``combination.T @ (frames - mean)`` and the signs that were given to them.
 
         The largest entry of every component is made positive. Sums are made in the precision of the frames, after
-        the first frame was subtracted.
+        the first frame was subtracted. Pixels without a value in some frame must have been found before.
         """
         count, number = combination.shape
         precise = any(np.asarray(image[:1]).dtype != np.float32 for image in self.frames)
@@ -153,27 +152,22 @@ class FrameStack:
         weights = np.zeros((number, count + -count % 4), dtype=work)
         # Weights of zero sum need no frames less their mean.
         weights[:, :count] = (combination - combination.mean(axis=0)).T / self.unit
-        mean = np.empty(self.good.size, dtype=np.float32)
         images = np.empty((number, self.good.size), dtype=np.float32)
         extremes = np.zeros((2, number))
         with threadpool_limits(limits=1, user_api="blas"):
-            for part, used, tile, total in self._tiles(work):
+            for part, used, tile, _ in self._tiles(work, sums=False):
                 begin = part.start * self.good.shape[1]
-                span = slice(begin, begin + used)
-                chosen = images[:, span]
+                chosen = images[:, begin : begin + used]
                 if precise:
                     chosen[:] = weights @ tile[:, :used]
                 else:
                     np.matmul(weights, tile[:, :used], out=chosen)
                 np.minimum(extremes[0], chosen.min(axis=1), out=extremes[0])
                 np.maximum(extremes[1], chosen.max(axis=1), out=extremes[1])
-                first = _native(self.frames[0][part])
-                good = self.good[part].ravel()
-                _add_first(total, count, first, self.offset[0], self.unit, good, mean[span])
         sign = np.where(extremes[1] < -extremes[0], -1.0, 1.0)
         for index in np.flatnonzero(sign < 0.0):
             np.negative(images[index], out=images[index])
-        return mean.reshape(self.good.shape), images.reshape(number, *self.good.shape), sign
+        return images.reshape(number, *self.good.shape), sign
 
     def _means(self) -> FloatArray:
         """Mean of every frame over the good pixels."""
@@ -185,12 +179,14 @@ class FrameStack:
             raise _no_pixels()
         return (first + beside_first) / self.pixels
 
-    def _tiles(self, precision: DTypeLike) -> Iterator[tuple[slice, int, NDArray[Any], FloatArray]]:
+    def _tiles(
+        self, precision: DTypeLike, *, sums: bool = True
+    ) -> Iterator[tuple[slice, int, NDArray[Any], FloatArray]]:
         """Rows, their number of pixels, ``frame - offset`` less that of the first, and its sum over the frames.
 
         The arrays ``[N + padding, pixels + padding]`` and ``[pixels]`` are overwritten by the next tile. Rows of
         padding make N a multiple of four. Pixels that are not good are 0, those beyond the number of pixels are not
-        to be used.
+        to be used. Without ``sums`` these are not made, and pixels without a value in some frame not looked for.
         """
         count, width = len(self.frames), self.good.shape[1]
         tile = np.zeros((count + -count % 4, self.rows * width + _SKEW), dtype=precision)
@@ -207,9 +203,11 @@ class FrameStack:
             used = values[0].size
             total[:used] = 0.0
             for number, each in enumerate(values):
-                _load(each, values[0], relative[number], tile[number], total)
-            good = self.good[part]
-            _drop(total, good.ravel(), tile)
+                if sums:
+                    _load_and_add(each, values[0], relative[number], tile[number], total)
+                else:
+                    _load(each, values[0], relative[number], tile[number])
+            _drop(total[:used], self.good[part].reshape(-1), tile)
             yield part, used, tile, total[:used]
 
 
@@ -239,16 +237,17 @@ def _no_pixels() -> InputError:
     return InputError("good pixels", 0, "at least one in which all frames have a value")
 
 
-def _add_block_products(tile: NDArray[np.float32], total: FloatArray) -> None:
-    """Add the products of all frames of a tile to the upper half of a Gram matrix."""
-    for i in range(0, len(tile), _PRODUCT_FRAMES):
-        total[i : i + _PRODUCT_FRAMES, i : len(tile)][: len(tile) - i] += (
-            tile[i : i + _PRODUCT_FRAMES] @ tile[i:].T
-        )
+@numba.njit(cache=True, fastmath={"contract"})
+def _load(
+    values: NDArray, first: NDArray, offset: float, row: NDArray
+) -> None:  # pragma: no cover - compiled
+    """One frame less the first and less an offset."""
+    for k in range(values.size):
+        row[k] = np.float64(values[k]) - np.float64(first[k]) - offset
 
 
 @numba.njit(cache=True, fastmath={"contract"})
-def _load(
+def _load_and_add(
     values: NDArray, first: NDArray, offset: float, row: NDArray, total: NDArray
 ) -> None:  # pragma: no cover - compiled
     """One frame less the first and less an offset; what is no number spoils the sum over frames."""
@@ -258,18 +257,26 @@ def _load(
         total[k] += value
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath={"contract"})
 def _add_first(
     total: NDArray, count: int, first: NDArray, offset: float, unit: float, good: NDArray, mean: NDArray
 ) -> None:  # pragma: no cover - compiled
     """Mean frame from the sum of the differences from the first frame."""
+    of_total, of_first = 1.0 / (count * unit), 1.0 / unit
     for k in range(good.size):
-        mean[k] = (total[k] / count + (np.float64(first[k]) - offset)) / unit if good[k] else 0.0
+        value = total[k] * of_total + (np.float64(first[k]) - offset) * of_first
+        mean[k] = value if good[k] else 0.0
 
 
 @numba.njit(cache=True)
 def _drop(total: NDArray, good: NDArray, tile: NDArray) -> None:  # pragma: no cover - compiled
     """Take out pixels that are masked or without a value in some frame."""
+    # Nearly always there are none, which is quickly seen.
+    usable = 0
+    for k in range(good.size):
+        usable += good[k] & (abs(total[k]) < np.inf)
+    if usable == good.size:
+        return
     for k in range(good.size):
         if not (good[k] and np.isfinite(total[k])):
             good[k] = False

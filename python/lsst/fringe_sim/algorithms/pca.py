@@ -99,7 +99,7 @@ def fit_pca(
         if isinstance(frame, SkyFringe):
             refuse_corrected(frame.metadata, frame.detector or None)
     stack = FrameStack.of(frames, mask, tile_bytes)
-    gram = stack.gram()
+    gram, mean = stack.gram_and_mean()
     total = float(np.trace(gram))
     if not total > 0.0:
         raise InputError("frames", "no differences between them", "frames that vary")
@@ -114,8 +114,9 @@ def fit_pca(
         raise OutOfRangeError("number of components", n_components, f"1 to {len(frames)}")
     kept = np.maximum(eigenvalues[:n_components], np.finfo(float).tiny)
     mask = np.zeros(stack.good.shape, np.int32)
-    mask[~stack.good] = mask_bits("NO_DATA")
-    mean, components, sign = stack.components(vectors[:, :n_components] / np.sqrt(kept))
+    if not stack.good.all():
+        mask[~stack.good] = mask_bits("NO_DATA")
+    components, sign = stack.components(vectors[:, :n_components] / np.sqrt(kept))
     return FringeComponents(
         mean=mean,
         components=components,
