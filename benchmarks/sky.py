@@ -23,7 +23,7 @@ from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.instrument.telescope import TRACED_RADII, BeamField, Telescope
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import FringeComponents
+from lsst.fringe_sim.products import BackgroundWriter, FringeComponents
 
 from ._table import Row, best_of, memory_now, memory_watch, timed
 
@@ -210,8 +210,9 @@ def sensor_night() -> list[Row]:
         before = memory_now()
 
         def frames() -> None:
-            for number, frame in enumerate(simulate_night(thickness, model, response, night)):
-                frame.write_fits(Path(folder) / f"{number}.fits")
+            with BackgroundWriter() as writer:
+                for number, frame in enumerate(simulate_night(thickness, model, response, night)):
+                    writer.write(frame, Path(folder) / f"{number}.fits")
 
         _, frames_wall, frames_cpu = timed(frames)
         size = sum(path.stat().st_size for path in Path(folder).iterdir()) / 2**30

@@ -442,12 +442,13 @@ def angular_response(
     lines, continua = split_components(sky, band, fineness.continuum_step_nm)
     merged = blend_components(lines, fineness.line_shift_nm) if lines else []
     few = min(CONTINUUM_ANGLES, angles)
-    of_lines = [_single_angles(model, item, limits, angles, grid) for item in merged]
-    of_continua = [_single_angles(model, item, limits, few, grid) for item in continua]
-    refine = _legendre_interpolation(few, angles)
     samples = error_samples((table.start_um, table.stop_um))
+    of_lines = [_single_angles(model, item, limits, angles, grid, samples) for item in merged]
+    of_continua = [_single_angles(model, item, limits, few, grid, samples) for item in continua]
+    refine = _legendre_interpolation(few, angles)
     error = spectral_error(model, sky, band, fineness, samples)
-    error += _angular_error(model, (merged, angles), (continua, few), limits=limits, samples=samples)
+    for components, made in ((merged, of_lines), (continua, of_continua)):
+        error += _angular_error(model, components, [sampled for _, sampled in made], limits, samples)
     return AngularResponse(
         tuple(item.name for item in [*merged, *continua]),
         photons,
@@ -455,8 +456,8 @@ def angular_response(
         limits,
         table.start_um,
         table.step_um,
-        np.stack([*of_lines, *(refine @ values for values in of_continua)]),
-        refine @ _single_angles(model, white_light(band, fineness.continuum_step_nm), limits, few, grid),
+        np.stack([*(values for values, _ in of_lines), *(refine @ values for values, _ in of_continua)]),
+        refine @ _single_angles(model, white_light(band, fineness.continuum_step_nm), limits, few, grid)[0],
         table.interpolation_error,
         error / level,
         sky.airmass,
@@ -556,9 +557,9 @@ def _single_angles(
     component: SpectralComponent,
     limits: tuple[float, float],
     angles: int,
-    grid: tuple[float, float, int],
-) -> FloatArray:
-    """Electrons from one component under every angle, shape ``(angles, thicknesses)``."""
+    *grids: tuple[float, float, int],
+) -> list[FloatArray]:
+    """Electrons from one component under every angle on each grid of thickness, ``(angles, thicknesses)``."""
     nodes, _ = np.polynomial.legendre.leggauss(angles)
     sine = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * nodes
     shape = (angles, component.photons.size)
@@ -568,8 +569,11 @@ def _single_angles(
         np.broadcast_to(component.photons / component.photons.sum(), shape),
     )
     reduced = model.system.reduce(light)
-    response = reduced.averaged_on_grid(light.weight, *grid)
-    return float(component.photons.sum()) * model.finish(reduced, light, response, None)
+    photons = float(component.photons.sum())
+    return [
+        photons * model.finish(reduced, light, reduced.averaged_on_grid(light.weight, *grid), None)
+        for grid in grids
+    ]
 
 
 def _legendre_interpolation(few: int, many: int) -> FloatArray:
@@ -583,26 +587,26 @@ def _legendre_interpolation(few: int, many: int) -> FloatArray:
 
 def _angular_error(
     model: FringeModel,
-    *groups: tuple[list[SpectralComponent], int],
+    components: list[SpectralComponent],
+    electrons: list[FloatArray],
     limits: tuple[float, float],
     samples: tuple[float, float, int],
 ) -> float:
     """Largest change of the electrons under the beam of the model when a sixth of the angles is left out.
 
-    As for `sky_response`, several times the error of all angles.
+    ``electrons`` are those of the components at the samples under all angles. As for `sky_response`, the change is
+    several times the error of all angles.
     """
+    if not components:
+        return 0.0
     beam = model.system.beam
     light = _ray_histogram(np.sin(beam.theta) ** 2, limits, beam.weight)
-    error = 0.0
-    for components, angles in groups:
-        if components:
-            sums = [
-                (_moment_weights(count) @ light)
-                @ sum(_single_angles(model, item, limits, count, samples) for item in components)
-                for count in (angles, 5 * angles // 6)
-            ]
-            error += float(np.abs(sums[0] - sums[1]).max())
-    return error
+    fewer = 5 * len(electrons[0]) // 6
+    sparse = [_single_angles(model, item, limits, fewer, samples)[0] for item in components]
+    sums = [
+        (_moment_weights(len(values[0])) @ light) @ np.asarray(sum(values)) for values in (electrons, sparse)
+    ]
+    return float(np.abs(sums[0] - sums[1]).max())
 
 
 @functools.lru_cache(maxsize=4)

@@ -22,7 +22,7 @@ from ..instrument.sky import SkySpectrum
 from ..mock.thickness import e2v_321
 from ..model import FringeModel, Setup
 from ..model.provenance import input_cards
-from ..products import SensorSection, SkyFringe
+from ..products import BackgroundWriter, SensorSection, SkyFringe
 from ..report.figures import sky_figure
 from ..report.sky_page import write_sky_report
 from ..report.style import save_figure
@@ -161,10 +161,10 @@ def sky(
             ]
         )
     made: list[SkyFringe] = []
-    with progress("simulating frames", frames) as advance:
+    with progress("simulating frames", frames) as advance, BackgroundWriter() as writer:
         for number, frame in enumerate(series):
             path = folder / f"sky_{sensor.name}_{number:02d}.fits"
-            frame.write_fits(path, {"SETUP": setup.name, **cards}, section=section)
+            writer.write(frame, path, {"SETUP": setup.name, **cards}, section=section)
             made.append(frame)
             advance()
     save_figure(sky_figure(made), folder / "sky.png")

@@ -5,6 +5,7 @@ at all, carry checksums, and two writes of one product agree to the byte.
 """
 
 from ..resources import DAMAGE
+from .background_writer import BackgroundWriter
 from .combined_bias import CombinedBias
 from .fringe_components import FringeComponents
 from .fringe_cube import CUBE_UNITS, FlatExposures, FringeCube
@@ -21,6 +22,7 @@ __all__ = [
     "DAMAGE",
     "MASK_PLANES",
     "SKY_UNITS",
+    "BackgroundWriter",
     "CombinedBias",
     "FlatExposures",
     "FringeComponents",

@@ -160,13 +160,42 @@ def primary_hdu(
     return hdu
 
 
+class _SteadyImage(fits.ImageHDU):
+    """Image whose data do not change: the sum over them is made once, and without turning their bytes round.
+
+    astropy makes it twice for the two checksums of an HDU, each time from a copy in the order of the file.
+    """
+
+    def _calculate_datasum(self) -> np.uint32:
+        found: np.uint32 | None = getattr(self, "_sum_of_data", None)
+        if found is None:
+            found = _sum_of_words(self.data) if self._has_data else None
+            self._sum_of_data = found = super()._calculate_datasum() if found is None else found
+        return found
+
+
+def _sum_of_words(data: NDArray[Any]) -> np.uint32 | None:
+    """Ones-complement sum of numbers of four bytes in the order of the machine; `None` for all others.
+
+    Such a sum of words in the order of the file is that of the numbers themselves.
+    """
+    if data.dtype.itemsize != 4 or data.dtype.kind not in "if" or not data.dtype.isnative:
+        return None
+    if not data.flags.c_contiguous:
+        return None
+    total = int(data.reshape(-1).view(np.uint32).sum(dtype=np.uint64))
+    while total >> 32:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    return np.uint32(total)
+
+
 def image_hdu(
     name: str, data: NDArray[Any], *, unit: str | None = None, cards: Sequence[tuple[str, Any, str]] = ()
 ) -> fits.ImageHDU:
     """Image extension; ``data`` is not copied and not changed."""
     view = data.view()
     view.flags.writeable = False  # astropy swaps the bytes of writeable arrays in place
-    hdu = fits.ImageHDU(view, name=name)
+    hdu = _SteadyImage(view, name=name)
     if unit is not None:
         hdu.header["BUNIT"] = unit
     for card in cards:
