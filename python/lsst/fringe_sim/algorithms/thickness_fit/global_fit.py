@@ -21,7 +21,7 @@ from .cells import (
     sample_pixels,
 )
 from .evidence import OrderEvidence, order_evidence, refine_cells
-from .narrow_sensor import is_own_mean, settle_narrow_sensor
+from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, first_nuisances, fit_nuisances, subtract_offset
 from .orders import solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
@@ -48,7 +48,21 @@ _SENSOR_ORDERS = 3.0
 """Orders of thickness that a sensor must span before its mean is near that of the range, whatever its order."""
 _FEWEST_TO_SETTLE = 4
 """Wavelengths from which on the mean response of a narrow sensor is sought together with its order."""
-_NARROW_MARGIN = 2.0
+_OPEN_ORDERS = 0.5
+"""Orders of thickness, times the relative bandwidth of the flats, up to which the mean response is open.
+
+The mean over the range misses that over a sensor by about the fringe amplitude over the number of orders; a wrong order
+turns the fringes at one end of the band against those at the other by the relative bandwidth.
+"""
+_MOST_MEANS = 4
+"""Solutions of a narrow sensor whose mean response is tried on all cells."""
+_MOST_SHAPES = 4
+"""Rounds of mean response and orders of a narrow sensor."""
+_SAME_SHAPE = 0.25
+"""Reliefs that agree within this many orders everywhere are one."""
+_WORTHWHILE = 0.01
+"""Relative gain of chi-square for which another round is worth its time."""
+_NARROW_MARGIN = 3.0
 """Orders beyond what a narrow sensor showed in a sample that its other cells may have."""
 
 
@@ -200,16 +214,29 @@ class _Solver:
         fitted, normalisation = templates.with_contrast(nuisance.contrast), "range"
         for _ in range(_MOST_SOLUTIONS):
             state = self._state(cells, fitted, nuisance, normalisation, self.range_um)
+            if normalisation == "range" and self._mean_is_open(state):
+                state = self._narrow(cells, state)
             if not spans_orders(state.thickness_um, self.order_um):
-                # Of fewer wavelengths nothing is believed, so there is nothing to settle.
-                enough = templates.n_wavelengths >= _FEWEST_TO_SETTLE
-                own = enough and not self.free.any and is_own_mean(state.cells, templates)
-                return self._narrow(cells, state) if own and np.isfinite(state.thickness_um).any() else state
+                return state
             before, state = state, self.adjust(replace(state, normalisation="sensor"))
             if _agree(before, state):
                 break
             fitted, nuisance, normalisation = state.templates, state.nuisance, state.normalisation
         return state
+
+    def _mean_is_open(self, state: _State) -> bool:
+        """Whether mean response and orders must be found together."""
+        if state.templates.n_wavelengths < _FEWEST_TO_SETTLE or self.free.any:
+            return False  # of fewer wavelengths nothing is believed, so there is nothing to settle
+        if not np.isfinite(state.thickness_um).any() or not is_own_mean(state.cells, state.templates):
+            return False
+        # Wrong orders make a sensor look thicker and thinner than it is; joined by phases alone it cannot jump.
+        joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
+        wavelength = state.templates.wavelength_nm
+        orders = max(_OPEN_ORDERS * float(wavelength.mean()) / max(float(np.ptp(wavelength)), 1e-3), _SENSOR_ORDERS)
+        return not all(
+            spans_orders(thickness, self.order_um, orders) for thickness in (state.thickness_um, joined)
+        )
 
     def _state(
         self,
@@ -231,23 +258,49 @@ class _Solver:
         )  # fmt: skip
 
     def _narrow(self, cells: Cells, first: _State) -> _State:
-        """Orders of a sensor of few orders, whose mean response depends on them."""
-        narrow = settle_narrow_sensor(
-            first.cells,
-            first.templates,
-            first.thickness_um,
-            self.order_um,
-            range_um=self.range_um,
-            temper=self.temper,
-            threads=self.threads,
-        )
+        """Orders of a sensor of few orders, whose mean response depends on them, and they on it.
+
+        With a mean response that is a little off, cells of some phases take the order of their neighbours' neighbours,
+        and no common thickness fits a relief so torn. So mean response and relief are found in turn.
+        """
+        shapes, best, solved = [first.thickness_um], None, first
+        for _ in range(_MOST_SHAPES):
+            ranked = settle_narrow_sensor(
+                first.cells,
+                first.templates,
+                shapes,
+                self.order_um,
+                range_um=self.range_um,
+                temper=self.temper,
+                threads=self.threads,
+            )
+            if best is not None and ranked[0].chi2 > (1.0 - _WORTHWHILE) * best.chi2:
+                break
+            best, solved = ranked[0], self._with_mean_of(ranked[0], cells, first)
+            if best.agrees_with(solved.thickness_um, self.order_um):
+                break
+            shapes = []
+            for other in ranked[:_MOST_MEANS]:
+                tried = solved if other is best else self._with_mean_of(other, cells, first)
+                joined = solve_orders(tried.cells, tried.found, sure=np.inf)
+                for shape in (tried.thickness_um, joined.thickness_um):
+                    if not any(_same_shape(shape, known, self.order_um) for known in shapes):
+                        shapes.append(shape)
+        if best is None:
+            return first
+        solved = replace(solved, common_slip=best.slip)
+        if spans_orders(solved.thickness_um, self.order_um):
+            return replace(solved, range_um=self.range_um)
+        return self.adjust(replace(solved, common_sigma_um=best.sigma_um))
+
+    def _with_mean_of(self, narrow: NarrowSensor, cells: Cells, first: _State) -> _State:
+        """Orders of all cells with the mean response of a solution, in its neighbourhood."""
         margin = _NARROW_MARGIN * self.order_um
         range_um = (
             max(self.range_um[0], narrow.range_um[0] - margin),
             min(self.range_um[1], narrow.range_um[1] + margin),
         )
-        state = self._state(cells, narrow.templates, first.nuisance, "narrow", range_um)
-        return self.adjust(replace(state, common_slip=narrow.slip, common_sigma_um=narrow.sigma_um))
+        return self._state(cells, narrow.templates, first.nuisance, "narrow", range_um)
 
     def adjust(self, state: _State) -> _State:
         """Fit mean response and nuisances to the cells, the orders being as they are."""
@@ -275,6 +328,12 @@ class _Solver:
         )
 
 
+def _same_shape(first: NDArray[np.float32], second: NDArray[np.float32], order_um: float) -> bool:
+    """Whether two maps differ by no more than a constant, to a fraction of an order."""
+    difference = first - second
+    return float(np.nanmax(np.abs(difference - np.nanmedian(difference)))) < _SAME_SHAPE * order_um
+
+
 def _agree(before: _State, after: _State) -> bool:
     """Whether two models differ too little to matter for the orders."""
     strength = after.templates.amplitude().std(axis=0)
@@ -291,10 +350,12 @@ def spread_to_pixels(cells: Cells, values: NDArray[Any]) -> NDArray[Any]:
     return np.repeat(rows, np.diff(cells.x_edges), axis=1)
 
 
-def spans_orders(thickness_um: NDArray[np.float32], order_um: float) -> bool:
+def spans_orders(
+    thickness_um: NDArray[np.float32], order_um: float, orders: float = _SENSOR_ORDERS
+) -> bool:
     """Whether a sensor holds enough orders for the mean response over it to be known from its map."""
     values = thickness_um[np.isfinite(thickness_um)]
-    return values.size > 0 and float(np.ptp(np.percentile(values, (2.0, 98.0)))) > _SENSOR_ORDERS * order_um
+    return values.size > 0 and float(np.ptp(np.percentile(values, (2.0, 98.0)))) > orders * order_um
 
 
 def normalise_to_cells(

@@ -15,12 +15,12 @@ true, and the variance of the common thickness from the Fisher information of al
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from .cells import Cells, run_threaded
 from .evidence import refine_row
@@ -42,6 +42,8 @@ _JOINT_STEPS = 25
 _LONGEST_STEP_UM = 0.02
 _SAME_SOLUTION = 0.25
 """Solutions whose common thickness agrees within this many orders are one."""
+_FEW_ASTRAY = 0.01
+"""Share of cells that may have another order before two maps are told apart."""
 _OWN_MEAN = 0.1
 """Mean amplitude, in rms amplitudes of the model, up to which flats have been divided by their own mean."""
 
@@ -60,12 +62,26 @@ class NarrowSensor:
         Probability that another solution is true.
     sigma_um : `float`
         Uncertainty of the mean thickness of the sensor [µm].
+    chi2 : `float`
+        Chi-square of this solution, summed over the cells that were asked.
+    cell : `numpy.ndarray` of `int`, shape ``(n,)``
+        Which cells were asked, counted row by row.
+    cell_um : `numpy.ndarray`, shape ``(n,)``
+        Their thickness [µm].
     """
 
     templates: FringeTemplates
     range_um: tuple[float, float]
     slip: float
     sigma_um: float
+    chi2: float
+    cell: NDArray[np.intp]
+    cell_um: FloatArray
+
+    def agrees_with(self, thickness_um: NDArray[np.float32], order_um: float) -> bool:
+        """Whether a map has the same orders where cells were asked, but for a few of them."""
+        miss = np.abs(thickness_um.ravel()[self.cell] - self.cell_um)
+        return bool(np.mean(miss < _SAME_SOLUTION * order_um) > 1.0 - _FEW_ASTRAY)
 
 
 def is_own_mean(cells: Cells, templates: FringeTemplates) -> bool:
@@ -89,14 +105,14 @@ def is_own_mean(cells: Cells, templates: FringeTemplates) -> bool:
 def settle_narrow_sensor(
     cells: Cells,
     templates: FringeTemplates,
-    thickness_um: NDArray[np.float32],
+    ideas_um: Sequence[NDArray[np.float32]],
     order_um: float,
     *,
     range_um: tuple[float, float],
     temper: float,
     threads: int = 2,
-) -> NarrowSensor:
-    """Find the common thickness of a sensor together with its mean response.
+) -> list[NarrowSensor]:
+    """Find the common thickness of a sensor together with its mean response; the best solutions, best first.
 
     Parameters
     ----------
@@ -104,8 +120,9 @@ def settle_narrow_sensor(
         Mean amplitudes.
     templates : `FringeTemplates`
         The model, with any mean response.
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        First idea of the thickness [µm], of which the shape is used; NaN where a cell has no data.
+    ideas_um : sequence of `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Ideas of the thickness [µm], of which the shape is used; NaN where a cell has no data. The shape that is
+        true within half an order everywhere must be among them, or the result may be wrong.
     order_um : `float`
         Thickness of one fringe order [µm].
     range_um : `tuple` [`float`, `float`]
@@ -115,32 +132,37 @@ def settle_narrow_sensor(
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
-    sample, shape_um = _Sample.of(cells, thickness_um, _MOST_CELLS)
-    few = sample.every(max(len(shape_um) // _FEW_CELLS, 1))
-    form = shape_um[:: max(len(shape_um) // _FEW_CELLS, 1)]
+    sample, shapes_um = _Sample.of(cells, ideas_um, templates.n_wavelengths, _MOST_CELLS)
+    stride = max(shapes_um.shape[1] // _FEW_CELLS, 1)
+    few = sample.every(stride)
     starts = np.arange(range_um[0], range_um[1], order_um / _STARTS_PER_ORDER)[:, None]
-    tried = few.follow(
-        templates, np.concatenate([starts + 0.0 * form, starts + form]), _FIRST_ROUNDS, threads
-    )
-    together = [_settle_together(few, solution, templates) for solution in _distinct(tried, order_um)[:_KEPT]]
+    together = []
+    for shape in shapes_um:
+        tried = few.follow(templates, starts + shape[::stride], _FIRST_ROUNDS, threads)
+        # Solutions of one shape compete only after they have settled: until then the mean hides what is wrong.
+        kept = _distinct(tried, order_um)[: _KEPT // len(shapes_um)]
+        together += [_settle_together(few, solution, templates) for solution in kept]
     best = _distinct(together, order_um)[:_COMPARED]
-    again = np.concatenate([sample.starts(solution, shape_um, form) for solution in best])
+    again = np.concatenate([sample.starts(solution, shapes_um, stride) for solution in best])
     followed = sample.follow(templates, again, _FIRST_ROUNDS, threads)
-    pairs = zip(followed[::2], followed[1::2], strict=True)
-    final = [_settle_together(sample, min(pair, key=lambda s: s.chi2), templates) for pair in pairs]
+    groups = zip(*[iter(followed)] * len(shapes_um), strict=True)
+    final = [_settle_together(sample, min(group, key=lambda s: s.chi2), templates) for group in groups]
     low, high = range_um
     inside = [s for s in final if low - 0.1 * order_um < s.mean_um < high + 0.1 * order_um] or final
     ranked = _distinct(inside, order_um)
-    chosen = ranked[0]
     slip = _slip(ranked, temper, sample)
-    sigma = _common_sigma(sample, chosen, templates)
-    sigma *= np.sqrt(len(shape_um) / max(int(np.count_nonzero(cells.n_wavelengths)), 1) / temper)
-    return NarrowSensor(
-        replace(templates, mean_response=chosen.mean_response),
-        (float(chosen.thickness_um.min()), float(chosen.thickness_um.max())),
-        slip,
-        sigma,
-    )
+    return [
+        NarrowSensor(
+            replace(templates, mean_response=solution.mean_response / sample.share),
+            (float(solution.thickness_um.min()), float(solution.thickness_um.max())),
+            slip if rank == 0 else 1.0,
+            _common_sigma(sample, solution, templates) / np.sqrt(temper),
+            solution.chi2,
+            sample.cell,
+            solution.thickness_um,
+        )
+        for rank, solution in enumerate(ranked)
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,26 +181,46 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """Some cells: relative flats ``1 + a`` and their weights, shape ``(n, padded wavelengths)``."""
+    """Some cells: relative flats over their mean in these cells, their weights, that mean, and which cells they are.
+
+    ``level`` and ``weight`` have shape ``(n, padded wavelengths)``, ``share`` has ``(n_wavelengths,)``. The mean of a
+    few hundred cells differs from that of all by more than the noise of a pixel; only what both the flats and
+    the model are divided by may be compared.
+    """
 
     level: NDArray[np.float32]
     weight: NDArray[np.float32]
+    share: FloatArray
+    cell: NDArray[np.intp]
 
     @classmethod
-    def of(cls, cells: Cells, thickness_um: NDArray[np.float32], most: int) -> tuple[_Sample, FloatArray]:
-        """Cells at equal distances that have most wavelengths, and their thickness about its middle."""
-        known = np.isfinite(thickness_um)
+    def of(
+        cls, cells: Cells, ideas_um: Sequence[NDArray[np.float32]], wavelengths: int, most: int
+    ) -> tuple[_Sample, FloatArray]:
+        """Cells at equal distances that have most wavelengths, and their thickness about its middle.
+
+        The shapes of the ideas follow the shape of a flat sensor, shape ``(1 + n_ideas, n)``.
+        """
+        known = np.all(np.isfinite(ideas_um), axis=0)
         number = np.where(known, cells.n_wavelengths, 0)
         seen = np.flatnonzero(known & (number == number.max()))
         seen = seen[:: -(-seen.size // most)]
         depth = cells.value.shape[-1]
         value, weight = (part.reshape(-1, depth)[seen] for part in (cells.value, cells.weight))
-        shape = thickness_um.ravel()[seen].astype(float)
-        return cls(value + np.float32(1), weight), shape - np.median(shape)
+        shapes = np.stack([idea.ravel()[seen].astype(float) for idea in ideas_um])
+        shapes -= np.median(shapes, axis=1, keepdims=True)
+        sample = cls(value + np.float32(1), weight, np.ones(wavelengths), seen)
+        return sample.every(1), np.concatenate([np.zeros_like(shapes[:1]), shapes])
 
     def every(self, stride: int) -> _Sample:
         """One cell in so many."""
-        return _Sample(self.level[::stride], self.weight[::stride])
+        level, weight = self.level[::stride], self.weight[::stride]
+        used = weight > 0.0
+        number = used.sum(axis=0)
+        total = np.where(used, level, 0.0).sum(axis=0, dtype=float)
+        mean = np.where(total > 0.0, total / np.maximum(number, 1), 1.0)
+        share = mean.astype(np.float32)
+        return _Sample(level / share, weight * share**2, self.share * mean[: self.share.size], self.cell[::stride])
 
     def follow(
         self, templates: FringeTemplates, starts_um: FloatArray, rounds: int, threads: int
@@ -214,10 +256,10 @@ class _Sample:
         wavelengths = templates.n_wavelengths
         return [_Solution(t, m[:wavelengths], float(c)) for t, m, c in zip(out, mean, chi2, strict=True)]
 
-    def starts(self, solution: _Solution, shape_um: FloatArray, form: FloatArray) -> FloatArray:
-        """Starts for these cells from the solution of fewer: its common thickness, without and with the shape."""
-        middle = float(np.median(solution.thickness_um - form))
-        return np.stack([np.full(len(shape_um), solution.mean_um), middle + shape_um])
+    def starts(self, solution: _Solution, shapes_um: FloatArray, stride: int) -> FloatArray:
+        """Starts for these cells from the solution of one in ``stride``: its common thickness with each shape."""
+        middle = np.median(solution.thickness_um - shapes_um[:, ::stride], axis=1, keepdims=True)
+        return middle + shapes_um
 
 
 def _interpolate(table: NDArray[Any], place: NDArray[np.floating]) -> NDArray[Any]:
@@ -251,11 +293,14 @@ class _Together:
     """Normal equations of all cells and the mean that they share.
 
     With ``g = R' / <R>`` and ``r = R / <R>``, moving cell ``j`` changes the amplitude of cell ``i`` by
-    ``g_ik δ_ij - r_ik g_jk / n``: by itself, and through the mean.
+    ``g_ik δ_ij - r_ik g_jk / n``: by itself, and through the mean. The matrix of second derivatives is therefore
+    diagonal but for two rows for each wavelength, ``D + W C W'`` with ``W = (g, w g r)``.
     """
 
     gradient: FloatArray
-    fisher: FloatArray
+    diagonal: FloatArray
+    factors: FloatArray
+    coupling: FloatArray
     chi2: float
 
     @classmethod
@@ -269,20 +314,28 @@ class _Together:
         slope, relative = (ahead - behind) / (2.0 * step * mean), here / mean
         weight = sample.weight[:, :wavelengths].astype(float)
         miss = sample.level[:, :wavelengths] - relative
-        cross = (weight * slope * relative) @ slope.T / count
         total = (weight * relative**2).sum(axis=0) / count**2
-        fisher = np.diag((weight * slope**2).sum(axis=1)) - cross - cross.T + (slope * total) @ slope.T
+        once = -np.eye(wavelengths) / count
         through_mean = (weight * miss * relative).sum(axis=0) / count
-        gradient = (weight * miss * slope).sum(axis=1) - slope @ through_mean
-        return cls(gradient, fisher, float((weight * miss**2).sum()))
+        return cls(
+            (weight * miss * slope).sum(axis=1) - slope @ through_mean,
+            (weight * slope**2).sum(axis=1),
+            np.hstack([slope, weight * slope * relative]),
+            np.block([[np.diag(total), once], [once, np.zeros_like(once)]]),
+            float((weight * miss**2).sum()),
+        )
 
-
-def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution with a symmetric matrix, by least squares if rounding makes it singular."""
-    try:
-        return np.asarray(cho_solve(cho_factor(matrix, lower=True, check_finite=False), right))
-    except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.lstsq(matrix, right, rcond=1e-14)[0])
+    def solve(self, right: FloatArray, added: FloatArray | float) -> FloatArray:
+        """Solution for a right-hand side, something being added to the diagonal."""
+        inverse = 1.0 / (self.diagonal + added + np.finfo(float).tiny)
+        scaled = inverse[:, None] * self.factors
+        inner = np.eye(len(self.coupling)) + self.coupling @ (self.factors.T @ scaled)
+        share = self.coupling @ (scaled.T @ right)
+        try:
+            answer = np.linalg.solve(inner, share)
+        except np.linalg.LinAlgError:
+            answer = np.linalg.lstsq(inner, share, rcond=1e-14)[0]
+        return np.asarray(inverse * right - scaled @ answer)
 
 
 def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> _Solution:
@@ -290,8 +343,7 @@ def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemp
     thickness, damping = solution.thickness_um.astype(float), 1e-6
     state = _Together.of(sample, thickness, templates)
     for _ in range(_JOINT_STEPS):
-        bound = state.fisher + np.diag(damping * np.diag(state.fisher) + np.finfo(float).tiny)
-        step = _solve(bound, state.gradient)
+        step = state.solve(state.gradient, damping * state.diagonal)
         tried = thickness + np.clip(step, -_LONGEST_STEP_UM, _LONGEST_STEP_UM)
         after = _Together.of(sample, tried, templates)
         if after.chi2 < state.chi2:
@@ -307,6 +359,8 @@ def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemp
 
 def _common_sigma(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> float:
     """Standard uncertainty of the mean thickness of the sampled cells, as if they were the whole sensor [µm]."""
-    values, vectors = np.linalg.eigh(_Together.of(sample, solution.thickness_um, templates).fisher)
-    lowest = max(float(values[-1]) * 1e-12, np.finfo(float).tiny)
-    return float(np.sqrt((vectors.sum(axis=0) ** 2 / np.maximum(values, lowest)).sum()) / len(values))
+    together = _Together.of(sample, solution.thickness_um, templates)
+    everywhere = np.ones(len(solution.thickness_um))
+    # What is added keeps rounding from turning a direction that nothing decides into a certain one.
+    variance = everywhere @ together.solve(everywhere, 1e-12 * float(together.diagonal.max()))
+    return float(np.sqrt(max(variance, 0.0)) / everywhere.size)

@@ -56,7 +56,7 @@ class OrderSolution:
     region_evidence: NDArray[np.float32]
 
 
-def solve_orders(cells: Cells, found: OrderEvidence) -> OrderSolution:
+def solve_orders(cells: Cells, found: OrderEvidence, sure: float = SURE) -> OrderSolution:
     """Join cells into regions and give each region its absolute order.
 
     Parameters
@@ -65,6 +65,8 @@ def solve_orders(cells: Cells, found: OrderEvidence) -> OrderSolution:
         The cells; only their edges are used.
     found : `OrderEvidence`
         From `order_evidence`.
+    sure : `float`, optional
+        Regions that are surer of their order than this chi-square difference stay apart where they disagree.
 
     Returns
     -------
@@ -76,7 +78,7 @@ def solve_orders(cells: Cells, found: OrderEvidence) -> OrderSolution:
     first, second, turn, key = _links(found.phase_um, rise_y, rise_x, found.order_um)
     ranked = np.argsort(key, kind="stable")
     evidence = found.evidence.reshape(ny * nx, -1).copy()
-    root, offset = _join(evidence, first[ranked], second[ranked], turn[ranked], SURE)
+    root, offset = _join(evidence, first[ranked], second[ranked], turn[ranked], sure)
     valid = np.isfinite(found.phase_um.ravel())
     roots = np.flatnonzero(root == np.arange(len(root)))
     best = np.zeros(len(root), np.int64)
