@@ -29,11 +29,12 @@ def test_cells_without_a_thickness_are_not_asked() -> None:
     weight[0, 1:, 3] = 0.0
     flat = np.zeros_like(value)
     cells = Cells(value, weight, flat, flat, np.array([0, 8]), np.array([0, 8, 16, 24]))
-    sample, shapes = _Sample.of(cells, [np.array([[np.nan, 13.0, 13.2]], np.float32)], 4, 10)
+    sample, shapes, middles = _Sample.of(cells, [np.array([[np.nan, 13.0, 13.2]], np.float32)], 4, 10)
     np.testing.assert_array_equal(sample.cell, [1, 2])
     np.testing.assert_allclose(sample.level[:, 0], np.array([5.0, 9.0]) / 7.0, rtol=1e-6)
     np.testing.assert_allclose(sample.share[0], 7.0)
     np.testing.assert_allclose(shapes, [[0.0, 0.0], [-0.1, 0.1]], atol=1e-6)
+    np.testing.assert_allclose(middles, [13.1, 13.1], atol=1e-6)
 
 
 @pytest.mark.parametrize("span", [0.05, 0.15, 0.3, 0.6, 0.85])

@@ -38,6 +38,11 @@ MOST_CELLS = 600_000
 """Bound on the memory of the order evidence: about 84 orders of 4 bytes for each cell."""
 _STEEPEST_STRUCTURE = 1.0
 """Largest ``1 - cos`` of the phase across a cell, in the steepest tenth of the sensor: a quarter of a fringe."""
+_LARGEST_LOSS = 1.0
+"""Largest loss of amplitude by the average over a cell, there, in standard deviations of that average.
+
+Slopes inside the cells make up for most of it; beyond this, cells of some phases take the wrong order all the same.
+"""
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
@@ -58,6 +63,8 @@ _MOST_MEANS = 4
 """Solutions of a narrow sensor whose mean response is tried on all cells."""
 _MOST_SHAPES = 4
 """Rounds of mean response and orders of a narrow sensor."""
+_RIVAL = 2.0
+"""Solutions of so many times the least chi-square are still looked at: cells astray cost the true one as much."""
 _SAME_SHAPE = 0.25
 """Reliefs that agree within this many orders everywhere are one."""
 _WORTHWHILE = 0.01
@@ -277,15 +284,18 @@ class _Solver:
             if best is not None and ranked[0].chi2 > (1.0 - _WORTHWHILE) * best.chi2:
                 break
             best, solved = ranked[0], self._with_mean_of(ranked[0], cells, first)
-            if best.agrees_with(solved.thickness_um, self.order_um):
+            rivals = [other for other in ranked[1:] if other.chi2 < _RIVAL * best.chi2]
+            if not rivals and best.agrees_with(solved.thickness_um, self.order_um):
                 break
-            shapes = []
+            known, shapes = shapes, []
             for other in ranked[:_MOST_MEANS]:
                 tried = solved if other is best else self._with_mean_of(other, cells, first)
                 joined = solve_orders(tried.cells, tried.found, sure=np.inf)
                 for shape in (tried.thickness_um, joined.thickness_um):
-                    if not any(_same_shape(shape, known, self.order_um) for known in shapes):
+                    if not _among(shape, shapes, self.order_um):
                         shapes.append(shape)
+            if all(_among(shape, known, self.order_um) for shape in shapes):
+                break
         if best is None:
             return first
         solved = replace(solved, common_slip=best.slip)
@@ -328,10 +338,13 @@ class _Solver:
         )
 
 
-def _same_shape(first: NDArray[np.float32], second: NDArray[np.float32], order_um: float) -> bool:
-    """Whether two maps differ by no more than a constant, to a fraction of an order."""
-    difference = first - second
-    return float(np.nanmax(np.abs(difference - np.nanmedian(difference)))) < _SAME_SHAPE * order_um
+def _among(shape: NDArray[np.float32], others: list[NDArray[np.float32]], order_um: float) -> bool:
+    """Whether a map differs from one of others by no more than a constant, to a fraction of an order."""
+    for other in others:
+        difference = shape - other
+        if np.nanmax(np.abs(difference - np.nanmedian(difference))) < _SAME_SHAPE * order_um:
+            return True
+    return False
 
 
 def _agree(before: _State, after: _State) -> bool:
@@ -414,7 +427,7 @@ def _normalise_to_pixels(
 
 
 def choose_cell_size(data: Amplitudes) -> int:
-    """Largest cell over which the steepest tenth of the sensor still shows its fringes.
+    """Largest cell over which the steepest tenth of the sensor still shows its fringes, to within the noise.
 
     The structure function ``<(a(x + s) - a(x))²> / 2 var(a)`` of a fringe is ``1 - cos`` of its phase over the
     distance ``s``; it is taken in blocks, at the wavelength of largest contrast, with the noise subtracted.
@@ -448,7 +461,12 @@ def choose_cell_size(data: Amplitudes) -> int:
     for size in (8, 4, 2):
         if size <= least:
             break
-        if size < max(ny, nx) and _structure(strips, size, float(noise[best]), signal) < _STEEPEST_STRUCTURE:
+        if size >= max(ny, nx):
+            continue
+        structure = _structure(strips, size, float(noise[best]), signal)
+        # The mean over a ramp of phase f is sin(f/2) / (f/2) of its middle: about 1 - (1 - cos f) / 12.
+        lost = structure / 12.0 * size * np.sqrt(signal / noise[best])
+        if structure < _STEEPEST_STRUCTURE and lost < _LARGEST_LOSS:
             return max(size, least)
     return max(least, 1)
 

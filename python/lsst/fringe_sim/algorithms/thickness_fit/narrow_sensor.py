@@ -40,6 +40,11 @@ _KEPT = 40
 _COMPARED = 6
 _JOINT_STEPS = 25
 _LONGEST_STEP_UM = 0.02
+_SIDES = (0.0, -0.125, 0.125, -0.25, 0.25, -0.375, 0.375)
+"""Orders from its thickness at which a cell is looked for again."""
+_SIDE_ROUNDS = 3
+_SIDE_MOVE = 0.05
+"""Orders by which a cell must move before that is more than what the steps left over."""
 _SAME_SOLUTION = 0.25
 """Solutions whose common thickness agrees within this many orders are one."""
 _FEW_ASTRAY = 0.01
@@ -132,21 +137,23 @@ def settle_narrow_sensor(
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
-    sample, shapes_um = _Sample.of(cells, ideas_um, templates.n_wavelengths, _MOST_CELLS)
+    sample, shapes_um, middles_um = _Sample.of(cells, ideas_um, templates.n_wavelengths, _MOST_CELLS)
     stride = max(shapes_um.shape[1] // _FEW_CELLS, 1)
     few = sample.every(stride)
-    starts = np.arange(range_um[0], range_um[1], order_um / _STARTS_PER_ORDER)[:, None]
+    spacing = order_um / _STARTS_PER_ORDER
     together = []
-    for shape in shapes_um:
+    for shape, middle in zip(shapes_um, middles_um, strict=True):
+        # One of the starts is the idea as it is: in others, cells at the crest of a fringe may take its other side.
+        starts = np.arange(range_um[0] + (middle - range_um[0]) % spacing, range_um[1], spacing)[:, None]
         tried = few.follow(templates, starts + shape[::stride], _FIRST_ROUNDS, threads)
         # Solutions of one shape compete only after they have settled: until then the mean hides what is wrong.
         kept = _distinct(tried, order_um)[: _KEPT // len(shapes_um)]
-        together += [_settle_together(few, solution, templates) for solution in kept]
+        together += [_settle_sides(few, solution, templates, order_um) for solution in kept]
     best = _distinct(together, order_um)[:_COMPARED]
     again = np.concatenate([sample.starts(solution, shapes_um, stride) for solution in best])
     followed = sample.follow(templates, again, _FIRST_ROUNDS, threads)
     groups = zip(*[iter(followed)] * len(shapes_um), strict=True)
-    final = [_settle_together(sample, min(group, key=lambda s: s.chi2), templates) for group in groups]
+    final = [_settle_sides(sample, min(group, key=lambda s: s.chi2), templates, order_um) for group in groups]
     low, high = range_um
     inside = [s for s in final if low - 0.1 * order_um < s.mean_um < high + 0.1 * order_um] or final
     ranked = _distinct(inside, order_um)
@@ -196,8 +203,8 @@ class _Sample:
     @classmethod
     def of(
         cls, cells: Cells, ideas_um: Sequence[NDArray[np.float32]], wavelengths: int, most: int
-    ) -> tuple[_Sample, FloatArray]:
-        """Cells at equal distances that have most wavelengths, and their thickness about its middle.
+    ) -> tuple[_Sample, FloatArray, FloatArray]:
+        """Cells at equal distances that have most wavelengths, their thickness about its middle, and that middle.
 
         The shapes of the ideas follow the shape of a flat sensor, shape ``(1 + n_ideas, n)``.
         """
@@ -208,9 +215,10 @@ class _Sample:
         depth = cells.value.shape[-1]
         value, weight = (part.reshape(-1, depth)[seen] for part in (cells.value, cells.weight))
         shapes = np.stack([idea.ravel()[seen].astype(float) for idea in ideas_um])
-        shapes -= np.median(shapes, axis=1, keepdims=True)
+        shapes = np.concatenate([np.full_like(shapes[:1], np.median(shapes[0])), shapes])
+        middle = np.median(shapes, axis=1)
         sample = cls(value + np.float32(1), weight, np.ones(wavelengths), seen)
-        return sample.every(1), np.concatenate([np.zeros_like(shapes[:1]), shapes])
+        return sample.every(1), shapes - middle[:, None], middle
 
     def every(self, stride: int) -> _Sample:
         """One cell in so many."""
@@ -255,6 +263,24 @@ class _Sample:
         run_threaded(work, len(starts_um), threads)
         wavelengths = templates.n_wavelengths
         return [_Solution(t, m[:wavelengths], float(c)) for t, m, c in zip(out, mean, chi2, strict=True)]
+
+    def better_sides(self, solution: _Solution, templates: FringeTemplates, order_um: float) -> FloatArray:
+        """Thickness of every cell at the least chi-square within half an order, the mean response being as it is."""
+        table = pad_wavelengths(templates.response)
+        origin, step = templates.start_um, templates.step_um
+        level = np.ones(table.shape[1])
+        level[: templates.n_wavelengths] = solution.mean_response
+        scale = level.astype(np.float32)
+        value, weight = self.level * scale, self.weight / scale**2
+        tried, miss = [], []
+        for side in _SIDES:
+            start = (solution.thickness_um + side * order_um).astype(np.float32)
+            found = np.full_like(start, np.nan)
+            refine_row(value, weight, table, origin, step, start, found)
+            difference = value - _interpolate(table, (found - origin) / step)
+            tried.append(found.astype(float))
+            miss.append((weight * difference**2).sum(axis=1))
+        return np.asarray(np.take_along_axis(np.array(tried), np.argmin(miss, axis=0)[None], axis=0)[0])
 
     def starts(self, solution: _Solution, shapes_um: FloatArray, stride: int) -> FloatArray:
         """Starts for these cells from the solution of one in ``stride``: its common thickness with each shape."""
@@ -355,6 +381,25 @@ def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemp
             damping *= 30.0
     place = (thickness - templates.start_um) / templates.step_um
     return _Solution(thickness, _interpolate(templates.response, place).mean(axis=0), state.chi2)
+
+
+def _settle_sides(
+    sample: _Sample, solution: _Solution, templates: FringeTemplates, order_um: float
+) -> _Solution:
+    """Settle together, and again with the cells that had taken the wrong side of a crest on the other one.
+
+    At neighbouring wavelengths the two sides of a crest look alike until the mean response is nearly right.
+    """
+    settled = _settle_together(sample, solution, templates)
+    for _ in range(_SIDE_ROUNDS):
+        moved = sample.better_sides(settled, templates, order_um)
+        if np.abs(moved - settled.thickness_um).max() < _SIDE_MOVE * order_um:
+            break
+        again = _settle_together(sample, replace(settled, thickness_um=moved), templates)
+        if again.chi2 >= settled.chi2:
+            break
+        settled = again
+    return settled
 
 
 def _common_sigma(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> float:
