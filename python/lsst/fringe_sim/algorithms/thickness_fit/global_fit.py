@@ -27,6 +27,7 @@ from .orders import solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
 from .relaxation import SettledCells, settle_orders
 from .rescue import rescue_pixels
+from .shared_misfit import doubt_from_shared_misfit
 from .smoothing import smooth_likelihood
 from .templates import FringeTemplates
 
@@ -180,11 +181,15 @@ def global_fit(
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))
         pixels = replace(pixels, sigma=np.asarray(whole, np.float32))
+    common_slip = state.common_slip
+    if state.searched:
+        doubt = doubt_from_shared_misfit(fringes, state.templates, pixels.value, order)
+        common_slip = 1.0 - (1.0 - common_slip) * (1.0 - doubt)
     # Near a step the pixels have been asked one by one, which is worth more than the answer of their cell.
     settled = replace(settled, cell_slip=np.where(surface.smooth, settled.cell_slip, np.float32(0)))
     return GlobalFit(
         pixels, state.cells, settled, border_slip, state.templates, state.nuisance, order, state.normalisation,
-        state.common_slip,
+        common_slip,
     )  # fmt: skip
 
 
@@ -203,6 +208,8 @@ class _State:
     range_um: tuple[float, float]
     common_slip: float = 0.0
     common_sigma_um: float = 0.0
+    searched: bool = False
+    """Whether mean response and orders were found together, by a search that may have missed the true ones."""
 
 
 @dataclass(frozen=True)
@@ -219,10 +226,13 @@ class _Solver:
         """Solve the orders, and again if the model turns out to be another than was thought."""
         nuisance = first_nuisances(cells, templates, self.free)
         fitted, normalisation = templates.with_contrast(nuisance.contrast), "range"
+        searched, slip = False, 0.0
         for _ in range(_MOST_SOLUTIONS):
             state = self._state(cells, fitted, nuisance, normalisation, self.range_um)
             if normalisation == "range" and self._mean_is_open(state):
                 state = self._narrow(cells, state)
+                searched, slip = state.searched, state.common_slip
+            state = replace(state, searched=searched, common_slip=slip)
             if not spans_orders(state.thickness_um, self.order_um):
                 return state
             before, state = state, self.adjust(replace(state, normalisation="sensor"))
@@ -298,7 +308,7 @@ class _Solver:
                 break
         if best is None:
             return first
-        solved = replace(solved, common_slip=best.slip)
+        solved = replace(solved, common_slip=best.slip, searched=True)
         if spans_orders(solved.thickness_um, self.order_um):
             return replace(solved, range_um=self.range_um)
         return self.adjust(replace(solved, common_sigma_um=best.sigma_um))

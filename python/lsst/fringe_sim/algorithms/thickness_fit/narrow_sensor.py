@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -147,16 +148,16 @@ def settle_narrow_sensor(
         starts = np.arange(range_um[0] + (middle - range_um[0]) % spacing, range_um[1], spacing)[:, None]
         tried = few.follow(templates, starts + shape[::stride], _FIRST_ROUNDS, threads)
         # Solutions of one shape compete only after they have settled: until then the mean hides what is wrong.
-        kept = _distinct(tried, order_um)[: _KEPT // len(shapes_um)]
+        kept = _distinct(tried, order_um, _KEPT // len(shapes_um))
         together += [_settle_sides(few, solution, templates, order_um) for solution in kept]
-    best = _distinct(together, order_um)[:_COMPARED]
+    best = _distinct(together, order_um, _COMPARED)
     again = np.concatenate([sample.starts(solution, shapes_um, stride) for solution in best])
     followed = sample.follow(templates, again, _FIRST_ROUNDS, threads)
     groups = zip(*[iter(followed)] * len(shapes_um), strict=True)
     final = [_settle_sides(sample, min(group, key=lambda s: s.chi2), templates, order_um) for group in groups]
     low, high = range_um
     inside = [s for s in final if low - 0.1 * order_um < s.mean_um < high + 0.1 * order_um] or final
-    ranked = _distinct(inside, order_um)
+    ranked = _distinct(inside, order_um, _COMPARED)
     slip = _slip(ranked, temper, sample)
     return [
         NarrowSensor(
@@ -246,19 +247,10 @@ class _Sample:
 
         def work(item: int) -> None:
             thickness = starts_um[item].astype(np.float32)
-            response = _interpolate(table, (thickness - origin) / step)
-            for _ in range(rounds):
-                level = response.mean(axis=0, dtype=float)
-                scale = np.where(level > 0.0, level, 1.0).astype(np.float32)
-                before, thickness = thickness, np.full_like(thickness, np.nan)
-                value, weight = self.level * scale, self.weight / scale**2
-                refine_row(value, weight, table, origin, step, before, thickness)
-                response = _interpolate(table, (thickness - origin) / step)
-                if np.abs(thickness - before).max() < 0.02 * step:
-                    break
-            mean[item] = response.mean(axis=0, dtype=float)
-            miss = self.level - response / np.where(mean[item] > 0.0, mean[item], 1.0)
-            out[item], chi2[item] = thickness, float((self.weight * miss**2).sum())
+            chi2[item] = _follow(
+                self.level, self.weight, table, origin, step, thickness, rounds, mean[item]
+            )
+            out[item] = thickness
 
         run_threaded(work, len(starts_um), threads)
         wavelengths = templates.n_wavelengths
@@ -288,6 +280,52 @@ class _Sample:
         return middle + shapes_um
 
 
+@numba.njit(cache=True, nogil=True)
+def _follow(level, weight, table, origin, step, thickness, rounds, mean):  # type: ignore[no-untyped-def]
+    """Refit and renormalise in turn, in place; returns chi-square."""
+    value, spread, before = np.empty_like(level), np.empty_like(weight), np.empty_like(thickness)
+    _mean_response(table, origin, step, thickness, mean)
+    for _ in range(rounds):
+        for c in range(level.shape[0]):
+            for band in range(level.shape[1]):
+                scale = np.float32(mean[band]) if mean[band] > 0.0 else np.float32(1.0)
+                value[c, band] = level[c, band] * scale
+                spread[c, band] = weight[c, band] / (scale * scale)
+        before[:] = thickness
+        refine_row(value, spread, table, origin, step, before, thickness)
+        _mean_response(table, origin, step, thickness, mean)
+        if np.abs(thickness - before).max() < 0.02 * step:
+            break
+    chi2 = 0.0
+    for c in range(level.shape[0]):
+        below, share = _place(table, (thickness[c] - origin) / step)
+        for band in range(level.shape[1]):
+            low = table[below, band]
+            response = low + share * (table[below + 1, band] - low)
+            miss = level[c, band] - response / (mean[band] if mean[band] > 0.0 else 1.0)
+            chi2 += weight[c, band] * miss * miss
+    return chi2
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean_response(table, origin, step, thickness, mean):  # type: ignore[no-untyped-def]
+    mean[:] = 0.0
+    for c in range(thickness.shape[0]):
+        below, share = _place(table, (thickness[c] - origin) / step)
+        for band in range(table.shape[1]):
+            low = table[below, band]
+            mean[band] += low + share * (table[below + 1, band] - low)
+    mean /= thickness.shape[0]
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _place(table, place):  # type: ignore[no-untyped-def]
+    """Node of the table below a place, and the share of the next."""
+    inside = min(max(place, 0.0), table.shape[0] - 1.001)
+    below = int(inside)
+    return below, np.float32(inside - below)
+
+
 def _interpolate(table: NDArray[Any], place: NDArray[np.floating]) -> NDArray[Any]:
     """Rows of a table between its nodes, in the precision of the table."""
     inside = np.clip(place, 0.0, len(table) - 1.001)
@@ -297,12 +335,14 @@ def _interpolate(table: NDArray[Any], place: NDArray[np.floating]) -> NDArray[An
     return np.asarray(low + share * (table[below + 1] - low))
 
 
-def _distinct(solutions: list[_Solution], order_um: float) -> list[_Solution]:
-    """Best first, and of those with the same common thickness only the best."""
+def _distinct(solutions: list[_Solution], order_um: float, most: int) -> list[_Solution]:
+    """The best so many, best first; of those with the same common thickness only the best."""
     found: list[_Solution] = []
     for solution in sorted(solutions, key=lambda solution: solution.chi2):
         if all(abs(solution.mean_um - other.mean_um) > _SAME_SOLUTION * order_um for other in found):
             found.append(solution)
+            if len(found) == most:
+                break
     return found
 
 

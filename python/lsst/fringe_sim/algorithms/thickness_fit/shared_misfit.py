@@ -1,0 +1,89 @@
+"""Misfit that neighbouring pixels share: no noise, so that pixels do not add up to certainty.
+
+Noise differs from pixel to pixel. What a wrong relief, a wrong mean response or a wrong model leaves over is the same
+in neighbouring pixels, however small it is beside the noise. If it is as large as what another order would
+leave over, then the sum over many pixels says nothing about which of the two is true.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .amplitudes import Amplitudes
+from .borders import gather_pixels
+from .evidence import refine_row
+from .templates import FringeTemplates
+
+__all__ = ["doubt_from_shared_misfit"]
+
+_MOST_PIXELS = 4000
+_SHIFTS = (-3, -2, -1, 1, 2, 3)
+"""Orders from the solution with which the shared misfit is compared."""
+_NOISE_SIGMA = 3.0
+"""Standard deviations of its own uncertainty by which the shared misfit is believed to be smaller."""
+_APART = 4.0
+"""Distance of two pixels, in standard deviations of the kernel that smoothed the flats, at which their noise differs."""
+
+
+def doubt_from_shared_misfit(
+    data: Amplitudes, templates: FringeTemplates, thickness_um: NDArray[np.float32], order_um: float
+) -> float:
+    """Probability that a solution is wrong, if all of its shared misfit has one cause.
+
+    The misfit of one pixel in the direction of another order is then as good as that of all: an excess of ``d`` in
+    the chi-square of a pixel at another order counts as ``d`` over the shared misfit per degree of freedom.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    templates : `FringeTemplates`
+        The model as it was normalised in the end.
+    thickness_um : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        Thickness of every pixel [µm].
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    """
+    apart = 1 + int(np.ceil(_APART * data.noise_correlation_px))
+    ny, nx = thickness_um.shape
+    if nx <= apart:
+        return 0.0
+    stride = max(int(np.sqrt(ny * nx / _MOST_PIXELS)), 1)
+    rows, columns = (index.ravel() for index in np.mgrid[0:ny:stride, 0 : nx - apart : stride])
+    usable = np.isfinite(thickness_um[rows, columns]) & np.isfinite(thickness_um[rows, columns + apart])
+    rows, columns = rows[usable], columns[usable]
+    value, weight = gather_pixels(data, rows, columns)
+    value_beside, weight_beside = gather_pixels(data, rows, columns + apart)
+    own = thickness_um[rows, columns]
+    miss = _pull(templates, value, weight, own)
+    product = miss * _pull(templates, value_beside, weight_beside, thickness_um[rows, columns + apart])
+    freedom = float(np.maximum(((weight > 0.0) & (weight_beside > 0.0)).sum(axis=1) - 1, 0).sum())
+    if freedom == 0.0:
+        return 0.0
+    each = product.sum(axis=1)
+    shared = float(each.sum() - _NOISE_SIGMA * each.std() * np.sqrt(each.size)) / freedom
+    if shared <= 0.0:
+        return 0.0
+    odds, chi2 = 0.0, (miss**2).sum(axis=1)
+    for shift in _SHIFTS:
+        start = (own + shift * order_um).astype(np.float32)
+        inside = (start > templates.start_um) & (start < templates.stop_um)
+        if inside.any():
+            found = np.full_like(start, np.nan)
+            refine_row(value, weight, templates.table(), templates.start_um, templates.step_um, start, found)
+            excess = (_pull(templates, value, weight, found) ** 2).sum(axis=1) - chi2
+            odds += float(np.exp(-0.5 * max(float(excess[inside].mean()), 0.0) / shared))
+    return odds / (1.0 + odds)
+
+
+def _pull(
+    templates: FringeTemplates,
+    value: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    thickness_um: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """What a thickness leaves over, in standard deviations, shape ``(n, n_wavelengths)``; 0 without data."""
+    wavelengths = templates.n_wavelengths
+    miss = value[:, :wavelengths] - templates.amplitude_at(thickness_um).T
+    return np.asarray(np.sqrt(weight[:, :wavelengths].astype(float)) * miss)
