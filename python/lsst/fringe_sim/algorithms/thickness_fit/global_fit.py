@@ -57,8 +57,8 @@ _FEWEST_TO_SETTLE = 4
 _OPEN_ORDERS = 0.5
 """Orders of thickness, times the relative bandwidth of the flats, up to which the mean response is open.
 
-The mean over the range misses that over a sensor by about the fringe amplitude over the number of orders; a wrong order
-turns the fringes at one end of the band against those at the other by the relative bandwidth.
+The mean over the range misses that over a sensor by about the fringe amplitude over the number of orders; a wrong
+order turns the fringes at one end of the band against those at the other by the relative bandwidth.
 """
 _MOST_MEANS = 4
 """Solutions of a narrow sensor whose mean response is tried on all cells."""
@@ -250,7 +250,8 @@ class _Solver:
         # Wrong orders make a sensor look thicker and thinner than it is; joined by phases alone it cannot jump.
         joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
         wavelength = state.templates.wavelength_nm
-        orders = max(_OPEN_ORDERS * float(wavelength.mean()) / max(float(np.ptp(wavelength)), 1e-3), _SENSOR_ORDERS)
+        bandwidth = max(float(np.ptp(wavelength)) / float(wavelength.mean()), 1e-6)
+        orders = max(_OPEN_ORDERS / bandwidth, _SENSOR_ORDERS)
         return not all(
             spans_orders(thickness, self.order_um, orders) for thickness in (state.thickness_um, joined)
         )
@@ -277,11 +278,13 @@ class _Solver:
     def _narrow(self, cells: Cells, first: _State) -> _State:
         """Orders of a sensor of few orders, whose mean response depends on them, and they on it.
 
-        With a mean response that is a little off, cells of some phases take the order of their neighbours' neighbours,
-        and no common thickness fits a relief so torn. So mean response and relief are found in turn.
+        With a mean response that is a little off, cells of some phases are joined a whole order off, and no common
+        thickness fits a relief so torn. So mean response and relief are found in turn.
         """
-        shapes, best, solved = [first.thickness_um], None, first
+        shapes: list[NDArray[np.float32]] = [first.thickness_um]
+        ranked: list[NarrowSensor] = []
         for _ in range(_MOST_SHAPES):
+            before = ranked[0].chi2 if ranked else np.inf
             ranked = settle_narrow_sensor(
                 first.cells,
                 first.templates,
@@ -289,13 +292,14 @@ class _Solver:
                 self.order_um,
                 range_um=self.range_um,
                 temper=self.temper,
+                earlier=ranked,
                 threads=self.threads,
             )
-            if best is not None and ranked[0].chi2 > (1.0 - _WORTHWHILE) * best.chi2:
-                break
-            best, solved = ranked[0], self._with_mean_of(ranked[0], cells, first)
-            rivals = [other for other in ranked[1:] if other.chi2 < _RIVAL * best.chi2]
-            if not rivals and best.agrees_with(solved.thickness_um, self.order_um):
+            best = ranked[0]
+            solved = self._with_mean_of(best, cells, first)
+            rivalled = any(other.chi2 < _RIVAL * best.chi2 for other in ranked[1:])
+            settled = not rivalled and best.agrees_with(solved.thickness_um, self.order_um)
+            if settled or best.chi2 > (1.0 - _WORTHWHILE) * before:
                 break
             known, shapes = shapes, []
             for other in ranked[:_MOST_MEANS]:
@@ -306,8 +310,6 @@ class _Solver:
                         shapes.append(shape)
             if all(_among(shape, known, self.order_um) for shape in shapes):
                 break
-        if best is None:
-            return first
         solved = replace(solved, common_slip=best.slip, searched=True)
         if spans_orders(solved.thickness_um, self.order_um):
             return replace(solved, range_um=self.range_um)
@@ -373,9 +375,7 @@ def spread_to_pixels(cells: Cells, values: NDArray[Any]) -> NDArray[Any]:
     return np.repeat(rows, np.diff(cells.x_edges), axis=1)
 
 
-def spans_orders(
-    thickness_um: NDArray[np.float32], order_um: float, orders: float = _SENSOR_ORDERS
-) -> bool:
+def spans_orders(thickness_um: NDArray[np.float32], order_um: float, orders: float = _SENSOR_ORDERS) -> bool:
     """Whether a sensor holds enough orders for the mean response over it to be known from its map."""
     values = thickness_um[np.isfinite(thickness_um)]
     return values.size > 0 and float(np.ptp(np.percentile(values, (2.0, 98.0)))) > orders * order_um

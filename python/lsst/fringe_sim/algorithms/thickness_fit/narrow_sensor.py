@@ -37,7 +37,9 @@ _FEW_CELLS = 120
 """Cells with which all starts are compared; only the best of these go on with more."""
 _STARTS_PER_ORDER = 12
 _FIRST_ROUNDS = 8
-_KEPT = 40
+_KEPT = 120
+_LEAST_KEPT = 12
+"""Solutions that go on to settle: of all shapes together, and of each. Most true ones are not yet among the first."""
 _COMPARED = 6
 _JOINT_STEPS = 25
 _LONGEST_STEP_UM = 0.02
@@ -116,6 +118,7 @@ def settle_narrow_sensor(
     *,
     range_um: tuple[float, float],
     temper: float,
+    earlier: Sequence[NarrowSensor] = (),
     threads: int = 2,
 ) -> list[NarrowSensor]:
     """Find the common thickness of a sensor together with its mean response; the best solutions, best first.
@@ -135,6 +138,8 @@ def settle_narrow_sensor(
         Possible thicknesses [µm].
     temper : `float`
         Independent cells per cell, as for `order_evidence`.
+    earlier : sequence of `NarrowSensor`, optional
+        Solutions from other ideas, which compete with the new ones.
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
@@ -148,13 +153,21 @@ def settle_narrow_sensor(
         starts = np.arange(range_um[0] + (middle - range_um[0]) % spacing, range_um[1], spacing)[:, None]
         tried = few.follow(templates, starts + shape[::stride], _FIRST_ROUNDS, threads)
         # Solutions of one shape compete only after they have settled: until then the mean hides what is wrong.
-        kept = _distinct(tried, order_um, _KEPT // len(shapes_um))
-        together += [_settle_sides(few, solution, templates, order_um) for solution in kept]
-    best = _distinct(together, order_um, _COMPARED)
+        kept = _distinct(tried, order_um, max(_KEPT // len(shapes_um), _LEAST_KEPT))
+        together += [_settle_together(few, solution, templates) for solution in kept]
+    hopeful = _distinct(together, order_um, 4 * _COMPARED)
+    sided = [_settle_sides(few, solution, templates, order_um) for solution in hopeful]
+    best = _distinct(sided, order_um, _COMPARED)
     again = np.concatenate([sample.starts(solution, shapes_um, stride) for solution in best])
     followed = sample.follow(templates, again, _FIRST_ROUNDS, threads)
     groups = zip(*[iter(followed)] * len(shapes_um), strict=True)
-    final = [_settle_sides(sample, min(group, key=lambda s: s.chi2), templates, order_um) for group in groups]
+    likely = [_settle_together(sample, min(group, key=lambda s: s.chi2), templates) for group in groups]
+    final = [_settle_sides(sample, solution, templates, order_um) for solution in likely]
+    final += [
+        _Solution(other.cell_um, other.templates.mean_response * sample.share, other.chi2)
+        for other in earlier
+        if np.array_equal(other.cell, sample.cell)
+    ]
     low, high = range_um
     inside = [s for s in final if low - 0.1 * order_um < s.mean_um < high + 0.1 * order_um] or final
     ranked = _distinct(inside, order_um, _COMPARED)
@@ -229,7 +242,9 @@ class _Sample:
         total = np.where(used, level, 0.0).sum(axis=0, dtype=float)
         mean = np.where(total > 0.0, total / np.maximum(number, 1), 1.0)
         share = mean.astype(np.float32)
-        return _Sample(level / share, weight * share**2, self.share * mean[: self.share.size], self.cell[::stride])
+        return _Sample(
+            level / share, weight * share**2, self.share * mean[: self.share.size], self.cell[::stride]
+        )
 
     def follow(
         self, templates: FringeTemplates, starts_um: FloatArray, rounds: int, threads: int
@@ -247,9 +262,7 @@ class _Sample:
 
         def work(item: int) -> None:
             thickness = starts_um[item].astype(np.float32)
-            chi2[item] = _follow(
-                self.level, self.weight, table, origin, step, thickness, rounds, mean[item]
-            )
+            chi2[item] = _follow(self.level, self.weight, table, origin, step, thickness, rounds, mean[item])
             out[item] = thickness
 
         run_threaded(work, len(starts_um), threads)
@@ -426,11 +439,11 @@ def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemp
 def _settle_sides(
     sample: _Sample, solution: _Solution, templates: FringeTemplates, order_um: float
 ) -> _Solution:
-    """Settle together, and again with the cells that had taken the wrong side of a crest on the other one.
+    """Settle a solution again with the cells that had taken the wrong side of a crest on the other one.
 
     At neighbouring wavelengths the two sides of a crest look alike until the mean response is nearly right.
     """
-    settled = _settle_together(sample, solution, templates)
+    settled = solution
     for _ in range(_SIDE_ROUNDS):
         moved = sample.better_sides(settled, templates, order_um)
         if np.abs(moved - settled.thickness_um).max() < _SIDE_MOVE * order_um:
@@ -447,5 +460,5 @@ def _common_sigma(sample: _Sample, solution: _Solution, templates: FringeTemplat
     together = _Together.of(sample, solution.thickness_um, templates)
     everywhere = np.ones(len(solution.thickness_um))
     # What is added keeps rounding from turning a direction that nothing decides into a certain one.
-    variance = everywhere @ together.solve(everywhere, 1e-12 * float(together.diagonal.max()))
-    return float(np.sqrt(max(variance, 0.0)) / everywhere.size)
+    variance = float(everywhere @ together.solve(everywhere, 1e-12 * float(together.diagonal.max())))
+    return float(np.sqrt(max(variance, 0.0))) / everywhere.size

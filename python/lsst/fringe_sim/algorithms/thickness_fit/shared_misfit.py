@@ -23,7 +23,7 @@ _SHIFTS = (-3, -2, -1, 1, 2, 3)
 _NOISE_SIGMA = 3.0
 """Standard deviations of its own uncertainty by which the shared misfit is believed to be smaller."""
 _APART = 4.0
-"""Distance of two pixels, in standard deviations of the kernel that smoothed the flats, at which their noise differs."""
+"""Distance at which the noise of two pixels is their own, in standard deviations of the kernel that smoothed them."""
 
 
 def doubt_from_shared_misfit(
