@@ -64,3 +64,21 @@ def test_a_misfit_that_neighbours_share_is_no_certainty(model, rng) -> None:
     thickness = truth.astype(np.float32)
     assert doubt_from_shared_misfit(data, right, thickness, order) < 1e-6
     assert doubt_from_shared_misfit(data, spoilt, thickness, order) > 0.05
+
+
+def test_a_flat_sensor_says_how_sure_it_is(model, rng) -> None:
+    """Too flat for the noise: what is said to be sure is right, and what is wrong has been said to be likely."""
+    said, wrong = [], []
+    for _ in range(24):
+        bands = np.sort(rng.choice(12, rng.integers(4, 8), replace=False))
+        truth = random_field((32, 40), rng, mean=rng.uniform(9.0, 14.0), span=rng.choice([0.005, 0.01, 0.02]))
+        cube = relative_flats(truth, model, rng, 0.008, TEN_NM[bands])
+        fitted = fit_thickness(cube, model, range_um=(8.0, 15.0))
+        said.append(float(np.median(fitted.slip_probability)))
+        wrong.append(float(np.median(np.abs(fitted.value - truth)) > HALF_ORDER_UM))
+    doubtful = np.array(said) > 0.01
+    assert np.sum(np.array(wrong)[~doubtful]) <= 1
+    expected = np.sum(said)
+    assert (
+        abs(np.sum(wrong) - expected) < 3.0 * np.sqrt(np.sum(np.array(said) * (1.0 - np.array(said)))) + 1.0
+    )

@@ -44,6 +44,8 @@ _LARGEST_LOSS = 1.0
 
 Slopes inside the cells make up for most of it; beyond this, cells of some phases take the wrong order all the same.
 """
+_NINTH_DECILE = 1.28
+"""Of a normal distribution, in standard deviations."""
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
@@ -512,5 +514,7 @@ def _structure(
                     square = good**2
                     # Spikes are cut: neither a fringe nor noise has squares so far above the median.
                     square = np.minimum(square, 8.0 * np.median(square))
-                    values.append((square.mean() - 2.0 * noise) / (2.0 * signal))
+                    # Where noise rules, the ninth decile would be that of the noise of these means.
+                    scatter = _NINTH_DECILE * 2.0 * noise * np.sqrt(2.0 / good.size)
+                    values.append((square.mean() - 2.0 * noise - scatter) / (2.0 * signal))
     return float(np.percentile(values, 90)) if values else np.inf
