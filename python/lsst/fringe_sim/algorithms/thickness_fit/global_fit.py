@@ -62,6 +62,8 @@ _OPEN_ORDERS = 0.5
 The mean over the range misses that over a sensor by about the fringe amplitude over the number of orders; a wrong
 order turns the fringes at one end of the band against those at the other by the relative bandwidth.
 """
+_SURELY_MORE = 4.0
+"""Times that many orders with which a sensor holds enough of them even if a good part is wrong."""
 _MOST_MEANS = 4
 """Solutions of a narrow sensor whose mean response is tried on all cells."""
 _MOST_SHAPES = 4
@@ -249,11 +251,13 @@ class _Solver:
             return False  # of fewer wavelengths nothing is believed, so there is nothing to settle
         if not np.isfinite(state.thickness_um).any() or not is_own_mean(state.cells, state.templates):
             return False
-        # Wrong orders make a sensor look thicker and thinner than it is; joined by phases alone it cannot jump.
-        joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
         wavelength = state.templates.wavelength_nm
         bandwidth = max(float(np.ptp(wavelength)) / float(wavelength.mean()), 1e-6)
         orders = max(_OPEN_ORDERS / bandwidth, _SENSOR_ORDERS)
+        if spans_orders(state.thickness_um, self.order_um, _SURELY_MORE * orders):
+            return False
+        # Wrong orders make a sensor look thicker and thinner than it is; joined by phases alone it cannot jump.
+        joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
         return not all(
             spans_orders(thickness, self.order_um, orders) for thickness in (state.thickness_um, joined)
         )
