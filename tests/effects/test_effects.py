@@ -8,7 +8,14 @@ import math
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.effects import EFFECTS, Effect, ImageGeometry, Parameter, activate_effects
+from lsst.fringe_sim.effects import (
+    EFFECTS,
+    Effect,
+    ImageGeometry,
+    Parameter,
+    activate_effects,
+    apply_to_image,
+)
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.model import FringeModel
 
@@ -150,3 +157,29 @@ def test_contrast_loss_scales_the_fringe_about_its_mean(base) -> None:
     full = base.response(phase, WAVELENGTHS)
     damped = base.with_effects({"contrast_loss.factor": 0.25}).response(phase, WAVELENGTHS)
     np.testing.assert_allclose(np.ptp(damped, axis=1), 0.25 * np.ptp(full, axis=1), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter"),
+    [
+        (effect, parameter)
+        for effect, parameter in CASES
+        if effect.acts_on == "image" and effect.name not in {"non_linearity", "crosstalk"}
+    ],
+    ids=lambda item: item.name,
+)
+def test_what_is_done_to_an_image_leaves_its_mean(effect, parameter, base) -> None:
+    """Otherwise electrons that are added beside it would be measured in units that the effect changed.
+
+    Charge that is lost, or counted twice, is no pattern.
+    """
+    rng = np.random.default_rng(2)
+    geometry = ImageGeometry.of_pixels((80, 80), WAVELENGTHS, 20_000.0)
+    image = 1.0 + 0.02 * rng.standard_normal((3, 80, 80))
+    image /= image.mean(axis=(1, 2), keepdims=True)
+    value = float(np.clip(4.0 * parameter.prior_scale, *parameter.bounds))
+    changed = base.with_effects({effect.name: {parameter.name: value}}).effects[0]
+    after = apply_to_image([changed], base.base_system, image, geometry)
+    assert np.abs(after - image).max() > 1e-6
+    # Noise correlates a little with the pattern, and the ends of 80 samples are not those of the sensor.
+    np.testing.assert_allclose(after.mean(axis=(1, 2)), 1.0, atol=0.03 * np.abs(after - image).max())

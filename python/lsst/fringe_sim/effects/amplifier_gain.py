@@ -26,6 +26,6 @@ class AmplifierGain(PlainNullEffect):
     def change_image(
         self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
     ) -> FloatArray:
-        """Divide by the gain of the amplifier that reads the sample."""
-        gain = np.array([1.0 + values[name] for name in AMPLIFIERS])
-        return image / gain[geometry.amplifier]
+        """Divide by the gain of the amplifier that reads the sample; a gain common to all is one of the level."""
+        counts = 1.0 / np.array([1.0 + values[name] for name in AMPLIFIERS])
+        return image * (counts / counts.mean())[geometry.amplifier]

@@ -114,7 +114,8 @@ class Effect(ABC):
     ) -> FloatArray:
         """Return the image cube ``[W, y, x]`` with the effect in it; must not write into ``image``.
 
-        The image is in units of its mean level; what is added to it in electrons is divided by the level.
+        The image is in units of its mean level, and stays so: patterns have a mean of one over the sensor, and what
+        is added in electrons is a part of the level.
         """
         return image
 

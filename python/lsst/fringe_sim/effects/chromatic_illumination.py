@@ -37,7 +37,7 @@ class ChromaticIllumination(PlainNullEffect):
     def change_image(
         self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
     ) -> FloatArray:
-        """Multiply each plane by its pattern."""
+        """Multiply each plane by its pattern over its mean."""
         v, u = geometry.v, geometry.u
         pattern = 0.5 * values["gradient_x"] * u + 0.5 * values["gradient_y"] * v
         pattern = pattern + values["curvature_xx"] * u**2 + values["curvature_xy"] * u * v
@@ -45,4 +45,5 @@ class ChromaticIllumination(PlainNullEffect):
         wavelength = geometry.wavelength_nm
         middle = 0.5 * (wavelength.min() + wavelength.max())
         colour = ((wavelength - middle) / _REACH_NM)[:, np.newaxis, np.newaxis]
-        return image * np.maximum(1.0 + colour * pattern, 0.0)
+        mean = 1.0 + colour * ((values["curvature_xx"] + values["curvature_yy"]) / 3.0)
+        return image * (np.maximum(1.0 + colour * pattern, 0.0) / mean)

@@ -41,10 +41,11 @@ class Illumination(PlainNullEffect):
     def change_image(
         self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
     ) -> FloatArray:
-        """Multiply by the pattern."""
+        """Multiply by the pattern over its mean."""
         v, u = geometry.v, geometry.u
         pattern = 1.0 + 0.5 * values["gradient_x"] * u + 0.5 * values["gradient_y"] * v
         pattern = pattern + values["curvature_xx"] * u**2 + values["curvature_xy"] * u * v
         pattern = pattern + values["curvature_yy"] * v**2 + values["cubic_xxx"] * u**3
         pattern = pattern + values["cubic_xxy"] * u**2 * v + values["cubic_xyy"] * u * v**2
-        return image * (pattern + values["cubic_yyy"] * v**3)
+        pattern = pattern + values["cubic_yyy"] * v**3
+        return image * (pattern / (1.0 + (values["curvature_xx"] + values["curvature_yy"]) / 3.0))

@@ -24,5 +24,7 @@ class MidlineStep(PlainNullEffect):
     def change_image(
         self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
     ) -> FloatArray:
-        """Scale the upper half."""
-        return np.where(geometry.upper_half, image * (1.0 + values["fraction"]), image)
+        """Scale the upper half, and both so that the mean stays."""
+        fraction = values["fraction"]
+        factor = np.where(geometry.upper_half, 1.0 + fraction, 1.0) / (1.0 + 0.5 * fraction)
+        return image * factor

@@ -23,5 +23,6 @@ class Vignetting(PlainNullEffect):
     def change_image(
         self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
     ) -> FloatArray:
-        """Multiply by the pattern."""
-        return image * (1.0 - 0.5 * values["corner"] * (geometry.u**2 + geometry.v**2))
+        """Multiply by the pattern over its mean."""
+        corner = values["corner"]
+        return image * ((1.0 - 0.5 * corner * (geometry.u**2 + geometry.v**2)) / (1.0 - corner / 3.0))
