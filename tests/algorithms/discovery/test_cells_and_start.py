@@ -13,7 +13,7 @@ from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
 from lsst.fringe_sim.algorithms.discovery.channels import measure_channels
 from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
+from lsst.fringe_sim.algorithms.discovery.forward import MOST_ROWS, Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.search import _chance_of
 from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector
@@ -287,6 +287,10 @@ def test_moved_wavelengths_recompute_only_what_they_move(monkeypatch: pytest.Mon
     np.testing.assert_allclose(moved, fresh, rtol=0.0, atol=1e-9)
     forward.table({**settings, "temperature.kelvin": 191.0})
     assert computed == [1, 12, 12]
+    # Rows that all settings share may be dropped, and are then made again.
+    for error in np.linspace(-1.0, 1.0, 10 * MOST_ROWS * len(WAVELENGTHS)):
+        forward.table({"wavelength_jitter.at_930": float(error)})
+    assert len(forward._rows) <= MOST_ROWS * len(WAVELENGTHS)
 
 
 def test_only_parameters_of_exposures_that_there_are_are_free() -> None:

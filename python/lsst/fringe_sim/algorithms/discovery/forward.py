@@ -137,10 +137,11 @@ class Forward:
             response = model.respond_on_grid(
                 part, low_um, TABLE_STEP_UM, count, wavelength[rows], tolerance=TABLE_TOLERANCE
             )
-            while len(self._rows) > MOST_ROWS * len(keys):
-                self._rows.pop(next(iter(self._rows)))
             self._rows.update(zip(fresh, response, strict=True))
-        return np.stack([self._rows[key] for key in keys])
+        result = np.stack([self._rows[key] for key in keys])
+        while len(self._rows) > MOST_ROWS * len(keys):
+            self._rows.pop(next(iter(self._rows)))
+        return result
 
     def _moves_wavelengths(self, key: str) -> bool:
         return self._effect(key.partition(".")[0]).moves_wavelengths
