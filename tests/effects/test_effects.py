@@ -15,10 +15,13 @@ from lsst.fringe_sim.effects import (
     Parameter,
     activate_effects,
     apply_to_image,
+    apply_to_sky,
 )
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
+from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.model import FringeModel
 
+SKY = SkySpectrum.dark()
 WAVELENGTHS = np.array([900.0, 960.0, 985.0])
 CASES = [(effect, parameter) for effect in EFFECTS for parameter in effect.parameters]
 IDS = [f"{effect.name}.{parameter.name}" for effect, parameter in CASES]
@@ -36,9 +39,14 @@ def thickness() -> np.ndarray:
 
 
 def observe(model: FringeModel, thickness: np.ndarray, wavelengths: np.ndarray = WAVELENGTHS) -> np.ndarray:
-    """Response, followed by the image of a flat of 20 000 electrons; a change of either is a change."""
+    """Response, image of a flat of 20 000 electrons, and light of the night sky; a change of any is a change."""
     geometry = ImageGeometry.of_pixels(thickness.shape, wavelengths, 20_000.0)
-    return np.concatenate([model.response(thickness, wavelengths), model.flat_image(thickness, geometry)])
+    flats = model.response(thickness, wavelengths), model.flat_image(thickness, geometry)
+    sky = apply_to_sky(model.effects, model.base_system, SKY)
+    lines = sky.lines.photon_radiance * sky.lines.transmission
+    return np.concatenate(
+        [*(part.ravel() for part in flats), lines, *(c.photon_radiance for c in sky.continua)]
+    )
 
 
 def exposures_of(parameter: Parameter) -> np.ndarray:
@@ -67,7 +75,7 @@ def test_names_are_unique() -> None:
 def test_every_effect_is_described(effect: Effect) -> None:
     assert effect.title
     assert effect.reference
-    assert effect.acts_on in {"stack", "illumination", "response", "image"}
+    assert effect.acts_on in {"stack", "illumination", "response", "image", "spectrum"}
     for parameter in effect.parameters:
         assert parameter.description
         assert parameter.bounds[0] < parameter.bounds[1]

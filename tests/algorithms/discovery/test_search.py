@@ -42,6 +42,8 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
         verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0))
         assert verdict.verdict == "no_discrepancy"
         assert verdict.effects == ()
+        # Flats do not see the spectrum of the night sky.
+        assert not {"sky_continuum", "oh_bands"} & {item["name"] for item in verdict.candidates}
 
 
 @pytest.mark.slow

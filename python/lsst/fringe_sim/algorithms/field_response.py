@@ -34,6 +34,7 @@ from .sky_frame import (
     error_samples,
     is_band,
     sky_response,
+    sky_with_effects,
     spectral_error,
     split_components,
     tabulate_components,
@@ -437,6 +438,7 @@ def angular_response(
         raise InputError("effects", sorted(model.effect_settings), "none that changes the beam")
     fineness = SkyQuadrature() if quadrature is None else quadrature
     band = bandpass_of(model) if bandpass is None else bandpass
+    sky = sky_with_effects(model, sky)
     table, photons, level = tabulate_components(model, sky, band, thickness_range_um, fineness)
     grid = (table.start_um, table.step_um, table.values.shape[1])
     lines, continua = split_components(sky, band, fineness.continuum_step_nm)

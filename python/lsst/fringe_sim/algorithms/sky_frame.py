@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..effects import ImageGeometry, apply_to_image
+from ..effects import ImageGeometry, apply_to_image, apply_to_sky
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.bandpass import Bandpass
 from ..instrument.night import NightHistory
@@ -224,6 +224,7 @@ def sky_response(
     """
     fineness = SkyQuadrature() if quadrature is None else quadrature
     band = bandpass_of(model) if bandpass is None else bandpass
+    sky = sky_with_effects(model, sky)
     table, photons, level = tabulate_components(model, sky, band, thickness_range_um, fineness)
     samples = error_samples((table.start_um, table.stop_um))
     error = spectral_error(model, sky, band, fineness, samples)
@@ -231,6 +232,11 @@ def sky_response(
     lines, continua = split_components(sky, band, fineness.continuum_step_nm)
     names = tuple(item.name for item in [*lines, *continua])
     return SkyResponse(names, photons, level, table, error / level, sky.airmass)
+
+
+def sky_with_effects(model: FringeModel, sky: SkySpectrum) -> SkySpectrum:
+    """The night sky with those effects of a model that act on it."""
+    return apply_to_sky(model.effects, model.base_system, sky)
 
 
 def tabulate_components(
@@ -450,7 +456,7 @@ def component_electrons(
     to_electrons = exposure_s * model.setup.effective_area_m2 * model.setup.pixel_scale_arcsec**2
     return {
         item.name: to_electrons * float(item.photons @ bandpass.quantum_efficiency(item.wavelength_nm))
-        for item in sky.components(bandpass)
+        for item in sky_with_effects(model, sky).components(bandpass)
     }
 
 

@@ -13,6 +13,7 @@ from .base import (
     activate_effects,
     apply_to_image,
     apply_to_response,
+    apply_to_sky,
     apply_to_system,
 )
 from .black_coating import BlackCoating
@@ -28,6 +29,7 @@ from .epoxy_index import EpoxyIndex
 from .gate_oxide import GateOxide
 from .gate_thickness import GateThickness
 from .ghost_pedestal import GhostPedestal
+from .hot_rotation import HotRotation
 from .illumination import Illumination
 from .image_geometry import AMPLIFIERS, ImageGeometry
 from .interface_roughness import InterfaceRoughness
@@ -36,14 +38,18 @@ from .line_triangle import LineTriangle
 from .line_wing import LineWing
 from .midline_step import MidlineStep
 from .non_linearity import NonLinearity
+from .oh_bands import OHBands
+from .rotational_temperature import RotationalTemperature
 from .silicon_absorption import SiliconAbsorption
 from .silicon_thickness import SiliconThickness
+from .sky_continuum import SkyContinuum
 from .support_coherence import SupportCoherence
 from .support_index import SupportIndex
 from .temperature import Temperature
 from .thickness_spread import ThicknessSpread
 from .tilt import Tilt
 from .vignetting import Vignetting
+from .water_vapour import WaterVapour
 from .wavelength_jitter import WavelengthJitter
 from .wavelength_offset import WavelengthOffset
 from .wavelength_scale import WavelengthScale
@@ -59,6 +65,7 @@ __all__ = [
     "activate_effects",
     "apply_to_image",
     "apply_to_response",
+    "apply_to_sky",
     "apply_to_system",
 ]
 
@@ -103,5 +110,11 @@ EFFECTS: tuple[Effect, ...] = (
     Crosstalk(),
     AmplifierGain(),
     AmplifierOffset(),
+    # night sky
+    RotationalTemperature(),
+    HotRotation(),
+    OHBands(),
+    SkyContinuum(),
+    WaterVapour(),
 )
 """Every effect that the model knows, in the order in which they are applied."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..instrument.sky import SkySpectrum
 from ..optics.system import OpticalSystem
 from .image_geometry import ImageGeometry
 
@@ -27,6 +28,7 @@ __all__ = [
     "activate_effects",
     "apply_to_image",
     "apply_to_response",
+    "apply_to_sky",
     "apply_to_system",
 ]
 
@@ -82,14 +84,14 @@ class ResponseContext:
 class Effect(ABC):
     """A physical effect with named parameters.
 
-    Subclasses are final. They override `change_system`, `change_response` or `change_image`, or several of them; each
-    is only called when some parameter differs from its null value.
+    Subclasses are final. They override `change_system`, `change_response`, `change_image` or `change_sky`, or several
+    of them; each is only called when some parameter differs from its null value.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
     acts_on: ClassVar[str]
-    """``stack``, ``illumination``, ``response`` or ``image``."""
+    """``stack``, ``illumination``, ``response``, ``image`` or ``spectrum`` (of the night sky)."""
     laboratory_only: ClassVar[bool] = False
     """Whether it belongs to lamp, bench or cryostat, which a sensor does not take along to the telescope."""
     couples_pixels: ClassVar[bool] = False
@@ -118,6 +120,10 @@ class Effect(ABC):
         is added in electrons is a part of the level.
         """
         return image
+
+    def change_sky(self, sky: SkySpectrum, values: Mapping[str, float]) -> SkySpectrum:
+        """Return the night sky with the effect in it."""
+        return sky
 
     @abstractmethod
     def null_values(self, system: OpticalSystem) -> dict[str, float]:
@@ -264,6 +270,14 @@ def apply_to_image(
         if not item.is_null(system):
             image = item.effect.change_image(image, item.complete_values(system), geometry)
     return image
+
+
+def apply_to_sky(active: Iterable[ActiveEffect], system: OpticalSystem, sky: SkySpectrum) -> SkySpectrum:
+    """Night sky with all effects in it; parameters as of `apply_to_image`."""
+    for item in active:
+        if not item.is_null(system):
+            sky = item.effect.change_sky(sky, item.complete_values(system))
+    return sky
 
 
 def _flatten(settings: Mapping[str, Any]) -> Iterable[tuple[str, str, Any]]:

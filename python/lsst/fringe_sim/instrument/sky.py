@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -68,17 +68,26 @@ class EmissionLines:
         Molecular transmission of the air at the wavelength of the line, zenith.
     band : `numpy.ndarray` of `str`, shape ``(N,)``
         Vibrational band, e.g. ``8-4``.
+    rotational_energy_cm : `numpy.ndarray`, shape ``(N,)``, optional
+        Energy of the upper level above the lowest of its vibrational level [1/cm], if it is known.
     """
 
     wavelength_nm: FloatArray
     photon_radiance: FloatArray
     transmission: FloatArray
     band: NDArray[np.str_]
+    rotational_energy_cm: FloatArray | None = None
 
     def __post_init__(self) -> None:
         shapes = {
             np.shape(array)
-            for array in (self.wavelength_nm, self.photon_radiance, self.transmission, self.band)
+            for array in (
+                self.wavelength_nm,
+                self.photon_radiance,
+                self.transmission,
+                self.band,
+                self.band if self.rotational_energy_cm is None else self.rotational_energy_cm,
+            )
         }
         if len(shapes) != 1 or len(next(iter(shapes))) != 1:
             raise InputError("shapes of the line list", shapes, "one common shape (lines,)")
@@ -150,6 +159,7 @@ class EmissionLines:
             radiance[order],
             np.asarray(table["transmission"], dtype=float)[order],
             np.asarray(table["band"], dtype=str)[order],
+            np.asarray(table["E_rot"], dtype=float)[order],
         )
         return lines.scaled(band_scale or {})
 
@@ -187,7 +197,32 @@ class EmissionLines:
             self.photon_radiance[chosen],
             self.transmission[chosen],
             self.band[chosen],
+            None if self.rotational_energy_cm is None else self.rotational_energy_cm[chosen],
         )
+
+    def with_rotation(self, factor: Callable[[FloatArray], FloatArray]) -> EmissionLines:
+        """Lines of other rotational populations; every band keeps its photons.
+
+        Parameters
+        ----------
+        factor : callable
+            Factor on the population at rotational energies [1/cm].
+
+        Raises
+        ------
+        InputError
+            The energies of the lines are not known.
+        """
+        if self.rotational_energy_cm is None:
+            raise InputError(
+                "rotational energies of the lines", None, "known, as those of `EmissionLines.oh`"
+            )
+        changed = self.photon_radiance * factor(self.rotational_energy_cm)
+        for name in self.bands:
+            own = self.band == name
+            total = float(changed[own].sum())
+            changed[own] *= float(self.photon_radiance[own].sum()) / total if total > 0.0 else 1.0
+        return replace(self, photon_radiance=changed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,14 +129,17 @@ def discover(
     say = report or (lambda text: None)
     model = setup if isinstance(setup, FringeModel) else FringeModel.from_setup(setup)
     check_setup(cube, model)
+    known = {item.effect.name for item in model.effects}
+    # Flats do not see the spectrum of the night sky.
+    seen = [effect for effect in effects if effect.acts_on != "spectrum" or effect.name in known]
     # Many small matrices: threads of the linear algebra would wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
         poor = why_too_poor(cube, model)
         if poor:
             return _no_answer(model, poor, cube)
         say("fitting the thickness with the unchanged model")
-        prepared = prepare(cube, model, effects, chosen.most_cells)
-        return _Search(prepared, model, effects, chosen, rng, say).run()
+        prepared = prepare(cube, model, seen, chosen.most_cells)
+        return _Search(prepared, model, seen, chosen, rng, say).run()
 
 
 def _no_answer(model: FringeModel, reason: str, cube: FringeCube) -> Verdict:
