@@ -11,7 +11,7 @@ import pytest
 
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
-from lsst.fringe_sim.algorithms.discovery.channels import measure_channels
+from lsst.fringe_sim.algorithms.discovery.channels import echo_channel, measure_channels
 from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import MOST_ROWS, Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
@@ -304,3 +304,22 @@ def test_only_parameters_of_exposures_that_there_are_are_free() -> None:
         geometry = ImageGeometry.of_pixels((4, 4), np.array(waves), 20_000.0)
         forward = Forward(FringeModel.from_setup("ts8_e2v"), EFFECTS, geometry, 1, (14.0, 16.0))
         assert [item.parameter for item in coordinates_of(effect, forward, thickness)] == names
+
+
+def test_a_misfit_of_the_field_is_no_echo() -> None:
+    """What a thickness can do leaves the test for copies as it is; a faint mirrored copy is seen all the same."""
+    truth = _smooth_field(32, 32)
+    cells = bin_cube(_cube(truth, {}, 2e4, 5), 1)
+    model = FringeModel.from_setup("ts8_e2v")
+    forward = Forward.of_cells(model, EFFECTS, cells, (12.0, 18.0))
+    basis = SplineBasis.of_grid(truth.shape, 4.0)
+    problem = Problem(cells, forward, basis, np.eye(len(WAVELENGTHS)))
+    null = fit_model(problem, (), np.zeros(0), basis.fit(truth, np.ones(truth.shape)))
+    state = Selector(problem, EFFECTS[:1], null, np.full(len(WAVELENGTHS), 1.6)).state(null)
+    plain = echo_channel(state)
+    assert plain.probability > 1e-3
+    bumps = 0.02 * np.cos(np.arange(32) / 3.0) * np.ones((32, 1))
+    bent = replace(state, residual=state.residual + state.design.slope * bumps)
+    assert echo_channel(bent).statistic == pytest.approx(plain.statistic)
+    copy = 0.1 * state.whiten(state.value - 1.0)[:, ::-1, ::-1]  # type: ignore[operator]
+    assert echo_channel(replace(state, residual=state.residual + copy)).probability < 1e-6

@@ -235,14 +235,16 @@ def _band_channel(name: str, power: FloatArray, planes: int, filled: float) -> C
 def echo_channel(state: State) -> Channel:
     """Copies of the image in the residual: moved (cross-talk) or mirrored (reflections), at any distance.
 
-    The residual is correlated with the whitened pattern, and each sum is over its standard deviation.
+    The residual is correlated with the whitened pattern, and each sum is over its standard deviation. What a change
+    of thickness does to a cell is taken out of the residual first: where the field is a little too smooth, its
+    misfit has the colours of a fringe, as a copy of the image has. The standard deviation is then an upper bound.
     """
     weight = state.whiten(np.ones(state.value.shape))  # type: ignore[operator]
     pattern = state.value - state.value.mean(axis=(1, 2), keepdims=True)
     scale = np.abs(weight).max(axis=(1, 2), keepdims=True)
     used = (weight != 0.0).astype(float)
     shape = tuple(next_fast_len(2 * size - 1, real=True) for size in pattern.shape[1:])
-    seen = rfft2(state.residual * used, shape), rfft2(used, shape)
+    seen = rfft2(_beside_thickness(state) * used, shape), rfft2(used, shape)
     largest, looks = 0.0, 0
     for rows, columns in itertools.product((1, -1), (1, -1)):
         copy = (scale * pattern)[:, ::rows, ::columns]
@@ -256,6 +258,16 @@ def echo_channel(state: State) -> Channel:
             looks += int(enough.sum())
     single = float(chi2_distribution.sf(largest, 1))
     return Channel("echoes", largest, 1.0, float(-np.expm1(looks * np.log1p(-min(single, 1.0 - 1e-16)))))
+
+
+def _beside_thickness(state: State) -> FloatArray:
+    """Whitened residual without what a thickness of its own would explain in each cell."""
+    slope = state.design.slope
+    square = (slope**2).sum(axis=0)
+    along = np.divide(
+        (slope * state.residual).sum(axis=0), square, out=np.zeros(square.shape), where=square > 0.0
+    )
+    return np.asarray(state.residual - slope * along)
 
 
 def _is_far(shape: tuple[int, ...], nearest: int) -> NDArray[np.bool_]:
