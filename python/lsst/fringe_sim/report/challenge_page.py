@@ -114,7 +114,8 @@ def accuracy_figure(result: ChallengeResult) -> Figure:
 
 def _draw_accuracy(axes: Axes, table: Table) -> None:
     place = np.arange(len(table))
-    labels = [f"{row['signal_to_noise_from']:g}–{row['signal_to_noise_to']:g}" for row in table]
+    edges = [(row["signal_to_noise_from"], row["signal_to_noise_to"]) for row in table]
+    labels = [f"{low:g}–{high:g}" if np.isfinite(high) else f"above {low:g}" for low, high in edges]
     axes.bar(place - 0.2, list(table["right_class"]), 0.4, label="right class")
     axes.bar(place + 0.2, list(table["exact"]), 0.4, label="exactly that name", hatch="//", edgecolor="white")
     for k, row in enumerate(table):
