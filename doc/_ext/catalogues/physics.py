@@ -20,6 +20,7 @@ PLACES = {
     "illumination": "On the light of a flat field",
     "response": "On the response, after the optics",
     "image": "On the image, from the light to the file",
+    "spectrum": "Night sky",
 }
 
 PLANE_MEANINGS = {
