@@ -45,6 +45,13 @@ def _cube(thickness: np.ndarray, settings: dict[str, float], level: float, seed:
     )
 
 
+def _problem(cells: CellData, truth: np.ndarray) -> tuple[Problem, np.ndarray]:
+    """A fit of some cells with a spline of four cells, and the coefficients of their true thickness."""
+    forward = Forward.of_cells(FringeModel.from_setup("ts8_e2v"), EFFECTS, cells, (12.0, 18.0))
+    basis = SplineBasis.of_grid(truth.shape, 4.0)
+    return Problem(cells, forward, basis, np.eye(len(WAVELENGTHS))), basis.fit(truth, np.ones(truth.shape))
+
+
 def test_variance_from_the_counts_no_longer_draws_a_mean_down() -> None:
     """Few electrons: weights from the counts themselves put a weighted mean one electron low."""
     level, shape = 60.0, (3, 200, 200)
@@ -126,12 +133,8 @@ def test_neighbouring_minima_are_in_the_uncertainty() -> None:
 def test_a_residual_of_known_size_is_not_called_noise_by_mistake() -> None:
     """What the description of an effect may be wrong by raises the chance of a residual, and nothing else."""
     cells = bin_cube(_cube(_smooth_field(20, 20), {"contrast_loss.factor": 0.97}, 2e4, 9), 1)
-    model = FringeModel.from_setup("ts8_e2v")
-    start = _smooth_field(20, 20)
-    forward = Forward.of_cells(model, EFFECTS, cells, (12.0, 18.0))
-    basis = SplineBasis.of_grid(start.shape, 4.0)
-    problem = Problem(cells, forward, basis, np.eye(len(WAVELENGTHS)))
-    null = fit_model(problem, (), np.zeros(0), basis.fit(start, np.ones(start.shape)))
+    problem, start = _problem(cells, _smooth_field(20, 20))
+    null = fit_model(problem, (), np.zeros(0), start)
     selector = Selector(problem, EFFECTS[:1], null, np.full(len(WAVELENGTHS), 1.6))
     state = selector.state(null)
     strict, lenient = (
@@ -147,13 +150,9 @@ def test_a_fit_far_behind_gives_up_and_one_that_is_near_does_not() -> None:
     """Thicker silicon in place of a wide bandpass: hopeless beside the right effect, converged beside its own fit."""
     truth = _smooth_field(24, 24)
     cells = bin_cube(_cube(truth, {"bandwidth.fwhm": 4.0}, 2e5, 11), 1)
-    model = FringeModel.from_setup("ts8_e2v")
-    forward = Forward.of_cells(model, EFFECTS, cells, (12.0, 18.0))
-    basis = SplineBasis.of_grid(truth.shape, 4.0)
-    problem = Problem(cells, forward, basis, np.eye(len(WAVELENGTHS)))
-    start = basis.fit(truth, np.ones(truth.shape))
+    problem, start = _problem(cells, truth)
     right, wrong = (
-        coordinates_of(next(effect for effect in EFFECTS if effect.name == name), forward, truth)
+        coordinates_of(next(effect for effect in EFFECTS if effect.name == name), problem.forward, truth)
         for name in ("bandwidth", "silicon_thickness")
     )
     rival = fit_model(problem, right, np.array([0.1]), start).chi2
@@ -310,11 +309,8 @@ def test_a_misfit_of_the_field_is_no_echo() -> None:
     """What a thickness can do leaves the test for copies as it is; a faint mirrored copy is seen all the same."""
     truth = _smooth_field(32, 32)
     cells = bin_cube(_cube(truth, {}, 2e4, 5), 1)
-    model = FringeModel.from_setup("ts8_e2v")
-    forward = Forward.of_cells(model, EFFECTS, cells, (12.0, 18.0))
-    basis = SplineBasis.of_grid(truth.shape, 4.0)
-    problem = Problem(cells, forward, basis, np.eye(len(WAVELENGTHS)))
-    null = fit_model(problem, (), np.zeros(0), basis.fit(truth, np.ones(truth.shape)))
+    problem, start = _problem(cells, truth)
+    null = fit_model(problem, (), np.zeros(0), start)
     state = Selector(problem, EFFECTS[:1], null, np.full(len(WAVELENGTHS), 1.6)).state(null)
     plain = echo_channel(state)
     assert plain.probability > 1e-3

@@ -11,7 +11,7 @@ import heapq
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,9 @@ from scipy.interpolate import RegularGridInterpolator
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..resources import read_table
-from .bandpass import Bandpass
+
+if TYPE_CHECKING:  # filters take time to import, and effects do without
+    from .bandpass import Bandpass
 
 __all__ = [
     "ContinuumTerm",

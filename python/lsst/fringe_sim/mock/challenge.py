@@ -33,10 +33,7 @@ from .raw_frames import setup_optics
 from .thickness import random_field
 
 __all__ = [
-    "CASE_KINDS",
     "OUTSIDERS",
-    "CaseResult",
-    "ChallengeResult",
     "SealedCase",
     "draw_case",
     "run_challenge",

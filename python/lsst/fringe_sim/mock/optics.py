@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import functools
 import math
-from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -199,14 +198,10 @@ class FlatFieldOptics:
         return nominal_nm + error + self._single_error(nominal_nm)
 
     def _single_error(self, nominal_nm: float) -> float:
-        """Error of this exposure alone [nm]: each node reaches as far as its neighbours."""
-        places = [place for place, _ in self.wavelength_errors_nm]
-        if not places:
+        """Error of this exposure alone [nm]."""
+        if not self.wavelength_errors_nm:
             return 0.0
-        inside = min(max(nominal_nm, places[0]), places[-1])
-        above = min(max(bisect_left(places, inside), 1), len(places) - 1)
-        (low, first), (high, second) = self.wavelength_errors_nm[above - 1 : above + 1]
-        return first + (second - first) * (inside - low) / (high - low)
+        return float(np.interp(nominal_nm, *np.transpose(self.wavelength_errors_nm)))
 
     def absorbed_fraction(
         self, thickness_um: ArrayLike, wavelength_nm: float, theta: float = 0.0, polarization: str = "mixed"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,8 @@ _KINDS = {
 
 def confusion_figure(result: ChallengeResult) -> Figure:
     """Matrix of hidden causes (single effects, none, outsiders) and verdicts; empty squares are left white."""
-    counts = _confusion(result)
+    single = replace(result, cases=tuple(case for case in result.cases if case.kind != "two"))
+    counts = {(_label(row["truth"]), _label(row["found"])): row["cases"] for row in single.confusion()}
     rows, columns = (sorted({pair[side] for pair in counts}) for side in (0, 1))
     matrix = np.full((max(len(rows), 1), max(len(columns), 1)), np.nan)
     for (truth, found), number in counts.items():
@@ -86,14 +88,10 @@ def confusion_figure(result: ChallengeResult) -> Figure:
         return made
 
 
-def _confusion(result: ChallengeResult) -> dict[tuple[str, str], int]:
-    counts: dict[tuple[str, str], int] = {}
-    for case in result.cases:
-        if case.kind != "two":
-            found = " + ".join(sorted(case.found)) if len(case.found) < 3 else "three effects"
-            pair = ("+".join(case.truth) or "nothing", found or case.verdict)
-            counts[pair] = counts.get(pair, 0) + 1
-    return counts
+def _label(names: str) -> str:
+    if names == "none":
+        return "nothing"
+    return "three effects" if names.count("+") > 1 else names.replace("+", " + ")
 
 
 def accuracy_figure(result: ChallengeResult) -> Figure:

@@ -149,12 +149,11 @@ def _seen_parameters(effect: Effect, wavelength_nm: FloatArray) -> list[Paramete
     places = np.array([parameter.wavelength_nm for parameter in effect.parameters])
     if np.isnan(places).any():
         return list(effect.parameters)
-    reach = np.clip(wavelength_nm, places.min(), places.max())
-    # The influence of a node ends at its neighbours.
-    above = np.clip(np.searchsorted(places, reach), 1, len(places) - 1)
-    share = (reach - places[above - 1]) / (places[above] - places[above - 1])
-    near = np.concatenate([above[share > 0.0], above[share < 1.0] - 1])
-    return [effect.parameters[place] for place in np.unique(near)]
+    return [
+        parameter
+        for parameter, alone in zip(effect.parameters, np.eye(len(places)), strict=True)
+        if np.interp(wavelength_nm, places, alone).any()
+    ]
 
 
 def _starts_quadratically(

@@ -179,10 +179,9 @@ class Forward:
         image_settings = self._image(settings)
         if not image_settings:
             return Prediction(value, slope)
-        active = activate_effects(image_settings, self.catalogue)
-        changed = apply_to_image(active, self.model.base_system, value, self.geometry)
+        changed = self._on_image(image_settings, value)
         nudge = 1e-3  # µm; effects on the image are nearly linear in the signal
-        beside = apply_to_image(active, self.model.base_system, value + nudge * slope, self.geometry)
+        beside = self._on_image(image_settings, value + nudge * slope)
         return Prediction(changed, (beside - changed) / nudge)
 
     def change(self, before: Settings, after: Settings, thickness_um: FloatArray) -> FloatArray:
@@ -192,13 +191,7 @@ class Forward:
         if any(images):
             first, _ = self._at_cells(tables[0], thickness_um)
             second = first if tables[1] is tables[0] else self._at_cells(tables[1], thickness_um)[0]
-            old, new = (
-                apply_to_image(
-                    activate_effects(settings, self.catalogue), self.model.base_system, value, self.geometry
-                )
-                for settings, value in zip(images, (first, second), strict=True)
-            )
-            return new - old
+            return self._on_image(images[1], second) - self._on_image(images[0], first)
         table = tables[1] - tables[0]
         # Effects on single exposures leave most planes as they are.
         rows = np.flatnonzero(table.any(axis=1))
@@ -206,6 +199,11 @@ class Forward:
         if rows.size:
             result[rows] = self._at_cells(table, thickness_um, rows)[0]
         return result
+
+    def _on_image(self, settings: Settings, value: FloatArray) -> FloatArray:
+        """Cells with effects on the image."""
+        active = activate_effects(settings, self.catalogue)
+        return apply_to_image(active, self.model.base_system, value, self.geometry)
 
     def _at_cells(
         self, table: FloatArray, thickness_um: FloatArray, rows: NDArray[np.intp] | None = None

@@ -22,7 +22,7 @@ from .describe import describe_residual, disagreement
 from .fit import Fit, fit_model
 from .next_step import with_next_measurements
 from .preparation import Prepared, check_setup, prepare, prepare_again, why_too_poor
-from .selection import IMPRECISION, MANY_PARAMETERS, Candidate, Hypothesis, Selector, similarity
+from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
 from .validation import HeldOut, held_out_blocks, misfit_rms, validate, whole_thickness
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
 
@@ -325,16 +325,19 @@ class _Search:
         """
         best = current
         for name in current.names:
-            few = len(selector.coordinates[name]) < MANY_PARAMETERS
-            if few or selector.prior_cost(current, name) < self.options.least_evidence:
+            if (
+                not selector.has_many(name)
+                or selector.prior_cost(current, name) < self.options.least_evidence
+            ):
                 continue
             rest = selector.hypothesis(tuple(n for n in current.names if n != name), None, current.fit)
             state = selector.state(rest.fit)
             own = selector.features(state, rest.fit, name)
             alike = []
             for candidate in selector.score(rest.fit, selector.others(current)):
-                features = selector.features(state, rest.fit, candidate.name)
-                if candidate.promise > 9.0 and len(features) < len(own):
+                smaller = len(selector.coordinates[candidate.name]) < len(own)
+                if candidate.promise > 9.0 and smaller:
+                    features = selector.features(state, rest.fit, candidate.name)
                     alike.append((similarity(state.design, own, features), candidate))
             for cosine, candidate in sorted(alike, key=lambda pair: -pair[0])[: self.options.parents]:
                 if cosine > CONTAINED:

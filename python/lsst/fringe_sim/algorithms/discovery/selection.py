@@ -214,6 +214,10 @@ class Selector:
         chance = float(chi2_distribution.sf(fit.chi2, max(degrees, 1))) if degrees > 0 else 1.0
         return Channel("all values", fit.chi2, float(max(degrees, 0)), chance)
 
+    def has_many(self, name: str) -> bool:
+        """Whether an effect has so many parameters that it may hide another."""
+        return len(self.coordinates[name]) >= MANY_PARAMETERS
+
     def others(self, hypothesis: Hypothesis) -> list[str]:
         """Effects that a set does not hold."""
         return [name for name in self.coordinates if name not in hypothesis.names]
@@ -234,8 +238,7 @@ class Selector:
             score, information = state.design.project(features, state.residual)
             start, gain, degrees = _bounded_minimum(score, information, coordinates)
             candidate = Candidate(name, gain, degrees, start, gain)
-            few = len(coordinates) < MANY_PARAMETERS
-            if scan and few and not self.problem.forward.is_image_effect(name):
+            if scan and not self.has_many(name) and not self.problem.forward.is_image_effect(name):
                 candidate = self._scanned(state, fit, candidate)
             found.append(candidate)
         return sorted(found, key=lambda item: -item.promise)
@@ -472,8 +475,7 @@ class Selector:
     def _shifts_of_phase(self, fit: Fit) -> list[int]:
         """Coordinates of the last effect that do, at each wavelength by itself, what a change of thickness does."""
         name = fit.coordinates[-1].effect
-        many = len(self.coordinates[name]) >= MANY_PARAMETERS
-        if not self.generic or many or self.problem.forward.is_image_effect(name):
+        if not self.generic or self.has_many(name) or self.problem.forward.is_image_effect(name):
             return []
         without = replace(
             fit,

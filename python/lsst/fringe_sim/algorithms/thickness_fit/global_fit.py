@@ -289,7 +289,7 @@ class _Solver:
         """
         shapes: list[NDArray[np.float32]] = [first.thickness_um]
         ranked: list[NarrowSensor] = []
-        for _ in range(_MOST_SHAPES):
+        for turn in range(_MOST_SHAPES):
             before = ranked[0].chi2 if ranked else np.inf
             ranked = settle_narrow_sensor(
                 first.cells,
@@ -305,7 +305,7 @@ class _Solver:
             solved = self._with_mean_of(best, cells, first)
             rivalled = any(other.chi2 < _RIVAL * best.chi2 for other in ranked[1:])
             settled = not rivalled and best.agrees_with(solved.thickness_um, self.order_um)
-            if settled or best.chi2 > (1.0 - _WORTHWHILE) * before:
+            if settled or best.chi2 > (1.0 - _WORTHWHILE) * before or turn == _MOST_SHAPES - 1:
                 break
             known, shapes = shapes, []
             for other in ranked[:_MOST_MEANS]:
