@@ -271,6 +271,21 @@ def tabulate_components(
     return table, np.array([each.light.photons for each in sums]), level
 
 
+def electrons_on_grid(
+    model: FringeModel, sky: SkySpectrum, band: Bandpass, start_um: float, step_um: float, count: int
+) -> dict[str, FloatArray]:
+    """Electrons s⁻¹ m⁻² arcsec⁻² from each component of a sky on a uniform grid of thickness, by name.
+
+    Summed as finely as for a table, but smooth from point to point as derivatives want it.
+    """
+    sky = sky_with_effects(model, sky)
+    lights = _lights(sky, band, SkyQuadrature(), model.system.beam)
+    return {
+        light.component.name: _SpectralSum.of(model, light).electrons(start_um, step_um, count)
+        for light in lights
+    }
+
+
 def simulate_sky_frame(
     thickness_um: ArrayLike,
     model: FringeModel,

@@ -8,17 +8,18 @@ from typing import Any
 import click
 import numpy as np
 
-from ..algorithms.discovery import SearchOptions, Verdict
+from ..algorithms.discovery import SearchOptions, Verdict, discover_sky
 from ..algorithms.discovery import discover as search
 from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..errors import InputError
 from ..model import FringeModel, Setup
 from ..products import FringeCube
-from ..report.discovery_page import discovery_page, residual_pair
+from ..report.discovery_page import ResidualPair, discovery_page, residual_pair
 from .inputs import prepare_folder, read_settings
 from .lab_frames import find_series, read_cube
-from .parameters import EFFECT, LABORATORY, effect_settings
+from .parameters import ANY_LIGHT, EFFECT, effect_settings
 from .progress import progress
+from .sky_frames import SkyFrames, read_sky_frames
 
 __all__ = ["discover"]
 
@@ -26,7 +27,11 @@ __all__ = ["discover"]
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
 @click.option(
-    "--setup", type=LABORATORY, default="ts8_e2v", show_default=True, help="Laboratory set-up: name or file."
+    "--setup",
+    type=ANY_LIGHT,
+    default="ts8_e2v",
+    show_default=True,
+    help="Set-up of flats, or of frames of the sky: name or file.",
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the verdict.")
 @click.option(
@@ -36,6 +41,9 @@ __all__ = ["discover"]
     "--effect", "effects", type=EFFECT, multiple=True, help="Effect known already; may be repeated."
 )
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@click.option(
+    "--thickness", default=None, help="Map of the varying layer, for frames of the sky: a FITS file [µm]."
+)
 @click.option(
     "--collections", default="*", show_default=True, help="Of a Butler repository, comma-separated."
 )
@@ -52,22 +60,36 @@ def discover(
     seed: int,
     effects: tuple[tuple[str, float], ...],
     effects_file: Path | None,
+    thickness: str | None,
     collections: str,
     detector: str | None,
     cells: int,
     skip_bad: bool,
     dry_run: bool,
 ) -> None:
-    """Find the effect that the model of a sensor lacks: raw flats, a fringe cube, or a Butler repository.
+    """Find the effect that the model of a sensor lacks.
+
+    From raw flats, a fringe cube, or a Butler repository; or, with the set-up of a telescope, from frames of the
+    night sky and a thickness map.
 
     \b
     Examples:
       fringe-sim discover raws --setup ts8_e2v --out verdict
       fringe-sim discover cube.fits --setup ts8_e2v --effect bandwidth.fwhm=2.3 --out verdict
       fringe-sim discover REPO --collections u/me/flats --detector 37 --out verdict
+      fringe-sim discover sky --setup lsst_e2v --thickness fit/thickness.fits --out verdict
     """
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
+    if setup.kind == "sky":
+        data = read_sky_frames(paths, setup, thickness)
+        if dry_run:
+            click.echo(f"would search {len(data.frames)} frames of {data.shape[1]} x {data.shape[0]} pixels")
+            return
+        _search_sky(data, data.model(settings), out, seed, cells)
+        return
+    if thickness is not None:
+        raise InputError("--thickness", thickness, "only with the set-up of a telescope, as lsst_e2v")
     model = FringeModel.from_setup(setup, settings)
     cube = _read(paths, setup, collections, detector, skip_bad, dry_run)
     if cube is None:
@@ -80,8 +102,26 @@ def discover(
         options=SearchOptions(most_cells=cells),
         report=lambda line: click.echo(line, err=True),
     )
+    _write(verdict, folder, residual_pair(cube, model, verdict))
+
+
+def _search_sky(data: SkyFrames, model: FringeModel, out: Path, seed: int, cells: int) -> None:
+    folder = prepare_folder(out)
+    verdict = discover_sky(
+        data.frames,
+        data.thickness_um,
+        data.thickness_sigma_um,
+        model,
+        rng=np.random.default_rng(seed),
+        options=SearchOptions(most_cells=cells),
+        report=lambda line: click.echo(line, err=True),
+    )
+    _write(verdict, folder, None)
+
+
+def _write(verdict: Verdict, folder: Path, residuals: ResidualPair | None) -> None:
     path = verdict.write(folder)
-    discovery_page(verdict, residual_pair(cube, model, verdict)).write(folder / "report.html")
+    discovery_page(verdict, residuals).write(folder / "report.html")
     _say(verdict)
     for name in (path.name, "discovery.ecsv", "effects.py", "report.html"):
         click.echo(str(folder / name))

@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..model import Setup, setup_names
 
 __all__ = [
+    "ANY_LIGHT",
     "EFFECT",
     "LABORATORY",
     "SIZE",
@@ -117,8 +118,8 @@ class SetupType(click.ParamType):
 
     Parameters
     ----------
-    kind : {"monochromator", "sky"}
-        Light that the command is for.
+    kind : {"monochromator", "sky", ""}
+        Light that the command is for; any if empty.
     wanted : `str`
         The same in words.
     """
@@ -144,7 +145,7 @@ class SetupType(click.ParamType):
         text = str(value)
         is_file = text.lower().endswith((".yaml", ".yml"))
         setup = Setup.from_file(text) if is_file else Setup.from_name(text)
-        if setup.kind != self.kind:
+        if self.kind and setup.kind != self.kind:
             raise InputError("set-up", text, self.wanted)
         return setup
 
@@ -155,7 +156,7 @@ class SetupType(click.ParamType):
         fitting = [
             name
             for name in setup_names()
-            if name.startswith(incomplete) and Setup.from_name(name).kind == self.kind
+            if name.startswith(incomplete) and self.kind in ("", Setup.from_name(name).kind)
         ]
         return [CompletionItem(name) for name in fitting] or [CompletionItem(incomplete, type="file")]
 
@@ -207,6 +208,7 @@ THICKNESS_RANGE = _ThicknessRange()
 SIZE = _Size()
 EFFECT = _EffectSetting()
 LABORATORY = SetupType("monochromator", "a laboratory set-up with a monochromator")
+ANY_LIGHT = SetupType("", "a set-up")
 SKY = SetupType("sky", "one behind a telescope, as lsst_e2v, monocam or hsc")
 
 

@@ -22,7 +22,7 @@ from ..instrument.sky import SkySpectrum
 from ..mock.thickness import e2v_321
 from ..model import FringeModel, Setup
 from ..model.provenance import input_cards
-from ..products import BackgroundWriter, SensorSection, SkyFringe
+from ..products import BackgroundWriter, SensorSection, SkyFringe, band_cards
 from ..report.figures import sky_figure
 from ..report.sky_page import write_sky_report
 from ..report.style import save_figure
@@ -164,7 +164,12 @@ def sky(
     with progress("simulating frames", frames) as advance, BackgroundWriter() as writer:
         for number, frame in enumerate(series):
             path = folder / f"sky_{sensor.name}_{number:02d}.fits"
-            writer.write(frame, path, {"SETUP": setup.name, **cards}, section=section)
+            scale = history.band_scale(number, response.bands) if night else {}
+            sky_cards = {
+                "BEAMS": "centre",
+                **band_cards({name: scale.get(name, 1.0) for name in response.bands}),
+            }
+            writer.write(frame, path, {"SETUP": setup.name, **sky_cards, **cards}, section=section)
             made.append(frame)
             advance()
     save_figure(sky_figure(made), folder / "sky.png")

@@ -49,6 +49,12 @@ _CACHED = 131_072
 MOST_RATIO = 0.94
 """Largest ``|g|`` whose harmonics fall below rounding within the terms that are summed."""
 
+_PIECES = 4
+"""Shares of the nodes of a single group, which cores take in turn."""
+
+_LEAST_PIECE = 4096
+"""Nodes of a share that are worth a grid of their own."""
+
 _POWERS = 12
 """Powers of the slow factor ``exp(-p Im kappa d)`` in one segment of an absorbing layer."""
 
@@ -90,6 +96,18 @@ def series_on_grid(
     -------
     response : `numpy.ndarray`, shape ``(W, count)``
     """
+    if len(weight) == 1 and weight.size >= _PIECES * _LEAST_PIECE:
+        # Shares of the nodes for all cores; as many on any machine, so that rounding is the same.
+        spare = -weight.size % _PIECES
+        *parts, part_weight = (
+            np.pad(each, ((0, 0), (0, spare)), mode="edge").reshape(_PIECES, -1)
+            for each in (*coefficients, weight)
+        )
+        part_weight[-1, part_weight.shape[1] - spare :] = 0.0
+        summed = series_on_grid(
+            tuple(parts), part_weight, spread_um, start_um, step_um, count, order, tolerance
+        )
+        return np.asarray(summed.sum(axis=0, keepdims=True))
     rule = _Gridding.of(tolerance)
     slow = float(np.max(coefficients[-1].imag))
     if slow == 0.0:

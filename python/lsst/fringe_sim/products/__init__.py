@@ -13,7 +13,14 @@ from .fringe_flat import FringeFlat
 from .fringe_frame import FringeFrame
 from .mask import MASK_PLANES, describe_mask, mask_bits
 from .sensor_section import SensorSection
-from .sky_frame import CORRECTED, SKY_UNITS, SkyFringe, refuse_corrected
+from .sky_frame import (
+    CORRECTED,
+    SKY_UNITS,
+    SkyFringe,
+    band_cards,
+    bands_of_header,
+    refuse_corrected,
+)
 from .thickness_map import ThicknessMap
 
 __all__ = [
@@ -32,6 +39,8 @@ __all__ = [
     "SensorSection",
     "SkyFringe",
     "ThicknessMap",
+    "band_cards",
+    "bands_of_header",
     "describe_mask",
     "mask_bits",
     "refuse_corrected",

@@ -26,6 +26,25 @@ SKY_UNITS = ("electron", "fraction")
 _OWN = ("DETNAME", "FILTER", "MEANE", "EXPTIME", "AIRMASS", "HOUR", "SEED", "QUADERR")
 
 
+_BAND = "BAND "
+
+
+def band_cards(scale: Mapping[str, float]) -> dict[str, float]:
+    """Header keywords that tell what the OH bands were during a frame.
+
+    Parameters
+    ----------
+    scale : mapping
+        Intensity of bands, by name, relative to the reference sky.
+    """
+    return {f"{_BAND}{name}": float(factor) for name, factor in scale.items()}
+
+
+def bands_of_header(metadata: Mapping[str, Any]) -> dict[str, float]:
+    """What `band_cards` stated; empty if nothing is known."""
+    return {key[len(_BAND) :]: float(value) for key, value in metadata.items() if key.startswith(_BAND)}
+
+
 @dataclass(frozen=True, eq=False)
 class SkyFringe(FitsProduct):
     """Night sky seen by one sensor in one exposure.

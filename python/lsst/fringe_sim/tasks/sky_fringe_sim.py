@@ -33,7 +33,7 @@ from ..instrument.sky import EmissionLines, SkySpectrum
 from ..instrument.telescope import Telescope
 from ..middleware.night import airmass_of, hour_of_night
 from ..model import FringeModel, Setup
-from ..products import ThicknessMap
+from ..products import ThicknessMap, band_cards
 from .quantum import common_header, data_id_of, sensor_of, unusable
 from .sky_model import (
     LINE_LIST,
@@ -245,7 +245,7 @@ class SkyFringeSimTask(PipelineTask):
             "LEVEL": self.config.level,
             "BEAMS": self.config.beams,
             "STANDIN": thickness is None,
-            **{f"BAND {name}": factor for name, factor in scale.items()},
+            **band_cards(scale),
             **frame.metadata,
         }
         self.log.info(

@@ -1,6 +1,7 @@
 """Discovery of missing effects: find the disagreement, name it, add it, show the gap shrink."""
 
 from .search import SearchOptions, discover
+from .sky_search import discover_sky
 from .verdict import (
     Gap,
     NamedEffect,
@@ -20,5 +21,6 @@ __all__ = [
     "Verdict",
     "Where",
     "discover",
+    "discover_sky",
     "read_effects_override",
 ]

@@ -272,7 +272,9 @@ class Problem:
     level_basis : `numpy.ndarray`, shape ``(W, L)``
         Free levels: the unit matrix, or a few smooth functions of wavelength.
     field_prior : `float`
-        Precision of the coefficients of the field about `prior_field` [1/µm²]; 0 for a free field.
+        Precision of the coefficients of the field about `field_centre` [1/µm²]; 0 for a free field.
+    field_centre : `numpy.ndarray`, shape ``(M,)``, optional
+        Coefficients of a map that is known; needed with a prior.
     free_contrast : `bool`
         Whether the fringes of each wavelength have an amplitude of their own: the ``W`` contrasts, relative to
         the model's, follow the levels.
@@ -286,6 +288,7 @@ class Problem:
     basis: FieldBasis
     level_basis: FloatArray
     field_prior: float = 0.0
+    field_centre: FloatArray | None = None
     free_contrast: bool = False
     reference: FloatArray | None = None
 
@@ -330,6 +333,18 @@ class Problem:
         amplitude = np.concatenate([whiten.root, whiten.root * (value - 1.0)])
         return LevelColumns(amplitude, np.tile(planes, 2), basis, whiten)
 
+    def field_pull(self, coefficients: FloatArray) -> FloatArray:
+        """Half the gradient of χ² from the map that is known, ``(M,)``."""
+        if self.field_centre is None:
+            return np.zeros(len(coefficients))
+        return self.field_prior * (coefficients - self.field_centre)
+
+    def field_penalty(self, coefficients: FloatArray) -> float:
+        """χ² of the field against the map that is known."""
+        if self.field_centre is None:
+            return 0.0
+        return self.field_prior * float(((coefficients - self.field_centre) ** 2).sum())
+
     def with_cells(self, cells: CellData) -> Problem:
         """Same problem with other data on the same cells."""
         return replace(self, cells=cells)
@@ -347,6 +362,8 @@ class Design:
         Derivatives with respect to the levels.
     effects : `numpy.ndarray`, shape ``(K, W, ny, nx)``
         Whitened derivatives with respect to the effects.
+    pull : `numpy.ndarray`, shape ``(M,)``
+        What draws the coefficients of the field besides the residual: half a gradient of χ².
     normal : `NormalMatrix`
         Curvature in the coefficients of the thickness field.
     """
@@ -355,15 +372,22 @@ class Design:
     slope: FloatArray
     levels: LevelColumns
     effects: FloatArray
+    pull: FloatArray
     normal: NormalMatrix
     _coupling: FloatArray
     _curvature: FloatArray
 
     @classmethod
     def build(
-        cls, basis: FieldBasis, slope: FloatArray, levels: LevelColumns, effects: FloatArray, prior: float
+        cls,
+        basis: FieldBasis,
+        slope: FloatArray,
+        levels: LevelColumns,
+        effects: FloatArray,
+        prior: float,
+        pull: FloatArray,
     ) -> Design:
-        """Assemble normal matrices."""
+        """Assemble normal matrices; ``prior`` is the precision of a field that is known."""
         normal = basis.normal_matrix((slope**2).sum(axis=0), prior)
         maps = np.concatenate([levels.along(slope), np.einsum("wyx,kwyx->kyx", slope, effects)])
         coupling = basis.gather(maps)
@@ -371,12 +395,16 @@ class Design:
         cross = levels.dot(effects)
         curvature = np.block([[levels.gram(), cross.T], [cross, flat @ flat.T]])
         curvature = curvature - coupling.T @ normal.solve(coupling)
-        return cls(basis, slope, levels, effects, normal, coupling, curvature)
+        return cls(basis, slope, levels, effects, pull, normal, coupling, curvature)
 
     @property
     def curvature(self) -> FloatArray:
         """Curvature in levels and effects with the field profiled out."""
         return self._curvature
+
+    def _field_score(self, residual: FloatArray) -> FloatArray:
+        """Half the fall of χ² along each coefficient of the field; none at a minimum."""
+        return self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0] - self.pull
 
     def _products(self, values: FloatArray) -> FloatArray:
         """Products of levels and effects with whitened ``(W, ny, nx)``."""
@@ -391,7 +419,7 @@ class Design:
         self, residual: FloatArray, ridge: FloatArray, pull: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Newton step of levels, effects and field; ``ridge`` is a prior precision, ``pull`` its gradient."""
-        field_side = self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0]
+        field_side = self._field_score(residual)
         solved = self.normal.solve(np.column_stack([field_side, self._coupling]))
         right = self._products(residual) - self._coupling.T @ solved[:, 0] - pull
         step = _solve_symmetric(self._curvature + np.diag(ridge), right)
@@ -421,7 +449,7 @@ class Design:
         )
         cross = cross - self._coupling.T @ solved
         score = flat @ residual.ravel()
-        field_side = self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0]
+        field_side = self._field_score(residual)
         score = score - solved.T @ field_side
         own_score = (
             self._products(residual) - self._coupling.T @ self.normal.solve(field_side[:, np.newaxis])[:, 0]
@@ -451,7 +479,7 @@ class Fit:
     field : `numpy.ndarray`, shape ``(M,)``
         Coefficients of the thickness.
     chi2 : `float`
-        Whitened sum of squares.
+        Whitened sum of squares, and that of the field against a map that is known.
     information : `numpy.ndarray`
         Curvature in the free coordinates, nuisances profiled out, without prior.
     spread : `numpy.ndarray`
@@ -535,7 +563,7 @@ def fit_model(
     -------
     fit : `Fit`
     """
-    solver = _Solver(problem, tuple(coordinates), dict(fixed or {}), field_start)
+    solver = _Solver(problem, tuple(coordinates), dict(fixed or {}))
     return solver.run(np.asarray(start, dtype=float), field_start, levels_start, iterations, rival)
 
 
@@ -545,11 +573,9 @@ class _Solver:
         problem: Problem,
         coordinates: tuple[Coordinate, ...],
         fixed: dict[str, float],
-        field_start: FloatArray,
     ) -> None:
         self.problem, self.coordinates, self.fixed = problem, coordinates, fixed
         self.ridge = _ridge(coordinates)
-        self.field_centre = field_start.copy()
 
     def settings(self, position: FloatArray) -> dict[str, float]:
         values = {c.key: c.value(x) for c, x in zip(self.coordinates, position, strict=True)}
@@ -562,14 +588,11 @@ class _Solver:
         point.prediction = problem.forward.predict(self.settings(point.position), thickness)
         expected = problem.expected(point.levels, point.prediction.value)
         point.residual = self.whiten(problem.cells.value - expected)
-        point.chi2 = float((point.residual**2).sum())
+        point.chi2 = float((point.residual**2).sum()) + problem.field_penalty(point.coefficients)
         return point
 
     def penalty(self, point: _Point) -> float:
-        total = float((self.ridge * point.position**2).sum())
-        if self.problem.field_prior:
-            total += self.problem.field_prior * float(((point.coefficients - self.field_centre) ** 2).sum())
-        return total
+        return float((self.ridge * point.position**2).sum())
 
     def run(
         self,
@@ -626,7 +649,8 @@ class _Solver:
             columns[number] = self.whiten(level * self.derivative(point, thickness, number))
         slope = self.whiten(level * point.prediction.slope)
         levels = problem.level_columns(point.prediction.value, self.whiten)
-        return Design.build(problem.basis, slope, levels, columns, problem.field_prior)
+        pull = problem.field_pull(point.coefficients)
+        return Design.build(problem.basis, slope, levels, columns, problem.field_prior, pull)
 
     def derivative(self, point: _Point, thickness: FloatArray, number: int) -> FloatArray:
         """Derivative of the prediction with respect to one coordinate, by a difference."""
@@ -739,7 +763,7 @@ def _solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 def linearise_at(problem: Problem, fit: Fit) -> tuple[Design, FloatArray, Prediction, FloatArray, Whitener]:
     """Design at a finished fit, its whitened residual, the prediction, the thickness and the whitener."""
-    solver = _Solver(problem, fit.coordinates, dict(fit.settings), fit.field)
+    solver = _Solver(problem, fit.coordinates, dict(fit.settings))
     thickness = problem.basis.expand(fit.field)
     problem.forward.cover(thickness)
     reference = problem.forward.predict(fit.settings, thickness).value

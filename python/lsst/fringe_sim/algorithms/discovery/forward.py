@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numba
 import numpy as np
@@ -14,7 +15,7 @@ from ...model import FringeModel
 from ...optics.illumination import Illumination
 from .cells import CellData
 
-__all__ = ["Forward", "Prediction"]
+__all__ = ["Exposures", "Forward", "Prediction"]
 
 FloatArray = NDArray[np.float64]
 Settings = Mapping[str, float]
@@ -57,6 +58,13 @@ class Prediction:
     slope: FloatArray
 
 
+class Exposures(Protocol):
+    """The light of the exposures, where it is not that of flats."""
+
+    def response(self, model: FringeModel, start_um: float, step_um: float, count: int) -> FloatArray:
+        """Response of every exposure on a uniform grid of thickness, ``(W, count)``, in any unit."""
+
+
 @dataclass(eq=False)
 class Forward:
     """Model of one sensor on cells.
@@ -77,6 +85,8 @@ class Forward:
         See `CellData`.
     seen : `numpy.ndarray` of `bool`, shape ``(ny, nx)``, optional
         Cells with data; by default all. The thickness of others is not known, and slopes do not lean on it.
+    exposures : `Exposures`, optional
+        The light; monochromator flats by default.
     """
 
     model: FringeModel
@@ -86,6 +96,7 @@ class Forward:
     range_um: tuple[float, float]
     centroid: FloatArray | None = None
     seen: NDArray[np.bool_] | None = None
+    exposures: Exposures | None = None
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[int, float], FloatArray] = field(default_factory=dict, repr=False)
     _rows_of: tuple[tuple[str, float], ...] | None = field(default=None, repr=False)
@@ -97,10 +108,17 @@ class Forward:
 
     @classmethod
     def of_cells(
-        cls, model: FringeModel, catalogue: Sequence[Effect], cells: CellData, range_um: tuple[float, float]
+        cls,
+        model: FringeModel,
+        catalogue: Sequence[Effect],
+        cells: CellData,
+        range_um: tuple[float, float],
+        exposures: Exposures | None = None,
     ) -> Forward:
         """Forward model of the cells of ``cells`` for a thickness range [µm]."""
-        return cls(model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid, cells.seen)
+        return cls(
+            model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid, cells.seen, exposures
+        )
 
     def table(self, settings: Settings) -> FloatArray:
         """Response ``(W, D)`` on the grid of thickness, relative to its mean, as flats are.
@@ -122,6 +140,8 @@ class Forward:
     def _response(self, settings: Settings, low_um: float, count: int) -> FloatArray:
         """Response ``(W, count)`` on the grid; what an exposure sees is kept while only others are moved."""
         model, wavelength = self.model_with(settings), self.geometry.wavelength_nm
+        if self.exposures is not None:
+            return self.exposures.response(model, low_um, TABLE_STEP_UM, count)
         light = model.system.flat_fields(wavelength, LINE_STEP_NM)
         rest = tuple(
             sorted((key, value) for key, value in settings.items() if not self._moves_wavelengths(key))

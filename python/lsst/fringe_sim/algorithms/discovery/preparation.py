@@ -16,7 +16,7 @@ from ...products.fringe_cube import FringeCube
 from .basis import CellBasis, FieldBasis, SplineBasis
 from .cells import CellData, bin_cube, finest_useful_cell
 from .fit import Fit, Problem, fit_model
-from .forward import Forward
+from .forward import Exposures, Forward
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
 from .start import mended_thickness, starting_thickness
 
@@ -132,15 +132,24 @@ def why_too_poor(cube: FringeCube, model: FringeModel) -> str:
     return ""
 
 
-def prepare(cube: FringeCube, model: FringeModel, effects: Sequence[Effect], most_cells: int) -> Prepared:
-    """Average a cube to cells, find their thickness, measure their noise, fit the unchanged model."""
+def prepare(
+    cube: FringeCube,
+    model: FringeModel,
+    effects: Sequence[Effect],
+    most_cells: int,
+    exposures: Exposures | None = None,
+) -> Prepared:
+    """Average a cube to cells, find their thickness, measure their noise, fit the unchanged model.
+
+    The thickness must be known where the light of the ``exposures`` is not that of flats.
+    """
     size = finest_useful_cell(cube, most_cells=most_cells)
     cells = bin_cube(cube, size)
     stack = model.system.stack
     medium = stack.layers[stack.position(model.system.varying)].medium
     index = np.real(medium.index(cells.wavelength_nm, model.system.temperature_k))
     if cells.thickness_um is not None:
-        return _prepare_known(cells, model, effects, index)
+        return _prepare_known(cells, model, effects, index, exposures)
     start = starting_thickness(model, cells)
     forward = Forward.of_cells(model, effects, cells, (float(start.min()) - 0.5, float(start.max()) + 0.5))
     if not _is_rich(cells):
@@ -203,16 +212,22 @@ def _free_levels(cells: CellData) -> FloatArray:
 
 
 def _prepare_known(
-    cells: CellData, model: FringeModel, effects: Sequence[Effect], index: FloatArray
+    cells: CellData,
+    model: FringeModel,
+    effects: Sequence[Effect],
+    index: FloatArray,
+    exposures: Exposures | None,
 ) -> Prepared:
     """Data with a thickness map: the field may move only within its uncertainty."""
     assert cells.thickness_um is not None
     known = np.where(np.isfinite(cells.thickness_um), cells.thickness_um, np.nanmedian(cells.thickness_um))
     sigma = 0.01 if cells.thickness_sigma_um is None else float(np.nanmedian(cells.thickness_sigma_um))
-    forward = Forward.of_cells(model, effects, cells, (float(known.min()) - 0.5, float(known.max()) + 0.5))
+    range_um = (float(known.min()) - 0.5, float(known.max()) + 0.5)
+    forward = Forward.of_cells(model, effects, cells, range_um, exposures)
     basis = CellBasis(known.shape)
-    problem = Problem(cells, forward, basis, _free_levels(cells), 1.0 / max(sigma, 1e-4) ** 2)
-    return _settle(problem, fit_model(problem, (), np.zeros(0), known.ravel()), cells, index)
+    centre = known.ravel()
+    problem = Problem(cells, forward, basis, _free_levels(cells), 1.0 / max(sigma, 1e-4) ** 2, centre)
+    return _settle(problem, fit_model(problem, (), np.zeros(0), centre), cells, index)
 
 
 def _prepare_few(cells: CellData, forward: Forward, start: FloatArray, index: FloatArray) -> Prepared:

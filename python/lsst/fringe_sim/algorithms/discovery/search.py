@@ -20,6 +20,7 @@ from .channels import Channel
 from .classes import EffectClass, classes_of, outsider_probability
 from .describe import describe_residual, disagreement
 from .fit import Fit, fit_model
+from .forward import Exposures
 from .next_step import with_next_measurements
 from .preparation import Prepared, check_setup, prepare, prepare_again, why_too_poor
 from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
@@ -125,21 +126,34 @@ def discover(
     InputError
         The set-up contradicts the data (temperature, bandpass), or is not one of a laboratory.
     """
-    chosen = options or SearchOptions()
-    say = report or (lambda text: None)
     model = setup if isinstance(setup, FringeModel) else FringeModel.from_setup(setup)
     check_setup(cube, model)
     known = {item.effect.name for item in model.effects}
     # Flats do not see the spectrum of the night sky.
-    seen = [effect for effect in effects if effect.acts_on != "spectrum" or effect.name in known]
+    own = [effect for effect in effects if effect.acts_on != "spectrum" or effect.name in known]
+    return search_exposures(cube, model, own, rng, options, report)
+
+
+def search_exposures(
+    cube: FringeCube,
+    model: FringeModel,
+    effects: Sequence[Effect],
+    rng: np.random.Generator,
+    options: SearchOptions | None,
+    report: Report | None,
+    exposures: Exposures | None = None,
+) -> Verdict:
+    """Search any exposures whose light is known; parameters as of `discover`, which is for flats."""
+    chosen = options or SearchOptions()
+    say = report or (lambda text: None)
     # Many small matrices: threads of the linear algebra would wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
         poor = why_too_poor(cube, model)
         if poor:
             return _no_answer(model, poor, cube)
         say("fitting the thickness with the unchanged model")
-        prepared = prepare(cube, model, seen, chosen.most_cells)
-        return _Search(prepared, model, seen, chosen, rng, say).run()
+        prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
+        return _Search(prepared, model, effects, chosen, rng, say).run()
 
 
 def _no_answer(model: FringeModel, reason: str, cube: FringeCube) -> Verdict:
@@ -480,6 +494,8 @@ class _Search:
         )
         if reasons:
             return self._unexplained(whole, final, chance, steps, "; ".join(reasons), partial=named)
+        if whole.problem.forward.exposures is not None:  # candidate measurements are flats
+            return self._verdict("named", whole, final, chance, tuple(named), {}, steps)
         thickness = whole.problem.basis.expand(final.fit.field)
         decided, self.next_measurements = with_next_measurements(
             named,

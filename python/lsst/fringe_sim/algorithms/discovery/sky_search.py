@@ -1,0 +1,377 @@
+"""The search on the night sky: frames of one sensor whose thickness is known from the laboratory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...effects import EFFECTS, Effect
+from ...errors import InputError
+from ...instrument.bandpass import Bandpass
+from ...instrument.sky import SkySpectrum, SpectralComponent, blend_components
+from ...instrument.telescope import reduce_beam
+from ...model import FringeModel, Setup
+from ...optics import Beam, Illumination
+from ...optics.phase_response import PhaseResponse
+from ...products import FlatExposures, FringeCube, SkyFringe, bands_of_header, mask_bits, refuse_corrected
+from ..sky_frame import (
+    bandpass_of,
+    component_factors,
+    electrons_on_grid,
+    is_band,
+    sky_with_effects,
+    split_components,
+)
+from .search import Report, SearchOptions, search_exposures
+from .verdict import Verdict
+
+__all__ = ["SkyExposures", "discover_sky"]
+
+FloatArray = NDArray[np.float64]
+Grid = tuple[float, float, int]
+"""First, step [µm] and number of thicknesses."""
+
+LINE_ANGLES = 32
+"""Angles of the beam for lines."""
+
+CONTINUUM_ANGLES = 8
+"""Angles for continua, whose fringes average out over wavelength."""
+
+CONTINUUM_STEP_NM = 0.2
+"""Spacing of the wavelengths that stand for a continuum [nm]."""
+
+LINE_SHIFT_NM = 0.01
+"""Rms shift of the lines that are merged [nm]."""
+
+TOLERANCE = 1e-7
+"""Error of the sums over harmonics, relative to the fringes of one line, 300 times those of all together."""
+
+AIRMASS_RANGE = 0.2
+"""Largest difference in airmass of frames that are searched together."""
+
+_KEPT = 8
+"""Sensors whose reductions are kept: parameters of the sky move while one of them stays."""
+
+_NO_DATA = mask_bits("NO_DATA")
+
+
+@dataclass(eq=False)
+class SkyExposures:
+    """Light of frames of the night sky, summed as fast as a search needs.
+
+    Few angles and few wavelengths tell well enough what an effect changes; the unchanged model is summed in full
+    once, and what the short sums lack of it is added to all. Lines keep the places at which the unchanged sky is
+    merged, so that what the sensor makes of every place and angle is worked out once for all skies.
+
+    Attributes
+    ----------
+    base : `FringeModel`
+        The model before the search.
+    sky : `SkySpectrum`
+        Lines and continua before any effect.
+    band : `Bandpass`
+        Optics and air.
+    scales : `tuple` of mapping
+        Factors on components of the sky, by name, for each frame.
+    """
+
+    base: FringeModel
+    sky: SkySpectrum
+    band: Bandpass
+    scales: tuple[Mapping[str, float], ...]
+    _places: dict[str, FloatArray] = field(init=False, repr=False)
+    _reduced: dict[tuple[Any, ...], dict[str, _Reduced]] = field(default_factory=dict, repr=False)
+    _missing: dict[Grid, FloatArray] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        lines, continua = split_components(
+            sky_with_effects(self.base, self.sky), self.band, CONTINUUM_STEP_NM
+        )
+        merged = blend_components(lines, LINE_SHIFT_NM) if lines else []
+        self._places = {part.name: part.wavelength_nm for part in [*merged, *continua]}
+
+    def response(self, model: FringeModel, start_um: float, step_um: float, count: int) -> FloatArray:
+        """Electrons of every frame on a uniform grid of thickness, ``(F, count)``."""
+        grid = (start_um, step_um, count)
+        if grid not in self._missing:
+            self._missing.clear()
+            self._missing[grid] = self._summed_in_full(grid) - self._summed(self.base, grid)
+        return self._summed(model, grid) + self._missing[grid]
+
+    def _summed_in_full(self, grid: Grid) -> FloatArray:
+        electrons = electrons_on_grid(self.base, self.sky, self.band, *grid)
+        parts = sky_with_effects(self.base, self.sky).components(self.band)
+        return np.asarray(self._factors(parts) @ np.stack([electrons[part.name] for part in parts]))
+
+    def _summed(self, model: FringeModel, grid: Grid) -> FloatArray:
+        """The short sums."""
+        sky = sky_with_effects(model, self.sky)
+        parts = [part for part in sky.components(self.band, CONTINUUM_STEP_NM) if part.name in self._places]
+        reduced = self._reductions(model)
+        factors = self._factors(parts)
+        together: dict[tuple[bytes, bytes], list[int]] = {}  # continua with one history
+        for number, part in enumerate(parts):
+            places = part.name if is_band(part.name) else self._places[part.name]
+            key = (
+                places.encode() if isinstance(places, str) else places.tobytes(),
+                factors[:, number].tobytes(),
+            )
+            together.setdefault(key, []).append(number)
+        result = np.zeros((len(self.scales), grid[2]))
+        for numbers in together.values():
+            name = parts[numbers[0]].name
+            photons = sum(_moved_to(self._places[name], parts[number]) for number in numbers)
+            electrons = _electrons_of(np.asarray(photons), self._places[name], reduced[name], model, grid)
+            result += np.outer(factors[:, numbers[0]], electrons)
+        return result
+
+    def _factors(self, parts: Sequence[SpectralComponent]) -> FloatArray:
+        """Factors of the components in every frame, ``(F, C)``."""
+        names = tuple(part.name for part in parts)
+        photons = np.array([part.photons.sum() for part in parts])
+        return np.stack(
+            [
+                component_factors(names, photons, {name: scale[name] for name in names if name in scale})
+                for scale in self.scales
+            ]
+        )
+
+    def _reductions(self, model: FringeModel) -> dict[str, _Reduced]:
+        """What the sensor makes of every place and angle, by component."""
+        key = tuple(
+            (item.effect.name, *sorted(item.values.items()))
+            for item in model.effects
+            if item.effect.acts_on not in ("spectrum", "response", "image")
+        )
+        if key not in self._reduced:
+            while len(self._reduced) >= _KEPT:
+                self._reduced.pop(next(iter(self._reduced)))
+            self._reduced[key] = self._reduce(model)
+        return self._reduced[key]
+
+    def _reduce(self, model: FringeModel) -> dict[str, _Reduced]:
+        beams = {
+            True: reduce_beam(model.system.beam, LINE_ANGLES),
+            False: reduce_beam(model.system.beam, CONTINUUM_ANGLES),
+        }
+        done: dict[tuple[bool, bytes], _Reduced] = {}  # continua share their places
+        result = {}
+        for name, places in self._places.items():
+            same = (is_band(name), places.tobytes())
+            if same not in done:
+                beam = beams[is_band(name)]
+                even = Illumination.spectrum(places, np.ones(places.size), beam)
+                done[same] = _Reduced(beam, model.system.reduce(even))
+            result[name] = done[same]
+        return result
+
+    def wavelength_nm(self) -> FloatArray:
+        """Mean wavelength of the light of every frame [nm]."""
+        parts = self.sky.components(self.band)
+        photons = np.array([part.photons.sum() for part in parts])
+        means = np.array([part.photons @ part.wavelength_nm for part in parts]) / photons
+        weights = self._factors(parts) * photons
+        return np.asarray((weights @ means) / weights.sum(axis=1))
+
+
+class _Reduced(NamedTuple):
+    """A stack of films at the places and angles of one component."""
+
+    beam: Beam
+    response: PhaseResponse
+
+
+def _electrons_of(
+    photons: FloatArray, places: FloatArray, reduced: _Reduced, model: FringeModel, grid: Grid
+) -> FloatArray:
+    """Electrons from photons at some places on a uniform grid of thickness."""
+    light = Illumination.spectrum(places, photons, reduced.beam)
+    mean = reduced.response.averaged_on_grid(light.weight, *grid, tolerance=TOLERANCE)
+    return float(photons.sum()) * model.finish(reduced.response, light, mean, None)[0]
+
+
+def _moved_to(places: FloatArray, part: SpectralComponent) -> FloatArray:
+    """Photons of a component at given places, each shared by its neighbours so that its mean wavelength stays."""
+    if np.array_equal(places, part.wavelength_nm):
+        return part.photons
+    if places.size == 1:
+        return np.array([part.photons.sum()])
+    upper = np.clip(np.searchsorted(places, part.wavelength_nm), 1, places.size - 1)
+    gap = places[upper] - places[upper - 1]
+    share = np.clip((part.wavelength_nm - places[upper - 1]) / gap, 0.0, 1.0)
+    result = np.bincount(upper, part.photons * share, places.size)
+    result += np.bincount(upper - 1, part.photons * (1.0 - share), places.size)
+    return np.asarray(result)
+
+
+def discover_sky(
+    frames: Sequence[SkyFringe],
+    thickness_um: ArrayLike,
+    thickness_sigma_um: ArrayLike | float,
+    setup: str | Setup | FringeModel,
+    effects: Sequence[Effect] = EFFECTS,
+    *,
+    rng: np.random.Generator,
+    sky: SkySpectrum | None = None,
+    scales: Sequence[Mapping[str, float]] | None = None,
+    options: SearchOptions | None = None,
+    report: Report | None = None,
+) -> Verdict:
+    """Find out whether frames of the night sky and the model disagree beyond noise, and what is the reason.
+
+    All frames of a night show nearly the same pattern; what tells effects apart is how it changes with thickness.
+    So the thickness must be known, and several orders of it on the sensor help.
+
+    Parameters
+    ----------
+    frames : sequence of `SkyFringe`
+        Frames of one sensor, not corrected for fringes.
+    thickness_um : array_like, shape ``(ny, nx)``
+        Thickness of the varying layer [µm]; NaN where it is not known.
+    thickness_sigma_um : array_like or `float`
+        Its standard uncertainty [µm].
+    setup : `str`, `Setup` or `FringeModel`
+        Sensor behind a telescope; a model may hold effects that are known already, such as those named from flats.
+    effects : sequence of `Effect`, optional
+        The catalogue; those of the laboratory are left out.
+    rng, options, report
+        See `discover`.
+    sky : `SkySpectrum`, optional
+        Lines and continua; by default a dark sky at the mean airmass of the frames.
+    scales : sequence of mapping, optional
+        Factors on components of that sky for each frame, as `NightHistory.band_scale` gives them; by default what the
+        headers of the frames say (`band_cards`). The bands change by factors during a night, and what they do to a
+        frame looks like many an effect: a search that guessed them would find what is not there.
+
+    Returns
+    -------
+    verdict : `Verdict`
+
+    Raises
+    ------
+    InputError
+        No frames, frames of different shapes, sensors or airmass or already corrected, a map of another shape, a
+        set-up of a laboratory; bands that nobody states.
+    UnknownNameError
+        A factor on a component that the sky does not have.
+    """
+    model = setup if isinstance(setup, FringeModel) else FringeModel.from_setup(setup)
+    if model.setup.kind != "sky":
+        raise InputError("set-up", model.setup.name, "one behind a telescope")
+    _check_frames(frames)
+    if sky is None:
+        sky = SkySpectrum.dark(airmass=float(np.mean([frame.airmass for frame in frames])))
+    factors = tuple(_stated_bands(frames) if scales is None else scales)
+    if len(factors) != len(frames):
+        raise InputError("factors on the sky", len(factors), f"one mapping for each of {len(frames)} frames")
+    _check_components(sky, factors)
+    light = SkyExposures(model, sky, bandpass_of(model), factors)
+    order = np.argsort(light.wavelength_nm(), kind="stable")  # that of a search
+    light = replace(light, scales=tuple(light.scales[number] for number in order))
+    cube = _as_cube(_images_of(frames).in_order(order), light, model, thickness_um, thickness_sigma_um)
+    known = {item.effect.name for item in model.effects}
+    own = [effect for effect in effects if not effect.laboratory_only or effect.name in known]
+    return search_exposures(cube, model, own, rng, options, report, light)
+
+
+def _stated_bands(frames: Sequence[SkyFringe]) -> list[dict[str, float]]:
+    """Intensity of the OH bands as the headers of the frames state it."""
+    found = [bands_of_header(frame.metadata) for frame in frames]
+    silent = [number for number, bands in enumerate(found) if not bands]
+    if silent:
+        raise InputError(
+            f"OH bands of frames {silent}",
+            "not stated",
+            "header cards like 'BAND 8-4' with their intensity relative to the reference sky",
+        )
+    return found
+
+
+def _check_frames(frames: Sequence[SkyFringe]) -> None:
+    if not frames:
+        raise InputError("sky frames", 0, "one or more")
+    shapes = sorted({frame.shape for frame in frames})
+    if len(shapes) > 1:
+        raise InputError("shapes of the sky frames", shapes, "one, that of the sensor")
+    names = sorted({frame.detector for frame in frames if frame.detector})
+    if len(names) > 1:
+        raise InputError("detectors of the sky frames", names, "one sensor")
+    airmass = [frame.airmass for frame in frames]
+    if np.ptp(airmass) > AIRMASS_RANGE:
+        raise InputError("airmass of the sky frames", airmass, f"one sky: within {AIRMASS_RANGE:g}")
+    for frame in frames:
+        refuse_corrected(frame.metadata, frame.detector or None)
+
+
+def _check_components(sky: SkySpectrum, scales: Sequence[Mapping[str, float]]) -> None:
+    names = (*sky.lines.bands, *(term.name for term in sky.continua))
+    for scale in scales:
+        component_factors(names, np.ones(len(names)), scale)
+
+
+class _Images(NamedTuple):
+    """Frames in electrons, ``(F, ny, nx)``."""
+
+    value: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    mask: NDArray[np.int16]
+    detector: str
+
+    def in_order(self, order: NDArray[np.intp]) -> _Images:
+        return _Images(self.value[order], self.variance[order], self.mask[order], self.detector)
+
+
+def _images_of(frames: Sequence[SkyFringe]) -> _Images:
+    value = np.stack([_electrons(frame) for frame in frames])
+    read_noise: list[Any] = [frame.metadata.get("RDNOISE", 0.0) for frame in frames]
+    noise = np.array([float(each) for each in read_noise])[:, None, None]
+    mask = np.stack([frame.mask for frame in frames]).astype(np.int16)
+    variance = (np.maximum(value, 1.0) + noise**2).astype(np.float32)
+    return _Images(value, variance, mask, frames[0].detector)
+
+
+def _as_cube(
+    images: _Images,
+    light: SkyExposures,
+    model: FringeModel,
+    thickness_um: ArrayLike,
+    sigma_um: ArrayLike | float,
+) -> FringeCube:
+    """Frames and map in the form of a cube."""
+    thickness = np.asarray(thickness_um, dtype=np.float32)
+    shape = images.value.shape[1:]
+    if thickness.shape != shape:
+        raise InputError("shape of the thickness map", thickness.shape, f"{shape}, that of the frames")
+    known = np.isfinite(thickness)
+    if not known.any():
+        raise InputError("thickness map", "no finite value", "a thickness in at least one pixel")
+    low, high = light.band.support()
+    good = images.mask == 0
+    return FringeCube(
+        images.value,
+        images.variance,
+        np.where(known, images.mask, images.mask | np.int16(_NO_DATA)),
+        FlatExposures(
+            light.wavelength_nm(),
+            np.array(high - low),
+            np.array(model.system.temperature_k),
+            level_e=np.array(
+                [plane[ok].mean() if ok.any() else 1.0 for plane, ok in zip(images.value, good, strict=True)]
+            ),
+        ),
+        "electron",
+        thickness=thickness,
+        thickness_sigma=np.broadcast_to(np.asarray(sigma_um, dtype=np.float32), shape).copy(),
+        layer=model.system.varying,
+        detector=images.detector,
+    )
+
+
+def _electrons(frame: SkyFringe) -> NDArray[np.float32]:
+    if frame.unit == "electron":
+        return frame.image
+    return np.asarray(frame.mean_electrons * (1.0 + frame.image), dtype=np.float32)
