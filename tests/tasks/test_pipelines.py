@@ -59,10 +59,12 @@ def test_pipelines_of_a_camera_name_its_instrument(name: str) -> None:
 
 
 def test_dataset_types_and_dimensions_are_those_agreed() -> None:
-    graphs = [load(f"lsstCam/{name}.yaml").to_graph() for name in ("fringe", "discovery")]
+    graphs = [load(f"lsstCam/{name}.yaml").to_graph() for name in ("fringe", "discovery", "skyDiscovery")]
     agreed = {
         "effectDiscovery": ("FringeJson", {"instrument", "detector"}),
         "effectOverride": ("ConfigOverride", {"instrument", "detector"}),
+        "skyEffectDiscovery": ("FringeJson", {"instrument", "detector"}),
+        "skyEffectOverride": ("ConfigOverride", {"instrument", "detector"}),
         "raw": ("RawFrame", {"instrument", "exposure", "detector"}),
         "fringeFlat": ("FringeFlat", {"instrument", "exposure", "detector"}),
         "epoxyThickness": ("ThicknessMap", {"instrument", "detector"}),

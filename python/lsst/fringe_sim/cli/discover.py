@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 
-from ..algorithms.discovery import SearchOptions, Verdict, discover_sky
+from ..algorithms.discovery import SKY_SEARCH, SearchOptions, Verdict, discover_sky, placement_in_frames
 from ..algorithms.discovery import discover as search
 from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..errors import InputError
@@ -112,8 +113,9 @@ def _search_sky(data: SkyFrames, model: FringeModel, out: Path, seed: int, cells
         data.thickness_um,
         data.thickness_sigma_um,
         model,
+        placement=placement_in_frames(data.frames, data.detector, data.setup.pixel_scale_arcsec),
         rng=np.random.default_rng(seed),
-        options=SearchOptions(most_cells=cells),
+        options=replace(SKY_SEARCH, most_cells=cells),
         report=lambda line: click.echo(line, err=True),
     )
     _write(verdict, folder, None)

@@ -30,6 +30,8 @@ _LAZY = {
     "IsrFlatPrepTask": ".isr_flat_prep",
     "RaftConfig": ".model_config",
     "SensorConfig": ".model_config",
+    "SkyEffectDiscoveryConfig": ".effect_discovery",
+    "SkyEffectDiscoveryTask": ".effect_discovery",
     "SkyFringeSimConfig": ".sky_fringe_sim",
     "SkyFringeSimTask": ".sky_fringe_sim",
     "UnusableDataError": ".quantum",

@@ -1,13 +1,15 @@
-"""From the flats of a sensor to the effect that its model lacks."""
+"""From the flats of a sensor, or from frames of the sky, to the effect that its model lacks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from lsst.pex.config import Field
+from lsst.pex.config import Config, Field, FieldValidationError
 from lsst.pipe.base import (
     InputQuantizedConnection,
     NoWorkFound,
@@ -21,13 +23,23 @@ from lsst.pipe.base import (
 from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms import discover
-from ..algorithms.discovery import SearchOptions, Verdict
+from ..algorithms.discovery import SKY_SEARCH, SearchOptions, Verdict, discover_sky, placement_in_frames
 from ..instrument.detector import Detector
-from ..products import FringeCube, FringeFlat
+from ..instrument.sky import EmissionLines, SkySpectrum
+from ..model import FringeModel, Setup
+from ..products import FringeCube, FringeFlat, SkyFringe, ThicknessMap
 from .model_config import FringeModelConfig, ModelChoice
 from .quantum import common_header, data_id_of, sensor_of, unusable
+from .sky_model import SkyModelConfig, known_thickness, thickness_input
 
-__all__ = ["EffectDiscoveryConfig", "EffectDiscoveryConnections", "EffectDiscoveryTask"]
+__all__ = [
+    "EffectDiscoveryConfig",
+    "EffectDiscoveryConnections",
+    "EffectDiscoveryTask",
+    "SkyEffectDiscoveryConfig",
+    "SkyEffectDiscoveryConnections",
+    "SkyEffectDiscoveryTask",
+]
 
 
 class EffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
@@ -64,22 +76,35 @@ class EffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrumen
         return {}, {}
 
 
-class EffectDiscoveryConfig(
-    FringeModelConfig, PipelineTaskConfig, pipelineConnections=EffectDiscoveryConnections
-):
-    """Configuration of `EffectDiscoveryTask`; ``effects`` are those that are known already."""
-
-    task_name: ClassVar[str] = "effectDiscovery"
+class SearchConfig(Config):
+    """How hard a search looks."""
 
     seed: Field[int] = Field(
         dtype=int, default=1, doc="With the number of the sensor: which parts of it are held out."
     )
     most_cells: Field[int] = Field(
-        dtype=int, default=20_000, doc="Cells that the flats are averaged to, if the pattern allows it."
+        dtype=int, default=20_000, doc="Cells that the images are averaged to, if the pattern allows it."
     )
     significance: Field[float] = Field(
         dtype=float, default=1e-3, doc="Chance of noise below which the model is held to disagree."
     )
+
+    @property
+    def options(self) -> SearchOptions:
+        """The same for the algorithm."""
+        return SearchOptions(most_cells=self.most_cells, significance=self.significance)
+
+    def rng(self, detector: Detector) -> np.random.Generator:
+        """Random numbers of a sensor."""
+        return np.random.default_rng([self.seed, detector.id])
+
+
+class EffectDiscoveryConfig(
+    SearchConfig, FringeModelConfig, PipelineTaskConfig, pipelineConnections=EffectDiscoveryConnections
+):
+    """Configuration of `EffectDiscoveryTask`; ``effects`` are those that are known already."""
+
+    task_name: ClassVar[str] = "effectDiscovery"
 
 
 class EffectDiscoveryTask(PipelineTask):
@@ -127,19 +152,143 @@ class EffectDiscoveryTask(PipelineTask):
         """
         choice = self.config.choice_of(detector)
         cube = FringeCube.from_flats(flats, number=number)
-        options = SearchOptions(most_cells=self.config.most_cells, significance=self.config.significance)
-        rng = np.random.default_rng([self.config.seed, detector.id])
-        verdict = discover(cube, choice.model(), rng=rng, options=options, report=self._say)
-        self.log.info("%s: %s", detector.name, verdict.summary())
-        stated = {**common_header(self.config), **choice.header(), "SEED": self.config.seed}
-        content = verdict.as_mapping(model_override=self.config.connections.override)
-        return Struct(
-            verdict={**content, "provenance": stated},
-            override=_override(choice, verdict, detector),
+        verdict = discover(
+            cube, choice.model(), rng=self.config.rng(detector), options=self.config.options, report=self._say
         )
+        self.log.info("%s: %s", detector.name, verdict.summary())
+        return _stored(self.config, choice, verdict, detector)
 
     def _say(self, line: str) -> None:
         self.log.verbose("%s", line)
+
+
+class SkyEffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
+    """Frames of the sky and the thickness of a sensor in; a verdict, and an override with what was found, out."""
+
+    frames = Input(
+        doc="Frames of the night sky, not corrected for fringes, whose headers state the OH bands.",
+        name="skyFringe",
+        storageClass="SkyFringe",
+        dimensions=("instrument", "exposure", "detector"),
+        multiple=True,
+        deferLoad=True,
+    )
+    thickness = thickness_input()
+    verdict = Output(
+        doc="Whether the sky and the model disagree, and which effect is the reason.",
+        name="skyEffectDiscovery",
+        storageClass="FringeJson",
+        dimensions=("instrument", "detector"),
+    )
+    override = Output(
+        doc="Effects that were known and that were found, as an override for any task with a fringe model: "
+        "-C label:FILE.",
+        name="skyEffectOverride",
+        storageClass="ConfigOverride",
+        dimensions=("instrument", "detector"),
+    )
+
+
+class SkyEffectDiscoveryConfig(
+    SearchConfig, SkyModelConfig, PipelineTaskConfig, pipelineConnections=SkyEffectDiscoveryConnections
+):
+    """Configuration of `SkyEffectDiscoveryTask`; ``effects`` are those that are known already."""
+
+    task_name: ClassVar[str] = "skyEffectDiscovery"
+
+    def validate(self) -> None:
+        """A search needs the thickness of its sensor."""
+        super().validate()
+        if self.stand_in:
+            raise FieldValidationError(SkyModelConfig.stand_in, self, "a search needs the map of the sensor")
+
+
+class SkyEffectDiscoveryTask(PipelineTask):
+    """Find where model and sky of a sensor disagree, and name the missing effect."""
+
+    ConfigClass = SkyEffectDiscoveryConfig
+    config: SkyEffectDiscoveryConfig
+    _DefaultName = "skyEffectDiscovery"
+
+    def runQuantum(
+        self,
+        butlerQC: QuantumContext,
+        inputRefs: InputQuantizedConnection,
+        outputRefs: OutputQuantizedConnection,
+    ) -> None:
+        """Read frames and map, search, store."""
+        detector = sensor_of(data_id_of(butlerQC))
+        frames = [butlerQC.get(ref).get() for ref in inputRefs.frames]
+        with unusable(detector.name):
+            result = self.run(frames, butlerQC.get(inputRefs.thickness), detector)
+        butlerQC.put(result, outputRefs)
+
+    def run(self, frames: Sequence[SkyFringe], thickness: ThicknessMap, detector: Detector) -> Struct:
+        """Search one sensor.
+
+        Parameters
+        ----------
+        frames : sequence of `SkyFringe`
+            Frames of the sensor, with the intensity of the OH bands in their headers.
+        thickness : `ThicknessMap`
+            Its thickness, fitted to flats of the laboratory.
+        detector : `Detector`
+            The sensor; its place in the focal plane decides the beams.
+
+        Returns
+        -------
+        result : `~lsst.pipe.base.Struct`
+            ``verdict`` and ``override``, as of `EffectDiscoveryTask`.
+
+        Raises
+        ------
+        InputError
+            Frames that do not belong together, are corrected already, or do not state the OH bands; a map of another
+            layer or shape.
+        """
+        choice = self.config.choice_of(detector)
+        layer = self.config.map_of(thickness, detector)
+        setup = Setup.from_name(choice.setup)
+        placement = placement_in_frames(frames, detector, setup.pixel_scale_arcsec)
+        lines = EmissionLines.oh(self.config.rotational_temperature_k, self.config.vibrational_temperature_k)
+        airmass = float(np.mean([frame.airmass for frame in frames]))
+        verdict = discover_sky(
+            frames,
+            known_thickness(layer),
+            layer.sigma,
+            self._model(choice, detector),
+            rng=self.config.rng(detector),
+            sky=SkySpectrum.dark(lines, airmass, solar_flux_sfu=self.config.solar_flux_sfu),
+            placement=placement,
+            options=replace(
+                SKY_SEARCH, most_cells=self.config.most_cells, significance=self.config.significance
+            ),
+            report=self._say,
+        )
+        self.log.info("%s: %s", detector.name, verdict.summary())
+        return _stored(self.config, choice, verdict, detector)
+
+    @staticmethod
+    def _model(choice: ModelChoice, detector: Detector) -> FringeModel:
+        """The sensor in its place."""
+        if math.isnan(detector.field_radius_deg):
+            return choice.model()
+        return choice.model(field_x_deg=detector.field_x_deg, field_y_deg=detector.field_y_deg)
+
+    def _say(self, line: str) -> None:
+        self.log.verbose("%s", line)
+
+
+def _stored(
+    config: EffectDiscoveryConfig | SkyEffectDiscoveryConfig,
+    choice: ModelChoice,
+    verdict: Verdict,
+    detector: Detector,
+) -> Struct:
+    """Verdict and override as they are stored."""
+    stated = {**common_header(config), **choice.header(), "SEED": config.seed}
+    content = verdict.as_mapping(model_override=config.connections.override)
+    return Struct(verdict={**content, "provenance": stated}, override=_override(choice, verdict, detector))
 
 
 def _override(choice: ModelChoice, verdict: Verdict, detector: Detector) -> str:

@@ -1,7 +1,7 @@
 """Discovery of missing effects: find the disagreement, name it, add it, show the gap shrink."""
 
 from .search import SearchOptions, discover
-from .sky_search import discover_sky
+from .sky_search import SKY_SEARCH, discover_sky, placement_in_frames
 from .verdict import (
     Gap,
     NamedEffect,
@@ -13,6 +13,7 @@ from .verdict import (
 )
 
 __all__ = [
+    "SKY_SEARCH",
     "Gap",
     "NamedEffect",
     "ParameterValue",
@@ -22,5 +23,6 @@ __all__ = [
     "Where",
     "discover",
     "discover_sky",
+    "placement_in_frames",
     "read_effects_override",
 ]

@@ -62,7 +62,13 @@ class Exposures(Protocol):
     """The light of the exposures, where it is not that of flats."""
 
     def response(self, model: FringeModel, start_um: float, step_um: float, count: int) -> FloatArray:
-        """Response of every exposure on a uniform grid of thickness, ``(W, count)``, in any unit."""
+        """Response of every exposure at K places of the field on a uniform grid of thickness, in any unit.
+
+        Shape ``(K * W, count)``, all exposures at one place after the other.
+        """
+
+    def place_weight(self, shape: tuple[int, int]) -> FloatArray:
+        """Weights of the places for every cell of a sensor, ``(K, ny, nx)``; their sum is 1."""
 
 
 @dataclass(eq=False)
@@ -100,11 +106,15 @@ class Forward:
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[int, float], FloatArray] = field(default_factory=dict, repr=False)
     _rows_of: tuple[tuple[str, float], ...] | None = field(default=None, repr=False)
+    place_weight: FloatArray | None = field(init=False, repr=False, default=None)
     _limits_um: tuple[float, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         low, high = self.range_um
         self._limits_um = (max(low - FARTHEST_UM, 0.05), high + FARTHEST_UM)
+        if self.exposures is not None:
+            weight = self.exposures.place_weight(self.geometry.shape)
+            self.place_weight = weight if len(weight) > 1 else None
 
     @classmethod
     def of_cells(
@@ -123,6 +133,7 @@ class Forward:
     def table(self, settings: Settings) -> FloatArray:
         """Response ``(W, D)`` on the grid of thickness, relative to its mean, as flats are.
 
+        Light that changes over the field has such rows for each of its places, ``(K * W, D)``.
         Effects on the image are parts of that mean, whatever effects on the response make of it.
         """
         key = tuple(sorted({**self.model.effect_settings, **self._optical(settings)}.items()))
@@ -132,7 +143,8 @@ class Forward:
             response = self._response(settings, low, count)
             # Tapered, so that a broken fringe order at an end of the table does not count.
             mean = np.average(response, axis=1, weights=np.hanning(count + 2)[1:-1])
-            self._tables[key] = table = response / mean[:, np.newaxis]
+            each = mean.reshape(-1, len(self.geometry.wavelength_nm)).mean(axis=0)  # over all places
+            self._tables[key] = table = response / np.resize(each, len(mean))[:, np.newaxis]
             while len(self._tables) * table.nbytes > MOST_TABLE_BYTES and len(self._tables) > 2:
                 self._tables.pop(next(iter(self._tables)))
         return self._tables[key]
@@ -213,6 +225,8 @@ class Forward:
             second = first if tables[1] is tables[0] else self._at_cells(tables[1], thickness_um)[0]
             return self._on_image(images[1], second) - self._on_image(images[0], first)
         table = tables[1] - tables[0]
+        if self.place_weight is not None:
+            return self._at_cells(table, thickness_um)[0]
         # Effects on single exposures leave most planes as they are.
         rows = np.flatnonzero(table.any(axis=1))
         result = np.zeros((len(table), *thickness_um.shape))
@@ -239,16 +253,27 @@ class Forward:
                 used, self.range_um[0], TABLE_STEP_UM, place.ravel(), second.ravel(), fourth.ravel()
             )
         )
+        if self.place_weight is not None:
+            value, slope = self._at_places(value), self._at_places(slope)
         if beside is not None:
             value += slope * (beside if rows is None else beside[rows])
         return value, slope
 
+    def _at_places(self, rows: FloatArray) -> FloatArray:
+        """Cells of the rows of all places, each seen at its own: ``(K * W, ny, nx)`` to ``(W, ny, nx)``."""
+        weight = self.place_weight
+        assert weight is not None
+        return np.asarray(np.einsum("kyx,kwyx->wyx", weight, rows.reshape(len(weight), -1, *rows.shape[1:])))
+
     def sampled(self, settings: Settings, thickness_um: FloatArray) -> FloatArray:
-        """Response at any thicknesses within the tables, without effects on the image; shape ``(W, ...)``."""
+        """Response at any thicknesses within the tables, without effects on the image; shape ``(W, ...)``.
+
+        Of light that changes over the field, that at its first place.
+        """
         table = self.table(settings)
         flat, nothing = thickness_um.ravel(), np.zeros(thickness_um.size)
         value, _ = _interpolate(table, self.range_um[0], TABLE_STEP_UM, flat, nothing, nothing)
-        return value.reshape(len(table), *thickness_um.shape)
+        return value.reshape(len(table), *thickness_um.shape)[: len(self.geometry.wavelength_nm)]
 
     def _at_centroids(
         self, thickness_um: FloatArray, gradient: FloatArray

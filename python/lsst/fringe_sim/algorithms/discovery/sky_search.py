@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BarycentricInterpolator
 
 from ...effects import EFFECTS, Effect
 from ...errors import InputError
 from ...instrument.bandpass import Bandpass
+from ...instrument.detector import Detector
 from ...instrument.sky import SkySpectrum, SpectralComponent, blend_components
 from ...instrument.telescope import reduce_beam
 from ...model import FringeModel, Setup
 from ...optics import Beam, Illumination
 from ...optics.phase_response import PhaseResponse
 from ...products import FlatExposures, FringeCube, SkyFringe, bands_of_header, mask_bits, refuse_corrected
+from ..field_response import SensorPlacement, beam_field
 from ..sky_frame import (
     bandpass_of,
     component_factors,
@@ -25,17 +29,18 @@ from ..sky_frame import (
     is_band,
     sky_with_effects,
     split_components,
+    white_light,
 )
 from .search import Report, SearchOptions, search_exposures
 from .verdict import Verdict
 
-__all__ = ["SkyExposures", "discover_sky"]
+__all__ = ["SKY_SEARCH", "SkyExposures", "discover_sky", "placement_in_frames"]
 
 FloatArray = NDArray[np.float64]
 Grid = tuple[float, float, int]
 """First, step [µm] and number of thicknesses."""
 
-LINE_ANGLES = 32
+LINE_ANGLES = 40
 """Angles of the beam for lines."""
 
 CONTINUUM_ANGLES = 8
@@ -44,7 +49,13 @@ CONTINUUM_ANGLES = 8
 CONTINUUM_STEP_NM = 0.2
 """Spacing of the wavelengths that stand for a continuum [nm]."""
 
-LINE_SHIFT_NM = 0.01
+FLAT_STEP_NM = 0.05
+"""Spacing of the wavelengths that stand for the light of flat fields [nm]."""
+
+RADII, FEW_RADII = 8, 3
+"""Field radii at which the beams of a sensor are summed in full, and those for what an effect changes."""
+
+LINE_SHIFT_NM = 0.02
 """Rms shift of the lines that are merged [nm]."""
 
 TOLERANCE = 1e-7
@@ -53,7 +64,10 @@ TOLERANCE = 1e-7
 AIRMASS_RANGE = 0.2
 """Largest difference in airmass of frames that are searched together."""
 
-_KEPT = 8
+SKY_SEARCH = SearchOptions(most_effects=2, refits=6, parents=2)
+"""Fewer trials than for flats: each costs seconds, and one pattern does not tell three effects apart."""
+
+_KEPT = 16
 """Sensors whose reductions are kept: parameters of the sky move while one of them stays."""
 
 _NO_DATA = mask_bits("NO_DATA")
@@ -77,57 +91,91 @@ class SkyExposures:
         Optics and air.
     scales : `tuple` of mapping
         Factors on components of the sky, by name, for each frame.
+    field : `BeamsOverSensor`, optional
+        How the beam changes over the sensor, in flat-fielded frames; by default it is that of the model everywhere.
     """
 
     base: FringeModel
     sky: SkySpectrum
     band: Bandpass
     scales: tuple[Mapping[str, float], ...]
-    _places: dict[str, FloatArray] = field(init=False, repr=False)
-    _reduced: dict[tuple[Any, ...], dict[str, _Reduced]] = field(default_factory=dict, repr=False)
-    _missing: dict[Grid, FloatArray] = field(default_factory=dict, repr=False)
+    field: BeamsOverSensor | None = None
+    _places: dict[str, FloatArray] = dataclass_field(init=False, repr=False)
+    _reduced: dict[tuple[Any, ...], dict[str, _Reduced]] = dataclass_field(default_factory=dict, repr=False)
+    _flat: FloatArray = dataclass_field(init=False, repr=False)
+    _missing: dict[Grid, FloatArray] = dataclass_field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         lines, continua = split_components(
             sky_with_effects(self.base, self.sky), self.band, CONTINUUM_STEP_NM
         )
-        merged = blend_components(lines, LINE_SHIFT_NM) if lines else []
+        # Lines that are faint now may be bright in another sky: square roots of the photons tell what may be merged.
+        even = [replace(part, photons=np.sqrt(part.photons)) for part in lines]
+        merged = blend_components(even, LINE_SHIFT_NM) if lines else []
         self._places = {part.name: part.wavelength_nm for part in [*merged, *continua]}
 
     def response(self, model: FringeModel, start_um: float, step_um: float, count: int) -> FloatArray:
-        """Electrons of every frame on a uniform grid of thickness, ``(F, count)``."""
+        """Electrons of every frame on a uniform grid of thickness, at every place: ``(K * F, count)``."""
         grid = (start_um, step_um, count)
         if grid not in self._missing:
             self._missing.clear()
-            self._missing[grid] = self._summed_in_full(grid) - self._summed(self.base, grid)
-        return self._summed(model, grid) + self._missing[grid]
+            self._missing[grid] = self._summed_in_full(grid) - self._short(self.base, grid)
+            self._flat = self._flat_field(grid)
+        return (self._short(model, grid) + self._missing[grid]) / self._flat
+
+    def place_weight(self, shape: tuple[int, int]) -> FloatArray:
+        """See `Exposures`."""
+        return np.ones((1, *shape)) if self.field is None else self.field.weight(shape)
+
+    def _short(self, model: FringeModel, grid: Grid) -> FloatArray:
+        """The short sums at every place."""
+        if self.field is None:
+            return self._summed(model, grid)
+        few = np.stack([self._summed(_behind(model, beam), grid) for beam in self.field.few_beams])
+        return np.einsum("kl,lfd->kfd", self.field.between, few).reshape(-1, grid[2])
 
     def _summed_in_full(self, grid: Grid) -> FloatArray:
-        electrons = electrons_on_grid(self.base, self.sky, self.band, *grid)
+        beams = [self.base.base_system.beam] if self.field is None else self.field.beams
         parts = sky_with_effects(self.base, self.sky).components(self.band)
-        return np.asarray(self._factors(parts) @ np.stack([electrons[part.name] for part in parts]))
+        rows = []
+        for beam in beams:
+            electrons = electrons_on_grid(_behind(self.base, beam), self.sky, self.band, *grid)
+            rows.append(self._factors(parts) @ np.stack([electrons[part.name] for part in parts]))
+        return np.concatenate(rows)
+
+    def _flat_field(self, grid: Grid) -> FloatArray:
+        """What flat fields of white light have taken out of the frames, ``(K * F, count)``."""
+        if self.field is None:
+            return np.ones((1, 1))
+        white = white_light(self.band, FLAT_STEP_NM)
+        rows = []
+        for beam in self.field.beams:
+            light = Illumination.spectrum(white.wavelength_nm, white.photons, reduce_beam(beam, LINE_ANGLES))
+            reduced = self.base.system.reduce(light)
+            rows.append(reduced.averaged_on_grid(light.weight, *grid)[0])
+        return np.repeat(rows, len(self.scales), axis=0)
 
     def _summed(self, model: FringeModel, grid: Grid) -> FloatArray:
-        """The short sums."""
+        """The short sums behind the beam of a model."""
         sky = sky_with_effects(model, self.sky)
         parts = [part for part in sky.components(self.band, CONTINUUM_STEP_NM) if part.name in self._places]
         reduced = self._reductions(model)
         factors = self._factors(parts)
-        together: dict[tuple[bytes, bytes], list[int]] = {}  # continua with one history
-        for number, part in enumerate(parts):
-            places = part.name if is_band(part.name) else self._places[part.name]
-            key = (
-                places.encode() if isinstance(places, str) else places.tobytes(),
-                factors[:, number].tobytes(),
-            )
-            together.setdefault(key, []).append(number)
         result = np.zeros((len(self.scales), grid[2]))
-        for numbers in together.values():
+        for numbers in self._together(parts, factors):
             name = parts[numbers[0]].name
-            photons = sum(_moved_to(self._places[name], parts[number]) for number in numbers)
-            electrons = _electrons_of(np.asarray(photons), self._places[name], reduced[name], model, grid)
+            photons = np.sum([_moved_to(self._places[name], parts[number]) for number in numbers], axis=0)
+            electrons = _electrons_of(photons, self._places[name], reduced[name], model, grid)
             result += np.outer(factors[:, numbers[0]], electrons)
         return result
+
+    def _together(self, parts: Sequence[SpectralComponent], factors: FloatArray) -> list[list[int]]:
+        """Components that can be summed at once: continua with one history."""
+        groups: dict[tuple[str, bytes], list[int]] = {}
+        for number, part in enumerate(parts):
+            band = part.name if is_band(part.name) else ""
+            groups.setdefault((band, factors[:, number].tobytes()), []).append(number)
+        return list(groups.values())
 
     def _factors(self, parts: Sequence[SpectralComponent]) -> FloatArray:
         """Factors of the components in every frame, ``(F, C)``."""
@@ -142,11 +190,12 @@ class SkyExposures:
 
     def _reductions(self, model: FringeModel) -> dict[str, _Reduced]:
         """What the sensor makes of every place and angle, by component."""
-        key = tuple(
+        key: tuple[Any, ...] = tuple(
             (item.effect.name, *sorted(item.values.items()))
             for item in model.effects
             if item.effect.acts_on not in ("spectrum", "response", "image")
         )
+        key = (*key, model.base_system.beam.theta.tobytes())
         if key not in self._reduced:
             while len(self._reduced) >= _KEPT:
                 self._reduced.pop(next(iter(self._reduced)))
@@ -178,6 +227,67 @@ class SkyExposures:
         return np.asarray((weights @ means) / weights.sum(axis=1))
 
 
+@dataclass(frozen=True, eq=False)
+class BeamsOverSensor:
+    """Beams of a telescope at some field radii of one sensor, and which of them a pixel sees.
+
+    Attributes
+    ----------
+    placement : `SensorPlacement`
+        Where the pixels lie.
+    radius_deg : `numpy.ndarray`, shape ``(K,)``
+        Field radii [deg].
+    beams : `tuple` of `Beam`
+        The beams there.
+    few_radius_deg : `numpy.ndarray`
+        Radii enough for what an effect changes [deg].
+    few_beams : `tuple` of `Beam`
+        The beams there.
+    """
+
+    placement: SensorPlacement
+    radius_deg: FloatArray
+    beams: tuple[Beam, ...]
+    few_radius_deg: FloatArray
+    few_beams: tuple[Beam, ...]
+
+    @classmethod
+    def of(cls, telescope: str, placement: SensorPlacement) -> BeamsOverSensor | None:
+        """Beams over a sensor; `None` behind a cone, or where they do not depend on the radius alone."""
+        beams = beam_field(telescope)
+        if beams is None:
+            return None
+        radii = [_radii(placement.radius_range_deg, number) for number in (RADII, FEW_RADII)]
+        many, few = (tuple(beams.beam(radius) for radius in each) for each in radii)
+        return cls(placement, radii[0], many, radii[1], few)
+
+    @property
+    def between(self) -> FloatArray:
+        """From values at the few radii to those at all, ``(K, L)``."""
+        return lagrange_matrix(self.few_radius_deg, self.radius_deg)
+
+    def weight(self, shape: tuple[int, int]) -> FloatArray:
+        """Weights of the radii for every cell of a map that covers the sensor, ``(K, ny, nx)``."""
+        radius = self.placement.radius_deg(shape)
+        return np.moveaxis(lagrange_matrix(self.radius_deg, radius.ravel()), 1, 0).reshape(-1, *shape)
+
+
+def _radii(limits: tuple[float, float], number: int) -> FloatArray:
+    """Chebyshev nodes between two radii."""
+    low, high = limits
+    return 0.5 * (low + high) - 0.5 * (high - low) * np.cos(np.pi * (np.arange(number) + 0.5) / number)
+
+
+def lagrange_matrix(nodes: FloatArray, places: FloatArray) -> FloatArray:
+    """Matrix from values at nodes to the polynomial through them at other places, ``(places, nodes)``."""
+    return np.asarray(BarycentricInterpolator(nodes, np.eye(len(nodes)))(places))
+
+
+def _behind(model: FringeModel, beam: Beam) -> FringeModel:
+    """The same sensor in another beam."""
+    return replace(model, base_system=replace(model.base_system, beam=beam))
+
+
 class _Reduced(NamedTuple):
     """A stack of films at the places and angles of one component."""
 
@@ -195,17 +305,12 @@ def _electrons_of(
 
 
 def _moved_to(places: FloatArray, part: SpectralComponent) -> FloatArray:
-    """Photons of a component at given places, each shared by its neighbours so that its mean wavelength stays."""
+    """Photons of a component at the nearest of given places."""
     if np.array_equal(places, part.wavelength_nm):
         return part.photons
-    if places.size == 1:
-        return np.array([part.photons.sum()])
-    upper = np.clip(np.searchsorted(places, part.wavelength_nm), 1, places.size - 1)
-    gap = places[upper] - places[upper - 1]
-    share = np.clip((part.wavelength_nm - places[upper - 1]) / gap, 0.0, 1.0)
-    result = np.bincount(upper, part.photons * share, places.size)
-    result += np.bincount(upper - 1, part.photons * (1.0 - share), places.size)
-    return np.asarray(result)
+    middles = 0.5 * (places[1:] + places[:-1])
+    near = np.searchsorted(middles, part.wavelength_nm)
+    return np.asarray(np.bincount(near, part.photons, places.size), dtype=float)
 
 
 def discover_sky(
@@ -218,6 +323,7 @@ def discover_sky(
     rng: np.random.Generator,
     sky: SkySpectrum | None = None,
     scales: Sequence[Mapping[str, float]] | None = None,
+    placement: SensorPlacement | None = None,
     options: SearchOptions | None = None,
     report: Report | None = None,
 ) -> Verdict:
@@ -238,14 +344,19 @@ def discover_sky(
         Sensor behind a telescope; a model may hold effects that are known already, such as those named from flats.
     effects : sequence of `Effect`, optional
         The catalogue; those of the laboratory are left out.
-    rng, options, report
+    rng, report
         See `discover`.
+    options : `SearchOptions`, optional
+        Thresholds and sizes; those of `SKY_SEARCH` by default.
     sky : `SkySpectrum`, optional
         Lines and continua; by default a dark sky at the mean airmass of the frames.
     scales : sequence of mapping, optional
         Factors on components of that sky for each frame, as `NightHistory.band_scale` gives them; by default what the
         headers of the frames say (`band_cards`). The bands change by factors during a night, and what they do to a
         frame looks like many an effect: a search that guessed them would find what is not there.
+    placement : `SensorPlacement`, optional
+        Where the pixels lie, of flat-fielded frames in which every pixel sees its own beam, as in any real one; by
+        default all see that of the model.
 
     Returns
     -------
@@ -269,13 +380,23 @@ def discover_sky(
     if len(factors) != len(frames):
         raise InputError("factors on the sky", len(factors), f"one mapping for each of {len(frames)} frames")
     _check_components(sky, factors)
-    light = SkyExposures(model, sky, bandpass_of(model), factors)
+    over = None if placement is None else BeamsOverSensor.of(model.setup.telescope, placement)
+    light = SkyExposures(model, sky, bandpass_of(model), factors, over)
     order = np.argsort(light.wavelength_nm(), kind="stable")  # that of a search
     light = replace(light, scales=tuple(light.scales[number] for number in order))
     cube = _as_cube(_images_of(frames).in_order(order), light, model, thickness_um, thickness_sigma_um)
     known = {item.effect.name for item in model.effects}
     own = [effect for effect in effects if not effect.laboratory_only or effect.name in known]
-    return search_exposures(cube, model, own, rng, options, report, light)
+    return search_exposures(cube, model, own, rng, options or SKY_SEARCH, report, light)
+
+
+def placement_in_frames(
+    frames: Sequence[SkyFringe], detector: Detector, pixel_scale_arcsec: float
+) -> SensorPlacement | None:
+    """Placement for `discover_sky`; `None` for frames that were simulated with the beam of the centre only."""
+    if all(str(frame.metadata.get("BEAMS", "")) == "centre" for frame in frames):
+        return None
+    return SensorPlacement.of(detector, pixel_scale_arcsec)
 
 
 def _stated_bands(frames: Sequence[SkyFringe]) -> list[dict[str, float]]:

@@ -1,0 +1,199 @@
+"""The search on frames of the night sky: light as fast as a search needs, null and hidden effects, bad input."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery import discover_sky
+from lsst.fringe_sim.algorithms.discovery.sky_search import BeamsOverSensor, SkyExposures
+from lsst.fringe_sim.algorithms.field_response import SensorPlacement, sensor_response
+from lsst.fringe_sim.algorithms.sky_frame import bandpass_of, simulate_sky_frame, sky_response
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.errors import InputError, UnknownNameError
+from lsst.fringe_sim.instrument.camera import Camera
+from lsst.fringe_sim.instrument.night import NightHistory
+from lsst.fringe_sim.instrument.sky import SkySpectrum
+from lsst.fringe_sim.mock.thickness import random_field
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import SkyFringe, band_cards, bands_of_header
+
+SHAPE = (48, 48)
+FRAMES = 3
+CATALOGUE = (
+    "contrast_loss",
+    "rotational_temperature",
+    "water_vapour",
+    "oh_bands",
+    "converging_beam",
+    "sky_continuum",
+)
+GRID = (12.0, 0.004, 500)
+
+
+def frames_of(
+    setup: str, settings: Mapping[str, float], seed: int, level: float = 4e6
+) -> tuple[list[SkyFringe], np.ndarray]:
+    """Frames of a night with photon noise, and the map of their sensor."""
+    rng = np.random.default_rng(seed)
+    model = FringeModel.from_setup(setup, settings)
+    truth = random_field(SHAPE, rng, mean=14.0, span=2.5)
+    sky = SkySpectrum.dark(airmass=model.setup.airmass)
+    response = sky_response(
+        model, sky, thickness_range_um=(float(truth.min()) - 0.1, float(truth.max()) + 0.1)
+    )
+    night, frames = NightHistory.guo2022(), []
+    for time in range(FRAMES):
+        scale = night.band_scale(3 * time, response.bands)
+        frame = simulate_sky_frame(
+            truth, model, response=response, scale=scale, mean_electrons=level, seed=seed + 10 * time
+        )
+        frames.append(replace(frame, metadata={**frame.metadata, **band_cards(scale)}))
+    return frames, truth + 0.002 * rng.standard_normal(SHAPE)
+
+
+def exposures(model: FringeModel, **parts: object) -> SkyExposures:
+    sky = SkySpectrum.dark(airmass=model.setup.airmass)
+    return SkyExposures(model, sky, bandpass_of(model), ({}, {"8-4": 0.5}), **parts)
+
+
+@pytest.mark.parametrize("setup", ["lsst_e2v", "monocam"])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"rotational_temperature.offset": 20.0},
+        {"contrast_loss.factor": 0.7},
+        {"thickness_spread.sigma": 20.0},
+        {"sky_continuum.scale": 1.5},
+    ],
+    ids=str,
+)
+def test_the_short_sums_are_the_sky_of_the_simulation(setup: str, settings: dict[str, float]) -> None:
+    """The unchanged model to rounding of its table, and a few percent of what an effect changes."""
+    base, model = FringeModel.from_setup(setup), FringeModel.from_setup(setup, settings)
+    thickness = GRID[0] + GRID[1] * np.arange(GRID[2])
+    light = exposures(base)
+
+    def relative(rows: np.ndarray) -> np.ndarray:
+        return rows / rows.mean(axis=1, keepdims=True)
+
+    def simulated(each: FringeModel) -> np.ndarray:
+        response = sky_response(each, light.sky, thickness_range_um=(thickness[0], thickness[-1] + 0.01))
+        return relative(np.concatenate([response.sky(scale).lookup(thickness) for scale in light.scales]))
+
+    expected, found = simulated(model), relative(light.response(model, *GRID))
+    change = float(np.std(expected - simulated(base)))
+    assert np.std(found - expected) < 2e-6 + 0.04 * change
+    if settings:
+        assert change > 1e-5
+
+
+def test_every_pixel_sees_its_own_beam() -> None:
+    """Behind a telescope: against frames that are simulated with the beam of every pixel."""
+    base = FringeModel.from_setup("lsst_e2v")
+    detector = Camera.from_name(base.setup.camera).detector("R22_S01")
+    placement = SensorPlacement.of(detector, base.setup.pixel_scale_arcsec)
+    light = exposures(base, field=BeamsOverSensor.of(base.setup.telescope, placement))
+    for settings, tolerance in (({}, 8e-3), ({"contrast_loss.factor": 0.8}, 2.5e-2)):
+        model = FringeModel.from_setup("lsst_e2v", settings)
+        rows = light.response(model, *GRID)
+        shape = (24, GRID[2])
+        weight = light.place_weight(shape)
+        np.testing.assert_allclose(weight.sum(axis=0), 1.0, atol=1e-9)
+        assert rows.shape == (2 * len(weight), GRID[2])
+        thickness = np.broadcast_to(GRID[0] + GRID[1] * np.arange(GRID[2]), shape)
+        response = sensor_response(model, light.sky, placement, (GRID[0], float(thickness.max()) + 0.01))
+        for number, scale in enumerate(light.scales):
+            own = rows[number::2] / rows[number::2].mean()
+            found = np.einsum("kyx,kx->yx", weight, own)
+            frame = np.asarray(response.sky(scale).frame(thickness), dtype=float)
+            miss = found / found.mean() - frame / frame.mean()
+            fringes = np.std(frame / frame.mean())
+            one_beam = found[12] / found[12].mean() - frame / frame.mean()
+            assert np.std(miss) < tolerance * fringes
+            assert np.std(one_beam) > 0.05 * fringes  # it matters
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("setup", "name", "settings"),
+    [
+        ("lsst_e2v", "", {}),
+        ("lsst_e2v", "contrast_loss", {"contrast_loss.factor": 0.75}),
+        ("monocam", "rotational_temperature", {"rotational_temperature.offset": 25.0}),
+    ],
+)
+def test_a_hidden_effect_is_found_on_the_sky(setup: str, name: str, settings: dict[str, float]) -> None:
+    seed = int(np.random.SeedSequence().generate_state(1)[0] >> 8)
+    level = 4e6 if setup == "lsst_e2v" else 1e5
+    frames, known = frames_of(setup, settings, seed, level)
+    catalogue = [effect for effect in EFFECTS if effect.name in CATALOGUE]
+    verdict = discover_sky(frames, known, 0.002, setup, catalogue, rng=np.random.default_rng(seed))
+    if not name:
+        assert verdict.verdict == "no_discrepancy", seed
+        return
+    assert verdict.verdict == "named", (seed, verdict.summary())
+    (found,) = verdict.effects
+    assert name in (found.name, *found.ambiguous_with), seed
+    if found.name == name:
+        ((key, value),) = settings.items()
+        item = found.parameters[key.partition(".")[2]]
+        assert abs(item.value - value) < 5.0 * item.sigma, seed
+
+
+def test_a_map_that_is_known_is_held_at_its_place() -> None:
+    """What a map lacks is no effect, however often fits start anew: the score of noise is that of noise."""
+    frames, known = frames_of("monocam", {}, 11, 1e5)
+    worse = known + 0.01 * np.random.default_rng(2).standard_normal(SHAPE)
+    catalogue = [effect for effect in EFFECTS if effect.name in ("contrast_loss", "sky_continuum")]
+    verdict = discover_sky(frames, worse, 0.0102, "monocam", catalogue, rng=np.random.default_rng(1))
+    assert verdict.verdict == "no_discrepancy"
+    assert verdict.global_probability > 1e-3
+
+
+def one_frame(**changes: object) -> SkyFringe:
+    image = np.random.default_rng(1).poisson(1000.0, SHAPE).astype(np.float32)
+    frame = SkyFringe(
+        image, np.zeros(SHAPE, np.int32), "electron", 1000.0, 30.0, 1.2, 24.0, None, 0.0, {"BAND 8-4": 1.0}
+    )
+    return replace(frame, **changes)
+
+
+@pytest.mark.parametrize(
+    ("frames", "setup", "message"),
+    [
+        ([], "lsst_e2v", "sky frames"),
+        ([one_frame()], "ts8_e2v", "behind a telescope"),
+        ([one_frame(metadata={})], "lsst_e2v", "OH bands of frames"),
+        ([one_frame(), one_frame(airmass=1.9)], "lsst_e2v", "airmass"),
+        ([one_frame(detector="R22_S11"), one_frame(detector="R22_S12")], "lsst_e2v", "one sensor"),
+        ([one_frame(metadata={"BAND 8-4": 1.0, "FRINGCOR": True})], "lsst_e2v", "corrected|fringe"),
+    ],
+)
+def test_frames_that_do_not_belong_together_are_refused(
+    frames: list[SkyFringe], setup: str, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        discover_sky(frames, np.full(SHAPE, 13.0), 0.002, setup, rng=np.random.default_rng(1))
+
+
+def test_maps_and_bands_that_do_not_fit_are_refused() -> None:
+    rng = np.random.default_rng(1)
+    with pytest.raises(InputError, match="shape of the thickness map"):
+        discover_sky([one_frame()], np.full((3, 4), 13.0), 0.002, "lsst_e2v", rng=rng)
+    with pytest.raises(InputError, match="no finite value"):
+        discover_sky([one_frame()], np.full(SHAPE, np.nan), 0.002, "lsst_e2v", rng=rng)
+    with pytest.raises(UnknownNameError, match="1-0"):
+        discover_sky([one_frame()], np.full(SHAPE, 13.0), 0.002, "lsst_e2v", rng=rng, scales=[{"1-0": 1.0}])
+    with pytest.raises(InputError, match="one mapping for each"):
+        discover_sky([one_frame()], np.full(SHAPE, 13.0), 0.002, "lsst_e2v", rng=rng, scales=[{}, {}])
+
+
+def test_headers_state_the_bands() -> None:
+    cards = band_cards({"8-4": 0.5, "5-2": 2.0})
+    assert cards == {"BAND 8-4": 0.5, "BAND 5-2": 2.0}
+    assert bands_of_header({**cards, "SETUP": "monocam"}) == {"8-4": 0.5, "5-2": 2.0}
