@@ -22,8 +22,8 @@ from lsst.fringe_sim.tasks import SkyEffectDiscoveryConfig, SkyFringeSimConfig
 pytestmark = [pytest.mark.middleware, pytest.mark.slow]
 
 PIPELINES = "resource://lsst.fringe_sim/pipelines/monocam"
-SHAPE = (96, 128)
-HIDDEN = 0.7
+SHAPE = (320, 384)
+HIDDEN = 0.5
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def repo(empty_repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     with Butler.from_config(str(repo), writeable=True) as butler:
         MonoCamFringe().register(butler.registry)
-        define_night(butler, "MonoCam", [NightPlan(datetime.date(2026, 1, 15), (19.0, 22.0, 24.0))])
+        define_night(butler, "MonoCam", [NightPlan(datetime.date(2026, 1, 15), (19.0, 20.0, 21.0))])
     with Butler.from_config(str(repo), writeable=True, run="u/map", instrument="MonoCam") as butler:
         kind = DatasetType(
             "epoxyThickness", ("instrument", "detector"), "ThicknessMap", universe=butler.dimensions
