@@ -7,6 +7,7 @@ variability), Leinert et al. 1998 (zodiacal light), Krisciunas & Schaefer 1991 (
 
 from __future__ import annotations
 
+import functools
 import heapq
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -165,7 +166,7 @@ class EmissionLines:
         )
         return lines.scaled(band_scale or {})
 
-    @property
+    @functools.cached_property
     def bands(self) -> tuple[str, ...]:
         """Names of the bands, in the order of their first line."""
         return tuple(dict.fromkeys(str(name) for name in self.band))

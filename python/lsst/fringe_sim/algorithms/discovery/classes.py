@@ -16,6 +16,9 @@ MIMICKED = 0.05
 DECADES_OF_CHANCE = 200.0
 """Powers of ten by which a residual of signal to noise 30 is improbable."""
 
+RIVALS_REFITTED = 3
+"""Best replacements of an effect that are fitted again."""
+
 LEAST_PROMISE = 4.0
 ALIKE = 0.8
 """Fall of χ² and cosine of signatures from which on a replacement is fitted."""
@@ -69,6 +72,7 @@ def _class_of(selector: Selector, chosen: Hypothesis, name: str, width: float) -
     rest = tuple(other for other in chosen.names if other != name)
     without = selector.hypothesis(rest, None, chosen.fit)
     found = {name: chosen, **_replacements(selector, chosen, name, without)}
+    _refit_rivals(selector, chosen, found, width)
     top = max(other.log_evidence for other in found.values())
     weight = {n: math.exp(max(other.log_evidence - top, -700.0)) for n, other in found.items()}
     total = sum(weight.values())
@@ -76,6 +80,15 @@ def _class_of(selector: Selector, chosen: Hypothesis, name: str, width: float) -
     values = {n: _values_of(n, found[n].fit) for n in members}
     significance = math.sqrt(max(without.fit.chi2 - chosen.fit.chi2, 0.0))
     return EffectClass(members, sum(members.values()), values, significance)
+
+
+def _refit_rivals(selector: Selector, chosen: Hypothesis, found: dict[str, Hypothesis], width: float) -> None:
+    """Fit the best replacements again from where the set itself has come: it may have found a deeper valley since."""
+    behind = {
+        n: h for n, h in found.items() if h is not chosen and h.log_evidence < chosen.log_evidence - width
+    }
+    for name in sorted(behind, key=lambda n: -behind[n].log_evidence)[:RIVALS_REFITTED]:
+        found[name] = selector.improved(behind[name].names, chosen.fit)
 
 
 def _replacements(

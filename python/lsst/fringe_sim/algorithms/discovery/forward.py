@@ -32,7 +32,7 @@ LINE_STEP_NM = 0.1
 MARGIN_UM = 0.45
 """Thickness beyond the field that a table covers [µm]: a step of a fit may not leave it."""
 
-MOST_TABLE_BYTES = 100e6
+MOST_TABLE_BYTES = 400e6
 """Memory of the tables kept for reuse."""
 
 MOST_ROWS = 8
