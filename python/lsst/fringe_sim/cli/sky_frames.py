@@ -20,7 +20,7 @@ __all__ = ["SkyFrames", "read_sky_frames"]
 
 FloatArray = NDArray[np.float64]
 
-UNKNOWN_SIGMA_UM = 0.01
+UNKNOWN_SIGMA_UM = 0.003
 """Uncertainty of a map that states none."""
 
 
