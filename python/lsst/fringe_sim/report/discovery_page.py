@@ -126,7 +126,7 @@ def _lead(verdict: Verdict) -> str:
     cells = "pixels" if data["cell_px"] == 1 else f"cells of {data['cell_px']} × {data['cell_px']} px"
     low, high = min(data["wavelength_nm"]), max(data["wavelength_nm"])
     return (
-        f"{planes} flats from {low:g} to {high:g} nm, {columns} × {rows} {cells}, against the model of set-up "
+        f"{planes} exposures from {low:g} to {high:g} nm, {columns} × {rows} {cells}, against the model of set-up "
         f"{verdict.setup}."
     )
 

@@ -248,7 +248,7 @@ class Verdict:
     def override(self) -> str:
         """Text of a config override that puts the effects into fit, sky simulation and templates."""
         lines = [
-            f"# Effects found in laboratory flats of set-up {self.setup}; verdict: {self.verdict}.",
+            f"# Effects found in data of set-up {self.setup}; verdict: {self.verdict}.",
             "# Use with -C label:effects.py on any task that reads effects.",
         ]
         for key, value in self.settings.items():
