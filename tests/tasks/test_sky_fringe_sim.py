@@ -15,7 +15,7 @@ from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import SkyFringe, ThicknessMap, mask_bits
+from lsst.fringe_sim.products import SkyFringe, ThicknessMap, bands_of_header, mask_bits
 from lsst.fringe_sim.tasks import RaftConfig, SkyFringeSimConfig, SkyFringeSimTask
 from lsst.fringe_sim.tasks.sky_fringe_sim import SkyExposure
 
@@ -124,6 +124,7 @@ def test_a_random_night_is_one_night_for_all_its_exposures() -> None:
 def test_a_steady_night_has_the_reference_sky_at_any_hour() -> None:
     first, last = (run(exposure=dataclasses.replace(EXPOSURE, hour=h), night="steady") for h in (19.0, 29.0))
     np.testing.assert_array_equal(first.image, last.image)
+    assert set(bands_of_header(first.metadata).values()) == {1.0}
 
 
 def test_noise_is_that_of_exposure_and_sensor() -> None:

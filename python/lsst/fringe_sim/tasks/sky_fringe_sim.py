@@ -259,7 +259,7 @@ class SkyFringeSimTask(PipelineTask):
     def _band_scale(self, exposure: SkyExposure, lines: EmissionLines) -> Mapping[str, float]:
         """Factors on the OH bands at the time of the exposure."""
         if self.config.night == "steady":
-            return {}
+            return dict.fromkeys(lines.bands, 1.0)
         if self.config.night == "guo2022":
             night, since = NightHistory.guo2022(), FIRST_HOUR
         else:
