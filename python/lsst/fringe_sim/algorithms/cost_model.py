@@ -51,6 +51,7 @@ QUANTUM_COSTS: Mapping[str, QuantumCost] = MappingProxyType(
         "isrFlatPrep": QuantumCost(2.5, 1031 * MIB),
         "epoxyFit": QuantumCost(20.6, 2878 * MIB),
         "effectDiscovery": QuantumCost(168.3, 3855 * MIB),
+        "skyEffectDiscovery": QuantumCost(740.0, 6144 * MIB),
         "skyFringeSim": QuantumCost(16.3, 1262 * MIB),
         "fringePca": QuantumCost(10.7, 3428 * MIB),
         "fringeForecast": QuantumCost(21.4, 1255 * MIB),
@@ -59,7 +60,8 @@ QUANTUM_COSTS: Mapping[str, QuantumCost] = MappingProxyType(
 )
 """By task, as ``python tests/bps/measure_quanta.py`` has measured them: twelve flats, three biases, eleven hours.
 
-The search for effects found none; with effects it takes longer.
+The search for effects found none; with effects it takes longer. That on the sky has not been measured on a full
+sensor: its time is that of a small one with an effect, its memory that of eleven frames, counted.
 """
 
 
