@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..model import FringeModel, Setup
 from ..products import FringeCube
 from ..report.discovery_page import ResidualPair, discovery_page, residual_pair
-from .inputs import prepare_folder, read_settings
+from .inputs import prepare_folder, read_settings, sky_settings
 from .lab_frames import find_series, read_cube
 from .parameters import ANY_LIGHT, EFFECT, effect_settings
 from .progress import progress
@@ -87,7 +87,7 @@ def discover(
         if dry_run:
             click.echo(f"would search {len(data.frames)} frames of {data.shape[1]} x {data.shape[0]} pixels")
             return
-        _search_sky(data, data.model(settings), out, seed, cells)
+        _search_sky(data, data.model(sky_settings(settings)), out, seed, cells)
         return
     if thickness is not None:
         raise InputError("--thickness", thickness, "only with the set-up of a telescope, as lsst_e2v")

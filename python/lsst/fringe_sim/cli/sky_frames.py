@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..algorithms.field_response import SensorPlacement
 from ..errors import InputError
 from ..instrument.camera import Camera
 from ..instrument.detector import Detector
@@ -53,11 +54,10 @@ class SkyFrames:
 
     def model(self, settings: Mapping[str, float]) -> FringeModel:
         """The sensor in its place, with effects that are known."""
-        x, y = (
-            0.0 if np.isnan(angle) else angle
-            for angle in (self.detector.field_x_deg, self.detector.field_y_deg)
+        place = SensorPlacement.of(self.detector, self.setup.pixel_scale_arcsec)
+        return FringeModel.from_setup(
+            self.setup, settings, field_x_deg=place.field_x_deg, field_y_deg=place.field_y_deg
         )
-        return FringeModel.from_setup(self.setup, settings, field_x_deg=x, field_y_deg=y)
 
 
 def read_sky_frames(paths: Sequence[str], setup: Setup, thickness: str | None) -> SkyFrames:
@@ -85,13 +85,8 @@ def read_sky_frames(paths: Sequence[str], setup: Setup, thickness: str | None) -
     if len(names) > 1:
         raise InputError("detectors of the sky frames", names, "one sensor")
     sensor = Camera.from_name(setup.camera).detector(names[0] if names else setup.detector)
-    return SkyFrames(
-        frames,
-        setup,
-        sensor,
-        read_thickness(thickness),
-        _sigma(thickness),
-    )
+    layer = read_thickness(thickness)
+    return SkyFrames(frames, setup, sensor, layer, _sigma(thickness, layer.shape))
 
 
 def _files(paths: Sequence[str]) -> list[Path]:
@@ -109,9 +104,9 @@ def _files(paths: Sequence[str]) -> list[Path]:
     return found
 
 
-def _sigma(path: str) -> FloatArray:
+def _sigma(path: str, shape: tuple[int, ...]) -> FloatArray:
     """Uncertainty of a map [µm]; some nm where the file states none."""
     try:
         return np.asarray(ThicknessMap.read_fits(path).sigma, dtype=float)
     except InputError:
-        return np.full(read_thickness(path).shape, UNKNOWN_SIGMA_UM)
+        return np.full(shape, UNKNOWN_SIGMA_UM)
