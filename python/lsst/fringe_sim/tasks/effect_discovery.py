@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -25,8 +24,6 @@ from lsst.pipe.base.connectionTypes import Input, Output
 from ..algorithms import discover
 from ..algorithms.discovery import SKY_SEARCH, SearchOptions, Verdict, discover_sky, placement_in_frames
 from ..instrument.detector import Detector
-from ..instrument.sky import EmissionLines, SkySpectrum
-from ..model import FringeModel, Setup
 from ..products import FringeCube, FringeFlat, SkyFringe, ThicknessMap
 from .model_config import FringeModelConfig, ModelChoice
 from .quantum import common_header, data_id_of, sensor_of, unusable
@@ -89,10 +86,9 @@ class SearchConfig(Config):
         dtype=float, default=1e-3, doc="Chance of noise below which the model is held to disagree."
     )
 
-    @property
-    def options(self) -> SearchOptions:
-        """The same for the algorithm."""
-        return SearchOptions(most_cells=self.most_cells, significance=self.significance)
+    def options(self, usual: SearchOptions) -> SearchOptions:
+        """The same for the algorithm, which has its usual ones."""
+        return replace(usual, most_cells=self.most_cells, significance=self.significance)
 
     def rng(self, detector: Detector) -> np.random.Generator:
         """Random numbers of a sensor."""
@@ -153,7 +149,11 @@ class EffectDiscoveryTask(PipelineTask):
         choice = self.config.choice_of(detector)
         cube = FringeCube.from_flats(flats, number=number)
         verdict = discover(
-            cube, choice.model(), rng=self.config.rng(detector), options=self.config.options, report=self._say
+            cube,
+            choice.model(),
+            rng=self.config.rng(detector),
+            options=self.config.options(SearchOptions()),
+            report=self._say,
         )
         self.log.info("%s: %s", detector.name, verdict.summary())
         return _stored(self.config, choice, verdict, detector)
@@ -248,32 +248,24 @@ class SkyEffectDiscoveryTask(PipelineTask):
         """
         choice = self.config.choice_of(detector)
         layer = self.config.map_of(thickness, detector)
-        setup = Setup.from_name(choice.setup)
-        placement = placement_in_frames(frames, detector, setup.pixel_scale_arcsec)
-        lines = EmissionLines.oh(self.config.rotational_temperature_k, self.config.vibrational_temperature_k)
-        airmass = float(np.mean([frame.airmass for frame in frames]))
+        known = known_thickness(layer)
+        sky_model = self.config.sky_model(
+            detector, float(np.mean([frame.airmass for frame in frames])), known
+        )
+        model = sky_model.fringe_model()
         verdict = discover_sky(
             frames,
-            known_thickness(layer),
+            known,
             layer.sigma,
-            self._model(choice, detector),
+            model,
             rng=self.config.rng(detector),
-            sky=SkySpectrum.dark(lines, airmass, solar_flux_sfu=self.config.solar_flux_sfu),
-            placement=placement,
-            options=replace(
-                SKY_SEARCH, most_cells=self.config.most_cells, significance=self.config.significance
-            ),
+            sky=sky_model.spectrum(),
+            placement=placement_in_frames(frames, detector, model.setup.pixel_scale_arcsec),
+            options=self.config.options(SKY_SEARCH),
             report=self._say,
         )
         self.log.info("%s: %s", detector.name, verdict.summary())
         return _stored(self.config, choice, verdict, detector)
-
-    @staticmethod
-    def _model(choice: ModelChoice, detector: Detector) -> FringeModel:
-        """The sensor in its place."""
-        if math.isnan(detector.field_radius_deg):
-            return choice.model()
-        return choice.model(field_x_deg=detector.field_x_deg, field_y_deg=detector.field_y_deg)
 
     def _say(self, line: str) -> None:
         self.log.verbose("%s", line)
