@@ -25,6 +25,8 @@ SKY = SkySpectrum.dark()
 WAVELENGTHS = np.array([900.0, 960.0, 985.0])
 CASES = [(effect, parameter) for effect in EFFECTS for parameter in effect.parameters]
 IDS = [f"{effect.name}.{parameter.name}" for effect, parameter in CASES]
+SIZES = [(effect, parameter) for effect, parameter in CASES if not parameter.place]
+PLACES = [(effect, parameter) for effect, parameter in CASES if parameter.place]
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +93,18 @@ def test_null_is_exactly_the_identity(effect, parameter, base, thickness) -> Non
     np.testing.assert_array_equal(observe(changed, thickness, seen), observe(base, thickness, seen))
 
 
-@pytest.mark.parametrize(("effect", "parameter"), CASES, ids=IDS)
+@pytest.mark.parametrize(("effect", "parameter"), PLACES, ids=lambda item: item.name)
+def test_a_place_changes_something_only_where_there_is_an_effect(effect, parameter, base, thickness) -> None:
+    moved = {parameter.name: null_of(effect, parameter.name, base) + 0.3 * parameter.prior_scale}
+    alone = base.with_effects({effect.name: moved})
+    np.testing.assert_array_equal(observe(alone, thickness), observe(base, thickness))
+    size = next(item for item in effect.parameters if not item.place)
+    strong = {size.name: null_of(effect, size.name, base) + size.prior_scale}
+    there, elsewhere = (base.with_effects({effect.name: {**strong, **place}}) for place in ({}, moved))
+    assert np.abs(observe(there, thickness) - observe(elsewhere, thickness)).max() > 0.0
+
+
+@pytest.mark.parametrize(("effect", "parameter"), SIZES, ids=lambda item: item.name)
 def test_onset_is_monotone_and_smooth(effect, parameter, base, thickness) -> None:
     """Small departures from null change the response, and more the larger they are."""
     null, seen = null_of(effect, parameter.name, base), exposures_of(parameter)
@@ -171,7 +184,7 @@ def test_contrast_loss_scales_the_fringe_about_its_mean(base) -> None:
     ("effect", "parameter"),
     [
         (effect, parameter)
-        for effect, parameter in CASES
+        for effect, parameter in SIZES
         if effect.acts_on == "image" and effect.name not in {"non_linearity", "crosstalk"}
     ],
     ids=lambda item: item.name,

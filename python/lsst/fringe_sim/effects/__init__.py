@@ -48,6 +48,7 @@ from .support_index import SupportIndex
 from .temperature import Temperature
 from .thickness_spread import ThicknessSpread
 from .tilt import Tilt
+from .tree_rings import TreeRings
 from .vignetting import Vignetting
 from .water_vapour import WaterVapour
 from .wavelength_jitter import WavelengthJitter
@@ -103,6 +104,7 @@ EFFECTS: tuple[Effect, ...] = (
     ChromaticIllumination(),
     Vignetting(),
     MidlineStep(),
+    TreeRings(),
     DarkPedestal(),
     ChargeDiffusion(),
     BrighterFatter(),

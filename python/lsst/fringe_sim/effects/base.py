@@ -53,6 +53,11 @@ class Parameter:
         Distance after which the fringes look nearly the same again: neighbouring minima of a fit; 0 if they do not.
     wavelength_nm : `float`
         Nominal wavelength of the exposures that it concerns [nm]; NaN if it concerns all.
+    place : `bool`
+        Whether it says where the effect is, not how strong: by itself it changes nothing. See `Effect.look`.
+    step : `float`
+        Change of the parameter to which the effect is in proportion, if that is less than a thousandth of
+        `prior_scale`; 0 if it is not.
     """
 
     name: str
@@ -63,6 +68,8 @@ class Parameter:
     description: str
     repeats_after: float = 0.0
     wavelength_nm: float = math.nan
+    place: bool = False
+    step: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -124,6 +131,20 @@ class Effect(ABC):
     def change_sky(self, sky: SkySpectrum, values: Mapping[str, float]) -> SkySpectrum:
         """Return the night sky with the effect in it."""
         return sky
+
+    def look(self, residual: FloatArray, weight: FloatArray, geometry: ImageGeometry) -> dict[str, float]:
+        """Values from which to fit an effect whose place is not known; empty where none is seen.
+
+        Parameters
+        ----------
+        residual : `numpy.ndarray`, shape ``(W, ny, nx)``
+            Data minus model, relative to the mean level.
+        weight : `numpy.ndarray`, shape ``(W, ny, nx)``
+            Inverse variance of the noise; 0 where there are no data.
+        geometry : `ImageGeometry`
+            Where the samples lie.
+        """
+        return {}
 
     @abstractmethod
     def null_values(self, system: OpticalSystem) -> dict[str, float]:

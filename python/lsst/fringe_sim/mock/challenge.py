@@ -60,6 +60,18 @@ def _errors(rng: np.random.Generator, rms: float) -> list[tuple[int, float]]:
     return [(node, rms * float(np.clip(rng.normal(), -3.0, 3.0))) for node in range(880, 991, 10)]
 
 
+def _rings(rng: np.random.Generator, size: float) -> dict[str, float]:
+    """Rings about a point on a small sensor or not far from it."""
+    phase = float(rng.uniform(0.0, 2.0 * math.pi))
+    return {
+        "tree_rings.cosine": size * math.cos(phase),
+        "tree_rings.sine": size * math.sin(phase),
+        "tree_rings.centre_x": float(rng.uniform(-200.0, 300.0)),
+        "tree_rings.centre_y": float(rng.uniform(-200.0, 300.0)),
+        "tree_rings.period": float(rng.uniform(5.0, 25.0)),
+    }
+
+
 SIZES: Mapping[str, Draw] = MappingProxyType(
     {
         "bandwidth": lambda r: {"bandwidth.fwhm": STATED_FWHM_NM + _signed(r, -1.3, 0.0) * 0.9},
@@ -87,6 +99,7 @@ SIZES: Mapping[str, Draw] = MappingProxyType(
         },
         "vignetting": lambda r: {"vignetting.corner": _decades(r, -3.3, -0.7)},
         "midline_step": lambda r: {"midline_step.fraction": _signed(r, -3.5, -1.7)},
+        "tree_rings": lambda r: _rings(r, _decades(r, -3.5, -2.3)),
         "crosstalk": lambda r: {"crosstalk.from_left": _decades(r, -3.7, -2.0)},
         "amplifier_gain": lambda r: {"amplifier_gain.rms": _decades(r, -3.3, -1.7)},
         "amplifier_offset": lambda r: {"amplifier_offset.rms": _decades(r, 1.0, 2.5)},
@@ -103,11 +116,13 @@ def _second_film(image: FloatArray, wavelength: float, scene: Mapping[str, Any])
     return image * (1.0 + scene["size"] * np.cos(phase))
 
 
-def _tree_rings(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
-    """Rings of the crystal around a point outside the sensor."""
+def _annealing(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
+    """Crossed stripes, as the laser leaves them that anneals the back of a sensor."""
     y, x = np.indices(image.shape)
-    radius = np.hypot(y + 0.4 * image.shape[0], x + 0.3 * image.shape[1])
-    return image * (1.0 + scene["size"] * np.cos(2.0 * math.pi * radius / scene["period"]))
+    turned = x * math.cos(scene["turn"]) + y * math.sin(scene["turn"])
+    across = y * math.cos(scene["turn"]) - x * math.sin(scene["turn"])
+    stripes = np.cos(2.0 * math.pi * turned / scene["period"]) + np.cos(2.0 * math.pi * across / 15.0)
+    return image * (1.0 + scene["size"] * stripes)
 
 
 def _ghost_image(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> FloatArray:
@@ -138,7 +153,7 @@ def _jitter(image: FloatArray, wavelength: float, scene: Mapping[str, Any]) -> F
 OUTSIDERS: Mapping[str, tuple[Callable[..., FloatArray], float, float]] = MappingProxyType(
     {
         "second_film": (_second_film, -3.5, -2.3),
-        "tree_rings": (_tree_rings, -3.5, -2.3),
+        "annealing": (_annealing, -3.5, -2.3),
         "ghost_image": (_ghost_image, -2.5, -1.3),
         "stains": (_stains, -3.0, -1.7),
         "columns": (_columns, -3.5, -2.5),
@@ -300,6 +315,7 @@ def _scene(
         "size": size,
         "film": random_field((shape[0], shape[1]), rng, mean=8.0, span=2.0),
         "period": float(rng.uniform(6.0, 20.0)),
+        "turn": float(rng.uniform(0.0, 0.5 * math.pi)),
         "stains": [
             (rng.uniform(0, shape[0]), rng.uniform(0, shape[1]), rng.uniform(4, 12)) for _ in range(4)
         ],

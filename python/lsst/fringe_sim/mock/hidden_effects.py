@@ -285,6 +285,16 @@ def _midline_step(light: FloatArray, values: Values) -> FloatArray:
     return light * np.where(upper, 1.0 + values["fraction"], 1.0)
 
 
+def _tree_rings(light: FloatArray, values: Values) -> FloatArray:
+    inside = (np.arange(3) - 1.0) / 3.0  # a pixel is seen at nine places
+    y, x = (np.add.outer(np.arange(size), inside).ravel() for size in light.shape)
+    radius = np.hypot(y[:, np.newaxis] - values["centre_y"], x - values["centre_x"])
+    middle = [0.5 * (size - 1) for size in light.shape]
+    turns = (radius - math.dist(middle, (values["centre_y"], values["centre_x"]))) / values["period"]
+    wave = values["cosine"] * np.cos(2.0 * math.pi * turns) + values["sine"] * np.sin(2.0 * math.pi * turns)
+    return light * (1.0 + wave.reshape(light.shape[0], 3, light.shape[1], 3).mean(axis=(1, 3)))
+
+
 def _sensor_coordinates(shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
     """Coordinates from -1 to 1 along y and x."""
     v = np.linspace(-1.0, 1.0, shape[0])[:, np.newaxis]
@@ -498,6 +508,20 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
             ),
         ),
         on_light=_midline_step,
+    ),
+    HiddenEffect(
+        "tree_rings",
+        "tree rings of the silicon",
+        (
+            HiddenParameter(
+                "cosine", "", 0.0, (-0.05, 0.05), "amplitude of the cosine; phase 0 in the middle"
+            ),
+            HiddenParameter("sine", "", 0.0, (-0.05, 0.05), "amplitude of the sine"),
+            HiddenParameter("centre_x", "px", 0.0, (-10_000.0, 14_000.0), "column of the centre"),
+            HiddenParameter("centre_y", "px", 0.0, (-10_000.0, 14_000.0), "row of the centre"),
+            HiddenParameter("period", "px", 50.0, (2.0, 2000.0), "distance of rings"),
+        ),
+        on_light=_tree_rings,
     ),
     HiddenEffect(
         "charge_diffusion",

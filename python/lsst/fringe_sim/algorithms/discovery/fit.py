@@ -68,6 +68,10 @@ class Coordinate:
         Distance of neighbouring minima of the misfit in the coordinate; 0 if there is only one.
     of_one_exposure : `bool`
         Whether it concerns the exposures at one wavelength only.
+    place : `bool`
+        Whether it says where an effect is; see `Parameter`.
+    step : `float`
+        Largest step of a derivative; 0 for a thousandth of the scale.
     """
 
     effect: str
@@ -80,6 +84,8 @@ class Coordinate:
     unit: str = ""
     neighbour: float = 0.0
     of_one_exposure: bool = False
+    place: bool = False
+    step: float = 0.0
 
     @property
     def key(self) -> str:
@@ -138,7 +144,7 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
         found.append(
             Coordinate(
                 effect.name, parameter.name, null, low, high, parameter.prior_scale, quadratic, parameter.unit,
-                parameter.repeats_after, parameter.wavelength_nm > 0.0,
+                parameter.repeats_after, parameter.wavelength_nm > 0.0, parameter.place, parameter.step,
             )
         )  # fmt: skip
     return tuple(found)
@@ -730,7 +736,7 @@ def coordinate_derivative(
     A one-sided difference of a phase would keep a part of its curvature, which no thickness absorbs, and make
     degenerate parameters look well measured.
     """
-    size = 1e-3 * coordinate.unit_step
+    size = coordinate.step or 1e-3 * coordinate.unit_step
     points = [at - size, at + size]
     if coordinate.quadratic:
         points = [at, at + max(size, 1e-3 * at)]

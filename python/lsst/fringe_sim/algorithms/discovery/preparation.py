@@ -18,6 +18,7 @@ from .cells import CellData, bin_cube, finest_useful_cell
 from .fit import Fit, Problem, fit_model
 from .forward import Exposures, Forward
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
+from .outliers import spoiled_cells
 from .start import mended_thickness, starting_thickness
 
 __all__ = ["Prepared", "check_setup", "prepare", "prepare_again", "why_too_poor"]
@@ -31,6 +32,11 @@ ORDERS_TRIED = 6
 """Fringe orders on both sides of the first one in which a few pixels are fitted."""
 
 STEPS_PER_ORDER = 12
+
+SPOILED_ROUNDS = 3
+FEW_SPOILED = 1e-5
+"""How often spoiled cells are looked for, and the part of the data that need not be looked at again: each draws the
+thickness of its surroundings."""
 
 NOISE_CHANGE = 0.02
 SCATTER_CHANGE = 0.05
@@ -155,7 +161,8 @@ def prepare(
     if not _is_rich(cells):
         return _prepare_few(cells, forward, start, index)
     problem = Problem(cells, forward, CellBasis(start.shape), _free_levels(cells))
-    return _settle(*_choose_field(problem, start, {}), cells, index)
+    problem, fit, cells = _without_spoiled(*_choose_field(problem, start, {}), cells)
+    return _settle(problem, fit, cells, index)
 
 
 def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tuple[Prepared | None, int]:
@@ -287,6 +294,24 @@ def _settle(problem: Problem, fit: Fit, stated: CellData, index: FloatArray) -> 
     if not noise.measured:
         notes.append("noise level taken as stated: too few cells to measure it")
     return Prepared(problem, settled, noise, index, _is_rich(stated), stated, tuple(notes), fit.field)
+
+
+def _without_spoiled(problem: Problem, fit: Fit, stated: CellData) -> tuple[Problem, Fit, CellData]:
+    """Fit and data without the cells that something spoiled in one exposure."""
+    start, spoiled = problem.basis.expand(fit.field), np.zeros(stated.shape, dtype=bool)
+    for _ in range(SPOILED_ROUNDS):
+        used = problem.cells.weight > 0.0
+        fresh = spoiled_cells(_residual(problem, problem.expected_of(fit)), used)
+        spoiled |= fresh
+        if fresh.sum() <= FEW_SPOILED * used.sum():
+            break
+        problem = problem.with_cells(problem.cells.restricted(~spoiled))
+        fit = fit_model(problem, (), np.zeros(0), fit.field, fit.levels)
+    if not spoiled.any():
+        return problem, fit, stated
+    cells = stated.restricted(~spoiled)
+    # They may have drawn the field into finer coefficients.
+    return *_choose_field(problem.with_cells(cells), start, {}), cells
 
 
 def _finer_is_better(coarse: tuple[Problem, Fit], fine: tuple[Problem, Fit]) -> bool:

@@ -159,6 +159,7 @@ class Selector:
         self.guess = dict(guess or {})
         self.null = Hypothesis((), null, 0.0)
         thickness = problem.basis.expand(null.field)
+        self.effects = {effect.name: effect for effect in catalogue}
         self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
         self.left_out: dict[str, str] = {}
         for effect in catalogue:
@@ -230,6 +231,9 @@ class Selector:
         state = self.state(fit)
         found = []
         for name in names:
+            if self.is_sought(name):  # at null its place is anywhere, and its derivative says nothing
+                found += self._sought(state, fit, name) if scan else []
+                continue
             coordinates = self.coordinates[name]
             try:
                 features = self.features(state, fit, name)
@@ -242,6 +246,32 @@ class Selector:
                 candidate = self._scanned(state, fit, candidate)
             found.append(candidate)
         return sorted(found, key=lambda item: -item.promise)
+
+    def is_sought(self, name: str) -> bool:
+        """Whether the place of an effect is not known, and has to be looked for in what the model leaves."""
+        return any(item.place for item in self.coordinates[name])
+
+    def _sought(self, state: State, fit: Fit, name: str) -> list[Candidate]:
+        """The effect where it is seen, if it is."""
+        start = self._seen(state, name)
+        if start is None:
+            return []
+        coordinates = self.coordinates[name]
+        settings = {item.key: item.value(x) for item, x in zip(coordinates, start, strict=True)}
+        level = (self.problem.level_basis @ fit.levels)[:, None, None]
+        change = self.problem.forward.change(fit.settings, {**fit.settings, **settings}, state.thickness_um)
+        column = state.whiten(level * change)[np.newaxis]  # type: ignore[operator]
+        score, information = state.design.project(column, state.residual)
+        promise = float(score[0] ** 2 / max(information[0, 0], 1e-300))
+        return [Candidate(name, 0.0, len(coordinates), start, promise)] if score[0] > 0.0 else []
+
+    def _seen(self, state: State, name: str) -> FloatArray | None:
+        """Coordinates of an effect where it is seen in what a fit leaves."""
+        cells, effect = self.problem.cells, self.effects[name]
+        values = effect.look(state.raw_residual, cells.weight, cells.geometry)
+        if not values:
+            return None
+        return np.array([item.coordinate(values[item.parameter]) for item in self.coordinates[name]])
 
     def _scanned(self, state: State, fit: Fit, candidate: Candidate) -> Candidate:
         """Candidate with the best of its finite signatures, where that promises more than the derivative."""
@@ -516,6 +546,8 @@ class Selector:
                 known += [item.coordinate(base.settings[item.key]) for item in own]
                 continue
             small = [0.1 * item.unit_step for item in own]
+            if start is None and self.is_sought(name):
+                start = self._seen(self.state(base), name)
             fresh = [np.array(small) if start is None else np.asarray(start, dtype=float)]
             if all(item.key in self.guess for item in own) and not base.coordinates:
                 fresh.append(np.array([item.coordinate(self.guess[item.key]) for item in own]))

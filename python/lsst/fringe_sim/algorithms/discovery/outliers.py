@@ -1,0 +1,78 @@
+"""Cells that something spoiled in one exposure: cosmic rays, mostly."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+__all__ = ["spoiled_cells"]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+OUTLIER_SIGMA = 6.0
+"""Robust standard deviations beyond which a cell is spoiled."""
+
+GROWTH_SIGMA = 3.0
+"""The same for what adjoins a spoiled cell."""
+
+MOST_OF_A_PLANE = 0.02
+"""Part of a plane beyond which outliers are a pattern of their own, and stay."""
+
+MOST_PLANES = 0.3
+"""Part of the exposures beyond which what is wrong with a cell is not an accident of one of them."""
+
+TILE = 24
+"""Side of the tiles in which the spread is taken [cells]: misfit of the model may be larger in some places."""
+
+
+def spoiled_cells(residual: FloatArray, used: BoolArray) -> BoolArray:
+    """Cells that stand out from their surroundings in one exposure, and not in most.
+
+    What all exposures have in common (the response of the cells) is taken off. The spread is that of the residual
+    itself, in tiles: where the model does not fit, only what is far worse than its misfit stands out.
+
+    Parameters
+    ----------
+    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Data minus a fit.
+    used : `numpy.ndarray` of `bool`, shape ``(W, ny, nx)``
+        Where there are data.
+
+    Returns
+    -------
+    spoiled : `numpy.ndarray` of `bool`, shape ``(W, ny, nx)``
+    """
+    waves = len(residual)
+    if waves < 3:
+        return np.zeros(used.shape, dtype=bool)
+    known = np.where(used, residual, np.nan)
+    seen = used.any(axis=0)
+    common = np.zeros(seen.shape)
+    common[seen] = np.nanmedian(known[:, seen], axis=0)
+    own = np.where(used, residual - common, 0.0)
+    departure = np.stack([_in_own_spread(plane, good) for plane, good in zip(own, used, strict=True)])
+    spoiled = np.abs(departure) > OUTLIER_SIGMA
+    spoiled &= spoiled.sum(axis=0) <= max(1.0, MOST_PLANES * waves)
+    around = np.ones((3, 3), dtype=bool)
+    for plane, beyond in zip(spoiled, np.abs(departure) > GROWTH_SIGMA, strict=True):
+        plane |= binary_dilation(plane, around, iterations=2, mask=beyond)
+    pattern = spoiled.sum(axis=(1, 2)) > MOST_OF_A_PLANE * used.sum(axis=(1, 2))
+    spoiled[pattern] = False
+    return spoiled
+
+
+def _in_own_spread(plane: FloatArray, good: BoolArray) -> FloatArray:
+    """Values over 1.48 times the median absolute value of their tile, or of the plane where that is larger."""
+    if not good.any():
+        return plane
+    whole = float(np.median(np.abs(plane[good])))
+    spread = np.full(plane.shape, whole)
+    for top in range(0, plane.shape[0], TILE):
+        for left in range(0, plane.shape[1], TILE):
+            tile = slice(top, top + TILE), slice(left, left + TILE)
+            inside = np.abs(plane[tile][good[tile]])
+            if inside.size >= TILE:
+                spread[tile] = max(whole, float(np.median(inside)))
+    return np.asarray(plane / np.maximum(1.4826 * spread, 1e-300))
