@@ -319,3 +319,30 @@ def test_a_misfit_of_the_field_is_no_echo() -> None:
     assert echo_channel(bent).statistic == pytest.approx(plain.statistic)
     copy = 0.1 * state.whiten(state.value - 1.0)[:, ::-1, ::-1]  # type: ignore[operator]
     assert echo_channel(replace(state, residual=state.residual + copy)).probability < 1e-6
+
+
+def test_a_window_keeps_places_and_levels(rng: np.random.Generator) -> None:
+    """A part of a sensor is seen where it lies: the same amplifiers, the same distance from the middle."""
+    case = draw_case("none", rng, size=(96, 128))
+    cells = bin_cube(case.cube, 2)
+    part = cells.window(slice(10, 40), slice(20, 60))
+    assert part.shape == (cells.shape[0], 30, 40)
+    np.testing.assert_array_equal(part.value, cells.value[:, 10:40, 20:60])
+    np.testing.assert_array_equal(part.geometry.u, cells.geometry.u[:, 20:60])
+    np.testing.assert_array_equal(part.geometry.v, cells.geometry.v[10:40])
+    np.testing.assert_array_equal(part.geometry.amplifier, cells.geometry.amplifier[10:40, 20:60])
+    np.testing.assert_array_equal(part.geometry.level_e, cells.geometry.level_e)
+
+
+def test_where_fringes_are_narrow_a_part_is_searched_and_that_is_said() -> None:
+    """Fringes of six pixels forbid larger cells, and a search of them all would take too long."""
+    v, u = np.mgrid[-1.0 : 1.0 : 100 * 1j, -1.0 : 1.0 : 200 * 1j]
+    thickness = 15.0 + 4.5 * u + 0.3 * v
+    cube, model = _cube(thickness, {}, 30_000.0, 5), FringeModel.from_setup("ts8_e2v")
+    prepared = prepare(cube, model, EFFECTS[:3], 4000)
+    assert prepared.stated.cell_px == 1
+    assert prepared.stated.shape == (12, 96, 83)
+    assert any("searched in rows 2 to 97 and columns 58 to 140" in note for note in prepared.notes)
+    found = prepared.problem.basis.expand(prepared.null.field)
+    np.testing.assert_allclose(found, thickness[2:98, 58:141], atol=0.02)
+    assert prepare(cube, model, EFFECTS[:3], 20_000).stated.shape == (12, 100, 200)

@@ -89,6 +89,23 @@ class CellData:
         """Same data with weight 0 where ``keep`` (broadcast to the values) is false."""
         return replace(self, weight=np.where(keep, self.weight, 0.0))
 
+    def window(self, rows: slice, columns: slice) -> CellData:
+        """The data of a part of the sensor; levels and positions stay those of the whole."""
+        geometry = replace(self.geometry, y_px=self.geometry.y_px[rows], x_px=self.geometry.x_px[columns])
+
+        def part(values: FloatArray | None) -> FloatArray | None:
+            return None if values is None else values[..., rows, columns]
+
+        return replace(
+            self,
+            value=self.value[:, rows, columns],
+            weight=self.weight[:, rows, columns],
+            geometry=geometry,
+            thickness_um=part(self.thickness_um),
+            thickness_sigma_um=part(self.thickness_sigma_um),
+            centroid=part(self.centroid),
+        )
+
     def with_noise_of(self, expected: FloatArray) -> CellData:
         """Same data with the variance that goes with what is expected of a cell, not with what it happened to get.
 

@@ -33,6 +33,12 @@ ORDERS_TRIED = 6
 
 STEPS_PER_ORDER = 12
 
+LARGEST_SEARCH = 2
+"""Cells, over those wanted, from which on a part of the sensor is searched: fringes of a few pixels forbid larger
+cells, and time grows with their number."""
+
+FEWEST_ROWS_OF_PART = 96
+
 SPOILED_ROUNDS = 3
 FEW_SPOILED = 1e-5
 """How often spoiled cells are looked for, and the part of the data that need not be looked at again: each draws the
@@ -151,6 +157,8 @@ def prepare(
     """
     size = finest_useful_cell(cube, most_cells=most_cells)
     cells = bin_cube(cube, size)
+    if exposures is None:
+        cells = cells.window(*_part_searched(cells.shape[1:], LARGEST_SEARCH * most_cells))
     stack = model.system.stack
     medium = stack.layers[stack.position(model.system.varying)].medium
     index = np.real(medium.index(cells.wavelength_nm, model.system.temperature_k))
@@ -163,6 +171,27 @@ def prepare(
     problem = Problem(cells, forward, CellBasis(start.shape), _free_levels(cells))
     problem, fit, cells = _without_spoiled(*_choose_field(problem, start, {}), cells)
     return _settle(problem, fit, cells, index)
+
+
+def _part_searched(shape: tuple[int, ...], most: int) -> tuple[slice, slice]:
+    """Rows and columns about the middle with so many cells at most: as wide as may be, to see all amplifiers."""
+    rows, columns = shape
+    high = rows if rows * columns <= most else min(rows, max(FEWEST_ROWS_OF_PART, most // columns))
+    wide = min(columns, max(most // high, 1))
+    top, left = (rows - high) // 2, (columns - wide) // 2
+    return slice(top, top + high), slice(left, left + wide)
+
+
+def _part_told(cells: CellData) -> list[str]:
+    """Which part of the sensor is searched, if it is not the whole."""
+    whole = tuple(size // cells.cell_px for size in cells.geometry.shape)
+    if cells.shape[1:] == whole:
+        return []
+    ends = [
+        f"{name} {int(place[0] - 0.5 * (cells.cell_px - 1))} to {int(place[-1] + 0.5 * (cells.cell_px - 1))}"
+        for name, place in (("rows", cells.geometry.y_px), ("columns", cells.geometry.x_px))
+    ]
+    return [f"the fringes are too narrow for larger cells: searched in {' and '.join(ends)}"]
 
 
 def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tuple[Prepared | None, int]:
@@ -288,7 +317,7 @@ def _settle(problem: Problem, fit: Fit, stated: CellData, index: FloatArray) -> 
     problem = replace(problem, cells=cells, free_contrast=False, reference=expected)
     levels = fit.levels[: problem.n_levels]
     settled = fit_model(problem, (), np.zeros(0), fit.field, levels)
-    notes = []
+    notes = _part_told(stated)
     if abs(noise.neighbour_correlation) > 0.1:
         notes.append(f"noise of neighbouring cells is correlated ({noise.neighbour_correlation:.2f})")
     if not noise.measured:
