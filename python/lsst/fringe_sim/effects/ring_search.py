@@ -180,7 +180,7 @@ def _strongest(part: _Samples, centres: FloatArray) -> tuple[FloatArray, FloatAr
     width = 0.5 * part.cell
     bins = int(2 ** math.ceil(math.log2(part.across / width + 2)))
     frequency = np.fft.rfftfreq(2 * bins, width)
-    allowed = (frequency > 1.5 / part.across) & (frequency < 1.0 / (SHORTEST_CELLS * part.cell))
+    allowed = (frequency > 3.0 / part.across) & (frequency < 1.0 / (SHORTEST_CELLS * part.cell))
     unit = 2.0 / (part.value.size * float(part.value.var()))
     power, period = np.zeros(len(centres)), np.ones(len(centres))
     for first in range(0, len(centres), 1024):

@@ -33,7 +33,7 @@ class TreeRings(PlainNullEffect):
         Parameter(
             "centre_y", "px", 0.0, (-10_000.0, 14_000.0), 3000.0, "row of their centre", place=True, step=0.01
         ),
-        Parameter("period", "px", 50.0, (2.0, 2000.0), 50.0, "distance of rings", place=True, step=1e-4),
+        Parameter("period", "px", 50.0, (2.0, 500.0), 50.0, "distance of rings", place=True, step=1e-4),
     )  # fmt: skip
 
     def change_image(

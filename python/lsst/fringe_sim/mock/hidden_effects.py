@@ -519,7 +519,7 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
             HiddenParameter("sine", "", 0.0, (-0.05, 0.05), "amplitude of the sine"),
             HiddenParameter("centre_x", "px", 0.0, (-10_000.0, 14_000.0), "column of the centre"),
             HiddenParameter("centre_y", "px", 0.0, (-10_000.0, 14_000.0), "row of the centre"),
-            HiddenParameter("period", "px", 50.0, (2.0, 2000.0), "distance of rings"),
+            HiddenParameter("period", "px", 50.0, (2.0, 500.0), "distance of rings"),
         ),
         on_light=_tree_rings,
     ),

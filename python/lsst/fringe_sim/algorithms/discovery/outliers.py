@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, median_filter
 
 __all__ = ["spoiled_cells"]
 
@@ -22,6 +22,9 @@ MOST_OF_A_PLANE = 0.02
 
 MOST_PLANES = 0.3
 """Part of the exposures beyond which what is wrong with a cell is not an accident of one of them."""
+
+NEIGHBOURHOOD = 7
+"""Side of the area whose median is taken off [cells]; a track covers less than half of it."""
 
 TILE = 24
 """Side of the tiles in which the spread is taken [cells]: misfit of the model may be larger in some places."""
@@ -52,6 +55,8 @@ def spoiled_cells(residual: FloatArray, used: BoolArray) -> BoolArray:
     common = np.zeros(seen.shape)
     common[seen] = np.nanmedian(known[:, seen], axis=0)
     own = np.where(used, residual - common, 0.0)
+    # What is wrong with all of a neighbourhood is no track: the light, or a wrong effect.
+    own = np.where(used, own - np.stack([median_filter(plane, NEIGHBOURHOOD) for plane in own]), 0.0)
     departure = np.stack([_in_own_spread(plane, good) for plane, good in zip(own, used, strict=True)])
     spoiled = np.abs(departure) > OUTLIER_SIGMA
     spoiled &= spoiled.sum(axis=0) <= max(1.0, MOST_PLANES * waves)
