@@ -84,6 +84,11 @@ def test_straight_stripes_are_no_rings() -> None:
     )
 
 
+def test_a_perfect_model_leaves_no_rings() -> None:
+    nothing = np.zeros((len(WAVELENGTHS), 90, 110))
+    assert TreeRings().look(nothing, nothing + 1.0, geometry_of((90, 110))) == {}
+
+
 def test_too_few_pixels_show_nothing() -> None:
     residual, weight = noise_and_weight((12, 20), 0.01, np.random.default_rng(1))
     assert TreeRings().look(residual, weight, geometry_of((12, 20))) == {}

@@ -138,7 +138,7 @@ def _averaged(
 
 def _found_in(part: _Samples, whole: _Samples, middle: FloatArray) -> Rings | None:
     """Rings that are clear in a part of the data, as all data have them."""
-    if part.value.size < FEWEST_CELLS:
+    if part.value.size < FEWEST_CELLS or not part.value.any():
         return None
     centres = _places(part)
     power, period = _strongest(part, centres)
