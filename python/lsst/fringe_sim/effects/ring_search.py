@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -59,13 +60,17 @@ class _Samples:
     value: FloatArray
     cell: float
 
-    @property
+    @cached_property
     def across(self) -> float:
         return float(np.hypot(np.ptp(self.y), np.ptp(self.x)))
 
-    @property
+    @cached_property
     def middle(self) -> FloatArray:
         return 0.5 * np.array([self.y.min() + self.y.max(), self.x.min() + self.x.max()])
+
+    @cached_property
+    def variance(self) -> float:
+        return float(self.value.var())
 
     def within(self, half: float) -> _Samples:
         """Those less than so far from the middle, along rows and columns."""
@@ -79,7 +84,7 @@ class _Samples:
 
     def power(self, wave: complex) -> float:
         """Power of a wave in units of that of noise: χ² of two degrees of freedom."""
-        return 2.0 * self.value.size * abs(wave) ** 2 / float(self.value.var())
+        return 2.0 * self.value.size * abs(wave) ** 2 / self.variance
 
 
 def find_rings(
@@ -181,7 +186,7 @@ def _strongest(part: _Samples, centres: FloatArray) -> tuple[FloatArray, FloatAr
     bins = int(2 ** math.ceil(math.log2(part.across / width + 2)))
     frequency = np.fft.rfftfreq(2 * bins, width)
     allowed = (frequency > 3.0 / part.across) & (frequency < 1.0 / (SHORTEST_CELLS * part.cell))
-    unit = 2.0 / (part.value.size * float(part.value.var()))
+    unit = 2.0 / (part.value.size * part.variance)
     power, period = np.zeros(len(centres)), np.ones(len(centres))
     for first in range(0, len(centres), 1024):
         chunk = slice(first, first + 1024)

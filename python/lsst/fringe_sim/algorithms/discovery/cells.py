@@ -14,6 +14,7 @@ from ...effects import ImageGeometry
 from ...errors import InputError
 from ...products.fringe_cube import FringeCube
 from ...products.mask import mask_bits
+from ..flat_prep_options import GAUSSIAN_MAD
 
 __all__ = ["CellData", "bin_cube", "finest_useful_cell", "spectral_order"]
 
@@ -91,20 +92,13 @@ class CellData:
 
     def window(self, rows: slice, columns: slice) -> CellData:
         """The data of a part of the sensor; levels and positions stay those of the whole."""
+        parts = {
+            name: values[..., rows, columns]
+            for name in ("value", "weight", "thickness_um", "thickness_sigma_um", "centroid")
+            if (values := getattr(self, name)) is not None
+        }
         geometry = replace(self.geometry, y_px=self.geometry.y_px[rows], x_px=self.geometry.x_px[columns])
-
-        def part(values: FloatArray | None) -> FloatArray | None:
-            return None if values is None else values[..., rows, columns]
-
-        return replace(
-            self,
-            value=self.value[:, rows, columns],
-            weight=self.weight[:, rows, columns],
-            geometry=geometry,
-            thickness_um=part(self.thickness_um),
-            thickness_sigma_um=part(self.thickness_sigma_um),
-            centroid=part(self.centroid),
-        )
+        return replace(self, geometry=geometry, **parts)
 
     def with_noise_of(self, expected: FloatArray) -> CellData:
         """Same data with the variance that goes with what is expected of a cell, not with what it happened to get.
@@ -285,7 +279,7 @@ def _pattern_variance(value: FloatArray, weight: FloatArray) -> tuple[float, flo
     if near.any():
         rows = value[2:] - 2.0 * value[1:-1] + value[:-2]
         both = (rows[:, 2:] - 2.0 * rows[:, 1:-1] + rows[:, :-2]) / 6.0
-        noise = (1.4826 * float(np.median(np.abs(both[near])))) ** 2
+        noise = (GAUSSIAN_MAD * float(np.median(np.abs(both[near])))) ** 2
     else:
         noise = float(np.median(1.0 / weight[good]))
     return max(float(value[good].var()) - noise, 0.0), noise * math.sqrt(2.0 / number)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..flat_prep_options import GAUSSIAN_MAD
 from .cells import CellData
 
 __all__ = ["NoiseEstimate", "estimate_noise"]
@@ -72,7 +73,7 @@ def estimate_noise(cells: CellData, residual: FloatArray) -> NoiseEstimate:
     clean = common.copy()
     for plane in range(waves):
         own = difference[plane][good[plane]]
-        spread = 1.4826 * float(np.median(np.abs(own)))
+        spread = GAUSSIAN_MAD * float(np.median(np.abs(own)))
         inlier = np.abs(difference[plane]) < CLIP_SIGMA * spread
         clean &= inlier
         use = good[plane] & inlier

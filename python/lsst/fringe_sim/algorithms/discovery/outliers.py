@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, median_filter
 
+from ..flat_prep_options import GAUSSIAN_MAD
+
 __all__ = ["spoiled_cells"]
 
 FloatArray = NDArray[np.float64]
@@ -69,7 +71,7 @@ def spoiled_cells(residual: FloatArray, used: BoolArray) -> BoolArray:
 
 
 def _in_own_spread(plane: FloatArray, good: BoolArray) -> FloatArray:
-    """Values over 1.48 times the median absolute value of their tile, or of the plane where that is larger."""
+    """Values over the robust spread of their tile, or of the plane where that is larger."""
     if not good.any():
         return plane
     whole = float(np.median(np.abs(plane[good])))
@@ -80,4 +82,4 @@ def _in_own_spread(plane: FloatArray, good: BoolArray) -> FloatArray:
             inside = np.abs(plane[tile][good[tile]])
             if inside.size >= TILE:
                 spread[tile] = max(whole, float(np.median(inside)))
-    return np.asarray(plane / np.maximum(1.4826 * spread, 1e-300))
+    return np.asarray(plane / np.maximum(GAUSSIAN_MAD * spread, 1e-300))
