@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from lsst.fringe_sim.algorithms.discovery import Verdict
+from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Step, Where
+from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures
 from lsst.fringe_sim.report.discovery_figures import candidates_figure, gap_figure, where_figure
-from lsst.fringe_sim.report.discovery_page import discovery_page
+from lsst.fringe_sim.report.discovery_page import discovery_page, residual_pair
 
 WAVELENGTHS = [880.0 + 10.0 * k for k in range(12)]
 
@@ -177,6 +180,24 @@ def test_data_that_are_too_poor_are_said_to_be() -> None:
     seen = words(discovery_page(TOO_POOR).to_html())
     assert "one flat and no thickness" in seen
     assert "nan" not in seen
+
+
+def test_a_search_that_could_not_begin_has_a_page() -> None:
+    """As the search itself answers two flats without a map of the thickness."""
+    case = draw_case("none", np.random.default_rng(1), size=(32, 32))
+    two = replace(
+        case.cube,
+        image=case.cube.image[:2],
+        variance=case.cube.variance[:2],
+        mask=case.cube.mask[:2],
+        exposures=FlatExposures(case.cube.wavelength_nm[:2], np.array(2.0), np.array(183.15)),
+    )
+    verdict = discover(two, case.setup, rng=np.random.default_rng(1))
+    assert verdict.unexplained["too_poor"]
+    assert residual_pair(two, FringeModel.from_setup(case.setup), verdict) is None
+    text = words(discovery_page(verdict).to_html())
+    assert "too poor to be searched" in text
+    assert "2 wavelength(s) without a thickness map" in text
 
 
 @pytest.mark.parametrize("draw", [where_figure, candidates_figure, gap_figure])

@@ -93,6 +93,8 @@ def residual_pair(cube: FringeCube, model: FringeModel, verdict: Verdict) -> Res
     residuals : `ResidualPair` or `None`
         None where the thickness cannot be fitted pixel by pixel, as with a single wavelength.
     """
+    if not _was_searched(verdict):
+        return None
     try:
         before = fit_and_compare(cube, model)
         after = None
@@ -107,6 +109,8 @@ def headline(verdict: Verdict) -> str:
     """The verdict in one line."""
     if verdict.verdict == "no_discrepancy":
         return "Model and data agree within the noise"
+    if verdict.unexplained.get("too_poor"):
+        return "These data are too poor to be searched"
     if verdict.verdict == "unexplained":
         return "Model and data disagree, and no known effect explains it"
     names = " and ".join(
@@ -118,9 +122,14 @@ def headline(verdict: Verdict) -> str:
     return f"Missing from the model: {names}"
 
 
+def _was_searched(verdict: Verdict) -> bool:
+    """Whether the data were good enough to be averaged and fitted."""
+    return "cell_px" in verdict.data
+
+
 def _lead(verdict: Verdict) -> str:
     data = verdict.data
-    if not data:
+    if not _was_searched(verdict):
         return f"Set-up {verdict.setup}."
     planes, rows, columns = data["shape"]
     cells = "pixels" if data["cell_px"] == 1 else f"cells of {data['cell_px']} × {data['cell_px']} px"
@@ -369,7 +378,7 @@ def _use(report: Report, verdict: Verdict) -> None:
 def _data(report: Report, verdict: Verdict) -> None:
     data = verdict.data
     report.section("Data and notes")
-    if data:
+    if _was_searched(verdict):
         table = Table(
             {"wavelength": data["wavelength_nm"], "noise over the stated noise": data["noise_factor"]}
         )
