@@ -29,7 +29,7 @@ def reach(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
         touched.append(effect.on_optics(optics, complete).flat_field([15.0, 15.1, 19.0], exposure_of(values)))
     light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
     if effect.on_light is not None:
-        touched.append(effect.on_light(light, complete))
+        touched.append(effect.on_light(light, 970.0, complete))
     if effect.on_charge is not None:
         touched.append(effect.on_charge(20_000.0 * light, complete))
     if effect.on_amplifier is not None:

@@ -10,7 +10,7 @@ import pytest
 import tmm
 
 from lsst.fringe_sim.errors import ConvergenceError, OutOfRangeError, StackError, UnknownNameError
-from lsst.fringe_sim.mock import Film, FlatFieldOptics, material_index, setup_optics
+from lsst.fringe_sim.mock import Film, FlatFieldOptics, material_index, setup_optics, validate_effects
 from lsst.fringe_sim.model import FringeModel, Setup
 from lsst.fringe_sim.optics import get_medium, medium_names
 from lsst.fringe_sim.resources import list_resources, read_yaml
@@ -139,6 +139,32 @@ def test_any_face_may_be_rough(e2v: FlatFieldOptics, face: str) -> None:
     ours = np.stack([rough.flat_field(thickness, wavelength) for wavelength in (880.0, 970.0)])
     np.testing.assert_allclose(ours, theirs, rtol=2e-6)
     assert np.max(np.abs(ours[1] / e2v.flat_field(thickness, 970.0) - 1.0)) > 1e-5
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "tolerance"),
+    [
+        ("gate_thickness.offset", 0.05, 1e-6),
+        ("gate_oxide.offset", 0.05, 1e-6),
+        ("black_coating.thickness", 0.3, 1e-6),
+        ("air_gap.thickness", 120.0, 1e-6),
+        ("support_coherence.spread", 0.02, 1e-6),
+        ("line_wing.fraction", 0.2, 1e-6),
+        ("line_triangle.fraction", 0.5, 1e-6),
+        ("lamp_lines.strength", 2.0, 3e-5),  # the model has the lamp on a grid of 0.1 nm
+        ("tilt.angle", 10.0, 1e-6),
+    ],
+)
+def test_hidden_optics_agree_with_the_model(key: str, value: float, tolerance: float) -> None:
+    """Fringes of two implementations that share nothing but the tables."""
+    thickness, wavelength = np.linspace(12.0, 14.0, 60), np.array([880.0, 980.0])
+    ((effect, values),) = validate_effects({key: value})
+    assert effect.on_optics is not None
+    optics = effect.on_optics(setup_optics("ts8_e2v")[0], effect.complete(values))
+    ours = np.stack([optics.flat_field(thickness, place) for place in wavelength])
+    theirs = FringeModel.from_setup("ts8_e2v", effects={key: value}).response(thickness, wavelength)
+    ours, theirs = (signal / signal.mean(axis=1, keepdims=True) for signal in (ours, theirs))
+    np.testing.assert_allclose(ours, theirs, atol=tolerance)
 
 
 def test_spread_agrees_with_the_model(e2v: FlatFieldOptics) -> None:

@@ -24,7 +24,7 @@ _PANEL_NODES = 8
 
 @dataclass(frozen=True)
 class LorentzianProfile(SpectralProfile):
-    """Lorentzian line, cut off at ten times its width: 6 % of an endless one lie beyond.
+    """Lorentzian line, cut off at ten times its width: 3 % of an endless one lie beyond.
 
     Attributes
     ----------

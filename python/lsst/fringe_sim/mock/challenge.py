@@ -87,6 +87,14 @@ SIZES: Mapping[str, Draw] = MappingProxyType(
         "silicon_thickness": lambda r: {"silicon_thickness.offset": _signed(r, -0.5, 1.0)},
         "silicon_absorption": lambda r: {"silicon_absorption.scale": 1.0 + _signed(r, -2.3, -0.7)},
         "ar_coating": lambda r: {"ar_coating.scale": 1.0 + _signed(r, -1.7, -0.7)},
+        "gate_oxide": lambda r: {"gate_oxide.offset": _signed(r, -2.3, -1.0)},
+        "gate_thickness": lambda r: {"gate_thickness.offset": _signed(r, -2.3, -0.8)},
+        "black_coating": lambda r: {"black_coating.thickness": _decades(r, -2.0, 0.3)},
+        "air_gap": lambda r: {"air_gap.thickness": _decades(r, 0.3, 2.7)},
+        "line_wing": lambda r: {"line_wing.fraction": _decades(r, -2.3, -0.3)},
+        "line_triangle": lambda r: {"line_triangle.fraction": float(r.uniform(0.1, 1.0))},
+        "lamp_lines": lambda r: {"lamp_lines.strength": _decades(r, -1.0, 1.0)},
+        "tilt": lambda r: {"tilt.angle": _decades(r, 0.3, 1.4)},
         "roughness": lambda r: {"roughness.sigma": _decades(r, 0.8, 2.0)},
         "thickness_spread": lambda r: {"thickness_spread.sigma": _decades(r, 0.3, 1.7)},
         "converging_beam": lambda r: {"converging_beam.numerical_aperture": _decades(r, -1.3, -0.6)},
@@ -98,6 +106,11 @@ SIZES: Mapping[str, Draw] = MappingProxyType(
             "illumination.gradient_y": _signed(r, -3.5, -1.0),
         },
         "vignetting": lambda r: {"vignetting.corner": _decades(r, -3.3, -0.7)},
+        "chromatic_illumination": lambda r: {
+            f"chromatic_illumination.{name}": _signed(r, -3.5, -1.5)
+            for name in ("gradient_x", "gradient_y", "curvature_xx", "curvature_yy")
+        },
+        "charge_diffusion": lambda r: {"charge_diffusion.sigma": _decades(r, -0.7, 0.5)},
         "midline_step": lambda r: {"midline_step.fraction": _signed(r, -3.5, -1.7)},
         "tree_rings": lambda r: _rings(r, _decades(r, -3.5, -2.3)),
         "crosstalk": lambda r: {"crosstalk.from_left": _decades(r, -3.7, -2.0)},
@@ -256,7 +269,7 @@ def _expose(
         light = light / light.mean()
         for effect, own in active:
             if effect.on_light is not None:
-                light = effect.on_light(light, effect.complete(own))
+                light = effect.on_light(light, float(wavelength), effect.complete(own))
         if outsider:
             light = OUTSIDERS[outsider][0](light, float(wavelength), scene)
         light = light / light.mean() * level * (1.0 + 0.02 * rng.standard_normal())

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, laplace
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
-from .optics import FlatFieldOptics
+from .optics import Film, FlatFieldOptics
 
 __all__ = ["HIDDEN_EFFECTS", "AmplifierState", "HiddenEffect", "HiddenParameter", "validate_effects"]
 
@@ -27,6 +27,20 @@ Values = Mapping[str, float]
 AMPLIFIER_NAMES = tuple(f"C{row}{column}" for row in (1, 0) for column in range(8))
 REFERENCE_CHARGE_E = 100_000.0
 """Charge at which the coefficient of the non-linearity is stated [electrons]."""
+
+COLOUR_PIVOT_NM, COLOUR_REACH_NM = 935.0, 50.0
+"""Wavelength at which a chromatic illumination is even, and distance to that at which its numbers are stated [nm]."""
+
+XENON_REFERENCE_NM, XENON_FWHM_NM = 992.592, 2.0
+XENON_LINES = (
+    (823.390, 10000.0), (834.912, 2000.0), (841.150, 2000.0), (882.183, 5000.0), (895.471, 1000.0),
+    (904.793, 400.0), (916.517, 500.0), (951.599, 200.0), (968.798, 150.0), (972.083, 100.0),
+    (980.238, 2000.0), (992.592, 3000.0), (1084.131, 1000.0),
+)  # fmt: skip
+"""Wavelengths in vacuum [nm] and intensities of the lines of xenon.
+
+Sansonetti & Martin 2005, Handbook of Basic Atomic Spectroscopic Data, doi 10.1063/1.1800011.
+"""
 
 
 @dataclass(frozen=True)
@@ -82,7 +96,7 @@ class HiddenEffect:
     on_optics : callable, optional
         ``(optics, values) -> optics``.
     on_light : callable, optional
-        ``(light [y, x], values) -> light``; the light is relative to its mean over the sensor.
+        ``(light [y, x], wavelength [nm], values) -> light``; the light is relative to its mean over the sensor.
     on_charge : callable, optional
         ``(electrons [y, x], values) -> electrons``, after the photon noise.
     on_amplifier : callable, optional
@@ -93,7 +107,7 @@ class HiddenEffect:
     title: str
     parameters: tuple[HiddenParameter, ...]
     on_optics: Callable[[FlatFieldOptics, Values], FlatFieldOptics] | None = None
-    on_light: Callable[[FloatArray, Values], FloatArray] | None = None
+    on_light: Callable[[FloatArray, float, Values], FloatArray] | None = None
     on_charge: Callable[[FloatArray, Values], FloatArray] | None = None
     on_amplifier: Callable[[AmplifierState, Values, float], AmplifierState] | None = None
 
@@ -234,6 +248,52 @@ def _gate_oxide(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     return optics.with_film("insulation", thickness_um=film.thickness_um + values["offset"])
 
 
+def _gate_thickness(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    film = optics.films[optics.position("gates")]
+    return optics.with_film("gates", thickness_um=film.thickness_um + values["offset"])
+
+
+def _black_coating(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    names = [film.name for film in optics.films]
+    if "black_coating" in names:
+        film = optics.films[optics.position("black_coating")]
+        return optics.with_film("black_coating", thickness_um=film.thickness_um + values["thickness"])
+    return _inserted(optics, Film("black_coating", "litho_black", values["thickness"]), "adhesive")
+
+
+def _air_gap(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return _inserted(optics, Film("air_gap", "vacuum", 1e-3 * values["thickness"]), "support")
+
+
+def _inserted(optics: FlatFieldOptics, film: Film, before: str) -> FlatFieldOptics:
+    """Optics with one film more; a film of no thickness is none."""
+    if film.thickness_um == 0.0:
+        return optics
+    place = optics.position(before)
+    return replace(optics, films=(*optics.films[:place], film, *optics.films[place:]))
+
+
+def _support_coherence(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(optics, support_spread_um=values["spread"])
+
+
+def _line_wing(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(optics, other_lines=(*optics.other_lines, ("lorentzian", values["fraction"])))
+
+
+def _line_triangle(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(optics, other_lines=(*optics.other_lines, ("triangular", values["fraction"])))
+
+
+def _lamp_lines(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    strongest = dict(XENON_LINES)[XENON_REFERENCE_NM]
+    lines = tuple(
+        (centre, values["strength"] * intensity / strongest, XENON_FWHM_NM)
+        for centre, intensity in XENON_LINES
+    )
+    return replace(optics, lamp_lines=lines if values["strength"] else ())
+
+
 def _tilt(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     return replace(optics, theta=tuple(theta + math.radians(values["angle"]) for theta in optics.theta))
 
@@ -262,30 +322,38 @@ def _converging_beam(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics
 # Light ----------------------------------------------------------------------------------------------------
 
 
-def _ghost_pedestal(light: FloatArray, values: Values) -> FloatArray:
+def _ghost_pedestal(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
     return light + values["fraction"]
 
 
-def _contrast_loss(light: FloatArray, values: Values) -> FloatArray:
+def _contrast_loss(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
     return 1.0 + values["factor"] * (light - 1.0)
 
 
-def _illumination(light: FloatArray, values: Values) -> FloatArray:
+def _illumination(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
     v, u = _sensor_coordinates(light.shape)
     return light * (1.0 + 0.5 * values["gradient_x"] * u + 0.5 * values["gradient_y"] * v)
 
 
-def _vignetting(light: FloatArray, values: Values) -> FloatArray:
+def _vignetting(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
     v, u = _sensor_coordinates(light.shape)
     return light * (1.0 - 0.5 * values["corner"] * (u * u + v * v))
 
 
-def _midline_step(light: FloatArray, values: Values) -> FloatArray:
+def _chromatic_illumination(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
+    v, u = _sensor_coordinates(light.shape)
+    pattern = 0.5 * (values["gradient_x"] * u + values["gradient_y"] * v)
+    pattern = pattern + values["curvature_xx"] * u * u + values["curvature_xy"] * u * v
+    pattern = pattern + values["curvature_yy"] * v * v
+    return light * (1.0 + (wavelength_nm - COLOUR_PIVOT_NM) / COLOUR_REACH_NM * pattern)
+
+
+def _midline_step(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
     upper = np.arange(light.shape[0])[:, np.newaxis] >= light.shape[0] // 2
     return light * np.where(upper, 1.0 + values["fraction"], 1.0)
 
 
-def _tree_rings(light: FloatArray, values: Values) -> FloatArray:
+def _tree_rings(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
     inside = (np.arange(3) - 1.0) / 3.0  # a pixel is seen at nine places
     y, x = (np.add.outer(np.arange(size), inside).ravel() for size in light.shape)
     radius = np.hypot(y[:, np.newaxis] - values["centre_y"], x - values["centre_x"])
@@ -302,7 +370,7 @@ def _sensor_coordinates(shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]
     return v, u
 
 
-def _charge_diffusion(light: FloatArray, values: Values) -> FloatArray:
+def _charge_diffusion(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
     return gaussian_filter(light, values["sigma"], mode="reflect", truncate=6.0) if values["sigma"] else light
 
 
@@ -437,6 +505,48 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
         on_optics=_gate_oxide,
     ),
     HiddenEffect(
+        "gate_thickness",
+        "polysilicon gates",
+        (HiddenParameter("offset", "um", 0.0, (-0.2, 0.3), "thickness minus that of the stack"),),
+        on_optics=_gate_thickness,
+    ),
+    HiddenEffect(
+        "black_coating",
+        "black coating behind the gates",
+        (HiddenParameter("thickness", "um", 0.0, (0.0, 3.0), "thickness added to that of the stack"),),
+        on_optics=_black_coating,
+    ),
+    HiddenEffect(
+        "air_gap",
+        "gap between adhesive and support",
+        (HiddenParameter("thickness", "nm", 0.0, (0.0, 2000.0), "thickness of the gap"),),
+        on_optics=_air_gap,
+    ),
+    HiddenEffect(
+        "support_coherence",
+        "partially incoherent support",
+        (HiddenParameter("spread", "um", 0.0, (0.0, 2.0), "rms thickness variation inside a pixel"),),
+        on_optics=_support_coherence,
+    ),
+    HiddenEffect(
+        "line_wing",
+        "Lorentzian wings of the line",
+        (HiddenParameter("fraction", "", 0.0, (0.0, 1.0), "part of the light in a Lorentzian"),),
+        on_optics=_line_wing,
+    ),
+    HiddenEffect(
+        "line_triangle",
+        "triangular line",
+        (HiddenParameter("fraction", "", 0.0, (0.0, 1.0), "part of the light in a triangle"),),
+        on_optics=_line_triangle,
+    ),
+    HiddenEffect(
+        "lamp_lines",
+        "lines of the xenon lamp",
+        (HiddenParameter("strength", "", 0.0, (0.0, 50.0), "peak of the 992.6 nm line over the continuum"),),
+        on_optics=_lamp_lines,
+    ),
+    HiddenEffect(
         "tilt",
         "tilted sensor",
         (HiddenParameter("angle", "deg", 0.0, (0.0, 40.0), "angle of incidence"),),
@@ -498,6 +608,21 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
             ),
         ),
         on_light=_vignetting,
+    ),
+    HiddenEffect(
+        "chromatic_illumination",
+        "uneven illumination, changing with wavelength",
+        tuple(
+            HiddenParameter(name, "", 0.0, (-0.3, 0.3), f"coefficient of {term} per {COLOUR_REACH_NM:g} nm")
+            for name, term in (
+                ("gradient_x", "u / 2"),
+                ("gradient_y", "v / 2"),
+                ("curvature_xx", "u²"),
+                ("curvature_xy", "u v"),
+                ("curvature_yy", "v²"),
+            )
+        ),
+        on_light=_chromatic_illumination,
     ),
     HiddenEffect(
         "midline_step",

@@ -48,6 +48,9 @@ LINE_STEP_NM = 0.03
 LINE_REACH = 6.0
 """Half width of the sampled Gaussian line in standard deviations; 2e-9 of the light is left out."""
 
+LORENTZIAN_REACH = 10.0
+"""Full widths at half maximum after which a Lorentzian line is cut off: 3 % of an endless one lie beyond."""
+
 HEIGHT_STEP_NM = 25.0
 """Largest spacing of the thicknesses inside a pixel [nm]: a fifth of a fringe in silicon."""
 
@@ -107,7 +110,7 @@ class FlatFieldOptics:
     bandwidth_fwhm_nm : `float`
         Full width at half maximum of the line [nm].
     line_shape : `str`
-        ``"gaussian"`` or ``"triangular"``.
+        ``"gaussian"``, ``"triangular"`` or ``"lorentzian"``.
     wavelength_offset_nm : `float`
         True minus nominal wavelength [nm].
     wavelength_stretch : `float`
@@ -124,6 +127,12 @@ class FlatFieldOptics:
         Rms height of that face [nm], on a lateral scale so short that light which is not specular is lost.
     spread_nm : `float`
         Rms variation of the varying layer inside a pixel [nm], slow enough for every part to be plane.
+    support_spread_um : `float`
+        The same of the layer called ``support`` [µm].
+    other_lines : `tuple` [`tuple` [`str`, `float`], ...]
+        Shapes of the same width, ``"lorentzian"`` too, each with the part that it takes of the light before it.
+    lamp_lines : `tuple` [`tuple` [`float`, `float`, `float`], ...]
+        Lines of the lamp: centre [nm], peak over the continuum, full width at half maximum [nm].
     line_step_nm, height_step_nm : `float`
         Largest spacing of the nodes over wavelength and over the thicknesses inside a pixel [nm].
 
@@ -151,6 +160,9 @@ class FlatFieldOptics:
     rough_face: str = "support"
     roughness_nm: float = 0.0
     spread_nm: float = 0.0
+    support_spread_um: float = 0.0
+    other_lines: tuple[tuple[str, float], ...] = ()
+    lamp_lines: tuple[tuple[float, float, float], ...] = ()
     line_step_nm: float = LINE_STEP_NM
     height_step_nm: float = HEIGHT_STEP_NM
 
@@ -163,13 +175,16 @@ class FlatFieldOptics:
         for name in ("line_step_nm", "height_step_nm"):
             if not getattr(self, name) > 0:
                 raise OutOfRangeError(name, getattr(self, name), "a positive number")
-        for name in ("roughness_nm", "spread_nm"):
+        for name in ("roughness_nm", "spread_nm", "support_spread_um"):
             if not getattr(self, name) >= 0:
                 raise OutOfRangeError(name, getattr(self, name), "zero or a positive number")
         if self.position(self.rough_face) == 0:
             raise UnknownNameError("rough face", self.rough_face, [film.name for film in self.films[1:]])
-        if self.line_shape not in _LINE_SHAPES:
-            raise UnknownNameError("line shape", self.line_shape, _LINE_SHAPES)
+        for shape, part in ((self.line_shape, 1.0), *self.other_lines):
+            if shape not in _LINE_SHAPES:
+                raise UnknownNameError("line shape", shape, _LINE_SHAPES)
+            if not 0.0 <= part <= 1.0:
+                raise OutOfRangeError(f"part of the light in the {shape} line", part, "0 to 1")
         if len(self.theta) != len(self.theta_weight) or not math.isclose(sum(self.theta_weight), 1.0):
             raise OutOfRangeError("angle weights", self.theta_weight, "one per angle, with sum 1")
 
@@ -251,13 +266,29 @@ class FlatFieldOptics:
             Detected over incident photons.
         """
         thickness = np.atleast_1d(np.asarray(thickness_um, dtype=float))
-        offset, line_weight = _LINE_SHAPES[self.line_shape](self.bandwidth_fwhm_nm, self.line_step_nm)
-        wavelength = self.true_wavelength(float(wavelength_nm)) + offset
+        wavelength, line_weight = self._line(float(wavelength_nm))
         total = np.zeros(thickness.shape)
-        for weight, theta, s_wave, height_um in self._modes():
-            light = _light(self, wavelength, weight * line_weight, theta, s_wave, height_um)
-            _add_mode(total, light, thickness)
+        for support_um, part in _heights(self.support_spread_um, 1e-3 * self.height_step_nm):
+            for weight, theta, s_wave, height_um in self._modes():
+                light = _light(
+                    self, wavelength, part * weight * line_weight, theta, s_wave, height_um, support_um
+                )
+                _add_mode(total, light, thickness)
         return total
+
+    def _line(self, nominal_nm: float) -> tuple[FloatArray, FloatArray]:
+        """Wavelengths [nm] and weights of one flat."""
+        offset, weight = _LINE_SHAPES[self.line_shape](self.bandwidth_fwhm_nm, self.line_step_nm)
+        for shape, part in self.other_lines:
+            if part > 0.0:
+                more, its_weight = _LINE_SHAPES[shape](self.bandwidth_fwhm_nm, self.line_step_nm)
+                offset = np.concatenate([offset, more])
+                weight = np.concatenate([(1.0 - part) * weight, part * its_weight])
+        wavelength = self.true_wavelength(nominal_nm) + offset
+        lamp = np.ones(wavelength.size)
+        for centre, peak, fwhm in self.lamp_lines:
+            lamp += peak / (1.0 + ((wavelength - centre) / (0.5 * fwhm)) ** 2)
+        return wavelength, weight * lamp / (weight * lamp).sum()
 
     def table(self, thickness_range_um: tuple[float, float], wavelengths_nm: Sequence[float]) -> SignalTable:
         """Tabulate the signal over thickness, one row per flat.
@@ -312,15 +343,7 @@ class FlatFieldOptics:
 
     def _modes(self) -> Iterator[tuple[float, float, bool, float]]:
         """Weight, angle [rad], s-wave or not, and departure of the varying layer from its mean [µm]."""
-        heights = [(0.0, 1.0)]
-        if self.spread_nm > 0.0:
-            # Equidistant nodes converge exponentially under a Gaussian.
-            count = max(12, math.ceil(HEIGHT_REACH * self.spread_nm / self.height_step_nm))
-            node = np.linspace(-HEIGHT_REACH, HEIGHT_REACH, 2 * count + 1)
-            node_weight = np.exp(-0.5 * node * node)
-            node_weight /= node_weight.sum()
-            heights = list(zip(1e-3 * self.spread_nm * node, node_weight, strict=True))
-        for height_um, height_weight in heights:
+        for height_um, height_weight in _heights(1e-3 * self.spread_nm, 1e-3 * self.height_step_nm):
             for theta, theta_weight in zip(self.theta, self.theta_weight, strict=True):
                 weight = float(height_weight * theta_weight)
                 if theta == 0.0:  # s and p are the same there
@@ -449,8 +472,26 @@ def _triangular_line(fwhm_nm: float, step_nm: float) -> tuple[FloatArray, FloatA
     return offset, weight / weight.sum()
 
 
+def _lorentzian_line(fwhm_nm: float, step_nm: float) -> tuple[FloatArray, FloatArray]:
+    """Offsets [nm] and weights; equal parts of the light, up to ten times the width."""
+    reach = math.atan(2.0 * LORENTZIAN_REACH)
+    count = math.ceil(2.0 * reach * LORENTZIAN_REACH * fwhm_nm / step_nm)
+    x, w = np.polynomial.legendre.leggauss(count)
+    return 0.5 * fwhm_nm * np.tan(reach * x), 0.5 * w
+
+
+def _heights(rms_um: float, step_um: float) -> list[tuple[float, float]]:
+    """Departures [µm] and weights of a thickness that varies; equidistant nodes converge fast under a Gaussian."""
+    if rms_um == 0.0:
+        return [(0.0, 1.0)]
+    count = max(12, math.ceil(HEIGHT_REACH * rms_um / step_um))
+    node = np.linspace(-HEIGHT_REACH, HEIGHT_REACH, 2 * count + 1)
+    weight = np.exp(-0.5 * node * node)
+    return list(zip((rms_um * node).tolist(), (weight / weight.sum()).tolist(), strict=True))
+
+
 _LINE_SHAPES: Mapping[str, Callable[[float, float], tuple[FloatArray, FloatArray]]] = MappingProxyType(
-    {"gaussian": _gaussian_line, "triangular": _triangular_line}
+    {"gaussian": _gaussian_line, "triangular": _triangular_line, "lorentzian": _lorentzian_line}
 )
 
 
@@ -484,8 +525,11 @@ def _light(
     theta: float,
     s_wave: bool,
     height_um: float,
+    support_um: float = 0.0,
 ) -> _Light:
     thickness = [film.thickness_um for film in optics.films]
+    if support_um:
+        thickness[optics.position("support")] += support_um
     wave_number = 2.0 * np.pi / (1e-3 * wavelength_nm)  # rad/µm
     index = np.stack([film.index(wavelength_nm, optics.temperature_k) for film in optics.films])
     along = index[0].real * math.sin(theta)

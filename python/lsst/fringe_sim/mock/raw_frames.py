@@ -138,7 +138,7 @@ class MockTruth:
         light = signal / signal.mean()
         for effect, values in _active(self.effects):
             if effect.on_light is not None:
-                light = effect.on_light(light, effect.complete(values))
+                light = effect.on_light(light, wavelength_nm, effect.complete(values))
         return light / light.mean()
 
     def expected_electrons(self, exposure: MockExposure) -> FloatArray:

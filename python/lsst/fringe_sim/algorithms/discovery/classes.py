@@ -11,7 +11,10 @@ from .selection import Hypothesis, Selector, similarity
 __all__ = ["EffectClass", "classes_of", "outsider_probability"]
 
 MIMICKED = 0.05
-"""Part of the causes outside the catalogue that effects in it can mimic."""
+"""Part of the causes outside the catalogue that effects in it can mimic, however strong they are."""
+
+HIDDEN_CHI2 = 25.0
+"""χ² that a residual may hold and still look like noise to tests that share their power among many patterns."""
 
 DECADES_OF_CHANCE = 200.0
 """Powers of ten by which a residual of signal to noise 30 is improbable."""
@@ -127,14 +130,27 @@ def _values_of(name: str, fit: Fit) -> dict[str, float]:
     }
 
 
-def outsider_probability(hypothesis: Hypothesis, prior: float) -> float:
+def outsider_probability(hypothesis: Hypothesis, prior: float, explained: float = math.inf) -> float:
     """Probability of a cause outside the catalogue, from the chance of noise in what is left.
 
     An effect of the catalogue leaves noise: any chance is as likely as any other. A cause outside it either is
     mimicked, and leaves noise as well, or leaves a residual whose chance may lie anywhere down to that of a signal to
-    noise of 30, each power of ten as likely as the other.
+    noise of 30, each power of ten as likely as the other. What share of it effects cannot mimic may be anything, and
+    is seen if it is not too weak: nearly nothing is known of the cause of a signal to noise of 5, and one effect more
+    mimics as much more.
+
+    Parameters
+    ----------
+    hypothesis : `Hypothesis`
+        The set that was found.
+    prior : `float`
+        Probability of such a cause before the data are seen.
+    explained : `float`, optional
+        χ² that the set takes off the unchanged model.
     """
+    hidden = HIDDEN_CHI2 * max(len(hypothesis.names), 1) / max(explained, 1e-300)
+    mimicked = min(max(MIMICKED, hidden), 1.0)
     p = min(max(hypothesis.probability_of_noise, 1e-100), 1.0)
-    density = MIMICKED + (1.0 - MIMICKED) / (p * math.log(10.0) * DECADES_OF_CHANCE)
+    density = mimicked + (1.0 - mimicked) / (p * math.log(10.0) * DECADES_OF_CHANCE)
     odds = prior / (1.0 - prior) * density
     return odds / (1.0 + odds)

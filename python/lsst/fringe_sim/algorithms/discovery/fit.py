@@ -614,7 +614,8 @@ class _Solver:
         reference = problem.forward.predict(self.settings(start), thickness).value
         self.whiten = problem.whitener(reference)
         levels = self._first_levels(reference) if levels_start is None else levels_start.copy()
-        point = self.evaluate(_Point(start.copy(), levels, field_start.copy()))
+        # Effects that start at a size need their own thickness before they are judged.
+        point = self._relax(self.evaluate(_Point(start.copy(), levels, field_start.copy())))
         damping, converged, count = 0.0, False, 0
         while count < iterations:
             count += 1

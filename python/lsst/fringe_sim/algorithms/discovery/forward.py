@@ -265,15 +265,18 @@ class Forward:
         assert weight is not None
         return np.asarray(np.einsum("kyx,kwyx->wyx", weight, rows.reshape(len(weight), -1, *rows.shape[1:])))
 
-    def sampled(self, settings: Settings, thickness_um: FloatArray) -> FloatArray:
-        """Response at any thicknesses within the tables, without effects on the image; shape ``(W, ...)``.
+    def sampled(self, settings: Settings, thickness_um: FloatArray) -> Prediction:
+        """Response at any thicknesses within the tables, without effects on the image; shapes ``(W, ...)``.
 
         Of light that changes over the field, that at its first place.
         """
         table = self.table(settings)
         flat, nothing = thickness_um.ravel(), np.zeros(thickness_um.size)
-        value, _ = _interpolate(table, self.range_um[0], TABLE_STEP_UM, flat, nothing, nothing)
-        return value.reshape(len(table), *thickness_um.shape)[: len(self.geometry.wavelength_nm)]
+        both = _interpolate(table, self.range_um[0], TABLE_STEP_UM, flat, nothing, nothing)
+        value, slope = (
+            part.reshape(len(table), *thickness_um.shape)[: len(self.geometry.wavelength_nm)] for part in both
+        )
+        return Prediction(value, slope)
 
     def _at_centroids(
         self, thickness_um: FloatArray, gradient: FloatArray

@@ -88,7 +88,7 @@ class SearchOptions:
     credit: float = 20.0
     parents: int = 5
     heldout_fraction: float = 0.25
-    outsider_prior: float = 0.1
+    outsider_prior: float = 0.15
 
 
 def discover(
@@ -481,7 +481,8 @@ class _Search:
             )
         if not self.unseen.better:
             reasons.append("data held out are not predicted better")
-        outsider = outsider_probability(final, self.options.outsider_prior)
+        explained = whole.null.fit.chi2 - final.fit.chi2
+        outsider = outsider_probability(final, self.options.outsider_prior, explained)
         named = []
         for name in final.names:
             probability = classes[name].probability * (1.0 - outsider)

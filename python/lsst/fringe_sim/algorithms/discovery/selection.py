@@ -23,6 +23,7 @@ from .fit import (
     fit_model,
     linearise_at,
 )
+from .following import ThicknessFollower, chi2_with_free_fringes
 
 __all__ = ["Candidate", "Hypothesis", "Selector"]
 
@@ -53,6 +54,9 @@ MINIMA_TRIED = 12
 
 PLACES_REFITTED = 10
 """Minima in size and thickness from which a few pixels are fitted."""
+
+LEAST_MOVE_UM = 0.005
+"""Move of the thickness that a fit finds by itself [µm]."""
 
 SAMPLED_CELLS = 1500
 ORDERS_MOVED = 4
@@ -278,6 +282,7 @@ class Selector:
         level = (self.problem.level_basis @ fit.levels)[:, None, None]
         coordinates = self.coordinates[candidate.name]
         places, columns = [], []
+        follower = self._follower(state.thickness_um)
         for number, item in enumerate(coordinates):
             for size in FINE_SCAN if item.quadratic else SCAN:
                 for sign in (1.0,) if item.quadratic else (1.0, -1.0):
@@ -285,9 +290,10 @@ class Selector:
                     if abs(item.clip(departure) - departure) > 1e-9 * abs(departure):
                         continue
                     settings = {**fit.settings, item.key: item.value(departure)}
-                    changed = level * self.problem.forward.predict(settings, state.thickness_um).value
-                    places.append((number, departure))
-                    columns.append(state.whiten(changed - state.value))  # type: ignore[operator]
+                    for thickness in follower.places(settings):
+                        changed = level * self.problem.forward.predict(settings, thickness).value
+                        places.append((number, departure))
+                        columns.append(state.whiten(changed - state.value))  # type: ignore[operator]
         if not columns:
             return candidate
         score, information = state.design.project(np.stack(columns), state.residual)
@@ -302,6 +308,9 @@ class Selector:
         start = np.zeros(len(coordinates))
         start[number] = coordinates[number].clip(departure * min(amplitude[best], 1.5))
         return replace(candidate, start=start, promise=float(gain[best]))
+
+    def _follower(self, thickness_um: FloatArray) -> ThicknessFollower:
+        return ThicknessFollower(self.problem, thickness_um, float(self.index.mean()))
 
     def features(self, state: State, fit: Fit, name: str) -> FloatArray:
         """Whitened signature of an effect: derivatives with respect to its coordinates at a fit.
@@ -465,7 +474,9 @@ class Selector:
         for moved, position in steps:
             settings = {c.key: c.value(x) for c, x in zip(fit.coordinates, position, strict=True)}
             chi2 = np.array([
-                _chi2_with_free_fringes(forward.sampled(settings, thickness * (1.0 + shift / middle)), value, weight)
+                chi2_with_free_fringes(
+                    forward.sampled(settings, thickness * (1.0 + shift / middle)).value, value, weight
+                )
                 for shift in shifts
             ])  # fmt: skip
             for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
@@ -647,6 +658,7 @@ class Selector:
         position = np.where(position == 0.0, nudge, position)
         field_start = base.field if base.coordinates else self.first_field
         rival = min(item.fit.chi2 for key, item in self.fitted.items() if len(key) <= len(names))
+        field_start = self._followed(names[-1], coordinates, position, field_start)
         fit = fit_model(self.problem, coordinates, position, field_start, base.levels, rival=rival)
         if fit.chi2 > base.chi2:
             small = np.array(
@@ -656,6 +668,32 @@ class Selector:
             other = fit_model(self.problem, coordinates, small, base.field, base.levels, rival=rival)
             fit = min(fit, other, key=lambda item: item.chi2)
         return fit
+
+    def _followed(
+        self, name: str, coordinates: tuple[Coordinate, ...], position: FloatArray, field_start: FloatArray
+    ) -> FloatArray:
+        """Field moved to where the effects at their first guess want it, if the last one acts on the response."""
+        if not self.generic or self.problem.field_prior or self.problem.forward.is_image_effect(name):
+            return field_start
+        thickness = self.problem.basis.expand(field_start)
+        self.problem.forward.cover(thickness)
+        settings = {item.key: item.value(x) for item, x in zip(coordinates, position, strict=True)}
+        moved = min(
+            self._follower(thickness).places(settings),
+            key=lambda place: self._chi2_with_levels(settings, place),
+        )
+        if np.abs(moved - thickness).max() < LEAST_MOVE_UM:
+            return field_start
+        self.problem.forward.cover(moved)
+        return self.problem.basis.fit(moved, self.problem.cells.seen.astype(float))
+
+    def _chi2_with_levels(self, settings: Mapping[str, float], thickness_um: FloatArray) -> float:
+        """χ² of a model at some thickness with the level of each wavelength free."""
+        cells = self.problem.cells
+        value = self.problem.forward.predict(settings, thickness_um).value
+        square = np.maximum((cells.weight * value**2).sum(axis=(1, 2)), 1e-300)
+        level = (cells.weight * value * cells.value).sum(axis=(1, 2)) / square
+        return float((cells.weight * (cells.value - level[:, None, None] * value) ** 2).sum())
 
     def with_channels(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis with its residual tested."""
@@ -698,16 +736,6 @@ class Selector:
 
 def _prior_cost(item: Coordinate, position: float) -> float:
     return math.log1p(item.departure(position) ** 2)
-
-
-def _chi2_with_free_fringes(model: FloatArray, value: FloatArray, weight: FloatArray) -> float:
-    """χ² with the best level and the best contrast, not a negative one, at each wavelength."""
-    total = np.maximum(weight.sum(axis=(1, 2)), 1e-300)[:, None, None]
-    fringe = model - (weight * model).sum(axis=(1, 2), keepdims=True) / total
-    rest = value - (weight * value).sum(axis=(1, 2), keepdims=True) / total
-    cross, square = (weight * fringe * rest).sum(axis=(1, 2)), (weight * fringe**2).sum(axis=(1, 2))
-    taken = np.divide(np.maximum(cross, 0.0) ** 2, square, out=np.zeros_like(cross), where=square > 0.0)
-    return float((weight * rest**2).sum() - taken.sum())
 
 
 def _bounded_minimum(
