@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry, activate_effects, apply_to_image
+from lsst.fringe_sim.effects.brighter_fatter import BrighterFatter
+from lsst.fringe_sim.mock import HIDDEN_EFFECTS
 from lsst.fringe_sim.model import FringeModel
 
 LEVEL = 30_000.0
@@ -55,6 +57,23 @@ def test_brighter_fatter_widens_and_keeps_the_charge() -> None:
     before, after = ((x**2 * image).sum() / image.sum() for image in (spot, changed))
     # A quarter of the Laplacian of q²: x² gains half of the mean of q, weighted by q; a Gaussian's is half its peak.
     assert after - before == pytest.approx(0.5 * 0.2 * LEVEL / 1e5 * 0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("cell_px", [1, 3])
+def test_brighter_fatter_correlates_the_noise(rng: np.random.Generator, cell_px: int) -> None:
+    """As in photon noise whose charge moved by the mock's own differences of neighbours."""
+    level, variance, side = 50_000.0, 0.08, 600
+    (hidden,) = (effect for effect in HIDDEN_EFFECTS if effect.name == "brighter_fatter")
+    assert hidden.on_charge is not None
+    charge = hidden.on_charge(rng.poisson(level, (side, side)).astype(float), {"variance": variance})
+    cells = charge.reshape(side // cell_px, cell_px, side // cell_px, cell_px).mean(axis=(1, 3))
+    noise = cells - cells.mean()
+    measured = 0.5 * sum(float((noise * np.roll(noise, 1, axis)).mean()) for axis in (0, 1)) / noise.var()
+    middle = cell_px * np.arange(cells.shape[0]) + 0.5 * (cell_px - 1)
+    geometry = ImageGeometry((side, side), middle, middle, np.array([960.0]), np.array([level]))
+    expected = BrighterFatter().noise_correlation({"variance": variance}, geometry)
+    assert measured == pytest.approx(expected, abs=4.0 / cells.shape[0], rel=0.1)
+    assert expected > 0.01
 
 
 def test_brighter_fatter_grows_with_the_level() -> None:

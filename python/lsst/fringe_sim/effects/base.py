@@ -146,6 +146,10 @@ class Effect(ABC):
         """
         return {}
 
+    def noise_correlation(self, values: Mapping[str, float], geometry: ImageGeometry) -> float:
+        """Correlation that the effect gives the noise of neighbouring samples; 0 where it leaves noise alone."""
+        return 0.0
+
     @abstractmethod
     def null_values(self, system: OpticalSystem) -> dict[str, float]:
         """Value of every parameter at which this effect leaves ``system`` as it is."""

@@ -111,6 +111,7 @@ SIZES: Mapping[str, Draw] = MappingProxyType(
             for name in ("gradient_x", "gradient_y", "curvature_xx", "curvature_yy")
         },
         "charge_diffusion": lambda r: {"charge_diffusion.sigma": _decades(r, -0.7, 0.5)},
+        "brighter_fatter": lambda r: {"brighter_fatter.variance": _decades(r, -2.3, -0.9)},
         "midline_step": lambda r: {"midline_step.fraction": _signed(r, -3.5, -1.7)},
         "tree_rings": lambda r: _rings(r, _decades(r, -3.5, -2.3)),
         "crosstalk": lambda r: {"crosstalk.from_left": _decades(r, -3.7, -2.0)},

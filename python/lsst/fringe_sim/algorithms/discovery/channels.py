@@ -100,7 +100,11 @@ def fringe_phase(thickness_um: FloatArray, wavelength_nm: FloatArray, index: Flo
 
 
 def measure_channels(
-    state: State, geometry: object, index: FloatArray, imprecision: float = 0.0
+    state: State,
+    geometry: object,
+    index: FloatArray,
+    imprecision: float = 0.0,
+    correlation: float = 0.0,
 ) -> tuple[Channel, ...]:
     """All tests that need no catalogue.
 
@@ -114,6 +118,8 @@ def measure_channels(
         Refractive index of the varying layer.
     imprecision : `float`, optional
         χ² by which the shape of the fringes may be off because effects that were found are described only so well.
+    correlation : `float`, optional
+        Correlation of the noise of neighbouring cells that the effects of the fit account for.
     """
     channels = [
         _feature_channel("thickness phase", phase_features(state, geometry, index), state, imprecision)
@@ -122,7 +128,7 @@ def measure_channels(
         channels.append(_feature_channel("large scales", spatial_features(state, geometry), state))
         channels.append(_feature_channel("amplifiers", amplifier_features(state, geometry), state))
     if min(state.thickness_um.shape) >= 24:
-        channels.extend(texture_channels(state))
+        channels.extend(texture_channels(state, correlation))
         channels.append(echo_channel(state))
     return tuple(channels)
 
@@ -188,18 +194,22 @@ def amplifier_features(state: State, geometry) -> FloatArray:  # type: ignore[no
     return np.stack(columns)
 
 
-def texture_channels(state: State) -> list[Channel]:
-    """Power of the residual in bands of spatial frequency against the highest band, and single peaks."""
+def texture_channels(state: State, correlation: float = 0.0) -> list[Channel]:
+    """Power of the residual in bands of spatial frequency against the highest band, and single peaks.
+
+    Power is relative to that of noise whose neighbours are correlated.
+    """
+    noise = _power_of_noise(state.thickness_um.shape, correlation)
     used = (state.whiten(np.ones(state.value.shape)) != 0.0).any(axis=0)  # type: ignore[operator]
     common = state.residual.sum(axis=0) / np.sqrt(len(state.residual))
     result = []
     for name, power in (
-        ("achromatic texture", dctn(common, norm="ortho") ** 2),
-        ("texture", np.mean([dctn(plane, norm="ortho") ** 2 for plane in state.residual], axis=0)),
+        ("achromatic texture", dctn(common, norm="ortho") ** 2 / noise),
+        ("texture", np.mean([dctn(plane, norm="ortho") ** 2 for plane in state.residual], axis=0) / noise),
     ):
         planes = 1 if name.startswith("achromatic") else len(state.residual)
         result.append(_band_channel(name, power, planes, float(used.mean())))
-    power = dctn(common, norm="ortho") ** 2
+    power = dctn(common, norm="ortho") ** 2 / noise
     power[0, 0] = 0.0
     top = power / np.median(power[power > 0]) * chi2_distribution.ppf(0.5, 1)
     single = float(chi2_distribution.sf(top.max(), 1))
@@ -209,6 +219,12 @@ def texture_channels(state: State) -> list[Channel]:
         )
     )
     return result
+
+
+def _power_of_noise(shape: tuple[int, ...], correlation: float) -> FloatArray:
+    """Power of unit noise with correlated neighbours at the frequencies of a cosine transform."""
+    waves = [np.cos(np.pi * np.arange(size) / size) for size in shape]
+    return np.asarray(np.maximum(1.0 + 2.0 * correlation * (waves[0][:, None] + waves[1]), 0.1))
 
 
 def _band_channel(name: str, power: FloatArray, planes: int, filled: float) -> Channel:

@@ -304,6 +304,11 @@ class Forward:
         """Whether an effect acts on the image and not on the response."""
         return self._effect(name).acts_on == "image"
 
+    def noise_correlation(self, settings: Settings) -> float:
+        """Correlation that effects on the image give the noise of neighbouring cells."""
+        active = activate_effects(self._image(settings), self.catalogue)
+        return sum(item.effect.noise_correlation(item.values, self.geometry) for item in active)
+
     def couples_pixels(self, name: str) -> bool:
         """Whether an effect carries signal from cell to cell."""
         return self._effect(name).couples_pixels

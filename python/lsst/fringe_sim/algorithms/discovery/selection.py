@@ -200,6 +200,7 @@ class Selector:
             self.problem.cells.geometry,
             self.index,
             IMPRECISION**2 * explained + self._undescribed,
+            self.problem.forward.noise_correlation(fit.settings),
         )
 
     def undescribed(self, name: str) -> float:
