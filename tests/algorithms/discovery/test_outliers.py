@@ -86,6 +86,17 @@ def test_cosmic_rays_are_no_discrepancy() -> None:
 
 
 @pytest.mark.slow
+def test_cosmic_rays_are_no_discrepancy_with_a_known_thickness() -> None:
+    rng = np.random.default_rng(43)
+    case = with_cosmic_rays(draw_case("none", rng), rng)
+    thickness = (case.thickness_um + 0.003 * rng.standard_normal((96, 96))).astype(np.float32)
+    cube = replace(
+        case.cube, thickness=thickness, thickness_sigma=np.full_like(thickness, 0.003), layer="epoxy"
+    )
+    assert discover(cube, case.setup, rng=rng).verdict == "no_discrepancy"
+
+
+@pytest.mark.slow
 def test_an_effect_is_named_behind_cosmic_rays() -> None:
     rng = np.random.default_rng(42)
     case = draw_case("one", rng, only=["tree_rings"])

@@ -68,6 +68,7 @@ def test_poor_data_are_told_to_be_poor() -> None:
     assert verdict.verdict == "unexplained"
     assert verdict.unexplained["too_poor"]
     assert "thickness map" in verdict.unexplained["reason"]
+    assert "nan" not in verdict.summary()
 
 
 def test_contradicting_set_up_is_refused() -> None:

@@ -263,7 +263,11 @@ def _prepare_known(
     basis = CellBasis(known.shape)
     centre = known.ravel()
     problem = Problem(cells, forward, basis, _free_levels(cells), 1.0 / max(sigma, 1e-4) ** 2, centre)
-    return _settle(problem, fit_model(problem, (), np.zeros(0), centre), cells, index)
+    fit = fit_model(problem, (), np.zeros(0), centre)
+    if _is_rich(cells):
+        problem, fit, spoiled = _spoiled_of(problem, fit)
+        cells = cells.restricted(~spoiled)
+    return _settle(problem, fit, cells, index)
 
 
 def _prepare_few(cells: CellData, forward: Forward, start: FloatArray, index: FloatArray) -> Prepared:
@@ -327,7 +331,18 @@ def _settle(problem: Problem, fit: Fit, stated: CellData, index: FloatArray) -> 
 
 def _without_spoiled(problem: Problem, fit: Fit, stated: CellData) -> tuple[Problem, Fit, CellData]:
     """Fit and data without the cells that something spoiled in one exposure."""
-    start, spoiled = problem.basis.expand(fit.field), np.zeros(stated.shape, dtype=bool)
+    start = problem.basis.expand(fit.field)
+    problem, fit, spoiled = _spoiled_of(problem, fit)
+    if not spoiled.any():
+        return problem, fit, stated
+    cells = stated.restricted(~spoiled)
+    # They may have drawn the field into finer coefficients.
+    return *_choose_field(problem.with_cells(cells), start, {}), cells
+
+
+def _spoiled_of(problem: Problem, fit: Fit) -> tuple[Problem, Fit, NDArray[np.bool_]]:
+    """Cells that something spoiled in one exposure, and the fit without them."""
+    spoiled = np.zeros(problem.cells.shape, dtype=bool)
     for _ in range(SPOILED_ROUNDS):
         used = problem.cells.weight > 0.0
         fresh = spoiled_cells(_residual(problem, problem.expected_of(fit)), used)
@@ -336,11 +351,7 @@ def _without_spoiled(problem: Problem, fit: Fit, stated: CellData) -> tuple[Prob
             break
         problem = problem.with_cells(problem.cells.restricted(~spoiled))
         fit = fit_model(problem, (), np.zeros(0), fit.field, fit.levels)
-    if not spoiled.any():
-        return problem, fit, stated
-    cells = stated.restricted(~spoiled)
-    # They may have drawn the field into finer coefficients.
-    return *_choose_field(problem.with_cells(cells), start, {}), cells
+    return problem, fit, spoiled
 
 
 def _finer_is_better(coarse: tuple[Problem, Fit], fine: tuple[Problem, Fit]) -> bool:

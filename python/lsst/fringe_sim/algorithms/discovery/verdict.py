@@ -281,6 +281,8 @@ class Verdict:
         if self.unexplained.get("reason"):
             lines.append(f"  {self.unexplained['reason']}")
         gap = self.gap
+        if not math.isfinite(gap.before):  # data too poor to be searched
+            return "\n".join(lines)
         lines.append(
             f"  {gap.metric}: {gap.before:.6g} -> {gap.after:.6g} "
             f"(held out {gap.heldout_before:.6g} -> {gap.heldout_after:.6g}, noise floor {gap.noise_floor:.6g})"
