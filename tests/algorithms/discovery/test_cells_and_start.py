@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
 from lsst.fringe_sim.algorithms.discovery.channels import echo_channel, measure_channels
@@ -20,6 +21,7 @@ from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector
 from lsst.fringe_sim.algorithms.discovery.start import mended_thickness, starting_thickness
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.effects.image_geometry import AMPLIFIERS
+from lsst.fringe_sim.mock import challenge
 from lsst.fringe_sim.mock.challenge import draw_case
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
@@ -95,6 +97,35 @@ def test_patches_in_a_wrong_order_are_taken_back() -> None:
     spoiled[33, 7] += ORDER_UM
     mended = mended_thickness(FringeModel.from_setup("ts8_e2v"), cells, spoiled)
     assert np.abs(mended - truth).max() < 0.5 * ORDER_UM
+
+
+def test_ragged_patches_are_taken_back_by_the_surface_around_them(rng: np.random.Generator) -> None:
+    """Two of five cells of an area in the wrong order, without a border."""
+    truth = _smooth_field(48, 48)
+    cells = bin_cube(_cube(truth, {}, 5e4, 5), 1)
+    wrong = np.zeros(truth.shape, dtype=bool)
+    wrong[20:34, 22:40] = rng.random((14, 18)) < 0.4
+    started = truth - 0.297 * wrong  # about an order
+    mended = mended_thickness(FringeModel.from_setup("ts8_e2v"), cells, started)
+    assert (np.abs(mended - truth) > 0.15).mean() < 0.002
+
+
+@pytest.mark.slow
+def test_fringes_that_diffusion_takes_away_in_places_do_not_hide_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of the fringes is left where the thickness is steep: without diffusion no field is right there."""
+
+    def diffusion(rng: np.random.Generator) -> dict[str, float]:
+        return {"charge_diffusion.sigma": 10.0 ** rng.uniform(-0.7, 0.5)}
+
+    # A case of a challenge that went wrong, which drew from so many effects.
+    monkeypatch.setattr(challenge, "SIZES", {str(number): diffusion for number in range(37)})
+    streams = np.random.default_rng([20270405, 1, 3]).spawn(2)
+    case = draw_case("one", streams[0])
+    assert case.values["charge_diffusion.sigma"] == pytest.approx(1.446, abs=1e-3)
+    verdict = discover(case.cube, case.setup, rng=streams[1])
+    assert [effect.name for effect in verdict.effects] == ["charge_diffusion"]
+    (sigma,) = verdict.effects[0].parameters.values()
+    assert abs(sigma.value - 1.4462) < 5.0 * sigma.sigma
 
 
 def test_thickness_in_the_right_order_is_left_alone() -> None:

@@ -16,6 +16,7 @@ from ...products.fringe_cube import FringeCube
 from .basis import CellBasis, FieldBasis, SplineBasis
 from .cells import CellData, bin_cube, finest_useful_cell
 from .fit import Fit, Problem, fit_model
+from .following import chi2_with_free_fringes
 from .forward import Exposures, Forward
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
 from .outliers import spoiled_cells
@@ -24,6 +25,10 @@ from .start import mended_thickness, starting_thickness
 __all__ = ["Prepared", "check_setup", "prepare", "prepare_again", "why_too_poor"]
 
 FloatArray = NDArray[np.float64]
+
+SMOOTH_SPACING = 8.0
+MUCH_BETTER = 0.7
+"""Knots with which two thicknesses are compared [cells], and the χ² for which one is taken for the other."""
 
 FEWEST_ROWS = 6
 """Rows and columns of cells from which on noise and levels can be measured."""
@@ -218,6 +223,7 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
         return None, 0
     model = problem.forward.model_with(fit.settings)
     start = mended_thickness(model, problem.cells, thickness_um)
+    start = _better_start(problem, fit.settings, start, starting_thickness(model, problem.cells))
     mended = int(np.count_nonzero(start != thickness_um))
     refined = _settle(*_choose_field(problem, start, fit.settings), prepared.stated, prepared.index)
     refined = replace(refined, null=_better_null(refined, prepared), guess=dict(fit.settings))
@@ -227,6 +233,24 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended
+
+
+def _better_start(
+    problem: Problem, settings: Mapping[str, float], first: FloatArray, second: FloatArray
+) -> FloatArray:
+    """The one of two thicknesses whose fringes lie better on the data, contrasts free, once both are smooth.
+
+    A fit without an effect that weakens the fringes in some places may have left the right thickness there.
+    """
+    basis = SplineBasis.of_grid((first.shape[0], first.shape[1]), SMOOTH_SPACING)
+    seen = problem.cells.seen.astype(float)
+    chi2 = []
+    for thickness in (first, second):
+        smooth = basis.expand(basis.fit(thickness, seen))
+        problem.forward.cover(smooth)
+        value = problem.forward.predict(settings, smooth).value
+        chi2.append(chi2_with_free_fringes(value, problem.cells.value, problem.cells.weight))
+    return second if chi2[1] < MUCH_BETTER * chi2[0] else first
 
 
 def _better_null(refined: Prepared, before: Prepared) -> Fit:

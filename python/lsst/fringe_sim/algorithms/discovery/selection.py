@@ -247,7 +247,9 @@ class Selector:
             score, information = state.design.project(features, state.residual)
             start, gain, degrees = _bounded_minimum(score, information, coordinates)
             candidate = Candidate(name, gain, degrees, start, gain)
-            if scan and not self.has_many(name) and not self.problem.forward.is_image_effect(name):
+            of_the_image = self.problem.forward.is_image_effect(name)
+            far_from_linear = not of_the_image or self.problem.forward.couples_pixels(name)
+            if scan and far_from_linear and not self.has_many(name):
                 candidate = self._scanned(state, fit, candidate)
             found.append(candidate)
         return sorted(found, key=lambda item: -item.promise)
@@ -291,7 +293,8 @@ class Selector:
                     if abs(item.clip(departure) - departure) > 1e-9 * abs(departure):
                         continue
                     settings = {**fit.settings, item.key: item.value(departure)}
-                    for thickness in follower.places(settings):
+                    image = self.problem.forward.is_image_effect(candidate.name)
+                    for thickness in [state.thickness_um] if image else follower.places(settings):
                         changed = level * self.problem.forward.predict(settings, thickness).value
                         places.append((number, departure))
                         columns.append(state.whiten(changed - state.value))  # type: ignore[operator]
@@ -300,8 +303,9 @@ class Selector:
         score, information = state.design.project(np.stack(columns), state.residual)
         strength = np.diag(information)
         amplitude = np.divide(score, strength, out=np.zeros_like(score), where=strength > 1e-6)
-        # A finite signature may be scaled only a little: its shape changes with its size.
-        gain = np.where((amplitude > 0.3) & (amplitude < 2.5), score * amplitude, 0.0)
+        # A finite signature may be scaled only a little: its shape changes with its size. Of one that grows with the
+        # square, no size between two of the scan may be lost.
+        gain = np.where((amplitude > 0.2) & (amplitude < 3.0), score * amplitude, 0.0)
         best = int(np.argmax(gain))
         if gain[best] <= candidate.gain:
             return candidate

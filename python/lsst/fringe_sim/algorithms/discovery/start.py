@@ -5,11 +5,12 @@ from __future__ import annotations
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median, uniform_filter
+from scipy.ndimage import median, median_filter, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ...model import FringeModel
+from .basis import SplineBasis
 from .cells import CellData
 
 __all__ = ["mended_thickness", "starting_thickness"]
@@ -27,6 +28,13 @@ PATCH_ROUNDS = 6
 LARGEST_PATCH = 0.1
 PATCH_LOSS = 0.9
 """How often patches are taken back, the largest part of the cells that is one, and the clarity it may lose."""
+
+SURFACE_SPACINGS = (16.0, 8.0)
+SURFACE_ROUNDS = 8
+SURFACE_LOSS = 0.999
+MEDIAN_SIDE = 15
+"""Knots of the smooth surface [cells], rounds in which it forgets what lies far from it, the clarity that all cells
+together may lose by it, and the side of the area in which it begins with the median [cells]."""
 
 
 def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
@@ -79,6 +87,7 @@ def mended_thickness(model: FringeModel, cells: CellData, thickness_um: FloatArr
     score = _correlate(template, cells)
     first = np.clip(np.rint((thickness_um.ravel() - low) / SEARCH_STEP_UM).astype(np.int64), 0, count - 1)
     best = _mend_patches(score, _mend_orders(score, first, cells.shape[1:], order), cells.shape[1:], order)
+    best = _mend_by_surface(score, best, cells, order)
     turned = np.abs(best - first) > 0.4 * order
     mended = np.where(turned, low + SEARCH_STEP_UM * best, thickness_um.ravel())
     return mended.reshape(thickness_um.shape)
@@ -100,6 +109,7 @@ def _follow(template: FloatArray, cells: CellData, order: float) -> tuple[NDArra
     best = best + _common_shift(score, best, order, count)
     best = _mend_orders(score, best, cells.shape[1:], order)
     best = _mend_patches(score, best, cells.shape[1:], order)
+    best = _mend_by_surface(score, best, cells, order)
     reached = score[np.arange(len(best)), np.clip(best, 0, count - 1)]
     return best, float((reached.astype(float) ** 2).mean())
 
@@ -227,6 +237,42 @@ def _mend_patches(
             break
         current = np.where(better[patch], moved, current)
     return current
+
+
+def _mend_by_surface(
+    score: NDArray[np.float32], best: NDArray[np.int64], cells: CellData, order: float
+) -> NDArray[np.int64]:
+    """Take back ragged patches: every cell at its best less than half an order from a smooth surface through most.
+
+    Where fringes are weak, cells far from one another may be in the wrong order, without a border to tell by.
+    """
+    shape, count = cells.shape[1:], score.shape[1]
+    if min(shape) < FEWEST_ROWS:
+        return best
+    places, reach = np.arange(len(best)), int(HALF_WINDOW_UM / SEARCH_STEP_UM)
+    current = best
+    for spacing in SURFACE_SPACINGS:
+        surface = _surface(current.reshape(shape), cells.seen, spacing, order)
+        middle = np.clip(np.rint(surface.ravel()).astype(np.int64), 0, count - 1)
+        moved = _nearby_peak(score, middle, reach)
+        away = np.abs(current - middle) > 0.5 * order
+        moved = np.where(away, moved, current)
+        power = [float((score[places, field].astype(float) ** 2).mean()) for field in (current, moved)]
+        if not away.any() or power[1] < SURFACE_LOSS * power[0]:
+            continue
+        current = moved
+    return current
+
+
+def _surface(field: NDArray[np.int64], seen: NDArray[np.bool_], spacing: float, order: float) -> FloatArray:
+    """Spline through most cells of a field; those that lie orders away do not count."""
+    basis = SplineBasis.of_grid((field.shape[0], field.shape[1]), spacing)
+    weight = seen.astype(float)
+    surface = median_filter(field, MEDIAN_SIDE).astype(float)
+    for _ in range(SURFACE_ROUNDS):
+        departure = (field - surface) / (0.3 * order)
+        surface = basis.expand(basis.fit(field.astype(float), weight / (1.0 + departure**2) ** 2))
+    return surface
 
 
 def _turns_of_patches(
