@@ -285,7 +285,8 @@ class Selector:
         level = (self.problem.level_basis @ fit.levels)[:, None, None]
         coordinates = self.coordinates[candidate.name]
         places, columns = [], []
-        follower = self._follower(state.thickness_um)
+        held = self.problem.field_prior > 0.0 or self.problem.forward.is_image_effect(candidate.name)
+        follower = None if held else self._follower(state.thickness_um)
         for number, item in enumerate(coordinates):
             for size in FINE_SCAN if item.quadratic else SCAN:
                 for sign in (1.0,) if item.quadratic else (1.0, -1.0):
@@ -293,8 +294,7 @@ class Selector:
                     if abs(item.clip(departure) - departure) > 1e-9 * abs(departure):
                         continue
                     settings = {**fit.settings, item.key: item.value(departure)}
-                    image = self.problem.forward.is_image_effect(candidate.name)
-                    for thickness in [state.thickness_um] if image else follower.places(settings):
+                    for thickness in follower.places(settings) if follower else [state.thickness_um]:
                         changed = level * self.problem.forward.predict(settings, thickness).value
                         places.append((number, departure))
                         columns.append(state.whiten(changed - state.value))  # type: ignore[operator]
