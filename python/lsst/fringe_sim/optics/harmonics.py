@@ -41,6 +41,9 @@ COARSEST = 1e-3
 _SMALLEST = 1e-17
 """Terms below this are left out; the response is of order one."""
 
+_LEFT_OUT = 0.01
+"""Terms that a tolerance allows to leave out, per tolerance: they fall geometrically."""
+
 _MOST_TERMS = 600
 
 _CACHED = 131_072
@@ -145,7 +148,7 @@ class _Gridding(NamedTuple):
         """The rule whose error is at most a tolerance, for twofold oversampling."""
         error = min(max(tolerance, ROUNDING), COARSEST)
         reach = math.ceil(-1.5 * math.log(error) / math.pi)
-        return cls(reach, 2.0 * reach / (4.0 * math.pi * 1.5), _SMALLEST * (error / ROUNDING))
+        return cls(reach, 2.0 * reach / (4.0 * math.pi * 1.5), max(_SMALLEST, _LEFT_OUT * (error - ROUNDING)))
 
 
 def _segment(
@@ -298,8 +301,12 @@ def _grid_group(
     shape = np.exp(-((np.arange(2 * reach) - (reach - 1.0)) ** 2) / (4.0 * width))
     harmonic = np.empty(powers, dtype=np.complex128)
     window = np.empty(2 * reach)
+    mean = np.abs(w).mean()
     for q in range(w.size):
+        if w[q] == 0.0:
+            continue
         h, kr = -g[q], kappa[q].real
+        least = smallest * mean / abs(w[q])  # what has little weight needs few terms
         transparent = kappa[q].imag == 0.0
         s = a[q] + b[q] + e[q]
         turn = np.exp(1j * kr * where)
@@ -342,7 +349,7 @@ def _grid_group(
                 else:
                     for i in range(2 * reach):
                         grid[power, (low + i) % size] += value * window[i]
-            if m >= 2 and amount < smallest * (m * abs(kappa[q])) ** order:
+            if m >= 2 and amount < least * (m * abs(kappa[q])) ** order:
                 break
 
 

@@ -175,7 +175,7 @@ def bin_cube(
         pixels, good, mean = _pixels_of(cube, int(source))
         sums = pixels.summed(cell_px)
         value[plane], weight[plane] = sums.cells(mean, cell_px)
-        centroid[:, plane] = _centroid(good, sums.number, weight[plane] > 0.0, cell_px)
+        centroid[:, plane] = _centroid(good, sums.number, cell_px)
         if cube.unit == "electron":
             level[source] = mean
     if level_e:
@@ -201,12 +201,10 @@ def bin_cube(
     return CellData(value, weight, geometry, cell_px, 0.0, known, sigma, moved)
 
 
-def _centroid(
-    good: NDArray[np.bool_], count: FloatArray, used: NDArray[np.bool_], cell_px: int
-) -> FloatArray:
+def _centroid(good: NDArray[np.bool_], count: FloatArray, cell_px: int) -> FloatArray:
     """Mean place of the good pixels of each cell from its centre, ``(2, ny, nx)`` [cells]."""
     result = np.zeros((2, *count.shape))
-    partial = used & (count < cell_px**2)
+    partial = (count > 0) & (count < cell_px**2)
     if not partial.any():
         return result
     within = (np.arange(cell_px) + 0.5) / cell_px - 0.5

@@ -14,7 +14,7 @@ from scipy.stats import f as f_distribution
 from scipy.stats import ncx2
 
 from ...effects import AMPLIFIERS
-from .fit import Design
+from .fit import Design, PlaneColumns, Whitener, as_columns
 
 __all__ = ["Channel", "State", "combined_probability", "fringe_phase", "measure_channels", "project_test"]
 
@@ -52,8 +52,8 @@ class State:
         Model.
     thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
         Fitted field.
-    whiten : callable
-        Whitens a derivative.
+    whiten : `Whitener`
+        The noise.
     """
 
     design: Design
@@ -61,7 +61,7 @@ class State:
     raw_residual: FloatArray
     value: FloatArray
     thickness_um: FloatArray
-    whiten: object
+    whiten: Whitener
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,12 @@ class Channel:
     probability: float
 
 
-def project_test(design: Design, features: FloatArray, residual: FloatArray) -> tuple[float, int]:
+def project_test(
+    design: Design, features: FloatArray | PlaneColumns, residual: FloatArray
+) -> tuple[float, int]:
     """Score statistic of features with all nuisances projected out, and its degrees of freedom."""
     score, information = design.project(features, residual)
-    scale = np.sqrt(np.maximum(np.einsum("fwyx,fwyx->f", features, features), 1e-300))
+    scale = np.sqrt(np.maximum(as_columns(features).square(), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     keep = values > RANK_TOLERANCE
     along = vectors[:, keep].T @ (score / scale)
@@ -139,29 +141,29 @@ def combined_probability(channels: Sequence[Channel]) -> float:
     return float(-np.expm1(len(channels) * np.log1p(-min(smallest, 1.0 - 1e-16))))
 
 
-def _feature_channel(name: str, features: FloatArray, state: State, imprecision: float = 0.0) -> Channel:
+def _feature_channel(
+    name: str, features: FloatArray | PlaneColumns, state: State, imprecision: float = 0.0
+) -> Channel:
     statistic, degrees = project_test(state.design, features, state.residual)
     noise = ncx2(max(degrees, 1), imprecision) if imprecision > 0.0 else chi2_distribution(max(degrees, 1))
     return Channel(name, statistic, degrees, float(noise.sf(statistic)))
 
 
-def phase_features(state: State, geometry, index: FloatArray) -> FloatArray:  # type: ignore[no-untyped-def]
+def phase_features(state: State, geometry, index: FloatArray) -> PlaneColumns:  # type: ignore[no-untyped-def]
     """Per wavelength: harmonics of the fringe, the first with a trend in thickness, and a smooth curve."""
     phase = fringe_phase(state.thickness_um, geometry.wavelength_nm, index)
     used = state.thickness_um
     half = max(0.5 * float(np.ptp(used)), 1e-6)
     depth = (used - 0.5 * (used.max() + used.min())) / half
-    columns = []
+    columns, planes = [], []
     for plane in range(len(phase)):
         shapes = [f(h * phase[plane]) for h in range(1, HARMONICS + 1) for f in (np.cos, np.sin)]
         shapes += [np.cos(phase[plane]) * depth, np.sin(phase[plane]) * depth]
         if half > 0.3:
             shapes += [depth, depth**2]
-        for shape in shapes:
-            column = np.zeros(phase.shape)
-            column[plane] = shape
-            columns.append(state.whiten(column))  # type: ignore[operator]
-    return np.stack(columns)
+        columns += [state.whiten.root[plane] * shape for shape in shapes]
+        planes += [plane] * len(shapes)
+    return PlaneColumns(np.stack(columns), np.array(planes), np.eye(len(planes)), state.whiten)
 
 
 def spatial_features(state: State, geometry) -> FloatArray:  # type: ignore[no-untyped-def]
@@ -174,9 +176,9 @@ def spatial_features(state: State, geometry) -> FloatArray:  # type: ignore[no-u
             if i + j == 0:
                 continue
             pattern = state.value * (np.cos(j * v) * np.cos(i * u))
-            columns.append(state.whiten(pattern))  # type: ignore[operator]
+            columns.append(state.whiten(pattern))
             if colour.any():
-                columns.append(state.whiten(pattern * colour))  # type: ignore[operator]
+                columns.append(state.whiten(pattern * colour))
     return np.stack(columns)
 
 
@@ -188,9 +190,9 @@ def amplifier_features(state: State, geometry) -> FloatArray:  # type: ignore[no
     for number in range(len(AMPLIFIERS)):
         inside = state.value * (place == number)
         if inside.any():
-            columns.append(state.whiten(inside))  # type: ignore[operator]
+            columns.append(state.whiten(inside))
             if colour.any():
-                columns.append(state.whiten(inside * colour))  # type: ignore[operator]
+                columns.append(state.whiten(inside * colour))
     return np.stack(columns)
 
 
@@ -200,18 +202,18 @@ def texture_channels(state: State, correlation: float = 0.0) -> list[Channel]:
     Power is relative to that of noise whose neighbours are correlated.
     """
     noise = _power_of_noise(state.thickness_um.shape, correlation)
-    used = (state.whiten(np.ones(state.value.shape)) != 0.0).any(axis=0)  # type: ignore[operator]
+    used = (state.whiten(np.ones(state.value.shape)) != 0.0).any(axis=0)
     common = state.residual.sum(axis=0) / np.sqrt(len(state.residual))
     result = []
+    shared = dctn(common, norm="ortho") ** 2 / noise
     for name, power in (
-        ("achromatic texture", dctn(common, norm="ortho") ** 2 / noise),
+        ("achromatic texture", shared),
         ("texture", np.mean([dctn(plane, norm="ortho") ** 2 for plane in state.residual], axis=0) / noise),
     ):
         planes = 1 if name.startswith("achromatic") else len(state.residual)
         result.append(_band_channel(name, power, planes, float(used.mean())))
-    power = dctn(common, norm="ortho") ** 2 / noise
-    power[0, 0] = 0.0
-    top = power / np.median(power[power > 0]) * chi2_distribution.ppf(0.5, 1)
+    shared[0, 0] = 0.0
+    top = shared / np.median(shared[shared > 0]) * chi2_distribution.ppf(0.5, 1)
     single = float(chi2_distribution.sf(top.max(), 1))
     result.append(
         Channel(
@@ -255,7 +257,7 @@ def echo_channel(state: State) -> Channel:
     of thickness does to a cell is taken out of the residual first: where the field is a little too smooth, its
     misfit has the colours of a fringe, as a copy of the image has. The standard deviation is then an upper bound.
     """
-    weight = state.whiten(np.ones(state.value.shape))  # type: ignore[operator]
+    weight = state.whiten(np.ones(state.value.shape))
     pattern = state.value - state.value.mean(axis=(1, 2), keepdims=True)
     scale = np.abs(weight).max(axis=(1, 2), keepdims=True)
     used = (weight != 0.0).astype(float)

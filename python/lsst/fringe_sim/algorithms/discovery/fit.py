@@ -20,6 +20,8 @@ __all__ = [
     "Coordinate",
     "Design",
     "Fit",
+    "FullColumns",
+    "PlaneColumns",
     "Problem",
     "Whitener",
     "coordinate_derivative",
@@ -219,17 +221,49 @@ class Whitener:
 
 
 @dataclass(frozen=True, eq=False)
-class LevelColumns:
-    """Whitened derivatives with respect to the levels, of which each wavelength has its own share.
+class FullColumns:
+    """Whitened derivatives that touch any wavelength, ``(L, W, ny, nx)``."""
 
-    A level touches one wavelength; written out, its columns would be zeros but for one plane in ``W``.
+    values: FloatArray
+
+    @property
+    def flat(self) -> FloatArray:
+        """One row for each column, ``(L, W * ny * nx)``."""
+        return self.values.reshape(len(self.values), math.prod(self.values.shape[1:]))
+
+    def dot(self, values: FloatArray) -> FloatArray:
+        """Products with whitened ``(..., W, ny, nx)``, shape ``(..., L)``."""
+        return np.asarray(values.reshape(*values.shape[:-3], self.flat.shape[1]) @ self.flat.T)
+
+    def along(self, slope: FloatArray) -> FloatArray:
+        """Products cell by cell with a whitened slope ``(W, ny, nx)``, shape ``(L, ny, nx)``."""
+        return np.einsum("wyx,kwyx->kyx", slope, self.values)
+
+    def gram(self) -> FloatArray:
+        """Products with one another, shape ``(L, L)``."""
+        return self.flat @ self.flat.T
+
+    def square(self) -> FloatArray:
+        """Products with themselves, shape ``(L,)``."""
+        return np.einsum("ki,ki->k", self.flat, self.flat)
+
+    def against(self, levels: PlaneColumns) -> FloatArray:
+        """Products with other columns, shape ``(L, their L)``."""
+        return levels.dot(self.values)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneColumns:
+    """Whitened derivatives each of which concerns one wavelength, as those with respect to the levels.
+
+    Written out, such columns would be zeros but for one plane in ``W``, and what the common response makes of it.
 
     Attributes
     ----------
     amplitude : `numpy.ndarray`, shape ``(C, ny, nx)``
-        What a level multiplies, in units of the noise.
+        Derivatives in units of the noise.
     plane : `numpy.ndarray`, shape ``(C,)``
-        The wavelength that it belongs to.
+        The wavelength that each belongs to.
     basis : `numpy.ndarray`, shape ``(C, L)``
         Free parameters of which they are made.
     whiten : `Whitener`
@@ -243,8 +277,13 @@ class LevelColumns:
 
     def dot(self, values: FloatArray) -> FloatArray:
         """Products with whitened ``(..., W, ny, nx)``, shape ``(..., L)``."""
-        planes = self.whiten.decorrelate(values)[..., self.plane, :, :]
-        return np.asarray(np.einsum("cyx,...cyx->...c", self.amplitude, planes) @ self.basis)
+        planes = self.whiten.decorrelate(values)
+        result = np.empty((*values.shape[:-3], len(self.plane)))
+        for wave in np.unique(self.plane):
+            own = self.plane == wave
+            flat = self.amplitude[own].reshape(int(own.sum()), -1)
+            result[..., own] = planes[..., wave, :, :].reshape(*values.shape[:-3], flat.shape[1]) @ flat.T
+        return np.asarray(result @ self.basis)
 
     def along(self, slope: FloatArray) -> FloatArray:
         """Products cell by cell with a whitened slope ``(W, ny, nx)``, shape ``(L, ny, nx)``."""
@@ -253,14 +292,30 @@ class LevelColumns:
 
     def gram(self) -> FloatArray:
         """Products with one another, shape ``(L, L)``."""
-        flat = self.amplitude.reshape(len(self.amplitude), -1)
-        planes = np.where(self.plane[:, np.newaxis] == self.plane, flat @ flat.T, 0.0)
+        return self.against(self)
+
+    def square(self) -> FloatArray:
+        """Products with themselves, shape ``(L,)``."""
+        return np.diag(self.gram())
+
+    def against(self, levels: PlaneColumns) -> FloatArray:
+        """Products with other columns of the same noise, shape ``(L, their L)``."""
+        pair = (self, levels)
+        first, second = (each.amplitude.reshape(len(each.plane), -1) for each in pair)
+        planes = np.where(self.plane[:, np.newaxis] == levels.plane, first @ second.T, 0.0)
         if self.whiten.gamma.any():
             direction, gamma = self.whiten.direction, self.whiten.gamma
-            share = 2.0 * gamma - gamma**2 * (direction**2).sum(axis=0)
-            both = (direction[self.plane] * self.amplitude * np.sqrt(share)).reshape(len(flat), -1)
-            planes = planes - both @ both.T
-        return np.asarray(self.basis.T @ planes @ self.basis)
+            share = np.sqrt(2.0 * gamma - gamma**2 * (direction**2).sum(axis=0))
+            first, second = (
+                (direction[each.plane] * each.amplitude * share).reshape(len(each.plane), -1) for each in pair
+            )
+            planes = planes - first @ second.T
+        return np.asarray(self.basis.T @ planes @ levels.basis)
+
+
+def as_columns(features: FloatArray | PlaneColumns) -> FullColumns | PlaneColumns:
+    """Columns of whitened derivatives ``(F, W, ny, nx)``, or those that are columns already."""
+    return features if isinstance(features, PlaneColumns) else FullColumns(features)
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,14 +385,14 @@ class Problem:
         value = self.forward.predict(fit.settings, self.basis.expand(fit.field)).value
         return self.expected(fit.levels, value)
 
-    def level_columns(self, value: FloatArray, whiten: Whitener) -> LevelColumns:
+    def level_columns(self, value: FloatArray, whiten: Whitener) -> PlaneColumns:
         """Derivatives of the expected data with respect to the levels."""
         planes = np.arange(self.cells.shape[0])
         if not self.free_contrast:
-            return LevelColumns(whiten.root * value, planes, self.level_basis, whiten)
+            return PlaneColumns(whiten.root * value, planes, self.level_basis, whiten)
         basis = block_diag(self.level_basis, np.eye(len(planes)))
         amplitude = np.concatenate([whiten.root, whiten.root * (value - 1.0)])
-        return LevelColumns(amplitude, np.tile(planes, 2), basis, whiten)
+        return PlaneColumns(amplitude, np.tile(planes, 2), basis, whiten)
 
     def field_pull(self, coefficients: FloatArray) -> FloatArray:
         """Half the gradient of χ² from the map that is known, ``(M,)``."""
@@ -364,7 +419,7 @@ class Design:
     ----------
     slope : `numpy.ndarray`, shape ``(W, ny, nx)``
         Whitened derivative with respect to thickness.
-    levels : `LevelColumns`
+    levels : `PlaneColumns`
         Derivatives with respect to the levels.
     effects : `numpy.ndarray`, shape ``(K, W, ny, nx)``
         Whitened derivatives with respect to the effects.
@@ -376,7 +431,7 @@ class Design:
 
     basis: FieldBasis
     slope: FloatArray
-    levels: LevelColumns
+    levels: PlaneColumns
     effects: FloatArray
     pull: FloatArray
     normal: NormalMatrix
@@ -388,7 +443,7 @@ class Design:
         cls,
         basis: FieldBasis,
         slope: FloatArray,
-        levels: LevelColumns,
+        levels: PlaneColumns,
         effects: FloatArray,
         prior: float,
         pull: FloatArray,
@@ -431,12 +486,14 @@ class Design:
         step = _solve_symmetric(self._curvature + np.diag(ridge), right)
         return step, solved[:, 0] - solved[:, 1:] @ step
 
-    def project(self, features: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def project(
+        self, features: FloatArray | PlaneColumns, residual: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Score and information of further columns with all nuisances of this design projected out.
 
         Parameters
         ----------
-        features : `numpy.ndarray`, shape ``(F, W, ny, nx)``
+        features : `numpy.ndarray`, shape ``(F, W, ny, nx)``, or `PlaneColumns`
             Whitened derivatives.
         residual : `numpy.ndarray`, shape ``(W, ny, nx)``
             Whitened residual at the minimum of this design.
@@ -446,15 +503,13 @@ class Design:
         score : `numpy.ndarray`, shape ``(F,)``
         information : `numpy.ndarray`, shape ``(F, F)``
         """
-        flat = features.reshape(len(features), -1)
-        coupling = self.basis.gather(np.einsum("wyx,kwyx->kyx", self.slope, features))
+        columns = as_columns(features)
+        coupling = self.basis.gather(columns.along(self.slope))
         solved = self.normal.solve(coupling)
-        information = flat @ flat.T - coupling.T @ solved
-        cross = np.concatenate(
-            [self.levels.dot(features).T, self.effects.reshape(len(self.effects), self.slope.size) @ flat.T]
-        )
+        information = columns.gram() - coupling.T @ solved
+        cross = np.concatenate([columns.against(self.levels).T, columns.dot(self.effects)])
         cross = cross - self._coupling.T @ solved
-        score = flat @ residual.ravel()
+        score = columns.dot(residual)
         field_side = self._field_score(residual)
         score = score - solved.T @ field_side
         own_score = (

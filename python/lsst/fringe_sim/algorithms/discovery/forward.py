@@ -32,11 +32,17 @@ LINE_STEP_NM = 0.1
 MARGIN_UM = 0.45
 """Thickness beyond the field that a table covers [µm]: a step of a fit may not leave it."""
 
+NO_DISTANCE_PX = 1e-12
+"""Distance between the centroids of a cell that is rounding."""
+
 MOST_TABLE_BYTES = 400e6
 """Memory of the tables kept for reuse."""
 
 MOST_ROWS = 8
 """Rows kept for each exposure while wavelengths are moved."""
+
+_BLOCK = 256
+"""Cells that a core interpolates at a time."""
 
 FARTHEST_UM = 3.0
 """Thickness by which a field may leave the first range [µm]: ten fringe orders. What goes farther does not fit."""
@@ -108,10 +114,16 @@ class Forward:
     _rows_of: tuple[tuple[str, float], ...] | None = field(default=None, repr=False)
     place_weight: FloatArray | None = field(init=False, repr=False, default=None)
     _limits_um: tuple[float, float] = field(init=False, repr=False)
+    _centroids: tuple[FloatArray, FloatArray | None] | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         low, high = self.range_um
         self._limits_um = (max(low - FARTHEST_UM, 0.05), high + FARTHEST_UM)
+        if self.centroid is not None:
+            common = self.centroid.mean(axis=1)
+            rest = self.centroid - common[:, np.newaxis]
+            differ = bool(np.abs(rest).max() > NO_DISTANCE_PX)
+            self._centroids = common, rest if differ else None
         if self.exposures is not None:
             weight = self.exposures.place_weight(self.geometry.shape)
             self.place_weight = weight if len(weight) > 1 else None
@@ -282,12 +294,11 @@ class Forward:
         self, thickness_um: FloatArray, gradient: FloatArray
     ) -> tuple[FloatArray, FloatArray | None]:
         """Thickness where the good pixels lie: common to all wavelengths, and what single ones differ from it."""
-        if self.centroid is None:
+        if self._centroids is None:
             return thickness_um, None
-        moved = np.einsum("ayx,awyx->wyx", gradient, self.centroid)
-        common = moved.mean(axis=0)
-        rest = moved - common
-        return thickness_um + common, rest if rest.any() else None
+        common, rest = self._centroids
+        place = thickness_um + (gradient * common).sum(axis=0)
+        return place, None if rest is None else gradient[0] * rest[0] + gradient[1] * rest[1]
 
     def _spread_in_cell(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Second and fourth moment of the thickness within each cell [µm², µm⁴], from the gradient of the field."""
@@ -345,7 +356,7 @@ def _gradient(field: FloatArray, seen: NDArray[np.bool_] | None) -> FloatArray:
     return result
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _interpolate(
     table: FloatArray,
     start: float,
@@ -356,32 +367,42 @@ def _interpolate(
 ) -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
     """Cubic interpolation of value and slope, averaged over the thickness spread to fourth order."""
     waves, nodes = table.shape
+    column = np.ascontiguousarray(table.T)  # the wavelengths of a node side by side
     value = np.empty((waves, thickness.size))
     slope = np.empty((waves, thickness.size))
-    for i in range(thickness.size):
-        # Cells without data may be anywhere; beyond the table they stay at its ends.
-        position = min(max((thickness[i] - start) / step, 3.0), nodes - 4.0)
-        k = min(int(np.floor(position)), nodes - 5)
-        x = position - k
-        half = 0.5 * second[i] / (step * step)
-        rest = fourth[i] / 24.0 / (step * step) ** 2
+    for block in numba.prange((thickness.size + _BLOCK - 1) // _BLOCK):
+        first = block * _BLOCK
+        number = min(_BLOCK, thickness.size - first)
+        own_value, own_slope = np.empty((number, waves)), np.empty((number, waves))
+        for j in range(number):
+            i = first + j
+            # Cells without data may be anywhere; beyond the table they stay at its ends.
+            position = min(max((thickness[i] - start) / step, 3.0), nodes - 4.0)
+            k = min(int(np.floor(position)), nodes - 5)
+            x = position - k
+            half = 0.5 * second[i] / (step * step)
+            rest = fourth[i] / 24.0 / (step * step) ** 2
+            for w in range(waves):
+                a, b, c, d = column[k - 1, w], column[k, w], column[k + 1, w], column[k + 2, w]
+                if half != 0.0:
+                    # The spread is taken into the nodes, by their second and fourth differences.
+                    o, p, q, r = column[k - 3, w], column[k - 2, w], column[k + 3, w], column[k + 4, w]
+                    a, b, c, d = (
+                        _spread_node(o, p, a, b, c, half, rest),
+                        _spread_node(p, a, b, c, d, half, rest),
+                        _spread_node(a, b, c, d, q, half, rest),
+                        _spread_node(b, c, d, q, r, half, rest),
+                    )
+                # Lagrange polynomial through four nodes, in powers of x
+                c1 = c - a / 3.0 - b / 2.0 - d / 6.0
+                c2 = 0.5 * (a + c) - b
+                c3 = (d - a) / 6.0 + 0.5 * (b - c)
+                own_value[j, w] = b + x * (c1 + x * (c2 + x * c3))
+                own_slope[j, w] = (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
         for w in range(waves):
-            a, b, c, d = table[w, k - 1], table[w, k], table[w, k + 1], table[w, k + 2]
-            if half != 0.0:
-                # The spread is taken into the nodes, by their second and fourth differences.
-                o, p, q, r = table[w, k - 3], table[w, k - 2], table[w, k + 3], table[w, k + 4]
-                a, b, c, d = (
-                    _spread_node(o, p, a, b, c, half, rest),
-                    _spread_node(p, a, b, c, d, half, rest),
-                    _spread_node(a, b, c, d, q, half, rest),
-                    _spread_node(b, c, d, q, r, half, rest),
-                )
-            # Lagrange polynomial through four nodes, in powers of x
-            c1 = c - a / 3.0 - b / 2.0 - d / 6.0
-            c2 = 0.5 * (a + c) - b
-            c3 = (d - a) / 6.0 + 0.5 * (b - c)
-            value[w, i] = b + x * (c1 + x * (c2 + x * c3))
-            slope[w, i] = (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
+            for j in range(number):
+                value[w, first + j] = own_value[j, w]
+                slope[w, first + j] = own_slope[j, w]
     return value, slope
 
 

@@ -21,6 +21,9 @@ SEARCH_STEP_UM = 0.01
 HALF_WINDOW_UM = 0.12
 """Reach of the search around a neighbour's thickness [µm]; below half a fringe order."""
 
+CELLS_AT_ONCE = 256
+"""Cells whose correlations are made together: all that they need stays in the cache of a processor."""
+
 FEWEST_ROWS = 12
 """Rows and columns of cells from which on they are looked at together."""
 
@@ -86,8 +89,7 @@ def mended_thickness(model: FringeModel, cells: CellData, thickness_um: FloatArr
     order, count = _order_steps(model, cells), template.shape[1]
     score = _correlate(template, cells)
     first = np.clip(np.rint((thickness_um.ravel() - low) / SEARCH_STEP_UM).astype(np.int64), 0, count - 1)
-    best = _mend_patches(score, _mend_orders(score, first, cells.shape[1:], order), cells.shape[1:], order)
-    best = _mend_by_surface(score, best, cells, order)
+    best = _mended(score, first, cells, order)
     turned = np.abs(best - first) > 0.4 * order
     mended = np.where(turned, low + SEARCH_STEP_UM * best, thickness_um.ravel())
     return mended.reshape(thickness_um.shape)
@@ -107,9 +109,7 @@ def _follow(template: FloatArray, cells: CellData, order: float) -> tuple[NDArra
     count = template.shape[1]
     best = _grow(score, cells.shape[1], cells.shape[2], int(HALF_WINDOW_UM / SEARCH_STEP_UM))
     best = best + _common_shift(score, best, order, count)
-    best = _mend_orders(score, best, cells.shape[1:], order)
-    best = _mend_patches(score, best, cells.shape[1:], order)
-    best = _mend_by_surface(score, best, cells, order)
+    best = _mended(score, best, cells, order)
     reached = score[np.arange(len(best)), np.clip(best, 0, count - 1)]
     return best, float((reached.astype(float) ** 2).mean())
 
@@ -152,8 +152,8 @@ def _correlate(template: FloatArray, cells: CellData) -> NDArray[np.float32]:
     amplitude = (cells.value - 1.0).reshape(cells.shape[0], -1)
     weight = cells.weight.reshape(cells.shape[0], -1)
     score = np.empty((amplitude.shape[1], template.shape[1]), np.float32)
-    for first in range(0, amplitude.shape[1], 4096):
-        part = slice(first, first + 4096)
+    for first in range(0, amplitude.shape[1], CELLS_AT_ONCE):
+        part = slice(first, first + CELLS_AT_ONCE)
         w = weight[:, part]
         total = np.maximum(w.sum(axis=0), 1e-30)  # a cell without data scores nothing
         # An offset common to all wavelengths of the cell is free as well: pixel response, illumination.
@@ -178,6 +178,15 @@ def _common_shift(score: NDArray[np.float32], best: NDArray[np.int64], order: fl
         if inside.mean() > 0.98:
             totals[number] = float((score[cells[inside], moved[inside]].astype(float) ** 2).sum())
     return int(shifts[int(np.argmax(totals))])
+
+
+def _mended(
+    score: NDArray[np.float32], best: NDArray[np.int64], cells: CellData, order: float
+) -> NDArray[np.int64]:
+    """Steps of all cells, with those in a wrong fringe order taken back in every way that is known."""
+    best = _mend_orders(score, best, cells.shape[1:], order)
+    best = _mend_patches(score, best, cells.shape[1:], order)
+    return _mend_by_surface(score, best, cells, order)
 
 
 def _mend_orders(
