@@ -9,7 +9,7 @@ import pytest
 from astropy.table import Table
 from scipy.integrate import quad
 
-from lsst.fringe_sim.effects.lamp_lines import XENON_LINES
+from lsst.fringe_sim.effects.lamp_lines import xenon_lines
 from lsst.fringe_sim.effects.line_profiles import LorentzianProfile, MixedProfile, line_width
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.model import FringeModel
@@ -107,7 +107,9 @@ def test_lines_are_those_of_the_test_stand(shared_dir: Path) -> None:
     """Digitised spectrum of the lamp of TS8: it peaks within 2 nm of the strong lines between 870 and 1000 nm."""
     table = Table.read(shared_dir / "data" / "ts8_lamp_xenon_digitised.ecsv", format="ascii.ecsv")
     wavelength, light = np.asarray(table["wavelength"]), np.asarray(table["radiance"])
-    strong = [nm for nm, intensity in XENON_LINES if intensity >= 400.0 and 870.0 < nm < 1000.0]
+    strong = [
+        nm for nm, intensity in zip(*xenon_lines(), strict=True) if intensity >= 400.0 and 870.0 < nm < 1000.0
+    ]
     assert len(strong) == 6
     for line in strong:
         near = np.abs(wavelength - line) < 4.0

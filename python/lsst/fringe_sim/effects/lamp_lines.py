@@ -10,32 +10,13 @@ import numpy as np
 
 from ..optics.illumination import LampSpectrum
 from ..optics.system import OpticalSystem
+from ..resources import read_table
 from .base import FloatArray, Parameter, PlainNullEffect
 
-__all__ = ["XENON_LINES", "LampLines"]
-
-XENON_LINES = (
-    (823.390, 10000.0),
-    (834.912, 2000.0),
-    (841.150, 2000.0),
-    (882.183, 5000.0),
-    (895.471, 1000.0),
-    (904.793, 400.0),
-    (916.517, 500.0),
-    (951.599, 200.0),
-    (968.798, 150.0),
-    (972.083, 100.0),
-    (980.238, 2000.0),
-    (992.592, 3000.0),
-    (1084.131, 1000.0),
-)
-"""Wavelengths in vacuum [nm] and relative intensities of neutral xenon.
-
-Sansonetti & Martin 2005, Handbook of Basic Atomic Spectroscopic Data, doi 10.1063/1.1800011; intensities are those of
-a discharge, of which an arc under pressure keeps the order only.
-"""
+__all__ = ["LampLines", "xenon_lines"]
 
 _LINE_FWHM_NM = 2.0
+_REFERENCE_NM = 992.6
 _STEP_NM = 0.1
 _RANGE_NM = (200.0, 1200.0)
 
@@ -65,12 +46,20 @@ class LampLines(PlainNullEffect):
         return replace(system, lamp=LampSpectrum(wavelength, light))
 
 
+def xenon_lines() -> tuple[FloatArray, FloatArray]:
+    """Wavelengths in vacuum [nm] and relative intensities of strong lines of neutral xenon."""
+    table = read_table("laboratory", "xenon_lines.ecsv")
+    return np.array(table["wavelength"]), np.array(table["intensity"])
+
+
 @functools.cache
 def _lines() -> tuple[FloatArray, FloatArray]:
     """Lorentzian lines relative to the peak of that at 992.6 nm, on a fine grid."""
     low, high = _RANGE_NM
+    places, intensities = xenon_lines()
     wavelength = np.linspace(low, high, round((high - low) / _STEP_NM) + 1)
     shape = np.zeros(wavelength.size)
-    for centre, intensity in XENON_LINES:
-        shape += intensity / 3000.0 / (1.0 + (2.0 * (wavelength - centre) / _LINE_FWHM_NM) ** 2)
+    reference = intensities[np.argmin(np.abs(places - _REFERENCE_NM))]
+    for centre, intensity in zip(places, intensities, strict=True):
+        shape += intensity / reference / (1.0 + (2.0 * (wavelength - centre) / _LINE_FWHM_NM) ** 2)
     return wavelength, shape

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, laplace
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..resources import read_table
 from .optics import Film, FlatFieldOptics
 
 __all__ = ["HIDDEN_EFFECTS", "AmplifierState", "HiddenEffect", "HiddenParameter", "validate_effects"]
@@ -32,15 +33,7 @@ COLOUR_PIVOT_NM, COLOUR_REACH_NM = 935.0, 50.0
 """Wavelength at which a chromatic illumination is even, and distance to that at which its numbers are stated [nm]."""
 
 XENON_REFERENCE_NM, XENON_FWHM_NM = 992.592, 2.0
-XENON_LINES = (
-    (823.390, 10000.0), (834.912, 2000.0), (841.150, 2000.0), (882.183, 5000.0), (895.471, 1000.0),
-    (904.793, 400.0), (916.517, 500.0), (951.599, 200.0), (968.798, 150.0), (972.083, 100.0),
-    (980.238, 2000.0), (992.592, 3000.0), (1084.131, 1000.0),
-)  # fmt: skip
-"""Wavelengths in vacuum [nm] and intensities of the lines of xenon.
-
-Sansonetti & Martin 2005, Handbook of Basic Atomic Spectroscopic Data, doi 10.1063/1.1800011.
-"""
+"""The line whose peak is the strength of all, and the width of each [nm]."""
 
 
 @dataclass(frozen=True)
@@ -223,11 +216,6 @@ def _epoxy_absorption(optics: FlatFieldOptics, values: Values) -> FlatFieldOptic
     return optics.with_film("adhesive", extinction_shift=values["k"])
 
 
-def _silicon_thickness(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    film = optics.films[optics.position(optics.detection)]
-    return optics.with_film(optics.detection, thickness_um=film.thickness_um + values["offset"])
-
-
 def _silicon_absorption(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     return optics.with_film(optics.detection, extinction_scale=values["scale"])
 
@@ -243,21 +231,16 @@ def _support_index(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     return optics.with_film("support", index_shift=values["offset"])
 
 
-def _gate_oxide(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    film = optics.films[optics.position("insulation")]
-    return optics.with_film("insulation", thickness_um=film.thickness_um + values["offset"])
-
-
-def _gate_thickness(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    film = optics.films[optics.position("gates")]
-    return optics.with_film("gates", thickness_um=film.thickness_um + values["offset"])
+def _thicker(optics: FlatFieldOptics, name: str, by_um: float) -> FlatFieldOptics:
+    """Optics with one film thicker."""
+    film = optics.films[optics.position(name)]
+    return optics.with_film(name, thickness_um=film.thickness_um + by_um)
 
 
 def _black_coating(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     names = [film.name for film in optics.films]
     if "black_coating" in names:
-        film = optics.films[optics.position("black_coating")]
-        return optics.with_film("black_coating", thickness_um=film.thickness_um + values["thickness"])
+        return _thicker(optics, "black_coating", values["thickness"])
     return _inserted(optics, Film("black_coating", "litho_black", values["thickness"]), "adhesive")
 
 
@@ -286,11 +269,10 @@ def _line_triangle(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
 
 
 def _lamp_lines(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    strongest = dict(XENON_LINES)[XENON_REFERENCE_NM]
-    lines = tuple(
-        (centre, values["strength"] * intensity / strongest, XENON_FWHM_NM)
-        for centre, intensity in XENON_LINES
-    )
+    table = read_table("laboratory", "xenon_lines.ecsv")
+    xenon = {float(row["wavelength"]): float(row["intensity"]) for row in table}
+    peak = values["strength"] / xenon[XENON_REFERENCE_NM]
+    lines = tuple((centre, peak * intensity, XENON_FWHM_NM) for centre, intensity in xenon.items())
     return replace(optics, lamp_lines=lines if values["strength"] else ())
 
 
@@ -478,7 +460,7 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
         "silicon_thickness",
         "silicon thickness",
         (HiddenParameter("offset", "um", 0.0, (-20.0, 20.0), "thickness minus that of the stack"),),
-        on_optics=_silicon_thickness,
+        on_optics=lambda optics, values: _thicker(optics, optics.detection, values["offset"]),
     ),
     HiddenEffect(
         "silicon_absorption",
@@ -502,13 +484,13 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
         "gate_oxide",
         "insulation at the gates",
         (HiddenParameter("offset", "um", 0.0, (-0.3, 0.5), "thickness minus that of the stack"),),
-        on_optics=_gate_oxide,
+        on_optics=lambda optics, values: _thicker(optics, "insulation", values["offset"]),
     ),
     HiddenEffect(
         "gate_thickness",
         "polysilicon gates",
         (HiddenParameter("offset", "um", 0.0, (-0.2, 0.3), "thickness minus that of the stack"),),
-        on_optics=_gate_thickness,
+        on_optics=lambda optics, values: _thicker(optics, "gates", values["offset"]),
     ),
     HiddenEffect(
         "black_coating",

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .comparison import chi2_with_free_fringes, fringe_order_um, sampled_part
 from .fit import Problem
 
-__all__ = ["ThicknessFollower", "chi2_with_free_fringes"]
+__all__ = ["ThicknessFollower"]
 
 FloatArray = NDArray[np.float64]
 
-SAMPLED_CELLS = 1500
 SHIFTS_PER_ORDER, ORDERS_TRIED = 10, 1.5
 COMPARED_CELLS = 500
 """Shifts that are compared before the first step, up to some fringe orders on either side, and the cells for it.
@@ -49,13 +48,13 @@ class ThicknessFollower:
 
     def __init__(self, problem: Problem, thickness_um: FloatArray, index: float) -> None:
         self.problem, self.thickness_um = problem, thickness_um
-        order = 1e-3 * float(np.median(problem.cells.wavelength_nm)) / (2.0 * index)
+        order = fringe_order_um(problem.cells.wavelength_nm, index)
         most = round(ORDERS_TRIED * SHIFTS_PER_ORDER)
         self._shifts = np.arange(-most, most + 1) * (order / SHIFTS_PER_ORDER)
         problem.forward.cover(thickness_um + self._shifts[0])
         problem.forward.cover(thickness_um + self._shifts[-1])
         cells = problem.cells
-        part, few = (_every(thickness_um.size, number) for number in (SAMPLED_CELLS, COMPARED_CELLS))
+        part, few = sampled_part(thickness_um.size), sampled_part(thickness_um.size, COMPARED_CELLS)
         self._sample, self._few = thickness_um[part[1:]], thickness_um[few[1:]]
         self._value, self._root = cells.value[part], np.sqrt(cells.weight[part])
         self._compared = cells.value[few], cells.weight[few]
@@ -121,19 +120,3 @@ class ThicknessFollower:
         if not matrix[1, 1] > 0.0:  # all of one thickness
             return np.array([features[0] @ without_level(data).ravel() / max(matrix[0, 0], 1e-300), 0.0])
         return np.asarray(np.linalg.solve(matrix, features @ without_level(data).ravel()))
-
-
-def _every(cells: int, wanted: int) -> tuple[slice, slice, slice]:
-    """Every so many rows and columns of planes, for about as many cells as wanted."""
-    stride = max(1, math.isqrt(cells // wanted))
-    return slice(None), slice(None, None, stride), slice(None, None, stride)
-
-
-def chi2_with_free_fringes(model: FloatArray, value: FloatArray, weight: FloatArray) -> float:
-    """χ² with the best level and the best contrast, not a negative one, at each wavelength; all ``(W, ny, nx)``."""
-    total = np.maximum(weight.sum(axis=(1, 2)), 1e-300)[:, None, None]
-    fringe = model - (weight * model).sum(axis=(1, 2), keepdims=True) / total
-    rest = value - (weight * value).sum(axis=(1, 2), keepdims=True) / total
-    cross, square = (weight * fringe * rest).sum(axis=(1, 2)), (weight * fringe**2).sum(axis=(1, 2))
-    taken = np.divide(np.maximum(cross, 0.0) ** 2, square, out=np.zeros_like(cross), where=square > 0.0)
-    return float((weight * rest**2).sum() - taken.sum())

@@ -15,8 +15,8 @@ from ...model import FringeModel
 from ...products.fringe_cube import FringeCube
 from .basis import CellBasis, FieldBasis, SplineBasis
 from .cells import CellData, bin_cube, finest_useful_cell
+from .comparison import chi2_with_free_fringes, fringe_order_um
 from .fit import Fit, Problem, fit_model
-from .following import chi2_with_free_fringes
 from .forward import Exposures, Forward
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
 from .outliers import spoiled_cells
@@ -297,7 +297,7 @@ def _prepare_known(
 def _prepare_few(cells: CellData, forward: Forward, start: FloatArray, index: FloatArray) -> Prepared:
     """A few pixels with many wavelengths: every fringe order is tried, the stated noise is believed."""
     basis = CellBasis(start.shape)
-    order = float(np.median(cells.wavelength_nm)) * 1e-3 / (2.0 * float(index.mean()))
+    order = fringe_order_um(cells.wavelength_nm, float(index.mean()))
     spread = cells.scaled_noise(1.0 + STATED_UNCERTAINTY, 0.0)
     problem = Problem(spread, forward, basis, _free_levels(cells))
     reach = np.arange(-ORDERS_TRIED * STEPS_PER_ORDER, ORDERS_TRIED * STEPS_PER_ORDER + 1)

@@ -13,6 +13,7 @@ from scipy.stats import chi2 as chi2_distribution
 from ...effects import Effect
 from ...errors import InputError
 from .channels import Channel, State, combined_probability, measure_channels
+from .comparison import chi2_with_free_fringes, chi2_with_free_levels, fringe_order_um, sampled_part
 from .fit import (
     Coordinate,
     Design,
@@ -23,7 +24,7 @@ from .fit import (
     fit_model,
     linearise_at,
 )
-from .following import ThicknessFollower, chi2_with_free_fringes
+from .following import ThicknessFollower
 
 __all__ = ["Candidate", "Hypothesis", "Selector"]
 
@@ -58,10 +59,9 @@ PLACES_REFITTED = 10
 LEAST_MOVE_UM = 0.005
 """Move of the thickness that a fit finds by itself [µm]."""
 
-SAMPLED_CELLS = 1500
 ORDERS_MOVED = 4
 ORDERS_REFITTED = 4
-"""Cells, fringe orders and fits with which a strong effect on the phase is looked for."""
+"""Fringe orders and fits with which a strong effect on the phase is looked for."""
 
 STEPS_PER_MINIMUM = 5
 MINIMA_REFITTED = 4
@@ -463,11 +463,10 @@ class Selector:
             return []
         forward, problem = self.problem.forward, self.problem
         whole = problem.basis.expand(self.first_field)
-        stride = max(1, math.isqrt(whole.size // SAMPLED_CELLS))
-        part = (slice(None), slice(None, None, stride), slice(None, None, stride))
+        part = sampled_part(whole.size)
         value, weight = problem.cells.value[part], problem.cells.weight[part]
         thickness, middle = whole[part[1:]], float(whole.mean())
-        order = 1e-3 * float(np.median(problem.cells.wavelength_nm)) / (2.0 * float(self.index.mean()))
+        order = fringe_order_um(problem.cells.wavelength_nm, float(self.index.mean()))
         shifts = np.arange(-ORDERS_MOVED * 12, ORDERS_MOVED * 12 + 1) * (order / 12.0)
         shifts = shifts[(middle + shifts) * thickness.min() / middle > 0.5]
         if not shifts.size:
@@ -683,22 +682,16 @@ class Selector:
         thickness = self.problem.basis.expand(field_start)
         self.problem.forward.cover(thickness)
         settings = {item.key: item.value(x) for item, x in zip(coordinates, position, strict=True)}
-        moved = min(
-            self._follower(thickness).places(settings),
-            key=lambda place: self._chi2_with_levels(settings, place),
-        )
+        cells, forward = self.problem.cells, self.problem.forward
+
+        def misfit(place: FloatArray) -> float:
+            return chi2_with_free_levels(forward.predict(settings, place).value, cells.value, cells.weight)
+
+        moved = min(self._follower(thickness).places(settings), key=misfit)
         if np.abs(moved - thickness).max() < LEAST_MOVE_UM:
             return field_start
-        self.problem.forward.cover(moved)
-        return self.problem.basis.fit(moved, self.problem.cells.seen.astype(float))
-
-    def _chi2_with_levels(self, settings: Mapping[str, float], thickness_um: FloatArray) -> float:
-        """χ² of a model at some thickness with the level of each wavelength free."""
-        cells = self.problem.cells
-        value = self.problem.forward.predict(settings, thickness_um).value
-        square = np.maximum((cells.weight * value**2).sum(axis=(1, 2)), 1e-300)
-        level = (cells.weight * value * cells.value).sum(axis=(1, 2)) / square
-        return float((cells.weight * (cells.value - level[:, None, None] * value) ** 2).sum())
+        forward.cover(moved)
+        return self.problem.basis.fit(moved, cells.seen.astype(float))
 
     def with_channels(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis with its residual tested."""

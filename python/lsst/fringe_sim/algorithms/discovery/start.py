@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from ...model import FringeModel
 from .basis import SplineBasis
 from .cells import CellData
+from .comparison import fringe_order_um
 
 __all__ = ["mended_thickness", "starting_thickness"]
 
@@ -144,7 +145,7 @@ def _order_steps(model: FringeModel, cells: CellData) -> float:
     stack = model.system.stack
     medium = stack.layers[stack.position(model.system.varying)].medium
     index = float(np.real(medium.index(middle, model.system.temperature_k)))
-    return middle * 1e-3 / (2.0 * index) / SEARCH_STEP_UM
+    return fringe_order_um(cells.wavelength_nm, index) / SEARCH_STEP_UM
 
 
 def _correlate(template: FloatArray, cells: CellData) -> NDArray[np.float32]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .comparison import chi2_with_free_levels
 from .fit import Fit, Problem, fit_model
 
 __all__ = ["HeldOut", "held_out_blocks", "misfit_rms", "validate", "whole_thickness"]
@@ -180,12 +181,4 @@ def _field_freedom(problem: Problem) -> int:
 def _predicted_chi2(problem: Problem, fit: Fit) -> float:
     """χ² of data that took no part in a fit, with their levels adjusted."""
     value = problem.forward.predict(fit.settings, problem.basis.expand(fit.field)).value
-    weight = problem.cells.weight
-    square = (weight * value**2).sum(axis=(1, 2))
-    level = np.divide(
-        (weight * value * problem.cells.value).sum(axis=(1, 2)),
-        square,
-        out=np.ones(len(square)),
-        where=square > 0,
-    )
-    return float((weight * (problem.cells.value - level[:, None, None] * value) ** 2).sum())
+    return chi2_with_free_levels(value, problem.cells.value, problem.cells.weight)
