@@ -99,6 +99,8 @@ class Forward:
         Cells with data; by default all. The thickness of others is not known, and slopes do not lean on it.
     exposures : `Exposures`, optional
         The light; monochromator flats by default.
+    scatter_um2 : `numpy.ndarray`, shape ``(ny, nx)``, optional
+        Variance of the thickness at which a cell is looked up about the true one [µm²]; by default none.
     """
 
     model: FringeModel
@@ -109,6 +111,7 @@ class Forward:
     centroid: FloatArray | None = None
     seen: NDArray[np.bool_] | None = None
     exposures: Exposures | None = None
+    scatter_um2: FloatArray | None = None
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[int, float], FloatArray] = field(default_factory=dict, repr=False)
     _rows_of: tuple[tuple[str, float], ...] | None = field(default=None, repr=False)
@@ -301,7 +304,19 @@ class Forward:
         return place, None if rest is None else gradient[0] * rest[0] + gradient[1] * rest[1]
 
     def _spread_in_cell(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Second and fourth moment of the thickness within each cell [µm², µm⁴], from the gradient of the field."""
+        """Second and fourth moment of the thickness within each cell [µm², µm⁴], without the scatter of its place.
+
+        Pixels of a cell average the fringes. A thickness that is known only so well averages them once more, in the
+        mean over many cells: as much is taken off before.
+        """
+        second, fourth = self._spread_of_pixels(gradient)
+        if self.scatter_um2 is None:
+            return second, fourth
+        scatter = self.scatter_um2
+        return second - scatter, fourth + 3.0 * scatter**2 - 6.0 * second * scatter
+
+    def _spread_of_pixels(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Second and fourth moment of the thickness of the pixels of each cell, from the gradient of the field."""
         if self.cell_px == 1:
             nothing = np.zeros(gradient.shape[1:])
             return nothing, nothing

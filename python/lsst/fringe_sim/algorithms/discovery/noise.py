@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..flat_prep_options import GAUSSIAN_MAD
 from .cells import CellData
 
-__all__ = ["NoiseEstimate", "estimate_noise"]
+__all__ = ["NoiseEstimate", "estimate_noise", "map_variance_share"]
 
 FloatArray = NDArray[np.float64]
 
@@ -21,6 +21,9 @@ STATED_UNCERTAINTY = 0.2
 """Relative uncertainty of a stated noise level that cannot be checked."""
 
 CLIP_SIGMA = 5.0
+
+LEAST_OTHERS = 2
+"""Wavelengths besides one that tell errors of a thickness map from noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,3 +130,36 @@ def _mean_of_nine(image: FloatArray) -> FloatArray:
     rows = image[:-2] + 4.0 * image[1:-1] + image[2:]
     both: FloatArray = (rows[:, :-2] + 4.0 * rows[:, 1:-1] + rows[:, 2:]) / 36.0
     return both
+
+
+def map_variance_share(slope: FloatArray, residual: FloatArray, variance_um2: float) -> float:
+    """Part of the stated variance of a thickness map that its errors have, at most all of it.
+
+    An error of the map shows along the derivative with respect to thickness, noise in all directions alike.
+
+    Parameters
+    ----------
+    slope, residual : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Whitened derivative with respect to thickness [1/µm], and whitened residual at the map; both 0 without data.
+    variance_um2 : `float`
+        Stated variance [µm²].
+
+    Returns
+    -------
+    share : `float`
+        Most likely part, 0 to 1; 1 where there are too few wavelengths to tell.
+    """
+    curvature = (slope**2).sum(axis=0)
+    others = (slope != 0.0).sum(axis=0) - 1
+    used = (curvature > 0.0) & (others >= LEAST_OTHERS)
+    if not used.any():
+        return 1.0
+    along = (slope * residual).sum(axis=0)[used] ** 2 / curvature[used]
+    beside = (residual**2).sum(axis=0)[used] - along
+    # Cells that something else has spoiled count for no more than the worst tenth of a percent.
+    noise = float(np.minimum(beside, np.percentile(beside, 99.9)).sum() / others[used].sum())
+    stated = variance_um2 * curvature[used]
+    along = np.minimum(along, CLIP_SIGMA**2 * (noise + stated))
+    shares = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 81)])
+    cost = [float((np.log(noise + part * stated) + along / (noise + part * stated)).sum()) for part in shares]
+    return float(shares[int(np.argmin(cost))])

@@ -16,9 +16,9 @@ from ...products.fringe_cube import FringeCube
 from .basis import CellBasis, FieldBasis, SplineBasis
 from .cells import CellData, bin_cube, finest_useful_cell
 from .comparison import chi2_with_free_fringes, fringe_order_um
-from .fit import Fit, Problem, fit_model
+from .fit import Fit, Problem, fit_model, linearise_at
 from .forward import Exposures, Forward
-from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise
+from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share
 from .outliers import spoiled_cells
 from .start import mended_thickness, starting_thickness
 
@@ -48,6 +48,12 @@ SPOILED_ROUNDS = 3
 FEW_SPOILED = 1e-5
 """How often spoiled cells are looked for, and the part of the data that need not be looked at again: each draws the
 thickness of its surroundings."""
+
+LARGEST_PRIOR, HELD_PRIOR = 1e8, 1e12
+"""Precision of the best map, and of one that is not to move [1/µm²]: 0.1 nm and a thousandth of that."""
+
+MOST_TAKEN = 0.9
+"""Part of the variance of the noise that a thickness may take up and still be told from it."""
 
 NOISE_CHANGE = 0.02
 SCATTER_CHANGE = 0.05
@@ -285,13 +291,39 @@ def _prepare_known(
     range_um = (float(known.min()) - 0.5, float(known.max()) + 0.5)
     forward = Forward.of_cells(model, effects, cells, range_um, exposures)
     basis = CellBasis(known.shape)
-    centre = known.ravel()
-    problem = Problem(cells, forward, basis, _free_levels(cells), 1.0 / max(sigma, 1e-4) ** 2, centre)
+    prior = min(1.0 / max(sigma, 1e-300) ** 2, LARGEST_PRIOR)
+    rich, centre = _is_rich(cells), known.ravel()
+    # Errors of the map at a wrong contrast would be taken for noise.
+    problem = Problem(cells, forward, basis, _free_levels(cells), prior, centre, free_contrast=rich)
     fit = fit_model(problem, (), np.zeros(0), centre)
-    if _is_rich(cells):
+    if rich:
         problem, fit, spoiled = _spoiled_of(problem, fit)
         cells = cells.restricted(~spoiled)
+        problem = _settle(problem, fit, cells, index).problem
+        problem, fit, taken = _with_map_as_good_as_it_is(problem, centre)
+        return _settle(problem, fit, cells, index, taken)
     return _settle(problem, fit, cells, index)
+
+
+def _with_map_as_good_as_it_is(problem: Problem, centre: FloatArray) -> tuple[Problem, Fit, FloatArray]:
+    """Problem and fit with the uncertainty of its map as the data show it, where that is less than stated.
+
+    Also the part of the variance of the noise, by wavelength, that the thickness takes up where it may move.
+
+    A thickness that may move further than it must follows the noise, and the fringes look stronger than they are, by
+    the square of the phase that it may move; what it scatters about the truth in the end weakens them.
+    """
+    held = replace(problem, field_prior=HELD_PRIOR, free_contrast=True)
+    design, residual, *_ = linearise_at(held, fit_model(held, (), np.zeros(0), centre))
+    share = map_variance_share(design.slope, residual, 1.0 / problem.field_prior)
+    prior = min(problem.field_prior / max(share, 1e-300), LARGEST_PRIOR)
+    variance = 1.0 / (prior + (design.slope**2).sum(axis=0))
+    problem.forward.scatter_um2 = variance
+    problem = replace(problem, field_prior=prior, free_contrast=True)
+    taken = (design.slope**2 * variance).sum(axis=(1, 2)) / np.maximum(
+        (design.slope != 0.0).sum(axis=(1, 2)), 1
+    )
+    return problem, fit_model(problem, (), np.zeros(0), centre), taken
 
 
 def _prepare_few(cells: CellData, forward: Forward, start: FloatArray, index: FloatArray) -> Prepared:
@@ -336,11 +368,18 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
     return best
 
 
-def _settle(problem: Problem, fit: Fit, stated: CellData, index: FloatArray) -> Prepared:
-    """Measure the noise at a first fit, and fit the unchanged model with it."""
+def _settle(
+    problem: Problem, fit: Fit, stated: CellData, index: FloatArray, taken: FloatArray | float = 0.0
+) -> Prepared:
+    """Measure the noise at a first fit, and fit the unchanged model with it.
+
+    The thickness has taken up a part ``taken`` of the variance.
+    """
     expected = problem.expected_of(fit)
     even = stated.with_noise_of(expected)
     noise = estimate_noise(even, _residual(replace(problem, cells=even), expected))
+    if noise.measured:
+        noise = replace(noise, factor=noise.factor / np.sqrt(1.0 - np.minimum(taken, MOST_TAKEN)))
     cells = even.scaled_noise(noise.factor, noise.response_scatter)
     problem = replace(problem, cells=cells, free_contrast=False, reference=expected)
     levels = fit.levels[: problem.n_levels]
