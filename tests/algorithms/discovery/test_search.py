@@ -8,8 +8,9 @@ import pytest
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover, read_effects_override
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, SplineBasis
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.mock.challenge import SealedCase, draw_case
 from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products.challenge_result import CASE_KINDS
 
 SIZE = (48, 64)
 
@@ -77,3 +78,26 @@ def test_contradicting_set_up_is_refused() -> None:
         discover(cube, "bnl_ts8_e2v", rng=np.random.default_rng(0))
     with pytest.raises(InputError, match="monochromator"):
         discover(cube, "lsst_e2v", rng=np.random.default_rng(0))
+
+
+@pytest.mark.slow
+def test_a_rival_in_a_deeper_valley_is_preferred() -> None:
+    """Behind 1.56 µm of black coating the fringes are as faint as behind a thickness that varies in every pixel."""
+    case, rng = hidden_case(20261122, "one", 8)
+    verdict = discover(case.cube, case.setup, rng=rng)
+    assert [effect.name for effect in verdict.effects] == ["black_coating"]
+    found = verdict.effects[0].parameters["thickness"]
+    assert abs(found.value - case.values["black_coating.thickness"]) < 4.0 * found.sigma
+
+
+@pytest.mark.slow
+def test_a_gradient_of_the_light_is_no_wide_ring() -> None:
+    case, rng = hidden_case(20261122, "one", 33)
+    verdict = discover(case.cube, case.setup, rng=rng)
+    assert [effect.name for effect in verdict.effects] == ["illumination"]
+
+
+def hidden_case(seed: int, kind: str, number: int) -> tuple[SealedCase, np.random.Generator]:
+    """A case of a challenge, and the generator of its search."""
+    parts = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)
+    return draw_case(kind, parts[0]), parts[1]

@@ -146,6 +146,10 @@ class Effect(ABC):
         """
         return {}
 
+    def bounds_on(self, parameter: Parameter, geometry: ImageGeometry) -> tuple[float, float]:
+        """Bounds of a parameter in a search on some samples; narrower where it could imitate something simpler."""
+        return parameter.bounds
+
     def noise_correlation(self, values: Mapping[str, float], geometry: ImageGeometry) -> float:
         """Correlation that the effect gives the noise of neighbouring samples; 0 where it leaves noise alone."""
         return 0.0

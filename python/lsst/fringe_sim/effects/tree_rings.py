@@ -16,6 +16,9 @@ __all__ = ["TreeRings"]
 MEAN_SAMPLES = 64
 """Samples along each axis from which the mean of the pattern over a sensor is taken."""
 
+LONGEST_PERIOD = 0.7
+"""Period of rings over the side of the sensor, beyond which they are not told from uneven light."""
+
 
 class TreeRings(PlainNullEffect):
     """Rings about the axis of the crystal: its doping changed while it grew, and moves the borders of pixels."""
@@ -58,6 +61,14 @@ class TreeRings(PlainNullEffect):
             "cosine": rings.amplitude.real, "sine": rings.amplitude.imag,
             "centre_x": rings.centre[1], "centre_y": rings.centre[0], "period": rings.period,
         }  # fmt: skip
+
+    def bounds_on(self, parameter: Parameter, geometry: ImageGeometry) -> tuple[float, float]:
+        """A wave longer than the sensor is a gradient of the light."""
+        low, high = parameter.bounds
+        if parameter.name != "period":
+            return low, high
+        across = max(float(np.ptp(geometry.y_px)), float(np.ptp(geometry.x_px)))
+        return low, min(high, max(LONGEST_PERIOD * across, 1.01 * parameter.null))
 
 
 def _middle(geometry: ImageGeometry) -> FloatArray:

@@ -20,7 +20,9 @@ DECADES_OF_CHANCE = 200.0
 """Powers of ten by which a residual of signal to noise 30 is improbable."""
 
 RIVALS_REFITTED = 3
-"""Best replacements of an effect that are fitted again."""
+MUCH_OF_IT = 0.9
+"""Best replacements of an effect that are fitted again, and the part of the log evidence from which on others are, at
+other sizes and in other orders: those that shift the phase."""
 
 LEAST_PROMISE = 4.0
 ALIKE = 0.8
@@ -44,12 +46,15 @@ class EffectClass:
         Fitted parameters of each member.
     significance : `float`
         Signal to noise of what the effect explains.
+    best : `Hypothesis`
+        The likeliest set of all, with this effect or with another in its place.
     """
 
     members: dict[str, float]
     probability: float
     values: dict[str, dict[str, float]]
     significance: float
+    best: Hypothesis
 
 
 def classes_of(selector: Selector, chosen: Hypothesis, width: float) -> dict[str, EffectClass]:
@@ -76,22 +81,31 @@ def _class_of(selector: Selector, chosen: Hypothesis, name: str, width: float) -
     without = selector.hypothesis(rest, None, chosen.fit)
     found = {name: chosen, **_replacements(selector, chosen, name, without)}
     _refit_rivals(selector, chosen, found, width)
-    top = max(other.log_evidence for other in found.values())
+    best = max(found.values(), key=lambda other: other.log_evidence)
+    top = best.log_evidence
     weight = {n: math.exp(max(other.log_evidence - top, -700.0)) for n, other in found.items()}
     total = sum(weight.values())
     members = {n: weight[n] / total for n, other in found.items() if _is_alike(other, chosen, top, width)}
     values = {n: _values_of(n, found[n].fit) for n in members}
     significance = math.sqrt(max(without.fit.chi2 - chosen.fit.chi2, 0.0))
-    return EffectClass(members, sum(members.values()), values, significance)
+    return EffectClass(members, sum(members.values()), values, significance, best)
 
 
 def _refit_rivals(selector: Selector, chosen: Hypothesis, found: dict[str, Hypothesis], width: float) -> None:
-    """Fit the best replacements again from where the set itself has come: it may have found a deeper valley since."""
+    """Fit the best replacements again from where the set itself has come: it may have found a deeper valley since.
+
+    Those that shift the phase are looked for at other sizes and in other orders too.
+    """
     behind = {
         n: h for n, h in found.items() if h is not chosen and h.log_evidence < chosen.log_evidence - width
     }
-    for name in sorted(behind, key=lambda n: -behind[n].log_evidence)[:RIVALS_REFITTED]:
-        found[name] = selector.improved(behind[name].names, chosen.fit)
+    ranked = sorted(behind, key=lambda n: -behind[n].log_evidence)
+    for number, name in enumerate(ranked):
+        scan = behind[name].log_evidence > MUCH_OF_IT * chosen.log_evidence and selector.shifts_phase(
+            behind[name]
+        )
+        if scan or number < RIVALS_REFITTED:
+            found[name] = selector.improved(behind[name].names, chosen.fit, scan=scan)
 
 
 def _replacements(

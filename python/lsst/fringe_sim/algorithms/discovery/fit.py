@@ -140,7 +140,7 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
     nulls = effect.null_values(forward.model.base_system)
     found = []
     for parameter in _seen_parameters(effect, forward.geometry.wavelength_nm):
-        null, (low, high) = nulls[parameter.name], parameter.bounds
+        null, (low, high) = nulls[parameter.name], effect.bounds_on(parameter, forward.geometry)
         one_sided = null <= low or null >= high
         quadratic = one_sided and _starts_quadratically(effect.name, parameter, null, forward, thickness_um)
         found.append(

@@ -468,8 +468,8 @@ class _Search:
             return self._unexplained(
                 whole, whole.null, chance, steps, "no effect of the catalogue explains it"
             )
+        chosen, classes = self._classified(training, chosen, steps)
         final = whole.with_channels(whole.settled(self._transfer(whole, chosen)))
-        classes = classes_of(training, chosen, self.options.class_width)
         self.unseen = validate(
             whole.problem, whole.null.fit, final.fit, self.heldout, rich=self.prepared.rich
         )
@@ -509,6 +509,22 @@ class _Search:
             self.say,
         )
         return self._verdict("named", whole, final, chance, decided, {}, steps)
+
+    def _classified(
+        self, training: Selector, chosen: Hypothesis, steps: list[Step]
+    ) -> tuple[Hypothesis, dict[str, EffectClass]]:
+        """Class of each effect of a set, and the set with a rival in the place of one that is clearly likelier."""
+        classes = classes_of(training, chosen, self.options.class_width)
+        for _ in range(self.options.most_effects):
+            best = max((group.best for group in classes.values()), key=lambda item: item.log_evidence)
+            if best.log_evidence < chosen.log_evidence + self.options.class_width:
+                break
+            likelier = self._most_credible(training, [chosen, best])
+            if likelier.names == chosen.names:
+                break
+            steps.append(self._step(training, chosen, likelier))
+            chosen, classes = likelier, classes_of(training, likelier, self.options.class_width)
+        return chosen, classes
 
     def _transfer(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
         """The chosen set fitted to all data."""
