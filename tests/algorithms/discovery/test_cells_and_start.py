@@ -111,6 +111,16 @@ def test_ragged_patches_are_taken_back_by_the_surface_around_them(rng: np.random
 
 
 @pytest.mark.slow
+def test_a_slope_of_a_fringe_in_four_cells_is_followed_upwards() -> None:
+    """It grew downwards in half of this sensor, by nineteen orders, and the search called the rest unexplained."""
+    part = np.random.default_rng([20261122, 0, 7]).spawn(2)[0]
+    case = draw_case("none", part)
+    assert np.hypot(*np.gradient(case.thickness_um)).max() > 0.085
+    cells = bin_cube(case.cube, 1)
+    found = starting_thickness(FringeModel.from_setup(case.setup), cells)
+    assert (np.abs(found - case.thickness_um) < 0.15).mean() > 0.999
+
+
 def test_fringes_that_diffusion_takes_away_in_places_do_not_hide_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the fringes is left where the thickness is steep: without diffusion no field is right there."""
 

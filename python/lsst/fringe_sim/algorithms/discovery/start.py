@@ -109,10 +109,28 @@ def _follow(template: FloatArray, cells: CellData, order: float) -> tuple[NDArra
     score = _correlate(template, cells)
     count = template.shape[1]
     best = _grow(score, cells.shape[1], cells.shape[2], int(HALF_WINDOW_UM / SEARCH_STEP_UM))
-    best = best + _common_shift(score, best, order, count)
-    best = _mended(score, best, cells, order)
-    reached = score[np.arange(len(best)), np.clip(best, 0, count - 1)]
-    return best, float((reached.astype(float) ** 2).mean())
+    found = [best + _common_shift(score, best, order, count)]
+    if min(cells.shape[1:]) >= FEWEST_ROWS:
+        found.append(_each_alone(score, cells, order))
+    places = np.arange(len(best))
+
+    def clarity(steps: NDArray[np.int64]) -> float:
+        return float((score[places, np.clip(steps, 0, count - 1)].astype(float) ** 2).mean())
+
+    mended = [_mended(score, steps, cells, order) for steps in found]
+    return max(((steps, clarity(steps)) for steps in mended), key=lambda item: item[1])
+
+
+def _each_alone(score: NDArray[np.float32], cells: CellData, order: float) -> NDArray[np.int64]:
+    """Steps of all cells, near a smooth surface through where each by itself is clearest.
+
+    Where fringes are less than four cells wide, a field that grows may go down where it should go up; many
+    wavelengths tell most cells their order without any neighbour.
+    """
+    current = score.argmax(axis=1).astype(np.int64)
+    for spacing in SURFACE_SPACINGS:
+        current = _near_surface(score, current, cells, spacing, order)[0]
+    return current
 
 
 def _contrast(template: FloatArray, cells: CellData) -> FloatArray:
@@ -256,22 +274,27 @@ def _mend_by_surface(
 
     Where fringes are weak, cells far from one another may be in the wrong order, without a border to tell by.
     """
-    shape, count = cells.shape[1:], score.shape[1]
-    if min(shape) < FEWEST_ROWS:
+    if min(cells.shape[1:]) < FEWEST_ROWS:
         return best
-    places, reach = np.arange(len(best)), int(HALF_WINDOW_UM / SEARCH_STEP_UM)
-    current = best
+    places, current = np.arange(len(best)), best
     for spacing in SURFACE_SPACINGS:
-        surface = _surface(current.reshape(shape), cells.seen, spacing, order)
-        middle = np.clip(np.rint(surface.ravel()).astype(np.int64), 0, count - 1)
-        moved = _nearby_peak(score, middle, reach)
-        away = np.abs(current - middle) > 0.5 * order
-        moved = np.where(away, moved, current)
+        moved, away = _near_surface(score, current, cells, spacing, order)
         power = [float((score[places, field].astype(float) ** 2).mean()) for field in (current, moved)]
         if not away.any() or power[1] < SURFACE_LOSS * power[0]:
             continue
         current = moved
     return current
+
+
+def _near_surface(
+    score: NDArray[np.float32], current: NDArray[np.int64], cells: CellData, spacing: float, order: float
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Steps with those more than half an order from a smooth surface moved to their best less far from it; which."""
+    surface = _surface(current.reshape(cells.shape[1:]), cells.seen, spacing, order)
+    middle = np.clip(np.rint(surface.ravel()).astype(np.int64), 0, score.shape[1] - 1)
+    away = np.abs(current - middle) > 0.5 * order
+    reach = int(HALF_WINDOW_UM / SEARCH_STEP_UM)
+    return np.where(away, _nearby_peak(score, middle, reach), current), away
 
 
 def _surface(field: NDArray[np.int64], seen: NDArray[np.bool_], spacing: float, order: float) -> FloatArray:
