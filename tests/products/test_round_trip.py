@@ -134,6 +134,23 @@ def test_one_damaged_byte_is_refused_or_harmless(kind: str, at: int, change: int
     assert source == str(path)
 
 
+@pytest.mark.parametrize(
+    "scale", [{"BZERO": 3.4028235677973366e38}, {"BSCALE": 1e308}, {"BZERO": 1e30}], ids=str
+)
+@pytest.mark.parametrize("kind", sorted(MAKERS))
+def test_scales_beyond_the_numbers_are_refused(kind: str, scale: dict[str, float], tmp_path: Path) -> None:
+    """A file without checksums, whose images overflow where astropy scales them."""
+    product, path = MAKERS[kind](), tmp_path / "product.fits"
+    product.write_fits(path)
+    with fits.open(path, mode="update", do_not_scale_image_data=True) as hdus:
+        for hdu in hdus:
+            hdu.header.update(scale if hdu.is_image and hdu.data is not None else {})
+            for card in ("CHECKSUM", "DATASUM"):
+                hdu.header.remove(card)
+    with pytest.raises(InputError, match=r"product\.fits"):
+        type(product).read_fits(path)
+
+
 @given(KINDS, st.integers(0, 10**6))
 def test_a_truncated_file_never_passes(kind: str, length: int) -> None:
     product = MAKERS[kind]()

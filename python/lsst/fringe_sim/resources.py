@@ -62,9 +62,9 @@ DAMAGE = (
         AssertionError,
         zlib.error,
     ),
-    *(UserWarning, fits.VerifyError),
+    *(Warning, fits.VerifyError),
 )
-"""What astropy raises when a file is not as its headers say."""
+"""What astropy raises when a file is not as its headers say; warnings, its own and numpy's, where they are errors."""
 
 _CARD, _CHUNK = 80, 1 << 22
 _COUNTS = (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT")

@@ -265,7 +265,7 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
             yield hdus
     except InputError as error:
         raise (error if error.source else error.in_source(source)) from None
-    except (*DAMAGE, Warning) as error:
+    except DAMAGE as error:
         raise FrameFormatError(
             "file", Path(source).name, f"a complete FITS file ({first_line(error)})", source=source
         ) from error
