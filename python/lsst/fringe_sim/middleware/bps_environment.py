@@ -38,7 +38,7 @@ def accept_resources() -> None:
     It is given one that knows more; nothing else changes, and later calls do nothing.
     """
     if getattr(initialize, "shutil", None) is shutil:
-        initialize.shutil = types.SimpleNamespace(**{**vars(shutil), "copy2": _copy})  # type: ignore[attr-defined]
+        initialize.shutil = types.SimpleNamespace(**{**vars(shutil), "copy2": _copy})
 
 
 def _copy(source: Any, target: Any, **kwargs: Any) -> Any:

@@ -107,7 +107,7 @@ def _draw_graph(axes: Axes, graph: Graph) -> None:
         y = np.asarray(curve.y, dtype=float)
         if graph.logarithmic:
             y = np.where(y > graph.lowest, y, np.nan)
-        axes.plot(curve.x, y, style, label=curve.label, **thick)  # type: ignore[arg-type]
+        axes.plot(curve.x, y, style, label=curve.label, **thick)
     axes.set_title(graph.title)
     axes.set_xlabel(graph.xlabel)
     axes.set_ylabel(graph.ylabel)

@@ -13,8 +13,8 @@ from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import f as f_distribution
 from scipy.stats import ncx2
 
-from ...effects import AMPLIFIERS
-from .fit import Design, PlaneColumns, Whitener, as_columns
+from ...effects import AMPLIFIERS, ImageGeometry
+from .fit import Columns, Design, FullColumns, PlaneColumns, Whitener
 
 __all__ = ["Channel", "State", "combined_probability", "fringe_phase", "measure_channels", "project_test"]
 
@@ -84,12 +84,10 @@ class Channel:
     probability: float
 
 
-def project_test(
-    design: Design, features: FloatArray | PlaneColumns, residual: FloatArray
-) -> tuple[float, int]:
-    """Score statistic of features with all nuisances projected out, and its degrees of freedom."""
-    score, information = design.project(features, residual)
-    scale = np.sqrt(np.maximum(as_columns(features).square(), 1e-300))
+def project_test(design: Design, columns: Columns, residual: FloatArray) -> tuple[float, int]:
+    """Score statistic of columns with all nuisances projected out, and its degrees of freedom."""
+    score, information = design.project(columns, residual)
+    scale = np.sqrt(np.maximum(np.diag(columns.gram), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     keep = values > RANK_TOLERANCE
     along = vectors[:, keep].T @ (score / scale)
@@ -103,7 +101,7 @@ def fringe_phase(thickness_um: FloatArray, wavelength_nm: FloatArray, index: Flo
 
 def measure_channels(
     state: State,
-    geometry: object,
+    geometry: ImageGeometry,
     index: FloatArray,
     imprecision: float = 0.0,
     correlation: float = 0.0,
@@ -141,15 +139,13 @@ def combined_probability(channels: Sequence[Channel]) -> float:
     return float(-np.expm1(len(channels) * np.log1p(-min(smallest, 1.0 - 1e-16))))
 
 
-def _feature_channel(
-    name: str, features: FloatArray | PlaneColumns, state: State, imprecision: float = 0.0
-) -> Channel:
-    statistic, degrees = project_test(state.design, features, state.residual)
+def _feature_channel(name: str, columns: Columns, state: State, imprecision: float = 0.0) -> Channel:
+    statistic, degrees = project_test(state.design, columns, state.residual)
     noise = ncx2(max(degrees, 1), imprecision) if imprecision > 0.0 else chi2_distribution(max(degrees, 1))
     return Channel(name, statistic, degrees, float(noise.sf(statistic)))
 
 
-def phase_features(state: State, geometry, index: FloatArray) -> PlaneColumns:  # type: ignore[no-untyped-def]
+def phase_features(state: State, geometry: ImageGeometry, index: FloatArray) -> PlaneColumns:
     """Per wavelength: harmonics of the fringe, the first with a trend in thickness, and a smooth curve."""
     phase = fringe_phase(state.thickness_um, geometry.wavelength_nm, index)
     used = state.thickness_um
@@ -166,7 +162,7 @@ def phase_features(state: State, geometry, index: FloatArray) -> PlaneColumns:  
     return PlaneColumns(np.stack(columns), np.array(planes), np.eye(len(planes)), state.whiten)
 
 
-def spatial_features(state: State, geometry) -> FloatArray:  # type: ignore[no-untyped-def]
+def spatial_features(state: State, geometry: ImageGeometry) -> FullColumns:
     """Cosine patterns over the sensor, the same at all wavelengths and in proportion to wavelength."""
     v, u = 0.5 * np.pi * (geometry.v + 1.0), 0.5 * np.pi * (geometry.u + 1.0)
     colour = _colour(geometry.wavelength_nm)
@@ -179,10 +175,10 @@ def spatial_features(state: State, geometry) -> FloatArray:  # type: ignore[no-u
             columns.append(state.whiten(pattern))
             if colour.any():
                 columns.append(state.whiten(pattern * colour))
-    return np.stack(columns)
+    return FullColumns(np.stack(columns))
 
 
-def amplifier_features(state: State, geometry) -> FloatArray:  # type: ignore[no-untyped-def]
+def amplifier_features(state: State, geometry: ImageGeometry) -> FullColumns:
     """One factor for each amplifier, the same at all wavelengths and in proportion to wavelength."""
     place = geometry.amplifier
     colour = _colour(geometry.wavelength_nm)
@@ -193,7 +189,7 @@ def amplifier_features(state: State, geometry) -> FloatArray:  # type: ignore[no
             columns.append(state.whiten(inside))
             if colour.any():
                 columns.append(state.whiten(inside * colour))
-    return np.stack(columns)
+    return FullColumns(np.stack(columns))
 
 
 def texture_channels(state: State, correlation: float = 0.0) -> list[Channel]:

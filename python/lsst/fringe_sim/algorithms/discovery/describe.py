@@ -92,13 +92,13 @@ def _by_wavelength(state: State, phase: FloatArray, geometry: ImageGeometry) -> 
 def _plane_weight(state: State, plane: int) -> FloatArray:
     unit = np.zeros(state.value.shape)
     unit[plane] = 1.0
-    weight: FloatArray = (state.whiten(unit) ** 2).sum(axis=0)  # type: ignore[operator]
+    weight: FloatArray = (state.whiten(unit) ** 2).sum(axis=0)
     return weight
 
 
 def _by_amplifier(state: State, geometry: ImageGeometry) -> list[dict[str, Any]]:
     place = geometry.amplifier
-    common = state.whiten(np.ones(state.value.shape))  # type: ignore[operator]
+    common = state.whiten(np.ones(state.value.shape))
     rows = []
     for number, name in enumerate(AMPLIFIERS):
         inside = place == number

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from .cells import CellData
 from .forward import Forward, Prediction
 
 __all__ = [
+    "Columns",
     "Coordinate",
     "Design",
     "Fit",
@@ -239,13 +241,10 @@ class FullColumns:
         """Products cell by cell with a whitened slope ``(W, ny, nx)``, shape ``(L, ny, nx)``."""
         return np.einsum("wyx,kwyx->kyx", slope, self.values)
 
+    @functools.cached_property
     def gram(self) -> FloatArray:
         """Products with one another, shape ``(L, L)``."""
         return self.flat @ self.flat.T
-
-    def square(self) -> FloatArray:
-        """Products with themselves, shape ``(L,)``."""
-        return np.einsum("ki,ki->k", self.flat, self.flat)
 
     def against(self, levels: PlaneColumns) -> FloatArray:
         """Products with other columns, shape ``(L, their L)``."""
@@ -290,13 +289,10 @@ class PlaneColumns:
         planes = self.amplitude * self.whiten.decorrelate(slope)[self.plane]
         return np.tensordot(self.basis.T, planes, axes=1)
 
+    @functools.cached_property
     def gram(self) -> FloatArray:
         """Products with one another, shape ``(L, L)``."""
         return self.against(self)
-
-    def square(self) -> FloatArray:
-        """Products with themselves, shape ``(L,)``."""
-        return np.diag(self.gram())
 
     def against(self, levels: PlaneColumns) -> FloatArray:
         """Products with other columns of the same noise, shape ``(L, their L)``."""
@@ -313,9 +309,8 @@ class PlaneColumns:
         return np.asarray(self.basis.T @ planes @ levels.basis)
 
 
-def as_columns(features: FloatArray | PlaneColumns) -> FullColumns | PlaneColumns:
-    """Columns of whitened derivatives ``(F, W, ny, nx)``, or those that are columns already."""
-    return features if isinstance(features, PlaneColumns) else FullColumns(features)
+Columns = FullColumns | PlaneColumns
+"""Whitened derivatives, written out or not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -421,8 +416,8 @@ class Design:
         Whitened derivative with respect to thickness.
     levels : `PlaneColumns`
         Derivatives with respect to the levels.
-    effects : `numpy.ndarray`, shape ``(K, W, ny, nx)``
-        Whitened derivatives with respect to the effects.
+    effects : `FullColumns`
+        Derivatives with respect to the effects.
     pull : `numpy.ndarray`, shape ``(M,)``
         What draws the coefficients of the field besides the residual: half a gradient of χ².
     normal : `NormalMatrix`
@@ -432,7 +427,7 @@ class Design:
     basis: FieldBasis
     slope: FloatArray
     levels: PlaneColumns
-    effects: FloatArray
+    effects: FullColumns
     pull: FloatArray
     normal: NormalMatrix
     _coupling: FloatArray
@@ -444,17 +439,15 @@ class Design:
         basis: FieldBasis,
         slope: FloatArray,
         levels: PlaneColumns,
-        effects: FloatArray,
+        effects: FullColumns,
         prior: float,
         pull: FloatArray,
     ) -> Design:
         """Assemble normal matrices; ``prior`` is the precision of a field that is known."""
         normal = basis.normal_matrix((slope**2).sum(axis=0), prior)
-        maps = np.concatenate([levels.along(slope), np.einsum("wyx,kwyx->kyx", slope, effects)])
-        coupling = basis.gather(maps)
-        flat = effects.reshape(len(effects), slope.size)
-        cross = levels.dot(effects)
-        curvature = np.block([[levels.gram(), cross.T], [cross, flat @ flat.T]])
+        coupling = basis.gather(np.concatenate([levels.along(slope), effects.along(slope)]))
+        cross = effects.against(levels)
+        curvature = np.block([[levels.gram, cross.T], [cross, effects.gram]])
         curvature = curvature - coupling.T @ normal.solve(coupling)
         return cls(basis, slope, levels, effects, pull, normal, coupling, curvature)
 
@@ -469,12 +462,16 @@ class Design:
 
     def _products(self, values: FloatArray) -> FloatArray:
         """Products of levels and effects with whitened ``(W, ny, nx)``."""
-        return np.concatenate(
-            [
-                self.levels.dot(values),
-                self.effects.reshape(len(self.effects), self.slope.size) @ values.ravel(),
-            ]
-        )
+        return np.concatenate([self.levels.dot(values), self.effects.dot(values)])
+
+    @functools.cached_property
+    def _inverse_curvature(self) -> FloatArray:
+        """Inverse of the curvature; what the data do not tell apart stays where it is."""
+        scale = np.sqrt(np.maximum(np.diag(self._curvature), 1e-300))
+        values, vectors = np.linalg.eigh(self._curvature / np.outer(scale, scale))
+        keep = values > 1e-10
+        inverse: FloatArray = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T / np.outer(scale, scale)
+        return inverse
 
     def step(
         self, residual: FloatArray, ridge: FloatArray, pull: FloatArray
@@ -486,15 +483,13 @@ class Design:
         step = _solve_symmetric(self._curvature + np.diag(ridge), right)
         return step, solved[:, 0] - solved[:, 1:] @ step
 
-    def project(
-        self, features: FloatArray | PlaneColumns, residual: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def project(self, columns: Columns, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Score and information of further columns with all nuisances of this design projected out.
 
         Parameters
         ----------
-        features : `numpy.ndarray`, shape ``(F, W, ny, nx)``, or `PlaneColumns`
-            Whitened derivatives.
+        columns : `FullColumns` or `PlaneColumns`
+            ``F`` derivatives.
         residual : `numpy.ndarray`, shape ``(W, ny, nx)``
             Whitened residual at the minimum of this design.
 
@@ -503,24 +498,17 @@ class Design:
         score : `numpy.ndarray`, shape ``(F,)``
         information : `numpy.ndarray`, shape ``(F, F)``
         """
-        columns = as_columns(features)
         coupling = self.basis.gather(columns.along(self.slope))
         solved = self.normal.solve(coupling)
-        information = columns.gram() - coupling.T @ solved
-        cross = np.concatenate([columns.against(self.levels).T, columns.dot(self.effects)])
+        cross = np.concatenate([columns.against(self.levels).T, columns.dot(self.effects.values)])
         cross = cross - self._coupling.T @ solved
-        score = columns.dot(residual)
         field_side = self._field_score(residual)
-        score = score - solved.T @ field_side
         own_score = (
             self._products(residual) - self._coupling.T @ self.normal.solve(field_side[:, np.newaxis])[:, 0]
         )
-        scale = np.sqrt(np.maximum(np.diag(self._curvature), 1e-300))
-        values, vectors = np.linalg.eigh(self._curvature / np.outer(scale, scale))
-        keep = values > 1e-10
-        inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T / np.outer(scale, scale)
-        solved_cross = inverse @ cross
-        return score - solved_cross.T @ own_score, information - cross.T @ solved_cross
+        within = self._inverse_curvature @ cross
+        score = columns.dot(residual) - solved.T @ field_side - within.T @ own_score
+        return score, columns.gram - coupling.T @ solved - cross.T @ within
 
 
 @dataclass(frozen=True, eq=False)
@@ -712,7 +700,7 @@ class _Solver:
         slope = self.whiten(level * point.prediction.slope)
         levels = problem.level_columns(point.prediction.value, self.whiten)
         pull = problem.field_pull(point.coefficients)
-        return Design.build(problem.basis, slope, levels, columns, problem.field_prior, pull)
+        return Design.build(problem.basis, slope, levels, FullColumns(columns), problem.field_prior, pull)
 
     def derivative(self, point: _Point, thickness: FloatArray, number: int) -> FloatArray:
         """Derivative of the prediction with respect to one coordinate, by a difference."""
@@ -746,7 +734,7 @@ class _Solver:
         square = (design.slope**2).sum(axis=0)
         levels = self.problem.n_levels
         change = design.slope * thickness
-        change = change + np.tensordot(step[levels:], design.effects, axes=1)
+        change = change + np.tensordot(step[levels:], design.effects.values, axes=1)
         along = (design.slope * change).sum(axis=0)
         used = square > 0.01 * square.max()
         return float(np.percentile(np.abs(along[used] / square[used]), 98.0)) if used.any() else 0.0

@@ -13,11 +13,12 @@ from scipy.stats import chi2 as chi2_distribution
 from ...effects import Effect
 from ...errors import InputError
 from .channels import Channel, State, combined_probability, measure_channels
-from .comparison import chi2_with_free_fringes, chi2_with_free_levels, fringe_order_um, sampled_part
+from .comparison import chi2_with_free_levels
 from .fit import (
     Coordinate,
     Design,
     Fit,
+    FullColumns,
     Problem,
     coordinate_derivative,
     coordinates_of,
@@ -25,6 +26,7 @@ from .fit import (
     linearise_at,
 )
 from .following import ThicknessFollower
+from .orders import FINE_SCAN, starts_in_other_orders
 
 __all__ = ["Candidate", "Hypothesis", "Selector"]
 
@@ -32,10 +34,8 @@ FloatArray = NDArray[np.float64]
 
 
 SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
-FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
 """Departures, in prior scales, at which the finite signature of an effect is tried; the fine ones where it may grow
-with the fourth power (a beam whose onset is taken for thickness), and where fringe orders change with it."""
-
+with the fourth power (a beam whose onset is taken for thickness)."""
 
 IMPRECISION = 0.01
 """Part of what an effect does to the fringes in which our description of it may be wrong, and not the effect."""
@@ -58,10 +58,6 @@ PLACES_REFITTED = 10
 
 LEAST_MOVE_UM = 0.005
 """Move of the thickness that a fit finds by itself [µm]."""
-
-ORDERS_MOVED = 4
-ORDERS_REFITTED = 4
-"""Fringe orders and fits with which a strong effect on the phase is looked for."""
 
 STEPS_PER_MINIMUM = 5
 MINIMA_REFITTED = 4
@@ -177,18 +173,24 @@ class Selector:
                 self.coordinates[effect.name] = found
         state = self.state(null)
         fringes = state.value - state.value.mean(axis=(1, 2), keepdims=True)
-        self._undescribed = PRECISION**2 * float((state.whiten(fringes) ** 2).sum())  # type: ignore[operator]
+        self._undescribed = PRECISION**2 * float((state.whiten(fringes) ** 2).sum())
         self.null = replace(self.null, channels=self.criticise(null))
         self.fitted: dict[frozenset[str], Hypothesis] = {frozenset(): self.null}
 
     def state(self, fit: Fit) -> State:
         """Everything the tests need at a fit."""
         design, residual, prediction, thickness, whiten = linearise_at(self.problem, fit)
-        level = (self.problem.level_basis @ fit.levels)[:, None, None]
-        raw = np.where(
-            self.problem.cells.weight > 0, self.problem.cells.value - level * prediction.value, 0.0
-        )
-        return State(design, residual, raw, level * prediction.value, thickness, whiten)
+        value = self.problem.expected(fit.levels, prediction.value)
+        raw = np.where(self.problem.cells.weight > 0, self.problem.cells.value - value, 0.0)
+        return State(design, residual, raw, value, thickness, whiten)
+
+    def _signature(
+        self, state: State, fit: Fit, settings: Mapping[str, float], thickness_um: FloatArray | None = None
+    ) -> FloatArray:
+        """Whitened change that other settings make, by default at the thickness of the fit."""
+        place = state.thickness_um if thickness_um is None else thickness_um
+        changed = self.problem.expected(fit.levels, self.problem.forward.predict(settings, place).value)
+        return state.whiten(changed - state.value)
 
     def criticise(self, fit: Fit) -> tuple[Channel, ...]:
         """Tests without a catalogue."""
@@ -244,7 +246,7 @@ class Selector:
                 features = self.features(state, fit, name)
             except InputError:
                 continue  # cannot be combined with an effect that is in already
-            score, information = state.design.project(features, state.residual)
+            score, information = state.design.project(FullColumns(features), state.residual)
             start, gain, degrees = _bounded_minimum(score, information, coordinates)
             candidate = Candidate(name, gain, degrees, start, gain)
             of_the_image = self.problem.forward.is_image_effect(name)
@@ -265,9 +267,9 @@ class Selector:
             return []
         coordinates = self.coordinates[name]
         settings = {item.key: item.value(x) for item, x in zip(coordinates, start, strict=True)}
-        level = (self.problem.level_basis @ fit.levels)[:, None, None]
+        level, _ = self.problem.amplitudes(fit.levels)
         change = self.problem.forward.change(fit.settings, {**fit.settings, **settings}, state.thickness_um)
-        column = state.whiten(level * change)[np.newaxis]  # type: ignore[operator]
+        column = FullColumns(state.whiten(level * change)[np.newaxis])
         score, information = state.design.project(column, state.residual)
         promise = float(score[0] ** 2 / max(information[0, 0], 1e-300))
         return [Candidate(name, 0.0, len(coordinates), start, promise)] if score[0] > 0.0 else []
@@ -282,7 +284,6 @@ class Selector:
 
     def _scanned(self, state: State, fit: Fit, candidate: Candidate) -> Candidate:
         """Candidate with the best of its finite signatures, where that promises more than the derivative."""
-        level = (self.problem.level_basis @ fit.levels)[:, None, None]
         coordinates = self.coordinates[candidate.name]
         places, columns = [], []
         held = self.problem.field_prior > 0.0 or self.problem.forward.is_image_effect(candidate.name)
@@ -295,12 +296,11 @@ class Selector:
                         continue
                     settings = {**fit.settings, item.key: item.value(departure)}
                     for thickness in follower.places(settings) if follower else [state.thickness_um]:
-                        changed = level * self.problem.forward.predict(settings, thickness).value
                         places.append((number, departure))
-                        columns.append(state.whiten(changed - state.value))  # type: ignore[operator]
+                        columns.append(self._signature(state, fit, settings, thickness))
         if not columns:
             return candidate
-        score, information = state.design.project(np.stack(columns), state.residual)
+        score, information = state.design.project(FullColumns(np.stack(columns)), state.residual)
         strength = np.diag(information)
         amplitude = np.divide(score, strength, out=np.zeros_like(score), where=strength > 1e-6)
         # A finite signature may be scaled only a little: its shape changes with its size. Of one that grows with the
@@ -327,12 +327,12 @@ class Selector:
         """
         coordinates = self.coordinates[name]
         forward = self.problem.forward
-        level = (self.problem.level_basis @ fit.levels)[:, None, None]
+        level, _ = self.problem.amplitudes(fit.levels)
         columns = []
         for item in coordinates:
             at = item.coordinate(fit.settings.get(item.key, item.null))
             slope = coordinate_derivative(forward, item, at, fit.settings, state.thickness_um)
-            columns.append(state.whiten(level * slope))  # type: ignore[operator]
+            columns.append(state.whiten(level * slope))
         return np.stack(columns)
 
     def hypothesis(
@@ -423,7 +423,10 @@ class Selector:
         trials = [(start, base.field) for start in starts]
         if scan:
             trials += [(start, base.field) for start in self._spread_starts(known.fit)]
-            trials += self._settled_alone(known.fit)
+            moved = self._shifts_of_phase(known.fit)
+            trials += starts_in_other_orders(
+                self.problem, known.fit, moved, self.first_field, float(self.index.mean())
+            )
         for start, thickness in trials:
             trial = fit_model(self.problem, coordinates, start, thickness, base.levels, rival=known.fit.chi2)
             if trial.chi2 < known.fit.chi2 - 1.0:
@@ -431,87 +434,6 @@ class Selector:
                 known = Hypothesis(known.names, trial, self._evidence(trial))
         self.fitted[frozenset(names)] = known
         return known
-
-    def _settled_alone(self, fit: Fit) -> list[tuple[FloatArray, FloatArray]]:
-        """Positions and fields in other orders, in which the moved coordinate found its size with the others held.
-
-        A second coordinate that is nearly thickness itself would lead a fit from a rough size astray.
-        """
-        found, least = [], math.inf
-        for moved, position, thickness in self._other_orders(fit):
-            others = [n for n in range(len(position)) if n != moved]
-            held = {fit.coordinates[n].key: fit.coordinates[n].value(position[n]) for n in others}
-            alone = fit_model(
-                self.problem, (fit.coordinates[moved],), position[[moved]], thickness, fit.levels, held,
-                rival=least,
-            )  # fmt: skip
-            settled = position.copy()
-            settled[moved] = alone.position[0]
-            found.append((settled, alone.field, alone.chi2))
-            least = min(least, alone.chi2)
-        found.sort(key=lambda place: place[2])
-        return [(position, thickness) for position, thickness, _ in found[:ORDERS_REFITTED]]
-
-    def _other_orders(self, fit: Fit) -> list[tuple[int, FloatArray, FloatArray]]:
-        """Places worth a fit: sizes of the last effect with fields moved by up to some fringe orders.
-
-        A strong effect on the phase is taken for thickness at first, in the order that suits it best; from there no
-        fit finds back. A sample of cells is compared with the model, levels and contrasts free.
-        """
-        steps = self._single_steps(fit)
-        if not steps:
-            return []
-        forward, problem = self.problem.forward, self.problem
-        whole = problem.basis.expand(self.first_field)
-        part = sampled_part(whole.size)
-        value, weight = problem.cells.value[part], problem.cells.weight[part]
-        thickness, middle = whole[part[1:]], float(whole.mean())
-        order = fringe_order_um(problem.cells.wavelength_nm, float(self.index.mean()))
-        shifts = np.arange(-ORDERS_MOVED * 12, ORDERS_MOVED * 12 + 1) * (order / 12.0)
-        shifts = shifts[(middle + shifts) * thickness.min() / middle > 0.5]
-        if not shifts.size:
-            return []
-        for edge in (shifts[0], shifts[-1]):
-            forward.cover(whole * (1.0 + edge / middle))
-        # The best of each parameter and order: sizes lie too far apart for the right one to win at once.
-        places: dict[tuple[int, int], tuple[float, FloatArray, float]] = {}
-        for moved, position in steps:
-            settings = {c.key: c.value(x) for c, x in zip(fit.coordinates, position, strict=True)}
-            chi2 = np.array([
-                chi2_with_free_fringes(
-                    forward.sampled(settings, thickness * (1.0 + shift / middle)).value, value, weight
-                )
-                for shift in shifts
-            ])  # fmt: skip
-            for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
-                inside = np.flatnonzero(np.abs(shifts - turn * order) <= 0.51 * order)
-                if inside.size:
-                    least = inside[int(chi2[inside].argmin())]
-                    if chi2[least] < places.get((moved, turn), (math.inf,))[0]:
-                        places[moved, turn] = (float(chi2[least]), position, float(shifts[least]))
-        best: list[tuple[int, tuple[float, FloatArray, float]]] = []
-        for number in {moved for moved, _ in places}:
-            own = [place for (moved, _), place in places.items() if moved == number]
-            best += [(number, place) for place in sorted(own, key=lambda place: place[0])[:ORDERS_REFITTED]]
-        used = problem.cells.seen.astype(float)
-        return [
-            (number, position, problem.basis.fit(whole * (1.0 + shift / middle), used))
-            for number, (_, position, shift) in best
-        ]
-
-    def _single_steps(self, fit: Fit) -> list[tuple[int, FloatArray]]:
-        """Positions in which one phase-like coordinate of the last effect has another size, its others none."""
-        own = np.array([item.effect == fit.coordinates[-1].effect for item in fit.coordinates])
-        found = []
-        for number in self._shifts_of_phase(fit):
-            item = fit.coordinates[number]
-            for bound in (item.low, item.high):
-                for size in item.null + np.sign(bound - item.null) * item.scale * np.array(FINE_SCAN):
-                    if item.low <= size <= item.high and size != item.null:
-                        position = np.where(own, 0.0, fit.position)
-                        position[number] = item.coordinate(float(size))
-                        found.append((number, position))
-        return found
 
     def shifts_phase(self, hypothesis: Hypothesis) -> bool:
         """Whether the last effect of a set shifts the phase of the fringes: its fit may be in the wrong order."""
@@ -587,15 +509,13 @@ class Selector:
             information=fit.information[np.ix_(others, others)],
         )
         state = self.state(held)
-        level = (self.problem.level_basis @ fit.levels)[:, None, None]
         reach = np.arange(-MINIMA_TRIED * STEPS_PER_MINIMUM, MINIMA_TRIED * STEPS_PER_MINIMUM + 1)
         around = fit.position[number] + reach * (item.neighbour / STEPS_PER_MINIMUM)
         places = np.unique([item.clip(x) for x in around])
         fall = np.zeros(len(places))
         for index, place in enumerate(places):
             settings = {**fit.settings, item.key: item.value(place)}
-            changed = level * self.problem.forward.predict(settings, state.thickness_um).value
-            column = state.whiten(changed - state.value)[np.newaxis]  # type: ignore[operator]
+            column = FullColumns(self._signature(state, fit, settings)[np.newaxis])
             score, information = state.design.project(column, state.residual)
             fall[index] = 2.0 * score[0] - information[0, 0]
         minimum = np.ones(len(places), dtype=bool)
@@ -770,8 +690,8 @@ def _inward(item: Coordinate) -> float:
 
 def similarity(design: Design, first: FloatArray, second: FloatArray) -> float:
     """Cosine between the signatures of two effects with nuisances projected out; the largest canonical one."""
-    both = np.concatenate([first, second])
-    _, information = design.project(both, np.zeros(both.shape[1:]))
+    both = FullColumns(np.concatenate([first, second]))
+    _, information = design.project(both, np.zeros(first.shape[1:]))
     number = len(first)
     a, b, c = information[:number, :number], information[number:, number:], information[:number, number:]
     inverse_roots = [_inverse_root(matrix) for matrix in (a, b)]
