@@ -13,8 +13,8 @@ from threadpoolctl import threadpool_limits
 
 from lsst.fringe_sim.algorithms import next_measurement as forecasts
 from lsst.fringe_sim.algorithms.next_measurement import (
+    FlatMeasurement,
     FlatSeries,
-    Measurement,
     RankedMeasurement,
     break_ambiguity,
     candidate_measurements,
@@ -26,11 +26,11 @@ from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.optics import response_gradient
 
 FLATS = tuple(float(nm) for nm in range(880, 1000, 10))
-NARROW = Measurement("narrow", "0.5 nm", FlatSeries(FLATS, bandwidth_fwhm_nm=0.5))
-SECOND_F = Measurement("f", "f/2", FlatSeries(FLATS, f_number=2.0))
-BRIGHT = Measurement("level", "80 000 e", FlatSeries(FLATS, 80_000.0))
-WIDE = Measurement("wide", "wider", FlatSeries((*np.linspace(800, 870, 8), *np.linspace(1000, 1050, 6))))
-AGAIN = Measurement("again", "again", FlatSeries(FLATS))
+NARROW = FlatMeasurement("narrow", "0.5 nm", FlatSeries(FLATS, bandwidth_fwhm_nm=0.5))
+SECOND_F = FlatMeasurement("f", "f/2", FlatSeries(FLATS, f_number=2.0))
+BRIGHT = FlatMeasurement("level", "80 000 e", FlatSeries(FLATS, 80_000.0))
+WIDE = FlatMeasurement("wide", "wider", FlatSeries((*np.linspace(800, 870, 8), *np.linspace(1000, 1050, 6))))
+AGAIN = FlatMeasurement("again", "again", FlatSeries(FLATS))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_separation_is_the_misfit_of_a_real_fit(model: FringeModel, monkeypatch:
     """Noiseless flats with a little of one effect, fitted with the other and with every nuisance."""
     monkeypatch.setattr(forecasts, "SAMPLES", (2, 6))
     found, other = {"bandwidth": {"fwhm": 2.02}}, "ar_coating"
-    measurement = Measurement("narrow", "", FlatSeries((935.0, 955.0, 975.0), bandwidth_fwhm_nm=0.7))
+    measurement = FlatMeasurement("narrow", "", FlatSeries((935.0, 955.0, 975.0), bandwidth_fwhm_nm=0.7))
     present = (885.0, 910.0, 935.0, 960.0, 985.0)
     (ranked,) = rank_measurements(
         model, {**found, other: {}}, wavelength_nm=present, measurements=[measurement]
@@ -151,7 +151,7 @@ PUBLISHED = [
 def test_published_likenesses(
     effects: dict[str, dict[str, float]],
     now: float,
-    added: Measurement | None,
+    added: FlatMeasurement | None,
     after: float | None,
     model: FringeModel,
 ) -> None:

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from sky_frames import SHAPE, sky_frames_of
 
 from lsst.fringe_sim.algorithms.discovery import discover_sky
 from lsst.fringe_sim.algorithms.discovery.sky_search import BeamsOverSensor, SkyExposures
 from lsst.fringe_sim.algorithms.field_response import SensorPlacement, sensor_response
-from lsst.fringe_sim.algorithms.sky_frame import bandpass_of, simulate_sky_frame, sky_response
+from lsst.fringe_sim.algorithms.sky_frame import bandpass_of, sky_response
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.instrument.camera import Camera
-from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.instrument.sky import SkySpectrum
-from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import SkyFringe, band_cards, bands_of_header
 
-SHAPE = (48, 48)
-FRAMES = 3
 CATALOGUE = (
     "contrast_loss",
     "rotational_temperature",
@@ -32,27 +28,6 @@ CATALOGUE = (
     "sky_continuum",
 )
 GRID = (12.0, 0.004, 500)
-
-
-def frames_of(
-    setup: str, settings: Mapping[str, float], seed: int, level: float = 4e6
-) -> tuple[list[SkyFringe], np.ndarray]:
-    """Frames of a night with photon noise, and the map of their sensor."""
-    rng = np.random.default_rng(seed)
-    model = FringeModel.from_setup(setup, settings)
-    truth = random_field(SHAPE, rng, mean=14.0, span=2.5)
-    sky = SkySpectrum.dark(airmass=model.setup.airmass)
-    response = sky_response(
-        model, sky, thickness_range_um=(float(truth.min()) - 0.1, float(truth.max()) + 0.1)
-    )
-    night, frames = NightHistory.guo2022(), []
-    for time in range(FRAMES):
-        scale = night.band_scale(3 * time, response.bands)
-        frame = simulate_sky_frame(
-            truth, model, response=response, scale=scale, mean_electrons=level, seed=seed + 10 * time
-        )
-        frames.append(replace(frame, metadata={**frame.metadata, **band_cards(scale)}))
-    return frames, truth + 0.002 * rng.standard_normal(SHAPE)
 
 
 def exposures(model: FringeModel, **parts: object) -> SkyExposures:
@@ -130,7 +105,7 @@ def test_every_pixel_sees_its_own_beam() -> None:
 def test_a_hidden_effect_is_found_on_the_sky(setup: str, name: str, settings: dict[str, float]) -> None:
     seed = int(np.random.SeedSequence().generate_state(1)[0] >> 8)
     level = 4e6 if setup == "lsst_e2v" else 1e5
-    frames, known = frames_of(setup, settings, seed, level)
+    frames, known = sky_frames_of(setup, settings, seed, level)
     catalogue = [effect for effect in EFFECTS if effect.name in CATALOGUE]
     verdict = discover_sky(frames, known, 0.002, setup, catalogue, rng=np.random.default_rng(seed))
     if not name:
@@ -147,7 +122,7 @@ def test_a_hidden_effect_is_found_on_the_sky(setup: str, name: str, settings: di
 
 def test_a_map_that_is_known_is_held_at_its_place() -> None:
     """What a map lacks is no effect, however often fits start anew: the score of noise is that of noise."""
-    frames, known = frames_of("monocam", {}, 11, 1e5)
+    frames, known = sky_frames_of("monocam", {}, 11, 1e5)
     worse = known + 0.01 * np.random.default_rng(2).standard_normal(SHAPE)
     catalogue = [effect for effect in EFFECTS if effect.name in ("contrast_loss", "sky_continuum")]
     verdict = discover_sky(frames, worse, 0.0102, "monocam", catalogue, rng=np.random.default_rng(1))

@@ -35,6 +35,7 @@ from ..optics.illumination import GaussianProfile, TriangularProfile
 from ..optics.system import OpticalSystem
 
 __all__ = [
+    "FlatMeasurement",
     "FlatSeries",
     "Measurement",
     "PairForecast",
@@ -144,18 +145,28 @@ def _in_proportion(
 
 @dataclass(frozen=True)
 class Measurement:
-    """Flats that could be taken in addition.
+    """Data that could be taken in addition.
 
     Attributes
     ----------
     name, title : `str`
         Key, and what to take, for people.
-    series : `FlatSeries`
-        The flats.
     """
 
     name: str
     title: str
+
+
+@dataclass(frozen=True)
+class FlatMeasurement(Measurement):
+    """Flats that could be taken in addition.
+
+    Attributes
+    ----------
+    series : `FlatSeries`
+        The flats.
+    """
+
     series: FlatSeries
 
 
@@ -228,7 +239,7 @@ class RankedMeasurement:
 
 def candidate_measurements(
     model: FringeModel, wavelength_nm: Sequence[float] | None = None, level_e: float = LEVEL_E
-) -> tuple[Measurement, ...]:
+) -> tuple[FlatMeasurement, ...]:
     """Measurements that a test stand can make besides its usual flats.
 
     Parameters
@@ -244,29 +255,29 @@ def candidate_measurements(
     waves, setup = present.wavelength_nm, model.setup
     n = f"{len(waves)} flats"
     found = [
-        Measurement("repeat", f"the same {n} once more", present),
-        Measurement(
+        FlatMeasurement("repeat", f"the same {n} once more", present),
+        FlatMeasurement(
             "temperature",
             f"{n} at {setup.temperature_k - COOLER_K:.0f} K",
             replace(present, temperature_k=setup.temperature_k - COOLER_K),
         ),
     ]
     level = HIGH_LEVEL_E if level_e < 0.5 * HIGH_LEVEL_E else 0.2 * level_e
-    found.append(Measurement("level", f"{n} of {level:.0f} electrons", replace(present, level_e=level)))
+    found.append(FlatMeasurement("level", f"{n} of {level:.0f} electrons", replace(present, level_e=level)))
     if setup.bandwidth_fwhm_nm > 1.5 * NARROW_FWHM_NM:
         title = f"{n} with a bandpass of {NARROW_FWHM_NM:g} nm"
         found.append(
-            Measurement("narrow_bandpass", title, replace(present, bandwidth_fwhm_nm=NARROW_FWHM_NM))
+            FlatMeasurement("narrow_bandpass", title, replace(present, bandwidth_fwhm_nm=NARROW_FWHM_NM))
         )
     if math.isinf(setup.f_number) or setup.f_number > 2.0 * SECOND_F_NUMBER:
         title = f"{n} in a beam of f/{SECOND_F_NUMBER:g}"
-        found.append(Measurement("f_number", title, replace(present, f_number=SECOND_F_NUMBER)))
+        found.append(FlatMeasurement("f_number", title, replace(present, f_number=SECOND_F_NUMBER)))
     further = tuple(
         float(w) for w in np.linspace(*WIDE_NM, 26) if w < min(waves) - 5.0 or w > max(waves) + 5.0
     )
     if further:
         title = f"{len(further)} flats at other wavelengths from {min(further):g} to {max(further):g} nm"
-        found.append(Measurement("wide_range", title, replace(present, wavelength_nm=further)))
+        found.append(FlatMeasurement("wide_range", title, replace(present, wavelength_nm=further)))
     return tuple(found)
 
 
@@ -278,7 +289,7 @@ def rank_measurements(
     level_e: float = LEVEL_E,
     thickness_um: tuple[float, float] | None = None,
     significance: float | None = None,
-    measurements: Sequence[Measurement] | None = None,
+    measurements: Sequence[FlatMeasurement] | None = None,
     nuisance_effects: Sequence[str] = (),
     catalogue: Sequence[Effect] = EFFECTS,
     report: Report | None = None,
@@ -345,7 +356,7 @@ def rank_measurements(
 def _ranked(
     forecast: _Forecast,
     present: FlatSeries,
-    measurements: Sequence[Measurement],
+    measurements: Sequence[FlatMeasurement],
     significance: float | None,
     say: Report,
 ) -> tuple[RankedMeasurement, ...]:

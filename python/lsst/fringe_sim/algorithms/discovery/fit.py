@@ -559,6 +559,18 @@ class Fit:
         variance = np.maximum(np.diag(np.linalg.pinv(total, hermitian=True)), 0.0)
         return np.asarray(np.sqrt(variance + self.spread**2))
 
+    def without(self, name: str) -> Fit:
+        """The same place with one effect taken out; not a minimum."""
+        kept = [number for number, item in enumerate(self.coordinates) if item.effect != name]
+        return replace(
+            self,
+            settings={key: value for key, value in self.settings.items() if key.partition(".")[0] != name},
+            coordinates=tuple(self.coordinates[number] for number in kept),
+            position=self.position[kept],
+            information=self.information[np.ix_(kept, kept)],
+            spread=self.spread[kept],
+        )
+
 
 def _ridge(coordinates: Sequence[Coordinate]) -> FloatArray:
     return np.array([1.0 / (PRIOR_WIDTH * item.unit_step) ** 2 for item in coordinates])

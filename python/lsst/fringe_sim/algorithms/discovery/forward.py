@@ -76,6 +76,12 @@ class Exposures(Protocol):
     def place_weight(self, shape: tuple[int, int]) -> FloatArray:
         """Weights of the places for every cell of a sensor, ``(K, ny, nx)``; their sum is 1."""
 
+    def further(self) -> Sequence[tuple[str, str, Exposures]]:
+        """Exposures that could be taken: a key, what to take, the present ones with as many of those behind them.
+
+        The text may hold ``{frames}``, their number.
+        """
+
 
 @dataclass(eq=False)
 class Forward:

@@ -14,22 +14,20 @@ from ..next_measurement import RankedMeasurement, break_ambiguity, rank_measurem
 from .cells import CellData
 from .verdict import NamedEffect
 
-__all__ = ["with_next_measurements"]
+__all__ = ["Ranking", "flats_ranked", "with_next_measurements"]
 
 MOST_RIVALS = 4
 """Members of a class, likeliest first, that a measurement is asked to tell from the effect."""
 
 Values = Mapping[str, Mapping[str, float]]
+Ranking = Callable[[NamedEffect, Values], tuple[RankedMeasurement, ...]]
+"""Ranks measurements by how well they tell an effect from others, of which the fitted values are given."""
 
 
 def with_next_measurements(
     named: Sequence[NamedEffect],
     rivals: Mapping[str, Values],
-    significance: Mapping[str, float],
-    model: FringeModel,
-    cells: CellData,
-    thickness_um: tuple[float, float],
-    catalogue: Sequence[Effect],
+    rank: Ranking,
     report: Callable[[str], None],
 ) -> tuple[tuple[NamedEffect, ...], tuple[dict[str, Any], ...]]:
     """Effects with the data that would decide between the members of their class, and all that was compared.
@@ -40,16 +38,8 @@ def with_next_measurements(
         Effects with their classes.
     rivals : mapping
         For each effect, the fitted values of the other members of its class.
-    significance : mapping
-        Standard deviations by which the data ask for each effect.
-    model : `FringeModel`
-        The model before the search.
-    cells : `CellData`
-        The data, for their wavelengths and levels.
-    thickness_um : `tuple` [`float`, `float`]
-        Smallest and largest thickness [µm].
-    catalogue : sequence of `Effect`
-        Where the effects are.
+    rank : callable
+        See `Ranking`.
     report : callable
         Called with a line of text at every stage.
     """
@@ -59,41 +49,56 @@ def with_next_measurements(
             result.append(effect)
             continue
         report(f"which measurement would tell {effect.name} from {', '.join(effect.ambiguous_with)}")
-        ranked = _rank(effect, named, rivals[effect.name], significance[effect.name], model, cells, thickness_um,
-                       catalogue)  # fmt: skip
+        others = {name: rivals[effect.name][name] for name in effect.ambiguous_with[:MOST_RIVALS]}
+        try:
+            ranked = rank(effect, others)
+        except FringeSimError:  # an effect at the edge of its bounds has no derivative there
+            ranked = ()
         text = break_ambiguity(ranked) or "no forecast: the effects couple neighbouring pixels"
         result.append(replace(effect, break_ambiguity=text))
         table += [_row(effect.name, item) for item in ranked]
     return tuple(result), tuple(table)
 
 
-def _rank(
+def flats_ranked(
     effect: NamedEffect,
-    named: Sequence[NamedEffect],
     rivals: Values,
-    significance: float,
+    named: Sequence[NamedEffect],
     model: FringeModel,
     cells: CellData,
     thickness_um: tuple[float, float],
     catalogue: Sequence[Effect],
 ) -> tuple[RankedMeasurement, ...]:
+    """Further flats by how well they tell an effect from others; see `rank_measurements`.
+
+    Parameters
+    ----------
+    effect : `NamedEffect`
+        The effect.
+    rivals : mapping
+        Fitted values of the others.
+    named : sequence of `NamedEffect`
+        All effects that were found.
+    model : `FringeModel`
+        The model before the search.
+    cells : `CellData`
+        The data, for their wavelengths and levels.
+    thickness_um : `tuple` [`float`, `float`]
+        Smallest and largest thickness [µm].
+    catalogue : sequence of `Effect`
+        Where the effects are.
+    """
     certain = dict(model.effect_settings)
     for other in named:
         if other is not effect:
             certain |= {f"{other.name}.{key}": p.value for key, p in other.parameters.items()}
-    members: dict[str, Mapping[str, float]] = {
-        effect.name: {key: p.value for key, p in effect.parameters.items()}
-    }
-    members |= {name: rivals[name] for name in effect.ambiguous_with[:MOST_RIVALS]}
+    found = {effect.name: {key: p.value for key, p in effect.parameters.items()}}
     levels = [level for level in cells.geometry.level_e if math.isfinite(level) and level > 0.0]
     known = {"level_e": sum(levels) / len(levels)} if levels else {}
-    try:
-        return rank_measurements(
-            model.with_effects(certain, catalogue), members, wavelength_nm=cells.wavelength_nm.tolist(),
-            thickness_um=thickness_um, significance=significance, catalogue=catalogue, **known,
-        )  # fmt: skip
-    except FringeSimError:  # an effect at the edge of its bounds has no derivative there
-        return ()
+    return rank_measurements(
+        model.with_effects(certain, catalogue), {**found, **rivals}, wavelength_nm=cells.wavelength_nm.tolist(),
+        thickness_um=thickness_um, significance=effect.significance, catalogue=catalogue, **known,
+    )  # fmt: skip
 
 
 def _row(name: str, item: RankedMeasurement) -> dict[str, Any]:

@@ -21,7 +21,8 @@ from .classes import EffectClass, classes_of, outsider_probability
 from .describe import describe_residual, disagreement
 from .fit import Fit, fit_model
 from .forward import Exposures
-from .next_step import with_next_measurements
+from .next_frames import FrameForecast
+from .next_step import Ranking, flats_ranked, with_next_measurements
 from .preparation import Prepared, check_setup, prepare, prepare_again, why_too_poor
 from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
 from .validation import HeldOut, held_out_blocks, misfit_rms, validate, whole_thickness
@@ -495,20 +496,24 @@ class _Search:
         )
         if reasons:
             return self._unexplained(whole, final, chance, steps, "; ".join(reasons), partial=named)
-        if whole.problem.forward.exposures is not None:  # candidate measurements are flats
-            return self._verdict("named", whole, final, chance, tuple(named), {}, steps)
-        thickness = whole.problem.basis.expand(final.fit.field)
         decided, self.next_measurements = with_next_measurements(
             named,
             {name: group.values for name, group in classes.items()},
-            {name: group.significance for name, group in classes.items()},
-            self.model,
-            self.cells,
-            (float(thickness.min()) - 1e-3, float(thickness.max()) + 1e-3),
-            self.effects,
+            self._ranking(whole, final, named),
             self.say,
         )
         return self._verdict("named", whole, final, chance, decided, {}, steps)
+
+    def _ranking(self, whole: Selector, final: Hypothesis, named: Sequence[NamedEffect]) -> Ranking:
+        """What ranks further data: flats beside flats, frames and flats beside frames of the sky."""
+        if whole.problem.forward.exposures is not None:
+            forecast = FrameForecast(whole.problem, final.fit, whole.coordinates)
+            return lambda effect, rivals: forecast.ranked(effect.name, rivals)
+        thickness = whole.problem.basis.expand(final.fit.field)
+        limits = (float(thickness.min()) - 1e-3, float(thickness.max()) + 1e-3)
+        return lambda effect, rivals: flats_ranked(
+            effect, rivals, named, self.model, self.cells, limits, self.effects
+        )
 
     def _classified(
         self, training: Selector, chosen: Hypothesis, steps: list[Step]

@@ -444,14 +444,7 @@ class Selector:
         name = fit.coordinates[-1].effect
         if not self.generic or self.has_many(name) or self.problem.forward.is_image_effect(name):
             return []
-        without = replace(
-            fit,
-            settings={key: value for key, value in fit.settings.items() if key.partition(".")[0] != name},
-            coordinates=(),
-            position=np.zeros(0),
-            information=np.zeros((0, 0)),
-            spread=np.zeros(0),
-        )
+        without = fit.without(name)
         state = self.state(without)
         features, slope = self.features(state, without, name), state.design.slope
         along = np.einsum("kwyx,wyx->kw", features, slope) ** 2 / (slope**2).sum(axis=(1, 2))

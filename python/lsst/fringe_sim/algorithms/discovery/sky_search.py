@@ -15,6 +15,7 @@ from ...effects import EFFECTS, Effect
 from ...errors import InputError
 from ...instrument.bandpass import Bandpass
 from ...instrument.detector import Detector
+from ...instrument.night import NightHistory
 from ...instrument.sky import SkySpectrum, SpectralComponent, blend_components
 from ...instrument.telescope import reduce_beam
 from ...model import FringeModel, Setup
@@ -126,6 +127,30 @@ class SkyExposures:
     def place_weight(self, shape: tuple[int, int]) -> FloatArray:
         """See `Exposures`."""
         return np.ones((1, *shape)) if self.field is None else self.field.weight(shape)
+
+    def further(self) -> list[tuple[str, str, SkyExposures]]:
+        """See `Exposures`: the same frames once more, and frames at the hour of a night that is least like theirs."""
+        bands = self.sky.lines.bands
+        night = NightHistory.guo2022()
+        hours = [night.band_scale(time, bands) for time in range(len(night))]
+        farthest = max(range(len(night)), key=lambda time: self._unlike(hours[time]))
+        number = len(self.scales)
+        other = ({**self.scales[0], **hours[farthest]},) * number
+        title = f"{{frames}} frames with the OH bands of another hour ({night.hours[farthest]:g} h after dusk in the "
+        title += "night of Guo et al. 2022)"
+        return [
+            ("repeat", "the same {frames} frames once more", self._with_further(self.scales)),
+            ("hour", title, self._with_further(other)),
+        ]
+
+    def _unlike(self, scale: Mapping[str, float]) -> float:
+        """Rms difference of the bands from those of the frames, in powers of e, without what all have in common."""
+        now = {name: float(np.mean([own.get(name, 1.0) for own in self.scales])) for name in scale}
+        tiny = 1e-3
+        return float(np.std([np.log((scale[name] + tiny) / (now[name] + tiny)) for name in scale]))
+
+    def _with_further(self, scales: Sequence[Mapping[str, float]]) -> SkyExposures:
+        return replace(self, scales=(*self.scales, *scales), _missing={})
 
     def _short(self, model: FringeModel, grid: Grid) -> FloatArray:
         """The short sums at every place."""
