@@ -8,8 +8,10 @@ found and those ``B`` of another one,
     separation² = |a|² (1 - likeness²),    likeness = |projection of a on B| / |a|
 
 is the χ² by which the second effect fits worse, whatever its size: the expected difference of two fits to noiseless
-("Asimov") data, to first order. Signatures, and their products (the Fisher information), add up over flats only
-together with the nuisances that flats share; so present and further flats are projected as one set.
+("Asimov") data, to first order. Where both have been fitted, the difference of what they do at their sizes, each at
+the thickness that suits it, takes the place of ``a`` in the separation, which is then good to second order.
+Signatures and their products (the Fisher information) add up over flats only together with the nuisances that flats
+share; so present and further flats are projected as one set.
 
 References
 ----------
@@ -62,6 +64,9 @@ DERIVATIVE_STEP = 0.002
 
 THICKNESS_STEP_UM = 1e-4
 """Step of a difference in thickness [µm]; a fringe of the silicon takes 0.13."""
+
+ORDERS_MOVED, STEPS_PER_ORDER = 1.5, 40
+"""Fringe orders, either way, and steps in which the thickness that suits an effect is looked for."""
 
 LINE_STEP_NM = 0.1
 """Spacing of wavelength nodes [nm]: five per fringe of detection layer and support together."""
@@ -397,12 +402,21 @@ def _present(
 
 @dataclass(frozen=True)
 class _Tested:
-    """An effect, the values at which it is differentiated, and the direction from null that was found."""
+    """An effect, the values at which it is differentiated, and the direction from null that was found.
+
+    If it has been fitted, and not to its null, the values are those of the fit.
+    """
 
     effect: Effect
     values: dict[str, float]
     direction: FloatArray
     scale: FloatArray
+    fitted: bool = False
+
+    @property
+    def settings(self) -> dict[str, dict[str, float]]:
+        """The effect at its values."""
+        return {self.effect.name: self.values}
 
     @classmethod
     def of(cls, effect: Effect, values: Mapping[str, float], model: FringeModel) -> _Tested:
@@ -424,7 +438,8 @@ class _Tested:
             effect.parameter(name)
         activate_effects({effect.name: at}, (effect,))
         scales = np.array([parameter.prior_scale for parameter in effect.parameters])
-        return cls(effect, at, np.array(direction), scales)
+        as_fitted = bool(values) and all(at[name] == value for name, value in values.items())
+        return cls(effect, at, np.array(direction), scales, as_fitted)
 
     def neighbours(self, parameter: Parameter) -> tuple[float, float]:
         """Values on both sides, within the bounds, between which a difference is taken."""
@@ -495,6 +510,8 @@ class _Block:
         Derivatives with respect to the two thicknesses [1/µm].
     tested, further : `numpy.ndarray`
         Derivatives with respect to the parameters of the effects, in units of their prior scales.
+    difference : `numpy.ndarray`
+        What the effect that was found does, and what it does that each of the others does not.
     """
 
     image: FloatArray
@@ -503,18 +520,21 @@ class _Block:
     silicon: FloatArray
     tested: FloatArray
     further: FloatArray
+    difference: FloatArray
 
 
 @dataclass(frozen=True)
 class _Likeness:
-    """Strength of the effect that was found, and how alike another one is."""
+    """Strength of the effect that was found, and what another one cannot imitate of it."""
 
     strength: float
-    likeness: float
+    separation: float
 
     @property
-    def separation(self) -> float:
-        return self.strength * math.sqrt(max(1.0 - self.likeness**2, 0.0))
+    def likeness(self) -> float:
+        if not self.strength > 0.0:
+            return math.nan
+        return math.sqrt(max(1.0 - (self.separation / self.strength) ** 2, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -528,19 +548,19 @@ class _Forecast:
     sample: _Sample
     _blocks: dict[FlatSeries, _Block] = field(default_factory=dict, init=False)
     _flats: dict[tuple[object, ...], FloatArray] = field(default_factory=dict, init=False)
+    _shifts: dict[tuple[str, FlatSeries], FloatArray] = field(default_factory=dict, init=False)
 
     def pairs(self, series: Sequence[FlatSeries]) -> list[_Likeness]:
-        """The first effect against each of the others."""
-        signature = self.signatures([self._block(each) for each in series])
+        """The first effect against each of the others, from the present flats and those behind them."""
         sizes = [item.scale.size for item in self.tested]
-        first, *others = np.split(signature, np.cumsum(sizes)[:-1], axis=1)
-        found = first @ (self.tested[0].direction / self.tested[0].scale)
-        strength = float(np.linalg.norm(found))
+        signature = self.signatures([self._block(each, series[0]) for each in series])
+        tested, difference = np.split(signature, [sum(sizes)], axis=1)
+        strength = float(np.linalg.norm(difference[:, 0]))
+        tangents = np.split(tested, np.cumsum(sizes)[:-1], axis=1)[1:]
         result = []
-        for other in others:
-            basis = _orthonormal(other)
-            alike = float(np.linalg.norm(basis.T @ found)) / strength if strength > 0.0 else math.nan
-            result.append(_Likeness(strength, min(alike, 1.0)))
+        for tangent, own in zip(tangents, difference[:, 1:].T, strict=True):
+            basis = _orthonormal(tangent)
+            result.append(_Likeness(strength, float(np.linalg.norm(own - basis @ (basis.T @ own)))))
         return result
 
     def signatures(self, blocks: Sequence[_Block]) -> FloatArray:
@@ -549,14 +569,16 @@ class _Forecast:
         Returns
         -------
         signature : `numpy.ndarray`, shape ``(rows, K)``
-            One column for each parameter; the products of columns are the Fisher information.
+            One column for each parameter, and one for each difference; the products of columns are the Fisher
+            information.
         """
         joined = [np.concatenate([getattr(block, name) for block in blocks], axis=-2) for name in _FIELDS]
-        image, weight, thickness, silicon, tested, further = joined
+        image, weight, thickness, silicon, tested, further, difference = joined
+        asked = np.concatenate([tested, difference])
         flats, pixels = image.shape
         level = np.zeros((flats, flats, pixels))
         level[np.arange(flats), np.arange(flats)] = image
-        columns = np.concatenate([tested, further, silicon[np.newaxis], level]) * weight
+        columns = np.concatenate([asked, further, silicon[np.newaxis], level]) * weight
         local = np.stack([thickness, image]) * weight
         # The response of a pixel is known a little: a further datum of each pixel, whose expectation no effect moves.
         columns = np.concatenate([columns, np.zeros((len(columns), 1, pixels))], axis=1)
@@ -567,7 +589,7 @@ class _Forecast:
         design = np.ascontiguousarray(columns.transpose(2, 1, 0))
         design -= basis @ (basis.transpose(0, 2, 1) @ design)
         design = design.reshape(-1, len(columns)) * math.sqrt(SENSOR_PX[0] * SENSOR_PX[1] / pixels)
-        wanted, nuisance = np.split(design, [len(tested)], axis=1)
+        wanted, nuisance = np.split(design, [len(asked)], axis=1)
         # Derivatives are per prior scale, so that the priors are unit rows.
         prior = np.eye(nuisance.shape[1])[: len(further)]
         nuisance = _orthonormal(np.concatenate([nuisance, prior]))
@@ -575,31 +597,81 @@ class _Forecast:
         signature: FloatArray = wanted - nuisance @ (nuisance.T @ wanted)
         return signature
 
-    def _block(self, series: FlatSeries) -> _Block:
+    def _block(self, series: FlatSeries, present: FlatSeries) -> _Block:
         if series not in self._blocks:
-            self._blocks[series] = self._differentiated(series)
+            self._blocks[series] = self._differentiated(series, present)
         return self._blocks[series]
 
-    def _differentiated(self, series: FlatSeries) -> _Block:
-        step = THICKNESS_STEP_UM
-        image = self._observe(series, {})
-        thickness = self._observe(series, {}, step) - self._observe(series, {}, -step)
+    def _differentiated(self, series: FlatSeries, present: FlatSeries) -> _Block:
+        step, found = THICKNESS_STEP_UM, self.tested[0]
+        base = found.settings if found.fitted else {}
+        image = self._observe(series, base)
+        thickness = self._observe(series, base, step) - self._observe(series, base, -step)
         silicon = np.zeros(image.shape)
         if self.model.base_system.varying != self.model.base_system.detection:
-            silicon = self._observe(series, {}, 0.0, step) - self._observe(series, {}, 0.0, -step)
+            silicon = self._observe(series, base, 0.0, step) - self._observe(series, base, 0.0, -step)
         tested, further = (
-            np.array([self._slope(series, item, parameter) for item in items for parameter in item.effect.parameters])
-            .reshape(-1, *image.shape)
+            np.array([
+                self._slope(series, item, parameter, self._shift(item, present))
+                for item in items for parameter in item.effect.parameters
+            ]).reshape(-1, *image.shape)
             for items in (self.tested, self.further)
         )  # fmt: skip
+        own = tested[: found.scale.size]
+        strong = image - self._observe(series, {}) if found.fitted else self._along(found, own)
+        difference = [strong] + [
+            image - self._observe(series, other.settings, self._shift(other, present))
+            if found.fitted and other.fitted
+            else strong
+            for other in self.tested[1:]
+        ]
         weight = np.sqrt(series.level_e / np.maximum(image, 1e-6))
-        return _Block(image, weight, thickness / (2.0 * step), silicon / (2.0 * step), tested, further)
+        return _Block(
+            image, weight, thickness / (2.0 * step), silicon / (2.0 * step), tested, further,
+            np.stack(difference),
+        )  # fmt: skip
 
-    def _slope(self, series: FlatSeries, item: _Tested, parameter: Parameter) -> FloatArray:
+    def _along(self, item: _Tested, slopes: FloatArray) -> FloatArray:
+        """An effect of which only the direction is known."""
+        return np.asarray(np.tensordot(item.direction / item.scale, slopes, axes=1))
+
+    def _shift(self, item: _Tested, present: FlatSeries) -> FloatArray:
+        """Move of the thickness of every pixel [µm] with which an effect comes next to the one that was found."""
+        found = self.tested[0]
+        if item is found or not (found.fitted and item.fitted):
+            return np.zeros(self.sample.thickness_um.shape)
+        key = (item.effect.name, present)
+        if key not in self._shifts:
+            self._shifts[key] = self._nearest_shift(item, present)
+        return self._shifts[key]
+
+    def _nearest_shift(self, item: _Tested, present: FlatSeries) -> FloatArray:
+        """Best move of all pixels together within some orders, then of each of them within half an order."""
+        system = self.model.base_system
+        medium = system.stack.layers[system.stack.position(system.varying)].medium
+        middle = float(np.median(present.wavelength_nm))
+        order = 0.5e-3 * middle / float(np.real(medium.index(middle, system.temperature_k)))
+        steps = np.arange(-round(ORDERS_MOVED * STEPS_PER_ORDER), round(ORDERS_MOVED * STEPS_PER_ORDER) + 1)
+        shifts = steps * (order / STEPS_PER_ORDER)
+        wanted = self._observe(present, self.tested[0].settings)
+        weight = 1.0 / np.maximum(wanted, 1e-6)
+        cost = []
+        for shift in shifts:
+            other = self._observe(present, item.settings, float(shift))
+            response = (weight * other * wanted).sum(axis=0) / (weight * other**2).sum(axis=0)
+            cost.append((weight * (wanted - response * other) ** 2).sum(axis=0))
+        misfit = np.array(cost)
+        common = int(misfit.sum(axis=1).argmin())
+        misfit[np.abs(steps - steps[common]) > STEPS_PER_ORDER // 4] = np.inf
+        return np.asarray(shifts[misfit.argmin(axis=0)].reshape(self.sample.thickness_um.shape))
+
+    def _slope(
+        self, series: FlatSeries, item: _Tested, parameter: Parameter, shift_um: FloatArray | float = 0.0
+    ) -> FloatArray:
         """Derivative with respect to a parameter, in units of its prior scale."""
         low, high = item.neighbours(parameter)
         ends = [
-            self._observe(series, {item.effect.name: {**item.values, parameter.name: value}})
+            self._observe(series, {item.effect.name: {**item.values, parameter.name: value}}, shift_um)
             for value in (low, high)
         ]
         slope: FloatArray = (ends[1] - ends[0]) * (parameter.prior_scale / (high - low))
@@ -609,7 +681,7 @@ class _Forecast:
         self,
         series: FlatSeries,
         effects: Mapping[str, Mapping[str, float]],
-        shift_um: float = 0.0,
+        shift_um: FloatArray | float = 0.0,
         silicon_um: float = 0.0,
     ) -> FloatArray:
         """Flats of the sample over their means, shape ``(W, P)``."""
@@ -618,31 +690,33 @@ class _Forecast:
         optical = tuple(item for item in model.effects if item.effect.acts_on != "image")
         # Neither the level nor an effect on the image changes what the optics do.
         settings = tuple((item.effect.name, *sorted(item.values.items())) for item in optical)
-        key = (replace(series, level_e=1.0), settings, shift_um, silicon_um)
+        moved = np.broadcast_to(shift_um, self.sample.thickness_um.shape)
+        key = (replace(series, level_e=1.0), settings, moved.tobytes(), silicon_um)
         if key not in self._flats:
             bare = replace(model, effects=optical)
-            self._flats[key] = self._optical(bare, series, shift_um, silicon_um)
+            self._flats[key] = self._optical(bare, series, moved, silicon_um)
         geometry = self.sample.geometry(series)
         image = apply_to_image(model.effects, model.base_system, self._flats[key], geometry)
         return image.reshape(len(image), -1)
 
     def _optical(
-        self, model: FringeModel, series: FlatSeries, shift_um: float, silicon_um: float
+        self, model: FringeModel, series: FlatSeries, shift_um: FloatArray, silicon_um: float
     ) -> FloatArray:
         """Response of the sample over its means, shape ``(W, ny, nx)``."""
         system, waves = model.base_system, np.array(series.wavelength_nm)
         nominal = system.stack.layers[system.stack.position(system.detection)].thickness_um
         rows = []
-        for thickness, offset in zip(self.sample.thickness_um, self.sample.silicon_um, strict=True):
+        places = zip(self.sample.thickness_um + shift_um, self.sample.silicon_um, strict=True)
+        for thickness, offset in places:
             moved = system.with_layer(system.detection, thickness_um=nominal + offset + silicon_um)
             one = replace(model, base_system=moved)
-            rows.append(one.respond(one.system.flat_fields(waves, LINE_STEP_NM), thickness + shift_um, waves))
+            rows.append(one.respond(one.system.flat_fields(waves, LINE_STEP_NM), thickness, waves))
         image = np.stack(rows, axis=1)
         image /= image.mean(axis=(1, 2), keepdims=True)
         return image
 
 
-_FIELDS = ("image", "weight", "thickness", "silicon", "tested", "further")
+_FIELDS = ("image", "weight", "thickness", "silicon", "tested", "further", "difference")
 
 
 def _orthonormal(columns: FloatArray) -> FloatArray:
