@@ -320,6 +320,12 @@ def test_the_silicon_may_be_the_layer_that_varies(few_samples: None) -> None:
     assert ranked.separation > 0.0
 
 
+def test_a_layer_may_be_thinner_than_the_orders_that_are_tried(model: FringeModel, few_samples: None) -> None:
+    effects = {"contrast_loss": {"factor": 0.5}, "roughness": {"sigma": 60.0}}
+    (ranked,) = rank_measurements(model, effects, thickness_um=(0.5, 0.9), measurements=[AGAIN])
+    assert ranked.separation > 0.0
+
+
 def test_bad_requests_are_refused(model: FringeModel) -> None:
     with pytest.raises(InputError, match="monochromator"):
         rank_measurements(FringeModel.from_setup("lsst_e2v"), {"roughness": {}, "black_coating": {}})

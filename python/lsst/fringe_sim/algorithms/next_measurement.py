@@ -65,7 +65,7 @@ DERIVATIVE_STEP = 0.002
 THICKNESS_STEP_UM = 1e-4
 """Step of a difference in thickness [µm]; a fringe of the silicon takes 0.13."""
 
-ORDERS_MOVED, STEPS_PER_ORDER = 1.5, 40
+ORDERS_MOVED, STEPS_PER_ORDER = 6, 24
 """Fringe orders, either way, and steps in which the thickness that suits an effect is looked for."""
 
 LINE_STEP_NM = 0.1
@@ -651,7 +651,8 @@ class _Forecast:
         medium = system.stack.layers[system.stack.position(system.varying)].medium
         middle = float(np.median(present.wavelength_nm))
         order = 0.5e-3 * middle / float(np.real(medium.index(middle, system.temperature_k)))
-        steps = np.arange(-round(ORDERS_MOVED * STEPS_PER_ORDER), round(ORDERS_MOVED * STEPS_PER_ORDER) + 1)
+        steps = np.arange(-ORDERS_MOVED * STEPS_PER_ORDER, ORDERS_MOVED * STEPS_PER_ORDER + 1)
+        steps = steps[self.sample.thickness_um.min() + steps * (order / STEPS_PER_ORDER) > 0.0]
         shifts = steps * (order / STEPS_PER_ORDER)
         wanted = self._observe(present, self.tested[0].settings)
         weight = 1.0 / np.maximum(wanted, 1e-6)

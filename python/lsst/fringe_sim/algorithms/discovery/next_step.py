@@ -10,7 +10,7 @@ from typing import Any
 from ...effects import Effect
 from ...errors import FringeSimError
 from ...model import FringeModel
-from ..next_measurement import RankedMeasurement, break_ambiguity, rank_measurements
+from ..next_measurement import Measurement, RankedMeasurement, break_ambiguity, rank_measurements
 from .cells import CellData
 from .verdict import NamedEffect
 
@@ -18,6 +18,9 @@ __all__ = ["Ranking", "flats_ranked", "with_next_measurements"]
 
 MOST_RIVALS = 4
 """Members of a class, likeliest first, that a measurement is asked to tell from the effect."""
+
+MANY_PX = 100
+"""Side of the part of a sensor that is recommended instead of a few pixels [px]."""
 
 Values = Mapping[str, Mapping[str, float]]
 Ranking = Callable[[NamedEffect, Values], tuple[RankedMeasurement, ...]]
@@ -50,11 +53,13 @@ def with_next_measurements(
             continue
         report(f"which measurement would tell {effect.name} from {', '.join(effect.ambiguous_with)}")
         others = {name: rivals[effect.name][name] for name in effect.ambiguous_with[:MOST_RIVALS]}
+        ranked: tuple[RankedMeasurement, ...] = ()
+        reason = "the effects couple neighbouring pixels"
         try:
             ranked = rank(effect, others)
-        except FringeSimError:  # an effect at the edge of its bounds has no derivative there
-            ranked = ()
-        text = break_ambiguity(ranked) or "no forecast: the effects couple neighbouring pixels"
+        except FringeSimError as error:  # an effect at the edge of its bounds has no derivative there
+            reason = str(error)
+        text = break_ambiguity(ranked) or f"no forecast: {reason}"
         result.append(replace(effect, break_ambiguity=text))
         table += [_row(effect.name, item) for item in ranked]
     return tuple(result), tuple(table)
@@ -68,6 +73,8 @@ def flats_ranked(
     cells: CellData,
     thickness_um: tuple[float, float],
     catalogue: Sequence[Effect],
+    *,
+    few: bool = False,
 ) -> tuple[RankedMeasurement, ...]:
     """Further flats by how well they tell an effect from others; see `rank_measurements`.
 
@@ -87,6 +94,8 @@ def flats_ranked(
         Smallest and largest thickness [µm].
     catalogue : sequence of `Effect`
         Where the effects are.
+    few : `bool`, optional
+        Whether the data are a few pixels only: then more of them are a measurement, too.
     """
     certain = dict(model.effect_settings)
     for other in named:
@@ -95,10 +104,25 @@ def flats_ranked(
     found = {effect.name: {key: p.value for key, p in effect.parameters.items()}}
     levels = [level for level in cells.geometry.level_e if math.isfinite(level) and level > 0.0]
     known = {"level_e": sum(levels) / len(levels)} if levels else {}
-    return rank_measurements(
+    ranked = rank_measurements(
         model.with_effects(certain, catalogue), {**found, **rivals}, wavelength_nm=cells.wavelength_nm.tolist(),
         thickness_um=thickness_um, significance=effect.significance, catalogue=catalogue, **known,
     )  # fmt: skip
+    if few and ranked:
+        ranked = (*ranked, _more_pixels(ranked[0], cells))
+    return tuple(sorted(ranked, key=lambda item: -item.separation))
+
+
+def _more_pixels(ranked: RankedMeasurement, cells: CellData) -> RankedMeasurement:
+    """The same flats of many pixels, whatever it is that sets the noise of one."""
+    gain = max(MANY_PX / math.sqrt(float(cells.seen.sum()) * cells.cell_px**2), 1.0)
+    pairs = [
+        replace(pair, likeness_after=pair.likeness_now, separation_after=gain * pair.separation_now)
+        for pair in ranked.pairs
+    ]
+    title = f"the same {cells.shape[0]} flats of {MANY_PX} x {MANY_PX} pixels"
+    pairs.sort(key=lambda pair: pair.separation_after)
+    return RankedMeasurement(Measurement("more_pixels", title), tuple(pairs))
 
 
 def _row(name: str, item: RankedMeasurement) -> dict[str, Any]:

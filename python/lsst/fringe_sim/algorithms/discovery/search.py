@@ -18,6 +18,7 @@ from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
 from .channels import Channel
 from .classes import EffectClass, classes_of, outsider_probability
+from .comparison import fringe_order_um
 from .describe import describe_residual, disagreement
 from .fit import Fit, fit_model
 from .forward import Exposures
@@ -510,9 +511,13 @@ class _Search:
             forecast = FrameForecast(whole.problem, final.fit, whole.coordinates)
             return lambda effect, rivals: forecast.ranked(effect.name, rivals)
         thickness = whole.problem.basis.expand(final.fit.field)
-        limits = (float(thickness.min()) - 1e-3, float(thickness.max()) + 1e-3)
+        # Of a few pixels, those of the same sensor that see the rest of a fringe.
+        middle = 0.5 * float(thickness.min() + thickness.max())
+        order = fringe_order_um(self.cells.wavelength_nm, float(self.prepared.index.mean()))
+        half = 0.5 * max(float(np.ptp(thickness)) + 2e-3, order)
+        limits = (middle - half, middle + half)
         return lambda effect, rivals: flats_ranked(
-            effect, rivals, named, self.model, self.cells, limits, self.effects
+            effect, rivals, named, self.model, self.cells, limits, self.effects, few=not self.prepared.rich
         )
 
     def _classified(
