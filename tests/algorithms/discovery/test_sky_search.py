@@ -9,10 +9,12 @@ import pytest
 from sky_frames import SHAPE, sky_frames_of
 
 from lsst.fringe_sim.algorithms.discovery import discover_sky
+from lsst.fringe_sim.algorithms.discovery.cells import CellData
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.sky_search import BeamsOverSensor, SkyExposures
 from lsst.fringe_sim.algorithms.field_response import SensorPlacement, sensor_response
 from lsst.fringe_sim.algorithms.sky_frame import bandpass_of, sky_response
-from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.sky import SkySpectrum
@@ -28,6 +30,10 @@ CATALOGUE = (
     "sky_continuum",
 )
 GRID = (12.0, 0.004, 500)
+
+
+def pixels_of(shape: tuple[int, int]) -> ImageGeometry:
+    return ImageGeometry.of_pixels(shape, np.full(2, 1000.0))
 
 
 def exposures(model: FringeModel, **parts: object) -> SkyExposures:
@@ -77,7 +83,7 @@ def test_every_pixel_sees_its_own_beam() -> None:
         model = FringeModel.from_setup("lsst_e2v", settings)
         rows = light.response(model, *GRID)
         shape = (24, GRID[2])
-        weight = light.place_weight(shape)
+        weight = light.place_weight(pixels_of(shape))
         np.testing.assert_allclose(weight.sum(axis=0), 1.0, atol=1e-9)
         assert rows.shape == (2 * len(weight), GRID[2])
         thickness = np.broadcast_to(GRID[0] + GRID[1] * np.arange(GRID[2]), shape)
@@ -91,6 +97,39 @@ def test_every_pixel_sees_its_own_beam() -> None:
             one_beam = found[12] / found[12].mean() - frame / frame.mean()
             assert np.std(miss) < tolerance * fringes
             assert np.std(one_beam) > 0.05 * fringes  # it matters
+
+
+def test_cells_of_many_pixels_see_the_mean_of_their_beams() -> None:
+    """Cells of a sensor against its pixels, averaged."""
+    base, side, cell_px = FringeModel.from_setup("lsst_e2v"), 64, 8
+    detector = Camera.from_name(base.setup.camera).detector("R22_S01")
+    placement = SensorPlacement.of(detector, base.setup.pixel_scale_arcsec)
+    light = exposures(base, field=BeamsOverSensor.of(base.setup.telescope, placement))
+    y, x = np.indices((side, side)) / side
+    thickness = 13.0 + 0.05 * y + 0.03 * x
+    pixels = pixels_of((side, side))
+    centres = cell_px * np.arange(side // cell_px) + 0.5 * (cell_px - 1)
+    whole = replace(pixels, y_px=centres, x_px=centres)
+    part = replace(whole, y_px=centres[2:5], x_px=centres[1:])  # as of a block that is held out
+
+    def predicted(
+        geometry: ImageGeometry, size: int, field: np.ndarray, light: SkyExposures = light
+    ) -> np.ndarray:
+        shape = (2, *field.shape)
+        cells = CellData(np.ones(shape), np.ones(shape), geometry, size)
+        return Forward.of_cells(base, (), cells, (12.5, 13.6), light).predict({}, field).value
+
+    def averaged(image: np.ndarray) -> np.ndarray:
+        blocks = image.reshape(*image.shape[:-2], side // cell_px, cell_px, side // cell_px, cell_px)
+        return blocks.mean(axis=(-3, -1))
+
+    expected, field = averaged(predicted(pixels, 1, thickness)), averaged(thickness)
+    fringes = np.std(expected)
+    np.testing.assert_allclose(predicted(whole, cell_px, field), expected, atol=0.02 * fringes)
+    one_beam = predicted(whole, cell_px, field, exposures(base))
+    assert np.abs(one_beam - expected).max() > 0.1 * fringes  # it matters
+    found = predicted(part, cell_px, field[2:5, 1:])
+    np.testing.assert_allclose(found, expected[:, 2:5, 1:], atol=0.02 * fringes)
 
 
 @pytest.mark.slow

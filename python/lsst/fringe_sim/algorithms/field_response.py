@@ -123,9 +123,12 @@ class SensorPlacement:
 
     def radius_deg(self, shape: tuple[int, int]) -> FloatArray:
         """Field radius of every pixel of a map that covers the sensor [deg], ``shape``."""
-        plane = self.plane(shape)
-        rows, columns = np.arange(shape[0])[:, None], np.arange(shape[1])[None, :]
-        return np.asarray(np.hypot(*(line[0] + line[1] * columns + line[2] * rows for line in plane)))
+        return self.radius_at_deg(shape, np.arange(shape[0]), np.arange(shape[1]))
+
+    def radius_at_deg(self, shape: tuple[int, int], rows: ArrayLike, columns: ArrayLike) -> FloatArray:
+        """Field radius on a grid of rows and columns of such a map [deg], shape ``(rows, columns)``."""
+        y, x = np.asarray(rows, dtype=float)[:, None], np.asarray(columns, dtype=float)[None, :]
+        return np.asarray(np.hypot(*(line[0] + line[1] * x + line[2] * y for line in self.plane(shape))))
 
     @property
     def radius_range_deg(self) -> tuple[float, float]:

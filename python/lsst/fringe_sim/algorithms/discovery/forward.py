@@ -73,8 +73,8 @@ class Exposures(Protocol):
         Shape ``(K * W, count)``, all exposures at one place after the other.
         """
 
-    def place_weight(self, shape: tuple[int, int]) -> FloatArray:
-        """Weights of the places for every cell of a sensor, ``(K, ny, nx)``; their sum is 1."""
+    def place_weight(self, geometry: ImageGeometry) -> FloatArray:
+        """Weights of the places for every cell, ``(K, ny, nx)``; their sum is 1."""
 
     def further(self) -> Sequence[tuple[str, str, Exposures]]:
         """Exposures that could be taken: a key, what to take, the present ones with as many of those behind them.
@@ -134,7 +134,7 @@ class Forward:
             differ = bool(np.abs(rest).max() > NO_DISTANCE_PX)
             self._centroids = common, rest if differ else None
         if self.exposures is not None:
-            weight = self.exposures.place_weight(self.geometry.shape)
+            weight = self.exposures.place_weight(self.geometry)
             self.place_weight = weight if len(weight) > 1 else None
 
     @classmethod

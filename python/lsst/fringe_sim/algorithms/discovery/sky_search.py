@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BarycentricInterpolator
 
-from ...effects import EFFECTS, Effect
+from ...effects import EFFECTS, Effect, ImageGeometry
 from ...errors import InputError
 from ...instrument.bandpass import Bandpass
 from ...instrument.detector import Detector
@@ -124,9 +124,9 @@ class SkyExposures:
             self._flat = self._flat_field(grid)
         return (self._short(model, grid) + self._missing[grid]) / self._flat
 
-    def place_weight(self, shape: tuple[int, int]) -> FloatArray:
+    def place_weight(self, geometry: ImageGeometry) -> FloatArray:
         """See `Exposures`."""
-        return np.ones((1, *shape)) if self.field is None else self.field.weight(shape)
+        return np.ones((1, 1, 1)) if self.field is None else self.field.weight(geometry)
 
     def further(self) -> list[tuple[str, str, SkyExposures]]:
         """See `Exposures`: the same frames once more, and frames at the hour of a night that is least like theirs."""
@@ -291,10 +291,10 @@ class BeamsOverSensor:
         """From values at the few radii to those at all, ``(K, L)``."""
         return lagrange_matrix(self.few_radius_deg, self.radius_deg)
 
-    def weight(self, shape: tuple[int, int]) -> FloatArray:
-        """Weights of the radii for every cell of a map that covers the sensor, ``(K, ny, nx)``."""
-        radius = self.placement.radius_deg(shape)
-        return np.moveaxis(lagrange_matrix(self.radius_deg, radius.ravel()), 1, 0).reshape(-1, *shape)
+    def weight(self, geometry: ImageGeometry) -> FloatArray:
+        """Weights of the radii for every sample of an image, ``(K, ny, nx)``."""
+        radius = self.placement.radius_at_deg(geometry.shape, geometry.y_px, geometry.x_px)
+        return np.moveaxis(lagrange_matrix(self.radius_deg, radius.ravel()), 1, 0).reshape(-1, *radius.shape)
 
 
 def _radii(limits: tuple[float, float], number: int) -> FloatArray:
