@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, median_filter
@@ -60,6 +63,7 @@ def spoiled_cells(residual: FloatArray, used: BoolArray) -> BoolArray:
     # What is wrong with all of a neighbourhood is no track: the light, or a wrong effect.
     own = np.where(used, own - np.stack([median_filter(plane, NEIGHBOURHOOD) for plane in own]), 0.0)
     departure = np.stack([_in_own_spread(plane, good) for plane, good in zip(own, used, strict=True)])
+    departure /= _tail_over_spread(waves)
     spoiled = np.abs(departure) > OUTLIER_SIGMA
     spoiled &= spoiled.sum(axis=0) <= max(1.0, MOST_PLANES * waves)
     around = np.ones((3, 3), dtype=bool)
@@ -68,6 +72,18 @@ def spoiled_cells(residual: FloatArray, used: BoolArray) -> BoolArray:
     pattern = spoiled.sum(axis=(1, 2)) > MOST_OF_A_PLANE * used.sum(axis=(1, 2))
     spoiled[pattern] = False
     return spoiled
+
+
+@functools.cache
+def _tail_over_spread(waves: int) -> float:
+    """Standard deviation that the tail of noise has behind its median over exposures, over its robust spread.
+
+    One exposure in three is the median itself: the spread of so few says little of the tail. For a value to be far
+    above the median, all below the median have to be low, so that the tail is that of ``x`` minus their mean.
+    """
+    noise = np.random.default_rng(0).standard_normal((waves, 40_000))
+    spread = GAUSSIAN_MAD * float(np.median(np.abs(noise - np.median(noise, axis=0))))
+    return math.sqrt(1.0 + 1.0 / (waves // 2 + 1)) / spread
 
 
 def _in_own_spread(plane: FloatArray, good: BoolArray) -> FloatArray:

@@ -168,8 +168,7 @@ def prepare(
     """
     size = finest_useful_cell(cube, most_cells=most_cells)
     cells = bin_cube(cube, size)
-    if exposures is None:  # light that changes over a field has its places for all cells
-        cells = cells.window(*_part_searched(cells.shape[1:], LARGEST_SEARCH * most_cells))
+    cells = cells.window(*_part_searched(cells.shape[1:], LARGEST_SEARCH * most_cells))
     stack = model.system.stack
     medium = stack.layers[stack.position(model.system.varying)].medium
     index = np.real(medium.index(cells.wavelength_nm, model.system.temperature_k))
