@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lsst.fringe_sim.algorithms.discovery import next_step
 from lsst.fringe_sim.algorithms.discovery.cells import CellData
 from lsst.fringe_sim.algorithms.discovery.next_step import flats_ranked, with_next_measurements
 from lsst.fringe_sim.algorithms.discovery.verdict import NamedEffect, ParameterValue
+from lsst.fringe_sim.algorithms.next_measurement import RankedMeasurement
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.model import FringeModel
@@ -28,19 +30,24 @@ def cells_of(side: int) -> CellData:
     return CellData(np.ones(shape), np.full(shape, 2e4), geometry, 1)
 
 
+@pytest.fixture(scope="module")
+def usual() -> tuple[RankedMeasurement, ...]:
+    """What is asked of flats of many pixels."""
+    effect, model = named("roughness"), FringeModel.from_setup("ts8_e2v")
+    return flats_ranked(effect, RIVALS, [effect], model, cells_of(6), (13.0, 14.0), EFFECTS)
+
+
 @pytest.mark.parametrize(("side", "gain"), [(1, 100.0), (4, 25.0), (200, 1.0)])
-def test_of_a_few_pixels_more_are_a_measurement(side: int, gain: float) -> None:
-    model = FringeModel.from_setup("ts8_e2v")
-    effect = named("roughness")
-    usual, few = (
-        flats_ranked(effect, RIVALS, [effect], model, cells_of(side), (13.0, 14.0), EFFECTS, few=few)
-        for few in (False, True)
-    )
+def test_of_a_few_pixels_more_are_a_measurement(
+    usual: tuple[RankedMeasurement, ...], side: int, gain: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    effect, model = named("roughness"), FringeModel.from_setup("ts8_e2v")
+    monkeypatch.setattr(next_step, "rank_measurements", lambda *args, **options: usual)
+    few = flats_ranked(effect, RIVALS, [effect], model, cells_of(side), (13.0, 14.0), EFFECTS, few=True)
     (more,) = (item for item in few if item.measurement.name == "more_pixels")
     assert len(few) == len(usual) + 1
     assert [item.separation for item in few] == sorted((item.separation for item in few), reverse=True)
-    now = usual[0].pairs[0].separation_now
-    assert more.separation == pytest.approx(gain * now)
+    assert more.separation == pytest.approx(gain * usual[0].pairs[0].separation_now)
     assert more.pairs[0].likeness_after == more.pairs[0].likeness_now
     assert more.measurement.title == "the same 5 flats of 100 x 100 pixels"
 
