@@ -47,7 +47,9 @@ def few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
 def forecast_of(model: FringeModel, **effects: dict[str, float]) -> Any:
     by_name = {effect.name: effect for effect in EFFECTS}
     tested = tuple(forecasts._Tested.of(by_name[name], values, model) for name, values in effects.items())
-    return forecasts._Forecast(model, EFFECTS, tested, (), forecasts._Sample.of(model, None))
+    return forecasts._Forecast(
+        model, EFFECTS, tested, (), forecasts._Sample.of(model, None), FlatSeries(FLATS)
+    )
 
 
 @pytest.mark.parametrize(

@@ -351,26 +351,27 @@ def rank_measurements(
         return ()
     further = [_Tested.of(known[name], {}, model) for name in nuisance_effects if name not in effects]
     present = _present(model, wavelength_nm, level_e)
-    forecast = _Forecast(model, catalogue, tuple(tested), tuple(further), _Sample.of(model, thickness_um))
+    forecast = _Forecast(
+        model, catalogue, tuple(tested), tuple(further), _Sample.of(model, thickness_um), present
+    )
     chosen = measurements or candidate_measurements(model, wavelength_nm, level_e)
     # Many small matrices: threads of the linear algebra would wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _ranked(forecast, present, chosen, significance, say)
+        return _ranked(forecast, chosen, significance, say)
 
 
 def _ranked(
     forecast: _Forecast,
-    present: FlatSeries,
     measurements: Sequence[FlatMeasurement],
     significance: float | None,
     say: Report,
 ) -> tuple[RankedMeasurement, ...]:
-    before = forecast.pairs([present])
+    before = forecast.pairs([forecast.present])
     first, *others = (item.effect.name for item in forecast.tested)
     scale = 1.0 if significance is None else significance / max(before[0].strength, 1e-300)
     ranked = []
     for measurement in measurements:
-        after = forecast.pairs([present, measurement.series])
+        after = forecast.pairs([forecast.present, measurement.series])
         pairs = [
             PairForecast(
                 first, other, now.likeness, then.likeness, scale * now.separation, scale * then.separation
@@ -539,21 +540,22 @@ class _Likeness:
 
 @dataclass(frozen=True, eq=False)
 class _Forecast:
-    """Fisher information of sets of flats about the effects of a class."""
+    """Fisher information of sets of flats about the effects of a class, of which the ``present`` ones are there."""
 
     model: FringeModel
     catalogue: Sequence[Effect]
     tested: tuple[_Tested, ...]
     further: tuple[_Tested, ...]
     sample: _Sample
+    present: FlatSeries
     _blocks: dict[FlatSeries, _Block] = field(default_factory=dict, init=False)
     _flats: dict[tuple[object, ...], FloatArray] = field(default_factory=dict, init=False)
-    _shifts: dict[tuple[str, FlatSeries], FloatArray] = field(default_factory=dict, init=False)
+    _shifts: dict[str, FloatArray] = field(default_factory=dict, init=False)
 
     def pairs(self, series: Sequence[FlatSeries]) -> list[_Likeness]:
-        """The first effect against each of the others, from the present flats and those behind them."""
+        """The first effect against each of the others."""
         sizes = [item.scale.size for item in self.tested]
-        signature = self.signatures([self._block(each, series[0]) for each in series])
+        signature = self.signatures([self._block(each) for each in series])
         tested, difference = np.split(signature, [sum(sizes)], axis=1)
         strength = float(np.linalg.norm(difference[:, 0]))
         tangents = np.split(tested, np.cumsum(sizes)[:-1], axis=1)[1:]
@@ -597,12 +599,12 @@ class _Forecast:
         signature: FloatArray = wanted - nuisance @ (nuisance.T @ wanted)
         return signature
 
-    def _block(self, series: FlatSeries, present: FlatSeries) -> _Block:
+    def _block(self, series: FlatSeries) -> _Block:
         if series not in self._blocks:
-            self._blocks[series] = self._differentiated(series, present)
+            self._blocks[series] = self._differentiated(series)
         return self._blocks[series]
 
-    def _differentiated(self, series: FlatSeries, present: FlatSeries) -> _Block:
+    def _differentiated(self, series: FlatSeries) -> _Block:
         step, found = THICKNESS_STEP_UM, self.tested[0]
         base = found.settings if found.fitted else {}
         image = self._observe(series, base)
@@ -612,7 +614,7 @@ class _Forecast:
             silicon = self._observe(series, base, 0.0, step) - self._observe(series, base, 0.0, -step)
         tested, further = (
             np.array([
-                self._slope(series, item, parameter, self._shift(item, present))
+                self._slope(series, item, parameter, self._shift(item))
                 for item in items for parameter in item.effect.parameters
             ]).reshape(-1, *image.shape)
             for items in (self.tested, self.further)
@@ -620,7 +622,7 @@ class _Forecast:
         own = tested[: found.scale.size]
         strong = image - self._observe(series, {}) if found.fitted else self._along(found, own)
         difference = [strong] + [
-            image - self._observe(series, other.settings, self._shift(other, present))
+            image - self._observe(series, other.settings, self._shift(other))
             if found.fitted and other.fitted
             else strong
             for other in self.tested[1:]
@@ -635,30 +637,27 @@ class _Forecast:
         """An effect of which only the direction is known."""
         return np.asarray(np.tensordot(item.direction / item.scale, slopes, axes=1))
 
-    def _shift(self, item: _Tested, present: FlatSeries) -> FloatArray:
+    def _shift(self, item: _Tested) -> FloatArray:
         """Move of the thickness of every pixel [µm] with which an effect comes next to the one that was found."""
         found = self.tested[0]
         if item is found or not (found.fitted and item.fitted):
             return np.zeros(self.sample.thickness_um.shape)
-        key = (item.effect.name, present)
-        if key not in self._shifts:
-            self._shifts[key] = self._nearest_shift(item, present)
-        return self._shifts[key]
+        name = item.effect.name
+        if name not in self._shifts:
+            self._shifts[name] = self._nearest_shift(item)
+        return self._shifts[name]
 
-    def _nearest_shift(self, item: _Tested, present: FlatSeries) -> FloatArray:
+    def _nearest_shift(self, item: _Tested) -> FloatArray:
         """Best move of all pixels together within some orders, then of each of them within half an order."""
-        system = self.model.base_system
-        medium = system.stack.layers[system.stack.position(system.varying)].medium
-        middle = float(np.median(present.wavelength_nm))
-        order = 0.5e-3 * middle / float(np.real(medium.index(middle, system.temperature_k)))
+        order = float(self.model.fringe_order_um(np.median(self.present.wavelength_nm)))
         steps = np.arange(-ORDERS_MOVED * STEPS_PER_ORDER, ORDERS_MOVED * STEPS_PER_ORDER + 1)
         steps = steps[self.sample.thickness_um.min() + steps * (order / STEPS_PER_ORDER) > 0.0]
         shifts = steps * (order / STEPS_PER_ORDER)
-        wanted = self._observe(present, self.tested[0].settings)
+        wanted = self._observe(self.present, self.tested[0].settings)
         weight = 1.0 / np.maximum(wanted, 1e-6)
         cost = []
         for shift in shifts:
-            other = self._observe(present, item.settings, float(shift))
+            other = self._observe(self.present, item.settings, float(shift))
             response = (weight * other * wanted).sum(axis=0) / (weight * other**2).sum(axis=0)
             cost.append((weight * (wanted - response * other) ** 2).sum(axis=0))
         misfit = np.array(cost)

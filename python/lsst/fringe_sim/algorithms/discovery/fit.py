@@ -30,6 +30,7 @@ __all__ = [
     "coordinates_of",
     "fit_model",
     "linearise_at",
+    "solve_symmetric",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -480,7 +481,7 @@ class Design:
         field_side = self._field_score(residual)
         solved = self.normal.solve(np.column_stack([field_side, self._coupling]))
         right = self._products(residual) - self._coupling.T @ solved[:, 0] - pull
-        step = _solve_symmetric(self._curvature + np.diag(ridge), right)
+        step = solve_symmetric(self._curvature + np.diag(ridge), right)
         return step, solved[:, 0] - solved[:, 1:] @ step
 
     def project(self, columns: Columns, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -570,6 +571,11 @@ class Fit:
             information=self.information[np.ix_(kept, kept)],
             spread=self.spread[kept],
         )
+
+    def held(self) -> Fit:
+        """The same place with all effects held."""
+        nothing = np.zeros(0)
+        return replace(self, coordinates=(), position=nothing, information=np.zeros((0, 0)), spread=nothing)
 
 
 def _ridge(coordinates: Sequence[Coordinate]) -> FloatArray:
@@ -810,10 +816,10 @@ def _profile(curvature: FloatArray, number: int) -> FloatArray:
         return np.zeros((0, 0))
     first = len(curvature) - number
     a, b, c = curvature[:first, :first], curvature[:first, first:], curvature[first:, first:]
-    return c - b.T @ _solve_symmetric(a, b)
+    return c - b.T @ solve_symmetric(a, b)
 
 
-def _solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
+def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solution scaled to a unit diagonal; directions without information stay put."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))

@@ -77,10 +77,7 @@ class Exposures(Protocol):
         """Weights of the places for every cell, ``(K, ny, nx)``; their sum is 1."""
 
     def further(self) -> Sequence[tuple[str, str, Exposures]]:
-        """Exposures that could be taken: a key, what to take, the present ones with as many of those behind them.
-
-        The text may hold ``{frames}``, their number.
-        """
+        """Exposures that could be taken: a key, what to take, the present ones with as many of those behind them."""
 
 
 @dataclass(eq=False)

@@ -25,14 +25,21 @@ from ..next_measurement import (
     RankedMeasurement,
 )
 from .cells import CellData
-from .fit import Coordinate, Fit, FullColumns, Problem, coordinate_derivative, linearise_at
-from .forward import Forward
+from .fit import (
+    Coordinate,
+    Fit,
+    FullColumns,
+    Problem,
+    coordinate_derivative,
+    linearise_at,
+    solve_symmetric,
+)
+from .forward import Exposures, Forward
+from .next_step import Values
 
 __all__ = ["FrameForecast", "laboratory_of"]
 
 FloatArray = NDArray[np.float64]
-
-Members = Mapping[str, Mapping[str, float]]
 
 
 class FrameForecast:
@@ -51,7 +58,7 @@ class FrameForecast:
     def __init__(self, problem: Problem, fit: Fit, coordinates: Mapping[str, tuple[Coordinate, ...]]) -> None:
         self.problem, self.fit, self.coordinates = problem, fit, coordinates
 
-    def ranked(self, name: str, rivals: Members) -> tuple[RankedMeasurement, ...]:
+    def ranked(self, name: str, rivals: Values) -> tuple[RankedMeasurement, ...]:
         """Measurements by how well they would tell an effect from others, best first.
 
         Parameters
@@ -75,23 +82,22 @@ class FrameForecast:
         return tuple(sorted(ranked, key=lambda item: -item.separation))
 
     def _candidates(
-        self, name: str, rivals: Members, present: FloatArray
+        self, name: str, rivals: Values, present: FloatArray
     ) -> list[tuple[Measurement, FloatArray]]:
         """What could be measured, and the information of all data then."""
         forward = self.problem.forward
         if forward.exposures is None:
             return []
-        frames, found = self.problem.cells.shape[0], []
+        found: list[tuple[Measurement, FloatArray]] = []
         for key, title, exposures in forward.exposures.further():
-            problem = _of_twice_as_many(self.problem, replace(forward, exposures=exposures))
-            information = self._information(problem, name, rivals)
-            found.append((Measurement(key, title.format(frames=frames)), information))
+            problem = _of_twice_as_many(self.problem, exposures)
+            found.append((Measurement(key, title), self._information(problem, name, rivals)))
         for measurement, laboratory in _laboratory_flats(forward.model):
             problem = _of_flats(self.problem, laboratory, measurement.series)
             found.append((measurement, present + self._information(problem, name, rivals)))
         return found
 
-    def _information(self, problem: Problem, name: str, rivals: Members) -> FloatArray:
+    def _information(self, problem: Problem, name: str, rivals: Values) -> FloatArray:
         """Products of signatures with one another, nuisances projected out.
 
         First that of the effect that was found; then, for each of the others, what the effect does beyond the other,
@@ -115,10 +121,8 @@ class FrameForecast:
 def _pair(information: FloatArray, own: slice) -> tuple[float, float]:
     """Likeness of the effect and another one, and the standard deviations by which the other fits worse."""
     difference, tangent = own.start, slice(own.start + 1, own.stop)
-    cross, square = information[tangent, difference], information[tangent, tangent]
-    scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
-    inverse = np.linalg.pinv(square / np.outer(scale, scale), rcond=1e-9, hermitian=True)
-    moved = float((cross / scale) @ inverse @ (cross / scale))
+    cross = information[tangent, difference]
+    moved = float(cross @ solve_symmetric(information[tangent, tangent], cross))
     left = max(float(information[difference, difference]) - moved, 0.0)
     strength = float(information[0, 0])
     likeness = math.sqrt(max(1.0 - left / strength, 0.0)) if strength > 0.0 else math.nan
@@ -151,7 +155,7 @@ def _laboratory_flats(model: FringeModel) -> list[tuple[FlatMeasurement, FringeM
     return [(FlatMeasurement("laboratory", title, series), FringeModel.from_setup(setup, settings))]
 
 
-def _of_twice_as_many(problem: Problem, forward: Forward) -> Problem:
+def _of_twice_as_many(problem: Problem, exposures: Exposures) -> Problem:
     """The data and as many further frames of the same noise."""
     cells = problem.cells
     geometry = replace(
@@ -167,7 +171,9 @@ def _of_twice_as_many(problem: Problem, forward: Forward) -> Problem:
         geometry=geometry,
         centroid=None if cells.centroid is None else np.tile(cells.centroid, (1, *twice)),
     )
-    return _problem_with(problem, both, forward.model, forward)
+    forward = _forward_like(problem.forward, both, problem.forward.model, exposures)
+    forward.scatter_um2 = problem.forward.scatter_um2
+    return _problem_with(problem, both, forward)
 
 
 def _of_flats(problem: Problem, model: FringeModel, series: FlatSeries) -> Problem:
@@ -182,17 +188,20 @@ def _of_flats(problem: Problem, model: FringeModel, series: FlatSeries) -> Probl
         cells.cell_px,
         RESPONSE_SCATTER / cells.cell_px,
     )
-    return replace(
-        _problem_with(problem, flats, model, replace(problem.forward, exposures=None)),
-        field_prior=0.0,
-        field_centre=None,
-    )
+    forward = _forward_like(problem.forward, flats, model, None)
+    return replace(_problem_with(problem, flats, forward), field_prior=0.0, field_centre=None)
 
 
-def _problem_with(problem: Problem, cells: CellData, model: FringeModel, forward: Forward) -> Problem:
-    own = Forward.of_cells(model, forward.catalogue, cells, forward.range_um, forward.exposures)
-    own.scatter_um2 = forward.scatter_um2 if forward.exposures is not None else None
+def _forward_like(
+    forward: Forward, cells: CellData, model: FringeModel, exposures: Exposures | None
+) -> Forward:
+    """Other data of the same thicknesses and effects."""
+    return Forward.of_cells(model, forward.catalogue, cells, forward.range_um, exposures)
+
+
+def _problem_with(problem: Problem, cells: CellData, forward: Forward) -> Problem:
+    """Other data with the same field, each exposure with a level of its own."""
     return replace(
-        problem, cells=cells, forward=own, level_basis=np.eye(cells.shape[0]), free_contrast=False,
+        problem, cells=cells, forward=forward, level_basis=np.eye(cells.shape[0]), free_contrast=False,
         reference=None,
     )  # fmt: skip

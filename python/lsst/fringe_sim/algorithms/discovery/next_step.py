@@ -14,7 +14,7 @@ from ..next_measurement import Measurement, RankedMeasurement, break_ambiguity, 
 from .cells import CellData
 from .verdict import NamedEffect
 
-__all__ = ["Ranking", "flats_ranked", "with_next_measurements"]
+__all__ = ["Ranking", "Values", "flats_ranked", "with_next_measurements"]
 
 MOST_RIVALS = 4
 """Members of a class, likeliest first, that a measurement is asked to tell from the effect."""

@@ -18,7 +18,6 @@ from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
 from .channels import Channel
 from .classes import EffectClass, classes_of, outsider_probability
-from .comparison import fringe_order_um
 from .describe import describe_residual, disagreement
 from .fit import Fit, fit_model
 from .forward import Exposures
@@ -513,7 +512,7 @@ class _Search:
         thickness = whole.problem.basis.expand(final.fit.field)
         # Of a few pixels, those of the same sensor that see the rest of a fringe.
         middle = 0.5 * float(thickness.min() + thickness.max())
-        order = fringe_order_um(self.cells.wavelength_nm, float(self.prepared.index.mean()))
+        order = float(self.model.fringe_order_um(np.median(self.cells.wavelength_nm)))
         half = 0.5 * max(float(np.ptp(thickness)) + 2e-3, order)
         limits = (middle - half, middle + half)
         return lambda effect, rivals: flats_ranked(

@@ -444,7 +444,7 @@ class Selector:
         name = fit.coordinates[-1].effect
         if not self.generic or self.has_many(name) or self.problem.forward.is_image_effect(name):
             return []
-        without = fit.without(name)
+        without = fit.without(name).held()
         state = self.state(without)
         features, slope = self.features(state, without, name), state.design.slope
         along = np.einsum("kwyx,wyx->kw", features, slope) ** 2 / (slope**2).sum(axis=(1, 2))

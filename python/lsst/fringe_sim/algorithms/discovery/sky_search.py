@@ -136,11 +136,14 @@ class SkyExposures:
         farthest = max(range(len(night)), key=lambda time: self._unlike(hours[time]))
         number = len(self.scales)
         other = ({**self.scales[0], **hours[farthest]},) * number
-        title = f"{{frames}} frames with the OH bands of another hour ({night.hours[farthest]:g} h after dusk in the "
-        title += "night of Guo et al. 2022)"
+        when = f"{night.hours[farthest]:g} h after dusk in the night of Guo et al. 2022"
         return [
-            ("repeat", "the same {frames} frames once more", self._with_further(self.scales)),
-            ("hour", title, self._with_further(other)),
+            ("repeat", f"the same {number} frames once more", self._with_further(self.scales)),
+            (
+                "hour",
+                f"{number} frames with the OH bands of another hour ({when})",
+                self._with_further(other),
+            ),
         ]
 
     def _unlike(self, scale: Mapping[str, float]) -> float:

@@ -12,7 +12,6 @@ from scipy.sparse.csgraph import connected_components
 from ...model import FringeModel
 from .basis import SplineBasis
 from .cells import CellData
-from .comparison import fringe_order_um
 
 __all__ = ["mended_thickness", "starting_thickness"]
 
@@ -159,11 +158,7 @@ def _running_mean(response: FloatArray, model: FringeModel, cells: CellData) -> 
 
 def _order_steps(model: FringeModel, cells: CellData) -> float:
     """Fringe order at the middle wavelength in search steps."""
-    middle = float(np.median(cells.wavelength_nm))
-    stack = model.system.stack
-    medium = stack.layers[stack.position(model.system.varying)].medium
-    index = float(np.real(medium.index(middle, model.system.temperature_k)))
-    return fringe_order_um(cells.wavelength_nm, index) / SEARCH_STEP_UM
+    return float(model.fringe_order_um(np.median(cells.wavelength_nm))) / SEARCH_STEP_UM
 
 
 def _correlate(template: FloatArray, cells: CellData) -> NDArray[np.float32]:
