@@ -31,8 +31,9 @@ lint: $(VENV)/.ready-test
 types: $(VENV)/.ready-test
 	$(BIN)/mypy
 
+# Two workers share the processors: threads of one that wait by spinning would keep the other from them.
 unit: $(VENV)/.ready-test
-	$(BIN)/pytest -n 2 $(PYTEST_ARGS)
+	OMP_WAIT_POLICY=passive OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 $(PYTEST_ARGS)
 
 docs: $(VENV)/.ready-test
 	$(BIN)/python -m sphinx -b html -W --keep-going -q doc doc/_build
