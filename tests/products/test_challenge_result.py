@@ -61,6 +61,23 @@ def test_summary_counts_visible_cases(result: ChallengeResult) -> None:
     assert summary["named_right"] == [3, 4]
 
 
+def test_every_named_effect_counts_once_in_the_pulls() -> None:
+    """Parameters of one effect are off together; those of two effects, or of two cases, are not."""
+    jitter = {f"wavelength_jitter.shift_{number}": -2.0 for number in range(12)}
+    cases = (
+        RIGHT,
+        replace(RIGHT, number=5, pulls={**jitter, "tilt.angle": 0.5}),
+        replace(RIGHT, kind="two", number=0, pulls={"roughness.sigma": 1.0}),
+    )
+    result = ChallengeResult(7, cases)
+    summary = result.summary()
+    assert result.pulls().size == 15
+    assert summary["pulled_effects"] == 4
+    np.testing.assert_allclose(summary["pull_mean"], np.mean([1.5, -2.0, 0.5, 1.0]))
+    np.testing.assert_allclose(summary["pull_std"], np.std([1.5, -2.0, 0.5, 1.0]))
+    assert math.isnan(ChallengeResult(7, (CLEAN,)).summary()["pull_mean"])
+
+
 def test_calibration_asks_whether_names_are_right(result: ChallengeResult) -> None:
     """A faint second effect that was not named makes the first name no worse."""
     table = result.calibration()

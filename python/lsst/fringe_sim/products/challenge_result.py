@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from collections import Counter
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -142,6 +143,17 @@ class ChallengeResult:
         """All pulls of exactly named effects."""
         return np.array([pull for case in self.cases for pull in case.pulls.values()])
 
+    def pull_weights(self) -> FloatArray:
+        """Weights of the pulls, by which every named effect counts once.
+
+        Parameters of one effect share their error: wavelengths of all exposures, for one, are off together.
+        """
+        effects = [
+            (case.kind, case.number, name.partition(".")[0]) for case in self.cases for name in case.pulls
+        ]
+        number = Counter(effects)
+        return np.array([1.0 / number[effect] for effect in effects])
+
     def summary(self) -> dict[str, Any]:
         """The numbers of the protocol."""
         null, one = self.of_kind("none"), self.of_kind("one")
@@ -149,7 +161,8 @@ class ChallengeResult:
         strong = [case for case in one if case.signal_to_noise >= VISIBLE]
         both = [case for case in two if case.weakest >= VISIBLE]
         faint = [case for case in two if not case.weakest >= VISIBLE]
-        pulls = self.pulls()
+        pulls, weights = self.pulls(), self.pull_weights()
+        pull_mean, pull_std = _moments(pulls, weights)
         shrink = [case.shrinkage for case in strong if case.right_class and math.isfinite(case.shrinkage)]
         named = [case for case in self.cases if case.verdict == "named"]
         alone = [case for case in strong if case.verdict == "named" and not any(case.ambiguous)]
@@ -162,12 +175,13 @@ class ChallengeResult:
             "two_right_class": [sum(case.right_class for case in both), len(both)],
             "one_of_two_faint_right": [sum(case.right_class for case in faint), len(faint)],
             "outsiders_named": [sum(case.verdict == "named" for case in outside), len(outside)],
-            "pull_mean": float(pulls.mean()) if pulls.size else math.nan,
+            "pulled_effects": round(weights.sum()),
+            "pull_mean": pull_mean,
             "pull_median": float(np.median(pulls)) if pulls.size else math.nan,
             "pull_width": float(1.4826 * np.median(np.abs(pulls - np.median(pulls))))
             if pulls.size
             else math.nan,
-            "pull_std": float(pulls.std()) if pulls.size else math.nan,
+            "pull_std": pull_std,
             "shrinkage_median": float(np.median(shrink)) if shrink else math.nan,
             "stated_probability": float(np.mean([case.probability for case in named])) if named else math.nan,
             "named_right": [sum(case.right_class for case in named), len(named)],
@@ -240,3 +254,11 @@ class ChallengeResult:
         for name, table in tables.items():
             table.write(folder / f"{name}.ecsv", format="ascii.ecsv", overwrite=True)
         return folder / "challenge.ecsv"
+
+
+def _moments(values: FloatArray, weights: FloatArray) -> tuple[float, float]:
+    """Weighted mean and standard deviation; not a number where there are no values."""
+    if not values.size:
+        return math.nan, math.nan
+    mean = float(np.average(values, weights=weights))
+    return mean, math.sqrt(float(np.average((values - mean) ** 2, weights=weights)))

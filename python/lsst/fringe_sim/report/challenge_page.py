@@ -182,6 +182,7 @@ _LEVELS = (
     ("two_right_class", "two visible effects: right classes", "95 %"),
     ("one_of_two_faint_right", "two effects, one too faint: right", ""),
     ("outsiders_named", "names for causes outside the catalogue", "none"),
+    ("pulled_effects", "effects named exactly", ""),
     ("pull_mean", "pulls: mean", "0 ± 0.1"),
     ("pull_std", "pulls: width", "1.0 ± 0.15"),
     ("shrinkage_median", "gap closed, part of the oracle's, median", "0.95"),
