@@ -98,6 +98,9 @@ UNEXPLAINED = replace(
         "spatial_power": [{"scale_px": 10.0, "power": 1.2, "probability": 0.1}],
         "amplifiers": [],
         "principal_modes": [3.0, 1.1, 1.0],
+        "places": [
+            {"y_px": 401.6, "x_px": 233.2, "diameter_px": 41.3, "excess_share": 0.76, "sigma": 31.0},
+        ],
     },
 )
 
@@ -166,6 +169,7 @@ def test_what_is_unexplained_is_described() -> None:
     assert "Tests that still fail: texture" in seen
     assert "roughness explains a part (probability 0.40)" in seen
     assert "Write the missing effect" in seen
+    assert re.search(r"402\s+233\s+41.3\s+76\s+31", seen)
     assert "To use it" not in seen
 
 

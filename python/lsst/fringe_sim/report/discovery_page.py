@@ -326,6 +326,9 @@ def _unexplained(report: Report, verdict: Verdict) -> None:
     if modes:
         listed = ", ".join(f"{value:.3g}" for value in modes)
         report.paragraph(f"Strength of the principal modes over the wavelengths (noise: 1): {listed}.")
+    if left.get("places"):
+        report.paragraph("Places that fit worse than the rest of the sensor:")
+        report.table(_place_table(left["places"]), "discovery_left_places")
 
 
 def _next(report: Report, verdict: Verdict) -> None:
@@ -402,6 +405,19 @@ def _curve_table(rows: Any) -> Table:
             table[name.removesuffix("_nm")].unit = "nm"
     for column in table.itercols():
         column.info.format = ".5g"
+    return table
+
+
+def _place_table(places: Any) -> Table:
+    """Places that fit worst, as a person looks for them."""
+    names = ("row", "column", "diameter", "part of the excess [%]", "worst cell [σ]")
+    rows = [
+        (item["y_px"], item["x_px"], item["diameter_px"], 100.0 * item["excess_share"], item["sigma"])
+        for item in places
+    ]
+    table = Table(rows=rows, names=names, units=("pix", "pix", "pix", None, None))
+    for column in table.itercols():
+        column.info.format = ".3g" if column.name not in names[:2] else ".0f"
     return table
 
 

@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn
+from scipy.ndimage import gaussian_filter, label
 from scipy.stats import chi2 as chi2_distribution
 
 from ...effects import AMPLIFIERS, ImageGeometry
+from ..flat_prep_options import GAUSSIAN_MAD
 from .channels import Channel, State, fringe_phase
 from .verdict import Where
 
-__all__ = ["describe_residual", "disagreement"]
+__all__ = ["describe_residual", "disagreement", "places_apart"]
 
 FloatArray = NDArray[np.float64]
 
 PHASE_BINS = 16
+
+PLACE_CELLS = 1.5
+"""Standard deviation of the window through which places are looked for [cells]."""
+
+PLACE_SIGMA = 6.0
+"""Standard deviations by which a place fits worse than the rest of the sensor."""
+
+LARGEST_PLACES = 0.25
+"""Part of the sensor beyond which a misfit is no longer one of places."""
+
+MOST_PLACES = 5
+"""Places that are listed, the worst first."""
 
 
 def disagreement(
@@ -67,7 +82,72 @@ def describe_residual(
         "spatial_power": _radial_power(state, cell_px),
         "amplifiers": _by_amplifier(state, geometry),
         "principal_modes": [float(x) for x in modes[:5]],
+        "places": places_apart(state.residual, geometry),
     }
+
+
+def places_apart(residual: FloatArray, geometry: ImageGeometry) -> list[dict[str, float]]:
+    """Places of the sensor that fit worse than the rest of it, the worst first.
+
+    Parameters
+    ----------
+    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Whitened residual; 0 where there are no data.
+    geometry : `ImageGeometry`
+        Where the cells lie.
+
+    Returns
+    -------
+    places : `list` [`dict`]
+        Row and column of the middle and diameter of a disk of the same area [px], part of the excess of all places
+        that lies here, and standard deviations of its worst cell. Empty where the misfit is everywhere.
+    """
+    used = residual != 0.0
+    number = used.sum(axis=0)
+    if min(number.shape) < 16:
+        return []
+    sigma = _badness(residual, number)
+    seen = sigma[number > 0]
+    if not seen.size:
+        return []
+    middle = float(np.median(seen))
+    sigma = (sigma - middle) / max(1.0, GAUSSIAN_MAD * float(np.median(np.abs(seen - middle))))
+    marked, found = label((sigma > PLACE_SIGMA) & (number > 0))
+    if found == 0 or (marked > 0).sum() > LARGEST_PLACES * seen.size:
+        return []
+    excess = (residual**2).sum(axis=0) - number
+    total = float(excess[marked > 0].sum())
+    cell_px = math.sqrt(geometry.cell_px[0] * geometry.cell_px[1])
+    rows = []
+    for one in range(1, found + 1):
+        inside = marked == one
+        weight = np.where(inside, np.maximum(excess, 0.0), 0.0)
+        rows.append(
+            {
+                "y_px": float((weight.sum(axis=1) * geometry.y_px).sum() / weight.sum()),
+                "x_px": float((weight.sum(axis=0) * geometry.x_px).sum() / weight.sum()),
+                "diameter_px": cell_px * 2.0 * math.sqrt(inside.sum() / math.pi),
+                "excess_share": float(excess[inside].sum()) / total,
+                "sigma": float(sigma[inside].max()),
+            }
+        )
+    return sorted(rows, key=lambda row: -row["excess_share"])[:MOST_PLACES]
+
+
+def _badness(residual: FloatArray, number: NDArray[np.int_]) -> FloatArray:
+    """Standard deviations by which the surroundings of every cell fit worse than noise, ``(ny, nx)``.
+
+    A smoothed sum of squares is nearly a χ²; its cube root is nearly Gaussian (Wilson & Hilferty 1931).
+    """
+    degrees = gaussian_filter(number.astype(float), PLACE_CELLS)
+    known = np.maximum(degrees, 1e-9)
+    # The square of a Gaussian window is a narrower one, of this area.
+    area = 1.0 / (4.0 * math.pi * PLACE_CELLS**2)
+    variance = area * gaussian_filter(number.astype(float), PLACE_CELLS / math.sqrt(2.0))
+    width = 2.0 / 9.0 * variance / known**2
+    ratio = gaussian_filter((residual**2).sum(axis=0), PLACE_CELLS) / known
+    sigma = (np.cbrt(ratio) - 1.0 + width) / np.sqrt(np.maximum(width, 1e-300))
+    return np.where(number > 0, sigma, 0.0)
 
 
 def _by_wavelength(state: State, phase: FloatArray, geometry: ImageGeometry) -> list[dict[str, float]]:
