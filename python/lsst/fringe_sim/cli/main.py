@@ -113,6 +113,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments : sequence of `str`, optional
         In place of ``sys.argv[1:]``.
     """
+    # Threads that wait for work by spinning keep a second command on the same machine from its processors. OpenMP
+    # reads this when it is loaded, with the first compiled loop.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     sys.exit(run(arguments))
 
 
