@@ -40,11 +40,29 @@ def chi2_with_free_levels(model: FloatArray, value: FloatArray, weight: FloatArr
     return float((weight * (value - level[:, None, None] * model) ** 2).sum())
 
 
-def chi2_with_free_fringes(model: FloatArray, value: FloatArray, weight: FloatArray) -> float:
-    """χ² with the best level and the best contrast, not a negative one, at each wavelength; all ``(W, ny, nx)``."""
-    total = np.maximum(weight.sum(axis=(1, 2)), 1e-300)[:, None, None]
-    fringe = model - (weight * model).sum(axis=(1, 2), keepdims=True) / total
-    rest = value - (weight * value).sum(axis=(1, 2), keepdims=True) / total
-    cross, square = (weight * fringe * rest).sum(axis=(1, 2)), (weight * fringe**2).sum(axis=(1, 2))
+def chi2_with_free_fringes(models: FloatArray, value: FloatArray, weight: FloatArray) -> FloatArray:
+    """χ² of several models, with the best level and the best contrast, not a negative one, at each wavelength.
+
+    Parameters
+    ----------
+    models : `numpy.ndarray`, shape ``(W, S, ny, nx)``
+        The models.
+    value, weight : `numpy.ndarray`, shape ``(W, ny, nx)``
+        Data and their inverse variance.
+
+    Returns
+    -------
+    chi2 : `numpy.ndarray`, shape ``(S,)``
+    """
+    waves = len(value)
+    weights = weight.reshape(waves, -1, 1)
+    total = np.maximum(weights.sum(axis=1), 1e-300)
+    data = value.reshape(waves, -1, 1)
+    rest = data - (weights * data).sum(axis=1, keepdims=True) / total[:, None]
+    flat = models.reshape(waves, models.shape[1], -1)
+    # Fringes are small: sums of squares are taken about a common middle.
+    flat = flat - ((flat[:, :1] @ weights) / total[:, None])
+    cross, mean = (flat @ (weights * rest))[..., 0], (flat @ weights)[..., 0] / total
+    square = np.einsum("wsn,wsn,wn->ws", flat, flat, weights[..., 0]) - mean**2 * total
     taken = np.divide(np.maximum(cross, 0.0) ** 2, square, out=np.zeros_like(cross), where=square > 0.0)
-    return float((weight * rest**2).sum() - taken.sum())
+    return np.asarray((weights * rest**2).sum() - taken.sum(axis=0))

@@ -86,12 +86,8 @@ class ThicknessFollower:
     def _best_shifts(self, settings: Mapping[str, float]) -> tuple[float, float]:
         """Shifts of all thicknesses with which fringes of any contrast fit best [µm]: of the nearest, and of all."""
         forward = self.problem.forward
-        chi2 = np.array(
-            [
-                chi2_with_free_fringes(forward.sampled(settings, self._few + shift).value, *self._compared)
-                for shift in self._shifts
-            ]
-        )
+        moved = self._few + self._shifts[:, None, None]
+        chi2 = chi2_with_free_fringes(forward.sampled(settings, moved).value, *self._compared)
         near = np.abs(np.arange(len(chi2)) - len(chi2) // 2) <= SHIFTS_PER_ORDER // 2
         nearest = np.flatnonzero(near)[int(np.argmin(chi2[near]))]
         return float(self._shifts[nearest]), float(self._shifts[int(np.argmin(chi2))])

@@ -120,9 +120,12 @@ class Forward:
     _rows_of: tuple[tuple[str, float], ...] | None = field(default=None, repr=False)
     place_weight: FloatArray | None = field(init=False, repr=False, default=None)
     _limits_um: tuple[float, float] = field(init=False, repr=False)
+    _by_name: dict[str, Effect] = field(init=False, repr=False)
+    _last_seen: tuple[FloatArray, FloatArray, FloatArray] | None = field(init=False, repr=False, default=None)
     _centroids: tuple[FloatArray, FloatArray | None] | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
+        self._by_name = {effect.name: effect for effect in self.catalogue}
         low, high = self.range_um
         self._limits_um = (max(low - FARTHEST_UM, 0.05), high + FARTHEST_UM)
         if self.centroid is not None:
@@ -239,7 +242,7 @@ class Forward:
         tables = self.table(before), self.table(after)
         images = self._image(before), self._image(after)
         if any(images):
-            first, _ = self._at_cells(tables[0], thickness_um)
+            first = self._seen_through(tables[0], thickness_um)
             second = first if tables[1] is tables[0] else self._at_cells(tables[1], thickness_um)[0]
             return self._on_image(images[1], second) - self._on_image(images[0], first)
         table = tables[1] - tables[0]
@@ -251,6 +254,13 @@ class Forward:
         if rows.size:
             result[rows] = self._at_cells(table, thickness_um, rows)[0]
         return result
+
+    def _seen_through(self, table: FloatArray, thickness_um: FloatArray) -> FloatArray:
+        """Value at all cells; kept, as derivatives of many effects on the image ask for it at one thickness."""
+        last = self._last_seen
+        if last is None or last[0] is not table or last[1] is not thickness_um:
+            last = self._last_seen = table, thickness_um, self._at_cells(table, thickness_um)[0]
+        return last[2]
 
     def _on_image(self, settings: Settings, value: FloatArray) -> FloatArray:
         """Cells with effects on the image."""
@@ -343,7 +353,7 @@ class Forward:
         return self._effect(name).couples_pixels
 
     def _effect(self, name: str) -> Effect:
-        return next(effect for effect in self.catalogue if effect.name == name)
+        return self._by_name[name]
 
     def _optical(self, settings: Settings) -> dict[str, float]:
         return {key: value for key, value in settings.items() if not self.is_image_effect(key.split(".")[0])}

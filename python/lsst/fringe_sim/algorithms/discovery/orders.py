@@ -104,13 +104,12 @@ def _places(
     part, middle = sampled_part(whole.size), float(whole.mean())
     for edge in (shifts[0], shifts[-1]):
         problem.forward.cover(whole * (1.0 + edge / middle))
-    fields = [whole[part[1:]] * (1.0 + shift / middle) for shift in shifts]
+    fields = whole[part[1:]] * (1.0 + shifts[:, None, None] / middle)
     value, weight = problem.cells.value[part], problem.cells.weight[part]
     best: dict[tuple[int, int], _Place] = {}
     for number, position in _single_steps(fit, moved):
         settings = {c.key: c.value(x) for c, x in zip(fit.coordinates, position, strict=True)}
-        models = (problem.forward.sampled(settings, field).value for field in fields)
-        chi2 = np.array([chi2_with_free_fringes(model, value, weight) for model in models])
+        chi2 = chi2_with_free_fringes(problem.forward.sampled(settings, fields).value, value, weight)
         for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
             inside = np.flatnonzero(np.abs(shifts - turn * order) <= 0.51 * order)
             if inside.size:

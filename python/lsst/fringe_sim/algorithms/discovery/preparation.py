@@ -254,7 +254,7 @@ def _better_start(
         smooth = basis.expand(basis.fit(thickness, seen))
         problem.forward.cover(smooth)
         value = problem.forward.predict(settings, smooth).value
-        chi2.append(chi2_with_free_fringes(value, problem.cells.value, problem.cells.weight))
+        chi2.append(chi2_with_free_fringes(value[:, None], problem.cells.value, problem.cells.weight)[0])
     return second if chi2[1] < MUCH_BETTER * chi2[0] else first
 
 
