@@ -273,7 +273,7 @@ class Forward:
         """Value and slope of some rows of a table, averaged over the cells; shape ``(R, ny, nx)``."""
         gradient = _gradient(thickness_um, self.seen)
         second, fourth = self._spread_in_cell(gradient)
-        place, beside = self._at_centroids(thickness_um, gradient)
+        place, rest = self._at_centroids(thickness_um, gradient)
         used = table if rows is None else table[rows]
         value, slope = (
             part.reshape(len(used), *thickness_um.shape)
@@ -283,8 +283,12 @@ class Forward:
         )
         if self.place_weight is not None:
             value, slope = self._at_places(value), self._at_places(slope)
-        if beside is not None:
-            value += slope * (beside if rows is None else beside[rows])
+        if rest is not None:
+            planes = np.arange(len(value)) if rows is None else rows
+            _move_to_centroids(
+                *(part.reshape(len(planes), -1) for part in (value, slope)),
+                gradient.reshape(2, -1), rest.reshape(*rest.shape[:2], -1), planes,
+            )  # fmt: skip
         return value, slope
 
     def _at_places(self, rows: FloatArray) -> FloatArray:
@@ -309,12 +313,11 @@ class Forward:
     def _at_centroids(
         self, thickness_um: FloatArray, gradient: FloatArray
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Thickness where the good pixels lie: common to all wavelengths, and what single ones differ from it."""
+        """Thickness where the good pixels lie at all wavelengths, and how far those of single ones lie from there."""
         if self._centroids is None:
             return thickness_um, None
         common, rest = self._centroids
-        place = thickness_um + (gradient * common).sum(axis=0)
-        return place, None if rest is None else gradient[0] * rest[0] + gradient[1] * rest[1]
+        return thickness_um + (gradient * common).sum(axis=0), rest
 
     def _spread_in_cell(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Second and fourth moment of the thickness within each cell [µm², µm⁴], without the scatter of its place.
@@ -432,6 +435,22 @@ def _interpolate(
                 value[w, first + j] = own_value[j, w]
                 slope[w, first + j] = own_slope[j, w]
     return value, slope
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _move_to_centroids(
+    value: FloatArray,
+    slope: FloatArray,
+    gradient: FloatArray,
+    rest: FloatArray,
+    planes: NDArray[np.intp],
+) -> None:  # pragma: no cover - compiled
+    """Add to the cells ``(R, n)`` of some planes what their centroids ``(2, W, n)`` change, to first order."""
+    for row in numba.prange(len(planes)):
+        plane = planes[row]
+        for i in range(value.shape[1]):
+            moved = gradient[0, i] * rest[0, plane, i] + gradient[1, i] * rest[1, plane, i]
+            value[row, i] += slope[row, i] * moved
 
 
 @numba.njit(cache=True, inline="always")

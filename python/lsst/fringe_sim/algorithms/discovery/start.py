@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,7 @@ HALF_WINDOW_UM = 0.12
 """Reach of the search around a neighbour's thickness [µm]; below half a fringe order."""
 
 CELLS_AT_ONCE = 256
-"""Cells whose correlations are made together: all that they need stays in the cache of a processor."""
+"""Cells that a processor correlates one after the other."""
 
 FEWEST_ROWS = 12
 """Rows and columns of cells from which on they are looked at together."""
@@ -162,22 +164,46 @@ def _order_steps(model: FringeModel, cells: CellData) -> float:
 
 
 def _correlate(template: FloatArray, cells: CellData) -> NDArray[np.float32]:
-    """Likelihood gain of the best positive contrast, ``(cells, thickness)``."""
-    amplitude = (cells.value - 1.0).reshape(cells.shape[0], -1)
-    weight = cells.weight.reshape(cells.shape[0], -1)
-    score = np.empty((amplitude.shape[1], template.shape[1]), np.float32)
-    for first in range(0, amplitude.shape[1], CELLS_AT_ONCE):
-        part = slice(first, first + CELLS_AT_ONCE)
-        w = weight[:, part]
-        total = np.maximum(w.sum(axis=0), 1e-30)  # a cell without data scores nothing
-        # An offset common to all wavelengths of the cell is free as well: pixel response, illumination.
-        mean = (w * amplitude[:, part]).sum(axis=0) / total
-        cross = (w * (amplitude[:, part] - mean)).T @ template
-        power = w.T @ template**2 - (w.T @ template) ** 2 / total[:, np.newaxis]
-        gain = np.where(cross > 0.0, cross, 0.0) / np.sqrt(np.maximum(power, 1e-30 * total[:, np.newaxis]))
-        score[part] = (
-            gain / np.sqrt(np.maximum((w * (amplitude[:, part] - mean) ** 2).sum(axis=0), 1e-300))[:, None]
-        )
+    """Correlation of every cell with the fringes, of the best positive contrast, ``(cells, thickness)``."""
+    waves = cells.shape[0]
+    amplitude = np.ascontiguousarray((cells.value - 1.0).reshape(waves, -1).T)
+    weight = np.ascontiguousarray(cells.weight.reshape(waves, -1).T)
+    return np.asarray(_correlations(amplitude, weight, np.ascontiguousarray(template), template**2))
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def _correlations(
+    amplitude: FloatArray, weight: FloatArray, template: FloatArray, square: FloatArray
+) -> NDArray[np.float32]:  # pragma: no cover - compiled
+    """Of cells ``(N, W)`` with fringes ``(W, D)`` and their squares.
+
+    An offset common to all wavelengths of a cell is free as well: pixel response, illumination.
+    """
+    number, waves = amplitude.shape
+    steps = template.shape[1]
+    score = np.empty((number, steps), np.float32)
+    for block in numba.prange((number + CELLS_AT_ONCE - 1) // CELLS_AT_ONCE):
+        cross, first, second = np.empty(steps), np.empty(steps), np.empty(steps)
+        for i in range(block * CELLS_AT_ONCE, min(number, (block + 1) * CELLS_AT_ONCE)):
+            total, mean = 1e-30, 0.0  # a cell without data scores nothing
+            for w in range(waves):
+                total += weight[i, w]
+                mean += weight[i, w] * amplitude[i, w]
+            mean /= total
+            cross[:], first[:], second[:] = 0.0, 0.0, 0.0
+            power = 1e-300
+            for w in range(waves):
+                own = weight[i, w]
+                signal = own * (amplitude[i, w] - mean)
+                power += signal * (amplitude[i, w] - mean)
+                for d in range(steps):
+                    cross[d] += signal * template[w, d]
+                    first[d] += own * template[w, d]
+                    second[d] += own * square[w, d]
+            root = math.sqrt(power)
+            for d in range(steps):
+                spread = max(second[d] - first[d] * first[d] / total, 1e-30 * total)
+                score[i, d] = max(cross[d], 0.0) / math.sqrt(spread) / root
     return score
 
 
