@@ -333,6 +333,28 @@ def test_moved_wavelengths_recompute_only_what_they_move(monkeypatch: pytest.Mon
     assert len(forward._rows) <= MOST_ROWS * len(WAVELENGTHS)
 
 
+def test_changes_are_differences_of_predictions(rng: np.random.Generator) -> None:
+    """Whatever was asked before: another thickness, pixels that are lost, a map known less well."""
+    centroid = 0.2 * rng.standard_normal((2, len(WAVELENGTHS), 12, 16))
+    geometry = ImageGeometry.of_pixels((12, 16), WAVELENGTHS, 20_000.0)
+    forward = Forward(FringeModel.from_setup("ts8_e2v"), EFFECTS, geometry, 1, (14.0, 16.0), centroid)
+    first, second = 15.0 + 0.3 * _smooth_field(12, 16) / 15.0, 14.8 + 0.02 * rng.standard_normal((12, 16))
+    gain, offset = {"amplifier_gain.C03": 0.01}, {"amplifier_offset.C11": 40.0}
+    beam = {**gain, "tilt.angle": 12.0}
+    for thickness, scatter in (
+        (first, None),
+        (second, None),
+        (second, np.full((12, 16), 2e-4)),
+        (first, None),
+    ):
+        forward.scatter_um2 = scatter
+        for before, after in (({}, gain), (gain, beam), (beam, offset), (gain, offset)):
+            seen = [forward.predict(settings, thickness).value for settings in (before, after)]
+            changed = forward.change(before, after, thickness)
+            np.testing.assert_allclose(changed, seen[1] - seen[0], rtol=0.0, atol=1e-13)
+            assert np.abs(changed).max() > 1e-4
+
+
 def test_only_parameters_of_exposures_that_there_are_are_free() -> None:
     effect = next(effect for effect in EFFECTS if effect.name == "wavelength_jitter")
     thickness = np.full((4, 4), 15.0)

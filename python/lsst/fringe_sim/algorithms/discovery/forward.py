@@ -121,7 +121,9 @@ class Forward:
     place_weight: FloatArray | None = field(init=False, repr=False, default=None)
     _limits_um: tuple[float, float] = field(init=False, repr=False)
     _by_name: dict[str, Effect] = field(init=False, repr=False)
-    _last_seen: tuple[FloatArray, FloatArray, FloatArray] | None = field(init=False, repr=False, default=None)
+    _last_seen: tuple[tuple[FloatArray, FloatArray, FloatArray | None], FloatArray] | None = field(
+        init=False, repr=False, default=None
+    )
     _centroids: tuple[FloatArray, FloatArray | None] | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
@@ -257,10 +259,10 @@ class Forward:
 
     def _seen_through(self, table: FloatArray, thickness_um: FloatArray) -> FloatArray:
         """Value at all cells; kept, as derivatives of many effects on the image ask for it at one thickness."""
-        last = self._last_seen
-        if last is None or last[0] is not table or last[1] is not thickness_um:
-            last = self._last_seen = table, thickness_um, self._at_cells(table, thickness_um)[0]
-        return last[2]
+        asked = table, thickness_um, self.scatter_um2
+        if self._last_seen is None or any(a is not b for a, b in zip(self._last_seen[0], asked, strict=True)):
+            self._last_seen = asked, self._at_cells(table, thickness_um)[0]
+        return self._last_seen[1]
 
     def _on_image(self, settings: Settings, value: FloatArray) -> FloatArray:
         """Cells with effects on the image."""
