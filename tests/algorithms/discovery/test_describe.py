@@ -43,6 +43,22 @@ def test_places_are_found_where_they_are(elsewhere: float, rng: np.random.Genera
     assert first["excess_share"] + second["excess_share"] == pytest.approx(1.0)
 
 
+def test_a_place_behind_lost_pixels_is_one_place(rng: np.random.Generator) -> None:
+    """Neither a bad column cuts it in two, nor is a sound cell beside it a place of its own."""
+    shape = (64, 64)
+    y, x = np.indices(shape)
+    for _ in range(30):
+        residual = rng.standard_normal((12, *shape))
+        residual[:, np.hypot(y - 30, x - 30) <= 3] *= rng.uniform(2.0, 5.0)
+        residual[:, :, rng.integers(28, 36)] = 0.0
+        residual[:, rng.random(shape) < 0.1] = 0.0
+        places = places_apart(residual, geometry_of(shape, 12))
+        assert len(places) == 1
+        assert places[0]["excess_share"] == 1.0
+        assert abs(places[0]["y_px"] / CELL_PX - 30.5) < 2.0
+        assert np.isfinite(list(places[0].values())).all()
+
+
 def test_a_misfit_everywhere_has_no_place(rng: np.random.Generator) -> None:
     wave = np.sin(np.arange(90) / 5.0)[np.newaxis, np.newaxis, :]
     residual = rng.standard_normal((12, 64, 90)) + 3.0 * wave

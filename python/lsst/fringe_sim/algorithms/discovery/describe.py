@@ -23,6 +23,9 @@ FloatArray = NDArray[np.float64]
 
 PHASE_BINS = 16
 
+FEWEST_ROWS = 16
+"""Rows and columns of cells from which on scales and places say something."""
+
 PLACE_CELLS = 1.5
 """Standard deviation of the window through which places are looked for [cells]."""
 
@@ -102,36 +105,40 @@ def places_apart(residual: FloatArray, geometry: ImageGeometry) -> list[dict[str
         Row and column of the middle and diameter of a disk of the same area [px], part of the excess of all places
         that lies here, and standard deviations of its worst cell. Empty where the misfit is everywhere.
     """
-    used = residual != 0.0
-    number = used.sum(axis=0)
-    if min(number.shape) < 16:
+    number = (residual != 0.0).sum(axis=0)
+    seen = number > 0
+    if min(number.shape) < FEWEST_ROWS or not seen.any():
         return []
     sigma = _badness(residual, number)
-    seen = sigma[number > 0]
-    if not seen.size:
-        return []
-    middle = float(np.median(seen))
-    sigma = (sigma - middle) / max(1.0, GAUSSIAN_MAD * float(np.median(np.abs(seen - middle))))
-    marked, found = label((sigma > PLACE_SIGMA) & (number > 0))
-    if found == 0 or (marked > 0).sum() > LARGEST_PLACES * seen.size:
+    middle = float(np.median(sigma[seen]))
+    sigma = (sigma - middle) / max(1.0, GAUSSIAN_MAD * float(np.median(np.abs(sigma[seen] - middle))))
+    # Cells without data in the midst of a place do not cut it in two.
+    bad = sigma > PLACE_SIGMA
+    if (bad & seen).sum() > LARGEST_PLACES * seen.sum():
         return []
     excess = (residual**2).sum(axis=0) - number
-    total = float(excess[marked > 0].sum())
+    places = [place for place in _pieces(bad) if excess[place].sum() > 0.0]
+    total = sum(float(excess[place].sum()) for place in places)
     cell_px = math.sqrt(geometry.cell_px[0] * geometry.cell_px[1])
     rows = []
-    for one in range(1, found + 1):
-        inside = marked == one
-        weight = np.where(inside, np.maximum(excess, 0.0), 0.0)
+    for place in places:
+        weight = np.where(place, np.maximum(excess, 0.0), 0.0)
         rows.append(
             {
                 "y_px": float((weight.sum(axis=1) * geometry.y_px).sum() / weight.sum()),
                 "x_px": float((weight.sum(axis=0) * geometry.x_px).sum() / weight.sum()),
-                "diameter_px": cell_px * 2.0 * math.sqrt(inside.sum() / math.pi),
-                "excess_share": float(excess[inside].sum()) / total,
-                "sigma": float(sigma[inside].max()),
+                "diameter_px": cell_px * 2.0 * math.sqrt(place.sum() / math.pi),
+                "excess_share": float(excess[place].sum()) / total,
+                "sigma": float(sigma[place & seen].max()),
             }
         )
     return sorted(rows, key=lambda row: -row["excess_share"])[:MOST_PLACES]
+
+
+def _pieces(marked: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Parts of an image that hang together."""
+    number, found = label(marked)
+    return [number == one for one in range(1, found + 1)]
 
 
 def _badness(residual: FloatArray, number: NDArray[np.int_]) -> FloatArray:
@@ -139,15 +146,14 @@ def _badness(residual: FloatArray, number: NDArray[np.int_]) -> FloatArray:
 
     A smoothed sum of squares is nearly a χ²; its cube root is nearly Gaussian (Wilson & Hilferty 1931).
     """
-    degrees = gaussian_filter(number.astype(float), PLACE_CELLS)
-    known = np.maximum(degrees, 1e-9)
+    degrees = number.astype(float)
+    known = np.maximum(gaussian_filter(degrees, PLACE_CELLS), 1e-9)
     # The square of a Gaussian window is a narrower one, of this area.
     area = 1.0 / (4.0 * math.pi * PLACE_CELLS**2)
-    variance = area * gaussian_filter(number.astype(float), PLACE_CELLS / math.sqrt(2.0))
+    variance = area * gaussian_filter(degrees, PLACE_CELLS / math.sqrt(2.0))
     width = 2.0 / 9.0 * variance / known**2
     ratio = gaussian_filter((residual**2).sum(axis=0), PLACE_CELLS) / known
-    sigma = (np.cbrt(ratio) - 1.0 + width) / np.sqrt(np.maximum(width, 1e-300))
-    return np.where(number > 0, sigma, 0.0)
+    return np.asarray((np.cbrt(ratio) - 1.0 + width) / np.sqrt(np.maximum(width, 1e-300)))
 
 
 def _by_wavelength(state: State, phase: FloatArray, geometry: ImageGeometry) -> list[dict[str, float]]:
@@ -214,7 +220,7 @@ def _harmonic(state: State, phase: FloatArray, harmonic: int) -> tuple[float, fl
 
 
 def _radial_power(state: State, cell_px: int) -> list[dict[str, float]]:
-    if min(state.thickness_um.shape) < 16:
+    if min(state.thickness_um.shape) < FEWEST_ROWS:
         return []
     power = np.mean([dctn(plane, norm="ortho") ** 2 for plane in state.residual], axis=0)
     ny, nx = power.shape
