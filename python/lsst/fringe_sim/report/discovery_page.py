@@ -416,8 +416,7 @@ def _place_table(places: Any) -> Table:
         for item in places
     ]
     table = Table(rows=rows, names=names, units=("pix", "pix", "pix", None, None))
-    for column in table.itercols():
-        column.info.format = ".3g" if column.name not in names[:2] else ".0f"
+    _format(table, **dict.fromkeys(names[:2], ".0f"), **dict.fromkeys(names[2:], ".3g"))
     return table
 
 

@@ -249,12 +249,12 @@ def _better_start(
     """
     basis = SplineBasis.of_grid((first.shape[0], first.shape[1]), SMOOTH_SPACING)
     seen = problem.cells.seen.astype(float)
-    chi2 = []
+    values = []
     for thickness in (first, second):
         smooth = basis.expand(basis.fit(thickness, seen))
         problem.forward.cover(smooth)
-        value = problem.forward.predict(settings, smooth).value
-        chi2.append(chi2_with_free_fringes(value[:, None], problem.cells.value, problem.cells.weight)[0])
+        values.append(problem.forward.predict(settings, smooth).value)
+    chi2 = chi2_with_free_fringes(np.stack(values, axis=1), problem.cells.value, problem.cells.weight)
     return second if chi2[1] < MUCH_BETTER * chi2[0] else first
 
 
