@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import inspect
+import math
 import pickle
 
 import pytest
 
 from lsst.fringe_sim import errors
-from lsst.fringe_sim.errors import FringeSimError, InputError, OutOfRangeError, UnknownNameError
+from lsst.fringe_sim.errors import (
+    FringeSimError,
+    InputError,
+    OutOfRangeError,
+    UnknownNameError,
+    to_number,
+)
 
 
 def test_message_has_source_field_value_and_allowed() -> None:
@@ -47,6 +54,27 @@ def test_source_can_be_added() -> None:
 
 
 def test_everything_derives_from_one_base() -> None:
-    for name in errors.__all__:
-        assert issubclass(getattr(errors, name), (FringeSimError, Warning))
-        assert inspect.getdoc(getattr(errors, name))
+    kinds = [getattr(errors, name) for name in errors.__all__ if inspect.isclass(getattr(errors, name))]
+    assert len(kinds) == len(errors.__all__) - 1
+    for kind in kinds:
+        assert issubclass(kind, (FringeSimError, Warning))
+        assert inspect.getdoc(kind)
+
+
+@pytest.mark.parametrize("digits", [400, 5000])
+def test_numbers_beyond_a_float_are_refused_in_words(digits) -> None:
+    """YAML and JSON hold integers of any length; Python neither converts nor even writes the longest."""
+    with pytest.raises(OutOfRangeError, match=r"fwhm is -inf; allowed: a number below 1\.8e308"):
+        to_number("fwhm", -(10**digits))
+    assert len(str(InputError("fwhm", 16**digits, "a number"))) < 600
+
+
+@pytest.mark.parametrize("value", [True, None, "wide", [1.0], {}])
+def test_what_is_no_number_is_refused(value) -> None:
+    with pytest.raises(InputError, match=r"own\.yaml: fwhm is .*; allowed: a number \[nm\]"):
+        to_number("fwhm", value, "a number [nm]", source="own.yaml")
+
+
+def test_numbers_and_their_text_are_taken() -> None:
+    assert to_number("fwhm", "2.5") == 2.5
+    assert math.isnan(to_number("fwhm", math.nan))

@@ -159,6 +159,7 @@ def test_order_is_that_of_the_catalogue() -> None:
         ({"bandwidth.fwhm": -1.0}, OutOfRangeError, "0.05 to 20"),
         ({"bandwidth.fwhm": float("nan")}, OutOfRangeError, "0.05 to 20"),
         ({"bandwidth.fwhm": "wide"}, InputError, "a number"),
+        ({"bandwidth.fwhm": 10**400}, OutOfRangeError, "a number below"),
         ({"bandwidth": 2.0}, InputError, "name.parameter=value"),
     ],
 )

@@ -301,6 +301,18 @@ def _numbers(low: float, high: float) -> st.SearchStrategy[float]:
     return st.one_of(sensible, sensible, sensible, sensible, odd)
 
 
+LARGE = 10**400
+"""An integer that no float can hold."""
+
+
+def _near(value: float) -> st.SearchStrategy[float]:
+    """Numbers as they stand in a file of a user: near one that is sound, now and then any."""
+    if not abs(value) < 1e300:
+        return _numbers(0.0, 1.0)
+    low, high = sorted((0.5 * value, 2.0 * value))
+    return st.one_of(_numbers(low, high), st.integers(-5, 5), st.just(LARGE))
+
+
 def _yaml_values() -> st.SearchStrategy[Any]:
     leaves = st.one_of(
         st.none(),
@@ -310,7 +322,7 @@ def _yaml_values() -> st.SearchStrategy[Any]:
         st.text(max_size=12),
         st.dates(),
         st.binary(max_size=8),
-        st.sampled_from(["ts8", "e2v_ccd250", "../../../etc/passwd", "/etc/passwd", "sky", "LSST", 10**400]),
+        st.sampled_from(["ts8", "e2v_ccd250", "../../../etc/passwd", "/etc/passwd", "sky", "LSST", LARGE]),
     )
     return st.recursive(
         leaves,
@@ -333,6 +345,7 @@ HOSTILE = (
     "? [1, 2]\n: 3",
     "{1: 2, [3]: 4}",
     "0x",
+    "bandwidth.fwhm: 0x" + "f" * 5000,
     "a: 0b",
     "\x00",
     "- \t- a",
@@ -363,6 +376,8 @@ def _alter_mapping(data: st.DataObject, content: Any) -> Any:
     if isinstance(content, list) and content and data.draw(st.integers(0, 2)):
         place = data.draw(st.integers(0, len(content) - 1))
         return [*content[:place], _alter_mapping(data, content[place]), *content[place + 1 :]]
+    if isinstance(content, int | float) and data.draw(st.integers(0, 3)):
+        return data.draw(_near(content))
     return data.draw(_yaml_values())
 
 
@@ -386,9 +401,7 @@ NAMES = [f"{effect.name}.{parameter.name}" for effect in EFFECTS for parameter i
 def effects_file(data: st.DataObject, folder: Path) -> None:
     """A file of effects, and the model with them."""
     keys = data.draw(st.lists(st.one_of(st.sampled_from(NAMES), st.text(max_size=20)), max_size=3))
-    valid = yaml.safe_dump(
-        {key: data.draw(_numbers(0.0, 3.0)) for key in keys} or {"bandwidth": {"fwhm": 2.4}}
-    )
+    valid = yaml.safe_dump({key: data.draw(_near(1.5)) for key in keys} or {"bandwidth": {"fwhm": 2.4}})
     path = _file(folder, _yaml_text(data, valid), "effects.yaml")
     setup = data.draw(st.sampled_from(["ts8_e2v", "ts8_itl"]))
     with guarded("effects files", folder):

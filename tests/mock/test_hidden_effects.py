@@ -114,6 +114,7 @@ def test_settings_may_be_flat_or_nested() -> None:
         ({"bandwidth.width": 3.0}, UnknownNameError, "fwhm"),
         ({"bandwidth": 3.0}, InputError, "name.parameter=value"),
         ({"bandwidth.fwhm": "wide"}, InputError, "a number"),
+        ({"bandwidth.fwhm": 10**400}, OutOfRangeError, "a number below"),
         ({"bandwidth.fwhm": 0.0}, OutOfRangeError, "0.05 to 20"),
         ({"bandwidth.fwhm": float("nan")}, OutOfRangeError, "0.05 to 20"),
     ],

@@ -8,7 +8,9 @@ value and what is allowed.
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable
+from typing import Any
 
 __all__ = [
     "ConvergenceError",
@@ -21,6 +23,7 @@ __all__ = [
     "StackError",
     "TableCacheWarning",
     "UnknownNameError",
+    "to_number",
 ]
 
 
@@ -52,7 +55,7 @@ class InputError(FringeSimError, ValueError):
 
     def __str__(self) -> str:
         where = f"{self.source}: " if self.source else ""
-        return f"{where}{self.field} is {self.value!r}; allowed: {self.allowed}"
+        return f"{where}{self.field} is {_shown(self.value)}; allowed: {self.allowed}"
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword arguments survive the trip between processes.
@@ -69,6 +72,14 @@ def _rebuild_input_error(
     error = kind.__new__(kind)
     InputError.__init__(error, field, value, allowed, source=source)
     return error
+
+
+def _shown(value: object) -> str:
+    try:
+        return repr(value)
+    except ValueError:
+        # Python writes no integer of more than a few thousand digits.
+        return f"{type(value).__name__} too long to be shown"
 
 
 class OutOfRangeError(InputError):
@@ -133,6 +144,38 @@ class ConvergenceError(FringeSimError):
 
 class TableCacheWarning(UserWarning):
     """A cached table is damaged or cannot be stored; the result is right, only slower to get."""
+
+
+def to_number(field: str, value: Any, allowed: str = "a number", *, source: str | None = None) -> float:
+    """Value from a user as a float, which may be infinite or NaN.
+
+    Parameters
+    ----------
+    field : `str`
+        What was given.
+    value : `object`
+        A number, or text that is one.
+    allowed : `str`
+        What would be accepted.
+    source : `str`, optional
+        File in which the value stands.
+
+    Raises
+    ------
+    InputError
+        Not a number; true and false are none.
+    OutOfRangeError
+        An integer beyond the largest float.
+    """
+    if isinstance(value, bool):
+        raise InputError(field, value, allowed, source=source)
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(field, value, allowed, source=source) from None
+    except OverflowError:
+        sign = -math.inf if value < 0 else math.inf
+        raise OutOfRangeError(field, sign, f"{allowed} below 1.8e308", source=source) from None
 
 
 def _shorten(names: list[str], most: int = 24) -> str:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..errors import InputError, OutOfRangeError, UnknownNameError, to_number
 from ..instrument.sky import SkySpectrum
 from ..optics.system import OpticalSystem
 from .image_geometry import ImageGeometry
@@ -240,11 +240,9 @@ def activate_effects(settings: Mapping[str, Any], effects: Sequence[Effect]) -> 
         if effect_name not in by_name:
             raise UnknownNameError("effect", effect_name, by_name)
         by_name[effect_name].parameter(parameter_name)
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            raise InputError(f"{effect_name}.{parameter_name}", value, "a number") from None
-        chosen.setdefault(effect_name, {})[parameter_name] = number
+        chosen.setdefault(effect_name, {})[parameter_name] = to_number(
+            f"{effect_name}.{parameter_name}", value
+        )
     return tuple(ActiveEffect(effect, chosen[effect.name]) for effect in effects if effect.name in chosen)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from astropy.io import fits
 from astropy.time import Time
 
-from ..errors import FrameFormatError, UnknownNameError
+from ..errors import FrameFormatError, InputError, UnknownNameError, to_number
 from .camera import Camera, Detector
 
 __all__ = ["DAY_ROLLOVER_H", "OBSERVATION_TYPES", "RawMetadata", "header_value"]
@@ -218,8 +218,8 @@ class _Header:
     def number(self, keyword: str, value: Any, allowed: str, accept: Callable[[float], bool]) -> float:
         """``value`` as a finite number that is accepted, or an error that names the keyword."""
         try:
-            number = math.nan if isinstance(value, bool) else float(value)
-        except (TypeError, ValueError):
+            number = to_number(keyword, value)
+        except InputError:
             number = math.nan
         if not (math.isfinite(number) and accept(number)):
             raise self.refuse(keyword, value, allowed)
@@ -399,7 +399,7 @@ def _date_obs(header: _Header) -> datetime.datetime:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 return Time(text, format=scale, scale="utc").to_datetime()
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             allowed = "YYYY-MM-DDThh:mm:ss.sss" if scale == "isot" else "a modified Julian date"
             raise header.refuse(keyword, value, allowed) from None
     raise header.refuse("DATE-OBS", None, "YYYY-MM-DDThh:mm:ss.sss, or MJD-OBS")

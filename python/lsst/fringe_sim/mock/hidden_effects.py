@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, laplace
 
-from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..errors import InputError, OutOfRangeError, UnknownNameError, to_number
 from ..resources import read_table
 from .optics import Film, FlatFieldOptics
 
@@ -168,10 +168,7 @@ def _flatten(settings: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
 
 
 def _number(what: str, value: Any, parameter: HiddenParameter) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise InputError(what, value, "a number") from None
+    number = to_number(what, value)
     low, high = parameter.bounds
     if not low <= number <= high:
         raise OutOfRangeError(f"{what} [{parameter.unit or '1'}]", number, f"{low:g} to {high:g}")

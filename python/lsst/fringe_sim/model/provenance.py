@@ -26,7 +26,7 @@ from typing import Any
 
 from .. import __version__
 from ..effects import EFFECTS, activate_effects, apply_to_system
-from ..errors import FrameFormatError, UnknownNameError
+from ..errors import FrameFormatError, InputError, UnknownNameError, to_number
 from ..optics.stack import LayerStack
 from ..optics.system import OpticalSystem
 from ..resources import REVISION_LENGTH, read_yaml, revision
@@ -103,9 +103,9 @@ def effects_of_header(header: Mapping[str, Any]) -> dict[str, float]:
     while f"EFFECT{number}" in header:
         name, value = str(header[f"EFFECT{number}"]), header.get(f"EFFVAL{number}")
         try:
-            found[name] = float(value)  # type: ignore[arg-type]
-        except (TypeError, ValueError):
-            raise FrameFormatError(f"EFFVAL{number}", value, f"a number, the value of {name}") from None
+            found[name] = to_number(f"EFFVAL{number}", value, f"a number, the value of {name}")
+        except InputError as error:
+            raise FrameFormatError(error.field, error.value, error.allowed) from None
         number += 1
     return found
 

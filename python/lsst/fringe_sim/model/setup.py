@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError, UnknownNameError
+from ..errors import InputError, UnknownNameError, to_number
 from ..optics.illumination import (
     Beam,
     GaussianProfile,
@@ -239,10 +239,8 @@ class _Reader:
 
     def numbers(self, key: str, count: int | None = None) -> list[float]:
         value = self._get(key)
-        good = isinstance(value, list) and all(
-            isinstance(item, int | float) and not isinstance(item, bool) for item in value
-        )
+        good = isinstance(value, list) and all(isinstance(item, int | float) for item in value)
         if not good or not value or (count is not None and len(value) != count):
             wanted = f"a list of {count} numbers" if count else "a list of numbers"
             raise InputError(f"{self._prefix}{key}", value, wanted, source=self.source)
-        return [float(item) for item in value]
+        return [to_number(f"{self._prefix}{key}", item, source=self.source) for item in value]

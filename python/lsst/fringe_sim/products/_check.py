@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FrameFormatError, InputError, OutOfRangeError
+from ..errors import FrameFormatError, InputError, OutOfRangeError, to_number
 from .mask import ALL_BITS
 
 __all__ = [
@@ -134,7 +134,7 @@ def check_number(
     """
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
         raise InputError(field, value, "a number")
-    number = float(value)
+    number = to_number(field, value)
     inside = (number > low if open_low else number >= low) and number <= high
     if not inside or (math.isinf(number) and not allow_inf):
         bracket = "(" if open_low else "["
