@@ -36,7 +36,7 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 
 PRIOR_WIDTH = 3.0
-"""Width of the weak Gaussian prior of a parameter in units of its prior scale."""
+"""Width of the weak Cauchy prior of a parameter in units of its prior scale: what is large is not drawn to null."""
 
 LARGEST_PHASE_STEP_UM = 0.06
 """Largest step of the fringe phase, as a thickness: a fifth of a fringe order."""
@@ -556,7 +556,7 @@ class Fit:
         """Uncertainty of the coordinates, weak prior and neighbouring minima included."""
         if not self.coordinates:
             return np.zeros(0)
-        total = self.information + np.diag(_ridge(self.coordinates))
+        total = self.information + np.diag(_ridge(self.coordinates, self.position))
         variance = np.maximum(np.diag(np.linalg.pinv(total, hermitian=True)), 0.0)
         return np.asarray(np.sqrt(variance + self.spread**2))
 
@@ -578,8 +578,13 @@ class Fit:
         return replace(self, coordinates=(), position=nothing, information=np.zeros((0, 0)), spread=nothing)
 
 
-def _ridge(coordinates: Sequence[Coordinate]) -> FloatArray:
-    return np.array([1.0 / (PRIOR_WIDTH * item.unit_step) ** 2 for item in coordinates])
+def _prior_widths(coordinates: Sequence[Coordinate]) -> FloatArray:
+    return np.array([PRIOR_WIDTH * item.unit_step for item in coordinates])
+
+
+def _ridge(coordinates: Sequence[Coordinate], position: FloatArray) -> FloatArray:
+    """Precision of the Gaussian prior that pulls at a position as the Cauchy prior does."""
+    return np.asarray(1.0 / (_prior_widths(coordinates) ** 2 + position**2))
 
 
 @dataclass(eq=False)
@@ -642,7 +647,7 @@ class _Solver:
         fixed: dict[str, float],
     ) -> None:
         self.problem, self.coordinates, self.fixed = problem, coordinates, fixed
-        self.ridge = _ridge(coordinates)
+        self.prior_widths = _prior_widths(coordinates)
 
     def settings(self, position: FloatArray) -> dict[str, float]:
         values = {c.key: c.value(x) for c, x in zip(self.coordinates, position, strict=True)}
@@ -659,7 +664,7 @@ class _Solver:
         return point
 
     def penalty(self, point: _Point) -> float:
-        return float((self.ridge * point.position**2).sum())
+        return float(np.log1p((point.position / self.prior_widths) ** 2).sum())
 
     def run(
         self,
@@ -759,8 +764,9 @@ class _Solver:
 
     def _improve(self, point: _Point, design: Design, damping: float) -> tuple[_Point | None, float]:
         levels = self.problem.n_levels
-        ridge = np.concatenate([np.zeros(levels), self.ridge])
-        pull = np.concatenate([np.zeros(levels), self.ridge * point.position])
+        own = _ridge(self.coordinates, point.position)
+        ridge = np.concatenate([np.zeros(levels), own])
+        pull = np.concatenate([np.zeros(levels), own * point.position])
         before = point.chi2 + self.penalty(point)
         held = np.zeros(len(ridge), dtype=bool)
         for _ in range(8):
@@ -801,7 +807,8 @@ def coordinate_derivative(
     size = coordinate.step or 1e-3 * coordinate.unit_step
     points = [at - size, at + size]
     if coordinate.quadratic:
-        points = [at, at + max(size, 1e-3 * at)]
+        size = max(size, 1e-3 * at)
+        points = [max(at - size, 0.0), at + size]
     elif coordinate.clip(points[0]) != points[0]:
         points[0] = at
     elif coordinate.clip(points[1]) != points[1]:

@@ -1,0 +1,83 @@
+"""Fits say how well they know an effect, and what is large is not drawn to null."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery import fit as fit_module
+from lsst.fringe_sim.algorithms.discovery.fit import (
+    Coordinate,
+    Fit,
+    Problem,
+    coordinate_derivative,
+    coordinates_of,
+    fit_model,
+)
+from lsst.fringe_sim.algorithms.discovery.preparation import prepare
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.model import FringeModel
+
+TILT = next(effect for effect in EFFECTS if effect.name == "tilt")
+
+
+@pytest.fixture(scope="module")
+def tilted() -> tuple[Problem, Fit]:
+    """A sensor that is tilted by so many degrees that only a part of it is not taken up by the thickness."""
+    for seed in range(1000):
+        case = draw_case("one", np.random.default_rng(seed), size=(48, 48), only=["tilt"])
+        if 12.0 < case.values["tilt.angle"] < 18.0:
+            break
+    without, near = (
+        prepare(case.cube, FringeModel.from_setup("ts8_e2v", effects), [TILT], 20_000)
+        for effects in ({}, case.values)
+    )
+    problem, null = replace(near.problem, forward=without.problem.forward), near.null
+    coordinates = coordinates_of(TILT, problem.forward, problem.basis.expand(null.field))
+    start = np.array([coordinates[0].coordinate(case.values["tilt.angle"])])
+    return problem, fit_model(problem, coordinates, start, null.field, null.levels)
+
+
+def held_at(problem: Problem, fit: Fit, position: float) -> float:
+    """χ² with the angle held and thickness and levels free."""
+    (item,) = fit.coordinates
+    return fit_model(
+        problem, (), np.zeros(0), fit.field, fit.levels, {item.key: item.value(position)}, iterations=60
+    ).chi2
+
+
+def test_curvature_is_that_of_the_misfit_with_everything_else_free(tilted, monkeypatch) -> None:
+    problem, fit = tilted
+    monkeypatch.setattr(fit_module, "CONVERGED", 1e-4)
+    away = 4.0 * fit.sigma[0]
+    middle, below, above = (held_at(problem, fit, fit.position[0] + sign * away) for sign in (0.0, -1.0, 1.0))
+    profile = (below + above - 2.0 * middle) / (2.0 * away**2)
+    assert fit.information[0, 0] == pytest.approx(profile, rel=0.2)
+
+
+def test_the_prior_draws_a_large_effect_by_a_part_of_its_uncertainty_only(tilted, monkeypatch) -> None:
+    problem, fit = tilted
+    assert fit.position[0] > 10.0 * fit.coordinates[0].unit_step  # far out in the prior
+    monkeypatch.setattr(fit_module, "PRIOR_WIDTH", 1e6)
+    free = fit_model(problem, fit.coordinates, fit.position, fit.field, fit.levels)
+    assert abs(fit.position[0] - free.position[0]) < 0.2 * fit.sigma[0]
+
+
+@pytest.mark.parametrize("at", [0.3, 4.0, 200.0])
+@pytest.mark.parametrize("quadratic", [False, True])
+def test_derivatives_are_central(at: float, quadratic: bool) -> None:
+    """A difference to one side would be wrong by 1 % to 10 % where the phase turns fast."""
+    item = Coordinate("tilt", "angle", 0.0, 0.0, 40.0, 3.0, quadratic, "deg")
+    at = at if quadratic else 0.1 * at
+
+    def change(low: dict[str, float], high: dict[str, float], thickness: np.ndarray) -> np.ndarray:
+        ends = (np.sin(item.coordinate(each["tilt.angle"]) + thickness) for each in (high, low))
+        return next(ends) - next(ends)
+
+    phase = np.linspace(0.0, 6.0, 20)
+    found = coordinate_derivative(SimpleNamespace(change=change), item, at, {}, phase)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found, np.cos(at + phase), atol=0.01)
