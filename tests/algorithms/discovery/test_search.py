@@ -97,6 +97,14 @@ def test_a_gradient_of_the_light_is_no_wide_ring() -> None:
     assert [effect.name for effect in verdict.effects] == ["illumination"]
 
 
+@pytest.mark.slow
+def test_what_only_all_data_show_is_looked_for() -> None:
+    """Behind a pedestal, a step of 6 sigma is noise to the part of the data that is searched, and not to all."""
+    case, rng = hidden_case(20291122, "two", 6)
+    verdict = discover(case.cube, case.setup, rng=rng)
+    assert {effect.name for effect in verdict.effects} == {"dark_pedestal", "midline_step"}
+
+
 def hidden_case(seed: int, kind: str, number: int) -> tuple[SealedCase, np.random.Generator]:
     """A case of a challenge, and the generator of its search."""
     parts = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)

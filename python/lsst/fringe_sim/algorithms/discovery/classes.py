@@ -28,6 +28,9 @@ LEAST_PROMISE = 4.0
 ALIKE = 0.8
 """Fall of χ² and cosine of signatures from which on a replacement is fitted."""
 
+MOST_OF_PROMISE = 0.9
+"""Part of the promised fall of χ² that a fit must bring, to be believed to be in the same valley as the set."""
+
 CHI2_PER_PARAMETER = 6.0
 """Fall of χ² that a further parameter must bring, for a fit to be as good as another."""
 
@@ -78,7 +81,7 @@ def classes_of(selector: Selector, chosen: Hypothesis, width: float) -> dict[str
 
 def _class_of(selector: Selector, chosen: Hypothesis, name: str, width: float) -> EffectClass:
     rest = tuple(other for other in chosen.names if other != name)
-    without = selector.hypothesis(rest, None, chosen.fit)
+    without = selector.improved(rest, chosen.fit)
     found = {name: chosen, **_replacements(selector, chosen, name, without)}
     _refit_rivals(selector, chosen, found, width)
     best = max(found.values(), key=lambda other: other.log_evidence)
@@ -122,7 +125,11 @@ def _replacements(
             alike = similarity(bare.design, own, features)
         names = (*without.names, candidate.name)
         if frozenset(names) in selector.fitted or alike > ALIKE:
-            found[candidate.name] = selector.hypothesis(names, candidate.start, without.fit)
+            rival = selector.hypothesis(names, candidate.start, without.fit)
+            # What was fitted before may be in another order, which promises nothing more here.
+            if without.fit.chi2 - rival.fit.chi2 < MOST_OF_PROMISE * candidate.promise:
+                rival = selector.improved(names, without.fit)
+            found[candidate.name] = rival
     return found
 
 

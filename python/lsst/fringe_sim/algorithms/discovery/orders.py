@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .comparison import chi2_with_free_fringes, fringe_order_um, sampled_part
 from .fit import Fit, Problem, fit_model
 
-__all__ = ["FINE_SCAN", "starts_in_other_orders"]
+__all__ = ["FINE_SCAN", "fields_in_other_orders", "starts_in_other_orders"]
 
 FloatArray = NDArray[np.float64]
 
@@ -24,6 +24,10 @@ ORDERS_REFITTED = 4
 
 LEAST_THICKNESS_UM, MOST_SIGMAS = 0.5, 4.0
 """Thinnest layer, and how far a map that is known may be moved, over its uncertainty."""
+
+
+NEIGHBOURING_ORDERS = (-2, -1, 1, 2)
+"""Orders in which an effect that shifts each wavelength by itself is looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +78,30 @@ def starts_in_other_orders(
     return [(position, field) for position, field, _ in found[:ORDERS_REFITTED]]
 
 
+def fields_in_other_orders(problem: Problem, field: FloatArray, index: float) -> list[FloatArray]:
+    """The field moved, in proportion, by one and two fringe orders to either side, where that leaves a layer.
+
+    For an effect with a shift of its own at each wavelength: it follows such a move by itself, as what an order more
+    lacks at the ends of the spectrum is a small part of a fringe.
+
+    Parameters
+    ----------
+    problem : `Problem`
+        Data and model.
+    field : `numpy.ndarray`, shape ``(M,)``
+        Field that is moved.
+    index : `float`
+        Refractive index of the layer.
+    """
+    whole, used = problem.basis.expand(field), problem.cells.seen.astype(float)
+    order, middle = fringe_order_um(problem.cells.wavelength_nm, index), float(whole.mean())
+    shifts = np.array(NEIGHBOURING_ORDERS, dtype=float) * order
+    return [
+        problem.basis.fit(whole * (1.0 + shift / middle), used)
+        for shift in shifts[_is_possible(problem, whole, shifts)]
+    ]
+
+
 def _fields(
     problem: Problem, places: Sequence[_Place], first_field: FloatArray
 ) -> list[tuple[_Place, FloatArray]]:
@@ -121,12 +149,15 @@ def _places(
 
 def _shifts(problem: Problem, whole: FloatArray, order: float) -> FloatArray:
     """Moves of the mean of a field [µm] that leave a layer everywhere, and the map where it is if it is known."""
-    steps = np.arange(-ORDERS_MOVED * STEPS_PER_ORDER, ORDERS_MOVED * STEPS_PER_ORDER + 1)
+    steps = np.arange(-ORDERS_MOVED * STEPS_PER_ORDER, ORDERS_MOVED * STEPS_PER_ORDER + 1, dtype=float)
     shifts = steps * (order / STEPS_PER_ORDER)
+    return np.asarray(shifts[_is_possible(problem, whole, shifts)])
+
+
+def _is_possible(problem: Problem, whole: FloatArray, shifts: FloatArray) -> NDArray[np.bool_]:
     middle = float(whole.mean())
     possible = (middle + shifts) * whole.min() / middle > LEAST_THICKNESS_UM
-    possible &= np.abs(shifts) * np.sqrt(problem.field_prior) <= MOST_SIGMAS
-    return np.asarray(shifts[possible])
+    return np.asarray(possible & (np.abs(shifts) * np.sqrt(problem.field_prior) <= MOST_SIGMAS))
 
 
 def _single_steps(fit: Fit, moved: Sequence[int]) -> list[tuple[int, FloatArray]]:

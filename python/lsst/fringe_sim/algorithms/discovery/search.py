@@ -287,18 +287,11 @@ class _Search:
         steps.append(self._step(selector, current, best))
         current = best
         while not steps[-1].consistent and len(current.names) < self.options.most_effects:
-            larger = self._enlarged(selector, current)
-            if not larger:
+            larger = self._one_more(selector, current)
+            if larger is None:
                 break
-            best = self._most_credible(selector, larger)
-            if not self._consistent(best):
-                best = self._most_credible(selector, self._in_other_orders(selector, larger))
-            if best.log_evidence < current.log_evidence + self.options.least_evidence:
-                break
-            if not self._consistent(best):
-                best = self._swapped(selector, best)
-            steps.append(self._step(selector, current, best))
-            current = best
+            steps.append(self._step(selector, current, larger))
+            current = larger
         while self._consistent(current) and len(current.names) < self.options.most_effects:
             better = self._surely_better(selector, current)
             if better is None:
@@ -309,6 +302,18 @@ class _Search:
         if complete.names != current.names:
             steps.append(self._step(selector, current, complete))
         return self._pruned(selector, complete), steps
+
+    def _one_more(self, selector: Selector, current: Hypothesis) -> Hypothesis | None:
+        """The most credible set with one effect more, if it is likelier."""
+        larger = self._enlarged(selector, current)
+        if not larger:
+            return None
+        best = self._most_credible(selector, larger)
+        if not self._consistent(best):
+            best = self._most_credible(selector, self._in_other_orders(selector, larger))
+        if best.log_evidence < current.log_evidence + self.options.least_evidence:
+            return None
+        return best if self._consistent(best) else self._swapped(selector, best)
 
     def _surely_better(self, selector: Selector, current: Hypothesis) -> Hypothesis | None:
         """The set with one effect more that no noise explains, though the tests without a catalogue see only noise.
@@ -470,7 +475,15 @@ class _Search:
                 whole, whole.null, chance, steps, "no effect of the catalogue explains it"
             )
         chosen, classes = self._classified(training, chosen, steps)
-        final = whole.with_channels(whole.settled(self._transfer(whole, chosen)))
+        final = self._of_all_data(whole, chosen)
+        room = len(chosen.names) < self.options.most_effects
+        if room and self._consistent(chosen) and not self._consistent(final):
+            self.say("a residual remains that only all data show")
+            larger = self._one_more(training, chosen)
+            if larger is not None:
+                steps.append(self._step(training, chosen, larger))
+                chosen, classes = self._classified(training, larger, steps)
+                final = self._of_all_data(whole, chosen)
         self.unseen = validate(
             whole.problem, whole.null.fit, final.fit, self.heldout, rich=self.prepared.rich
         )
@@ -534,6 +547,9 @@ class _Search:
             steps.append(self._step(training, chosen, likelier))
             chosen, classes = likelier, classes_of(training, likelier, self.options.class_width)
         return chosen, classes
+
+    def _of_all_data(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
+        return whole.with_channels(whole.settled(self._transfer(whole, chosen)))
 
     def _transfer(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
         """The chosen set fitted to all data."""

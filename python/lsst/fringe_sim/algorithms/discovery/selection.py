@@ -26,7 +26,7 @@ from .fit import (
     linearise_at,
 )
 from .following import ThicknessFollower
-from .orders import FINE_SCAN, starts_in_other_orders
+from .orders import FINE_SCAN, fields_in_other_orders, starts_in_other_orders
 
 __all__ = ["Candidate", "Hypothesis", "Selector"]
 
@@ -423,10 +423,7 @@ class Selector:
         trials = [(start, base.field) for start in starts]
         if scan:
             trials += [(start, base.field) for start in self._spread_starts(known.fit)]
-            moved = self._shifts_of_phase(known.fit)
-            trials += starts_in_other_orders(
-                self.problem, known.fit, moved, self.first_field, float(self.index.mean())
-            )
+            trials += self._starts_in_other_orders(known.fit)
         for start, thickness in trials:
             trial = fit_model(self.problem, coordinates, start, thickness, base.levels, rival=known.fit.chi2)
             if trial.chi2 < known.fit.chi2 - 1.0:
@@ -435,6 +432,14 @@ class Selector:
         self.fitted[frozenset(names)] = known
         return known
 
+    def _starts_in_other_orders(self, fit: Fit) -> list[tuple[FloatArray, FloatArray]]:
+        """Positions and fields from which the last effect may be found in another fringe order."""
+        moved, index = self._shifts_of_phase(fit), float(self.index.mean())
+        if moved and self.has_many(fit.coordinates[-1].effect):
+            fields = fields_in_other_orders(self.problem, fit.field, index)
+            return [(fit.position, field) for field in fields]
+        return starts_in_other_orders(self.problem, fit, moved, self.first_field, index)
+
     def shifts_phase(self, hypothesis: Hypothesis) -> bool:
         """Whether the last effect of a set shifts the phase of the fringes: its fit may be in the wrong order."""
         return bool(self._shifts_of_phase(hypothesis.fit))
@@ -442,7 +447,7 @@ class Selector:
     def _shifts_of_phase(self, fit: Fit) -> list[int]:
         """Coordinates of the last effect that do, at each wavelength by itself, what a change of thickness does."""
         name = fit.coordinates[-1].effect
-        if not self.generic or self.has_many(name) or self.problem.forward.is_image_effect(name):
+        if not self.generic or self.problem.forward.is_image_effect(name):
             return []
         without = fit.without(name).held()
         state = self.state(without)

@@ -1,0 +1,83 @@
+"""Effects with which the thickness settles in the wrong fringe order are found in the right one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery.classes import classes_of
+from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, fit_model
+from lsst.fringe_sim.algorithms.discovery.orders import fields_in_other_orders
+from lsst.fringe_sim.algorithms.discovery.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.model import FringeModel
+
+JITTER, CAUSE, RIVAL = "wavelength_jitter", "dark_pedestal", "contrast_loss"
+CATALOGUE = [effect for effect in EFFECTS if effect.name in (JITTER, CAUSE, RIVAL)]
+INDEX = 1.6
+
+
+@pytest.fixture(scope="module")
+def sensor() -> tuple[Problem, Fit, np.ndarray]:
+    """Flats whose wavelengths are off one by one, behind a pedestal; fit with both known; index of the layer."""
+    case = draw_case("two", np.random.default_rng(7), size=(48, 48), only=[JITTER, CAUSE])
+    without, known = (
+        prepare(case.cube, FringeModel.from_setup("ts8_e2v", effects), CATALOGUE, 20_000)
+        for effects in ({}, case.values)
+    )
+    return replace(known.problem, forward=without.problem.forward), known.null, known.index
+
+
+def fitted_at(
+    sensor: tuple[Problem, Fit, np.ndarray], selector: Selector, field: np.ndarray, *names: str
+) -> Fit:
+    """Fit of some effects that starts from a field."""
+    problem, known, _ = sensor
+    items = tuple(item for name in names for item in selector.coordinates[name])
+    return fit_model(problem, items, np.zeros(len(items)), field, known.levels, iterations=60)
+
+
+@pytest.fixture
+def selector(sensor) -> Selector:
+    problem, known, index = sensor
+    null = fit_model(problem, (), np.zeros(0), known.field, known.levels)
+    return Selector(problem, CATALOGUE, null, index)
+
+
+def test_fields_lie_whole_orders_away(sensor) -> None:
+    problem, known, _ = sensor
+    whole = problem.basis.expand(known.field)
+    moved = [problem.basis.expand(field) for field in fields_in_other_orders(problem, known.field, INDEX)]
+    order = 1e-3 * np.median(problem.cells.wavelength_nm) / (2.0 * INDEX)
+    np.testing.assert_allclose([(each - whole).mean() / order for each in moved], [-2, -1, 1, 2], atol=0.01)
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_wavelengths_that_are_off_are_found_from_another_order(sensor, selector, number: int) -> None:
+    """Each wavelength follows a wrong order by itself, to where only the ends of the spectrum tell."""
+    problem, known, _ = sensor
+    right = fitted_at(sensor, selector, known.field, CAUSE, JITTER)
+    away = fields_in_other_orders(problem, known.field, INDEX)[number]
+    wrong = fitted_at(sensor, selector, away, CAUSE, JITTER)
+    assert wrong.chi2 > right.chi2 + 50.0
+    selector.fitted[frozenset((CAUSE, JITTER))] = Hypothesis((CAUSE, JITTER), wrong, 0.0)
+    found = selector.improved((CAUSE, JITTER), wrong, scan=True)
+    assert found.fit.chi2 == pytest.approx(right.chi2, abs=2.0)
+
+
+def test_rivals_fitted_in_another_order_are_fitted_again(sensor, selector) -> None:
+    """What was compared before the right order was known says nothing."""
+    problem, known, _ = sensor
+    away = fields_in_other_orders(problem, known.field, INDEX)[1]
+    wrong = fitted_at(sensor, selector, away, JITTER, RIVAL)
+    selector.fitted[frozenset((JITTER, RIVAL))] = Hypothesis((JITTER, RIVAL), wrong, 0.0)
+    chosen = selector.hypothesis((JITTER, CAUSE), None, fitted_at(sensor, selector, known.field, JITTER))
+    classes_of(selector, chosen, 5.0)
+    rival = selector.hypothesis((JITTER, RIVAL))
+    right = fitted_at(sensor, selector, known.field, JITTER, RIVAL)
+    assert wrong.chi2 > right.chi2 + 50.0
+    assert rival.fit.chi2 == pytest.approx(right.chi2, abs=2.0)
