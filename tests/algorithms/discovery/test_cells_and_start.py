@@ -18,7 +18,7 @@ from lsst.fringe_sim.algorithms.discovery.forward import MOST_ROWS, Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.search import _chance_of
 from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector
-from lsst.fringe_sim.algorithms.discovery.start import mended_thickness, starting_thickness
+from lsst.fringe_sim.algorithms.discovery.start import _mend_patches, mended_thickness, starting_thickness
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.effects.image_geometry import AMPLIFIERS
 from lsst.fringe_sim.mock import challenge
@@ -97,6 +97,15 @@ def test_patches_in_a_wrong_order_are_taken_back() -> None:
     spoiled[33, 7] += ORDER_UM
     mended = mended_thickness(FringeModel.from_setup("ts8_e2v"), cells, spoiled)
     assert np.abs(mended - truth).max() < 0.5 * ORDER_UM
+
+
+def test_halves_of_the_same_size_are_two_patches(rng: np.random.Generator) -> None:
+    """Neither is larger than the other, and neither small enough to be taken back."""
+    steps = np.full((12, 20), 30)
+    steps[:, 10:] += 29
+    score = rng.random((steps.size, 100)).astype(np.float32)
+    mended = _mend_patches(score, steps.ravel(), (12, 20), 29.0)
+    np.testing.assert_array_equal(mended, steps.ravel())
 
 
 def test_ragged_patches_are_taken_back_by_the_surface_around_them(rng: np.random.Generator) -> None:

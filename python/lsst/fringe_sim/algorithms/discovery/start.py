@@ -333,12 +333,13 @@ def _turns_of_patches(
     best: NDArray[np.int64], patch: NDArray[np.int32], border: NDArray[np.int64], size: NDArray[np.int64],
     order: float,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """Orders by which each patch stands above the largest of its neighbours."""
+    """Orders by which each patch stands above the largest of its neighbours; of two of a size, one is the larger."""
     turns = np.zeros(size.size, dtype=np.int64)
     both = np.concatenate([border, border[:, ::-1]])
     own, other = patch[both[:, 0]], patch[both[:, 1]]
     jump = best[both[:, 0]] - best[both[:, 1]]
-    use = size[other] > size[own]
+    larger = size[other] > size[own]
+    use = larger | ((size[other] == size[own]) & (other < own))  # halves of the same size are two as well
     own, other, jump = own[use], other[use], jump[use]
     largest = np.full(size.size, -1)
     by_size = np.lexsort((-other, size[other]))
