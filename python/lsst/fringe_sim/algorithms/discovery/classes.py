@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from .fit import Fit
 from .selection import Hypothesis, Selector, similarity
 
-__all__ = ["EffectClass", "classes_of", "outsider_probability"]
+__all__ = ["EffectClass", "classes_in_all_data", "classes_of", "outsider_probability"]
 
 MIMICKED = 0.05
 """Part of the causes outside the catalogue that effects in it can mimic, however strong they are."""
@@ -27,6 +28,9 @@ other sizes and in other orders: those that shift the phase."""
 LEAST_PROMISE = 4.0
 ALIKE = 0.8
 """Fall of χ² and cosine of signatures from which on a replacement is fitted."""
+
+WIDTHS_BEHIND = 3.0
+"""How far a rival may be behind in the part of the data that is searched and still be compared in all data."""
 
 MOST_OF_PROMISE = 0.9
 """Part of the promised fall of χ² that a fit must bring, to be believed to be in the same valley as the set."""
@@ -51,6 +55,8 @@ class EffectClass:
         Signal to noise of what the effect explains.
     best : `Hypothesis`
         The likeliest set of all, with this effect or with another in its place.
+    rivals : `dict` [`str`, `Hypothesis`]
+        Every set that was compared with the first, by the effect in this one's place.
     """
 
     members: dict[str, float]
@@ -58,6 +64,7 @@ class EffectClass:
     values: dict[str, dict[str, float]]
     significance: float
     best: Hypothesis
+    rivals: dict[str, Hypothesis]
 
 
 def classes_of(selector: Selector, chosen: Hypothesis, width: float) -> dict[str, EffectClass]:
@@ -84,14 +91,56 @@ def _class_of(selector: Selector, chosen: Hypothesis, name: str, width: float) -
     without = selector.improved(rest, chosen.fit)
     found = {name: chosen, **_replacements(selector, chosen, name, without)}
     _refit_rivals(selector, chosen, found, width)
-    best = max(found.values(), key=lambda other: other.log_evidence)
+    significance = math.sqrt(max(without.fit.chi2 - chosen.fit.chi2, 0.0))
+    return _compared(name, found, width, significance)
+
+
+def _compared(name: str, found: dict[str, Hypothesis], width: float, significance: float) -> EffectClass:
+    """Class of an effect among sets with it and with others in its place."""
+    chosen, best = found[name], max(found.values(), key=lambda other: other.log_evidence)
     top = best.log_evidence
     weight = {n: math.exp(max(other.log_evidence - top, -700.0)) for n, other in found.items()}
     total = sum(weight.values())
-    members = {n: weight[n] / total for n, other in found.items() if _is_alike(other, chosen, top, width)}
+    members = {
+        n: weight[n] / total
+        for n, other in found.items()
+        if n == name or _is_alike(other, chosen, top, width)
+    }
     values = {n: _values_of(n, found[n].fit) for n in members}
-    significance = math.sqrt(max(without.fit.chi2 - chosen.fit.chi2, 0.0))
-    return EffectClass(members, sum(members.values()), values, significance, best)
+    rivals = {n: other for n, other in found.items() if n != name}
+    return EffectClass(members, sum(members.values()), values, significance, best, rivals)
+
+
+def classes_in_all_data(
+    classes: Mapping[str, EffectClass],
+    chosen: Hypothesis,
+    final: Hypothesis,
+    fitted_to_all: Callable[[Hypothesis], Hypothesis],
+    width: float,
+) -> dict[str, EffectClass]:
+    """Classes as all data see them: a rival that the part searched all but excludes may be the likelier one in all.
+
+    Parameters
+    ----------
+    classes : mapping [`str`, `EffectClass`]
+        Classes of the effects in the part that was searched.
+    chosen, final : `Hypothesis`
+        The set fitted to that part, and to all data.
+    fitted_to_all : callable
+        Fits a set to all data, from its fit to the part.
+    width : `float`
+        Difference in log evidence within which effects are one class.
+
+    Returns
+    -------
+    classes : `dict` [`str`, `EffectClass`]
+    """
+    least = chosen.log_evidence - WIDTHS_BEHIND * width
+    found = {}
+    for name, group in classes.items():
+        near = {n: fitted_to_all(h) for n, h in group.rivals.items() if h.log_evidence > least}
+        found[name] = _compared(name, {name: final, **near}, width, group.significance) if near else group
+    return found
 
 
 def _refit_rivals(selector: Selector, chosen: Hypothesis, found: dict[str, Hypothesis], width: float) -> None:

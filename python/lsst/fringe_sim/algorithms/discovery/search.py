@@ -17,7 +17,7 @@ from ...effects import EFFECTS, Effect
 from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
 from .channels import Channel
-from .classes import EffectClass, classes_of, outsider_probability
+from .classes import EffectClass, classes_in_all_data, classes_of, outsider_probability
 from .describe import describe_residual, disagreement
 from .fit import Fit, fit_model
 from .forward import Exposures
@@ -484,6 +484,9 @@ class _Search:
                 steps.append(self._step(training, chosen, larger))
                 chosen, classes = self._classified(training, larger, steps)
                 final = self._of_all_data(whole, chosen)
+        classes = classes_in_all_data(
+            classes, chosen, final, lambda rival: self._transfer(whole, rival), self.options.class_width
+        )
         self.unseen = validate(
             whole.problem, whole.null.fit, final.fit, self.heldout, rich=self.prepared.rich
         )

@@ -1,0 +1,55 @@
+"""Effects are one class if all data, not only the part that was searched, cannot tell them apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery.classes import EffectClass, classes_in_all_data
+from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit
+from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis
+
+WIDTH = 5.0
+NEAR, FAR = "contrast_loss", "bandwidth"
+
+
+def fitted(name: str, log_evidence: float) -> Hypothesis:
+    item = Coordinate(name, "size", 0.0, -1.0, 1.0, 0.1, False, "")
+    settings, one = {f"{name}.size": 0.2}, np.ones(1)
+    fit = Fit(
+        settings, (item,), 0.2 * one, one, 0.0 * one, -2.0 * log_evidence, np.eye(1), 5, True
+    )  # fmt: skip
+    return Hypothesis((name,), fit, log_evidence)
+
+
+def class_in_part() -> tuple[Hypothesis, EffectClass]:
+    chosen = fitted("roughness", 60.0)
+    rivals = {NEAR: fitted(NEAR, 60.0 - 2.0 * WIDTH), FAR: fitted(FAR, 60.0 - 4.0 * WIDTH)}
+    return chosen, EffectClass({"roughness": 1.0}, 1.0, {}, 11.0, chosen, rivals)
+
+
+def in_all_data(near: float) -> EffectClass:
+    chosen, group = class_in_part()
+    known = {NEAR: fitted(NEAR, near)}  # one far behind is not fitted again
+    final = fitted("roughness", 80.0)
+    return classes_in_all_data(
+        {"roughness": group}, chosen, final, lambda rival: known[rival.names[0]], WIDTH
+    )["roughness"]
+
+
+def test_a_rival_that_was_behind_in_a_part_joins_where_all_data_want_it() -> None:
+    group = in_all_data(79.0)
+    share = np.exp(-1.0) / (1.0 + np.exp(-1.0))
+    assert group.members == pytest.approx({"roughness": 1.0 - share, NEAR: share})
+    assert group.values[NEAR] == {"size": 0.2}
+    assert group.probability == pytest.approx(1.0)
+
+
+def test_one_that_is_behind_in_all_data_does_not() -> None:
+    assert set(in_all_data(70.0).members) == {"roughness"}
+
+
+def test_the_effect_that_was_chosen_stays_in_its_class() -> None:
+    group = in_all_data(90.0)
+    assert set(group.members) == {"roughness", NEAR}
+    assert group.members[NEAR] > 0.99
