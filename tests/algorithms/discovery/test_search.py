@@ -105,6 +105,18 @@ def test_what_only_all_data_show_is_looked_for() -> None:
     assert {effect.name for effect in verdict.effects} == {"dark_pedestal", "midline_step"}
 
 
+@pytest.mark.slow
+def test_cells_get_finer_where_a_blur_hid_how_fine_the_light_was() -> None:
+    """Behind 1.8 px of diffusion, cells of 2 px hold what is left of fringes of 5 px, and not what they were."""
+    parts = np.random.default_rng([7, 0]).spawn(2)
+    case = draw_case("one", parts[0], only=["charge_diffusion"])
+    verdict = discover(case.cube, case.setup, rng=parts[1])
+    assert [effect.name for effect in verdict.effects] == ["charge_diffusion"]
+    found = verdict.effects[0].parameters["sigma"]
+    assert abs(found.value - case.values["charge_diffusion.sigma"]) < 4.0 * found.sigma
+    assert verdict.data["cell_px"] == 1
+
+
 def hidden_case(seed: int, kind: str, number: int) -> tuple[SealedCase, np.random.Generator]:
     """A case of a challenge, and the generator of its search."""
     parts = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 
 from ...effects import Effect
 from ...errors import InputError
@@ -22,7 +23,7 @@ from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_varian
 from .outliers import spoiled_cells
 from .start import mended_thickness, starting_thickness
 
-__all__ = ["Prepared", "check_setup", "prepare", "prepare_again", "why_too_poor"]
+__all__ = ["Prepared", "check_setup", "prepare", "prepare_again", "prepare_finer", "why_too_poor"]
 
 FloatArray = NDArray[np.float64]
 
@@ -166,9 +167,7 @@ def prepare(
 
     The thickness must be known where the light of the ``exposures`` is not that of flats.
     """
-    size = finest_useful_cell(cube, most_cells=most_cells)
-    cells = bin_cube(cube, size)
-    cells = cells.window(*_part_searched(cells.shape[1:], LARGEST_SEARCH * most_cells))
+    cells = _cells_of(cube, finest_useful_cell(cube, most_cells=most_cells), most_cells)
     stack = model.system.stack
     medium = stack.layers[stack.position(model.system.varying)].medium
     index = np.real(medium.index(cells.wavelength_nm, model.system.temperature_k))
@@ -179,8 +178,49 @@ def prepare(
     if not _is_rich(cells):
         return _prepare_few(cells, forward, start, index)
     problem = Problem(cells, forward, CellBasis(start.shape), _free_levels(cells))
-    problem, fit, cells = _without_spoiled(*_choose_field(problem, start, {}), cells)
+    problem, fit, cells = _without_spoiled(*_choose_field(problem, start, {}), cells, {})
     return _settle(problem, fit, cells, index)
+
+
+def prepare_finer(
+    cube: FringeCube, prepared: Prepared, fit: Fit, thickness_um: FloatArray, most_cells: int
+) -> Prepared:
+    """Data in cells of half the size, with field and noise as judged with an effect in the model.
+
+    Cells are chosen by what is seen of the pattern. An effect that blurs it hides how fine the light was.
+
+    Parameters
+    ----------
+    cube : `FringeCube`
+        The data.
+    prepared : `Prepared`
+        Their larger cells, without a map of the thickness.
+    fit : `Fit`
+        Fit with the effect.
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness of all larger cells in that fit.
+    most_cells : `int`
+        As of `prepare`.
+    """
+    larger, old = prepared.problem.cells, prepared.problem.forward
+    cells = _cells_of(cube, larger.cell_px // 2, most_cells)
+    places = np.meshgrid(cells.geometry.y_px, cells.geometry.x_px, indexing="ij")
+    between = RegularGridInterpolator(
+        (larger.geometry.y_px, larger.geometry.x_px), thickness_um, bounds_error=False, fill_value=None
+    )
+    start = np.asarray(between(np.stack(places, axis=-1)))
+    limits = (float(start.min()) - 0.5, float(start.max()) + 0.5)
+    forward = Forward.of_cells(old.model, old.catalogue, cells, limits, old.exposures)
+    problem = Problem(cells, forward, CellBasis(start.shape), _free_levels(cells))
+    problem, field_fit, cells = _without_spoiled(
+        *_choose_field(problem, start, fit.settings), cells, fit.settings
+    )
+    return replace(_settle(problem, field_fit, cells, prepared.index), guess=dict(fit.settings))
+
+
+def _cells_of(cube: FringeCube, size: int, most_cells: int) -> CellData:
+    cells = bin_cube(cube, size)
+    return cells.window(*_part_searched(cells.shape[1:], LARGEST_SEARCH * most_cells))
 
 
 def _part_searched(shape: tuple[int, ...], most: int) -> tuple[slice, slice]:
@@ -296,7 +336,7 @@ def _prepare_known(
     problem = Problem(cells, forward, basis, _free_levels(cells), prior, centre, free_contrast=rich)
     fit = fit_model(problem, (), np.zeros(0), centre)
     if rich:
-        problem, fit, spoiled = _spoiled_of(problem, fit)
+        problem, fit, spoiled = _spoiled_of(problem, fit, {})
         cells = cells.restricted(~spoiled)
         problem = _settle(problem, fit, cells, index).problem
         problem, fit, taken = _with_map_as_good_as_it_is(problem, centre)
@@ -391,18 +431,22 @@ def _settle(
     return Prepared(problem, settled, noise, index, _is_rich(stated), stated, tuple(notes), fit.field)
 
 
-def _without_spoiled(problem: Problem, fit: Fit, stated: CellData) -> tuple[Problem, Fit, CellData]:
-    """Fit and data without the cells that something spoiled in one exposure."""
+def _without_spoiled(
+    problem: Problem, fit: Fit, stated: CellData, settings: Mapping[str, float]
+) -> tuple[Problem, Fit, CellData]:
+    """Fit with some effects, and data, without the cells that something spoiled in one exposure."""
     start = problem.basis.expand(fit.field)
-    problem, fit, spoiled = _spoiled_of(problem, fit)
+    problem, fit, spoiled = _spoiled_of(problem, fit, settings)
     if not spoiled.any():
         return problem, fit, stated
     cells = stated.restricted(~spoiled)
     # They may have drawn the field into finer coefficients.
-    return *_choose_field(problem.with_cells(cells), start, {}), cells
+    return *_choose_field(problem.with_cells(cells), start, settings), cells
 
 
-def _spoiled_of(problem: Problem, fit: Fit) -> tuple[Problem, Fit, NDArray[np.bool_]]:
+def _spoiled_of(
+    problem: Problem, fit: Fit, settings: Mapping[str, float]
+) -> tuple[Problem, Fit, NDArray[np.bool_]]:
     """Cells that something spoiled in one exposure, and the fit without them."""
     spoiled = np.zeros(problem.cells.shape, dtype=bool)
     for _ in range(SPOILED_ROUNDS):
@@ -412,7 +456,7 @@ def _spoiled_of(problem: Problem, fit: Fit) -> tuple[Problem, Fit, NDArray[np.bo
         if fresh.sum() <= FEW_SPOILED * used.sum():
             break
         problem = problem.with_cells(problem.cells.restricted(~spoiled))
-        fit = fit_model(problem, (), np.zeros(0), fit.field, fit.levels)
+        fit = fit_model(problem, (), np.zeros(0), fit.field, fit.levels, settings)
     return problem, fit, spoiled
 
 

@@ -23,7 +23,7 @@ from .fit import Fit, fit_model
 from .forward import Exposures
 from .next_frames import FrameForecast
 from .next_step import Ranking, flats_ranked, with_next_measurements
-from .preparation import Prepared, check_setup, prepare, prepare_again, why_too_poor
+from .preparation import Prepared, check_setup, prepare, prepare_again, prepare_finer, why_too_poor
 from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
 from .validation import HeldOut, held_out_blocks, misfit_rms, validate, whole_thickness
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
@@ -154,7 +154,7 @@ def search_exposures(
             return _no_answer(model, poor, cube)
         say("fitting the thickness with the unchanged model")
         prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
-        return _Search(prepared, model, effects, chosen, rng, say).run()
+        return _Search(cube, prepared, model, effects, chosen, rng, say).run()
 
 
 def _no_answer(model: FringeModel, reason: str, cube: FringeCube) -> Verdict:
@@ -170,6 +170,7 @@ class _Search:
 
     def __init__(
         self,
+        cube: FringeCube,
         prepared: Prepared,
         model: FringeModel,
         effects: Sequence[Effect],
@@ -177,11 +178,15 @@ class _Search:
         rng: np.random.Generator,
         say: Report,
     ) -> None:
-        self.model, self.effects, self.options, self.say = model, effects, options, say
-        shape = prepared.problem.cells.shape[1:]
-        self.heldout = held_out_blocks(shape, options.heldout_fraction, rng)
+        self.cube, self.model, self.effects, self.options, self.say = cube, model, effects, options, say
+        self.rng = rng
         self.next_measurements: tuple[dict[str, Any], ...] = ()
         self.unseen: HeldOut | None = None
+        self._take_other_cells(prepared)
+
+    def _take_other_cells(self, prepared: Prepared) -> None:
+        shape = prepared.problem.cells.shape[1:]
+        self.heldout = held_out_blocks(shape, self.options.heldout_fraction, self.rng)
         self._take(prepared)
 
     def _take(self, prepared: Prepared) -> None:
@@ -213,6 +218,8 @@ class _Search:
                 self.say("field and noise are judged again with the best effect in the model")
                 self._take(refined)
                 return self.run(refinements - 1)
+        if singles and self._is_too_coarse(training.with_channels(singles[0])):
+            return self._run_finer(singles[0].fit, self._thickness(whole, singles[0].fit))
         chosen, steps = self._grow(training, singles)
         return self._conclude(whole, training, chosen, steps, chance)
 
@@ -271,6 +278,20 @@ class _Search:
         if mended:
             self.say(f"{mended} cells change their fringe order")
         return refined
+
+    def _is_too_coarse(self, found: Hypothesis) -> bool:
+        """Whether a blur explains much, but not all, in cells that were chosen for the image that it left."""
+        if self.cells.cell_px == 1 or not self.prepared.rich or self.prepared.problem.field_prior:
+            return False
+        blurs = any(self.prepared.problem.forward.couples_pixels(name) for name in found.names)
+        return blurs and not self._consistent(found)
+
+    def _run_finer(self, fit: Fit, thickness_um: FloatArray) -> Verdict:
+        """Search again in cells of half the size."""
+        self.say(f"light was finer before it was blurred: cells of {self.cells.cell_px // 2} px")
+        finer = prepare_finer(self.cube, self.prepared, fit, thickness_um, self.options.most_cells)
+        self._take_other_cells(finer)
+        return self.run(refinements=1)
 
     def _thickness(self, whole: Selector, fit: Fit) -> FloatArray:
         return whole_thickness(whole.problem, whole.null.fit, fit, self.heldout)
@@ -476,6 +497,8 @@ class _Search:
             )
         chosen, classes = self._classified(training, chosen, steps)
         final = self._of_all_data(whole, chosen)
+        if self._is_too_coarse(final):
+            return self._run_finer(final.fit, whole.problem.basis.expand(final.fit.field))
         room = len(chosen.names) < self.options.most_effects
         if room and self._consistent(chosen) and not self._consistent(final):
             self.say("a residual remains that only all data show")
