@@ -81,3 +81,18 @@ def test_rivals_fitted_in_another_order_are_fitted_again(sensor, selector) -> No
     right = fitted_at(sensor, selector, known.field, JITTER, RIVAL)
     assert wrong.chi2 > right.chi2 + 50.0
     assert rival.fit.chi2 == pytest.approx(right.chi2, abs=2.0)
+
+
+@pytest.mark.parametrize("first_seed", [0, 1000, 2000])
+def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
+    """Its misfit has a minimum for every fringe, in every order of the thickness."""
+    for seed in range(first_seed, first_seed + 1000):
+        case = draw_case("one", np.random.default_rng(seed), size=(48, 48), only=["gate_thickness"])
+        if abs(case.values["gate_thickness.offset"]) > 0.05:
+            break
+    gate = [effect for effect in EFFECTS if effect.name == "gate_thickness"]
+    prepared = prepare(case.cube, FringeModel.from_setup("ts8_e2v"), gate, 20_000)
+    selector = Selector(prepared.problem, gate, prepared.null, prepared.index)
+    found = selector.improved(("gate_thickness",), prepared.null, scan=True)
+    error = found.fit.settings["gate_thickness.offset"] - case.values["gate_thickness.offset"]
+    assert abs(error) < 5.0 * max(found.fit.sigma[0], 1e-4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover, read_effects_override
-from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, SplineBasis
+from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.mock.challenge import SealedCase, draw_case
 from lsst.fringe_sim.model import FringeModel
@@ -37,6 +37,11 @@ def test_splines_of_any_number_of_cells() -> None:
 
 
 @pytest.mark.slow
+def test_cells_that_are_not_seen_keep_their_thickness(rng: np.random.Generator) -> None:
+    field, basis = 12.0 + rng.random((5, 7)), CellBasis((5, 7))
+    np.testing.assert_array_equal(basis.expand(basis.fit(field, rng.integers(0, 2, (5, 7)) * 1.0)), field)
+
+
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
     for seed in (11, 12):
         case = draw_case("none", np.random.default_rng(seed), size=SIZE)

@@ -115,6 +115,10 @@ class CellBasis(FieldBasis):
         """Field on the cells; see `FieldBasis.expand`."""
         return coefficients.reshape(self.shape)
 
+    def fit(self, field: FloatArray, weight: FloatArray) -> FloatArray:
+        """The field itself; cells without weight keep it too, see `FieldBasis.fit`."""
+        return np.array(field, dtype=np.float64).ravel()
+
     def gather(self, fields: FloatArray) -> FloatArray:
         """Cells themselves; see `FieldBasis.gather`."""
         return np.ascontiguousarray(fields.reshape(len(fields), -1).T)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .comparison import chi2_with_free_fringes, fringe_order_um, sampled_part
-from .fit import Fit, Problem, fit_model
+from .fit import Coordinate, Fit, Problem, fit_model
 
 __all__ = ["FINE_SCAN", "fields_in_other_orders", "starts_in_other_orders"]
 
@@ -18,13 +18,21 @@ FloatArray = NDArray[np.float64]
 FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
 """Departures, in prior scales, at which an effect is tried where fringe orders change with it."""
 
-ORDERS_MOVED, STEPS_PER_ORDER = 4, 12
-ORDERS_REFITTED = 4
+SIZES_TRIED = (0.1, 0.15, 0.23, 0.35, *(0.5 * n for n in range(1, 21)))
+"""Departures, in prior scales, at which one that shifts the phase is: its misfit has a minimum for every fringe."""
+
+PARTS_BETWEEN = (0.5, 0.25)
+"""Parts of the distance to the next size by which the best ones are changed, in turn."""
+
+ORDERS_MOVED, STEPS_PER_ORDER = 6, 12
+PLACES_REFITTED, PLACES_KEPT = 8, 4
 """Fringe orders and fits with which a strong effect on the phase is looked for, and the steps to an order."""
+
+COMPARED_CELLS = 500
+"""Cells with which places are compared."""
 
 LEAST_THICKNESS_UM, MOST_SIGMAS = 0.5, 4.0
 """Thinnest layer, and how far a map that is known may be moved, over its uncertainty."""
-
 
 NEIGHBOURING_ORDERS = (-2, -1, 1, 2)
 """Orders in which an effect that shifts each wavelength by itself is looked for."""
@@ -35,9 +43,9 @@ class _Place:
     """A size of one coordinate, with the field moved to where it fits best within an order."""
 
     moved: int
-    order: int
     position: FloatArray
     shift_um: float
+    even: bool
     chi2: float
 
 
@@ -69,17 +77,17 @@ def starts_in_other_orders(
         others = [n for n in range(len(place.position)) if n != place.moved]
         held = {fit.coordinates[n].key: fit.coordinates[n].value(place.position[n]) for n in others}
         own = (fit.coordinates[place.moved],)
-        alone = fit_model(problem, own, place.position[[place.moved]], field, fit.levels, held, rival=least)
+        alone = fit_model(problem, own, place.position[[place.moved]], field, fit.levels, held)
         settled = place.position.copy()
         settled[place.moved] = alone.position[0]
         found.append((settled, alone.field, alone.chi2))
         least = min(least, alone.chi2)
     found.sort(key=lambda item: item[2])
-    return [(position, field) for position, field, _ in found[:ORDERS_REFITTED]]
+    return [(position, field) for position, field, _ in found[:PLACES_KEPT]]
 
 
 def fields_in_other_orders(problem: Problem, field: FloatArray, index: float) -> list[FloatArray]:
-    """The field moved, in proportion, by one and two fringe orders to either side, where that leaves a layer.
+    """The field moved evenly by one and two fringe orders to either side, where that leaves a layer.
 
     For an effect with a shift of its own at each wavelength: it follows such a move by itself, as what an order more
     lacks at the ends of the spectrum is a small part of a fringe.
@@ -94,12 +102,8 @@ def fields_in_other_orders(problem: Problem, field: FloatArray, index: float) ->
         Refractive index of the layer.
     """
     whole, used = problem.basis.expand(field), problem.cells.seen.astype(float)
-    order, middle = fringe_order_um(problem.cells.wavelength_nm, index), float(whole.mean())
-    shifts = np.array(NEIGHBOURING_ORDERS, dtype=float) * order
-    return [
-        problem.basis.fit(whole * (1.0 + shift / middle), used)
-        for shift in shifts[_is_possible(problem, whole, shifts)]
-    ]
+    shifts = np.array(NEIGHBOURING_ORDERS, dtype=float) * fringe_order_um(problem.cells.wavelength_nm, index)
+    return [problem.basis.fit(whole + shift, used) for shift in shifts[_is_possible(problem, whole, shifts)]]
 
 
 def _fields(
@@ -107,20 +111,25 @@ def _fields(
 ) -> list[tuple[_Place, FloatArray]]:
     """The best places of each coordinate, with their fields."""
     whole, used = problem.basis.expand(first_field), problem.cells.seen.astype(float)
+    middle = float(whole.mean())
     best: list[_Place] = []
     for number in {place.moved for place in places}:
         own = [place for place in places if place.moved == number]
-        best += sorted(own, key=lambda place: place.chi2)[:ORDERS_REFITTED]
+        best += sorted(own, key=lambda place: place.chi2)[:PLACES_REFITTED]
     return [
-        (place, problem.basis.fit(whole * (1.0 + place.shift_um / float(whole.mean())), used))
-        for place in best
+        (place, problem.basis.fit(_moved(whole, place.shift_um, place.even, middle), used)) for place in best
     ]
+
+
+def _moved(field: FloatArray, shift_um: float, even: bool, middle_um: float) -> FloatArray:
+    """A field moved in proportion, as an index wants it, or evenly, as fringes from another layer do."""
+    return field + shift_um if even else field * (1.0 + shift_um / middle_um)
 
 
 def _places(
     problem: Problem, fit: Fit, moved: Sequence[int], first_field: FloatArray, index: float
 ) -> list[_Place]:
-    """The best size of each coordinate in each order; sizes lie too far apart for the right one to win at once.
+    """The best sizes of each coordinate in each order; sizes lie too far apart for the right one to win at once.
 
     A sample of cells is compared with the model, levels and contrasts free.
     """
@@ -129,22 +138,98 @@ def _places(
     shifts = _shifts(problem, whole, order)
     if not shifts.size:
         return []
-    part, middle = sampled_part(whole.size), float(whole.mean())
     for edge in (shifts[0], shifts[-1]):
-        problem.forward.cover(whole * (1.0 + edge / middle))
-    fields = whole[part[1:]] * (1.0 + shifts[:, None, None] / middle)
-    value, weight = problem.cells.value[part], problem.cells.weight[part]
-    best: dict[tuple[int, int], _Place] = {}
-    for number, position in _single_steps(fit, moved):
-        settings = {c.key: c.value(x) for c, x in zip(fit.coordinates, position, strict=True)}
-        chi2 = chi2_with_free_fringes(problem.forward.sampled(settings, fields).value, value, weight)
-        for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
-            inside = np.flatnonzero(np.abs(shifts - turn * order) <= 0.51 * order)
-            if inside.size:
-                least = inside[int(chi2[inside].argmin())]
-                place = _Place(number, turn, position, float(shifts[least]), float(chi2[least]))
-                best[number, turn] = min(best.get((number, turn), place), place, key=lambda item: item.chi2)
-    return list(best.values())
+        for even in (False, True):
+            problem.forward.cover(_moved(whole, edge, even, float(whole.mean())))
+    found = []
+    for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
+        inside = shifts[np.abs(shifts - turn * order) <= 0.51 * order]
+        if inside.size:
+            trial = _Trial(problem, fit, whole, inside)
+            found += [place for number in moved for place in trial.places(number)]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """Comparison of a sample of cells with a field that is moved by less than an order."""
+
+    problem: Problem
+    fit: Fit
+    whole: FloatArray
+    shifts_um: FloatArray
+
+    def places(self, number: int) -> list[_Place]:
+        """The sizes of one coordinate than which no size near it is better."""
+        sizes = _sizes(self.fit.coordinates[number])
+        own = [self.place(number, size) for size in sizes]
+        found = []
+        for low in _lowest(own):
+            best, size = own[low], sizes[low]
+            gap = np.diff(sizes)[max(low - 1, 0) : low + 1].min()
+            for part in PARTS_BETWEEN:
+                beside = [size - part * gap, size + part * gap]
+                tried = [(self.place(number, one), one) for one in beside]
+                best, size = min([(best, size), *tried], key=lambda item: item[0].chi2)
+            found.append(best)
+        return found
+
+    def place(self, number: int, size: float) -> _Place:
+        """One coordinate at a size, with the field where it fits best."""
+        position = _single_step(self.fit, number, size)
+        settings = {c.key: c.value(x) for c, x in zip(self.fit.coordinates, position, strict=True)}
+        part = sampled_part(self.whole.size, COMPARED_CELLS)
+        fields = [
+            _moved(self.whole[part[1:]], shift, even, self._middle)
+            for even in (False, True)
+            for shift in self.shifts_um
+        ]
+        model = self.problem.forward.sampled(settings, np.stack(fields)).value
+        cells = self.problem.cells
+        chi2 = chi2_with_free_fringes(model, cells.value[part], cells.weight[part]).reshape(2, -1)
+        lowest = [_vertex(self.shifts_um, values) for values in chi2]
+        even = lowest[1][1] < lowest[0][1]
+        return _Place(number, position, lowest[even][0], even, lowest[even][1])
+
+    @property
+    def _middle(self) -> float:
+        return float(self.whole.mean())
+
+
+def _vertex(places: FloatArray, values: FloatArray) -> tuple[float, float]:
+    """Place and value of the minimum of a function on even steps, by a parabola through the lowest three."""
+    low = int(values.argmin())
+    if not 0 < low < len(values) - 1:
+        return float(places[low]), float(values[low])
+    before, middle, after = values[low - 1 : low + 2]
+    part = 0.5 * (before - after) / max(before - 2.0 * middle + after, 1e-300)
+    return float(places[low] + part * (places[low] - places[low - 1])), float(
+        middle - 0.25 * (before - after) * part
+    )
+
+
+def _lowest(places: Sequence[_Place]) -> list[int]:
+    """Which of places in the order of their size have no better neighbour."""
+    chi2 = np.array([place.chi2 for place in places])
+    return [
+        int(n)
+        for n in np.flatnonzero(np.r_[True, chi2[1:] <= chi2[:-1]] & np.r_[chi2[:-1] <= chi2[1:], True])
+    ]
+
+
+def _sizes(item: Coordinate) -> FloatArray:
+    """Values of a parameter at which it is tried, from the lowest to the highest."""
+    away = item.scale * np.array(SIZES_TRIED)
+    sizes = np.sort(np.concatenate([item.null - away, item.null + away]))
+    return np.asarray(sizes[(sizes >= item.low) & (sizes <= item.high)])
+
+
+def _single_step(fit: Fit, number: int, size: float) -> FloatArray:
+    """Position in which one coordinate of the last effect has another size, its others none."""
+    own = np.array([item.effect == fit.coordinates[-1].effect for item in fit.coordinates])
+    position = np.where(own, 0.0, fit.position)
+    position[number] = fit.coordinates[number].clip(fit.coordinates[number].coordinate(float(size)))
+    return position
 
 
 def _shifts(problem: Problem, whole: FloatArray, order: float) -> FloatArray:
@@ -155,21 +240,6 @@ def _shifts(problem: Problem, whole: FloatArray, order: float) -> FloatArray:
 
 
 def _is_possible(problem: Problem, whole: FloatArray, shifts: FloatArray) -> NDArray[np.bool_]:
-    middle = float(whole.mean())
-    possible = (middle + shifts) * whole.min() / middle > LEAST_THICKNESS_UM
+    least = whole.min() + np.minimum(shifts, shifts * whole.min() / whole.mean())
+    possible = least > LEAST_THICKNESS_UM
     return np.asarray(possible & (np.abs(shifts) * np.sqrt(problem.field_prior) <= MOST_SIGMAS))
-
-
-def _single_steps(fit: Fit, moved: Sequence[int]) -> list[tuple[int, FloatArray]]:
-    """Positions in which one coordinate of the last effect has another size, its others none."""
-    own = np.array([item.effect == fit.coordinates[-1].effect for item in fit.coordinates])
-    found = []
-    for number in moved:
-        item = fit.coordinates[number]
-        for bound in (item.low, item.high):
-            for size in item.null + np.sign(bound - item.null) * item.scale * np.array(FINE_SCAN):
-                if item.low <= size <= item.high and size != item.null:
-                    position = np.where(own, 0.0, fit.position)
-                    position[number] = item.coordinate(float(size))
-                    found.append((number, position))
-    return found
