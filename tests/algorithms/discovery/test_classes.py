@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,3 +55,12 @@ def test_the_effect_that_was_chosen_stays_in_its_class() -> None:
     group = in_all_data(90.0)
     assert set(group.members) == {"roughness", NEAR}
     assert group.members[NEAR] > 0.99
+
+
+def test_a_wider_class_is_no_likelier_than_in_the_part_that_chose_it() -> None:
+    chosen, group = class_in_part()
+    unsure = replace(group, probability=0.9)
+    found = classes_in_all_data(
+        {"roughness": unsure}, chosen, fitted("roughness", 80.0), lambda _: fitted(NEAR, 80.0), WIDTH
+    )
+    assert found["roughness"].probability == 0.9

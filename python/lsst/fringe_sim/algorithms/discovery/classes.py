@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .fit import Fit
 from .selection import Hypothesis, Selector, similarity
@@ -139,7 +139,11 @@ def classes_in_all_data(
     found = {}
     for name, group in classes.items():
         near = {n: fitted_to_all(h) for n, h in group.rivals.items() if h.log_evidence > least}
-        found[name] = _compared(name, {name: final, **near}, width, group.significance) if near else group
+        found[name] = group
+        if near:
+            seen = _compared(name, {name: final, **near}, width, group.significance)
+            # All data widen a class; that does not make it likelier than the part that chose it does.
+            found[name] = replace(seen, probability=min(seen.probability, group.probability))
     return found
 
 
