@@ -36,12 +36,12 @@ def test_splines_of_any_number_of_cells() -> None:
             np.testing.assert_allclose(along.sum(axis=1), 1.0, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_cells_that_are_not_seen_keep_their_thickness(rng: np.random.Generator) -> None:
     field, basis = 12.0 + rng.random((5, 7)), CellBasis((5, 7))
     np.testing.assert_array_equal(basis.expand(basis.fit(field, rng.integers(0, 2, (5, 7)) * 1.0)), field)
 
 
+@pytest.mark.slow
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
     for seed in (11, 12):
         case = draw_case("none", np.random.default_rng(seed), size=SIZE)

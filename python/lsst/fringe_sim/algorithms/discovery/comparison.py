@@ -12,6 +12,7 @@ __all__ = [
     "chi2_with_free_fringes",
     "chi2_with_free_levels",
     "fringe_order_um",
+    "local_minima",
     "sampled_part",
 ]
 
@@ -30,6 +31,11 @@ def sampled_part(cells: int, wanted: int = SAMPLED_CELLS) -> tuple[slice, slice,
 def fringe_order_um(wavelength_nm: FloatArray, index: float) -> float:
     """Thickness from one fringe to the next at the middle wavelength, for a refractive index [µm]."""
     return 1e-3 * float(np.median(wavelength_nm)) / (2.0 * index)
+
+
+def local_minima(values: FloatArray) -> NDArray[np.intp]:
+    """Places of values than which neither neighbour is lower."""
+    return np.flatnonzero(np.r_[True, values[1:] <= values[:-1]] & np.r_[values[:-1] <= values[1:], True])
 
 
 def chi2_with_free_levels(model: FloatArray, value: FloatArray, weight: FloatArray) -> float:

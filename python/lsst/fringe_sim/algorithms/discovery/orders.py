@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .comparison import chi2_with_free_fringes, fringe_order_um, sampled_part
+from .comparison import chi2_with_free_fringes, fringe_order_um, local_minima, sampled_part
 from .fit import Coordinate, Fit, Problem, fit_model
 
-__all__ = ["FINE_SCAN", "fields_in_other_orders", "starts_in_other_orders"]
+__all__ = ["fields_in_other_orders", "starts_in_other_orders"]
 
 FloatArray = NDArray[np.float64]
-
-FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
-"""Departures, in prior scales, at which an effect is tried where fringe orders change with it."""
 
 SIZES_TRIED = (0.1, 0.15, 0.23, 0.35, *(0.5 * n for n in range(1, 21)))
 """Departures, in prior scales, at which one that shifts the phase is: its misfit has a minimum for every fringe."""
@@ -77,7 +75,7 @@ def starts_in_other_orders(
         others = [n for n in range(len(place.position)) if n != place.moved]
         held = {fit.coordinates[n].key: fit.coordinates[n].value(place.position[n]) for n in others}
         own = (fit.coordinates[place.moved],)
-        alone = fit_model(problem, own, place.position[[place.moved]], field, fit.levels, held)
+        alone = fit_model(problem, own, place.position[[place.moved]], field, fit.levels, held, rival=least)
         settled = place.position.copy()
         settled[place.moved] = alone.position[0]
         found.append((settled, alone.field, alone.chi2))
@@ -159,12 +157,24 @@ class _Trial:
     whole: FloatArray
     shifts_um: FloatArray
 
+    @cached_property
+    def sample(self) -> tuple[slice, slice, slice]:
+        """Which cells are compared."""
+        return sampled_part(self.whole.size, COMPARED_CELLS)
+
+    @cached_property
+    def fields_um(self) -> FloatArray:
+        """The sample moved in proportion, and then evenly, ``(2 S, ny, nx)``; the same for every size."""
+        few, middle = self.whole[self.sample[1:]], float(self.whole.mean())
+        moves = [(shift, even) for even in (False, True) for shift in self.shifts_um]
+        return np.stack([_moved(few, shift, even, middle) for shift, even in moves])
+
     def places(self, number: int) -> list[_Place]:
         """The sizes of one coordinate than which no size near it is better."""
         sizes = _sizes(self.fit.coordinates[number])
         own = [self.place(number, size) for size in sizes]
         found = []
-        for low in _lowest(own):
+        for low in local_minima(np.array([place.chi2 for place in own])):
             best, size = own[low], sizes[low]
             gap = np.diff(sizes)[max(low - 1, 0) : low + 1].min()
             for part in PARTS_BETWEEN:
@@ -178,22 +188,12 @@ class _Trial:
         """One coordinate at a size, with the field where it fits best."""
         position = _single_step(self.fit, number, size)
         settings = {c.key: c.value(x) for c, x in zip(self.fit.coordinates, position, strict=True)}
-        part = sampled_part(self.whole.size, COMPARED_CELLS)
-        fields = [
-            _moved(self.whole[part[1:]], shift, even, self._middle)
-            for even in (False, True)
-            for shift in self.shifts_um
-        ]
-        model = self.problem.forward.sampled(settings, np.stack(fields)).value
-        cells = self.problem.cells
-        chi2 = chi2_with_free_fringes(model, cells.value[part], cells.weight[part]).reshape(2, -1)
-        lowest = [_vertex(self.shifts_um, values) for values in chi2]
+        model = self.problem.forward.sampled(settings, self.fields_um).value
+        value, weight = self.problem.cells.value[self.sample], self.problem.cells.weight[self.sample]
+        chi2 = chi2_with_free_fringes(model, value, weight).reshape(2, -1)
+        lowest = [_vertex(self.shifts_um, each) for each in chi2]
         even = lowest[1][1] < lowest[0][1]
         return _Place(number, position, lowest[even][0], even, lowest[even][1])
-
-    @property
-    def _middle(self) -> float:
-        return float(self.whole.mean())
 
 
 def _vertex(places: FloatArray, values: FloatArray) -> tuple[float, float]:
@@ -206,15 +206,6 @@ def _vertex(places: FloatArray, values: FloatArray) -> tuple[float, float]:
     return float(places[low] + part * (places[low] - places[low - 1])), float(
         middle - 0.25 * (before - after) * part
     )
-
-
-def _lowest(places: Sequence[_Place]) -> list[int]:
-    """Which of places in the order of their size have no better neighbour."""
-    chi2 = np.array([place.chi2 for place in places])
-    return [
-        int(n)
-        for n in np.flatnonzero(np.r_[True, chi2[1:] <= chi2[:-1]] & np.r_[chi2[:-1] <= chi2[1:], True])
-    ]
 
 
 def _sizes(item: Coordinate) -> FloatArray:

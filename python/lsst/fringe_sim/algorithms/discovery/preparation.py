@@ -177,9 +177,7 @@ def prepare(
     forward = Forward.of_cells(model, effects, cells, (float(start.min()) - 0.5, float(start.max()) + 0.5))
     if not _is_rich(cells):
         return _prepare_few(cells, forward, start, index)
-    problem = Problem(cells, forward, CellBasis(start.shape), _free_levels(cells))
-    problem, fit, cells = _without_spoiled(*_choose_field(problem, start, {}), cells, {})
-    return _settle(problem, fit, cells, index)
+    return _prepare_rich(cells, forward, start, index, {})
 
 
 def prepare_finer(
@@ -211,11 +209,17 @@ def prepare_finer(
     start = np.asarray(between(np.stack(places, axis=-1)))
     limits = (float(start.min()) - 0.5, float(start.max()) + 0.5)
     forward = Forward.of_cells(old.model, old.catalogue, cells, limits, old.exposures)
+    finer = _prepare_rich(cells, forward, start, prepared.index, fit.settings)
+    return replace(finer, guess=dict(fit.settings))
+
+
+def _prepare_rich(
+    cells: CellData, forward: Forward, start: FloatArray, index: FloatArray, settings: Mapping[str, float]
+) -> Prepared:
+    """Field and noise from a first thickness, as judged with some effects in the model."""
     problem = Problem(cells, forward, CellBasis(start.shape), _free_levels(cells))
-    problem, field_fit, cells = _without_spoiled(
-        *_choose_field(problem, start, fit.settings), cells, fit.settings
-    )
-    return replace(_settle(problem, field_fit, cells, prepared.index), guess=dict(fit.settings))
+    problem, fit, cells = _without_spoiled(*_choose_field(problem, start, settings), cells, settings)
+    return _settle(problem, fit, cells, index)
 
 
 def _cells_of(cube: FringeCube, size: int, most_cells: int) -> CellData:

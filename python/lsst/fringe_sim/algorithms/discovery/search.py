@@ -218,7 +218,7 @@ class _Search:
                 self.say("field and noise are judged again with the best effect in the model")
                 self._take(refined)
                 return self.run(refinements - 1)
-        if singles and self._is_too_coarse(training.with_channels(singles[0])):
+        if singles and self._is_too_coarse(training, singles[0]):
             return self._run_finer(singles[0].fit, self._thickness(whole, singles[0].fit))
         chosen, steps = self._grow(training, singles)
         return self._conclude(whole, training, chosen, steps, chance)
@@ -279,12 +279,12 @@ class _Search:
             self.say(f"{mended} cells change their fringe order")
         return refined
 
-    def _is_too_coarse(self, found: Hypothesis) -> bool:
+    def _is_too_coarse(self, selector: Selector, found: Hypothesis) -> bool:
         """Whether a blur explains much, but not all, in cells that were chosen for the image that it left."""
         if self.cells.cell_px == 1 or not self.prepared.rich or self.prepared.problem.field_prior:
             return False
-        blurs = any(self.prepared.problem.forward.couples_pixels(name) for name in found.names)
-        return blurs and not self._consistent(found)
+        blurs = any(selector.problem.forward.couples_pixels(name) for name in found.names)
+        return blurs and not self._consistent(selector.with_channels(found))
 
     def _run_finer(self, fit: Fit, thickness_um: FloatArray) -> Verdict:
         """Search again in cells of half the size."""
@@ -497,7 +497,7 @@ class _Search:
             )
         chosen, classes = self._classified(training, chosen, steps)
         final = self._of_all_data(whole, chosen)
-        if self._is_too_coarse(final):
+        if self._is_too_coarse(whole, final):
             return self._run_finer(final.fit, whole.problem.basis.expand(final.fit.field))
         room = len(chosen.names) < self.options.most_effects
         if room and self._consistent(chosen) and not self._consistent(final):

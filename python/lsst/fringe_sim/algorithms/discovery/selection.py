@@ -13,7 +13,7 @@ from scipy.stats import chi2 as chi2_distribution
 from ...effects import Effect
 from ...errors import InputError
 from .channels import Channel, State, combined_probability, measure_channels
-from .comparison import chi2_with_free_levels
+from .comparison import chi2_with_free_levels, local_minima
 from .fit import (
     Coordinate,
     Design,
@@ -26,7 +26,7 @@ from .fit import (
     linearise_at,
 )
 from .following import ThicknessFollower
-from .orders import FINE_SCAN, fields_in_other_orders, starts_in_other_orders
+from .orders import fields_in_other_orders, starts_in_other_orders
 
 __all__ = ["Candidate", "Hypothesis", "Selector"]
 
@@ -34,6 +34,7 @@ FloatArray = NDArray[np.float64]
 
 
 SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
+FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
 """Departures, in prior scales, at which the finite signature of an effect is tried; the fine ones where it may grow
 with the fourth power (a beam whose onset is taken for thickness)."""
 
@@ -378,8 +379,7 @@ class Selector:
             row[:] = [self._shifted_chi2(settings, shift) for shift in self.shifts_um]
         # Every thickness may have its best size: near the true one no size that was tried need be good.
         size, least = chi2.argmin(axis=0), chi2.min(axis=0)
-        lowest = np.r_[True, least[1:] <= least[:-1]] & np.r_[least[:-1] <= least[1:], True]
-        best = sorted(np.flatnonzero(lowest), key=lambda place: float(least[place]))[:PLACES_REFITTED]
+        best = sorted(local_minima(least), key=lambda place: float(least[place]))[:PLACES_REFITTED]
         trials = [
             fit_model(
                 self.problem,
@@ -516,11 +516,9 @@ class Selector:
             column = FullColumns(self._signature(state, fit, settings)[np.newaxis])
             score, information = state.design.project(column, state.residual)
             fall[index] = 2.0 * score[0] - information[0, 0]
-        minimum = np.ones(len(places), dtype=bool)
-        minimum[1:] &= fall[1:] >= fall[:-1]
-        minimum[:-1] &= fall[:-1] >= fall[1:]
-        minimum &= np.abs(places - fit.position[number]) > 0.5 * item.neighbour
-        best = sorted(np.flatnonzero(minimum), key=lambda index: -fall[index])[:MINIMA_REFITTED]
+        away = np.abs(places - fit.position[number]) > 0.5 * item.neighbour
+        minima = [index for index in local_minima(-fall) if away[index]]
+        best = sorted(minima, key=lambda index: -fall[index])[:MINIMA_REFITTED]
         trials = []
         for index in map(int, best):
             start = fit.position.copy()
@@ -615,6 +613,9 @@ class Selector:
         """The hypothesis with its residual tested."""
         if hypothesis.channels:
             return hypothesis
+        known = self.fitted.get(frozenset(hypothesis.names))
+        if known is not None and known.fit is hypothesis.fit and known.channels:
+            return known
         tested = replace(hypothesis, channels=self.criticise(hypothesis.fit))
         self.fitted[frozenset(hypothesis.names)] = tested
         return tested
