@@ -35,6 +35,12 @@ FloatArray = NDArray[np.float64]
 SURELY = 1e-7
 """Chance of noise below which an effect is added to a set that leaves nothing else to see."""
 
+LEAST_PROMISE = 9.0
+"""Fall of χ² that an effect must promise to be fitted."""
+
+MORE_THAN_PROMISED = 3.0
+"""By how much a fit may bring more than its score promised."""
+
 SHIFTING_SETS = 3
 """Sets of several effects that are looked for in other fringe orders."""
 
@@ -260,13 +266,17 @@ class _Search:
             guess=self.prepared.guess,
         )
 
-    def _refit(self, selector: Selector, base: Hypothesis) -> list[Hypothesis]:
-        """Refits of the best-scored additions to a set, likeliest first."""
+    def _refit(
+        self, selector: Selector, base: Hypothesis, rival: Hypothesis | None = None
+    ) -> list[Hypothesis]:
+        """Refits of the best-scored additions to a set, likeliest first; none that cannot come near a rival."""
         scores = selector.score(base.fit, selector.others(base), scan=True)
         if self.prepared.shifts_um:  # a score in the wrong order says nothing
             worth = scores
         else:
-            worth = [c for c in scores if c.promise > 9.0][: self.options.refits]
+            missing = base.fit.chi2 - rival.fit.chi2 if rival else 0.0
+            least = max(LEAST_PROMISE, missing / MORE_THAN_PROMISED)
+            worth = [c for c in scores if c.promise > least][: self.options.refits]
         refitted = [selector.hypothesis((*base.names, c.name), c.start, base.fit) for c in worth]
         for hypothesis in refitted:
             self._say_refit(base, hypothesis)
@@ -377,7 +387,7 @@ class _Search:
             alike = []
             for candidate in selector.score(rest.fit, selector.others(current)):
                 smaller = len(selector.coordinates[candidate.name]) < len(own)
-                if candidate.promise > 9.0 and smaller:
+                if candidate.promise > LEAST_PROMISE and smaller:
                     features = selector.features(state, rest.fit, candidate.name)
                     alike.append((similarity(state.design, own, features), candidate))
             for cosine, candidate in sorted(alike, key=lambda pair: -pair[0])[: self.options.parents]:
@@ -404,7 +414,7 @@ class _Search:
             for candidate in selector.score(parent.fit, selector.others(parent), scan=True):
                 key = frozenset((*parent.names, candidate.name))
                 left = parent.fit.chi2 - candidate.promise
-                if candidate.promise > 9.0 and left < promised.get(key, (math.inf,))[0]:
+                if candidate.promise > LEAST_PROMISE and left < promised.get(key, (math.inf,))[0]:
                     promised[key] = (left, parent, candidate)
         best = sorted(promised.values(), key=lambda item: item[0])[: 2 * self.options.refits]
         found = []
@@ -426,7 +436,7 @@ class _Search:
             for name in current.names:
                 rest = tuple(other for other in current.names if other != name)
                 best = max(
-                    self._refit(selector, selector.improved(rest, current.fit)),
+                    self._refit(selector, selector.improved(rest, current.fit), current),
                     key=lambda item: item.log_evidence,
                     default=current,
                 )

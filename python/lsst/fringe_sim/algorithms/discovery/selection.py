@@ -177,6 +177,8 @@ class Selector:
         self._undescribed = PRECISION**2 * float((state.whiten(fringes) ** 2).sum())
         self.null = replace(self.null, channels=self.criticise(null))
         self.fitted: dict[frozenset[str], Hypothesis] = {frozenset(): self.null}
+        self._searched: dict[frozenset[str], Fit] = {}
+        self._scores: dict[tuple[int, bool], tuple[Fit, dict[str, Candidate | None]]] = {}
 
     def state(self, fit: Fit) -> State:
         """Everything the tests need at a fit."""
@@ -236,36 +238,46 @@ class Selector:
 
         With ``scan``, finite signatures are tried besides the derivative.
         """
-        state = self.state(fit)
-        found = []
-        for name in names:
-            if self.is_sought(name):  # at null its place is anywhere, and its derivative says nothing
-                found += self._sought(state, fit, name) if scan else []
-                continue
-            coordinates = self.coordinates[name]
-            try:
-                features = self.features(state, fit, name)
-            except InputError:
-                continue  # cannot be combined with an effect that is in already
-            score, information = state.design.project(FullColumns(features), state.residual)
-            start, gain, degrees = _bounded_minimum(score, information, coordinates)
-            candidate = Candidate(name, gain, degrees, start, gain)
-            of_the_image = self.problem.forward.is_image_effect(name)
-            far_from_linear = not of_the_image or self.problem.forward.couples_pixels(name)
-            if scan and far_from_linear and not self.has_many(name):
-                candidate = self._scanned(state, fit, candidate)
-            found.append(candidate)
+        known = self._scored(fit, scan)
+        missing = [name for name in names if name not in known]
+        if missing:
+            state = self.state(fit)
+            known |= {name: self._candidate(state, fit, name, scan) for name in missing}
+        found = [candidate for name in names if (candidate := known[name]) is not None]
         return sorted(found, key=lambda item: -item.promise)
+
+    def _scored(self, fit: Fit, scan: bool) -> dict[str, Candidate | None]:
+        """Score tests made at a fit: sets are enlarged, swapped and compared from the same ones."""
+        # The fit is kept beside them, that no other gets its identity.
+        return self._scores.setdefault((id(fit), scan), (fit, {}))[1]
+
+    def _candidate(self, state: State, fit: Fit, name: str, scan: bool) -> Candidate | None:
+        """Score test of an effect; `None` if it is not seen or cannot be combined with those that are in already."""
+        if self.is_sought(name):  # at null its place is anywhere, and its derivative says nothing
+            return self._sought(state, fit, name) if scan else None
+        coordinates = self.coordinates[name]
+        try:
+            features = self.features(state, fit, name)
+        except InputError:
+            return None
+        score, information = state.design.project(FullColumns(features), state.residual)
+        start, gain, degrees = _bounded_minimum(score, information, coordinates)
+        candidate = Candidate(name, gain, degrees, start, gain)
+        of_the_image = self.problem.forward.is_image_effect(name)
+        far_from_linear = not of_the_image or self.problem.forward.couples_pixels(name)
+        if scan and far_from_linear and not self.has_many(name):
+            candidate = self._scanned(state, fit, candidate)
+        return candidate
 
     def is_sought(self, name: str) -> bool:
         """Whether the place of an effect is not known, and has to be looked for in what the model leaves."""
         return any(item.place for item in self.coordinates[name])
 
-    def _sought(self, state: State, fit: Fit, name: str) -> list[Candidate]:
+    def _sought(self, state: State, fit: Fit, name: str) -> Candidate | None:
         """The effect where it is seen, if it is."""
         start = self._seen(state, name)
         if start is None:
-            return []
+            return None
         coordinates = self.coordinates[name]
         settings = {item.key: item.value(x) for item, x in zip(coordinates, start, strict=True)}
         level, _ = self.problem.amplitudes(fit.levels)
@@ -273,7 +285,7 @@ class Selector:
         column = FullColumns(state.whiten(level * change)[np.newaxis])
         score, information = state.design.project(column, state.residual)
         promise = float(score[0] ** 2 / max(information[0, 0], 1e-300))
-        return [Candidate(name, 0.0, len(coordinates), start, promise)] if score[0] > 0.0 else []
+        return Candidate(name, 0.0, len(coordinates), start, promise) if score[0] > 0.0 else None
 
     def _seen(self, state: State, name: str) -> FloatArray | None:
         """Coordinates of an effect where it is seen in what a fit leaves."""
@@ -421,15 +433,19 @@ class Selector:
                           for item in coordinates])  # fmt: skip
         starts = [first] if any(item.key in base.settings for item in coordinates) else []
         trials = [(start, base.field) for start in starts]
-        if scan:
-            trials += [(start, base.field) for start in self._spread_starts(known.fit)]
-            trials += self._starts_in_other_orders(known.fit)
+        key = frozenset(names)
+        if scan and self._searched.get(key) is not known.fit:
+            trials += self._starts_in_other_orders(known.fit) or [
+                (start, base.field) for start in self._spread_starts(known.fit)
+            ]
         for start, thickness in trials:
             trial = fit_model(self.problem, coordinates, start, thickness, base.levels, rival=known.fit.chi2)
             if trial.chi2 < known.fit.chi2 - 1.0:
                 trial = self._deepest(trial)
                 known = Hypothesis(known.names, trial, self._evidence(trial))
-        self.fitted[frozenset(names)] = known
+        self.fitted[key] = known
+        if scan:
+            self._searched[key] = known.fit
         return known
 
     def _starts_in_other_orders(self, fit: Fit) -> list[tuple[FloatArray, FloatArray]]:
