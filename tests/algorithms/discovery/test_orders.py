@@ -96,3 +96,32 @@ def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
     found = selector.improved(("gate_thickness",), prepared.null, scan=True)
     error = found.fit.settings["gate_thickness.offset"] - case.values["gate_thickness.offset"]
     assert abs(error) < 5.0 * max(found.fit.sigma[0], 1e-4)
+
+
+def test_a_set_is_not_looked_for_twice_from_the_same_fit(selector, monkeypatch) -> None:
+    found = selector.improved((JITTER,), selector.null.fit, scan=True)
+    tried = []
+    monkeypatch.setattr(Selector, "_starts_in_other_orders", lambda self, fit: tried.append(fit) or [])
+    assert selector.improved((JITTER,), selector.null.fit, scan=True) is found
+    assert not tried
+    # A better fit is a new place to look from.
+    selector.fitted[frozenset((JITTER,))] = replace(found, fit=replace(found.fit, chi2=found.fit.chi2 - 10.0))
+    selector.improved((JITTER,), selector.null.fit, scan=True)
+    assert tried
+
+
+def test_scores_at_a_fit_are_made_once(selector, monkeypatch) -> None:
+    """Without a scan they are others than with one, and one fit's are not another's."""
+    fit = selector.null.fit
+    first = {scan: selector.score(fit, [JITTER, CAUSE, RIVAL], scan=scan) for scan in (False, True)}
+    made = []
+    original = Selector.features
+    monkeypatch.setattr(
+        Selector, "features", lambda self, *given: made.append(given[-1]) or original(self, *given)
+    )
+    for scan, before in first.items():
+        again = selector.score(fit, [RIVAL, JITTER], scan=scan)
+        assert again == [candidate for candidate in before if candidate.name != CAUSE]
+    assert not made
+    selector.score(selector.hypothesis((JITTER,)).fit, [CAUSE])
+    assert made == [CAUSE]
