@@ -7,6 +7,7 @@ import pytest
 
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover, read_effects_override
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
+from lsst.fringe_sim.algorithms.discovery.search import _below
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.mock.challenge import SealedCase, draw_case
 from lsst.fringe_sim.model import FringeModel
@@ -126,3 +127,22 @@ def hidden_case(seed: int, kind: str, number: int) -> tuple[SealedCase, np.rando
     """A case of a challenge, and the generator of its search."""
     parts = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)
     return draw_case(kind, parts[0]), parts[1]
+
+
+@pytest.mark.slow
+def test_a_scale_found_in_a_wrong_order_is_looked_for_in_others() -> None:
+    """Too few data may see only noise there; nothing else is named for what all data show then."""
+    case = draw_case("one", np.random.default_rng(102), size=(48, 48), only=["wavelength_scale"])
+    verdict = discover(case.cube, case.setup, rng=np.random.default_rng(1))
+    assert [effect.name for effect in verdict.effects] == ["wavelength_scale"]
+    stretch = verdict.effects[0].parameters["stretch"]
+    assert abs(stretch.value - case.values["wavelength_scale.stretch"]) < 5.0 * stretch.sigma
+
+
+@pytest.mark.parametrize(
+    ("probability", "text"), [(0.9499, "0.94"), (0.95, "0.95"), (0.0, "0.00"), (1.0, "1.00")]
+)
+def test_a_probability_below_a_threshold_does_not_read_as_if_it_had_reached_it(
+    probability: float, text: str
+) -> None:
+    assert _below(probability) == text

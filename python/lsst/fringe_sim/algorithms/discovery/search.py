@@ -315,6 +315,8 @@ class _Search:
         best = self._most_credible(selector, singles)
         if not self._consistent(best):
             best = self._most_credible(selector, self._searched_harder(selector, singles))
+        elif selector.shifts_phase(best):  # few data see only noise in a wrong order too
+            best = selector.with_channels(selector.improved(best.names, selector.null.fit, scan=True))
         steps.append(self._step(selector, current, best))
         current = best
         while not steps[-1].consistent and len(current.names) < self.options.most_effects:
@@ -514,6 +516,7 @@ class _Search:
             self.say("a residual remains that only all data show")
             larger = self._one_more(training, chosen)
             if larger is not None:
+                larger = self._pruned(training, larger)
                 steps.append(self._step(training, chosen, larger))
                 chosen, classes = self._classified(training, larger, steps)
                 final = self._of_all_data(whole, chosen)
@@ -537,7 +540,7 @@ class _Search:
         for name in final.names:
             probability = classes[name].probability * (1.0 - outsider)
             if probability < self.options.least_probability:
-                reasons.append(f"the class of {name} has probability {probability:.2f} only")
+                reasons.append(f"the class of {name} has probability {_below(probability)} only")
             named.append(self._named(final, name, classes[name], probability))
         self.notes.append(
             f"held out: chi2 of blocks falls by {self.unseen.blocks:.1f}, "
@@ -667,6 +670,11 @@ class _Search:
             verdict, effects, self.where, gap, tuple(steps), unexplained, self.model.setup.name, chance, candidates,
             self.next_measurements, tuple(self.notes), data,
         )  # fmt: skip
+
+
+def _below(probability: float) -> str:
+    """A probability to two digits, rounded down: what missed a threshold does not read as if it had reached it."""
+    return f"{math.floor(100.0 * probability) / 100.0:.2f}"
 
 
 def _chance_of(gain: float, degrees: int, undescribed: float) -> float:
