@@ -35,7 +35,7 @@ FloatArray = NDArray[np.float64]
 SURELY = 1e-7
 """Chance of noise below which an effect is added to a set that leaves nothing else to see."""
 
-LEAST_PROMISE = 9.0
+WORTH_FITTING = 9.0
 """Fall of χ² that an effect must promise to be fitted."""
 
 MORE_THAN_PROMISED = 3.0
@@ -275,7 +275,7 @@ class _Search:
             worth = scores
         else:
             missing = base.fit.chi2 - rival.fit.chi2 if rival else 0.0
-            least = max(LEAST_PROMISE, missing / MORE_THAN_PROMISED)
+            least = max(WORTH_FITTING, missing / MORE_THAN_PROMISED)
             worth = [c for c in scores if c.promise > least][: self.options.refits]
         refitted = [selector.hypothesis((*base.names, c.name), c.start, base.fit) for c in worth]
         for hypothesis in refitted:
@@ -389,7 +389,7 @@ class _Search:
             alike = []
             for candidate in selector.score(rest.fit, selector.others(current)):
                 smaller = len(selector.coordinates[candidate.name]) < len(own)
-                if candidate.promise > LEAST_PROMISE and smaller:
+                if candidate.promise > WORTH_FITTING and smaller:
                     features = selector.features(state, rest.fit, candidate.name)
                     alike.append((similarity(state.design, own, features), candidate))
             for cosine, candidate in sorted(alike, key=lambda pair: -pair[0])[: self.options.parents]:
@@ -416,7 +416,7 @@ class _Search:
             for candidate in selector.score(parent.fit, selector.others(parent), scan=True):
                 key = frozenset((*parent.names, candidate.name))
                 left = parent.fit.chi2 - candidate.promise
-                if candidate.promise > LEAST_PROMISE and left < promised.get(key, (math.inf,))[0]:
+                if candidate.promise > WORTH_FITTING and left < promised.get(key, (math.inf,))[0]:
                     promised[key] = (left, parent, candidate)
         best = sorted(promised.values(), key=lambda item: item[0])[: 2 * self.options.refits]
         found = []

@@ -178,7 +178,8 @@ class Selector:
         self.null = replace(self.null, channels=self.criticise(null))
         self.fitted: dict[frozenset[str], Hypothesis] = {frozenset(): self.null}
         self._searched: dict[frozenset[str], Fit] = {}
-        self._scores: dict[tuple[int, bool], tuple[Fit, dict[str, Candidate | None]]] = {}
+        # Sets are enlarged, swapped and compared from the same fits.
+        self._scores: dict[tuple[Fit, bool], dict[str, Candidate | None]] = {}
 
     def state(self, fit: Fit) -> State:
         """Everything the tests need at a fit."""
@@ -238,18 +239,13 @@ class Selector:
 
         With ``scan``, finite signatures are tried besides the derivative.
         """
-        known = self._scored(fit, scan)
+        known = self._scores.setdefault((fit, scan), {})
         missing = [name for name in names if name not in known]
         if missing:
             state = self.state(fit)
             known |= {name: self._candidate(state, fit, name, scan) for name in missing}
         found = [candidate for name in names if (candidate := known[name]) is not None]
         return sorted(found, key=lambda item: -item.promise)
-
-    def _scored(self, fit: Fit, scan: bool) -> dict[str, Candidate | None]:
-        """Score tests made at a fit: sets are enlarged, swapped and compared from the same ones."""
-        # The fit is kept beside them, that no other gets its identity.
-        return self._scores.setdefault((id(fit), scan), (fit, {}))[1]
 
     def _candidate(self, state: State, fit: Fit, name: str, scan: bool) -> Candidate | None:
         """Score test of an effect; `None` if it is not seen or cannot be combined with those that are in already."""
