@@ -30,7 +30,7 @@ from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
 from .hidden_effects import AmplifierState, HiddenEffect, validate_effects
 from .raw_frames import setup_optics
-from .thickness import random_field
+from .thickness import PixelArea, random_field
 
 __all__ = [
     "OUTSIDERS",
@@ -41,6 +41,9 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 Draw = Callable[[np.random.Generator], dict[str, float]]
+
+FULL_SPAN_PX = 96
+"""Side from which on a sensor has the full range of thickness [px]: smaller ones get no finer fringes."""
 
 STATED_FWHM_NM, STATED_KELVIN = 2.0, 183.15
 READ_NOISE_E = 6.0
@@ -234,9 +237,8 @@ def draw_case(
             values.update(SIZES[str(name)](rng))
     elif kind == "outsider":
         outsider = str(rng.choice(list(only) or list(OUTSIDERS)))
-    thickness = random_field(
-        size, rng, mean=float(rng.uniform(13.0, 20.0)), span=float(rng.uniform(1.5, 5.0))
-    )
+    mean, span = float(rng.uniform(13.0, 20.0)), float(rng.uniform(1.5, 5.0))
+    thickness = random_field(size, rng, mean=mean, span=span * min(1.0, min(size) / FULL_SPAN_PX))
     noise_factor = float(rng.uniform(0.8, 1.2) ** 2)
     cube, sizes = _expose(thickness, values, outsider, noise_factor, rng)
     names = tuple(dict.fromkeys(key.split(".")[0] for key in values)) or ((outsider,) if outsider else ())
@@ -258,7 +260,8 @@ def _expose(
     wavelengths = np.arange(880.0, 991.0, 10.0)
     if rng.random() < 0.3:  # real runs lose exposures
         wavelengths = np.sort(rng.choice(wavelengths, size=10, replace=False))
-    table = optics.table((float(thickness.min()), float(thickness.max())), tuple(wavelengths))
+    area = PixelArea.of(thickness)
+    table = optics.table(area.range_um, tuple(wavelengths))
     shape = thickness.shape
     response = 1.0 + float(rng.choice([0.0, 0.003, 0.006])) * rng.standard_normal(shape)
     gain, offset = _amplifiers(active, shape, rng)
@@ -266,7 +269,7 @@ def _expose(
     level = _decades(rng, 4.0, 4.7)
     images, variances = [], []
     for row, wavelength in enumerate(wavelengths):
-        light = table.evaluate(row, thickness)
+        light = area.average(partial(table.evaluate, row))
         light = light / light.mean()
         for effect, own in active:
             if effect.on_light is not None:

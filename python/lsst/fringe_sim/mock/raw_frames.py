@@ -10,6 +10,7 @@ import datetime
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from .hidden_effects import AmplifierState, HiddenEffect, validate_effects
 from .optics import Film, FlatFieldOptics, SignalTable
 from .raw_files import Clock, primary_header, write_frame
 from .readout import Readout
+from .thickness import PixelArea
 
 __all__ = [
     "Defects",
@@ -134,7 +136,7 @@ class MockTruth:
     def light(self, wavelength_nm: float) -> FloatArray:
         """Light that becomes charge, relative to its mean over the sensor: fringes and illumination, no defects."""
         row = self.table.wavelengths_nm.index(float(wavelength_nm))
-        signal = self.table.evaluate(row, self.thickness_um)
+        signal = PixelArea.of(self.thickness_um).average(partial(self.table.evaluate, row))
         light = signal / signal.mean()
         for effect, values in _active(self.effects):
             if effect.on_light is not None:
@@ -396,7 +398,7 @@ def _make_truth(
         thickness_um=thickness,
         effects={effect.name: dict(values) for effect, values in active},
         optics=optics,
-        table=optics.table((float(thickness.min()), float(thickness.max())), wavelengths),
+        table=optics.table(PixelArea.of(thickness).range_um, wavelengths),
         amplifiers=tuple(_amplifier_state(amp, active, amplifier_rng) for amp in sensor.amplifiers),
         response=response,
         excess_e=excess,

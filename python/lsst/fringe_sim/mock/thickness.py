@@ -5,7 +5,9 @@ Every map is an array ``[y, x]`` in µm on the assembled, trimmed sensor, lower-
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
@@ -20,6 +22,7 @@ from ..resources import read_table
 __all__ = [
     "E2V_SHAPE",
     "HARD_MAPS",
+    "PixelArea",
     "Sampling",
     "closed_islands",
     "e2v_321",
@@ -35,6 +38,9 @@ E2V_SHAPE = (4004, 4096)
 
 FRINGE_ORDER_UM = 0.300
 """Thickness of one fringe order at 960 nm in an adhesive of index 1.6 [µm]."""
+
+GAUSS_NODES = ((-0.5 * math.sqrt(0.6), 5.0 / 18.0), (0.0, 4.0 / 9.0), (0.5 * math.sqrt(0.6), 5.0 / 18.0))
+"""Places along a side of a pixel [px] and their weights: exact to the fifth power."""
 
 Sampling = Literal["resample", "window"]
 """How a large map becomes a small one: the whole of it on fewer pixels, or a part of it pixel by pixel."""
@@ -244,6 +250,62 @@ HARD_MAPS: Mapping[str, Callable[[tuple[int, int]], NDArray[np.float64]]] = Mapp
     }
 )
 """Maps that a thickness fit must master, by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class PixelArea:
+    """A thickness map over the area of its pixels: each is a plane through its own thickness.
+
+    Attributes
+    ----------
+    thickness_um : `numpy.ndarray` [y, x]
+        Thickness at the centres of the pixels [µm].
+    slope_y, slope_x : `numpy.ndarray` [y, x]
+        How the thickness rises within a pixel [µm per px].
+    """
+
+    thickness_um: NDArray[np.float64]
+    slope_y: NDArray[np.float64]
+    slope_x: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, thickness_um: NDArray[np.float64]) -> PixelArea:
+        """Slopes from the neighbours; where the map has a step or a summit, a pixel does not reach beyond it."""
+        slopes = [_limited_slope(thickness_um, axis) for axis in (0, 1)]
+        return cls(thickness_um, slopes[0], slopes[1])
+
+    @property
+    def range_um(self) -> tuple[float, float]:
+        """Thinnest and thickest place within any pixel [µm]."""
+        reach = 0.5 * (np.abs(self.slope_y) + np.abs(self.slope_x))
+        return float((self.thickness_um - reach).min()), float((self.thickness_um + reach).max())
+
+    def average(self, signal: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Mean over each pixel of what depends on the thickness, by 3 × 3 nodes of Gauss and Legendre."""
+        total = np.zeros(self.thickness_um.shape)
+        for thickness, weight in self._nodes():
+            total += weight * signal(thickness)
+        return total
+
+    def _nodes(self) -> Iterator[tuple[NDArray[np.float64], float]]:
+        for up, weight_y in GAUSS_NODES:
+            for along, weight_x in GAUSS_NODES:
+                yield self.thickness_um + up * self.slope_y + along * self.slope_x, weight_y * weight_x
+
+
+def _limited_slope(field: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Harmonic mean of the differences to both neighbours, zero where they disagree (van Leer 1977)."""
+    result = np.zeros(field.shape)
+    size = field.shape[axis]
+    if size < 2:
+        return result
+    own = result.swapaxes(0, axis)
+    step = np.diff(field, axis=axis).swapaxes(0, axis)
+    below, above = step[:-1], step[1:]
+    product = below * above
+    np.divide(2.0 * product, below + above, out=own[1:-1], where=product > 0.0)
+    own[0], own[-1] = step[0], step[-1]
+    return result
 
 
 def _positions(what: str, wanted: int, available: int, sampling: Sampling, first: int) -> NDArray[np.float64]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numba
@@ -40,6 +41,9 @@ MOST_TABLE_BYTES = 400e6
 
 MOST_ROWS = 8
 """Rows kept for each exposure while wavelengths are moved."""
+
+LEAST_SPREAD = 1e-12
+"""Variance of the thickness in a cell that is rounding [steps of the table squared]."""
 
 _BLOCK = 256
 """Cells that a core interpolates at a time."""
@@ -104,6 +108,8 @@ class Forward:
         The light; monochromator flats by default.
     scatter_um2 : `numpy.ndarray`, shape ``(ny, nx)``, optional
         Variance of the thickness at which a cell is looked up about the true one [µm²]; by default none.
+    point_pixels : `bool`, optional
+        A pixel sees the thickness at its centre only. Real pixels, and by default these, average over their area.
     """
 
     model: FringeModel
@@ -115,6 +121,7 @@ class Forward:
     seen: NDArray[np.bool_] | None = None
     exposures: Exposures | None = None
     scatter_um2: FloatArray | None = None
+    point_pixels: bool = False
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[int, float], FloatArray] = field(default_factory=dict, repr=False)
     _rows_of: tuple[tuple[str, float], ...] | None = field(default=None, repr=False)
@@ -152,6 +159,10 @@ class Forward:
         return cls(
             model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid, cells.seen, exposures
         )
+
+    def with_point_pixels(self, point_pixels: bool) -> Forward:
+        """The same with pixels that are points, or areas; tables made so far are kept."""
+        return replace(self, point_pixels=point_pixels, _tables=dict(self._tables), _rows=dict(self._rows))
 
     def table(self, settings: Settings) -> FloatArray:
         """Response ``(W, D)`` on the grid of thickness, relative to its mean, as flats are.
@@ -334,12 +345,9 @@ class Forward:
         return second - scatter, fourth + 3.0 * scatter**2 - 6.0 * second * scatter
 
     def _spread_of_pixels(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Second and fourth moment of the thickness of the pixels of each cell, from the gradient of the field."""
-        if self.cell_px == 1:
-            nothing = np.zeros(gradient.shape[1:])
-            return nothing, nothing
-        # Pixels stand evenly along both axes: moments of two discrete uniform distributions.
-        square, inverse = gradient**2, 1.0 / self.cell_px**2
+        """Second and fourth moment of the thickness over the area of each cell, from the gradient of the field."""
+        # Uniform along both axes; points stand evenly, and their distributions are discrete.
+        square, inverse = gradient**2, 1.0 / self.cell_px**2 if self.point_pixels else 0.0
         along = square * (1.0 - inverse) / 12.0
         fourth = (square**2).sum(axis=0) * (1.0 - inverse) * (3.0 - 7.0 * inverse) / 240.0
         return along.sum(axis=0), fourth + 6.0 * along[0] * along[1]
@@ -398,40 +406,31 @@ def _interpolate(
     second: FloatArray,
     fourth: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
-    """Cubic interpolation of value and slope, averaged over the thickness spread to fourth order."""
-    waves, nodes = table.shape
+    """Cubic interpolation of value and slope, averaged over the thickness spread.
+
+    Three places have its second and fourth moment: of a uniform spread those of Gauss and Legendre.
+    """
+    waves = table.shape[0]
     column = np.ascontiguousarray(table.T)  # the wavelengths of a node side by side
     value = np.empty((waves, thickness.size))
     slope = np.empty((waves, thickness.size))
     for block in numba.prange((thickness.size + _BLOCK - 1) // _BLOCK):
         first = block * _BLOCK
         number = min(_BLOCK, thickness.size - first)
-        own_value, own_slope = np.empty((number, waves)), np.empty((number, waves))
+        own_value, own_slope = np.zeros((number, waves)), np.zeros((number, waves))
         for j in range(number):
             i = first + j
-            # Cells without data may be anywhere; beyond the table they stay at its ends.
-            position = min(max((thickness[i] - start) / step, 3.0), nodes - 4.0)
-            k = min(int(np.floor(position)), nodes - 5)
-            x = position - k
-            half = 0.5 * second[i] / (step * step)
-            rest = fourth[i] / 24.0 / (step * step) ** 2
-            for w in range(waves):
-                a, b, c, d = column[k - 1, w], column[k, w], column[k + 1, w], column[k + 2, w]
-                if half != 0.0:
-                    # The spread is taken into the nodes, by their second and fourth differences.
-                    o, p, q, r = column[k - 3, w], column[k - 2, w], column[k + 3, w], column[k + 4, w]
-                    a, b, c, d = (
-                        _spread_node(o, p, a, b, c, half, rest),
-                        _spread_node(p, a, b, c, d, half, rest),
-                        _spread_node(a, b, c, d, q, half, rest),
-                        _spread_node(b, c, d, q, r, half, rest),
-                    )
-                # Lagrange polynomial through four nodes, in powers of x
-                c1 = c - a / 3.0 - b / 2.0 - d / 6.0
-                c2 = 0.5 * (a + c) - b
-                c3 = (d - a) / 6.0 + 0.5 * (b - c)
-                own_value[j, w] = b + x * (c1 + x * (c2 + x * c3))
-                own_slope[j, w] = (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
+            position = (thickness[i] - start) / step
+            spread, tail = second[i] / (step * step), fourth[i] / (step * step) ** 2
+            if abs(spread) < LEAST_SPREAD:
+                _add_lookup(own_value[j], own_slope[j], column, position, 1.0, step)
+            elif spread > 0.0 and tail >= spread * spread:
+                away, weight = math.sqrt(tail / spread), 0.5 * spread * spread / tail
+                _add_lookup(own_value[j], own_slope[j], column, position, 1.0 - 2.0 * weight, step)
+                _add_lookup(own_value[j], own_slope[j], column, position - away, weight, step)
+                _add_lookup(own_value[j], own_slope[j], column, position + away, weight, step)
+            else:
+                _add_series(own_value[j], own_slope[j], column, position, 0.5 * spread, tail / 24.0, step)
         for w in range(waves):
             for j in range(number):
                 value[w, first + j] = own_value[j, w]
@@ -453,6 +452,44 @@ def _move_to_centroids(
         for i in range(value.shape[1]):
             moved = gradient[0, i] * rest[0, plane, i] + gradient[1, i] * rest[1, plane, i]
             value[row, i] += slope[row, i] * moved
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _add_lookup(value, slope, column, position, weight, step):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Add the Lagrange polynomial through four nodes, and its derivative, at one place, all wavelengths."""
+    # Cells without data may be anywhere; beyond the table they stay at its ends.
+    inside = min(max(position, 1.0), column.shape[0] - 2.0)
+    k = min(int(np.floor(inside)), column.shape[0] - 3)
+    x = inside - k
+    for w in range(value.size):
+        a, b, c, d = column[k - 1, w], column[k, w], column[k + 1, w], column[k + 2, w]
+        c1 = c - a / 3.0 - b / 2.0 - d / 6.0
+        c2 = 0.5 * (a + c) - b
+        c3 = (d - a) / 6.0 + 0.5 * (b - c)
+        value[w] += weight * (b + x * (c1 + x * (c2 + x * c3)))
+        slope[w] += weight * (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _add_series(value, slope, column, position, half, rest, step):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """The same with moments that no spread has: they are taken into the nodes, by second and fourth differences."""
+    inside = min(max(position, 3.0), column.shape[0] - 4.0)
+    k = min(int(np.floor(inside)), column.shape[0] - 5)
+    x = inside - k
+    for w in range(value.size):
+        o, p, a, b = column[k - 3, w], column[k - 2, w], column[k - 1, w], column[k, w]
+        c, d, q, r = column[k + 1, w], column[k + 2, w], column[k + 3, w], column[k + 4, w]
+        a, b, c, d = (
+            _spread_node(o, p, a, b, c, half, rest),
+            _spread_node(p, a, b, c, d, half, rest),
+            _spread_node(a, b, c, d, q, half, rest),
+            _spread_node(b, c, d, q, r, half, rest),
+        )
+        c1 = c - a / 3.0 - b / 2.0 - d / 6.0
+        c2 = 0.5 * (a + c) - b
+        c3 = (d - a) / 6.0 + 0.5 * (b - c)
+        value[w] += b + x * (c1 + x * (c2 + x * c3))
+        slope[w] += (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
 
 
 @numba.njit(cache=True, inline="always")

@@ -196,7 +196,8 @@ def _forward_like(
     forward: Forward, cells: CellData, model: FringeModel, exposures: Exposures | None
 ) -> Forward:
     """Other data of the same thicknesses and effects."""
-    return Forward.of_cells(model, forward.catalogue, cells, forward.range_um, exposures)
+    like = Forward.of_cells(model, forward.catalogue, cells, forward.range_um, exposures)
+    return like.with_point_pixels(forward.point_pixels)
 
 
 def _problem_with(problem: Problem, cells: CellData, forward: Forward) -> Problem:

@@ -31,6 +31,9 @@ SMOOTH_SPACING = 8.0
 MUCH_BETTER = 0.7
 """Knots with which two thicknesses are compared [cells], and the χ² for which one is taken for the other."""
 
+MUCH_SHARPER = 16.0
+"""χ², over its mean, that pixels without an area must gain."""
+
 FEWEST_ROWS = 6
 """Rows and columns of cells from which on noise and levels can be measured."""
 
@@ -219,7 +222,7 @@ def _prepare_rich(
     """Field and noise from a first thickness, as judged with some effects in the model."""
     problem = Problem(cells, forward, CellBasis(start.shape), _free_levels(cells))
     problem, fit, cells = _without_spoiled(*_choose_field(problem, start, settings), cells, settings)
-    return _settle(problem, fit, cells, index)
+    return _settle(*_choose_pixels(problem, fit, settings), cells, index)
 
 
 def _cells_of(cube: FringeCube, size: int, most_cells: int) -> CellData:
@@ -274,11 +277,13 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     start = mended_thickness(model, problem.cells, thickness_um)
     start = _better_start(problem, fit.settings, start, starting_thickness(model, problem.cells))
     mended = int(np.count_nonzero(start != thickness_um))
-    refined = _settle(*_choose_field(problem, start, fit.settings), prepared.stated, prepared.index)
+    chosen = _choose_pixels(*_choose_field(problem, start, fit.settings), fit.settings)
+    refined = _settle(*chosen, prepared.stated, prepared.index)
     refined = replace(refined, null=_better_null(refined, prepared), guess=dict(fit.settings))
     change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
     scatter = abs(refined.noise.response_scatter - prepared.noise.response_scatter)
-    same_field = refined.problem.basis.size <= problem.basis.size and not mended
+    same_pixels = refined.problem.forward.point_pixels == problem.forward.point_pixels
+    same_field = refined.problem.basis.size <= problem.basis.size and not mended and same_pixels
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended
@@ -342,6 +347,7 @@ def _prepare_known(
     if rich:
         problem, fit, spoiled = _spoiled_of(problem, fit, {})
         cells = cells.restricted(~spoiled)
+        problem, fit = _choose_pixels(problem, fit, {})
         problem = _settle(problem, fit, cells, index).problem
         problem, fit, taken = _with_map_as_good_as_it_is(problem, centre)
         return _settle(problem, fit, cells, index, taken)
@@ -411,6 +417,20 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
     return best
 
 
+def _choose_pixels(problem: Problem, fit: Fit, settings: Mapping[str, float]) -> tuple[Problem, Fit]:
+    """Pixels as areas or as points, and the fit with them; points only where the data are clearly sharper.
+
+    Real pixels average over their area. Simulated frames may not, and no effect would ever sharpen them.
+    """
+    forward = problem.forward
+    other = replace(problem, forward=forward.with_point_pixels(not forward.point_pixels))
+    again = fit_model(other, (), np.zeros(0), fit.field, fit.levels, settings)
+    areas, points = ((problem, fit), (other, again))[:: -1 if forward.point_pixels else 1]
+    degrees = max(problem.cells.n_values - problem.basis.size - problem.cells.shape[0], 1)
+    unit = areas[1].chi2 / degrees
+    return points if areas[1].chi2 - points[1].chi2 > MUCH_SHARPER * unit else areas
+
+
 def _settle(
     problem: Problem, fit: Fit, stated: CellData, index: FloatArray, taken: FloatArray | float = 0.0
 ) -> Prepared:
@@ -430,6 +450,8 @@ def _settle(
     notes = _part_told(stated)
     if abs(noise.neighbour_correlation) > 0.1:
         notes.append(f"noise of neighbouring cells is correlated ({noise.neighbour_correlation:.2f})")
+    if problem.forward.point_pixels:
+        notes.append("sharper than light averaged over pixels can be: each is taken as a point")
     if not noise.measured:
         notes.append("noise level taken as stated: too few cells to measure it")
     return Prepared(problem, settled, noise, index, _is_rich(stated), stated, tuple(notes), fit.field)
