@@ -11,7 +11,7 @@ from astropy.io import fits
 
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.mock import E2V_SHAPE, HARD_MAPS, e2v_321, fit_to_sensor, random_field
-from lsst.fringe_sim.mock.thickness import closed_islands, steep_gradient, two_halves
+from lsst.fringe_sim.mock.thickness import PixelArea, closed_islands, steep_gradient, two_halves
 from lsst.fringe_sim.resources import read_table
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "fit_e2v_321_thickness.py"
@@ -168,3 +168,23 @@ def test_halves_are_disconnected() -> None:
     step = thickness[50] - thickness[49]
     assert step[40] == pytest.approx(1.37, abs=0.15)
     assert np.abs(np.diff(thickness, axis=0))[:49].max() < 0.1
+
+
+def test_light_is_averaged_over_the_area_of_a_pixel() -> None:
+    """Of a plane: a fifth power exactly; the variance within a square of one pixel is a twelfth along either side."""
+    y, x = np.indices((9, 7))
+    plane = 15.0 + 0.03 * x - 0.05 * y
+    area = PixelArea.of(plane)
+    np.testing.assert_allclose(area.average(lambda t: (t - plane) ** 2), (0.03**2 + 0.05**2) / 12.0)
+    np.testing.assert_allclose(area.average(lambda t: (t - plane) ** 5), 0.0, atol=1e-18)
+    wave = area.average(lambda t: np.cos(20.0 * (t - 15.0)))
+    exact = np.cos(20.0 * (plane - 15.0)) * np.sinc(0.3 / np.pi) * np.sinc(0.5 / np.pi)
+    np.testing.assert_allclose(wave, exact, rtol=0.0, atol=6e-7)  # 1 / 448 - 0.15^3 * 5 / 9, over 6!, is 5e-7
+    assert area.range_um == pytest.approx((plane.min() - 0.04, plane.max() + 0.04))
+
+
+def test_a_pixel_does_not_reach_over_a_step() -> None:
+    step = np.where(np.arange(10) < 5, 15.0, 16.0)[:, np.newaxis] * np.ones(4)
+    area = PixelArea.of(step)
+    np.testing.assert_allclose(area.average(np.asarray), step, rtol=1e-14)
+    assert area.range_um == (15.0, 16.0)

@@ -23,6 +23,7 @@ from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.effects.image_geometry import AMPLIFIERS
 from lsst.fringe_sim.mock import challenge
 from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.mock.thickness import PixelArea
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
 from lsst.fringe_sim.products.mask import mask_bits
@@ -37,9 +38,15 @@ def _smooth_field(rows: int, columns: int) -> np.ndarray:
     return field
 
 
+def _light(thickness: np.ndarray, settings: dict[str, float]) -> np.ndarray:
+    """Relative flats, averaged over the pixels."""
+    model = FringeModel.from_setup("ts8_e2v", settings)
+    light = PixelArea.of(thickness).average(lambda each: model.response(each, WAVELENGTHS))
+    return np.asarray(light / light.mean(axis=(1, 2), keepdims=True))
+
+
 def _cube(thickness: np.ndarray, settings: dict[str, float], level: float, seed: int) -> FringeCube:
-    response = FringeModel.from_setup("ts8_e2v", settings).response(thickness, WAVELENGTHS)
-    light = level * response / response.mean(axis=(1, 2), keepdims=True)
+    light = level * _light(thickness, settings)
     counts = np.random.default_rng(seed).poisson(light).astype(np.float32)
     exposures = FlatExposures(WAVELENGTHS, np.array(2.0), np.array(183.15))
     return FringeCube(
@@ -243,8 +250,7 @@ def test_an_offset_is_a_part_of_flats_that_another_effect_has_made_weaker() -> N
     cells = bin_cube(cube, 1)
     model = FringeModel.from_setup("ts8_e2v")
     forward = Forward.of_cells(model, EFFECTS, cells, (float(truth.min()) - 0.5, float(truth.max()) + 0.5))
-    light = FringeModel.from_setup("ts8_e2v", {"temperature.kelvin": 204.0}).response(truth, WAVELENGTHS)
-    counts = level * light / light.mean(axis=(1, 2), keepdims=True)
+    counts = level * _light(truth, {"temperature.kelvin": 204.0})
     amplifier = cells.geometry.amplifier
     counts += 400.0 * (amplifier == AMPLIFIERS.index("C03")) - 600.0 * (amplifier == AMPLIFIERS.index("C12"))
     forward.predict({}, truth)  # the search begins with the unchanged model

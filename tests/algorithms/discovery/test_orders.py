@@ -87,7 +87,7 @@ def test_rivals_fitted_in_another_order_are_fitted_again(sensor, selector) -> No
 def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
     """Its misfit has a minimum for every fringe, in every order of the thickness."""
     for seed in range(first_seed, first_seed + 1000):
-        case = draw_case("one", np.random.default_rng(seed), size=(48, 48), only=["gate_thickness"])
+        case = draw_case("one", np.random.default_rng(seed), only=["gate_thickness"])
         if abs(case.values["gate_thickness.offset"]) > 0.05:
             break
     gate = [effect for effect in EFFECTS if effect.name == "gate_thickness"]

@@ -282,10 +282,7 @@ class PixelArea:
 
     def average(self, signal: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> NDArray[np.float64]:
         """Mean over each pixel of what depends on the thickness, by 3 × 3 nodes of Gauss and Legendre."""
-        total = np.zeros(self.thickness_um.shape)
-        for thickness, weight in self._nodes():
-            total += weight * signal(thickness)
-        return total
+        return np.asarray(sum(weight * signal(thickness) for thickness, weight in self._nodes()))
 
     def _nodes(self) -> Iterator[tuple[NDArray[np.float64], float]]:
         for up, weight_y in GAUSS_NODES:

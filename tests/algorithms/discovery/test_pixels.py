@@ -1,0 +1,84 @@
+"""Pixels are areas: they average the fringes over themselves, unless the data are sharper than that."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from lsst.fringe_sim.algorithms.discovery import discover
+from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.mock import random_field
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
+
+WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
+MODEL = FringeModel.from_setup("ts8_e2v")
+SUBPIXELS = (np.arange(9) - 4.0) / 9.0
+
+
+def _light(thickness: np.ndarray, *, points: bool) -> np.ndarray:
+    """Relative flats of a map, at the centres of the pixels or as the mean of 81 places in each."""
+    if points:
+        light = MODEL.response(thickness, WAVELENGTHS)
+    else:
+        y, x = np.indices(thickness.shape)
+        light = np.mean(
+            [
+                MODEL.response(
+                    map_coordinates(thickness, [y + up, x + along], order=3, mode="mirror"), WAVELENGTHS
+                )
+                for up in SUBPIXELS
+                for along in SUBPIXELS
+            ],
+            axis=0,
+        )
+    return np.asarray(light / light.mean(axis=(1, 2), keepdims=True))
+
+
+def _cube(thickness: np.ndarray, rng: np.random.Generator, *, points: bool) -> FringeCube:
+    counts = rng.poisson(3e4 * _light(thickness, points=points)).astype(np.float32)
+    exposures = FlatExposures(WAVELENGTHS, np.array(2.0), np.array(183.15))
+    return FringeCube(counts, counts, np.zeros(counts.shape, np.int32), exposures, "electron")
+
+
+@pytest.mark.parametrize("cell_px", [1, 2])
+def test_the_fringes_are_averaged_over_the_area_of_a_cell(cell_px: int) -> None:
+    """Of a plane whose fringes are four cells wide, inside, where the gradient is that of the plane."""
+    size = 48
+    y, x = np.indices((size, size))
+    thickness = 15.0 + (0.06 * x + 0.04 * y) / cell_px
+    light = _light(thickness, points=False)
+    cube = FringeCube(
+        light.astype(np.float32),
+        np.ones(light.shape, np.float32),
+        np.zeros(light.shape, np.int32),
+        FlatExposures(WAVELENGTHS, np.array(2.0), np.array(183.15)),
+        "relative",
+    )
+    cells = bin_cube(cube, cell_px)
+    centres = thickness.reshape(size // cell_px, cell_px, size // cell_px, cell_px).mean(axis=(1, 3))
+    limits = (float(thickness.min()) - 0.5, float(thickness.max()) + 0.5)
+    inside = (slice(None), slice(4, -4), slice(4, -4))
+    errors = {}
+    for points in (False, True):
+        forward = Forward.of_cells(MODEL, EFFECTS, cells, limits).with_point_pixels(points)
+        value = forward.predict({}, centres).value[inside]
+        # Flats are over the mean of the sensor, tables over that of all thicknesses.
+        scale = (cells.value[inside] * value).sum(axis=(1, 2)) / (value**2).sum(axis=(1, 2))
+        miss = cells.value[inside] - scale[:, np.newaxis, np.newaxis] * value
+        errors[points] = float(miss.std() / cells.value[inside].std())
+    assert errors[False] < 2e-3
+    assert errors[True] > 10.0 * errors[False]
+
+
+@pytest.mark.parametrize("points", [False, True])
+def test_a_sensor_without_an_effect_is_taken_for_what_it_is(points: bool) -> None:
+    """Steep fringes show whether pixels are areas; either way nothing is missing, and points are told."""
+    rng = np.random.default_rng(41)
+    thickness = random_field((64, 64), rng, mean=15.0, span=2.5)
+    verdict = discover(_cube(thickness, rng, points=points), "ts8_e2v", rng=rng)
+    assert verdict.verdict == "no_discrepancy"
+    assert any("taken as a point" in note for note in verdict.notes) == points
