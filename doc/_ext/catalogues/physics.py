@@ -50,7 +50,8 @@ def effects() -> str:
             if effect.acts_on != place:
                 continue
             parts.append(f"### `{effect.name}`")
-            parts.append(f"{_sentence(effect.title)} {_first_paragraph(type(effect).__doc__)}")
+            first, *conventions = _paragraphs(type(effect).__doc__)
+            parts += [f"{_sentence(effect.title)} {first}", *conventions]
             head = ("parameter", "meaning", "unit", "absent at", "bounds", "typical")
             parts.append(table(head, [_parameter_row(effect.name, each) for each in effect.parameters]))
             parts.append(f"Source: {effect.reference}.")
@@ -194,8 +195,8 @@ def mask_planes() -> str:
     return table(("bit", "plane", "meaning"), rows)
 
 
-def _first_paragraph(docstring: str | None) -> str:
-    return " ".join((docstring or "").strip().split("\n\n")[0].split())
+def _paragraphs(docstring: str | None) -> list[str]:
+    return [" ".join(part.split()) for part in (docstring or "").strip().split("\n\n")]
 
 
 def _sentence(text: str) -> str:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover, read_effects_override
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
+from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
 from lsst.fringe_sim.algorithms.discovery.search import _below
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.mock.challenge import SealedCase, draw_case
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.challenge_result import CASE_KINDS
+from lsst.fringe_sim.products.fringe_cube import FringeCube
 
 SIZE = (48, 64)
+MODEL = FringeModel.from_setup("ts8_e2v")
 
 
 def test_banded_normal_matrix_is_the_dense_one() -> None:
@@ -84,6 +89,24 @@ def test_contradicting_set_up_is_refused() -> None:
         discover(cube, "bnl_ts8_e2v", rng=np.random.default_rng(0))
     with pytest.raises(InputError, match="monochromator"):
         discover(cube, "lsst_e2v", rng=np.random.default_rng(0))
+
+
+def test_a_temperature_that_the_flats_state_is_told_or_refused() -> None:
+    """The model keeps that of the set-up: three kelvin would be found as if nobody had known."""
+    cube = draw_case("none", np.random.default_rng(3), size=SIZE).cube
+    rows = cube.exposures
+
+    def at(kelvin: float) -> FringeCube:
+        return replace(cube, exposures=replace(rows, temperature_k=np.full(len(rows.wavelength_nm), kelvin)))
+
+    with pytest.raises(InputError, match=r"\[K\] is 190.0; allowed: within 5 .* temperature.kelvin"):
+        check_setup(at(190.0), MODEL)
+    check_setup(at(186.5), MODEL)
+    assert headers_apart(cube, MODEL) == ()
+    (note,) = headers_apart(at(186.5), MODEL)
+    assert "186.5 K" in note
+    assert "183.15" in note
+    assert headers_apart(at(186.5), FringeModel.from_setup("ts8_e2v", {"temperature.kelvin": 186.5})) == ()
 
 
 @pytest.mark.slow

@@ -13,14 +13,19 @@ __all__ = ["AmplifierGain"]
 
 
 class AmplifierGain(PlainNullEffect):
-    """Each amplifier has another gain than the tables say; a common factor does not show in relative flats."""
+    """Each amplifier has another gain (electrons per count) than the tables say, and one that is larger counts fewer.
+
+    A factor common to all does not show in relative flats: the errors are known relative to one another, and the
+    uncertainty of each is mostly that of their mean.
+    """
 
     name = "amplifier_gain"
     title = "gain errors of the amplifiers"
     acts_on = "image"
     reference = "Guo, Walter, Lage & Lupton 2022, section 3.2; gains of LSSTCam scatter by a few per cent"
     parameters = tuple(
-        Parameter(name, "", 0.0, (-0.5, 0.5), 0.01, f"relative gain error of {name}") for name in AMPLIFIERS
+        Parameter(name, "", 0.0, (-0.5, 0.5), 0.01, f"true over stated gain of {name}, minus 1")
+        for name in AMPLIFIERS
     )
 
     def change_image(

@@ -16,7 +16,11 @@ _REACH_NM = 50.0
 
 
 class ChromaticIllumination(PlainNullEffect):
-    """The illumination pattern changes in proportion to wavelength about the middle of the exposures."""
+    """The illumination pattern changes in proportion to wavelength about the middle of the exposures.
+
+    The exposures halfway between the shortest and the longest wavelength are evenly lit; u and v go from -1 at the
+    left and lower edge of the sensor to 1 at the right and upper one.
+    """
 
     name = "chromatic_illumination"
     title = "uneven illumination, changing with wavelength"

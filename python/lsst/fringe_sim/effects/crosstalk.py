@@ -13,7 +13,10 @@ __all__ = ["Crosstalk"]
 
 
 class Crosstalk(PlainNullEffect):
-    """Each amplifier adds a small part of the pixels that its neighbours read at the same time."""
+    """Each amplifier adds a small part of the pixels that its neighbours in x read at the same time.
+
+    The part is one of what the neighbours hold before any crosstalk; all amplifiers read in the same direction.
+    """
 
     name = "crosstalk"
     title = "crosstalk between neighbouring amplifiers"

@@ -13,7 +13,10 @@ __all__ = ["LineWing"]
 
 
 class LineWing(PlainNullEffect):
-    """A part of the light lies in a Lorentzian of the same width: its wings make hardly any fringes."""
+    """A part of the light lies in a Lorentzian of the same width: its wings make hardly any fringes.
+
+    The Lorentzian has the full width at half maximum of the line, and ends at ten times that from its middle.
+    """
 
     name = "line_wing"
     title = "Lorentzian wings of the line"

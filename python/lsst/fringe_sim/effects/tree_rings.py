@@ -21,7 +21,11 @@ LONGEST_PERIOD = 0.7
 
 
 class TreeRings(PlainNullEffect):
-    """Rings about the axis of the crystal: its doping changed while it grew, and moves the borders of pixels."""
+    """Rings about the axis of the crystal: its doping changed while it grew, and moves the borders of pixels.
+
+    The light is multiplied by 1 + cosine cos(2π (r - r₀) / period) + sine sin(2π (r - r₀) / period), averaged over
+    each pixel: r is the distance from the centre of the rings, r₀ that of the middle of the sensor.
+    """
 
     name = "tree_rings"
     title = "tree rings of the silicon"

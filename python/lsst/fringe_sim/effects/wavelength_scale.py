@@ -12,7 +12,7 @@ __all__ = ["WavelengthScale"]
 
 
 class WavelengthScale(PlainNullEffect):
-    """The wavelength error grows linearly from the middle of the range."""
+    """The wavelength error grows linearly from 935 nm, the middle of 880 to 990 nm, where it is zero."""
 
     name = "wavelength_scale"
     title = "wavelength scale"

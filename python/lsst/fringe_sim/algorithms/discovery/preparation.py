@@ -23,13 +23,24 @@ from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_varian
 from .outliers import spoiled_cells
 from .start import mended_thickness, starting_thickness
 
-__all__ = ["Prepared", "check_setup", "prepare", "prepare_again", "prepare_finer", "why_too_poor"]
+__all__ = [
+    "Prepared",
+    "check_setup",
+    "headers_apart",
+    "prepare",
+    "prepare_again",
+    "prepare_finer",
+    "why_too_poor",
+]
 
 FloatArray = NDArray[np.float64]
 
 SMOOTH_SPACING = 8.0
 MUCH_BETTER = 0.7
 """Knots with which two thicknesses are compared [cells], and the χ² for which one is taken for the other."""
+
+FARTHEST_K, SAME_K = 5.0, 0.5
+"""How far the temperature of flats may be from that of the set-up, and how far it is taken to be the same [K]."""
 
 MUCH_SHARPER = 16.0
 """χ², over its mean, that pixels without an area must gain."""
@@ -117,10 +128,10 @@ def check_setup(cube: FringeCube, model: FringeModel) -> None:
     rows = cube.exposures
     known = {item.effect.name for item in model.effects}
     stated = model.base_system.temperature_k
-    if np.any(np.abs(rows.temperature_k - stated) > 5.0) and "temperature" not in known:
-        raise InputError(
-            "temperature [K]", rows.temperature_k.tolist(), f"within 5 of the set-up's {stated:g}"
-        )
+    if np.any(np.abs(rows.temperature_k - stated) > FARTHEST_K) and "temperature" not in known:
+        allowed = f"within {FARTHEST_K:g} of the set-up's {stated:g}, or with the effect temperature.kelvin"
+        farthest = rows.temperature_k[np.abs(rows.temperature_k - stated).argmax()]
+        raise InputError("temperature of the flats [K]", float(farthest), allowed)
     width = model.setup.bandwidth_fwhm_nm
     measured = rows.bandwidth_fwhm_nm[rows.bandwidth_fwhm_nm > 0.0]
     if np.any(np.abs(measured - width) > 0.02 * width) and "bandwidth" not in known:
@@ -128,6 +139,24 @@ def check_setup(cube: FringeCube, model: FringeModel) -> None:
     single = model.base_system.beam.theta.size == 1
     if single and np.any(np.isfinite(rows.f_number)) and "converging_beam" not in known:
         raise InputError("f_number", rows.f_number.tolist(), "infinite: the set-up's light is parallel")
+
+
+def headers_apart(cube: FringeCube, model: FringeModel) -> tuple[str, ...]:
+    """What the flats say of the laboratory and the model does not follow, for the verdict."""
+    stated, temperature = model.base_system.temperature_k, cube.exposures.temperature_k
+    known = any(item.effect.name == "temperature" for item in model.effects)
+    if known or not np.any(np.abs(temperature - stated) > SAME_K):
+        return ()
+    return (
+        f"the flats state {_span(temperature)} K, the model has the set-up's {stated:g} K; to believe the flats, "
+        f"set the effect temperature.kelvin",
+    )
+
+
+def _span(values: FloatArray) -> str:
+    """A number, or the smallest and the largest of several."""
+    low, high = float(values.min()), float(values.max())
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def why_too_poor(cube: FringeCube, model: FringeModel) -> str:

@@ -23,7 +23,15 @@ from .fit import Fit, fit_model
 from .forward import Exposures
 from .next_frames import FrameForecast
 from .next_step import Ranking, flats_ranked, with_next_measurements
-from .preparation import Prepared, check_setup, prepare, prepare_again, prepare_finer, why_too_poor
+from .preparation import (
+    Prepared,
+    check_setup,
+    headers_apart,
+    prepare,
+    prepare_again,
+    prepare_finer,
+    why_too_poor,
+)
 from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
 from .validation import HeldOut, held_out_blocks, misfit_rms, validate, whole_thickness
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
@@ -186,6 +194,7 @@ class _Search:
     ) -> None:
         self.cube, self.model, self.effects, self.options, self.say = cube, model, effects, options, say
         self.rng = rng
+        self.headers = headers_apart(cube, model)
         self.next_measurements: tuple[dict[str, Any], ...] = ()
         self.unseen: HeldOut | None = None
         self._take_other_cells(prepared)
@@ -197,7 +206,7 @@ class _Search:
 
     def _take(self, prepared: Prepared) -> None:
         self.prepared, self.cells = prepared, prepared.problem.cells
-        self.notes = list(prepared.notes)
+        self.notes = [*self.headers, *prepared.notes]
 
     def run(self, refinements: int = 2) -> Verdict:
         """Search; start again if a named effect shows that field or noise were misjudged without it."""
