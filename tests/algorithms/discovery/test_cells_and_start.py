@@ -23,7 +23,7 @@ from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.effects.image_geometry import AMPLIFIERS
 from lsst.fringe_sim.mock import challenge
 from lsst.fringe_sim.mock.challenge import draw_case
-from lsst.fringe_sim.mock.thickness import PixelArea
+from lsst.fringe_sim.mock.thickness import PixelArea, random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
 from lsst.fringe_sim.products.mask import mask_bits
@@ -124,6 +124,19 @@ def test_ragged_patches_are_taken_back_by_the_surface_around_them(rng: np.random
     started = truth - 0.297 * wrong  # about an order
     mended = mended_thickness(FringeModel.from_setup("ts8_e2v"), cells, started)
     assert (np.abs(mended - truth) > 0.15).mean() < 0.002
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_sensor_of_less_than_a_fringe_has_levels_of_its_own(seed: int) -> None:
+    """Its flats are not relative to the mean of a fringe, as those of a hundred pixels of a real sensor are not."""
+    rng = np.random.default_rng(seed)
+    truth = random_field(
+        (64, 64), rng, mean=float(rng.uniform(12.5, 20.0)), span=float(rng.uniform(0.15, 0.3))
+    )
+    cells = bin_cube(_cube(truth, {}, 3e4, seed), 2)
+    centres = truth.reshape(32, 2, 32, 2).mean(axis=(1, 3))
+    found = starting_thickness(FringeModel.from_setup("ts8_e2v"), cells)
+    assert (np.abs(found - centres) < 0.5 * ORDER_UM).mean() > 0.99
 
 
 @pytest.mark.slow

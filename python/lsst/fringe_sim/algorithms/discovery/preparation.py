@@ -42,8 +42,8 @@ MUCH_BETTER = 0.7
 FARTHEST_K, SAME_K = 5.0, 0.5
 """How far the temperature of flats may be from that of the set-up, and how far it is taken to be the same [K]."""
 
-MUCH_SHARPER = 16.0
-"""χ², over its mean, that pixels without an area must gain."""
+MUCH_SHARPER = 9.0
+"""χ², over its mean, that pixels without an area must gain: three standard deviations."""
 
 FEWEST_ROWS = 6
 """Rows and columns of cells from which on noise and levels can be measured."""
@@ -455,8 +455,8 @@ def _choose_pixels(problem: Problem, fit: Fit, settings: Mapping[str, float]) ->
     other = replace(problem, forward=forward.with_point_pixels(not forward.point_pixels))
     again = fit_model(other, (), np.zeros(0), fit.field, fit.levels, settings)
     areas, points = ((problem, fit), (other, again))[:: -1 if forward.point_pixels else 1]
-    degrees = max(problem.cells.n_values - problem.basis.size - problem.cells.shape[0], 1)
-    unit = areas[1].chi2 / degrees
+    free = problem.n_levels + (0 if problem.field_prior else problem.basis.size)
+    unit = areas[1].chi2 / max(problem.cells.n_values - free, 1)
     return points if areas[1].chi2 - points[1].chi2 > MUCH_SHARPER * unit else areas
 
 

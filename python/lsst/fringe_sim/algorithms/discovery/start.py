@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numba
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from ...model import FringeModel
 from .basis import SplineBasis
 from .cells import CellData
+from .comparison import chi2_with_free_fringes
 
 __all__ = ["mended_thickness", "starting_thickness"]
 
@@ -41,6 +43,19 @@ MEDIAN_SIDE = 15
 """Knots of the smooth surface [cells], rounds in which it forgets what lies far from it, the clarity that all cells
 together may lose by it, and the side of the area in which it begins with the median [cells]."""
 
+LEVEL_ROUNDS, LEVEL_CELLS = 2, 1500
+"""How often levels and thickness follow from each other, and about how many cells are followed for them."""
+
+WINDOW_ORDERS = (0.15, 0.3, 0.5, 0.75, 1.0, 1.5)
+GUESS_STEP, GUESS_APART = 0.1, 0.3
+GUESSES_FOLLOWED, GUESS_CELLS = 6, 100
+"""Ranges of thickness that a sensor of few fringes may hold [orders], the step and the least distance of their
+middles [orders], how many are followed, and with how many cells they are compared."""
+
+HOPELESS, AS_GOOD = 2.0, 1.2
+"""χ², levels and contrasts free: of the best guess over that of the first thickness, from which on no other is
+followed, and of one over the least of all, up to which a contrast common to all wavelengths decides."""
+
 
 def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     """Thickness of every cell, with the fringe order decided by all cells together.
@@ -50,6 +65,9 @@ def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     from the clearest cell to its neighbours, each within less than half a fringe order of what they predict; then the
     whole field is moved by whole orders to where the sum of all correlations is best. Cells without data take the
     value of a neighbour.
+
+    Flats are relative to their mean. On a sensor of few fringes that is not the mean of a fringe: levels are guessed
+    for every mean thickness there, and those with which the fringes lie best on the data are kept.
 
     Parameters
     ----------
@@ -68,7 +86,110 @@ def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     if min(cells.shape[1:]) >= FEWEST_ROWS:
         templates.append(template * _contrast(template, cells))
     best, _ = max((_follow(each, cells, order) for each in templates), key=lambda item: item[1])
+    if len(templates) > 1:
+        best = _of_few_fringes(best, template, cells, order)
     return low + SEARCH_STEP_UM * best.reshape(cells.shape[1:]).astype(float)
+
+
+def _of_few_fringes(
+    first: NDArray[np.int64], template: FloatArray, cells: CellData, order: float
+) -> NDArray[np.int64]:
+    """Steps of all cells with levels at which the fringes lie on the data, or the first ones if they lie better."""
+    stride = max(1, math.isqrt(first.size // LEVEL_CELLS))
+    few = cells.window(slice(None, None, stride), slice(None, None, stride))
+    if min(few.shape[1:]) < FEWEST_ROWS:
+        stride, few = 1, cells
+    found = [(_misfit(template, first.reshape(cells.shape[1:])[::stride, ::stride].ravel(), few), np.ones(0))]
+    for levels in _guessed_levels(template, few, order):
+        for _ in range(LEVEL_ROUNDS):
+            steps = _follow(template, _over(few, levels), order)[0]
+            levels = _levels(template, steps, few)
+        found.append((_misfit(template, steps, few), levels))
+        if found[1][0][0] > HOPELESS * found[0][0][0]:
+            break  # the sensor has many fringes
+    # A third of a fringe can be made of any thickness by contrasts of many colours.
+    least = min(misfit for (misfit, _), _ in found)
+    likely = [(even, levels) for (misfit, even), levels in found if misfit <= AS_GOOD * least]
+    levels = min(likely, key=lambda item: item[0])[1]
+    return _follow(template, _over(cells, levels), order)[0] if levels.size else first
+
+
+def _guessed_levels(template: FloatArray, cells: CellData, order: float) -> list[FloatArray]:
+    """Levels of sensors of few fringes whose thicknesses explain most of the data, best first.
+
+    A sensor that holds all thicknesses of a window evenly has the mean of the fringes there for its own; each of some
+    cells is then compared with the fringes about that mean at all of them, its contrast free.
+    """
+    used = np.flatnonzero((cells.weight > 0.0).all(axis=0))
+    if not used.size:
+        return []
+    stride = max(1, used.size // GUESS_CELLS)
+    value = (cells.value - 1.0).reshape(len(template), -1)[:, used[::stride]].T
+    guesses = []
+    for width in {max(2, round(part * order)) for part in WINDOW_ORDERS}:
+        for start in range(0, template.shape[1] - width, max(1, int(GUESS_STEP * max(order, width)))):
+            window = template[:, start : start + width]
+            mean = window.mean(axis=1)
+            about = window - mean[:, np.newaxis]
+            cross = np.maximum(value @ about, 0.0)
+            square = (about**2).sum(axis=0)
+            power = np.divide(cross**2, square, out=np.zeros_like(cross), where=square > 0.0)
+            best = power.argmax(axis=1)
+            strength = cross[np.arange(len(best)), best].sum() / max(square[best].sum(), 1e-300)
+            explained = float(power.max(axis=1).sum())
+            guesses.append((explained, start + 0.5 * width, 1.0 + strength * mean))
+    guesses.sort(key=lambda item: -item[0])
+    return [levels for _, _, levels in _far_apart(guesses, GUESS_APART * order)]
+
+
+def _far_apart(
+    guesses: list[tuple[float, float, FloatArray]], distance: float
+) -> list[tuple[float, float, FloatArray]]:
+    """The first of those near one another."""
+    kept: list[tuple[float, float, FloatArray]] = []
+    for guess in guesses:
+        if all(abs(guess[1] - other[1]) > distance for other in kept):
+            kept.append(guess)
+        if len(kept) == GUESSES_FOLLOWED:
+            break
+    return kept
+
+
+def _levels(template: FloatArray, steps: NDArray[np.int64], cells: CellData) -> FloatArray:
+    """Mean of a fringe over that of the flat at each wavelength, for fringes that all have the same strength."""
+    level = _strength(_at(template, steps), cells)[1].ravel()
+    return np.divide(1.0, level, out=np.ones_like(level), where=level > 0.0)
+
+
+def _strength(fringes: FloatArray, cells: CellData) -> tuple[float, FloatArray]:
+    """Common strength of fringes ``(W, cells)`` in the data, and the level of each wavelength ``(W, 1)``."""
+    value, weight = (part.reshape(len(fringes), -1) for part in (cells.value, cells.weight))
+    total = np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
+    apart = fringes - (weight * fringes).sum(axis=1, keepdims=True) / total
+    strength = max(float((weight * apart * value).sum() / max((weight * apart**2).sum(), 1e-300)), 0.0)
+    light = 1.0 + strength * fringes
+    product, square = ((weight * light * part).sum(axis=1, keepdims=True) for part in (value, light))
+    return strength, np.asarray(product / np.maximum(square, 1e-300))
+
+
+def _over(cells: CellData, levels: FloatArray) -> CellData:
+    """Flats relative to the mean of a fringe."""
+    return replace(cells, value=cells.value * levels[:, np.newaxis, np.newaxis])
+
+
+def _misfit(template: FloatArray, steps: NDArray[np.int64], cells: CellData) -> tuple[float, float]:
+    """χ² of the fringes at some steps with free levels, each wavelength with its own contrast and all with one."""
+    fringes = _at(template, steps)
+    free = chi2_with_free_fringes(
+        fringes.reshape(len(template), 1, *cells.shape[1:]), cells.value, cells.weight
+    )
+    strength, level = _strength(fringes, cells)
+    value, weight = (part.reshape(len(template), -1) for part in (cells.value, cells.weight))
+    return float(free[0]), float((weight * (value - level * (1.0 + strength * fringes)) ** 2).sum())
+
+
+def _at(template: FloatArray, steps: NDArray[np.int64]) -> FloatArray:
+    return template[:, np.clip(steps, 0, template.shape[1] - 1)]
 
 
 def mended_thickness(model: FringeModel, cells: CellData, thickness_um: FloatArray) -> FloatArray:
