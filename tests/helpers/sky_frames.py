@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lsst.fringe_sim.algorithms.image_noise import add_exposure_noise
 from lsst.fringe_sim.algorithms.sky_frame import simulate_sky_frame, sky_response
 from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.instrument.sky import SkySpectrum
@@ -16,24 +17,27 @@ from lsst.fringe_sim.products import SkyFringe, band_cards
 
 SHAPE = (48, 48)
 FRAMES = 3
+FINER = 3
 
 
 def sky_frames_of(
     setup: str, settings: Mapping[str, float], seed: int, level: float = 4e6
 ) -> tuple[list[SkyFringe], np.ndarray]:
-    """Frames of a night with photon noise, and the map of their sensor."""
+    """Frames of a night with photon noise, and the map of their sensor at the centres of the pixels."""
     rng = np.random.default_rng(seed)
     model = FringeModel.from_setup(setup, settings)
-    truth = random_field(SHAPE, rng, mean=14.0, span=2.5)
+    fine = random_field((FINER * SHAPE[0], FINER * SHAPE[1]), rng, mean=14.0, span=2.5)
+    truth = fine[FINER // 2 :: FINER, FINER // 2 :: FINER]
     sky = SkySpectrum.dark(airmass=model.setup.airmass)
-    response = sky_response(
-        model, sky, thickness_range_um=(float(truth.min()) - 0.1, float(truth.max()) + 0.1)
-    )
+    response = sky_response(model, sky, thickness_range_um=(float(fine.min()) - 0.1, float(fine.max()) + 0.1))
     night, frames = NightHistory.guo2022(), []
     for time in range(FRAMES):
         scale = night.band_scale(3 * time, response.bands)
-        frame = simulate_sky_frame(
-            truth, model, response=response, scale=scale, mean_electrons=level, seed=seed + 10 * time
-        )
-        frames.append(replace(frame, metadata={**frame.metadata, **band_cards(scale)}))
+        frame = simulate_sky_frame(fine, model, response=response, scale=scale, mean_electrons=level)
+        # Pixels average the light over their area.
+        light = frame.image.reshape(SHAPE[0], FINER, SHAPE[1], FINER).mean(axis=(1, 3), dtype=np.float64)
+        image = add_exposure_noise(light.astype(np.float32), np.random.default_rng(seed + 10 * time), 0.0)
+        cards = {**frame.metadata, **band_cards(scale)}
+        mask = np.zeros(SHAPE, dtype=frame.mask.dtype)
+        frames.append(replace(frame, image=image, mask=mask, seed=seed + 10 * time, metadata=cards))
     return frames, truth + 0.002 * rng.standard_normal(SHAPE)
