@@ -75,6 +75,9 @@ SCATTER_CHANGE = 0.05
 """Parts by which noise and response scatter may change before the search is done again with them."""
 
 
+POINTS_TOLD = "sharper than light averaged over pixels can be: each is taken as a point"
+
+
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """Data and model, ready for the search.
@@ -113,6 +116,11 @@ class Prepared:
     undistorted_field: FloatArray | None = None
     shifts_um: tuple[float, ...] = ()
     guess: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Notes, and how pixels are taken if not as areas."""
+        return (*self.notes, POINTS_TOLD) if self.problem.forward.point_pixels else self.notes
 
 
 def check_setup(cube: FringeCube, model: FringeModel) -> None:
@@ -300,8 +308,10 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
         Cells that are in another fringe order now.
     """
     problem = prepared.problem
-    if not prepared.rich or problem.field_prior:
+    if not prepared.rich:
         return None, 0
+    if problem.field_prior:
+        return _with_other_pixels(prepared, fit), 0
     model = problem.forward.model_with(fit.settings)
     start = mended_thickness(model, problem.cells, thickness_um)
     start = _better_start(problem, fit.settings, start, starting_thickness(model, problem.cells))
@@ -316,6 +326,19 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended
+
+
+def _with_other_pixels(prepared: Prepared, fit: Fit) -> Prepared | None:
+    """Data with a map, if an effect in the model changes how their pixels are judged; it can look like an area."""
+    problem = prepared.problem
+    free = replace(problem, free_contrast=True)
+    first = fit_model(free, (), np.zeros(0), fit.field, None, fit.settings)
+    forward = _choose_pixels(free, first, fit.settings)[0].forward
+    if forward.point_pixels == problem.forward.point_pixels:
+        return None
+    problem = replace(problem, forward=forward)
+    null = fit_model(problem, (), np.zeros(0), prepared.null.field, prepared.null.levels)
+    return replace(prepared, problem=problem, null=null, guess=dict(fit.settings))
 
 
 def _better_start(
@@ -479,8 +502,6 @@ def _settle(
     notes = _part_told(stated)
     if abs(noise.neighbour_correlation) > 0.1:
         notes.append(f"noise of neighbouring cells is correlated ({noise.neighbour_correlation:.2f})")
-    if problem.forward.point_pixels:
-        notes.append("sharper than light averaged over pixels can be: each is taken as a point")
     if not noise.measured:
         notes.append("noise level taken as stated: too few cells to measure it")
     return Prepared(problem, settled, noise, index, _is_rich(stated), stated, tuple(notes), fit.field)

@@ -206,7 +206,7 @@ class _Search:
 
     def _take(self, prepared: Prepared) -> None:
         self.prepared, self.cells = prepared, prepared.problem.cells
-        self.notes = [*self.headers, *prepared.notes]
+        self.notes = [*self.headers, *prepared.told]
 
     def run(self, refinements: int = 2) -> Verdict:
         """Search; start again if a named effect shows that field or noise were misjudged without it."""
