@@ -19,6 +19,7 @@ from .cells import CellData, bin_cube, finest_useful_cell
 from .comparison import chi2_with_free_fringes, fringe_order_um
 from .fit import Fit, Problem, fit_model, linearise_at
 from .forward import Exposures, Forward
+from .growth import grown_basis, grown_fit
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share
 from .outliers import spoiled_cells
 from .start import mended_thickness, starting_thickness
@@ -43,7 +44,12 @@ FARTHEST_K, SAME_K = 5.0, 0.5
 """How far the temperature of flats may be from that of the set-up, and how far it is taken to be the same [K]."""
 
 MUCH_SHARPER = 9.0
-"""χ², over its mean, that pixels without an area must gain: three standard deviations."""
+MUCH_EXPLAINED, NOISE_SIGMAS = 0.5, 5.0
+"""χ², over its mean, that pixels without an area must gain: three standard deviations; the part of the misfit beyond
+noise that they may leave, and the uncertainty of that noise [standard deviations]."""
+
+PIXEL_RMS = 1.0 / math.sqrt(12.0)
+"""Rms radius of a pixel's area along one axis [px]."""
 
 FEWEST_ROWS = 6
 """Rows and columns of cells from which on noise and levels can be measured."""
@@ -312,13 +318,12 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
         return None, 0
     if problem.field_prior:
         return _with_other_pixels(prepared, fit), 0
-    model = problem.forward.model_with(fit.settings)
-    start = mended_thickness(model, problem.cells, thickness_um)
-    start = _better_start(problem, fit.settings, start, starting_thickness(model, problem.cells))
-    mended = int(np.count_nonzero(start != thickness_um))
-    chosen = _choose_pixels(*_choose_field(problem, start, fit.settings), fit.settings)
+    start, settings = _mended(problem, fit, thickness_um)
+    half_order = 0.5 * fringe_order_um(problem.cells.wavelength_nm, float(prepared.index.mean()))
+    mended = int(np.count_nonzero(np.abs(start - thickness_um) > half_order))
+    chosen = _choose_pixels(*_choose_field(problem, start, settings), settings)
     refined = _settle(*chosen, prepared.stated, prepared.index)
-    refined = replace(refined, null=_better_null(refined, prepared), guess=dict(fit.settings))
+    refined = replace(refined, null=_better_null(refined, prepared), guess=settings)
     change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
     scatter = abs(refined.noise.response_scatter - prepared.noise.response_scatter)
     same_pixels = refined.problem.forward.point_pixels == problem.forward.point_pixels
@@ -326,6 +331,21 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended
+
+
+def _mended(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[FloatArray, dict[str, float]]:
+    """Thickness without the cells that a better model shows in another fringe order, and its effects."""
+    model = problem.forward.model_with(fit.settings)
+    start = mended_thickness(model, problem.cells, thickness_um)
+    start = _better_start(problem, fit.settings, start, starting_thickness(model, problem.cells))
+    if not any(problem.forward.couples_pixels(item.effect) for item in fit.coordinates):
+        return start, dict(fit.settings)
+    if _is_blurred(fit.settings):
+        problem = replace(problem, forward=problem.forward.with_point_pixels(False))
+    grown = grown_fit(problem, fit, start)
+    if grown is None:
+        return start, dict(fit.settings)
+    return grown_basis(problem).expand(grown.field), dict(grown.settings)
 
 
 def _with_other_pixels(prepared: Prepared, fit: Fit) -> Prepared | None:
@@ -472,15 +492,42 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
 def _choose_pixels(problem: Problem, fit: Fit, settings: Mapping[str, float]) -> tuple[Problem, Fit]:
     """Pixels as areas or as points, and the fit with them; points only where the data are clearly sharper.
 
-    Real pixels average over their area. Simulated frames may not, and no effect would ever sharpen them.
+    Real pixels average over their area. Simulated frames may not, and no effect would ever sharpen them. Points that
+    something else blurs by more than that are not told from areas that it blurs by less, which are taken.
     """
     forward = problem.forward
+    if _is_blurred(settings):
+        if forward.point_pixels:
+            problem = replace(problem, forward=forward.with_point_pixels(False))
+            fit = fit_model(problem, (), np.zeros(0), fit.field, fit.levels, settings)
+        return problem, fit
     other = replace(problem, forward=forward.with_point_pixels(not forward.point_pixels))
     again = fit_model(other, (), np.zeros(0), fit.field, fit.levels, settings)
     areas, points = ((problem, fit), (other, again))[:: -1 if forward.point_pixels else 1]
     free = problem.n_levels + (0 if problem.field_prior else problem.basis.size)
-    unit = areas[1].chi2 / max(problem.cells.n_values - free, 1)
-    return points if areas[1].chi2 - points[1].chi2 > MUCH_SHARPER * unit else areas
+    degrees = max(problem.cells.n_values - free, 1)
+    noise = _noise_of(*points) * degrees
+    gain = areas[1].chi2 - points[1].chi2
+    # A field in a wrong order, or an effect that is not in the model, may leave either somewhat better.
+    chance = NOISE_SIGMAS * noise * math.sqrt(2.0 / degrees)
+    explained = points[1].chi2 - noise < MUCH_EXPLAINED * (areas[1].chi2 - noise) + chance
+    return points if gain > MUCH_SHARPER * areas[1].chi2 / degrees and explained else areas
+
+
+def _noise_of(problem: Problem, fit: Fit) -> float:
+    """Mean of χ² that a value has from noise alone, as measured in what a fit leaves."""
+    cells = problem.cells
+    noise = estimate_noise(cells, _residual(problem, problem.expected_of(fit)))
+    used = cells.weight > 0.0
+    response = (
+        noise.response_scatter**2 * cells.weight.sum(axis=(1, 2)) / np.maximum(used.sum(axis=(1, 2)), 1)
+    )
+    return float(np.average(noise.factor**2 + response, weights=used.sum(axis=(1, 2))))
+
+
+def _is_blurred(settings: Mapping[str, float]) -> bool:
+    """Whether effects blur the light by at least as much as the area of a pixel does."""
+    return settings.get("charge_diffusion.sigma", 0.0) >= PIXEL_RMS
 
 
 def _settle(

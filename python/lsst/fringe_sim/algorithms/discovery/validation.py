@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .comparison import chi2_with_free_levels
+from .continuation import continued
 from .fit import Fit, Problem, fit_model
 
 __all__ = ["HeldOut", "held_out_blocks", "misfit_rms", "validate", "whole_thickness"]
@@ -19,6 +20,9 @@ BoolArray = NDArray[np.bool_]
 BLOCKS_ACROSS = 8
 FEWEST_ROWS = 12
 """Blocks along a side of the sensor that are held out or not, and the rows of cells from which on there are any."""
+
+MUCH_WORSE = 4.0
+"""χ² of the cells held out over that of the others, from which on their thickness may be another."""
 
 FEWEST_WAVELENGTHS = 8
 """Wavelengths from which on every fourth is left out at once."""
@@ -73,10 +77,31 @@ def held_out_blocks(shape: tuple[int, int], fraction: float, rng: np.random.Gene
 
 
 def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) -> FloatArray:
-    """Thickness of all cells from a fit to a part: what the part moved by, as a function of thickness."""
+    """Thickness of all cells from a fit to a part of them.
+
+    What the part moved by, as a function of thickness, is added everywhere; where the unchanged model has another
+    order, that does not suit the rest, and the part is continued with little curvature.
+    """
     moved = problem.basis.expand(fit.field)
     if not held_out.any():
         return moved
+    found = _moved_everywhere(problem, null, moved, held_out)
+    rest = problem.with_cells(problem.cells.restricted(held_out))
+    seen = problem.cells.restricted(~held_out)
+    if _chi2_at(rest, fit, found) < MUCH_WORSE * fit.chi2 * rest.cells.n_values / max(seen.n_values, 1):
+        return found
+    beyond = np.where(held_out, continued(moved, ~held_out & problem.cells.seen), moved)
+    return min(found, beyond, key=lambda field: _chi2_at(rest, fit, field))
+
+
+def _chi2_at(problem: Problem, fit: Fit, thickness_um: FloatArray) -> float:
+    """χ² of a thickness with the effects of a fit, levels free."""
+    problem.forward.cover(thickness_um)
+    value = problem.forward.predict(fit.settings, thickness_um).value
+    return chi2_with_free_levels(value, problem.cells.value, problem.cells.weight)
+
+
+def _moved_everywhere(problem: Problem, null: Fit, moved: FloatArray, held_out: BoolArray) -> FloatArray:
     before = problem.basis.expand(null.field)
     seen = ~held_out & problem.cells.seen
     middle, half = before.mean(), max(0.5 * float(np.ptp(before)), 1e-6)
@@ -180,5 +205,4 @@ def _field_freedom(problem: Problem) -> int:
 
 def _predicted_chi2(problem: Problem, fit: Fit) -> float:
     """χ² of data that took no part in a fit, with their levels adjusted."""
-    value = problem.forward.predict(fit.settings, problem.basis.expand(fit.field)).value
-    return chi2_with_free_levels(value, problem.cells.value, problem.cells.weight)
+    return _chi2_at(problem, fit, problem.basis.expand(fit.field))

@@ -1,0 +1,48 @@
+"""A field continued into cells where nothing is known of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+__all__ = ["continued"]
+
+FloatArray = NDArray[np.float64]
+
+STIFFNESS, NO_WEIGHT = 1e-3, 1e-9
+"""Weights of the curvature and of cells that are not known; those of the others are 1."""
+
+
+def continued(field: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
+    """Continue a field from where it is known with the least sum of squares of its second derivatives.
+
+    Parameters
+    ----------
+    field : `numpy.ndarray`, shape ``(ny, nx)``
+        The field; its values elsewhere do not matter.
+    known : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
+        Where it is known.
+
+    Returns
+    -------
+    field : `numpy.ndarray`, shape ``(ny, nx)``
+        Slightly smoothed where it is known.
+    """
+    rows, columns = field.shape
+    bends = (
+        sparse.kron(_differences(rows, 2), sparse.identity(columns)),
+        sparse.kron(sparse.identity(rows), _differences(columns, 2)),
+        np.sqrt(2.0) * sparse.kron(_differences(rows, 1), _differences(columns, 1)),
+    )
+    weight = np.where(known, 1.0, NO_WEIGHT).ravel()
+    matrix = sparse.diags(weight) + STIFFNESS * sum(bend.T @ bend for bend in bends)
+    right = weight * np.where(known, field, 0.0).ravel()
+    return np.asarray(splu(matrix.tocsc()).solve(right).reshape(field.shape))
+
+
+def _differences(size: int, order: int) -> sparse.spmatrix:
+    """First or second differences of so many values."""
+    signs = {1: (-1.0, 1.0), 2: (1.0, -2.0, 1.0)}[order]
+    return sparse.diags(signs, tuple(range(order + 1)), shape=(size - order, size), dtype=float)
