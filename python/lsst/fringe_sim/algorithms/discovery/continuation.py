@@ -11,7 +11,7 @@ __all__ = ["continued"]
 
 FloatArray = NDArray[np.float64]
 
-STIFFNESS, NO_WEIGHT = 1e-3, 1e-9
+STIFFNESS, NO_WEIGHT = 1e-3, 1e-12
 """Weights of the curvature and of cells that are not known; those of the others are 1."""
 
 
@@ -38,8 +38,9 @@ def continued(field: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     )
     weight = np.where(known, 1.0, NO_WEIGHT).ravel()
     matrix = sparse.diags(weight) + STIFFNESS * sum(bend.T @ bend for bend in bends)
-    right = weight * np.where(known, field, 0.0).ravel()
-    return np.asarray(splu(matrix.tocsc()).solve(right).reshape(field.shape))
+    middle = float(field[known].mean())
+    right = weight * np.where(known, field - middle, 0.0).ravel()
+    return np.asarray(middle + splu(matrix.tocsc()).solve(right).reshape(field.shape))
 
 
 def _differences(size: int, order: int) -> sparse.spmatrix:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,19 @@ from .basis import SplineBasis
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
 
-__all__ = ["grown_fit"]
+__all__ = ["Grown", "grown_thickness"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-KNOTS, SIDE = 6.0, 3
-"""Spacing of the spline that is fitted [cells], and side of the area in which the misfit is averaged [cells]."""
+KNOTS, TURNS = (8.0, 6.0), 3
+"""Spacings of the spline that is fitted [cells], and how often each is tried: one may succeed where another fails."""
+
+GAIN = 0.98
+"""Part of χ² to which a growth must lower it."""
+
+SIDE = 3
+"""Side of the area in which the misfit is averaged [cells]."""
 
 STEP, STEPS_ACROSS = 3, 32
 """Cells that a round goes further, and rounds that cross a large sensor at least."""
@@ -34,12 +40,27 @@ CONTINUED_SIGMA_UM = 0.03
 """How far the thickness may move from a continuation with the least curvature, where that is new [µm]."""
 
 ROUNDS, IDLE_ROUNDS, ROUND_GAIN = 60, 2, 1.003
-PASSES, PASS_GAIN = 4, 0.98
-"""Rounds of growth, how many of them may add nearly nothing; passes, and the part of χ² that one must save."""
+"""Rounds of one growth, how many of them may add nearly nothing, and the growth that is more than that."""
 
 
-def grown_fit(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Fit | None:
-    """Fit whose thickness does not lose a fringe order where a blur takes the fringes away.
+@dataclass(frozen=True, eq=False)
+class Grown:
+    """What has grown.
+
+    Attributes
+    ----------
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness of all cells.
+    settings : `dict`
+        Effects that were fitted with it.
+    """
+
+    thickness_um: FloatArray
+    settings: dict[str, float]
+
+
+def grown_thickness(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Grown | None:
+    """Thickness that does not lose a fringe order where a blur takes the fringes away.
 
     There single cells do not tell their thickness, and what lies beyond may be off by whole orders. The largest area
     in which the model with its effects fits is taken for right; it grows into its surroundings, which continue it
@@ -56,42 +77,57 @@ def grown_fit(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Fit | Non
 
     Returns
     -------
-    fit : `Fit` or `None`
-        Coefficients are those of `grown_basis`; `None` if nothing else fits better, or the model fits everywhere.
+    grown : `Grown` or `None`
+        `None` if nothing fits better, or the model fits everywhere.
     """
-    basis = grown_basis(problem)
-    stiff = replace(problem, basis=basis)
-    first = fit_model(
-        stiff, fit.coordinates, fit.position, basis.fit(thickness_um, problem.cells.seen.astype(float))
-    )
-    best = first
-    for _ in range(PASSES):
-        misfit = _misfit(stiff, best)
+    first = best = _fitted(problem, fit, thickness_um, KNOTS[-1])
+    failed = 0
+    for knots in KNOTS * TURNS:
+        begin = _fitted(problem, best.fit, thickness_um, knots)
+        misfit = _misfit(begin.problem, begin.fit)
         if np.mean(misfit > BAD * np.quantile(misfit, BETTER_PART)) < FEW_BAD:
+            best = min(best, begin, key=lambda item: item.fit.chi2)
             break
-        grown = _grown(stiff, best, misfit)
-        if grown is None or grown.chi2 > PASS_GAIN * best.chi2:
+        grown = _grown(begin.problem, begin.fit, misfit)
+        better = grown is not None and grown.chi2 < GAIN * best.fit.chi2
+        if grown is not None and better:
+            best = _Fitted(begin.problem, grown)
+            thickness_um = best.problem.basis.expand(grown.field)
+        failed = 0 if better else failed + 1
+        if failed == len(KNOTS):
             break
-        best = grown
-    return None if best is first else best
+    if best.fit.chi2 > GAIN * first.fit.chi2:
+        return None
+    return Grown(best.problem.basis.expand(best.fit.field), dict(best.fit.settings))
 
 
-def grown_basis(problem: Problem) -> SplineBasis:
-    """Spline of a thickness that grows."""
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A fit, and the data and model that it was made to."""
+
+    problem: Problem
+    fit: Fit
+
+
+def _fitted(problem: Problem, fit: Fit, thickness_um: FloatArray, knots: float) -> _Fitted:
+    """Fit with a spline of so many cells from knot to knot."""
     rows, columns = problem.cells.shape[1:]
-    return SplineBasis.of_grid((rows, columns), KNOTS)
+    basis = SplineBasis.of_grid((rows, columns), knots)
+    stiff = replace(problem, basis=basis)
+    start = basis.fit(thickness_um, problem.cells.seen.astype(float))
+    return _Fitted(stiff, fit_model(stiff, fit.coordinates, fit.position, start))
 
 
 def _grown(problem: Problem, fit: Fit, misfit: FloatArray) -> Fit | None:
-    """One pass: fit of all cells after growth from the largest area that the model fits."""
-    unit = np.quantile(misfit, BETTER_PART)
+    """Fit of all cells after growth from the largest area that the model fits."""
+    unit = float(np.quantile(misfit, BETTER_PART))
     known = _largest(binary_erosion(misfit < GOOD * unit))
     if not known.any():
         return None
     step = max(STEP, max(known.shape) // STEPS_ACROSS)
     idle = 0
     for _ in range(ROUNDS):
-        centre = problem.basis.fit(continued(problem.basis.expand(fit.field), known), np.ones(known.shape))
+        centre = _centre(problem, fit, known)
         reached = binary_dilation(known, iterations=step)
         part = replace(
             problem.with_cells(problem.cells.restricted(reached)),
@@ -104,8 +140,13 @@ def _grown(problem: Problem, fit: Fit, misfit: FloatArray) -> Fit | None:
         if idle == IDLE_ROUNDS or not larger.any():
             break
         known = larger
-    centre = problem.basis.fit(continued(problem.basis.expand(fit.field), known), np.ones(known.shape))
-    return fit_model(problem, fit.coordinates, fit.position, centre, fit.levels)
+    return fit_model(problem, fit.coordinates, fit.position, _centre(problem, fit, known), fit.levels)
+
+
+def _centre(problem: Problem, fit: Fit, known: BoolArray) -> FloatArray:
+    """Coefficients of the field of a fit, continued from where it is known."""
+    field = continued(problem.basis.expand(fit.field), known)
+    return problem.basis.fit(field, np.ones(known.shape))
 
 
 def _misfit(problem: Problem, fit: Fit) -> FloatArray:

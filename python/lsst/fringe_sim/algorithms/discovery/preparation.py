@@ -19,7 +19,7 @@ from .cells import CellData, bin_cube, finest_useful_cell
 from .comparison import chi2_with_free_fringes, fringe_order_um
 from .fit import Fit, Problem, fit_model, linearise_at
 from .forward import Exposures, Forward
-from .growth import grown_basis, grown_fit
+from .growth import grown_thickness
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share
 from .outliers import spoiled_cells
 from .start import mended_thickness, starting_thickness
@@ -342,10 +342,8 @@ def _mended(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[Float
         return start, dict(fit.settings)
     if _is_blurred(fit.settings):
         problem = replace(problem, forward=problem.forward.with_point_pixels(False))
-    grown = grown_fit(problem, fit, start)
-    if grown is None:
-        return start, dict(fit.settings)
-    return grown_basis(problem).expand(grown.field), dict(grown.settings)
+    grown = grown_thickness(problem, fit, start)
+    return (start, dict(fit.settings)) if grown is None else (grown.thickness_um, grown.settings)
 
 
 def _with_other_pixels(prepared: Prepared, fit: Fit) -> Prepared | None:

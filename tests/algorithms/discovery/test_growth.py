@@ -1,0 +1,105 @@
+"""Thickness that grows from where a blurred model fits, and fields that are continued."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery import preparation
+from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
+from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
+from lsst.fringe_sim.algorithms.discovery.continuation import continued
+from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
+from lsst.fringe_sim.algorithms.discovery.growth import grown_thickness
+from lsst.fringe_sim.algorithms.discovery.validation import whole_thickness
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.model import FringeModel
+
+BLUR = "charge_diffusion"
+ORDER_UM = 0.27
+
+
+@pytest.fixture(scope="module")
+def blurred():
+    """A sensor whose fringes a blur nearly takes away where they are narrow, its thickness and its blur."""
+    # Between a tenth and a hundredth of the narrowest fringes is left.
+    for seed in range(1000):
+        case = draw_case("one", np.random.default_rng([77, seed]), size=(64, 64), only=[BLUR])
+        slope = np.hypot(*np.gradient(case.thickness_um))
+        left = math.exp(-2.0 * (math.pi * slope.max() * case.values[f"{BLUR}.sigma"] / ORDER_UM) ** 2)
+        if 0.01 < left < 0.1:
+            break
+    cells = bin_cube(case.cube, 1).scaled_noise(math.sqrt(case.noise_factor), 0.0)
+    truth = case.thickness_um
+    limits = (float(truth.min()) - 1.0, float(truth.max()) + 1.0)
+    forward = Forward.of_cells(FringeModel.from_setup(case.setup), EFFECTS, cells, limits)
+    problem = Problem(cells, forward, CellBasis(truth.shape), np.eye(len(cells.value)))
+    return problem, truth, case.values[f"{BLUR}.sigma"]
+
+
+def _fit_at(problem: Problem, sigma: float, thickness: np.ndarray):
+    effect = next(item for item in EFFECTS if item.name == BLUR)
+    coordinates = coordinates_of(effect, problem.forward, thickness)
+    position = np.array([coordinates[0].coordinate(sigma)])
+    return fit_model(problem, coordinates, position, thickness.ravel())
+
+
+def _is_wrong(field: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.abs(field - truth) > 0.5 * ORDER_UM
+
+
+def test_what_lies_behind_a_blur_gets_its_order_back(blurred) -> None:
+    """An order is lost on the way from the middle to a side, as where no fringes are seen."""
+    problem, truth, sigma = blurred
+    columns = np.arange(truth.shape[1])
+    lost = truth + ORDER_UM / (1.0 + np.exp(-(columns - 44.0) / 1.5))
+    assert _is_wrong(lost, truth).mean() > 0.25
+    fit = _fit_at(problem, sigma, lost)
+    assert _is_wrong(fit.field.reshape(truth.shape), truth).mean() > 0.1  # no fit finds back by itself
+    grown = grown_thickness(problem, fit, lost)
+    assert grown is not None
+    assert _is_wrong(grown.thickness_um, truth).mean() < 0.01
+    assert grown.settings[f"{BLUR}.sigma"] == pytest.approx(sigma, rel=0.02)
+
+
+def test_where_the_model_fits_nothing_grows(blurred) -> None:
+    problem, truth, sigma = blurred
+    assert grown_thickness(problem, _fit_at(problem, sigma, truth), truth) is None
+
+
+def test_a_blur_that_is_seen_is_not_taken_for_pixels_without_area(blurred) -> None:
+    """With it points and areas are the same but for its size."""
+    problem, truth, sigma = blurred
+    fit = _fit_at(problem, sigma, truth)
+    points = problem.forward.with_point_pixels(True)
+    chosen, again = preparation._choose_pixels(
+        Problem(problem.cells, points, problem.basis, problem.level_basis), fit, fit.settings
+    )
+    assert not chosen.forward.point_pixels
+    assert again.chi2 == pytest.approx(fit.chi2, rel=1e-2)
+
+
+def test_cells_held_out_follow_a_fit_whose_field_is_another_than_without_effects(blurred) -> None:
+    """Added to a field in another order, what the others moved by is no thickness of those held out."""
+    problem, truth, sigma = blurred
+    held_out = np.zeros(truth.shape, dtype=bool)
+    held_out[8:16, 24:32] = held_out[32:40, 40:48] = True
+    rng = np.random.default_rng(5)
+    spoiled = truth + ORDER_UM * rng.integers(-2, 3, (8, 8)).repeat(8, axis=0).repeat(8, axis=1)
+    null = fit_model(problem, (), np.zeros(0), spoiled.ravel(), iterations=0)
+    seen = problem.with_cells(problem.cells.restricted(~held_out))
+    fit = fit_model(seen, (), np.zeros(0), truth.ravel(), None, {f"{BLUR}.sigma": sigma})
+    found = whole_thickness(problem, null, fit, held_out)
+    assert not _is_wrong(found, truth).any()
+    np.testing.assert_array_equal(found[~held_out], fit.field.reshape(truth.shape)[~held_out])
+
+
+def test_a_plane_is_continued_as_a_plane() -> None:
+    y, x = np.indices((30, 40))
+    plane = 14.0 + 0.02 * x - 0.03 * y
+    known = (x - 20) ** 2 + (y - 15) ** 2 < 100
+    np.testing.assert_allclose(continued(np.where(known, plane, np.nan), known), plane, atol=1e-3)
