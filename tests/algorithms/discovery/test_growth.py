@@ -33,6 +33,8 @@ def blurred():
         left = math.exp(-2.0 * (math.pi * slope.max() * case.values[f"{BLUR}.sigma"] / ORDER_UM) ** 2)
         if 0.01 < left < 0.1:
             break
+    else:
+        pytest.fail("no sensor is blurred as much")
     cells = bin_cube(case.cube, 1).scaled_noise(math.sqrt(case.noise_factor), 0.0)
     truth = case.thickness_um
     limits = (float(truth.min()) - 1.0, float(truth.max()) + 1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -30,17 +32,22 @@ def continued(field: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     field : `numpy.ndarray`, shape ``(ny, nx)``
         Slightly smoothed where it is known.
     """
-    rows, columns = field.shape
+    weight = np.where(known, 1.0, NO_WEIGHT).ravel()
+    matrix = sparse.diags(weight) + STIFFNESS * _curvature(*field.shape)
+    middle = float(field[known].mean())
+    right = weight * np.where(known, field - middle, 0.0).ravel()
+    return np.asarray(middle + splu(matrix.tocsc()).solve(right).reshape(field.shape))
+
+
+@lru_cache(maxsize=2)
+def _curvature(rows: int, columns: int) -> sparse.spmatrix:
+    """Sum of squares of all second derivatives as a quadratic form in the cells, of every round of a growth."""
     bends = (
         sparse.kron(_differences(rows, 2), sparse.identity(columns)),
         sparse.kron(sparse.identity(rows), _differences(columns, 2)),
         np.sqrt(2.0) * sparse.kron(_differences(rows, 1), _differences(columns, 1)),
     )
-    weight = np.where(known, 1.0, NO_WEIGHT).ravel()
-    matrix = sparse.diags(weight) + STIFFNESS * sum(bend.T @ bend for bend in bends)
-    middle = float(field[known].mean())
-    right = weight * np.where(known, field - middle, 0.0).ravel()
-    return np.asarray(middle + splu(matrix.tocsc()).solve(right).reshape(field.shape))
+    return sum(bend.T @ bend for bend in bends)
 
 
 def _differences(size: int, order: int) -> sparse.spmatrix:

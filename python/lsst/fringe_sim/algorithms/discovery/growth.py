@@ -89,11 +89,11 @@ def grown_thickness(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Gro
             best = min(best, begin, key=lambda item: item.fit.chi2)
             break
         grown = _grown(begin.problem, begin.fit, misfit)
-        better = grown is not None and grown.chi2 < GAIN * best.fit.chi2
-        if grown is not None and better:
-            best = _Fitted(begin.problem, grown)
+        if grown is not None and grown.chi2 < GAIN * best.fit.chi2:
+            best, failed = _Fitted(begin.problem, grown), 0
             thickness_um = best.problem.basis.expand(grown.field)
-        failed = 0 if better else failed + 1
+        else:
+            failed += 1
         if failed == len(KNOTS):
             break
     if best.fit.chi2 > GAIN * first.fit.chi2:

@@ -504,23 +504,22 @@ def _choose_pixels(problem: Problem, fit: Fit, settings: Mapping[str, float]) ->
     areas, points = ((problem, fit), (other, again))[:: -1 if forward.point_pixels else 1]
     free = problem.n_levels + (0 if problem.field_prior else problem.basis.size)
     degrees = max(problem.cells.n_values - free, 1)
+    if areas[1].chi2 - points[1].chi2 <= MUCH_SHARPER * areas[1].chi2 / degrees:
+        return areas
     noise = _noise_of(*points) * degrees
-    gain = areas[1].chi2 - points[1].chi2
     # A field in a wrong order, or an effect that is not in the model, may leave either somewhat better.
     chance = NOISE_SIGMAS * noise * math.sqrt(2.0 / degrees)
     explained = points[1].chi2 - noise < MUCH_EXPLAINED * (areas[1].chi2 - noise) + chance
-    return points if gain > MUCH_SHARPER * areas[1].chi2 / degrees and explained else areas
+    return points if explained else areas
 
 
 def _noise_of(problem: Problem, fit: Fit) -> float:
     """Mean of χ² that a value has from noise alone, as measured in what a fit leaves."""
     cells = problem.cells
     noise = estimate_noise(cells, _residual(problem, problem.expected_of(fit)))
-    used = cells.weight > 0.0
-    response = (
-        noise.response_scatter**2 * cells.weight.sum(axis=(1, 2)) / np.maximum(used.sum(axis=(1, 2)), 1)
-    )
-    return float(np.average(noise.factor**2 + response, weights=used.sum(axis=(1, 2))))
+    used = (cells.weight > 0.0).sum(axis=(1, 2))
+    response = noise.response_scatter**2 * cells.weight.sum(axis=(1, 2)) / np.maximum(used, 1)
+    return float(np.average(noise.factor**2 + response, weights=used))
 
 
 def _is_blurred(settings: Mapping[str, float]) -> bool:

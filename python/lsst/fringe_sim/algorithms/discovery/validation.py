@@ -87,11 +87,12 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
         return moved
     found = _moved_everywhere(problem, null, moved, held_out)
     rest = problem.with_cells(problem.cells.restricted(held_out))
-    seen = problem.cells.restricted(~held_out)
-    if _chi2_at(rest, fit, found) < MUCH_WORSE * fit.chi2 * rest.cells.n_values / max(seen.n_values, 1):
+    ratio = rest.cells.n_values / max(problem.cells.n_values - rest.cells.n_values, 1)
+    chi2 = _chi2_at(rest, fit, found)
+    if chi2 < MUCH_WORSE * ratio * fit.chi2:
         return found
     beyond = np.where(held_out, continued(moved, ~held_out & problem.cells.seen), moved)
-    return min(found, beyond, key=lambda field: _chi2_at(rest, fit, field))
+    return beyond if _chi2_at(rest, fit, beyond) < chi2 else found
 
 
 def _chi2_at(problem: Problem, fit: Fit, thickness_um: FloatArray) -> float:
@@ -102,6 +103,7 @@ def _chi2_at(problem: Problem, fit: Fit, thickness_um: FloatArray) -> float:
 
 
 def _moved_everywhere(problem: Problem, null: Fit, moved: FloatArray, held_out: BoolArray) -> FloatArray:
+    """Thickness without effects, moved in all cells as a function of itself as a fit moved it in a part."""
     before = problem.basis.expand(null.field)
     seen = ~held_out & problem.cells.seen
     middle, half = before.mean(), max(0.5 * float(np.ptp(before)), 1e-6)
