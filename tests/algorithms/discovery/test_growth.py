@@ -68,6 +68,21 @@ def test_what_lies_behind_a_blur_gets_its_order_back(blurred) -> None:
     assert grown.settings[f"{BLUR}.sigma"] == pytest.approx(sigma, rel=0.02)
 
 
+def test_cells_without_data_do_not_stop_it(blurred) -> None:
+    """Two sides are masked, a band that the growth has to pass, and single cells."""
+    problem, truth, sigma = blurred
+    seen = np.random.default_rng(3).random(truth.shape) > 0.1
+    seen[:14] = seen[:, :10] = seen[:, 32:40] = False
+    masked = problem.with_cells(problem.cells.restricted(seen))
+    lost = truth + ORDER_UM / (1.0 + np.exp(-(np.arange(truth.shape[1]) - 44.0) / 1.5))
+    fit = _fit_at(masked, sigma, lost)
+    assert _is_wrong(fit.field.reshape(truth.shape), truth)[seen].mean() > 0.1
+    grown = grown_thickness(masked, fit, lost)
+    assert grown is not None
+    assert _is_wrong(grown.thickness_um, truth)[seen].mean() < 0.01
+    assert grown.settings[f"{BLUR}.sigma"] == pytest.approx(sigma, rel=0.02)
+
+
 def test_where_the_model_fits_nothing_grows(blurred) -> None:
     problem, truth, sigma = blurred
     assert grown_thickness(problem, _fit_at(problem, sigma, truth), truth) is None

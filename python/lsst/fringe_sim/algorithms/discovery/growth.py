@@ -36,6 +36,9 @@ that may be so."""
 BETTER_PART = 0.3
 """Quantile of the misfit that stands for cells where the model fits."""
 
+NO_DATA = 1e-9
+"""Part of the data of a cell and its neighbours that is nothing but rounding."""
+
 CONTINUED_SIGMA_UM = 0.03
 """How far the thickness may move from a continuation with the least curvature, where that is new [µm]."""
 
@@ -85,7 +88,7 @@ def grown_thickness(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Gro
     for knots in KNOTS * TURNS:
         begin = _fitted(problem, best.fit, thickness_um, knots)
         misfit = _misfit(begin.problem, begin.fit)
-        if np.mean(misfit > BAD * np.quantile(misfit, BETTER_PART)) < FEW_BAD:
+        if np.mean(misfit[~np.isnan(misfit)] > BAD * _unit(misfit)) < FEW_BAD:
             best = min(best, begin, key=lambda item: item.fit.chi2)
             break
         grown = _grown(begin.problem, begin.fit, misfit)
@@ -120,7 +123,7 @@ def _fitted(problem: Problem, fit: Fit, thickness_um: FloatArray, knots: float) 
 
 def _grown(problem: Problem, fit: Fit, misfit: FloatArray) -> Fit | None:
     """Fit of all cells after growth from the largest area that the model fits."""
-    unit = float(np.quantile(misfit, BETTER_PART))
+    unit = _unit(misfit)
     known = _largest(binary_erosion(misfit < GOOD * unit))
     if not known.any():
         return None
@@ -135,7 +138,7 @@ def _grown(problem: Problem, fit: Fit, misfit: FloatArray) -> Fit | None:
             field_centre=centre,
         )
         fit = fit_model(part, fit.coordinates, fit.position, centre, fit.levels)
-        larger = _largest(reached & (_misfit(problem, fit) < GOOD * unit))
+        larger = _largest(reached & ~(_misfit(problem, fit) > GOOD * unit))  # through cells without data
         idle = idle + 1 if larger.sum() <= ROUND_GAIN * known.sum() else 0
         if idle == IDLE_ROUNDS or not larger.any():
             break
@@ -150,10 +153,17 @@ def _centre(problem: Problem, fit: Fit, known: BoolArray) -> FloatArray:
 
 
 def _misfit(problem: Problem, fit: Fit) -> FloatArray:
-    """Sum of squares of the whitened residuals of each cell and its neighbours."""
+    """Mean square of the whitened residuals of each cell and its neighbours; NaN where none of them has data."""
     expected = problem.expected_of(fit)
     residual = problem.whitener(expected)(problem.cells.value - expected)
-    return np.asarray(uniform_filter((residual**2).sum(axis=0), SIDE))
+    seen = uniform_filter((problem.cells.weight > 0).mean(axis=0), SIDE)
+    square = uniform_filter((residual**2).mean(axis=0), SIDE)
+    return np.where(seen > NO_DATA, square / np.maximum(seen, NO_DATA), np.nan)
+
+
+def _unit(misfit: FloatArray) -> float:
+    """Misfit of cells where the model fits."""
+    return float(np.nanquantile(misfit, BETTER_PART))
 
 
 def _largest(area: BoolArray) -> BoolArray:
