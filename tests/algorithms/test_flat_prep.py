@@ -353,6 +353,7 @@ def test_prepared_flat_is_the_smoothed_truth(run: MockRun, bias: CombinedBias, n
     assert prepared.temperature_k == pytest.approx(183.15)
     assert prepared.bandwidth_fwhm_nm == 2.0
     assert prepared.detector == run.detector.name
+    assert prepared.dark_time_s == RawFrame.read(run.flats[number].path).metadata.dark_time_s > 10.0
     good = prepared.mask == 0
     truth = run.truth.expected_electrons(run.flats[number]).astype(np.float32)
     smooth, _ = smooth_masked(truth, np.ones(SHAPE, np.float32), good, 3.0)

@@ -49,6 +49,18 @@ def test_the_right_model_leaves_nothing_of_noiseless_flats(thickness_um, effects
     assert np.isfinite(residual).sum() == residual.size - 5 * 56 - len(WAVELENGTH_NM)
 
 
+@pytest.mark.parametrize("effects", [{"dark_pedestal.electrons": 900.0}, {"dark_current.rate": 30.0}])
+def test_relative_flats_know_their_levels_and_times(thickness_um, effects) -> None:
+    """As prepared from raw frames; what is added in electrons needs both."""
+    model = FringeModel.from_setup("ts8_e2v", effects)
+    level, seconds = np.linspace(15e3, 25e3, 12), np.linspace(10.0, 60.0, 12)
+    geometry = ImageGeometry.of_pixels(thickness_um.shape, WAVELENGTH_NM, level, seconds)
+    image = model.flat_image(thickness_um, geometry).astype(np.float32)
+    rows = FlatExposures(WAVELENGTH_NM, np.array(2.0), np.array(183.15), level_e=level, dark_time_s=seconds)
+    cube = FringeCube(image, np.full_like(image, 1e-8), np.zeros(image.shape, np.int16), rows, "relative")
+    assert np.abs(flat_residual(cube, model, thickness_um)).max() < 3e-6
+
+
 def test_an_effect_on_the_image_is_seen_where_it_acts(thickness_um) -> None:
     gain = FringeModel.from_setup("ts8_e2v", {"amplifier_gain.C03": 0.02})
     residual = flat_residual(flats(gain, thickness_um), FringeModel.from_setup("ts8_e2v"), thickness_um)

@@ -284,6 +284,31 @@ def test_usual_candidates(model: FringeModel) -> None:
     assert ("narrow_bandpass" in names) == (narrow.setup.bandwidth_fwhm_nm > 0.75)
 
 
+def test_exposures_get_longer_with_more_light_and_a_narrower_line(model: FringeModel) -> None:
+    seconds = tuple(np.linspace(10.0, 32.0, len(FLATS)))
+    found = {item.name: item.series for item in candidate_measurements(model, FLATS, dark_time_s=seconds)}
+    assert found["repeat"].dark_time_s == found["temperature"].dark_time_s == seconds
+    assert found["level"].dark_time_s == pytest.approx([4.0 * time for time in seconds])
+    assert found["narrow_bandpass"].dark_time_s == pytest.approx([4.0 * time for time in seconds])
+    assert len(found["wide_range"].dark_time_s) == len(found["wide_range"].wavelength_nm)
+    assert set(found["wide_range"].dark_time_s) == {10.0, 32.0}
+    with pytest.raises(InputError, match="dark times"):
+        FlatSeries(FLATS, dark_time_s=(10.0,))
+
+
+def test_a_level_that_grows_with_time_is_told_from_one_that_does_not(
+    model: FringeModel, few_samples: None
+) -> None:
+    effects = {"dark_pedestal": {"electrons": 1000.0}, "dark_current": {"rate": 50.0}}
+    seconds = [20.0] * len(FLATS)
+    ranked = rank_measurements(model, effects, wavelength_nm=FLATS, dark_time_s=seconds)
+    (pair,) = ranked[0].pairs
+    assert pair.separation_now < 1e-3 * pair.separation_after
+    assert ranked[0].measurement.name in {"level", "narrow_bandpass"}
+    with pytest.raises(InputError, match="dark time"):
+        rank_measurements(model, effects, wavelength_nm=FLATS)
+
+
 def test_what_cannot_be_forecast_is_left_out(model: FringeModel, few_samples: None) -> None:
     assert rank_measurements(model, {"charge_diffusion": {}, "thickness_spread": {}}) == ()
     assert break_ambiguity(()) == ""

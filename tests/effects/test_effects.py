@@ -42,7 +42,8 @@ def thickness() -> np.ndarray:
 
 def observe(model: FringeModel, thickness: np.ndarray, wavelengths: np.ndarray = WAVELENGTHS) -> np.ndarray:
     """Response, image of a flat of 20 000 electrons, and light of the night sky; a change of any is a change."""
-    geometry = ImageGeometry.of_pixels(thickness.shape, wavelengths, 20_000.0)
+    seconds = np.linspace(10.0, 30.0, len(wavelengths))
+    geometry = ImageGeometry.of_pixels(thickness.shape, wavelengths, 20_000.0, seconds)
     flats = model.response(thickness, wavelengths), model.flat_image(thickness, geometry)
     sky = apply_to_sky(model.effects, model.base_system, SKY)
     lines = sky.lines.photon_radiance * sky.lines.transmission
@@ -60,7 +61,7 @@ def test_light_and_bench_of_the_laboratory_stay_there() -> None:
     """The telescope has its own light; the sensor's layers and electronics come along."""
     left_behind = {effect.name for effect in EFFECTS if effect.laboratory_only}
     assert {effect.name for effect in EFFECTS if effect.acts_on == "illumination"} <= left_behind
-    assert {"temperature", "ghost_pedestal", "vignetting", "dark_pedestal"} <= left_behind
+    assert {"temperature", "ghost_pedestal", "vignetting", "dark_pedestal", "dark_current"} <= left_behind
     assert not {"epoxy_index", "roughness", "silicon_thickness", "charge_diffusion"} & left_behind
 
 
@@ -196,7 +197,7 @@ def test_what_is_done_to_an_image_leaves_its_mean(effect, parameter, base) -> No
     Charge that is lost, or counted twice, is no pattern.
     """
     rng = np.random.default_rng(2)
-    geometry = ImageGeometry.of_pixels((80, 80), WAVELENGTHS, 20_000.0)
+    geometry = ImageGeometry.of_pixels((80, 80), WAVELENGTHS, 20_000.0, np.array([10.0, 20.0, 30.0]))
     image = 1.0 + 0.02 * rng.standard_normal((3, 80, 80))
     image /= image.mean(axis=(1, 2), keepdims=True)
     value = float(np.clip(4.0 * parameter.prior_scale, *parameter.bounds))

@@ -49,6 +49,7 @@ def test_a_minimal_cube_is_read(tmp_path: Path) -> None:
     assert np.isinf(cube.exposures.f_number).all()
     assert cube.variance.dtype == np.float32
     assert not cube.exposures.level_e.any()
+    assert not cube.exposures.dark_time_s.any()
 
 
 def test_one_pixel_with_many_wavelengths(tmp_path: Path) -> None:

@@ -164,6 +164,7 @@ def test_a_scalar_is_kept_or_refused(name: str, value: Any) -> None:
         ({"f_number": [np.inf, np.nan]}, "f_number"),
         ({"f_number": 0.0}, "f_number"),
         ({"level_e": -5.0}, "level"),
+        ({"dark_time_s": [10.0, -5.0]}, "dark_time"),
     ],
 )
 def test_exposures_name_the_column(columns: dict[str, Any], field: str) -> None:

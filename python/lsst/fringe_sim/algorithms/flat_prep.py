@@ -360,6 +360,7 @@ def prepare_flat(
         metadata=_flat_metadata(frame, bias, charge, options),
         detector=detector.name,
         f_number=f_number,
+        dark_time_s=metadata.dark_time_s,
     )
 
 

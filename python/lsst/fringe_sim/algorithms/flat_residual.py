@@ -94,7 +94,8 @@ def flat_residual(
     image: NDArray[np.floating] = np.stack([table.frame(filled, row) for row in range(len(wavelength))])
     if any(active.effect.acts_on == "image" for active in model.effects):
         level = image.mean(axis=(1, 2), keepdims=True, dtype=float)
-        geometry = ImageGeometry.of_pixels((filled.shape[0], filled.shape[1]), wavelength, _levels(cube))
+        shape = (filled.shape[0], filled.shape[1])
+        geometry = ImageGeometry.of_pixels(shape, wavelength, cube.level_e, cube.exposures.dark_time_s)
         image = apply_to_image(model.effects, model.base_system, image / level, geometry)
     residual = np.full(cube.shape, np.nan, dtype=np.float32)
     for plane, modelled in enumerate(image):
@@ -134,11 +135,3 @@ def _plane_mean(image: FloatArray) -> FloatArray:
     count = np.isfinite(image).sum(axis=(1, 2), keepdims=True)
     total = np.nansum(image, axis=(1, 2), keepdims=True)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-
-
-def _levels(cube: FringeCube) -> FloatArray | float:
-    """Mean electrons of each plane; 0 where the cube does not tell."""
-    if cube.unit != "electron":
-        return 0.0
-    image = np.where(cube.mask == 0, np.asarray(cube.image, dtype=float), np.nan)
-    return np.nan_to_num(_plane_mean(image)[:, 0, 0])

@@ -94,6 +94,8 @@ class FlatSeries:
         Mean level [electrons].
     bandwidth_fwhm_nm, temperature_k, f_number : `float` or `None`
         Nominal width of the line [nm], temperature [K] and focal ratio; as in the set-up where not given.
+    dark_time_s : `tuple` [`float`, ...]
+        Time in which each flat gathers charge [s]; empty, the default, if not known.
     """
 
     wavelength_nm: tuple[float, ...]
@@ -101,12 +103,37 @@ class FlatSeries:
     bandwidth_fwhm_nm: float | None = None
     temperature_k: float | None = None
     f_number: float | None = None
+    dark_time_s: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.wavelength_nm or not all(0.0 < w < math.inf for w in self.wavelength_nm):
             raise InputError("wavelengths of a series [nm]", self.wavelength_nm, "one or more, positive")
         if not 0.0 < self.level_e < math.inf:
             raise OutOfRangeError("level of a series [e]", self.level_e, "positive")
+        if self.dark_time_s and len(self.dark_time_s) != len(self.wavelength_nm):
+            raise InputError(
+                "dark times of a series [s]", self.dark_time_s, "one for each wavelength, or none"
+            )
+
+    def at_level(self, level_e: float) -> FlatSeries:
+        """The same light for as long as another level takes [electrons]."""
+        return replace(self, level_e=level_e, dark_time_s=self._longer(level_e / self.level_e))
+
+    def at_bandwidth(self, fwhm_nm: float, setup_fwhm_nm: float) -> FlatSeries:
+        """The same level behind a slit of another width than the set-up's [nm]: exposures get longer."""
+        return replace(self, bandwidth_fwhm_nm=fwhm_nm, dark_time_s=self._longer(setup_fwhm_nm / fwhm_nm))
+
+    def at_wavelengths(self, wavelength_nm: tuple[float, ...]) -> FlatSeries:
+        """Flats at other wavelengths [nm]; as long as those of the nearest."""
+        if not self.dark_time_s:
+            return replace(self, wavelength_nm=wavelength_nm)
+        order = np.argsort(self.wavelength_nm)
+        waves, known = np.array(self.wavelength_nm)[order], np.array(self.dark_time_s)[order]
+        times = tuple(np.interp(wavelength_nm, waves, known).tolist())
+        return replace(self, wavelength_nm=wavelength_nm, dark_time_s=times)
+
+    def _longer(self, factor: float) -> tuple[float, ...]:
+        return tuple(factor * time for time in self.dark_time_s)
 
     def conditions(self, model: FringeModel) -> FringeModel:
         """Model under the nominal conditions of the series.
@@ -243,7 +270,10 @@ class RankedMeasurement:
 
 
 def candidate_measurements(
-    model: FringeModel, wavelength_nm: Sequence[float] | None = None, level_e: float = LEVEL_E
+    model: FringeModel,
+    wavelength_nm: Sequence[float] | None = None,
+    level_e: float = LEVEL_E,
+    dark_time_s: Sequence[float] = (),
 ) -> tuple[FlatMeasurement, ...]:
     """Measurements that a test stand can make besides its usual flats.
 
@@ -255,8 +285,10 @@ def candidate_measurements(
         Wavelengths of the present flats [nm]; by default those of the set-up.
     level_e : `float`, optional
         Their mean level [electrons].
+    dark_time_s : sequence of `float`, optional
+        Time in which each of them gathers charge [s], where it is known.
     """
-    present = _present(model, wavelength_nm, level_e)
+    present = _present(model, wavelength_nm, level_e, dark_time_s)
     waves, setup = present.wavelength_nm, model.setup
     n = f"{len(waves)} flats"
     found = [
@@ -268,12 +300,11 @@ def candidate_measurements(
         ),
     ]
     level = HIGH_LEVEL_E if level_e < 0.5 * HIGH_LEVEL_E else 0.2 * level_e
-    found.append(FlatMeasurement("level", f"{n} of {level:.0f} electrons", replace(present, level_e=level)))
+    found.append(FlatMeasurement("level", f"{n} of {level:.0f} electrons", present.at_level(level)))
     if setup.bandwidth_fwhm_nm > 1.5 * NARROW_FWHM_NM:
         title = f"{n} with a bandpass of {NARROW_FWHM_NM:g} nm"
-        found.append(
-            FlatMeasurement("narrow_bandpass", title, replace(present, bandwidth_fwhm_nm=NARROW_FWHM_NM))
-        )
+        narrow = present.at_bandwidth(NARROW_FWHM_NM, setup.bandwidth_fwhm_nm)
+        found.append(FlatMeasurement("narrow_bandpass", title, narrow))
     if math.isinf(setup.f_number) or setup.f_number > 2.0 * SECOND_F_NUMBER:
         title = f"{n} in a beam of f/{SECOND_F_NUMBER:g}"
         found.append(FlatMeasurement("f_number", title, replace(present, f_number=SECOND_F_NUMBER)))
@@ -282,7 +313,7 @@ def candidate_measurements(
     )
     if further:
         title = f"{len(further)} flats at other wavelengths from {min(further):g} to {max(further):g} nm"
-        found.append(FlatMeasurement("wide_range", title, replace(present, wavelength_nm=further)))
+        found.append(FlatMeasurement("wide_range", title, present.at_wavelengths(further)))
     return tuple(found)
 
 
@@ -292,6 +323,7 @@ def rank_measurements(
     *,
     wavelength_nm: Sequence[float] | None = None,
     level_e: float = LEVEL_E,
+    dark_time_s: Sequence[float] = (),
     thickness_um: tuple[float, float] | None = None,
     significance: float | None = None,
     measurements: Sequence[FlatMeasurement] | None = None,
@@ -309,8 +341,9 @@ def rank_measurements(
         The class, the effect that was found first: fitted values by effect and parameter. Where nothing is known
         (an empty mapping) an effect departs from null by its prior scale if it can do so to one side only, and
         otherwise by little.
-    wavelength_nm, level_e
-        Wavelengths [nm] and mean level [electrons] of the present flats; by default those of the set-up.
+    wavelength_nm, level_e, dark_time_s
+        Wavelengths [nm] and mean level [electrons] of the present flats, by default those of the set-up, and the
+        time in which each gathers charge [s], where it is known.
     thickness_um : `tuple` [`float`, `float`], optional
         Smallest and largest thickness of the varying layer on the sensor [µm]; by default within 1.5 of the stack's.
     significance : `float`, optional
@@ -350,11 +383,11 @@ def rank_measurements(
     if len(tested) < 2:
         return ()
     further = [_Tested.of(known[name], {}, model) for name in nuisance_effects if name not in effects]
-    present = _present(model, wavelength_nm, level_e)
+    present = _present(model, wavelength_nm, level_e, dark_time_s)
     forecast = _Forecast(
         model, catalogue, tuple(tested), tuple(further), _Sample.of(model, thickness_um), present
     )
-    chosen = measurements or candidate_measurements(model, wavelength_nm, level_e)
+    chosen = measurements or candidate_measurements(model, wavelength_nm, level_e, dark_time_s)
     # Many small matrices: threads of the linear algebra would wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
         return _ranked(forecast, chosen, significance, say)
@@ -395,10 +428,12 @@ def break_ambiguity(ranked: Sequence[RankedMeasurement]) -> str:
 
 
 def _present(
-    model: FringeModel, wavelength_nm: Sequence[float] | None, level_e: float = LEVEL_E
+    model: FringeModel, wavelength_nm: Sequence[float] | None, level_e: float, dark_time_s: Sequence[float]
 ) -> FlatSeries:
     waves = model.setup.wavelengths_nm if wavelength_nm is None else wavelength_nm
-    return FlatSeries(tuple(float(w) for w in waves), level_e)
+    return FlatSeries(
+        tuple(float(w) for w in waves), level_e, dark_time_s=tuple(float(time) for time in dark_time_s)
+    )
 
 
 @dataclass(frozen=True)
@@ -494,7 +529,8 @@ class _Sample:
             for size, count in zip(SENSOR_PX, self.thickness_um.shape, strict=True)
         )
         waves = np.array(series.wavelength_nm)
-        return ImageGeometry(SENSOR_PX, y, x, waves, np.full(waves.shape, series.level_e))
+        level, dark_time = np.full(waves.shape, series.level_e), np.array(series.dark_time_s)
+        return ImageGeometry(SENSOR_PX, y, x, waves, level, dark_time_s=dark_time)
 
 
 @dataclass(frozen=True, eq=False)
@@ -688,10 +724,10 @@ class _Forecast:
         model = self.model.with_effects({**self.model.effect_settings, **effects}, self.catalogue)
         model = series.conditions(model)
         optical = tuple(item for item in model.effects if item.effect.acts_on != "image")
-        # Neither the level nor an effect on the image changes what the optics do.
+        # Neither the level, nor the time it takes, nor an effect on the image changes what the optics do.
         settings = tuple((item.effect.name, *sorted(item.values.items())) for item in optical)
         moved = np.broadcast_to(shift_um, self.sample.thickness_um.shape)
-        key = (replace(series, level_e=1.0), settings, moved.tobytes(), silicon_um)
+        key = (replace(series, level_e=1.0, dark_time_s=()), settings, moved.tobytes(), silicon_um)
         if key not in self._flats:
             bare = replace(model, effects=optical)
             self._flats[key] = self._optical(bare, series, moved, silicon_um)

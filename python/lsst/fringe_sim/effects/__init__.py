@@ -23,6 +23,7 @@ from .chromatic_illumination import ChromaticIllumination
 from .contrast_loss import ContrastLoss
 from .converging_beam import ConvergingBeam
 from .crosstalk import Crosstalk
+from .dark_current import DarkCurrent
 from .dark_pedestal import DarkPedestal
 from .epoxy_absorption import EpoxyAbsorption
 from .epoxy_index import EpoxyIndex
@@ -106,6 +107,7 @@ EFFECTS: tuple[Effect, ...] = (
     MidlineStep(),
     TreeRings(),
     DarkPedestal(),
+    DarkCurrent(),
     ChargeDiffusion(),
     BrighterFatter(),
     NonLinearity(),

@@ -150,6 +150,15 @@ class Effect(ABC):
         """Bounds of a parameter in a search on some samples; narrower where it could imitate something simpler."""
         return parameter.bounds
 
+    def check_search(self, geometry: ImageGeometry) -> None:  # noqa: B027
+        """Refuse to be looked for on some samples.
+
+        Raises
+        ------
+        InputError
+            They do not state what the effect depends on, or it is nothing but a simpler one there.
+        """
+
     def noise_correlation(self, values: Mapping[str, float], geometry: ImageGeometry) -> float:
         """Correlation that the effect gives the noise of neighbouring samples; 0 where it leaves noise alone."""
         return 0.0

@@ -1,4 +1,4 @@
-"""Dark signal or light leak."""
+"""Level that does not come from the light of the exposure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class DarkPedestal(PlainNullEffect):
     """Every exposure holds the same number of electrons that are not from the monochromator."""
 
     name = "dark_pedestal"
-    title = "dark signal or light leak"
+    title = "dark pedestal, the same in every exposure"
     acts_on = "image"
     laboratory_only = True
     reference = "EMVA standard 1288, release 4 (dark signal of a camera)"

@@ -35,6 +35,8 @@ class ImageGeometry:
         Mean level of each plane [electrons]; 0 where it is not known.
     y_edges, x_edges : `tuple` [`int`, ...]
         Borders of the amplifiers [px]; by default two rows of eight of equal size.
+    dark_time_s : `numpy.ndarray`, shape ``(W,)``
+        Time in which each plane gathered charge [s]; 0, the default, where it is not known.
     """
 
     shape: tuple[int, int]
@@ -44,6 +46,7 @@ class ImageGeometry:
     level_e: FloatArray
     y_edges: tuple[int, ...] = field(default=())
     x_edges: tuple[int, ...] = field(default=())
+    dark_time_s: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         rows, columns = self.shape
@@ -55,17 +58,31 @@ class ImageGeometry:
             raise InputError("amplifier borders", (self.y_edges, self.x_edges), "3 rows and 9 columns")
         if self.wavelength_nm.shape != self.level_e.shape or self.wavelength_nm.ndim != 1:
             raise InputError("levels", self.level_e.shape, f"{self.wavelength_nm.shape}, one for each plane")
+        if not self.dark_time_s.size:
+            object.__setattr__(self, "dark_time_s", np.zeros(self.level_e.shape))
+        if self.dark_time_s.shape != self.level_e.shape:
+            raise InputError(
+                "dark times", self.dark_time_s.shape, f"{self.level_e.shape}, one for each plane"
+            )
 
     @classmethod
     def of_pixels(
-        cls, shape: tuple[int, int], wavelength_nm: FloatArray, level_e: FloatArray | float = 0.0
+        cls,
+        shape: tuple[int, int],
+        wavelength_nm: FloatArray,
+        level_e: FloatArray | float = 0.0,
+        dark_time_s: FloatArray | float = 0.0,
     ) -> ImageGeometry:
         """Geometry of a full image, one sample per pixel."""
         wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
-        level = np.broadcast_to(np.asarray(level_e, dtype=float), wavelength.shape)
-        return cls(
-            shape, np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float), wavelength, level
+        level, dark_time = (
+            np.full(wavelength.shape, each, dtype=float)
+            if np.ndim(each) == 0
+            else np.asarray(each, dtype=float)
+            for each in (level_e, dark_time_s)
         )
+        y, x = (np.arange(size, dtype=float) for size in shape)
+        return cls(shape, y, x, wavelength, level, dark_time_s=dark_time)
 
     @property
     def sample_shape(self) -> tuple[int, int]:
@@ -124,6 +141,20 @@ class ImageGeometry:
                 f"level of the flats (effect {effect})", self.level_e.tolist(), "electrons, above 0"
             )
         return self.level_e[:, np.newaxis, np.newaxis]
+
+    def require_dark_times(self, effect: str) -> FloatArray:
+        """Dark times [s] as ``(W, 1, 1)``.
+
+        Raises
+        ------
+        InputError
+            One is not known.
+        """
+        if not np.all(self.dark_time_s > 0.0):
+            raise InputError(
+                f"dark time of the flats (effect {effect})", self.dark_time_s.tolist(), "seconds, above 0"
+            )
+        return self.dark_time_s[:, np.newaxis, np.newaxis]
 
 
 def _unit(position: FloatArray, size: int) -> FloatArray:

@@ -29,6 +29,7 @@ from ..products.challenge_result import CASE_KINDS, VISIBLE, CaseResult, Challen
 from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
 from .hidden_effects import AmplifierState, HiddenEffect, validate_effects
+from .raw_files import exposure_time
 from .raw_frames import setup_optics
 from .thickness import PixelArea, random_field
 
@@ -121,6 +122,7 @@ SIZES: Mapping[str, Draw] = MappingProxyType(
         "amplifier_gain": lambda r: {"amplifier_gain.rms": _decades(r, -3.3, -1.7)},
         "amplifier_offset": lambda r: {"amplifier_offset.rms": _decades(r, 1.0, 2.5)},
         "dark_pedestal": lambda r: {"dark_pedestal.electrons": _decades(r, 2.0, 4.0)},
+        "dark_current": lambda r: {"dark_current.rate": _decades(r, 0.3, 2.3)},
         "non_linearity": lambda r: {"non_linearity.quadratic": _signed(r, -2.3, -0.9)},
     }
 )
@@ -264,7 +266,11 @@ def _expose(
     table = optics.table(area.range_um, tuple(wavelengths))
     shape = thickness.shape
     response = 1.0 + float(rng.choice([0.0, 0.003, 0.006])) * rng.standard_normal(shape)
-    gain, offset = _amplifiers(active, shape, rng)
+    states = _amplifiers(active, rng)
+    gain, offset = (
+        _of_pixels(shape, [getattr(state, name) for state in states]) for name in ("gain", "offset_e")
+    )
+    seconds = [exposure_time(float(wavelength)) for wavelength in wavelengths]
     scene, sizes = _scene(outsider, shape, rng)
     level = _decades(rng, 4.0, 4.7)
     images, variances = [], []
@@ -277,7 +283,8 @@ def _expose(
         if outsider:
             light = OUTSIDERS[outsider][0](light, float(wavelength), scene)
         light = light / light.mean() * level * (1.0 + 0.02 * rng.standard_normal())
-        charge = rng.poisson(light * response).astype(float)
+        dark = _of_pixels(shape, [state.dark_signal_e(seconds[row]) for state in states])
+        charge = rng.poisson(light * response + dark).astype(float)
         for effect, own in active:
             if effect.on_charge is not None:
                 charge = effect.on_charge(charge, effect.complete(own))
@@ -292,7 +299,9 @@ def _expose(
         np.array(images, dtype=np.float32),
         np.array(variances, dtype=np.float32),
         mask,
-        FlatExposures(wavelengths, np.array(STATED_FWHM_NM), np.array(STATED_KELVIN)),
+        FlatExposures(
+            wavelengths, np.array(STATED_FWHM_NM), np.array(STATED_KELVIN), dark_time_s=np.array(seconds)
+        ),
         "electron",
         detector="sealed",
     )
@@ -300,25 +309,27 @@ def _expose(
 
 
 def _amplifiers(
-    active: Sequence[tuple[HiddenEffect, dict[str, float]]], shape: tuple[int, ...], rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Gain and offset of every pixel."""
-    gain, offset = np.ones(shape), np.zeros(shape)
-    deviates = rng.standard_normal((2, 8, max(len(active), 1)))
-    for row in range(2):
-        for column in range(8):
-            state = AmplifierState(f"C{row}{column}", 1.0, READ_NOISE_E, 1e9)
-            for number, (effect, own) in enumerate(active):
-                if effect.on_amplifier is not None:
-                    state = effect.on_amplifier(
-                        state, effect.complete(own), float(deviates[row, column, number])
-                    )
-            place = (
-                slice(shape[0] * row // 2, shape[0] * (row + 1) // 2),
-                slice(shape[1] * column // 8, shape[1] * (column + 1) // 8),
-            )
-            gain[place], offset[place] = state.gain, state.offset_e + state.dark_e
-    return gain, offset
+    active: Sequence[tuple[HiddenEffect, dict[str, float]]], rng: np.random.Generator
+) -> list[AmplifierState]:
+    """The two rows of eight amplifiers, as they really are."""
+    deviates = rng.standard_normal((2, 8, max(len(active), 1))).reshape(16, -1)
+    states = []
+    for number, own_deviates in enumerate(deviates):
+        state = AmplifierState(f"C{number // 8}{number % 8}", 1.0, READ_NOISE_E, 1e9)
+        for (effect, own), deviate in zip(active, own_deviates, strict=False):
+            if effect.on_amplifier is not None:
+                state = effect.on_amplifier(state, effect.complete(own), float(deviate))
+        states.append(state)
+    return states
+
+
+def _of_pixels(shape: tuple[int, ...], values: Sequence[float]) -> FloatArray:
+    """Numbers of the amplifiers, put into their pixels."""
+    row, column = (
+        np.searchsorted(size * np.arange(1, parts) // parts, np.arange(size), side="right")
+        for size, parts in zip(shape, (2, 8), strict=True)
+    )
+    return np.asarray(values)[8 * row[:, np.newaxis] + column[np.newaxis, :]]
 
 
 def _scene(

@@ -63,6 +63,8 @@ class AmplifierState:
         Full well [electrons].
     dark_e : `float`
         Charge that gathers in every imaging pixel of a flat without being light [electrons].
+    dark_rate_e : `float`
+        The same, in each second of the exposure [electrons / s].
     offset_e : `float`
         Level that the imaging pixels of a flat have and its overscan has not, without noise of its own
         [electrons].
@@ -74,6 +76,11 @@ class AmplifierState:
     saturation_e: float
     dark_e: float = 0.0
     offset_e: float = 0.0
+    dark_rate_e: float = 0.0
+
+    def dark_signal_e(self, seconds: float) -> float:
+        """Charge without light of an exposure of so many seconds [electrons]."""
+        return self.dark_e + self.dark_rate_e * seconds
 
 
 @dataclass(frozen=True)
@@ -392,6 +399,10 @@ def _dark_pedestal(state: AmplifierState, values: Values, deviate: float) -> Amp
     return replace(state, dark_e=state.dark_e + values["electrons"])
 
 
+def _dark_current(state: AmplifierState, values: Values, deviate: float) -> AmplifierState:
+    return replace(state, dark_rate_e=state.dark_rate_e + values["rate"])
+
+
 def _amplifier_gain(state: AmplifierState, values: Values, deviate: float) -> AmplifierState:
     return replace(state, gain=state.gain * (1.0 + values[state.name] + values["rms"] * deviate))
 
@@ -647,9 +658,15 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     ),
     HiddenEffect(
         "dark_pedestal",
-        "dark signal or light leak",
+        "dark pedestal",
         (HiddenParameter("electrons", "electron", 0.0, (0.0, 100_000.0), "level in every flat"),),
         on_amplifier=_dark_pedestal,
+    ),
+    HiddenEffect(
+        "dark_current",
+        "dark current or light leak",
+        (HiddenParameter("rate", "electron/s", 0.0, (0.0, 2000.0), "electrons per second of a flat"),),
+        on_amplifier=_dark_current,
     ),
     HiddenEffect(
         "brighter_fatter",

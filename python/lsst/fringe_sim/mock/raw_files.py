@@ -35,12 +35,12 @@ class Clock:
 
     def next(self, wavelength_nm: float | None) -> tuple[datetime.datetime, float]:
         """Start and length [s] of the next exposure."""
-        start, length = self._now, _exposure_time(wavelength_nm)
+        start, length = self._now, exposure_time(wavelength_nm)
         self._now = start + datetime.timedelta(seconds=math.ceil(length) + READOUT_S)
         return start, length
 
 
-def _exposure_time(wavelength_nm: float | None) -> float:
+def exposure_time(wavelength_nm: float | None) -> float:
     """Time that a lamp and a sensor that both fade towards the infrared need for one level [s]."""
     if wavelength_nm is None:
         return 0.0

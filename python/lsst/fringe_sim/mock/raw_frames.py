@@ -308,11 +308,10 @@ def write_mock_flats(
     written: list[MockExposure] = []
     for number, (wavelength, frame_rng) in enumerate(zip(plan, frames_rng.spawn(len(plan)), strict=True)):
         level = 0.0 if wavelength is None else level_e * (1.0 + LEVEL_SCATTER * level_rng.standard_normal())
-        header = primary_header(
-            camera, sensor, _nominal_celsius(setup), wavelength, number, *clock.next(wavelength)
-        )
+        start, seconds = clock.next(wavelength)
+        header = primary_header(camera, sensor, _nominal_celsius(setup), wavelength, number, start, seconds)
         exposure = MockExposure(folder / str(header["FILENAME"]), wavelength, level)
-        images = readout.read(truth.expected_electrons(exposure), wavelength is not None, active, frame_rng)
+        images = readout.read(truth.expected_electrons(exposure), seconds, active, frame_rng)
         write_frame(exposure.path, header, sensor, images)
         written.append(exposure)
         if progress is not None:

@@ -55,28 +55,33 @@ class Readout:
         return cls(sensor, states, tuple(levels.tolist()), patterns)
 
     def read(
-        self, electrons: FloatArray, lit: bool, active: ActiveEffects, rng: np.random.Generator
+        self, electrons: FloatArray, seconds: float, active: ActiveEffects, rng: np.random.Generator
     ) -> list[NDArray[np.int32]]:
-        """Raw images of all amplifiers; each has its own stream of random numbers."""
+        """Raw images of all amplifiers, without charge in 0 s; each has its own stream of random numbers."""
         streams = rng.spawn(len(self.sensor.amplifiers))
 
         def one(number: int) -> NDArray[np.int32]:
             amp = self.sensor.amplifiers[number]
             view = electrons[amp.section][:: -1 if amp.flip_y else 1, :: -1 if amp.flip_x else 1]
-            return self._read_amplifier(number, view, lit, active, streams[number])
+            return self._read_amplifier(number, view, seconds, active, streams[number])
 
         # The random number generators work without the interpreter lock.
         with ThreadPoolExecutor(max_workers=2) as pool:
             return list(pool.map(one, range(len(streams))))
 
     def _read_amplifier(
-        self, number: int, electrons: FloatArray, lit: bool, active: ActiveEffects, rng: np.random.Generator
+        self,
+        number: int,
+        electrons: FloatArray,
+        seconds: float,
+        active: ActiveEffects,
+        rng: np.random.Generator,
     ) -> NDArray[np.int32]:
         state = self.states[number]
         segment = raw_segment(self.sensor.amplifiers[number])
         image = np.zeros(segment.shape, dtype=np.float32)
-        if lit:
-            charge = rng.poisson(electrons + state.dark_e).astype(np.float64)
+        if seconds > 0.0:
+            charge = rng.poisson(electrons + state.dark_signal_e(seconds)).astype(np.float64)
             np.minimum(charge, state.saturation_e, out=charge)
             for effect, values in active:
                 if effect.on_charge is not None:

@@ -41,6 +41,8 @@ class FlatExposures:
         Focal ratio; infinite (the default) for a collimated beam.
     level_e : array-like, shape ``(n_wavelengths,)``, optional
         Mean level in electrons; 0 (the default) where it is not known.
+    dark_time_s : array-like, shape ``(n_wavelengths,)``, optional
+        Time in which charge was gathered, in seconds; 0 (the default) where it is not known.
     """
 
     wavelength_nm: NDArray[np.float64]
@@ -48,6 +50,7 @@ class FlatExposures:
     temperature_k: NDArray[np.float64]
     f_number: NDArray[np.float64] = field(default_factory=lambda: np.array(np.inf))
     level_e: NDArray[np.float64] = field(default_factory=lambda: np.array(0.0))
+    dark_time_s: NDArray[np.float64] = field(default_factory=lambda: np.array(0.0))
 
     def __post_init__(self) -> None:
         wavelength = check.as_float_array("wavelength", self.wavelength_nm, 1, np.float64)
@@ -58,6 +61,7 @@ class FlatExposures:
             "temperature_k": _positive("temperature", self.temperature_k, number),
             "f_number": _positive("f_number", self.f_number, number, infinite=True),
             "level_e": _positive("level", self.level_e, number, zero=True),
+            "dark_time_s": _positive("dark_time", self.dark_time_s, number, zero=True),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -74,6 +78,7 @@ class FlatExposures:
             self.temperature_k[at],
             self.f_number[at],
             self.level_e[at],
+            self.dark_time_s[at],
         )
 
 
@@ -178,6 +183,19 @@ class FringeCube(FitsProduct):
         """Wavelength of each plane, in nm."""
         return self.exposures.wavelength_nm
 
+    @property
+    def level_e(self) -> NDArray[np.float64]:
+        """Mean of the good pixels of each plane [electrons]; 0 where it is not known."""
+        if self.unit != "electron":
+            return self.exposures.level_e
+        good = self.mask == 0
+        return np.array(
+            [
+                np.mean(plane, where=use, dtype=np.float64) if use.any() else 0.0
+                for plane, use in zip(self.image, good, strict=True)
+            ]
+        )
+
     def take(self, index: ArrayLike) -> FringeCube:
         """Cube of the planes at the given positions, in the given order."""
         at = np.asarray(index)
@@ -266,6 +284,7 @@ class FringeCube(FitsProduct):
                 ("temperature", rows.temperature_k, "K"),
                 ("f_number", rows.f_number, None),
                 ("level", rows.level_e, "electron"),
+                ("dark_time", rows.dark_time_s, "s"),
             ],
         )
 
@@ -372,8 +391,11 @@ class _Stack:
             if keyword in flat.metadata and flat.metadata[keyword] == value
         }
         self.rows.append(
-            (flat.wavelength_nm, flat.bandwidth_fwhm_nm, flat.temperature_k, flat.f_number, flat.level_e)
-        )
+            (
+                flat.wavelength_nm, flat.bandwidth_fwhm_nm, flat.temperature_k,
+                flat.f_number, flat.level_e, flat.dark_time_s,
+            )
+        )  # fmt: skip
 
     def _add_mask(self, plane: int, mask: NDArray[Any]) -> None:
         """Keep one mask for all wavelengths until one has another: the fifth part of a cube."""
@@ -422,9 +444,9 @@ def _read_exposures(hdus: fits.HDUList, source: str) -> FlatExposures:
         raise FrameFormatError("extension", "no EXPOSURES", "a binary table named EXPOSURES", source=source)
     table = hdus["EXPOSURES"].data
     names = {str(name).lower(): str(name) for name in table.names}
-    absent = {"f_number": np.inf, "level": 0.0}
+    absent = {"f_number": np.inf, "level": 0.0, "dark_time": 0.0}
     columns: list[NDArray[Any]] = []
-    for name in ("wavelength", "bandwidth_fwhm", "temperature", "f_number", "level"):
+    for name in ("wavelength", "bandwidth_fwhm", "temperature", "f_number", "level", "dark_time"):
         if name in names:
             columns.append(np.array(table[names[name]]))
         elif name in absent:

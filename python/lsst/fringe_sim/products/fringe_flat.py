@@ -17,7 +17,7 @@ from .fits_product import FitsProduct
 
 __all__ = ["FringeFlat"]
 
-_OWN = ("DETNAME", "WAVELEN", "BANDFWHM", "TEMPK", "LEVELE", "FNUMBER")
+_OWN = ("DETNAME", "WAVELEN", "BANDFWHM", "TEMPK", "LEVELE", "FNUMBER", "DARKTIME")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,8 @@ class FringeFlat(FitsProduct):
         Name of the sensor, as ``R11_S01``; empty if not known.
     f_number : `float`
         Focal ratio of the light; infinite for a collimated beam.
+    dark_time_s : `float`
+        Time in which charge was gathered, in s; 0 if not known.
 
     Raises
     ------
@@ -65,6 +67,7 @@ class FringeFlat(FitsProduct):
     metadata: Mapping[str, Any] = field(default_factory=dict)
     detector: str = ""
     f_number: float = math.inf
+    dark_time_s: float = 0.0
 
     def __post_init__(self) -> None:
         image = check.as_float_array("IMAGE", self.image, 2)
@@ -82,6 +85,7 @@ class FringeFlat(FitsProduct):
             "temperature_k": check.check_number("temperature_k", self.temperature_k, low=0, open_low=True),
             "level_e": check.check_number("level_e", self.level_e, low=0, open_low=True),
             "f_number": check.check_number("f_number", self.f_number, low=0, open_low=True, allow_inf=True),
+            "dark_time_s": check.check_number("dark_time_s", self.dark_time_s, low=0),
             "detector": check.check_name("detector", self.detector),
             "metadata": io.normalise_metadata(self.metadata, _OWN),
         }
@@ -104,6 +108,8 @@ class FringeFlat(FitsProduct):
         ]
         if math.isfinite(self.f_number):
             own.append(("FNUMBER", self.f_number, "focal ratio; absent: collimated"))
+        if self.dark_time_s > 0:
+            own.append(("DARKTIME", self.dark_time_s, "[s] time of gathering charge; absent: not known"))
         hdus = [
             io.primary_hdu("FringeFlat", own, io.merge_metadata(self.metadata, metadata, _OWN)),
             io.image_hdu("IMAGE", self.image, unit=""),
@@ -134,5 +140,6 @@ class FringeFlat(FitsProduct):
                 level_e=io.read_keyword(header, "LEVELE", source=source),
                 detector=header.get("DETNAME", ""),
                 f_number=header.get("FNUMBER", math.inf),
+                dark_time_s=header.get("DARKTIME", 0.0),
                 metadata=io.read_metadata(header, _OWN),
             )

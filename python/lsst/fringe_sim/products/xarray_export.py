@@ -187,6 +187,7 @@ def _of_cube(product: Any) -> tuple[dict[str, _Variable], dict[str, _Variable]]:
         "temperature": _variable(plane, rows.temperature_k, "K", "temperature of the sensor"),
         "f_number": _variable(plane, rows.f_number, "1", "focal ratio; infinite: collimated"),
         "level": _variable(plane, rows.level_e, "electron", "mean level; 0: not known"),
+        "dark_time": _variable(plane, rows.dark_time_s, "s", "time of gathering charge; 0: not known"),
     }
 
 

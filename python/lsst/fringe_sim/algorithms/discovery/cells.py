@@ -190,6 +190,7 @@ def bin_cube(
         level[order],
         y_edges,
         x_edges,
+        np.asarray(cube.exposures.dark_time_s, dtype=float)[order],
     )
     known = sigma = None
     if cube.thickness is not None:

@@ -162,6 +162,7 @@ def _of_twice_as_many(problem: Problem, exposures: Exposures) -> Problem:
         cells.geometry,
         wavelength_nm=np.tile(cells.geometry.wavelength_nm, 2),
         level_e=np.tile(cells.geometry.level_e, 2),
+        dark_time_s=np.tile(cells.geometry.dark_time_s, 2),
     )
     twice = (2, 1, 1)
     both = replace(
@@ -181,10 +182,16 @@ def _of_flats(problem: Problem, model: FringeModel, series: FlatSeries) -> Probl
     cells, waves = problem.cells, np.array(series.wavelength_nm)
     shape = (len(waves), *cells.shape[1:])
     weight = np.where(cells.seen, series.level_e * cells.cell_px**2, 0.0)
+    geometry = replace(
+        cells.geometry,
+        wavelength_nm=waves,
+        level_e=np.full(len(waves), series.level_e),
+        dark_time_s=np.array(series.dark_time_s),
+    )
     flats = CellData(
         np.ones(shape),
         np.broadcast_to(weight, shape).copy(),
-        replace(cells.geometry, wavelength_nm=waves, level_e=np.full(len(waves), series.level_e)),
+        geometry,
         cells.cell_px,
         RESPONSE_SCATTER / cells.cell_px,
     )

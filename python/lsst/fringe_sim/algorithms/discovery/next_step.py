@@ -103,7 +103,10 @@ def flats_ranked(
             certain |= {f"{other.name}.{key}": p.value for key, p in other.parameters.items()}
     found = {effect.name: {key: p.value for key, p in effect.parameters.items()}}
     levels = [level for level in cells.geometry.level_e if math.isfinite(level) and level > 0.0]
-    known = {"level_e": sum(levels) / len(levels)} if levels else {}
+    known: dict[str, Any] = {"level_e": sum(levels) / len(levels)} if levels else {}
+    times = cells.geometry.dark_time_s.tolist()
+    if min(times) > 0.0:
+        known["dark_time_s"] = times
     ranked = rank_measurements(
         model.with_effects(certain, catalogue), {**found, **rivals}, wavelength_nm=cells.wavelength_nm.tolist(),
         thickness_um=thickness_um, significance=effect.significance, catalogue=catalogue, **known,

@@ -165,6 +165,7 @@ class Selector:
         self.left_out: dict[str, str] = {}
         for effect in catalogue:
             try:
+                effect.check_search(problem.forward.geometry)
                 found = coordinates_of(effect, problem.forward, thickness)
                 for item in found:
                     problem.forward.predict({item.key: item.value(0.1 * item.unit_step)}, thickness)
