@@ -54,7 +54,8 @@ class Parameter:
     wavelength_nm : `float`
         Nominal wavelength of the exposures that it concerns [nm]; NaN if it concerns all.
     place : `bool`
-        Whether it says where the effect is, not how strong: by itself it changes nothing. See `Effect.look`.
+        Whether it says where the effect is, not how strong: by itself it changes nothing. Unless the effect is
+        seen from the null value of its place, it needs `Effect.look`.
     step : `float`
         Change of the parameter to which the effect is in proportion, if that is less than a thousandth of
         `prior_scale`; 0 if it is not.

@@ -267,8 +267,8 @@ class Selector:
         return candidate
 
     def is_sought(self, name: str) -> bool:
-        """Whether the place of an effect is not known, and has to be looked for in what the model leaves."""
-        return any(item.place for item in self.coordinates[name])
+        """Whether an effect has to be looked for in what the model leaves, its place not being known."""
+        return type(self.effects[name]).look is not Effect.look
 
     def _sought(self, state: State, fit: Fit, name: str) -> Candidate | None:
         """The effect where it is seen, if it is."""
