@@ -42,6 +42,21 @@ def test_splines_of_any_number_of_cells() -> None:
             np.testing.assert_allclose(along.sum(axis=1), 1.0, rtol=1e-12)
 
 
+@pytest.mark.parametrize("spacing", [8.0, 4.0])
+def test_a_field_goes_on_where_it_has_no_weight(spacing: float) -> None:
+    """It would have any slope at its rim otherwise, and pixels there would average over fringes that are not there."""
+    y, x = np.indices((96, 96))
+    field = 14.0 + 0.02 * x + 0.3 * np.sin(y / 20.0)
+    seen = np.ones(field.shape)
+    seen[24:48, 40:64] = seen[:, 80:] = 0.0
+    basis = SplineBasis.of_grid(field.shape, spacing)
+    fitted = basis.expand(basis.fit(np.where(seen > 0.0, field, 0.0), seen))
+    assert np.abs(fitted - field)[seen > 0.0].max() < 1e-3
+    assert np.abs(fitted - field)[:, :80].max() < 0.1
+    assert np.abs(fitted - field).max() < 0.5
+    np.testing.assert_allclose(basis.expand(basis.fit(np.full((96, 96), 15.0), seen)), 15.0, rtol=1e-9)
+
+
 def test_cells_that_are_not_seen_keep_their_thickness(rng: np.random.Generator) -> None:
     field, basis = 12.0 + rng.random((5, 7)), CellBasis((5, 7))
     np.testing.assert_array_equal(basis.expand(basis.fit(field, rng.integers(0, 2, (5, 7)) * 1.0)), field)

@@ -18,6 +18,9 @@ FloatArray = NDArray[np.float64]
 RIDGE = 1e-8
 """Smallest curvature relative to the largest; keeps coefficients without data where they are."""
 
+STIFFNESS = 1e-6
+"""Curvature along differences of neighbouring coefficients, over the largest, that continues a fitted field."""
+
 
 class NormalMatrix(ABC):
     """Curvature of χ² in the coefficients of a field."""
@@ -47,10 +50,9 @@ class FieldBasis(ABC):
     def normal_matrix(self, curvature: FloatArray, prior: FloatArray | float = 0.0) -> NormalMatrix:
         """Normal matrix for the curvature ``(ny, nx)`` of the cells; ``prior`` is the precision of a coefficient."""
 
+    @abstractmethod
     def fit(self, field: FloatArray, weight: FloatArray) -> FloatArray:
-        """Weighted least-squares coefficients of a field."""
-        right = self.gather((weight * field)[np.newaxis])
-        return self.normal_matrix(weight).solve(right)[:, 0]
+        """Weighted least-squares coefficients of a field, which must not be NaN anywhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +88,26 @@ class SplineBasis(FieldBasis):
         partial = np.matmul(self.along_y.T, np.matmul(fields, self.along_x))
         return np.ascontiguousarray(partial.reshape(len(fields), -1).T)
 
+    def fit(self, field: FloatArray, weight: FloatArray) -> FloatArray:
+        """Coefficients that continue the field evenly where it has no weight; see `FieldBasis.fit`.
+
+        What lies there decides on the slope of the field at the rim.
+        """
+        middle = float(np.average(field, weights=weight)) if weight.any() else float(np.mean(field))
+        right = self.gather((weight * (field - middle))[np.newaxis])
+        return np.asarray(middle + self._normal(weight, 0.0, STIFFNESS).solve(right)[:, 0])
+
     def normal_matrix(self, curvature: FloatArray, prior: FloatArray | float = 0.0) -> NormalMatrix:
         """Banded matrix; see `FieldBasis.normal_matrix`."""
+        return self._normal(curvature, prior, 0.0)
+
+    def _normal(self, curvature: FloatArray, prior: FloatArray | float, stiffness: float) -> NormalMatrix:
         first_y, first_x = _first_nonzero(self.along_y), _first_nonzero(self.along_x)
         band = _assemble(self.along_y, self.along_x, first_y, first_x, np.ascontiguousarray(curvature))
-        band[0] += RIDGE * max(float(band[0].max()), 1e-300) + prior
+        largest = max(float(band[0].max()), 1e-300)
+        band[0] += RIDGE * largest + prior
+        if stiffness:
+            _stiffen(band, self.along_y.shape[1], self.along_x.shape[1], stiffness * largest)
         return _Banded(cholesky_banded(band, lower=True, overwrite_ab=True))
 
 
@@ -127,6 +144,15 @@ class CellBasis(FieldBasis):
         """Diagonal matrix; see `FieldBasis.normal_matrix`."""
         diagonal = curvature.ravel() + prior
         return _Diagonal(diagonal + RIDGE * max(float(diagonal.max()), 1e-300))
+
+
+def _stiffen(band: FloatArray, rows: int, columns: int, stiffness: float) -> None:
+    """Add the squares of the differences of neighbouring coefficients to the lower band of a matrix."""
+    number = np.arange(rows * columns).reshape(rows, columns)
+    for first, distance in ((number[:, :-1].ravel(), 1), (number[:-1].ravel(), columns)):
+        band[0, first] += stiffness
+        band[0, first + distance] += stiffness
+        band[distance, first] -= stiffness
 
 
 @dataclass(frozen=True, eq=False)

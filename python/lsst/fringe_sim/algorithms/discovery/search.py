@@ -60,6 +60,11 @@ _METRIC = "rms of data minus model, relative counts"
 Report = Callable[[str], None]
 
 
+PAIR = 2
+"""Effects with which fringe orders are judged again before a third is looked for: what leaves a residual may be one
+effect and a thickness that is wrong in places."""
+
+
 @dataclass(frozen=True)
 class SearchOptions:
     """Thresholds and sizes of a search; the defaults were chosen on other seeds than those of the recorded challenge.
@@ -197,6 +202,7 @@ class _Search:
         self.headers = headers_apart(cube, model)
         self.next_measurements: tuple[dict[str, Any], ...] = ()
         self.unseen: HeldOut | None = None
+        self._may_judge_orders = True
         self._take_other_cells(prepared)
 
     def _take_other_cells(self, prepared: Prepared) -> None:
@@ -228,14 +234,23 @@ class _Search:
         training = self._training(whole)
         singles = self._refit(training, training.null)
         if singles and singles[0].log_evidence > self.options.least_evidence and refinements > 0:
-            refined = self._refined(whole, singles[0])
+            refined, _ = self._refined(whole, singles[0])
             if refined is not None:
                 self.say("field and noise are judged again with the best effect in the model")
                 self._take(refined)
                 return self.run(refinements - 1)
         if singles and self._is_too_coarse(training, singles[0]):
             return self._run_finer(singles[0].fit, self._thickness(whole, singles[0].fit))
-        chosen, steps = self._grow(training, singles)
+        chosen, steps = self._first(training, singles)
+        chosen = self._enlarge(training, chosen, steps, PAIR)
+        if self._may_judge_orders and chosen.names and not self._consistent(chosen):
+            self._may_judge_orders = False
+            refined, mended = self._refined(whole, chosen)
+            if refined is not None and mended:
+                self._take(refined)
+                return self.run(refinements=1)
+        chosen = self._enlarge(training, chosen, steps, self.options.most_effects)
+        chosen = self._finished(training, chosen, steps)
         return self._conclude(whole, training, chosen, steps, chance)
 
     # Stages -------------------------------------------------------------------------------------------------
@@ -291,12 +306,12 @@ class _Search:
             self._say_refit(base, hypothesis)
         return sorted(refitted, key=lambda item: -item.log_evidence)
 
-    def _refined(self, whole: Selector, best: Hypothesis) -> Prepared | None:
-        """Field and noise as judged with an effect in the model, if that differs from the judgement without."""
+    def _refined(self, whole: Selector, best: Hypothesis) -> tuple[Prepared | None, int]:
+        """Field and noise as judged with effects in the model, if that differs, and cells that change their order."""
         refined, mended = prepare_again(self.prepared, best.fit, self._thickness(whole, best.fit))
         if mended:
-            self.say(f"{mended} cells change their fringe order")
-        return refined
+            self.say(f"{mended} cells change their fringe order with {', '.join(best.names)}")
+        return refined, mended
 
     def _is_too_coarse(self, selector: Selector, found: Hypothesis) -> bool:
         """Whether a blur explains much, but not all, in cells that were chosen for the image that it left."""
@@ -315,25 +330,31 @@ class _Search:
     def _thickness(self, whole: Selector, fit: Fit) -> FloatArray:
         return whole_thickness(whole.problem, whole.null.fit, fit, self.heldout)
 
-    def _grow(self, selector: Selector, singles: list[Hypothesis]) -> tuple[Hypothesis, list[Step]]:
-        """Add effects while they help; look two ahead where one is not enough."""
-        current: Hypothesis = selector.null
-        steps: list[Step] = []
+    def _first(self, selector: Selector, singles: list[Hypothesis]) -> tuple[Hypothesis, list[Step]]:
+        """The most credible single effect, if there is one that helps."""
         if not singles or singles[0].log_evidence < self.options.least_evidence:
-            return current, []
+            return selector.null, []
         best = self._most_credible(selector, singles)
         if not self._consistent(best):
             best = self._most_credible(selector, self._searched_harder(selector, singles))
         elif selector.shifts_phase(best):  # few data see only noise in a wrong order too
             best = selector.with_channels(selector.improved(best.names, selector.null.fit, scan=True))
-        steps.append(self._step(selector, current, best))
-        current = best
-        while not steps[-1].consistent and len(current.names) < self.options.most_effects:
+        return best, [self._step(selector, selector.null, best)]
+
+    def _enlarge(self, selector: Selector, current: Hypothesis, steps: list[Step], most: int) -> Hypothesis:
+        """Add effects, up to so many, while a residual remains and they help."""
+        while steps and not steps[-1].consistent and len(current.names) < most:
             larger = self._one_more(selector, current)
             if larger is None:
                 break
             steps.append(self._step(selector, current, larger))
             current = larger
+        return current
+
+    def _finished(self, selector: Selector, current: Hypothesis, steps: list[Step]) -> Hypothesis:
+        """The set with what noise surely does not explain, and without members that bring nothing."""
+        if not steps:
+            return current
         while self._consistent(current) and len(current.names) < self.options.most_effects:
             better = self._surely_better(selector, current)
             if better is None:
@@ -343,7 +364,7 @@ class _Search:
         complete = selector.with_channels(self._completed(selector, current))
         if complete.names != current.names:
             steps.append(self._step(selector, current, complete))
-        return self._pruned(selector, complete), steps
+        return self._pruned(selector, complete)
 
     def _one_more(self, selector: Selector, current: Hypothesis) -> Hypothesis | None:
         """The most credible set with one effect more, if it is likelier."""
