@@ -44,7 +44,7 @@ def test_splines_of_any_number_of_cells() -> None:
 
 @pytest.mark.parametrize("spacing", [8.0, 4.0])
 def test_a_field_goes_on_where_it_has_no_weight(spacing: float) -> None:
-    """It would have any slope at its rim otherwise, and pixels there would average over fringes that are not there."""
+    """At its rim it would have any slope, and pixels there would average over fringes that are not there."""
     y, x = np.indices((96, 96))
     field = 14.0 + 0.02 * x + 0.3 * np.sin(y / 20.0)
     seen = np.ones(field.shape)
