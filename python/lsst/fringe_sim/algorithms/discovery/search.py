@@ -241,15 +241,15 @@ class _Search:
                 return self.run(refinements - 1)
         if singles and self._is_too_coarse(training, singles[0]):
             return self._run_finer(singles[0].fit, self._thickness(whole, singles[0].fit))
-        chosen, steps = self._first(training, singles)
-        chosen = self._enlarge(training, chosen, steps, PAIR)
+        chosen, steps = self._first(whole, training, singles)
+        chosen = self._enlarge(whole, training, chosen, steps, PAIR)
         if self._may_judge_orders and chosen.names and not self._consistent(chosen):
             self._may_judge_orders = False
             refined, mended = self._refined(whole, chosen)
             if refined is not None and mended:
                 self._take(refined)
                 return self.run(refinements=1)
-        chosen = self._enlarge(training, chosen, steps, self.options.most_effects)
+        chosen = self._enlarge(whole, training, chosen, steps, self.options.most_effects)
         chosen = self._finished(training, chosen, steps)
         return self._conclude(whole, training, chosen, steps, chance)
 
@@ -330,7 +330,9 @@ class _Search:
     def _thickness(self, whole: Selector, fit: Fit) -> FloatArray:
         return whole_thickness(whole.problem, whole.null.fit, fit, self.heldout)
 
-    def _first(self, selector: Selector, singles: list[Hypothesis]) -> tuple[Hypothesis, list[Step]]:
+    def _first(
+        self, whole: Selector, selector: Selector, singles: list[Hypothesis]
+    ) -> tuple[Hypothesis, list[Step]]:
         """The most credible single effect, if there is one that helps."""
         if not singles or singles[0].log_evidence < self.options.least_evidence:
             return selector.null, []
@@ -339,17 +341,33 @@ class _Search:
             best = self._most_credible(selector, self._searched_harder(selector, singles))
         elif selector.shifts_phase(best):  # few data see only noise in a wrong order too
             best = selector.with_channels(selector.improved(best.names, selector.null.fit, scan=True))
+        best = self._rescued(whole, selector, best)
         return best, [self._step(selector, selector.null, best)]
 
-    def _enlarge(self, selector: Selector, current: Hypothesis, steps: list[Step], most: int) -> Hypothesis:
+    def _enlarge(
+        self, whole: Selector, selector: Selector, current: Hypothesis, steps: list[Step], most: int
+    ) -> Hypothesis:
         """Add effects, up to so many, while a residual remains and they help."""
         while steps and not steps[-1].consistent and len(current.names) < most:
             larger = self._one_more(selector, current)
             if larger is None:
                 break
+            larger = self._rescued(whole, selector, larger)
             steps.append(self._step(selector, current, larger))
             current = larger
         return current
+
+    def _rescued(self, whole: Selector, training: Selector, found: Hypothesis) -> Hypothesis:
+        """The set fitted again from its fit to all data, where that leaves noise and this one does not.
+
+        Single cells between others that are held out or masked may be in another fringe order.
+        """
+        if self._consistent(found):
+            return found
+        final = self._of_all_data(whole, found)
+        if not self._consistent(final):
+            return found
+        return training.with_channels(training.improved(found.names, final.fit))
 
     def _finished(self, selector: Selector, current: Hypothesis, steps: list[Step]) -> Hypothesis:
         """The set with what noise surely does not explain, and without members that bring nothing."""
@@ -546,7 +564,7 @@ class _Search:
             self.say("a residual remains that only all data show")
             larger = self._one_more(training, chosen)
             if larger is not None:
-                larger = self._pruned(training, larger)
+                larger = self._pruned(training, self._rescued(whole, training, larger))
                 steps.append(self._step(training, chosen, larger))
                 chosen, classes = self._classified(training, larger, steps)
                 final = self._of_all_data(whole, chosen)
