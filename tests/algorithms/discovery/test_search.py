@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery import Verdict, discover, read_effects_override
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover, read_effects_override
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
 from lsst.fringe_sim.algorithms.discovery.search import _below
@@ -122,6 +122,15 @@ def test_a_temperature_that_the_flats_state_is_told_or_refused() -> None:
     assert "186.5 K" in note
     assert "183.15" in note
     assert headers_apart(at(186.5), FringeModel.from_setup("ts8_e2v", {"temperature.kelvin": 186.5})) == ()
+
+
+@pytest.mark.slow
+def test_no_more_effects_are_named_than_may_be() -> None:
+    case = draw_case("two", np.random.default_rng(4), size=SIZE, only=["illumination", "bandwidth"])
+    options = SearchOptions(most_effects=1)
+    verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0), options=options)
+    assert verdict.verdict == "unexplained"
+    assert [step.added for step in verdict.steps] == [("illumination",)]
 
 
 @pytest.mark.slow

@@ -242,14 +242,15 @@ class _Search:
         if singles and self._is_too_coarse(training, singles[0]):
             return self._run_finer(singles[0].fit, self._thickness(whole, singles[0].fit))
         chosen, steps = self._first(whole, training, singles)
-        chosen = self._enlarge(whole, training, chosen, steps, PAIR)
+        chosen = self._enlarge(whole, training, chosen, steps, min(PAIR, self.options.most_effects))
         if self._may_judge_orders and chosen.names and not self._consistent(chosen):
             self._may_judge_orders = False
             refined, mended = self._refined(whole, chosen)
             if refined is not None and mended:
                 self._take(refined)
                 return self.run(refinements=1)
-        chosen = self._enlarge(whole, training, chosen, steps, self.options.most_effects)
+        if len(chosen.names) == PAIR:
+            chosen = self._enlarge(whole, training, chosen, steps, self.options.most_effects)
         chosen = self._finished(training, chosen, steps)
         return self._conclude(whole, training, chosen, steps, chance)
 
