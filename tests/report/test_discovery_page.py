@@ -167,7 +167,7 @@ def test_what_is_unexplained_is_described() -> None:
     assert "&lt;of the catalogue&gt;" in text
     seen = words(text)
     assert "Tests that still fail: texture" in seen
-    assert "roughness explains a part (probability 0.40)" in seen
+    assert "roughness explains a part (probability 0.400)" in seen
     assert "Write the missing effect" in seen
     assert re.search(r"402\s+233\s+41.3\s+76\s+31", seen)
     assert "To use it" not in seen

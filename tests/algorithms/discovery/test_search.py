@@ -7,10 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover, read_effects_override
+from lsst.fringe_sim.algorithms.discovery import (
+    SearchOptions,
+    Verdict,
+    discover,
+    probability_text,
+    read_effects_override,
+)
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
-from lsst.fringe_sim.algorithms.discovery.search import _below
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.mock.challenge import SIZES, SealedCase, draw_case
 from lsst.fringe_sim.model import FringeModel
@@ -193,9 +198,10 @@ def test_a_scale_found_in_a_wrong_order_is_looked_for_in_others() -> None:
 
 
 @pytest.mark.parametrize(
-    ("probability", "text"), [(0.9499, "0.94"), (0.95, "0.95"), (0.0, "0.00"), (1.0, "1.00")]
+    ("probability", "text"),
+    [(0.9499, "0.949"), (0.95, "0.950"), (0.0, "0.000"), (0.99999, "0.999"), (1.0, "1.000")],
 )
 def test_a_probability_below_a_threshold_does_not_read_as_if_it_had_reached_it(
     probability: float, text: str
 ) -> None:
-    assert _below(probability) == text
+    assert probability_text(probability) == text

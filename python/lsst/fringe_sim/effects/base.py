@@ -59,6 +59,9 @@ class Parameter:
     step : `float`
         Change of the parameter to which the effect is in proportion, if that is less than a thousandth of
         `prior_scale`; 0 if it is not.
+    refinement : `int`
+        0 for what the effect surely has. Parameters of 1, 2, ... may be absent, each with all of a higher number: the
+        effect is judged as if it had those up to a number, any of which is as likely.
     """
 
     name: str
@@ -71,6 +74,7 @@ class Parameter:
     wavelength_nm: float = math.nan
     place: bool = False
     step: float = 0.0
+    refinement: int = 0
 
 
 @dataclass(frozen=True)

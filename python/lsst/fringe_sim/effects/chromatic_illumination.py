@@ -15,11 +15,11 @@ REACH_NM = 50.0
 """Distance in wavelength at which the pattern is stated."""
 
 _TERMS = {
-    "gradient_x": ("u / 2", 0.01),
-    "gradient_y": ("v / 2", 0.01),
-    "curvature_xx": ("u²", 0.003),
-    "curvature_xy": ("u v", 0.003),
-    "curvature_yy": ("v²", 0.003),
+    "gradient_x": ("u / 2", 0.01, 0),
+    "gradient_y": ("v / 2", 0.01, 0),
+    "curvature_xx": ("u²", 0.003, 1),
+    "curvature_xy": ("u v", 0.003, 1),
+    "curvature_yy": ("v²", 0.003, 1),
 }
 
 
@@ -37,8 +37,10 @@ class ChromaticIllumination(PlainNullEffect):
     reference = "pattern of a diffuser or sphere depends on wavelength; no value is published for TS8"
     parameters = (
         *(
-            Parameter(name, "", 0.0, (-0.3, 0.3), scale, f"coefficient of {term} per {REACH_NM:g} nm")
-            for name, (term, scale) in _TERMS.items()
+            Parameter(
+                name, "", 0.0, (-0.3, 0.3), scale, f"coefficient of {term} per {REACH_NM:g} nm", refinement=curved
+            )
+            for name, (term, scale, curved) in _TERMS.items()
         ),
         Parameter(
             "even_offset", "nm", 0.0, (-120.0, 120.0), 30.0,

@@ -22,7 +22,13 @@ class EpoxyIndex(PlainNullEffect):
     parameters = (
         Parameter("offset", "", 0.0, (-0.3, 0.3), 0.03, "index minus that of the set-up at 960 nm"),
         Parameter(
-            "cauchy", "um2", 0.0, (-0.05, 0.05), 0.005, "coefficient of 1/wavelength² relative to 960 nm"
+            "cauchy",
+            "um2",
+            0.0,
+            (-0.05, 0.05),
+            0.005,
+            "coefficient of 1/wavelength² relative to 960 nm",
+            refinement=1,
         ),
     )
 

@@ -11,13 +11,13 @@ __all__ = ["Illumination"]
 
 
 _CURVED = (
-    ("curvature_xx", "u²", 0.005),
-    ("curvature_xy", "u v", 0.005),
-    ("curvature_yy", "v²", 0.005),
-    ("cubic_xxx", "u³", 0.002),
-    ("cubic_xxy", "u² v", 0.002),
-    ("cubic_xyy", "u v²", 0.002),
-    ("cubic_yyy", "v³", 0.002),
+    ("curvature_xx", "u²", 0.005, 1),
+    ("curvature_xy", "u v", 0.005, 1),
+    ("curvature_yy", "v²", 0.005, 1),
+    ("cubic_xxx", "u³", 0.002, 2),
+    ("cubic_xxy", "u² v", 0.002, 2),
+    ("cubic_xyy", "u v²", 0.002, 2),
+    ("cubic_yyy", "v³", 0.002, 2),
 )
 
 
@@ -33,8 +33,16 @@ class Illumination(PlainNullEffect):
         Parameter("gradient_x", "", 0.0, (-0.5, 0.5), 0.02, "relative rise from the left to the right edge"),
         Parameter("gradient_y", "", 0.0, (-0.5, 0.5), 0.02, "relative rise from the lower to the upper edge"),
         *(
-            Parameter(name, "", 0.0, (-0.3, 0.3), scale, f"coefficient of {term}, both from -1 to 1")
-            for name, term, scale in _CURVED
+            Parameter(
+                name,
+                "",
+                0.0,
+                (-0.3, 0.3),
+                scale,
+                f"coefficient of {term}, both from -1 to 1",
+                refinement=degree,
+            )
+            for name, term, scale, degree in _CURVED
         ),
     )
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from ..algorithms.discovery import Verdict
+from ..algorithms.discovery import Verdict, probability_text
 from ..algorithms.flat_residual import FlatResidual, fit_and_compare
 from ..errors import InputError
 from ..model import FringeModel
@@ -156,7 +156,7 @@ def _answer(report: Report, verdict: Verdict) -> None:
             f"{value.value:.6g}",
             f"{value.sigma:.2g}",
             value.unit or "1",
-            f"{effect.probability:.3f}",
+            probability_text(effect.probability),
             ", ".join(effect.ambiguous_with) or "nothing",
         )
         for effect in verdict.effects
@@ -315,7 +315,7 @@ def _unexplained(report: Report, verdict: Verdict) -> None:
         report.paragraph(f"Tests that still fail: {', '.join(left['channels'])}.")
     for item in left.get("partial", ()):
         report.paragraph(
-            f"{item['name']} explains a part (probability {item['probability']:.2f}), and leaves more than noise."
+            f"{item['name']} explains a part (probability {probability_text(item['probability'])}): not named."
         )
     if left.get("thickness_phase_waveform"):
         report.figure(leftover_figure(left), "What the best model leaves.")

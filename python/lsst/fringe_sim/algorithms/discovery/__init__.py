@@ -9,6 +9,7 @@ from .verdict import (
     Step,
     Verdict,
     Where,
+    probability_text,
     read_effects_override,
 )
 
@@ -24,5 +25,6 @@ __all__ = [
     "discover",
     "discover_sky",
     "placement_in_frames",
+    "probability_text",
     "read_effects_override",
 ]

@@ -77,6 +77,8 @@ class Coordinate:
         Whether it says where an effect is; see `Parameter`.
     step : `float`
         Largest step of a derivative; 0 for a thousandth of the scale.
+    refinement : `int`
+        0 for what the effect surely has; see `Parameter`.
     """
 
     effect: str
@@ -91,6 +93,7 @@ class Coordinate:
     of_one_exposure: bool = False
     place: bool = False
     step: float = 0.0
+    refinement: int = 0
 
     @property
     def key(self) -> str:
@@ -150,6 +153,7 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
             Coordinate(
                 effect.name, parameter.name, null, low, high, parameter.prior_scale, quadratic, parameter.unit,
                 parameter.repeats_after, parameter.wavelength_nm > 0.0, parameter.place, parameter.step,
+                parameter.refinement,
             )
         )  # fmt: skip
     return tuple(found)

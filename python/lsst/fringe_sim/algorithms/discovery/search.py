@@ -34,7 +34,7 @@ from .preparation import (
 )
 from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
 from .validation import HeldOut, held_out_blocks, misfit_rms, validate, whole_thickness
-from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where
+from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
 
 __all__ = ["SearchOptions", "discover"]
 
@@ -575,12 +575,11 @@ class _Search:
         self.unseen = validate(
             whole.problem, whole.null.fit, final.fit, self.heldout, rich=self.prepared.rich
         )
-        reasons = []
-        if not self._consistent(final) or not self._consistent(chosen):
-            worst = min(final.channels, key=lambda c: c.probability)
-            reasons.append(
-                f"with {', '.join(final.names)} a residual remains in '{worst.name}' (chance {worst.probability:.2g})"
-            )
+        reasons = [
+            self._what_remains(item, where)
+            for item, where in ((final, ""), (chosen, " of the part searched"))
+            if not self._consistent(item)
+        ][:1]
         if not self.unseen.better:
             reasons.append("data held out are not predicted better")
         explained = whole.null.fit.chi2 - final.fit.chi2
@@ -589,7 +588,7 @@ class _Search:
         for name in final.names:
             probability = classes[name].probability * (1.0 - outsider)
             if probability < self.options.least_probability:
-                reasons.append(f"the class of {name} has probability {_below(probability)} only")
+                reasons.append(f"the class of {name} has probability {probability_text(probability)} only")
             named.append(self._named(final, name, classes[name], probability))
         self.notes.append(
             f"held out: chi2 of blocks falls by {self.unseen.blocks:.1f}, "
@@ -604,6 +603,14 @@ class _Search:
             self.say,
         )
         return self._verdict("named", whole, final, chance, decided, {}, steps)
+
+    @staticmethod
+    def _what_remains(found: Hypothesis, where: str) -> str:
+        worst = min(found.channels, key=lambda channel: channel.probability)
+        return (
+            f"with {', '.join(found.names)} a residual{where} remains in '{worst.name}' "
+            f"(chance {worst.probability:.2g})"
+        )
 
     def _ranking(self, whole: Selector, final: Hypothesis, named: Sequence[NamedEffect]) -> Ranking:
         """What ranks further data: flats beside flats, frames and flats beside frames of the sky."""
@@ -719,11 +726,6 @@ class _Search:
             verdict, effects, self.where, gap, tuple(steps), unexplained, self.model.setup.name, chance, candidates,
             self.next_measurements, tuple(self.notes), data,
         )  # fmt: skip
-
-
-def _below(probability: float) -> str:
-    """A probability to two digits, rounded down: what missed a threshold does not read as if it had reached it."""
-    return f"{math.floor(100.0 * probability) / 100.0:.2f}"
 
 
 def _chance_of(gain: float, degrees: int, undescribed: float) -> float:

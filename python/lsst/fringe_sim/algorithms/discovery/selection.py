@@ -14,6 +14,7 @@ from ...effects import Effect
 from ...errors import InputError
 from .channels import Channel, State, combined_probability, measure_channels
 from .comparison import chi2_with_free_levels, local_minima
+from .evidence import log_evidence, prior_cost
 from .fit import (
     Coordinate,
     Design,
@@ -373,7 +374,7 @@ class Selector:
             key=lambda item: item.chi2,
         )
         fit = self._best_order(self._deepest(fit))
-        hypothesis = Hypothesis(ordered, fit, self._evidence(fit))
+        hypothesis = Hypothesis(ordered, fit, log_evidence(fit, self.null.fit.chi2))
         self.fitted[key] = hypothesis
         return hypothesis
 
@@ -439,7 +440,7 @@ class Selector:
             trial = fit_model(self.problem, coordinates, start, thickness, base.levels, rival=known.fit.chi2)
             if trial.chi2 < known.fit.chi2 - 1.0:
                 trial = self._deepest(trial)
-                known = Hypothesis(known.names, trial, self._evidence(trial))
+                known = Hypothesis(known.names, trial, log_evidence(trial, self.null.fit.chi2))
         self.fitted[key] = known
         if scan:
             self._searched[key] = known.fit
@@ -553,7 +554,7 @@ class Selector:
                 fit = self._among_minima(fit, number)
         if fit is hypothesis.fit:
             return hypothesis
-        best = replace(hypothesis, fit=fit, log_evidence=self._evidence(fit))
+        best = replace(hypothesis, fit=fit, log_evidence=log_evidence(fit, self.null.fit.chi2))
         self.fitted[frozenset(hypothesis.names)] = best
         return best
 
@@ -638,34 +639,14 @@ class Selector:
         found = [item for key, item in self.fitted.items() if len(key) == size]
         return sorted(found, key=lambda item: -item.log_evidence)
 
-    def _evidence(self, fit: Fit) -> float:
-        """Laplace approximation of log Z(fit) - log Z(null) with half-Cauchy or Cauchy priors."""
-        total = 0.5 * (self.null.fit.chi2 - fit.chi2)
-        if not fit.coordinates:
-            return total
-        scale = np.array([item.unit_step for item in fit.coordinates])
-        information = fit.information * np.outer(scale, scale)
-        # In units of the prior scale; no parameter is worse known after the data than before.
-        sign, log_determinant = np.linalg.slogdet(information + np.eye(len(scale)))
-        total -= 0.5 * (log_determinant if sign > 0 else 0.0)
-        for item, position in zip(fit.coordinates, fit.position, strict=True):
-            total -= _prior_cost(item, position)
-            if item.quadratic:  # the prior is one of the parameter, the fit one of its square
-                total -= math.log(max(2.0 * item.departure(position), 0.05))
-        return float(total)
-
     def prior_cost(self, hypothesis: Hypothesis, name: str) -> float:
         """Log evidence that the sizes of one effect cost a set, over what sizes near zero would."""
         fit = hypothesis.fit
         return sum(
-            _prior_cost(item, position)
+            prior_cost(item, position)
             for item, position in zip(fit.coordinates, fit.position, strict=True)
             if item.effect == name
         )
-
-
-def _prior_cost(item: Coordinate, position: float) -> float:
-    return math.log1p(item.departure(position) ** 2)
 
 
 def _bounded_minimum(

@@ -11,9 +11,33 @@ from typing import Any
 
 from astropy.table import Table
 
-__all__ = ["Gap", "NamedEffect", "ParameterValue", "Step", "Verdict", "Where", "read_effects_override"]
+__all__ = [
+    "Gap",
+    "NamedEffect",
+    "ParameterValue",
+    "Step",
+    "Verdict",
+    "Where",
+    "probability_text",
+    "read_effects_override",
+]
 
 VERDICTS = ("named", "no_discrepancy", "unexplained")
+
+
+def probability_text(probability: float) -> str:
+    """A probability to three digits, rounded down: what missed a threshold does not read as if it had reached it.
+
+    Parameters
+    ----------
+    probability : `float`
+        Between 0 and 1.
+
+    Returns
+    -------
+    text : `str`
+    """
+    return f"{math.floor(1000.0 * probability) / 1000.0:.3f}"
 
 
 @dataclass(frozen=True)
@@ -274,7 +298,7 @@ class Verdict:
                 f"{name} = {p.value:.6g} ± {p.sigma:.2g} {p.unit}".rstrip()
                 for name, p in effect.parameters.items()
             )
-            lines.append(f"  {effect.name}: {values}  (probability {effect.probability:.3f})")
+            lines.append(f"  {effect.name}: {values}  (probability {probability_text(effect.probability)})")
             if effect.ambiguous_with:
                 lines.append(f"    these data cannot tell it from: {', '.join(effect.ambiguous_with)}")
                 lines.append(f"    what would decide: {effect.break_ambiguity}")
