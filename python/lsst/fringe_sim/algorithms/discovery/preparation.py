@@ -467,7 +467,8 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
     """Coarsest parametrisation of the field that the data do not want finer, and its fit.
 
     The contrast of each wavelength is free: a field that had to make up for a wrong contrast would be drawn into
-    ever finer coefficients.
+    ever finer coefficients. A coarse field may leave steep parts in wrong fringe orders; finer ones begin from the
+    first thickness too.
     """
     cells = problem.cells
     weight = cells.seen.astype(float)
@@ -477,14 +478,29 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
         if spacing and basis.size > start.size:
             continue
         trial = replace(problem, basis=basis, free_contrast=True)
-        field_map = start if best is None else best[0].basis.expand(best[1].field)
-        levels = None if best is None else best[1].levels
-        fit = fit_model(trial, (), np.zeros(0), basis.fit(field_map, weight), levels, settings)
+        first = [start] if best is None else [best[0].basis.expand(best[1].field), start]
+        fits = [
+            fit_model(trial, (), np.zeros(0), field, None if best is None else best[1].levels, settings)
+            for field in _in_different_orders([basis.fit(one, weight) for one in first], trial)
+        ]
+        fit = min(fits, key=lambda item: item.chi2)
         if best is not None and not _finer_is_better(best, (trial, fit)):
             break
         best = (trial, fit)
     assert best is not None
     return best
+
+
+def _in_different_orders(fields: Sequence[FloatArray], problem: Problem) -> Sequence[FloatArray]:
+    """The fields that are not in the same fringe order as the first one everywhere, and the first."""
+    maps = [problem.basis.expand(field) for field in fields]
+    order = problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm)))
+    seen = problem.cells.seen
+    return [
+        field
+        for number, (field, each) in enumerate(zip(fields, maps, strict=True))
+        if number == 0 or np.abs(each - maps[0])[seen].max(initial=0.0) > 0.5 * order
+    ]
 
 
 def _choose_pixels(problem: Problem, fit: Fit, settings: Mapping[str, float]) -> tuple[Problem, Fit]:
