@@ -37,6 +37,15 @@ def test_its_part_of_the_level_grows_with_time() -> None:
     np.testing.assert_allclose(dark - 1.0, left[:, np.newaxis, np.newaxis] * (plain - 1.0), rtol=1e-12)
 
 
+def test_beside_a_pedestal_both_are_parts_of_one_level() -> None:
+    plain = image_with({}, geometry_of(SECONDS))
+    both = image_with({"dark_current.rate": 40.0, "dark_pedestal.electrons": 3000.0}, geometry_of(SECONDS))
+    left = 1.0 - (3000.0 + 40.0 * SECONDS) / LEVEL_E
+    np.testing.assert_allclose(
+        both - 1.0, left[:, np.newaxis, np.newaxis] * (plain - 1.0), rtol=1e-12, atol=1e-15
+    )
+
+
 def test_in_exposures_of_one_length_it_is_a_pedestal_and_not_looked_for() -> None:
     equal = geometry_of(20.0)
     np.testing.assert_allclose(

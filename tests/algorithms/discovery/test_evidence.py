@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -15,11 +16,31 @@ NULL_CHI2 = 500.0
 GRID = np.linspace(-30.0, 30.0, 6001)
 
 
-def gaussian_fit(best: np.ndarray, information: np.ndarray, refinement: tuple[int, ...]) -> Fit:
-    """Fit of parameters of scale 1 to data that know them with this information."""
+def gaussian_fit(
+    best: np.ndarray,
+    information: np.ndarray,
+    refinement: tuple[int, ...],
+    exchangeable: tuple[str, ...] = (),
+    scale: float = 1.0,
+) -> Fit:
+    """Fit of parameters of a scale to data that know them with this information.
+
+    Those that are exchangeable belong to the effects named.
+    """
+    groups = exchangeable or ("",) * len(best)
     coordinates = tuple(
-        Coordinate("effect", f"p{i}", 0.0, -40.0, 40.0, 1.0, False, refinement=grade)
-        for i, grade in enumerate(refinement)
+        Coordinate(
+            group or "effect",
+            f"p{i}",
+            0.0,
+            -40.0,
+            40.0,
+            scale,
+            False,
+            refinement=grade,
+            exchangeable=group != "",
+        )
+        for i, (grade, group) in enumerate(zip(refinement, groups, strict=True))
     )
     settings = {item.key: float(x) for item, x in zip(coordinates, best, strict=True)}
     fall = float(best @ information @ best)
@@ -65,6 +86,62 @@ def test_terms_that_are_not_there_cost_next_to_nothing() -> None:
     assert 0.0 < missing < math.log(3.0) + 1e-6
     curved = gaussian_fit(np.array([0.3, -0.2, 0.1, 0.0, 0.0]), information, (0, 0, 1, 1, 2))
     assert log_evidence(curved, NULL_CHI2) > log_evidence(simple, NULL_CHI2) + 100.0
+
+
+def normal(values: np.ndarray, covariance: np.ndarray) -> float:
+    """Log density of a Gaussian about zero, but for the factor of its dimension."""
+    return float(-0.5 * (values @ np.linalg.solve(covariance, values) + np.linalg.slogdet(covariance)[1]))
+
+
+def drawn(best: np.ndarray, information: np.ndarray, groups: tuple[str, ...], *, widths: int = 400) -> float:
+    """Log evidence of parameters drawn from Gaussians of half-Cauchy widths, over that of the null, by quadrature."""
+    covariance = np.linalg.inv(information)
+    names = sorted(set(groups))
+    log_width = np.linspace(math.log(1e-5), math.log(1e4), widths)
+    prior = (
+        np.exp(log_width) * 2.0 / math.pi / (1.0 + np.exp(2.0 * log_width)) * (log_width[1] - log_width[0])
+    )
+    total = -math.inf
+    for places in itertools.product(range(widths), repeat=len(names)):
+        square = np.array([math.exp(2.0 * log_width[places[names.index(group)]]) for group in groups])
+        weight = float(np.log(prior[list(places)]).sum())
+        with_prior = normal(best, covariance + np.diag(square))
+        total = np.logaddexp(total, weight + with_prior)
+    return float(total - normal(np.zeros(len(best)), covariance))
+
+
+SIXTEEN = np.diag(np.geomspace(50.0, 5000.0, 16)) + 20.0 * np.ones((16, 16))
+
+
+@pytest.mark.parametrize("size", [0.0, 0.03, 0.3, 3.0])
+def test_sixteen_draws_of_one_width_cost_one_prior(size: float) -> None:
+    best = size * np.random.default_rng(7).normal(size=16)
+    groups = ("gain",) * 16
+    found = log_evidence(gaussian_fit(best, SIXTEEN, (0,) * 16, groups), NULL_CHI2)
+    null_fall = float(best @ SIXTEEN @ best)  # of the data, from null to best
+    assert found - 0.5 * null_fall == pytest.approx(drawn(best, SIXTEEN, groups), abs=0.05)
+
+
+def test_two_kinds_of_draws_have_a_width_each() -> None:
+    rng = np.random.default_rng(8)
+    best = np.concatenate([0.2 * rng.normal(size=8), 2.0 * rng.normal(size=8)])
+    groups = ("gain",) * 8 + ("offset",) * 8
+    found = log_evidence(gaussian_fit(best, SIXTEEN, (0,) * 16, groups), NULL_CHI2)
+    expected = drawn(best, SIXTEEN, groups, widths=80)
+    assert found - 0.5 * float(best @ SIXTEEN @ best) == pytest.approx(expected, abs=0.1)
+
+
+def test_a_prior_scale_counts_once_for_draws_and_each_time_for_others() -> None:
+    best = 0.1 * np.random.default_rng(9).normal(size=16)
+    lost = {}
+    for groups in (("gain",) * 16, ("",) * 16):
+        narrow, wide = (
+            log_evidence(gaussian_fit(best, SIXTEEN, (0,) * 16, groups, scale), NULL_CHI2)
+            for scale in (1.0, 10.0)
+        )
+        lost[groups[0]] = narrow - wide
+    assert lost["gain"] == pytest.approx(math.log(10.0), abs=0.1)
+    assert lost[""] == pytest.approx(16.0 * math.log(10.0), abs=1.0)
 
 
 def test_no_effects_no_evidence() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -81,3 +82,21 @@ def test_derivatives_are_central(at: float, quadratic: bool) -> None:
     phase = np.linspace(0.0, 6.0, 20)
     found = coordinate_derivative(SimpleNamespace(change=change), item, at, {}, phase)  # type: ignore[arg-type]
     np.testing.assert_allclose(found, np.cos(at + phase), atol=0.01)
+
+
+@pytest.mark.parametrize("exchangeable", [True, False])
+def test_what_data_do_not_say_of_draws_is_as_wide_as_they_scatter(exchangeable: bool) -> None:
+    """The level common to sixteen gains does not show; it is that of sixteen draws."""
+    number, width = 16, 0.1
+    position = width * np.random.default_rng(5).standard_normal(number)
+    coordinates = tuple(
+        Coordinate("gain", f"C{i}", 0.0, -9.0, 9.0, 1.0, False, exchangeable=exchangeable)
+        for i in range(number)
+    )
+    information = 1e6 * (np.eye(number) - 1.0 / number)
+    nothing = np.zeros(0)
+    fit = Fit({}, coordinates, position, nothing, nothing, 0.0, information)
+    expected = width / math.sqrt(number) if exchangeable else fit_module.PRIOR_WIDTH / math.sqrt(number)
+    np.testing.assert_allclose(fit.sigma, expected, rtol=0.3)
+    few = Fit({}, coordinates[:2], position[:2], nothing, nothing, 0.0, information[:2, :2])
+    assert few.sigma.min() > 5e-4

@@ -94,6 +94,21 @@ def test_a_hidden_effect_is_named(name: str, tmp_path) -> None:
     FringeModel.from_setup(case.setup, verdict.settings)
 
 
+@pytest.mark.slow
+def test_what_a_strong_pedestal_leaves_is_another_effect() -> None:
+    """Electrons cannot be described wrongly; a fainter index of the adhesive beside them is no flaw of their form."""
+    rng = np.random.default_rng([20331123, CASE_KINDS.index("two"), 16]).spawn(2)
+    case = draw_case("two", rng[0], size=(96, 96))
+    assert set(case.names) == {"dark_pedestal", "epoxy_index"}
+    verdict = discover(case.cube, case.setup, rng=rng[1])
+    found = {effect.name: effect for effect in verdict.effects}
+    assert set(found) == set(case.names)
+    for key in ("dark_pedestal.electrons", "epoxy_index.offset"):
+        name, _, parameter = key.partition(".")
+        value = found[name].parameters[parameter]
+        assert abs(value.value - case.values[key]) < 4.0 * value.sigma
+
+
 def test_poor_data_are_told_to_be_poor() -> None:
     cube = draw_case("none", np.random.default_rng(3), size=SIZE).cube
     verdict = discover(cube.take([4]), "ts8_e2v", rng=np.random.default_rng(0))

@@ -22,6 +22,8 @@ class AmplifierGain(PlainNullEffect):
     name = "amplifier_gain"
     title = "gain errors of the amplifiers"
     acts_on = "image"
+    exact = True
+    exchangeable = True
     reference = "Guo, Walter, Lage & Lupton 2022, section 3.2; gains of LSSTCam scatter by a few per cent"
     parameters = tuple(
         Parameter(name, "", 0.0, (-0.5, 0.5), 0.01, f"true over stated gain of {name}, minus 1")

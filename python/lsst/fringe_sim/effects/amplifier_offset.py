@@ -18,6 +18,8 @@ class AmplifierOffset(PlainNullEffect):
     name = "amplifier_offset"
     title = "bias residuals of the amplifiers"
     acts_on = "image"
+    exact = True
+    exchangeable = True
     reference = "Guo, Walter, Lage & Lupton 2022, section 3.2 (bias subtraction)"
     parameters = tuple(
         Parameter(name, "electron", 0.0, (-5000.0, 5000.0), 50.0, f"offset of {name}") for name in AMPLIFIERS

@@ -110,6 +110,10 @@ class Effect(ABC):
     """Whether the signal of a pixel depends on other pixels, so that scattered samples of an image cannot show it."""
     moves_wavelengths: ClassVar[bool] = False
     """Whether all that it does is to move the wavelengths of exposures."""
+    exact: ClassVar[bool] = False
+    """Whether its form is no guess: electrons or factors that all pixels of an amplifier share."""
+    exchangeable: ClassVar[bool] = False
+    """Whether its parameters are draws about null from one distribution, the width of which nobody knows."""
     parameters: ClassVar[tuple[Parameter, ...]]
     reference: ClassVar[str]
 
@@ -132,6 +136,13 @@ class Effect(ABC):
         is added in electrons is a part of the level.
         """
         return image
+
+    def dark_charge(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
+        """Electrons of every sample that are not light, a part of the mean level; shape ``(W, 1, 1)``.
+
+        What all effects add is one part of the level, and light the rest.
+        """
+        return np.zeros((1, 1, 1))
 
     def change_sky(self, sky: SkySpectrum, values: Mapping[str, float]) -> SkySpectrum:
         """Return the night sky with the effect in it."""
@@ -307,9 +318,14 @@ def apply_to_image(
     geometry : `ImageGeometry`
         Where the samples lie.
     """
-    for item in active:
-        if not item.is_null(system):
-            image = item.effect.change_image(image, item.complete_values(system), geometry)
+    present = [(item.effect, item.complete_values(system)) for item in active if not item.is_null(system)]
+    dark = {effect.name: effect.dark_charge(values, geometry) for effect, values in present}
+    of_dark = [name for name, charge in dark.items() if charge.any()]
+    for effect, values in present:
+        image = effect.change_image(image, values, geometry)
+        if effect.name in of_dark[:1]:
+            part = sum(dark[name] for name in of_dark) / geometry.require_levels(effect.name)
+            image = (1.0 - part) * image + part
     return image
 
 

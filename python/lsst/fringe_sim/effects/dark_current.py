@@ -22,17 +22,14 @@ class DarkCurrent(PlainNullEffect):
     name = "dark_current"
     title = "dark current or light leak, per second"
     acts_on = "image"
+    exact = True
     laboratory_only = True
     reference = "EMVA standard 1288, release 4 (dark current of a camera)"
     parameters = (Parameter("rate", "electron/s", 0.0, (-50.0, 2000.0), 2.0, "electrons per second"),)
 
-    def change_image(
-        self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
-    ) -> FloatArray:
-        """Let the dark signal be its part of the level, and light the rest."""
-        dark_e = values["rate"] * geometry.require_dark_times(self.name)
-        part = dark_e / geometry.require_levels(self.name)
-        return (1.0 - part) * image + part
+    def dark_charge(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
+        """The rate, times the length of each exposure."""
+        return values["rate"] * geometry.require_dark_times(self.name)
 
     def check_search(self, geometry: ImageGeometry) -> None:
         """Refuse exposures of one length, in which it is `DarkPedestal`."""

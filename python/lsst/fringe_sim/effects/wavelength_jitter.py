@@ -26,6 +26,7 @@ class WavelengthJitter(PlainNullEffect):
     acts_on = "illumination"
     laboratory_only = True
     moves_wavelengths = True
+    exchangeable = True
     reference = "repeatability of grating drives, 0.1-0.3 nm; MONOCH-WAVELENG against MONOWL in TS8 headers"
     parameters = tuple(
         Parameter(

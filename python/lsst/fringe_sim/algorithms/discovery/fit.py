@@ -79,6 +79,8 @@ class Coordinate:
         Largest step of a derivative; 0 for a thousandth of the scale.
     refinement : `int`
         0 for what the effect surely has; see `Parameter`.
+    exchangeable : `bool`
+        Whether it is one of many draws about null; see `Effect`.
     """
 
     effect: str
@@ -94,6 +96,7 @@ class Coordinate:
     place: bool = False
     step: float = 0.0
     refinement: int = 0
+    exchangeable: bool = False
 
     @property
     def key(self) -> str:
@@ -153,7 +156,7 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
             Coordinate(
                 effect.name, parameter.name, null, low, high, parameter.prior_scale, quadratic, parameter.unit,
                 parameter.repeats_after, parameter.wavelength_nm > 0.0, parameter.place, parameter.step,
-                parameter.refinement,
+                parameter.refinement, effect.exchangeable,
             )
         )  # fmt: skip
     return tuple(found)
@@ -560,7 +563,7 @@ class Fit:
         """Uncertainty of the coordinates, weak prior and neighbouring minima included."""
         if not self.coordinates:
             return np.zeros(0)
-        total = self.information + np.diag(_ridge(self.coordinates, self.position))
+        total = self.information + np.diag(_precision_beside(self.coordinates, self.position))
         variance = np.maximum(np.diag(np.linalg.pinv(total, hermitian=True)), 0.0)
         return np.asarray(np.sqrt(variance + self.spread**2))
 
@@ -589,6 +592,20 @@ def _prior_widths(coordinates: Sequence[Coordinate]) -> FloatArray:
 def _ridge(coordinates: Sequence[Coordinate], position: FloatArray) -> FloatArray:
     """Precision of the Gaussian prior that pulls at a position as the Cauchy prior does."""
     return np.asarray(1.0 / (_prior_widths(coordinates) ** 2 + position**2))
+
+
+def _precision_beside(coordinates: Sequence[Coordinate], position: FloatArray) -> FloatArray:
+    """Precision of what is known besides the data, once they are fitted: how far draws from one distribution scatter.
+
+    A few of them hardly say so.
+    """
+    precision = _ridge(coordinates, position)
+    owners = np.array([item.effect if item.exchangeable else "" for item in coordinates])
+    for name in set(owners) - {""}:
+        own = owners == name
+        square = float((position[own] ** 2).sum())
+        precision[own] = np.maximum(precision[own], max(own.sum() - 2, 0) / max(square, 1e-300))
+    return precision
 
 
 @dataclass(eq=False)

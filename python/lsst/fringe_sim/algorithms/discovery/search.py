@@ -402,8 +402,7 @@ class _Search:
 
         Those tests share their power among many patterns; one effect has a single one.
         """
-        explained = selector.null.fit.chi2 - current.fit.chi2
-        least = IMPRECISION**2 * explained
+        least = IMPRECISION**2 * self._explained_by_guesses(selector, current)
         worth = [
             candidate
             for candidate in selector.score(current.fit, selector.others(current))
@@ -418,6 +417,15 @@ class _Search:
         if best is None or best.log_evidence < current.log_evidence + self.options.least_evidence:
             return None
         return selector.with_channels(best)
+
+    @staticmethod
+    def _explained_by_guesses(selector: Selector, current: Hypothesis) -> float:
+        """χ² that the effects of a set explain whose form may be wrong."""
+        exact = tuple(name for name in current.names if selector.effects[name].exact)
+        if exact == current.names:
+            return 0.0
+        without = selector.hypothesis(exact, None, current.fit) if exact else selector.null
+        return max(without.fit.chi2 - current.fit.chi2, 0.0)
 
     def _completed(self, selector: Selector, current: Hypothesis) -> Hypothesis:
         """The set with an effect beside one of many parameters that can play its part, where that is likelier.
