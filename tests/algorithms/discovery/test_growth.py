@@ -92,11 +92,11 @@ def test_a_blur_that_is_seen_is_not_taken_for_pixels_without_area(blurred) -> No
     """With it points and areas are the same but for its size."""
     problem, truth, sigma = blurred
     fit = _fit_at(problem, sigma, truth)
-    points = problem.forward.with_point_pixels(True)
+    points = problem.forward.with_places(1)
     chosen, again = preparation._choose_pixels(
         Problem(problem.cells, points, problem.basis, problem.level_basis), fit, fit.settings
     )
-    assert not chosen.forward.point_pixels
+    assert chosen.forward.places == 0
     assert again.chi2 == pytest.approx(fit.chi2, rel=1e-2)
 
 

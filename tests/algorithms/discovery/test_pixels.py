@@ -64,7 +64,7 @@ def test_the_fringes_are_averaged_over_the_area_of_a_cell(cell_px: int) -> None:
     inside = (slice(None), slice(4, -4), slice(4, -4))
     errors = {}
     for points in (False, True):
-        forward = Forward.of_cells(MODEL, EFFECTS, cells, limits).with_point_pixels(points)
+        forward = Forward.of_cells(MODEL, EFFECTS, cells, limits).with_places(int(points))
         value = forward.predict({}, centres).value[inside]
         # Flats are over the mean of the sensor, tables over that of all thicknesses.
         scale = (cells.value[inside] * value).sum(axis=(1, 2)) / (value**2).sum(axis=(1, 2))

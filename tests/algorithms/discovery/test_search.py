@@ -97,16 +97,30 @@ def test_a_hidden_effect_is_named(name: str, tmp_path) -> None:
 @pytest.mark.slow
 def test_what_a_strong_pedestal_leaves_is_another_effect() -> None:
     """Electrons cannot be described wrongly; a fainter index of the adhesive beside them is no flaw of their form."""
-    rng = np.random.default_rng([20331123, CASE_KINDS.index("two"), 16]).spawn(2)
-    case = draw_case("two", rng[0], size=(96, 96))
+    parts = np.random.default_rng([20331123, CASE_KINDS.index("two"), 16]).spawn(2)
+    case, rng = draw_case("two", parts[0]), parts[1]
     assert set(case.names) == {"dark_pedestal", "epoxy_index"}
-    verdict = discover(case.cube, case.setup, rng=rng[1])
+    verdict = discover(case.cube, case.setup, rng=rng)
     found = {effect.name: effect for effect in verdict.effects}
     assert set(found) == set(case.names)
     for key in ("dark_pedestal.electrons", "epoxy_index.offset"):
         name, _, parameter = key.partition(".")
         value = found[name].parameters[parameter]
         assert abs(value.value - case.values[key]) < 4.0 * value.sigma
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("outsider", "least"), [("annealing", 0.004), ("wandering_light", 0.007)])
+def test_where_the_catalogue_explains_next_to_nothing_no_pairs_are_tried(outsider: str, least: float) -> None:
+    rng, size = np.random.default_rng(22), 0.0
+    while size < least:
+        case = draw_case("outsider", rng.spawn(1)[0], size=SIZE, only=[outsider])
+        size = case.values[f"{outsider}.size"]
+    told: list[str] = []
+    verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0), report=told.append)
+    assert verdict.verdict == "unexplained"
+    assert any("next to nothing" in line for line in told)
+    assert max((len(step.added) for step in verdict.steps), default=0) <= 1
 
 
 def test_poor_data_are_told_to_be_poor() -> None:

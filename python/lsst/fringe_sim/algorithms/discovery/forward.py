@@ -10,11 +10,13 @@ from typing import Protocol
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
 from ...model import FringeModel
 from ...optics.illumination import Illumination
 from .cells import CellData
+from .slopes import slope_operator
 
 __all__ = ["Exposures", "Forward", "Prediction"]
 
@@ -108,8 +110,9 @@ class Forward:
         The light; monochromator flats by default.
     scatter_um2 : `numpy.ndarray`, shape ``(ny, nx)``, optional
         Variance of the thickness at which a cell is looked up about the true one [µm²]; by default none.
-    point_pixels : `bool`, optional
-        A pixel sees the thickness at its centre only. Real pixels, and by default these, average over their area.
+    places : `int`, optional
+        Places along the side of a pixel at which it sees the thickness; 0, the default, for all of its area, as real
+        pixels do.
     """
 
     model: FringeModel
@@ -121,7 +124,7 @@ class Forward:
     seen: NDArray[np.bool_] | None = None
     exposures: Exposures | None = None
     scatter_um2: FloatArray | None = None
-    point_pixels: bool = False
+    places: int = 0
     _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[int, float], FloatArray] = field(default_factory=dict, repr=False)
     _rows_of: tuple[tuple[str, float], ...] | None = field(default=None, repr=False)
@@ -132,6 +135,7 @@ class Forward:
         init=False, repr=False, default=None
     )
     _centroids: tuple[FloatArray, FloatArray | None] | None = field(init=False, repr=False, default=None)
+    _slopes: csr_matrix | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         self._by_name = {effect.name: effect for effect in self.catalogue}
@@ -160,9 +164,9 @@ class Forward:
             model, catalogue, cells.geometry, cells.cell_px, range_um, cells.centroid, cells.seen, exposures
         )
 
-    def with_point_pixels(self, point_pixels: bool) -> Forward:
-        """The same with pixels that are points, or areas; tables made so far are kept."""
-        return replace(self, point_pixels=point_pixels, _tables=dict(self._tables), _rows=dict(self._rows))
+    def with_places(self, places: int) -> Forward:
+        """The same with pixels that see their area (0), or so many places on each side; tables are kept."""
+        return replace(self, places=places, _tables=dict(self._tables), _rows=dict(self._rows))
 
     def table(self, settings: Settings) -> FloatArray:
         """Response ``(W, D)`` on the grid of thickness, relative to its mean, as flats are.
@@ -284,7 +288,7 @@ class Forward:
         self, table: FloatArray, thickness_um: FloatArray, rows: NDArray[np.intp] | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Value and slope of some rows of a table, averaged over the cells; shape ``(R, ny, nx)``."""
-        gradient = _gradient(thickness_um, self.seen)
+        gradient = self._gradient(thickness_um)
         second, fourth = self._spread_in_cell(gradient)
         place, rest = self._at_centroids(thickness_um, gradient)
         used = table if rows is None else table[rows]
@@ -303,6 +307,13 @@ class Forward:
                 gradient.reshape(2, -1), rest.reshape(*rest.shape[:2], -1), planes,
             )  # fmt: skip
         return value, slope
+
+    def _gradient(self, thickness_um: FloatArray) -> FloatArray:
+        """Change of the thickness from cell to cell along rows and columns, ``(2, ny, nx)``."""
+        if self._slopes is None:
+            known = np.ones(thickness_um.shape, dtype=bool) if self.seen is None else self.seen
+            self._slopes = slope_operator(known)
+        return np.asarray(self._slopes @ thickness_um.ravel()).reshape(2, *thickness_um.shape)
 
     def _at_places(self, rows: FloatArray) -> FloatArray:
         """Cells of the rows of all places, each seen at its own: ``(K * W, ny, nx)`` to ``(W, ny, nx)``."""
@@ -346,8 +357,8 @@ class Forward:
 
     def _spread_of_pixels(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Second and fourth moment of the thickness over the area of each cell, from the gradient of the field."""
-        # Uniform along both axes; points stand evenly, and their distributions are discrete.
-        square, inverse = gradient**2, 1.0 / self.cell_px**2 if self.point_pixels else 0.0
+        # Uniform along both axes; places stand evenly, and their distributions are discrete.
+        square, inverse = gradient**2, 1.0 / (self.cell_px * self.places) ** 2 if self.places else 0.0
         along = square * (1.0 - inverse) / 12.0
         fourth = (square**2).sum(axis=0) * (1.0 - inverse) * (3.0 - 7.0 * inverse) / 240.0
         return along.sum(axis=0), fourth + 6.0 * along[0] * along[1]
@@ -374,27 +385,6 @@ class Forward:
     def _image(self, settings: Settings) -> dict[str, float]:
         known = {**self.model.effect_settings, **settings}
         return {key: value for key, value in known.items() if self.is_image_effect(key.split(".")[0])}
-
-
-def _gradient(field: FloatArray, seen: NDArray[np.bool_] | None) -> FloatArray:
-    """Change of a field from cell to cell along rows and columns, ``(2, ny, nx)``.
-
-    The mean of the differences to both neighbours, or to the one that is seen.
-    """
-    known = np.ones(field.shape, dtype=bool) if seen is None else seen
-    result = np.zeros((2, *field.shape))
-    for axis in (0, 1):
-        moved = result[axis].swapaxes(0, axis)
-        own, there = field.swapaxes(0, axis), known.swapaxes(0, axis)
-        both = there[1:] & there[:-1]
-        step = np.where(both, own[1:] - own[:-1], 0.0)
-        number = np.zeros(own.shape)
-        moved[1:] += step
-        moved[:-1] += step
-        number[1:] += both
-        number[:-1] += both
-        moved /= np.maximum(number, 1.0)
-    return result
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)

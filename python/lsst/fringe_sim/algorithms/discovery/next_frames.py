@@ -204,7 +204,7 @@ def _forward_like(
 ) -> Forward:
     """Other data of the same thicknesses and effects."""
     like = Forward.of_cells(model, forward.catalogue, cells, forward.range_um, exposures)
-    return like.with_point_pixels(forward.point_pixels)
+    return like.with_places(forward.places)
 
 
 def _problem_with(problem: Problem, cells: CellData, forward: Forward) -> Problem:

@@ -43,10 +43,12 @@ MUCH_BETTER = 0.7
 FARTHEST_K, SAME_K = 5.0, 0.5
 """How far the temperature of flats may be from that of the set-up, and how far it is taken to be the same [K]."""
 
-MUCH_SHARPER = 9.0
+MUCH_SHARPER, SURELY_SHARPER = 9.0, 25.0
+FEW_PLACES = (2, 3, 4)
 MUCH_EXPLAINED, NOISE_SIGMAS = 0.5, 5.0
-"""χ², over its mean, that pixels without an area must gain: three standard deviations; the part of the misfit beyond
-noise that they may leave, and the uncertainty of that noise [standard deviations]."""
+"""χ², over its mean, that pixels without an area must gain: three standard deviations, five if they have a few places
+along a side; the part of the misfit beyond noise that they may leave, and the uncertainty of that noise [standard
+deviations]."""
 
 PIXEL_RMS = 1.0 / math.sqrt(12.0)
 """Rms radius of a pixel's area along one axis [px]."""
@@ -79,9 +81,6 @@ MOST_TAKEN = 0.9
 NOISE_CHANGE = 0.02
 SCATTER_CHANGE = 0.05
 """Parts by which noise and response scatter may change before the search is done again with them."""
-
-
-POINTS_TOLD = "sharper than light averaged over pixels can be: each is taken as a point"
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +125,13 @@ class Prepared:
     @property
     def told(self) -> tuple[str, ...]:
         """Notes, and how pixels are taken if not as areas."""
-        return (*self.notes, POINTS_TOLD) if self.problem.forward.point_pixels else self.notes
+        places = self.problem.forward.places
+        return (*self.notes, _places_told(places)) if places else self.notes
+
+
+def _places_told(places: int) -> str:
+    taken = "a point" if places == 1 else f"{places} by {places} points"
+    return f"sharper than light averaged over pixels can be: each is taken as {taken}"
 
 
 def check_setup(cube: FringeCube, model: FringeModel) -> None:
@@ -326,7 +331,7 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     refined = replace(refined, null=_better_null(refined, prepared), guess=settings)
     change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
     scatter = abs(refined.noise.response_scatter - prepared.noise.response_scatter)
-    same_pixels = refined.problem.forward.point_pixels == problem.forward.point_pixels
+    same_pixels = refined.problem.forward.places == problem.forward.places
     same_field = refined.problem.basis.size <= problem.basis.size and not mended and same_pixels
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
@@ -341,7 +346,7 @@ def _mended(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[Float
     if not any(problem.forward.couples_pixels(item.effect) for item in fit.coordinates):
         return start, dict(fit.settings)
     if _is_blurred(fit.settings):
-        problem = replace(problem, forward=problem.forward.with_point_pixels(False))
+        problem = replace(problem, forward=problem.forward.with_places(0))
     grown = grown_thickness(problem, fit, start)
     return (start, dict(fit.settings)) if grown is None else (grown.thickness_um, grown.settings)
 
@@ -352,7 +357,7 @@ def _with_other_pixels(prepared: Prepared, fit: Fit) -> Prepared | None:
     free = replace(problem, free_contrast=True)
     first = fit_model(free, (), np.zeros(0), fit.field, None, fit.settings)
     forward = _choose_pixels(free, first, fit.settings)[0].forward
-    if forward.point_pixels == problem.forward.point_pixels:
+    if forward.places == problem.forward.places:
         return None
     problem = replace(problem, forward=forward)
     null = fit_model(problem, (), np.zeros(0), prepared.null.field, prepared.null.levels)
@@ -506,27 +511,39 @@ def _in_different_orders(fields: Sequence[FloatArray], problem: Problem) -> Sequ
 def _choose_pixels(problem: Problem, fit: Fit, settings: Mapping[str, float]) -> tuple[Problem, Fit]:
     """Pixels as areas or as points, and the fit with them; points only where the data are clearly sharper.
 
-    Real pixels average over their area. Simulated frames may not, and no effect would ever sharpen them. Points that
+    Real pixels average over their area. Simulated frames may average over none of it or a few places, and no effect
+    would ever sharpen them. Points that
     something else blurs by more than that are not told from areas that it blurs by less, which are taken.
     """
     forward = problem.forward
     if _is_blurred(settings):
-        if forward.point_pixels:
-            problem = replace(problem, forward=forward.with_point_pixels(False))
+        if forward.places:
+            problem = replace(problem, forward=forward.with_places(0))
             fit = fit_model(problem, (), np.zeros(0), fit.field, fit.levels, settings)
         return problem, fit
-    other = replace(problem, forward=forward.with_point_pixels(not forward.point_pixels))
-    again = fit_model(other, (), np.zeros(0), fit.field, fit.levels, settings)
-    areas, points = ((problem, fit), (other, again))[:: -1 if forward.point_pixels else 1]
     free = problem.n_levels + (0 if problem.field_prior else problem.basis.size)
     degrees = max(problem.cells.n_values - free, 1)
-    if areas[1].chi2 - points[1].chi2 <= MUCH_SHARPER * areas[1].chi2 / degrees:
+    tried = {forward.places: (problem, fit)}
+
+    def taken_as(places: int) -> tuple[Problem, Fit]:
+        if places not in tried:
+            other = replace(problem, forward=forward.with_places(places))
+            tried[places] = other, fit_model(other, (), np.zeros(0), fit.field, fit.levels, settings)
+        return tried[places]
+
+    areas, best = taken_as(0), taken_as(1)
+    mean = areas[1].chi2 / degrees
+    least = MUCH_SHARPER
+    if abs(areas[1].chi2 - best[1].chi2) > SURELY_SHARPER * mean:
+        best = min(map(taken_as, (1, *FEW_PLACES)), key=lambda item: item[1].chi2)
+        least = MUCH_SHARPER if best[0].forward.places == 1 else SURELY_SHARPER
+    if areas[1].chi2 - best[1].chi2 <= least * mean:
         return areas
-    noise = _noise_of(*points) * degrees
+    noise = _noise_of(*best) * degrees
     # A field in a wrong order, or an effect that is not in the model, may leave either somewhat better.
     chance = NOISE_SIGMAS * noise * math.sqrt(2.0 / degrees)
-    explained = points[1].chi2 - noise < MUCH_EXPLAINED * (areas[1].chi2 - noise) + chance
-    return points if explained else areas
+    explained = best[1].chi2 - noise < MUCH_EXPLAINED * (areas[1].chi2 - noise) + chance
+    return best if explained else areas
 
 
 def _noise_of(problem: Problem, fit: Fit) -> float:

@@ -49,6 +49,12 @@ WORTH_FITTING = 9.0
 MORE_THAN_PROMISED = 3.0
 """By how much a fit may bring more than its score promised."""
 
+MUCH_LEFT = 0.05
+"""χ² above that of noise, over the number of values, that is surely no error of the noise."""
+
+HARDLY_LESS = 0.5
+"""Part of that excess which one effect must take off, or further ones promise, for sets of several to be tried."""
+
 SHIFTING_SETS = 3
 """Sets of several effects that are looked for in other fringe orders."""
 
@@ -242,6 +248,9 @@ class _Search:
         if singles and self._is_too_coarse(training, singles[0]):
             return self._run_finer(singles[0].fit, self._thickness(whole, singles[0].fit))
         chosen, steps = self._first(whole, training, singles)
+        if self._is_hopeless(training, chosen):
+            self.say("the catalogue explains next to nothing of it: no sets of several effects are tried")
+            return self._conclude(whole, training, chosen, steps, chance)
         chosen = self._enlarge(whole, training, chosen, steps, min(PAIR, self.options.most_effects))
         if self._may_judge_orders and chosen.names and not self._consistent(chosen):
             self._may_judge_orders = False
@@ -457,6 +466,16 @@ class _Search:
                     self._say_refit(current, larger)
                     best = max(best, larger, key=lambda item: item.log_evidence)
         return best if best.log_evidence > current.log_evidence + self.options.least_evidence else current
+
+    def _is_hopeless(self, selector: Selector, chosen: Hypothesis) -> bool:
+        """Whether so much is left, and so little of it promised by all effects, that no set leaves noise."""
+        noise = selector.problem.cells.n_values
+        before, excess = selector.null.fit.chi2 - noise, chosen.fit.chi2 - noise
+        if self.prepared.shifts_um or excess < max(MUCH_LEFT * noise, HARDLY_LESS * before):
+            return False
+        scores = selector.score(chosen.fit, selector.others(chosen), scan=True)
+        best = sorted((candidate.promise for candidate in scores), reverse=True)[: self.options.most_effects]
+        return MORE_THAN_PROMISED * sum(best) < HARDLY_LESS * excess
 
     def _enlarged(self, selector: Selector, current: Hypothesis) -> list[Hypothesis]:
         """Refits of the most promising sets with one effect more.

@@ -1,0 +1,83 @@
+"""The search on flats of a simulator that shares nothing with the model but the tables of the media."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from field_matrices import DETECTION, ForeignSensor
+
+from lsst.fringe_sim.algorithms.discovery import discover
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
+
+WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
+SIZE = 96
+READ_NOISE_E = 6.0
+
+
+def steep_map(rng: np.random.Generator, places: int) -> np.ndarray:
+    """Thickness [µm] at so many places by places in every pixel: a Gaussian field, fringes of 7 pixels and more."""
+    side = SIZE * places
+    wave = np.fft.fftfreq(side) * side
+    damped = np.exp(-((wave**2 + wave[:, np.newaxis] ** 2) * rng.uniform(0.3, 0.45) ** 2))
+    smooth = np.fft.ifft2(np.fft.fft2(rng.standard_normal((side, side))) * damped).real
+    smooth = (smooth - smooth.min()) / np.ptp(smooth)
+    return np.asarray(rng.uniform(10.0, 18.0) + rng.uniform(0.6, 1.1) * smooth)
+
+
+def exposed(sensor: ForeignSensor, rng: np.random.Generator, places: int = 7) -> FringeCube:
+    """Twelve flats with photon and read noise."""
+    thickness = steep_map(rng, places)
+    electrons = rng.uniform(2e4, 6e4) * sensor.flats(WAVELENGTHS, thickness, places)
+    image = rng.poisson(electrons) + READ_NOISE_E * rng.standard_normal(electrons.shape)
+    rows = FlatExposures(WAVELENGTHS, np.full(12, 2.0), np.full(12, 183.15))
+    return FringeCube(
+        image.astype(np.float32), (np.maximum(image, 1.0) + READ_NOISE_E**2).astype(np.float32),
+        np.zeros(image.shape, np.int32), rows, "electron", detector="foreign",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("epoxy_k", [0.0, 0.003])
+def test_the_optics_agree(epoxy_k: float) -> None:
+    thickness = np.linspace(13.0, 14.0, 101)
+    own = ForeignSensor(epoxy_k=epoxy_k)
+    line = np.linspace(-3.5, 3.5, 161)
+    share = np.exp(-0.5 * line**2)
+    sigma = 2.0 / np.sqrt(8.0 * np.log(2.0))
+    foreign = np.array(
+        [share @ own.absorbed(middle + sigma * line, thickness) / share.sum() for middle in WAVELENGTHS]
+    )
+    model = FringeModel.from_setup("ts8_e2v", {"epoxy_absorption.k": epoxy_k})
+    found = model.response(thickness, WAVELENGTHS)
+    apart = found / found.mean(axis=1, keepdims=True) - foreign / foreign.mean(axis=1, keepdims=True)
+    assert np.ptp(foreign / foreign.mean(axis=1, keepdims=True)) > 0.1
+    assert np.abs(apart).max() < 2e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sensor", "key", "value"),
+    [
+        (ForeignSensor(line=1.3), "bandwidth.fwhm", 2.6),
+        (ForeignSensor(epoxy_k=0.003), "epoxy_absorption.k", 0.003),
+        (ForeignSensor(thicker_um={DETECTION: 0.5}), "silicon_thickness.offset", 0.5),
+    ],
+    ids=lambda item: item if isinstance(item, str) else "",
+)
+def test_what_another_simulator_hides_is_named(sensor: ForeignSensor, key: str, value: float) -> None:
+    verdict = discover(exposed(sensor, np.random.default_rng(41)), "ts8_e2v", rng=np.random.default_rng(0))
+    assert verdict.verdict == "named", verdict.summary()
+    (effect,) = verdict.effects
+    name, _, parameter = key.partition(".")
+    assert name in {effect.name, *effect.ambiguous_with}
+    if effect.name == name:
+        found = effect.parameters[parameter]
+        assert abs(found.value - value) < 4.0 * found.sigma
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("places", [9, 3])
+def test_nothing_is_found_in_another_simulators_plain_flats(places: int) -> None:
+    """Pixels that average over three places by three see a ninth less of their area than real ones."""
+    cube = exposed(ForeignSensor(), np.random.default_rng(42), places)
+    assert discover(cube, "ts8_e2v", rng=np.random.default_rng(0)).verdict == "no_discrepancy"
