@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from .base import FloatArray, Parameter, PlainNullEffect
 from .image_geometry import ImageGeometry
 
@@ -25,6 +27,11 @@ class NonLinearity(PlainNullEffect):
     def change_image(
         self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
     ) -> FloatArray:
-        """Take the quadratic term off."""
-        charge = geometry.require_levels(self.name) / REFERENCE_E
+        """Take the quadratic term off.
+
+        The level of the flats is what was counted. More charge is behind it: the root of
+        ``counted = charge - quadratic * charge**2``, up to where more charge would count less.
+        """
+        counted = geometry.require_levels(self.name) / REFERENCE_E
+        charge = 2.0 * counted / (1.0 + np.sqrt(np.maximum(1.0 - 4.0 * values["quadratic"] * counted, 0.0)))
         return image * (1.0 - values["quadratic"] * charge * image)

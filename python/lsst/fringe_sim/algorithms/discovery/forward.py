@@ -10,13 +10,12 @@ from typing import Protocol
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
 
 from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
 from ...model import FringeModel
 from ...optics.illumination import Illumination
 from .cells import CellData
-from .slopes import slope_operator
+from .slopes import Slopes
 
 __all__ = ["Exposures", "Forward", "Prediction"]
 
@@ -135,7 +134,7 @@ class Forward:
         init=False, repr=False, default=None
     )
     _centroids: tuple[FloatArray, FloatArray | None] | None = field(init=False, repr=False, default=None)
-    _slopes: csr_matrix | None = field(init=False, repr=False, default=None)
+    _slopes: Slopes | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         self._by_name = {effect.name: effect for effect in self.catalogue}
@@ -311,9 +310,8 @@ class Forward:
     def _gradient(self, thickness_um: FloatArray) -> FloatArray:
         """Change of the thickness from cell to cell along rows and columns, ``(2, ny, nx)``."""
         if self._slopes is None:
-            known = np.ones(thickness_um.shape, dtype=bool) if self.seen is None else self.seen
-            self._slopes = slope_operator(known)
-        return np.asarray(self._slopes @ thickness_um.ravel()).reshape(2, *thickness_um.shape)
+            self._slopes = Slopes(np.ones(thickness_um.shape, bool) if self.seen is None else self.seen)
+        return self._slopes(thickness_um)
 
     def _at_places(self, rows: FloatArray) -> FloatArray:
         """Cells of the rows of all places, each seen at its own: ``(K * W, ny, nx)`` to ``(W, ny, nx)``."""

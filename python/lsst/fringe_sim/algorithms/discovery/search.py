@@ -220,6 +220,11 @@ class _Search:
         self.prepared, self.cells = prepared, prepared.problem.cells
         self.notes = [*self.headers, *prepared.told]
 
+    @property
+    def _places(self) -> int:
+        """Places along a pixel's side that see the thickness, 0 for its area; effects may have looked like a few."""
+        return self.prepared.problem.forward.places
+
     def run(self, refinements: int = 2) -> Verdict:
         """Search; start again if a named effect shows that field or noise were misjudged without it."""
         whole = Selector(
@@ -252,10 +257,11 @@ class _Search:
             self.say("the catalogue explains next to nothing of it: no sets of several effects are tried")
             return self._conclude(whole, training, chosen, steps, chance)
         chosen = self._enlarge(whole, training, chosen, steps, min(PAIR, self.options.most_effects))
-        if self._may_judge_orders and chosen.names and not self._consistent(chosen):
+        doubtful = not self._consistent(chosen) or self._places > 0
+        if self._may_judge_orders and chosen.names and doubtful:
             self._may_judge_orders = False
             refined, mended = self._refined(whole, chosen)
-            if refined is not None and mended:
+            if refined is not None and (mended or refined.problem.forward.places != self._places):
                 self._take(refined)
                 return self.run(refinements=1)
         if len(chosen.names) == PAIR:
