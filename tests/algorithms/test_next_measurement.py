@@ -330,7 +330,8 @@ def test_a_rival_that_was_fitted_at_null_is_compared_at_its_usual_size(
 
 
 def test_a_brighter_series_has_the_optics_of_the_present_one(model: FringeModel, few_samples: None) -> None:
-    forecast = forecast_of(model, ghost_pedestal={"fraction": 0.02}, non_linearity={"quadratic": 0.01})
+    # Of a loss that is there, the signature grows faster than the level that was counted.
+    forecast = forecast_of(model, ghost_pedestal={"fraction": 0.02}, non_linearity={"quadratic": 0.0})
     forecast.pairs([FlatSeries(FLATS)])
     computed = len(forecast._flats)
     forecast.pairs([FlatSeries(FLATS), BRIGHT.series])
