@@ -16,7 +16,15 @@ from scipy.stats import ncx2
 from ...effects import AMPLIFIERS, ImageGeometry
 from .fit import Columns, Design, FullColumns, PlaneColumns, Whitener
 
-__all__ = ["Channel", "State", "combined_probability", "fringe_phase", "measure_channels", "project_test"]
+__all__ = [
+    "Channel",
+    "State",
+    "beside_thickness",
+    "combined_probability",
+    "fringe_phase",
+    "measure_channels",
+    "project_test",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -258,7 +266,7 @@ def echo_channel(state: State) -> Channel:
     scale = np.abs(weight).max(axis=(1, 2), keepdims=True)
     used = (weight != 0.0).astype(float)
     shape = tuple(next_fast_len(2 * size - 1, real=True) for size in pattern.shape[1:])
-    seen = rfft2(_beside_thickness(state) * used, shape), rfft2(used, shape)
+    seen = rfft2(beside_thickness(state, state.residual) * used, shape), rfft2(used, shape)
     largest, looks = 0.0, 0
     for rows, columns in itertools.product((1, -1), (1, -1)):
         copy = (scale * pattern)[:, ::rows, ::columns]
@@ -274,14 +282,12 @@ def echo_channel(state: State) -> Channel:
     return Channel("echoes", largest, 1.0, float(-np.expm1(looks * np.log1p(-min(single, 1.0 - 1e-16)))))
 
 
-def _beside_thickness(state: State) -> FloatArray:
-    """Whitened residual without what a thickness of its own would explain in each cell."""
+def beside_thickness(state: State, whitened: FloatArray) -> FloatArray:
+    """Whitened values without what a thickness of its own would explain in each cell."""
     slope = state.design.slope
     square = (slope**2).sum(axis=0)
-    along = np.divide(
-        (slope * state.residual).sum(axis=0), square, out=np.zeros(square.shape), where=square > 0.0
-    )
-    return np.asarray(state.residual - slope * along)
+    along = np.divide((slope * whitened).sum(axis=0), square, out=np.zeros(square.shape), where=square > 0.0)
+    return np.asarray(whitened - slope * along)
 
 
 def _is_far(shape: tuple[int, ...], nearest: int) -> NDArray[np.bool_]:

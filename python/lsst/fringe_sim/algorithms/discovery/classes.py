@@ -204,7 +204,9 @@ def _values_of(name: str, fit: Fit) -> dict[str, float]:
     }
 
 
-def outsider_probability(hypothesis: Hypothesis, prior: float, explained: float = math.inf) -> float:
+def outsider_probability(
+    hypothesis: Hypothesis, prior: float, explained: float = math.inf, spots: float = -math.inf
+) -> float:
     """Probability of a cause outside the catalogue, from the chance of noise in what is left.
 
     An effect of the catalogue leaves noise: any chance is as likely as any other. A cause outside it either is
@@ -221,10 +223,12 @@ def outsider_probability(hypothesis: Hypothesis, prior: float, explained: float 
         Probability of such a cause before the data are seen.
     explained : `float`, optional
         χ² that the set takes off the unchanged model.
+    spots : `float`, optional
+        Log evidence of spots, which no effect is, in the place of an effect, over that of the effect.
     """
     hidden = HIDDEN_CHI2 * max(len(hypothesis.names), 1) / max(explained, 1e-300)
     mimicked = min(max(MIMICKED, hidden), 1.0)
     p = min(max(hypothesis.probability_of_noise, 1e-100), 1.0)
     density = mimicked + (1.0 - mimicked) / (p * math.log(10.0) * DECADES_OF_CHANCE)
-    odds = prior / (1.0 - prior) * density
+    odds = prior / (1.0 - prior) * (density + math.exp(min(spots, 100.0)))
     return odds / (1.0 + odds)

@@ -28,6 +28,7 @@ from .fit import (
 )
 from .following import ThicknessFollower
 from .orders import fields_in_other_orders, starts_in_other_orders
+from .spots import log_evidence_of_spots, spot_channel
 
 __all__ = ["Candidate", "Hypothesis", "Selector"]
 
@@ -203,13 +204,17 @@ class Selector:
         if not self.generic:
             return (self._total(fit),)
         explained = max(self.null.fit.chi2 - fit.chi2, 0.0)
-        return measure_channels(
-            self.state(fit),
-            self.problem.cells.geometry,
-            self.index,
-            IMPRECISION**2 * explained + self._undescribed,
-            self.problem.forward.noise_correlation(fit.settings),
-        )
+        state, correlation = self.state(fit), self.problem.forward.noise_correlation(fit.settings)
+        imprecision = IMPRECISION**2 * explained + self._undescribed
+        channels = measure_channels(state, self.problem.cells.geometry, self.index, imprecision, correlation)
+        return (*channels, spot_channel(state, correlation))
+
+    def evidence_of_spots(self, hypothesis: Hypothesis) -> float:
+        """Log evidence that a few spots, which no effect is, would bring beside a set."""
+        if not self.generic:
+            return 0.0
+        correlation = self.problem.forward.noise_correlation(hypothesis.fit.settings)
+        return log_evidence_of_spots(self.state(hypothesis.fit), correlation)
 
     def undescribed(self, name: str) -> float:
         """χ² that an effect may gain because the fringes are described only so well."""
