@@ -146,6 +146,7 @@ def test_any_face_may_be_rough(e2v: FlatFieldOptics, face: str) -> None:
     [
         ("gate_thickness.offset", 0.05, 1e-6),
         ("gate_oxide.offset", 0.05, 1e-6),
+        ("insulation.offset", 0.05, 1e-6),
         ("black_coating.thickness", 0.3, 1e-6),
         ("air_gap.thickness", 120.0, 1e-6),
         ("support_coherence.spread", 0.02, 1e-6),

@@ -111,8 +111,23 @@ def test_halves_of_the_same_size_are_two_patches(rng: np.random.Generator) -> No
     steps = np.full((12, 20), 30)
     steps[:, 10:] += 29
     score = rng.random((steps.size, 100)).astype(np.float32)
-    mended = _mend_patches(score, steps.ravel(), (12, 20), 29.0)
+    mended = _mend_patches(score, steps.ravel(), np.ones((12, 20), bool), 29.0)
     np.testing.assert_array_equal(mended, steps.ravel())
+
+
+def test_a_patch_at_the_rim_of_the_data_hangs_on_nothing_beyond_it() -> None:
+    """Below the rim a field without data comes down from the patch slowly, to where its surroundings are."""
+    shape, order = (30, 40), 29
+    seen = np.zeros(shape, bool)
+    seen[4:-6, 4:-4] = True
+    away = np.abs(np.arange(shape[1]) - 16)
+    steps = np.full(shape, 30)
+    steps[16:24, 14:19] += order
+    steps[24:] += np.clip(order - 4 * (away - 2), 0, order)
+    score = np.zeros((steps.size, 100), np.float32)
+    score[:, 30], score[:, 30 + order] = 1.0, 0.99
+    mended = _mend_patches(score, steps.ravel(), seen, float(order)).reshape(shape)
+    assert (mended[seen] == 30).all()
 
 
 def test_ragged_patches_are_taken_back_by_the_surface_around_them(rng: np.random.Generator) -> None:

@@ -33,6 +33,7 @@ from .ghost_pedestal import GhostPedestal
 from .hot_rotation import HotRotation
 from .illumination import Illumination
 from .image_geometry import AMPLIFIERS, ImageGeometry
+from .insulation import Insulation
 from .interface_roughness import InterfaceRoughness
 from .lamp_lines import LampLines
 from .line_triangle import LineTriangle
@@ -86,6 +87,7 @@ EFFECTS: tuple[Effect, ...] = (
     SupportCoherence(),
     GateOxide(),
     GateThickness(),
+    Insulation(),
     BlackCoating(),
     # illumination
     Bandwidth(),

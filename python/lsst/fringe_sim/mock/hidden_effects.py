@@ -502,7 +502,13 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     ),
     HiddenEffect(
         "gate_oxide",
-        "insulation at the gates",
+        "oxide under the gates",
+        (HiddenParameter("offset", "um", 0.0, (-0.09, 0.3), "thickness minus that of the stack"),),
+        on_optics=lambda optics, values: _thicker(optics, "gate_oxide", values["offset"]),
+    ),
+    HiddenEffect(
+        "insulation",
+        "insulation behind the gates",
         (HiddenParameter("offset", "um", 0.0, (-0.3, 0.5), "thickness minus that of the stack"),),
         on_optics=lambda optics, values: _thicker(optics, "insulation", values["offset"]),
     ),

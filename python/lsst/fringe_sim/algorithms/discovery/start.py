@@ -8,7 +8,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median, median_filter, uniform_filter
+from scipy.ndimage import binary_closing, median, median_filter, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -34,7 +34,9 @@ FEWEST_ROWS = 12
 PATCH_ROUNDS = 6
 LARGEST_PATCH = 0.1
 PATCH_LOSS = 0.9
-"""How often patches are taken back, the largest part of the cells that is one, and the clarity it may lose."""
+WIDEST_GAP = 4
+"""How often patches are taken back, the largest part of the cells that is one, the clarity it may lose, and the gap in
+the data across which cells are neighbours [cells]."""
 
 SURFACE_SPACINGS = (16.0, 8.0)
 SURFACE_ROUNDS = 8
@@ -346,7 +348,7 @@ def _mended(
 ) -> NDArray[np.int64]:
     """Steps of all cells, with those in a wrong fringe order taken back in every way that is known."""
     best = _mend_orders(score, best, cells.shape[1:], order)
-    best = _mend_patches(score, best, cells.shape[1:], order)
+    best = _mend_patches(score, best, cells.seen, order)
     return _mend_by_surface(score, best, cells, order)
 
 
@@ -375,28 +377,31 @@ def _mend_orders(
 
 
 def _mend_patches(
-    score: NDArray[np.float32], best: NDArray[np.int64], shape: tuple[int, int], order: float
+    score: NDArray[np.float32], best: NDArray[np.int64], seen: NDArray[np.bool_], order: float
 ) -> NDArray[np.int64]:
     """Take back small patches, single cells among them, that stand whole orders off what surrounds them.
 
     A patch is what hangs together without a cliff. It is moved by the orders that its border shows, if it then fits
-    the data nearly as well as before.
+    the data nearly as well as before. What lies beyond the data is whatever it grew to, and joins nothing; narrow
+    gaps are between cells with data.
     """
-    if min(shape) < FEWEST_ROWS:
+    if min(seen.shape) < FEWEST_ROWS:
         return best
     cells, count = np.arange(len(best)), score.shape[1]
-    places = cells.reshape(shape)
+    places = cells.reshape(seen.shape)
+    known = _without_gaps(seen).ravel()
     pairs = np.concatenate([
         np.stack([places[:, :-1].ravel(), places[:, 1:].ravel()], axis=1),
         np.stack([places[:-1].ravel(), places[1:].ravel()], axis=1),
     ])  # fmt: skip
+    pairs = pairs[known[pairs].all(axis=1)]
     current = best
     for _ in range(PATCH_ROUNDS):
         flat = np.abs(current[pairs[:, 0]] - current[pairs[:, 1]]) < 0.5 * order
-        links = coo_array((np.ones(int(flat.sum())), pairs[flat].T), shape=(len(best), len(best)))
-        number, patch = connected_components(links, directed=False)
-        if number == 1:
+        if flat.all():
             break
+        links = coo_array((np.ones(int(flat.sum())), pairs[flat].T), shape=(len(best), len(best)))
+        patch = connected_components(links, directed=False)[1]
         size = np.bincount(patch)
         turns = _turns_of_patches(current, patch, pairs[~flat], size, order)
         moved = np.clip(current - np.rint(turns[patch] * order).astype(np.int64), 0, count - 1)
@@ -407,6 +412,13 @@ def _mend_patches(
             break
         current = np.where(better[patch], moved, current)
     return current
+
+
+def _without_gaps(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells with data, and those in gaps between them of a few cells."""
+    filled = binary_closing(np.pad(seen, WIDEST_GAP), iterations=WIDEST_GAP // 2)
+    inner = slice(WIDEST_GAP, -WIDEST_GAP)
+    return np.asarray(seen | filled[inner, inner])
 
 
 def _mend_by_surface(
@@ -461,6 +473,8 @@ def _turns_of_patches(
     jump = best[both[:, 0]] - best[both[:, 1]]
     larger = size[other] > size[own]
     use = larger | ((size[other] == size[own]) & (other < own))  # halves of the same size are two as well
+    if not use.any():  # a cliff within a patch
+        return turns
     own, other, jump = own[use], other[use], jump[use]
     largest = np.full(size.size, -1)
     by_size = np.lexsort((-other, size[other]))
