@@ -35,8 +35,8 @@ PATCH_ROUNDS = 6
 LARGEST_PATCH = 0.1
 PATCH_LOSS = 0.9
 WIDEST_GAP = 4
-"""How often patches are taken back, the largest part of the cells that is one, the clarity it may lose, and the gap in
-the data across which cells are neighbours [cells]."""
+"""How often patches are taken back, the largest part of the cells that is one, the clarity it may lose, and the gap
+in the data across which cells are neighbours [cells]."""
 
 SURFACE_SPACINGS = (16.0, 8.0)
 SURFACE_ROUNDS = 8
