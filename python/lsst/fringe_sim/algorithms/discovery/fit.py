@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 
@@ -491,6 +491,12 @@ class Design:
         step = solve_symmetric(self._curvature + np.diag(ridge), right)
         return step, solved[:, 0] - solved[:, 1:] @ step
 
+    def field_errors(self, draws: Iterable[FloatArray]) -> FloatArray:
+        """What draws of whitened noise ``(W, ny, nx)`` make of the field, levels and effects held, in its unit."""
+        moved = [self.basis.gather((self.slope * noise).sum(axis=0)[np.newaxis]) for noise in draws]
+        solved = self.normal.solve(np.concatenate(moved, axis=1))
+        return np.stack([self.basis.expand(one) for one in solved.T])
+
     def project(self, columns: Columns, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Score and information of further columns with all nuisances of this design projected out.
 
@@ -557,6 +563,12 @@ class Fit:
     def __post_init__(self) -> None:
         if self.spread.size != len(self.coordinates):
             object.__setattr__(self, "spread", np.zeros(len(self.coordinates)))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the coordinates from the data and the weak prior alone, ``(P, P)``."""
+        total = self.information + np.diag(_ridge(self.coordinates, self.position))
+        return np.asarray(np.linalg.pinv(total, hermitian=True))
 
     @property
     def sigma(self) -> FloatArray:

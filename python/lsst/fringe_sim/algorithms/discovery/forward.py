@@ -167,6 +167,19 @@ class Forward:
         """The same with pixels that see their area (0), or so many places on each side; tables are kept."""
         return replace(self, places=places, _tables=dict(self._tables), _rows=dict(self._rows))
 
+    def with_scatter(self, scatter_um2: FloatArray | None) -> Forward:
+        """The same with thicknesses that scatter so much about the true ones; tables are kept."""
+        return replace(self, scatter_um2=scatter_um2, _tables=dict(self._tables), _rows=dict(self._rows))
+
+    def scatter_of(self, thickness_um: FloatArray, errors_um: FloatArray) -> FloatArray:
+        """Variance of a thickness that has such errors, ``(K, ny, nx)``, and what their slopes do to the cells [µm²].
+
+        Cells average the fringes over their slope, which has errors too.
+        """
+        plain = self._spread_of_pixels(self._gradient(thickness_um))[0]
+        spreads = [self._spread_of_pixels(self._gradient(thickness_um + error))[0] for error in errors_um]
+        return np.asarray((errors_um**2).mean(axis=0) + np.mean(spreads, axis=0) - plain)
+
     def table(self, settings: Settings) -> FloatArray:
         """Response ``(W, D)`` on the grid of thickness, relative to its mean, as flats are.
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from ..flat_prep_options import GAUSSIAN_MAD
 from .cells import CellData
 
-__all__ = ["NoiseEstimate", "estimate_noise", "map_variance_share"]
+__all__ = ["NoiseEstimate", "estimate_noise", "map_variance_share", "noise_ratio"]
 
 FloatArray = NDArray[np.float64]
 
@@ -21,6 +22,9 @@ STATED_UNCERTAINTY = 0.2
 """Relative uncertainty of a stated noise level that cannot be checked."""
 
 CLIP_SIGMA = 5.0
+
+MOST_TAKEN = 0.9
+"""Part of the variance of the noise that a thickness may take up and still be told from it."""
 
 LEAST_OTHERS = 2
 """Wavelengths besides one that tell errors of a thickness map from noise."""
@@ -46,6 +50,34 @@ class NoiseEstimate:
     response_scatter: float
     measured: bool
     neighbour_correlation: float
+
+    def with_taken(self, part: FloatArray | float) -> NoiseEstimate:
+        """The same of data whose fit has taken up a part of the variance of the noise."""
+        return replace(self, factor=self.factor / np.sqrt(1.0 - np.clip(part, 0.0, MOST_TAKEN)))
+
+
+def noise_ratio(cells: CellData, left: Iterable[FloatArray], noise: Iterable[FloatArray]) -> FloatArray:
+    """What second differences see of noise that a fit has left, over what they see of all of it.
+
+    Parameters
+    ----------
+    cells : `CellData`
+        Which cells have data.
+    left, noise : iterable of `numpy.ndarray`, shape ``(W, ny, nx)``
+        Draws of whitened noise after and before the fit.
+
+    Returns
+    -------
+    ratio : `numpy.ndarray`, shape ``(W,)``
+        Ratio of variances; 1 for wavelengths without data.
+    """
+    good = _all_of_nine(cells.weight > 0)
+
+    def variance(draws: Iterable[FloatArray]) -> FloatArray:
+        return np.asarray(sum((_second_difference(one) ** 2 * good).sum(axis=(1, 2)) for one in draws))
+
+    whole = variance(noise)
+    return np.divide(variance(left), whole, out=np.ones_like(whole), where=whole > 0.0)
 
 
 def estimate_noise(cells: CellData, residual: FloatArray) -> NoiseEstimate:

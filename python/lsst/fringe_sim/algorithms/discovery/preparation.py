@@ -20,7 +20,7 @@ from .comparison import chi2_with_free_fringes, fringe_order_um
 from .fit import Fit, Problem, fit_model, linearise_at
 from .forward import Exposures, Forward
 from .growth import grown_thickness
-from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share
+from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share, noise_ratio
 from .outliers import spoiled_cells
 from .start import mended_thickness, starting_thickness
 
@@ -72,11 +72,11 @@ FEW_SPOILED = 1e-5
 """How often spoiled cells are looked for, and the part of the data that need not be looked at again: each draws the
 thickness of its surroundings."""
 
+NOISE_DRAWS, LARGEST_ERROR = 24, 0.1
+"""Draws of noise from which the scatter of the thickness is found; the part of an order to which it is believed."""
+
 LARGEST_PRIOR, HELD_PRIOR = 1e8, 1e12
 """Precision of the best map, and of one that is not to move [1/µm²]: 0.1 nm and a thousandth of that."""
-
-MOST_TAKEN = 0.9
-"""Part of the variance of the noise that a thickness may take up and still be told from it."""
 
 NOISE_CHANGE = 0.02
 SCATTER_CHANGE = 0.05
@@ -477,12 +477,13 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
     """
     cells = problem.cells
     weight = cells.seen.astype(float)
+    forward = problem.forward.with_scatter(None)
     best: tuple[Problem, Fit] | None = None
     for spacing in (8.0, 4.0, 2.0, 0.0):
         basis: FieldBasis = SplineBasis.of_grid(start.shape, spacing) if spacing else CellBasis(start.shape)
         if spacing and basis.size > start.size:
             continue
-        trial = replace(problem, basis=basis, free_contrast=True)
+        trial = replace(problem, basis=basis, free_contrast=True, forward=forward)
         first = [start] if best is None else [best[0].basis.expand(best[1].field), start]
         fits = [
             fit_model(trial, (), np.zeros(0), field, None if best is None else best[1].levels, settings)
@@ -550,6 +551,8 @@ def _noise_of(problem: Problem, fit: Fit) -> float:
     """Mean of χ² that a value has from noise alone, as measured in what a fit leaves."""
     cells = problem.cells
     noise = estimate_noise(cells, _residual(problem, problem.expected_of(fit)))
+    if not problem.field_prior:
+        noise = noise.with_taken(_follow_noise(problem, fit).taken)
     used = (cells.weight > 0.0).sum(axis=(1, 2))
     response = noise.response_scatter**2 * cells.weight.sum(axis=(1, 2)) / np.maximum(used, 1)
     return float(np.average(noise.factor**2 + response, weights=used))
@@ -571,9 +574,17 @@ def _settle(
     even = stated.with_noise_of(expected)
     noise = estimate_noise(even, _residual(replace(problem, cells=even), expected))
     if noise.measured:
-        noise = replace(noise, factor=noise.factor / np.sqrt(1.0 - np.minimum(taken, MOST_TAKEN)))
-    cells = even.scaled_noise(noise.factor, noise.response_scatter)
-    problem = replace(problem, cells=cells, free_contrast=False, reference=expected)
+        noise = noise.with_taken(taken)
+    problem = replace(
+        problem, cells=even.scaled_noise(noise.factor, noise.response_scatter), reference=expected
+    )
+    if _is_rich(stated) and not problem.field_prior:
+        follows = _follow_noise(problem, fit)
+        if noise.measured:
+            noise = noise.with_taken(follows.taken)
+            problem = replace(problem, cells=even.scaled_noise(noise.factor, noise.response_scatter))
+        problem = replace(problem, forward=problem.forward.with_scatter(follows.scatter_um2))
+    problem = replace(problem, free_contrast=False)
     levels = fit.levels[: problem.n_levels]
     settled = fit_model(problem, (), np.zeros(0), fit.field, levels)
     notes = _part_told(stated)
@@ -582,6 +593,30 @@ def _settle(
     if not noise.measured:
         notes.append("noise level taken as stated: too few cells to measure it")
     return Prepared(problem, settled, noise, index, _is_rich(stated), stated, tuple(notes), fit.field)
+
+
+@dataclass(frozen=True, eq=False)
+class _Following:
+    """What a thickness that follows the noise does: its scatter [µm²], and the part of the noise that it takes up."""
+
+    scatter_um2: FloatArray
+    taken: FloatArray
+
+
+def _follow_noise(problem: Problem, fit: Fit) -> _Following:
+    """How far the thicknesses of a fit follow the noise, from draws of it.
+
+    Each lies where the noise has moved it along the fringe. What is left beside it is less than all of the noise, and
+    makes the fringes of all cells look stronger, by half the variance of their phases.
+    """
+    design, _, _, thickness, _ = linearise_at(problem, fit)
+    noise = np.random.default_rng(0).standard_normal((NOISE_DRAWS, *problem.cells.shape))
+    errors = design.field_errors(noise)
+    left = (each - design.slope * error for each, error in zip(noise, errors, strict=True))
+    taken = 1.0 - noise_ratio(problem.cells, left, noise)
+    order = problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm)))
+    errors = np.clip(errors, -LARGEST_ERROR * order, LARGEST_ERROR * order)
+    return _Following(problem.forward.scatter_of(thickness, errors), taken)
 
 
 def _without_spoiled(

@@ -29,6 +29,7 @@ from .fit import (
 from .following import ThicknessFollower
 from .orders import fields_in_other_orders, starts_in_other_orders
 from .spots import log_evidence_of_spots, spot_channel
+from .trends import FEWEST_DRAWS, trend_channel
 
 __all__ = ["Candidate", "Hypothesis", "Selector"]
 
@@ -207,7 +208,20 @@ class Selector:
         state, correlation = self.state(fit), self.problem.forward.noise_correlation(fit.settings)
         imprecision = IMPRECISION**2 * explained + self._undescribed
         channels = measure_channels(state, self.problem.cells.geometry, self.index, imprecision, correlation)
-        return (*channels, spot_channel(state, correlation))
+        return (*channels, spot_channel(state, correlation), *self._trends(fit))
+
+    def _trends(self, fit: Fit) -> list[Channel]:
+        """Tests that errors of single exposures, where a fit has them, are draws."""
+        channels = []
+        for name in dict.fromkeys(item.effect for item in fit.coordinates if item.exchangeable):
+            own = np.flatnonzero([item.effect == name and item.of_one_exposure for item in fit.coordinates])
+            if len(own) < FEWEST_DRAWS:
+                continue
+            effect = self.effects[name]
+            place = [effect.parameter(fit.coordinates[number].parameter).wavelength_nm for number in own]
+            covariance = fit.covariance[np.ix_(own, own)]
+            channels.append(trend_channel(effect.title, np.array(place), fit.position[own], covariance))
+        return channels
 
     def evidence_of_spots(self, hypothesis: Hypothesis) -> float:
         """Log evidence that a few spots, which no effect is, would bring beside a set."""
