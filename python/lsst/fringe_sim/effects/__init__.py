@@ -43,6 +43,7 @@ from .non_linearity import NonLinearity
 from .oh_bands import OHBands
 from .rotational_temperature import RotationalTemperature
 from .silicon_absorption import SiliconAbsorption
+from .silicon_gradient import SiliconGradient
 from .silicon_thickness import SiliconThickness
 from .sky_continuum import SkyContinuum
 from .support_coherence import SupportCoherence
@@ -103,6 +104,7 @@ EFFECTS: tuple[Effect, ...] = (
     GhostPedestal(),
     ContrastLoss(),
     # image, from the light to the file
+    SiliconGradient(),
     Illumination(),
     ChromaticIllumination(),
     Vignetting(),

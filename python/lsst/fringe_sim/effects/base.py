@@ -96,8 +96,8 @@ class ResponseContext:
 class Effect(ABC):
     """A physical effect with named parameters.
 
-    Subclasses are final. They override `change_system`, `change_response`, `change_image` or `change_sky`, or several
-    of them; each is only called when some parameter differs from its null value.
+    Subclasses are final. They override `change_system`, `change_response`, `change_image` (or `change_image_of`) or
+    `change_sky`, or several of them; each is only called when some parameter differs from its null value.
     """
 
     name: ClassVar[str]
@@ -136,6 +136,12 @@ class Effect(ABC):
         is added in electrons is a part of the level.
         """
         return image
+
+    def change_image_of(
+        self, system: OpticalSystem, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
+    ) -> FloatArray:
+        """Like `change_image`, for an effect that depends on the sensor; ``system`` is the one before any effect."""
+        return self.change_image(image, values, geometry)
 
     def dark_charge(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
         """Electrons of every sample that are not light, a part of the mean level; shape ``(W, 1, 1)``.
@@ -322,7 +328,7 @@ def apply_to_image(
     dark = {effect.name: effect.dark_charge(values, geometry) for effect, values in present}
     of_dark = [name for name, charge in dark.items() if charge.any()]
     for effect, values in present:
-        image = effect.change_image(image, values, geometry)
+        image = effect.change_image_of(system, image, values, geometry)
         if effect.name in of_dark[:1]:
             part = sum(dark[name] for name in of_dark) / geometry.require_levels(effect.name)
             image = (1.0 - part) * image + part
