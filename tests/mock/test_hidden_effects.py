@@ -8,7 +8,8 @@ import pytest
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.mock import HIDDEN_EFFECTS, HiddenEffect, e2v_321, setup_optics, validate_effects
-from lsst.fringe_sim.mock.hidden_effects import AMPLIFIER_NAMES, AmplifierState
+from lsst.fringe_sim.mock.hidden_effects import AMPLIFIER_NAMES, AmplifierState, added_silicon
+from lsst.fringe_sim.mock.sensor_signal import SensorSignal
 
 BY_NAME = {effect.name: effect for effect in HIDDEN_EFFECTS}
 STATE = AmplifierState("C03", 1.5, 6.0, 150_000.0)
@@ -28,6 +29,8 @@ def reach(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
         optics = setup_optics("ts8_e2v")[0]
         touched.append(effect.on_optics(optics, complete).flat_field([15.0, 15.1, 19.0], exposure_of(values)))
     light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
+    if effect.on_silicon is not None:
+        touched.append(effect.on_silicon((16, 24), complete))
     if effect.on_light is not None:
         touched.append(effect.on_light(light, 970.0, complete))
     if effect.on_charge is not None:
@@ -41,6 +44,7 @@ def untouched(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
     light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
     everything: list[tuple[object, object]] = [
         (effect.on_optics, setup_optics("ts8_e2v")[0].flat_field([15.0, 15.1, 19.0], exposure_of(values))),
+        (effect.on_silicon, np.zeros((16, 24))),
         (effect.on_light, light),
         (effect.on_charge, 20_000.0 * light),
         (effect.on_amplifier, STATE),
@@ -134,3 +138,20 @@ def test_diffusion_lowers_fringes_by_the_transform_of_its_gaussian(sigma: float)
     square = (np.pi * 14 / 60) ** 2 + (np.pi * 5 / 48) ** 2
     light = BY_NAME["charge_diffusion"].on_light(1.0 + 0.1 * fringes, 970.0, {"sigma": sigma})
     np.testing.assert_allclose(light, 1.0 + 0.1 * np.exp(-0.5 * sigma**2 * square) * fringes, atol=1e-12)
+
+
+def test_a_wedge_of_silicon_is_that_of_every_column() -> None:
+    optics = setup_optics("ts8_e2v")[0]
+    thickness = np.linspace(15.0, 15.4, 40)[:, np.newaxis] * np.ones(8)
+    wedge = BY_NAME["silicon_gradient"]
+    added = added_silicon(thickness.shape, [(wedge, {"gradient_x": 0.7})])
+    assert added is not None
+    signal = SensorSignal.of(optics, thickness, [900.0, 980.0], added)
+    assert added_silicon(thickness.shape, [(BY_NAME["bandwidth"], {"fwhm": 2.4})]) is None
+    nominal = optics.films[optics.position("detection")].thickness_um
+    for column in (0, 3, 7):
+        thicker = optics.with_film("detection", thickness_um=nominal + added[0, column])
+        alone = SensorSignal.of(thicker, thickness, [900.0, 980.0])
+        for row in (0, 1):
+            np.testing.assert_allclose(signal.flat(row)[:, column], alone.flat(row)[:, column], rtol=3e-4)
+    assert np.ptp(signal.flat(1)[0]) > 0.002 * signal.flat(1).mean()

@@ -23,7 +23,7 @@ from lsst.fringe_sim.products.challenge_result import CASE_KINDS
 from lsst.fringe_sim.products.fringe_cube import FringeCube
 
 SIZE = (48, 64)
-LATER = ("dark_current", "insulation")
+LATER = ("dark_current", "insulation", "silicon_gradient")
 """Effects that challenges drew not yet when the hidden cases of these tests were; they would change what is drawn."""
 MODEL = FringeModel.from_setup("ts8_e2v")
 

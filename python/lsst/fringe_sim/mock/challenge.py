@@ -28,10 +28,11 @@ from ..errors import UnknownNameError
 from ..products.challenge_result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
 from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
-from .hidden_effects import AmplifierState, HiddenEffect, validate_effects
+from .hidden_effects import AmplifierState, HiddenEffect, added_silicon, validate_effects
 from .raw_files import exposure_time
 from .raw_frames import setup_optics
-from .thickness import PixelArea, random_field
+from .sensor_signal import SensorSignal
+from .thickness import random_field
 
 __all__ = [
     "OUTSIDERS",
@@ -89,6 +90,10 @@ SIZES: Mapping[str, Draw] = MappingProxyType(
         "epoxy_dispersion": lambda r: {"epoxy_index.cauchy": _signed(r, -3.3, -2.0)},
         "epoxy_absorption": lambda r: {"epoxy_absorption.k": _decades(r, -5.0, -2.5)},
         "silicon_thickness": lambda r: {"silicon_thickness.offset": _signed(r, -0.5, 1.0)},
+        "silicon_gradient": lambda r: {
+            "silicon_gradient.gradient_x": _signed(r, -1.5, 0.3),
+            "silicon_gradient.gradient_y": _signed(r, -1.5, 0.3),
+        },
         "silicon_absorption": lambda r: {"silicon_absorption.scale": 1.0 + _signed(r, -2.3, -0.7)},
         "ar_coating": lambda r: {"ar_coating.scale": 1.0 + _signed(r, -1.7, -0.7)},
         "gate_oxide": lambda r: {"gate_oxide.offset": _signed(r, -2.6, -1.1)},
@@ -263,9 +268,8 @@ def _expose(
     wavelengths = np.arange(880.0, 991.0, 10.0)
     if rng.random() < 0.3:  # real runs lose exposures
         wavelengths = np.sort(rng.choice(wavelengths, size=10, replace=False))
-    area = PixelArea.of(thickness)
-    table = optics.table(area.range_um, tuple(wavelengths))
-    shape = thickness.shape
+    shape = (thickness.shape[0], thickness.shape[1])
+    signal = SensorSignal.of(optics, thickness, tuple(wavelengths), added_silicon(shape, active))
     response = 1.0 + float(rng.choice([0.0, 0.003, 0.006])) * rng.standard_normal(shape)
     states = _amplifiers(active, rng)
     gain, offset = (
@@ -276,7 +280,7 @@ def _expose(
     level = _decades(rng, 4.0, 4.7)
     images, variances = [], []
     for row, wavelength in enumerate(wavelengths):
-        light = area.average(partial(table.evaluate, row))
+        light = signal.flat(row)
         light = light / light.mean()
         for effect, own in active:
             if effect.on_light is not None:
@@ -292,7 +296,7 @@ def _expose(
         counts = (charge + offset + READ_NOISE_E * rng.standard_normal(shape)) / gain
         images.append(counts)
         variances.append((np.maximum(counts, 1.0) + READ_NOISE_E**2) / noise_factor)
-    mask = np.zeros((len(wavelengths), *shape), dtype=np.int32)
+    mask = np.zeros((len(wavelengths), *shape), dtype=np.int16)
     if rng.random() < 0.5:
         mask[:, rng.random(shape) < 0.005] = mask_bits("BAD")
         mask[:, :, rng.integers(shape[1])] = mask_bits("BAD")

@@ -8,7 +8,7 @@ units agree with the catalogue of the model where both know an effect; no code i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,14 @@ from ..errors import InputError, OutOfRangeError, UnknownNameError, to_number
 from ..resources import read_table
 from .optics import Film, FlatFieldOptics
 
-__all__ = ["HIDDEN_EFFECTS", "AmplifierState", "HiddenEffect", "HiddenParameter", "validate_effects"]
+__all__ = [
+    "HIDDEN_EFFECTS",
+    "AmplifierState",
+    "HiddenEffect",
+    "HiddenParameter",
+    "added_silicon",
+    "validate_effects",
+]
 
 FloatArray = NDArray[np.float64]
 Values = Mapping[str, float]
@@ -95,6 +102,8 @@ class HiddenEffect:
         Its numbers.
     on_optics : callable, optional
         ``(optics, values) -> optics``.
+    on_silicon : callable, optional
+        ``(shape, values) -> thickness [y, x]``, what is added to the detection layer [µm].
     on_light : callable, optional
         ``(light [y, x], wavelength [nm], values) -> light``; the light is relative to its mean over the sensor.
     on_charge : callable, optional
@@ -107,6 +116,7 @@ class HiddenEffect:
     title: str
     parameters: tuple[HiddenParameter, ...]
     on_optics: Callable[[FlatFieldOptics, Values], FlatFieldOptics] | None = None
+    on_silicon: Callable[[tuple[int, int], Values], FloatArray] | None = None
     on_light: Callable[[FloatArray, float, Values], FloatArray] | None = None
     on_charge: Callable[[FloatArray, Values], FloatArray] | None = None
     on_amplifier: Callable[[AmplifierState, Values, float], AmplifierState] | None = None
@@ -334,6 +344,23 @@ def _chromatic_illumination(light: FloatArray, wavelength_nm: float, values: Val
     return light * (1.0 + (wavelength_nm - COLOUR_PIVOT_NM) / COLOUR_REACH_NM * pattern)
 
 
+def _silicon_gradient(shape: tuple[int, int], values: Values) -> FloatArray:
+    v, u = _sensor_coordinates(shape)
+    return np.asarray(0.5 * (values["gradient_x"] * u + values["gradient_y"] * v))
+
+
+def added_silicon(
+    shape: tuple[int, int], active: Iterable[tuple[HiddenEffect, Mapping[str, float]]]
+) -> FloatArray | None:
+    """What effects add to the detection layer at every pixel [µm]; `None` if they leave it alone."""
+    parts = [
+        effect.on_silicon(shape, effect.complete(values))
+        for effect, values in active
+        if effect.on_silicon is not None
+    ]
+    return np.sum(parts, axis=0) if parts else None
+
+
 def _midline_step(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
     upper = np.arange(light.shape[0])[:, np.newaxis] >= light.shape[0] // 2
     return light * np.where(upper, 1.0 + values["fraction"], 1.0)
@@ -481,6 +508,15 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
         "silicon thickness",
         (HiddenParameter("offset", "um", 0.0, (-20.0, 20.0), "thickness minus that of the stack"),),
         on_optics=lambda optics, values: _thicker(optics, optics.detection, values["offset"]),
+    ),
+    HiddenEffect(
+        "silicon_gradient",
+        "silicon thicker on one side",
+        (
+            HiddenParameter("gradient_x", "um", 0.0, (-10.0, 10.0), "rise from the left to the right edge"),
+            HiddenParameter("gradient_y", "um", 0.0, (-10.0, 10.0), "rise from the lower to the upper edge"),
+        ),
+        on_silicon=_silicon_gradient,
     ),
     HiddenEffect(
         "silicon_absorption",

@@ -10,7 +10,6 @@ import datetime
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,11 @@ from numpy.typing import NDArray
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.camera import Amplifier, Camera, Detector
 from ..resources import list_resources, read_yaml
-from .hidden_effects import AmplifierState, HiddenEffect, validate_effects
-from .optics import Film, FlatFieldOptics, SignalTable
+from .hidden_effects import AmplifierState, HiddenEffect, added_silicon, validate_effects
+from .optics import Film, FlatFieldOptics
 from .raw_files import Clock, primary_header, write_frame
 from .readout import Readout
-from .thickness import PixelArea
+from .sensor_signal import SensorSignal
 
 __all__ = [
     "Defects",
@@ -112,8 +111,8 @@ class MockTruth:
         Hidden effects, ``{"name": {"parameter": value}}``.
     optics : `FlatFieldOptics`
         Sensor and light with the hidden effects.
-    table : `SignalTable`
-        Signal against thickness with its error.
+    signal : `SensorSignal`
+        Signal of every pixel, with its error.
     amplifiers : `tuple` [`AmplifierState`, ...]
         True gain, noise, full well and offset, in the order of the raw file.
     response : `numpy.ndarray` [y, x], float32
@@ -127,7 +126,7 @@ class MockTruth:
     thickness_um: FloatArray
     effects: dict[str, dict[str, float]]
     optics: FlatFieldOptics
-    table: SignalTable
+    signal: SensorSignal
     amplifiers: tuple[AmplifierState, ...]
     response: NDArray[np.float32]
     excess_e: NDArray[np.float32]
@@ -135,8 +134,7 @@ class MockTruth:
 
     def light(self, wavelength_nm: float) -> FloatArray:
         """Light that becomes charge, relative to its mean over the sensor: fringes and illumination, no defects."""
-        row = self.table.wavelengths_nm.index(float(wavelength_nm))
-        signal = PixelArea.of(self.thickness_um).average(partial(self.table.evaluate, row))
+        signal = self.signal.flat(self.signal.tables[0].wavelengths_nm.index(float(wavelength_nm)))
         light = signal / signal.mean()
         for effect, values in _active(self.effects):
             if effect.on_light is not None:
@@ -397,7 +395,7 @@ def _make_truth(
         thickness_um=thickness,
         effects={effect.name: dict(values) for effect, values in active},
         optics=optics,
-        table=optics.table(PixelArea.of(thickness).range_um, wavelengths),
+        signal=SensorSignal.of(optics, thickness, wavelengths, added_silicon(sensor.shape, active)),
         amplifiers=tuple(_amplifier_state(amp, active, amplifier_rng) for amp in sensor.amplifiers),
         response=response,
         excess_e=excess,

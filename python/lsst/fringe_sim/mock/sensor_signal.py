@@ -1,0 +1,85 @@
+"""Signal of every pixel of a sensor, whose detection layer may be a wedge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .optics import FlatFieldOptics, SignalTable
+from .thickness import PixelArea
+
+__all__ = ["SensorSignal"]
+
+FloatArray = NDArray[np.float64]
+
+SILICON_STEP_UM = 0.03
+"""Largest step from one detection layer to the next [µm], a quarter of the period of its own fringes."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorSignal:
+    """Signal of flats at every pixel.
+
+    Attributes
+    ----------
+    area : `PixelArea`
+        Thickness of the varying layer.
+    thicker_um : `numpy.ndarray` [y, x]
+        What is added to the detection layer [µm].
+    added_um : `numpy.ndarray`, shape ``(N,)``
+        The same for the N tables, increasing [µm].
+    tables : `tuple` [`SignalTable`, ...]
+        Signal against the thickness of the varying layer.
+    """
+
+    area: PixelArea
+    thicker_um: FloatArray
+    added_um: FloatArray
+    tables: tuple[SignalTable, ...]
+
+    @classmethod
+    def of(
+        cls,
+        optics: FlatFieldOptics,
+        thickness_um: FloatArray,
+        wavelengths_nm: Sequence[float],
+        thicker_um: FloatArray | None = None,
+    ) -> SensorSignal:
+        """Tabulate what the pixels need; ``thicker_um`` is added to the detection layer, by default nothing."""
+        area = PixelArea.of(thickness_um)
+        wedge = np.zeros(thickness_um.shape) if thicker_um is None else thicker_um
+        low, high = float(wedge.min()), float(wedge.max())
+        added = np.linspace(low, high, 1 + math.ceil((high - low) / SILICON_STEP_UM))
+        nominal = optics.films[optics.position(optics.detection)].thickness_um
+        tables = tuple(
+            optics.with_film(optics.detection, thickness_um=nominal + more).table(
+                area.range_um, tuple(wavelengths_nm)
+            )
+            for more in added
+        )
+        return cls(area, wedge, added, tables)
+
+    def flat(self, row: int) -> FloatArray:
+        """Signal of one flat, in a straight line between detection layers."""
+        if len(self.tables) == 1:
+            return self.area.average(partial(self.tables[0].evaluate, row))
+        place = (self.thicker_um - self.added_um[0]) / (self.added_um[1] - self.added_um[0])
+        signal = np.zeros(place.shape)
+        for number, table in enumerate(self.tables):
+            share = 1.0 - np.abs(place - number)
+            near = share > 0.0
+            if not near.any():
+                continue
+            part = PixelArea(self.area.thickness_um[near], self.area.slope_y[near], self.area.slope_x[near])
+            signal[near] += share[near] * part.average(partial(table.evaluate, row))
+        return signal
+
+    @property
+    def relative_error(self) -> float:
+        """Largest error of the tables."""
+        return max(table.relative_error for table in self.tables)
