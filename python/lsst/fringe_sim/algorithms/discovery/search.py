@@ -262,8 +262,9 @@ class _Search:
             self._may_judge_orders = False
             refined, mended = self._refined(whole, chosen)
             if refined is not None and (mended or refined.problem.forward.places != self._places):
+                # One effect alone, whose misfit may look like sharper pixels, does not judge them better once more.
                 self._take(refined)
-                return self.run(refinements=1)
+                return self.run(refinements=0)
         if len(chosen.names) == PAIR:
             chosen = self._enlarge(whole, training, chosen, steps, self.options.most_effects)
         chosen = self._finished(training, chosen, steps)
