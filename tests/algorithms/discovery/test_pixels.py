@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from lsst.fringe_sim.algorithms.discovery import discover
+from lsst.fringe_sim.algorithms.discovery import discover, preparation
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.effects import EFFECTS
@@ -82,3 +82,23 @@ def test_a_sensor_without_an_effect_is_taken_for_what_it_is(points: bool) -> Non
     verdict = discover(_cube(thickness, rng, points=points), "ts8_e2v", rng=rng)
     assert verdict.verdict == "no_discrepancy"
     assert any("taken as a point" in note for note in verdict.notes) == points
+
+
+@pytest.mark.parametrize(
+    ("places", "blur", "taken"),
+    [
+        (3, {"charge_diffusion.sigma": 0.0927}, False),
+        (2, {"brighter_fatter.variance": 0.07}, False),  # 0.021 px² behind 30 000 electrons
+        (3, {"charge_diffusion.sigma": 0.2}, True),
+        (2, {"charge_diffusion.sigma": 0.05}, True),
+        (0, {"charge_diffusion.sigma": 0.0927}, True),
+    ],
+)
+def test_places_beside_the_blur_that_they_lack_are_areas(places: int, blur: dict, taken: bool) -> None:
+    """Nine places in a pixel and 0.096 px of diffusion are an area: no effect, and not to be named as one."""
+    thickness = random_field((48, 48), np.random.default_rng(43), mean=15.0, span=1.5)
+    cells = bin_cube(_cube(thickness, np.random.default_rng(44), points=False), 1)
+    forward = Forward.of_cells(MODEL, EFFECTS, cells, (14.0, 16.0)).with_places(places)
+    settings = {"epoxy_index.cauchy": -0.005, **blur}
+    kept = preparation._without_rest_of_area(settings, forward)
+    assert kept == (settings if taken else {"epoxy_index.cauchy": -0.005})

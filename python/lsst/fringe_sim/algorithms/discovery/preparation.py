@@ -53,6 +53,12 @@ deviations]."""
 PIXEL_RMS = 1.0 / math.sqrt(12.0)
 """Rms radius of a pixel's area along one axis [px]."""
 
+SAME_AREA = 0.5
+"""Part by which the variance of a blur may differ from what few places lack of an area, to be taken for it."""
+
+BLURS, FULL_PIXEL_E = ("charge_diffusion", "brighter_fatter"), 1e5
+"""Effects that blur the light, and the charge behind which the second is stated [electrons]."""
+
 FEWEST_ROWS = 6
 """Rows and columns of cells from which on noise and levels can be measured."""
 
@@ -326,7 +332,8 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     start, settings = _mended(problem, fit, thickness_um)
     half_order = 0.5 * fringe_order_um(problem.cells.wavelength_nm, float(prepared.index.mean()))
     mended = int(np.count_nonzero(np.abs(start - thickness_um) > half_order))
-    chosen = _choose_pixels(*_choose_field(problem, start, settings), settings)
+    seen, fitted = _choose_field(problem, start, settings)
+    chosen = _choose_pixels(seen, fitted, _without_rest_of_area(settings, problem.forward))
     refined = _settle(*chosen, prepared.stated, prepared.index)
     refined = replace(refined, null=_better_null(refined, prepared), guess=settings)
     change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
@@ -561,6 +568,19 @@ def _noise_of(problem: Problem, fit: Fit) -> float:
 def _is_blurred(settings: Mapping[str, float]) -> bool:
     """Whether effects blur the light by at least as much as the area of a pixel does."""
     return settings.get("charge_diffusion.sigma", 0.0) >= PIXEL_RMS
+
+
+def _without_rest_of_area(settings: Mapping[str, float], forward: Forward) -> Mapping[str, float]:
+    """Effects without a blur that is what a few places in a pixel lack of its area: that is no effect."""
+    if not forward.places:
+        return settings
+    missing = (PIXEL_RMS / forward.places) ** 2
+    level = float(forward.geometry.level_e.mean())
+    variance = settings.get("charge_diffusion.sigma", 0.0) ** 2
+    variance += settings.get("brighter_fatter.variance", 0.0) * level / FULL_PIXEL_E
+    if abs(variance - missing) > SAME_AREA * missing:
+        return settings
+    return {key: value for key, value in settings.items() if key.partition(".")[0] not in BLURS}
 
 
 def _settle(
