@@ -112,7 +112,7 @@ class MockTruth:
     optics : `FlatFieldOptics`
         Sensor and light with the hidden effects.
     signal : `SensorSignal`
-        Signal of every pixel, with its error.
+        Signal of every pixel.
     amplifiers : `tuple` [`AmplifierState`, ...]
         True gain, noise, full well and offset, in the order of the raw file.
     response : `numpy.ndarray` [y, x], float32

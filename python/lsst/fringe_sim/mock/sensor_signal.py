@@ -78,8 +78,3 @@ class SensorSignal:
             part = PixelArea(self.area.thickness_um[near], self.area.slope_y[near], self.area.slope_x[near])
             signal[near] += share[near] * part.average(partial(table.evaluate, row))
         return signal
-
-    @property
-    def relative_error(self) -> float:
-        """Largest error of the tables."""
-        return max(table.relative_error for table in self.tables)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from ...effects import Effect
+from ...effects.brighter_fatter import FULL_PIXEL_E
 from ...errors import InputError
 from ...model import FringeModel
 from ...products.fringe_cube import FringeCube
@@ -56,8 +57,8 @@ PIXEL_RMS = 1.0 / math.sqrt(12.0)
 SAME_AREA = 0.5
 """Part by which the variance of a blur may differ from what few places lack of an area, to be taken for it."""
 
-BLURS, FULL_PIXEL_E = ("charge_diffusion", "brighter_fatter"), 1e5
-"""Effects that blur the light, and the charge behind which the second is stated [electrons]."""
+BLURS = ("charge_diffusion", "brighter_fatter")
+"""Effects that blur the light."""
 
 FEWEST_ROWS = 6
 """Rows and columns of cells from which on noise and levels can be measured."""
