@@ -8,7 +8,13 @@ import pytest
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.mock import HIDDEN_EFFECTS, HiddenEffect, e2v_321, setup_optics, validate_effects
-from lsst.fringe_sim.mock.hidden_effects import AMPLIFIER_NAMES, AmplifierState, added_silicon
+from lsst.fringe_sim.mock.hidden_effects import (
+    AMPLIFIER_NAMES,
+    AmplifierState,
+    added_silicon,
+    hidden_islands,
+    with_hidden_optics,
+)
 from lsst.fringe_sim.mock.sensor_signal import SensorSignal
 
 BY_NAME = {effect.name: effect for effect in HIDDEN_EFFECTS}
@@ -29,6 +35,8 @@ def reach(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
         optics = setup_optics("ts8_e2v")[0]
         touched.append(effect.on_optics(optics, complete).flat_field([15.0, 15.1, 19.0], exposure_of(values)))
     light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
+    if effect.on_island is not None:
+        touched.append(effect.on_island((16, 24), complete))
     if effect.on_silicon is not None:
         touched.append(effect.on_silicon((16, 24), complete))
     if effect.on_light is not None:
@@ -44,6 +52,7 @@ def untouched(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
     light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
     everything: list[tuple[object, object]] = [
         (effect.on_optics, setup_optics("ts8_e2v")[0].flat_field([15.0, 15.1, 19.0], exposure_of(values))),
+        (effect.on_island, effect.on_island and effect.on_island((16, 24), effect.complete({}))),
         (effect.on_silicon, np.zeros((16, 24))),
         (effect.on_light, light),
         (effect.on_charge, 20_000.0 * light),
@@ -82,9 +91,8 @@ def test_every_parameter_does_something(name: str, parameter: str) -> None:
     value = 0.3 * high if np.isnan(null) or null == 0.0 else null + 0.3 * (high - null)
     if name == "temperature":
         value = 210.0
-    others = (
-        {"cosine": 0.02} if name == "tree_rings" and parameter != "cosine" else {}
-    )  # rings must have a size
+    size = {"tree_rings": ("cosine", 0.02), "void": ("thickness", 100.0)}.get(name)
+    others = {size[0]: size[1]} if size and parameter != size[0] else {}  # at a place there must be something
     changed = reach(effect, {**others, parameter: value})
     before = reach(effect, others) if others else untouched(effect, {parameter: value})
     assert not all(same(left, right) for left, right in zip(changed, before, strict=True))
@@ -155,3 +163,24 @@ def test_a_wedge_of_silicon_is_that_of_every_column() -> None:
         for row in (0, 1):
             np.testing.assert_allclose(signal.flat(row)[:, column], alone.flat(row)[:, column], rtol=3e-4)
     assert np.ptp(signal.flat(1)[0]) > 0.002 * signal.flat(1).mean()
+
+
+def test_an_island_sees_its_own_optics() -> None:
+    optics, _ = setup_optics("ts8_e2v")
+    thickness = np.linspace(15.0, 15.4, 20)[:, np.newaxis] * np.ones(30)
+    values = {"thickness": 120.0, "centre_x": 12.0, "centre_y": 9.0, "radius": 5.0}
+    active = [(BY_NAME["void"], values)]
+    assert with_hidden_optics(optics, active) is optics
+    islands = hidden_islands(optics, thickness.shape, active)
+    ((part, inside),) = islands
+    assert part.sum() == pytest.approx(np.pi * 25.0, rel=0.01)
+    mixed, outside, gap = (
+        SensorSignal.of(*stack).flat(0)
+        for stack in (
+            (optics, thickness, [960.0], None, islands),
+            (optics, thickness, [960.0]),
+            (inside, thickness, [960.0]),
+        )
+    )
+    np.testing.assert_allclose(mixed, outside + part * (gap - outside), rtol=1e-12)
+    assert np.abs(gap - outside).max() > 0.01 * outside.mean()

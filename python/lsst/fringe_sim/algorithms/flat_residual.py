@@ -90,12 +90,17 @@ def flat_residual(
         raise InputError("known pixels of the thickness map", 0, "one or more")
     filled = np.where(known, thickness, thickness[known].mean())
     wavelength = np.asarray(cube.wavelength_nm, dtype=float)
-    table = model.table((float(filled.min()), float(filled.max()) + 1e-6), wavelength)
-    image: NDArray[np.floating] = np.stack([table.frame(filled, row) for row in range(len(wavelength))])
+    span = float(filled.min()), float(filled.max()) + 1e-6
+
+    def flats(own: FringeModel) -> NDArray[np.floating]:
+        table = own.table(span, wavelength)
+        return np.stack([table.frame(filled, row) for row in range(len(wavelength))])
+
+    shape = (filled.shape[0], filled.shape[1])
+    geometry = ImageGeometry.of_pixels(shape, wavelength, cube.level_e, cube.exposures.dark_time_s)
+    image = model.with_islands(flats, geometry)
     if any(active.effect.acts_on == "image" for active in model.effects):
         level = image.mean(axis=(1, 2), keepdims=True, dtype=float)
-        shape = (filled.shape[0], filled.shape[1])
-        geometry = ImageGeometry.of_pixels(shape, wavelength, cube.level_e, cube.exposures.dark_time_s)
         image = apply_to_image(model.effects, model.base_system, image / level, geometry)
     residual = np.full(cube.shape, np.nan, dtype=np.float32)
     for plane, modelled in enumerate(image):

@@ -22,6 +22,7 @@ from ..instrument.camera import Camera
 from ..instrument.night import AirglowField
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel, Setup
+from .island_response import response_with_islands
 from .sky_frame import sky_response
 from .thickness_stand_in import ThicknessField
 
@@ -174,10 +175,9 @@ class CCDFringing:
     @functools.cached_property
     def _pattern(self) -> FloatArray:
         low, high = float(self.thickness_um.min()), float(self.thickness_um.max())
-        response = sky_response(
-            self._model,
-            SkySpectrum.dark(airmass=self.airmass),
-            thickness_range_um=(low - 1e-6, high + 1e-6),
+        dark, span = SkySpectrum.dark(airmass=self.airmass), (low - 1e-6, high + 1e-6)
+        response = response_with_islands(
+            self._model, lambda own: sky_response(own, dark, thickness_range_um=span)
         )
         level = self.fringe_variation_level()
         table = response.sky(dict.fromkeys(response.bands, level))

@@ -26,6 +26,7 @@ from ..optics.phase_response import PhaseResponse
 from ..products import SkyFringe, mask_bits
 from .fringe_amplitudes import fringe_amplitudes
 from .image_noise import add_exposure_noise
+from .island_response import response_with_islands
 from .photon_migration import spread_charge
 
 __all__ = [
@@ -315,7 +316,8 @@ def simulate_sky_frame(
         Lines and continua; by default a dark sky at the airmass of the set-up.
     response : `SkyResponse` or `SensorResponse`, optional
         Result of `sky_response` (one beam for all pixels) or `sensor_response` (the beam of every pixel) for this
-        model and sky, so that many frames share it. By default one beam, that of the model.
+        model and sky, or of `response_with_islands` where an effect is local, so that many frames share it. By
+        default one beam, that of the model.
     scale : mapping, optional
         Factors on components of the sky: OH bands and continua by name.
     exposure_s : `float`, optional
@@ -358,7 +360,8 @@ def simulate_sky_frame(
         raise OutOfRangeError("exposure time [s]", exposure, "positive")
     if response is None:
         dark = SkySpectrum.dark(airmass=model.setup.airmass) if sky is None else sky
-        response = sky_response(model, dark, thickness_range_um=_range_of(thickness[known]))
+        span = _range_of(thickness[known])
+        response = response_with_islands(model, lambda own: sky_response(own, dark, thickness_range_um=span))
 
     level = response.sky(scale)
     setup = model.setup

@@ -8,6 +8,7 @@ from typing import Any
 import click
 import numpy as np
 
+from ..algorithms.island_response import response_with_islands
 from ..algorithms.sky_frame import (
     simulate_night,
     simulate_sky_frame,
@@ -118,9 +119,8 @@ def sky(
     known = layer[np.isfinite(layer)]
     dark = SkySpectrum.dark(airmass=airmass or setup.airmass)
     click.echo("tabulating the response to the sky", err=True)
-    response = sky_response(
-        model, dark, thickness_range_um=(float(known.min()) - 1e-6, float(known.max()) + 1e-6)
-    )
+    span = float(known.min()) - 1e-6, float(known.max()) + 1e-6
+    response = response_with_islands(model, lambda own: sky_response(own, dark, thickness_range_um=span))
     read_noise = sensor.read_noise if noise else 0.0
     common: dict[str, Any] = {
         "read_noise_e": read_noise,

@@ -53,6 +53,7 @@ from .thickness_spread import ThicknessSpread
 from .tilt import Tilt
 from .tree_rings import TreeRings
 from .vignetting import Vignetting
+from .void import Void
 from .water_vapour import WaterVapour
 from .wavelength_jitter import WavelengthJitter
 from .wavelength_offset import WavelengthOffset
@@ -90,6 +91,7 @@ EFFECTS: tuple[Effect, ...] = (
     GateThickness(),
     Insulation(),
     BlackCoating(),
+    Void(),
     # illumination
     Bandwidth(),
     LineWing(),

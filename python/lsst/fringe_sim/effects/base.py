@@ -104,6 +104,8 @@ class Effect(ABC):
     title: ClassVar[str]
     acts_on: ClassVar[str]
     """``stack``, ``illumination``, ``response``, ``image`` or ``spectrum`` (of the night sky)."""
+    local: ClassVar[bool] = False
+    """Whether it changes the stack in a part of the sensor only, that of `coverage`."""
     laboratory_only: ClassVar[bool] = False
     """Whether it belongs to lamp, bench or cryostat, which a sensor does not take along to the telescope."""
     couples_pixels: ClassVar[bool] = False
@@ -120,6 +122,10 @@ class Effect(ABC):
     def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
         """Return the optical system with the effect in it."""
         return system
+
+    def coverage(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
+        """Part of every sample that has the effect, if it is local; shape ``(ny, nx)``."""
+        return np.ones(geometry.sample_shape)
 
     def change_response(
         self, response: FloatArray, values: Mapping[str, float], context: ResponseContext
@@ -242,8 +248,11 @@ class ActiveEffect:
         return {**self.effect.null_values(system), **self.values}
 
     def is_null(self, system: OpticalSystem) -> bool:
-        """Whether every value equals its null."""
-        return self.complete_values(system) == self.effect.null_values(system)
+        """Whether every value equals its null, but those that only say where the effect would be."""
+        nulls, places = self.effect.null_values(system), {p.name for p in self.effect.parameters if p.place}
+        return all(
+            value == nulls[name] for name, value in self.complete_values(system).items() if name not in places
+        )
 
 
 def activate_effects(settings: Mapping[str, Any], effects: Sequence[Effect]) -> tuple[ActiveEffect, ...]:
@@ -278,10 +287,10 @@ def activate_effects(settings: Mapping[str, Any], effects: Sequence[Effect]) -> 
 
 
 def apply_to_system(active: Iterable[ActiveEffect], system: OpticalSystem) -> OpticalSystem:
-    """Optical system with all effects in it."""
+    """Optical system with all effects in it, but those that are local."""
     changed = system
     for item in active:
-        if not item.is_null(system):
+        if not item.effect.local and not item.is_null(system):
             changed = item.effect.change_system(changed, item.complete_values(system))
     return changed
 

@@ -28,7 +28,14 @@ from ..errors import UnknownNameError
 from ..products.challenge_result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
 from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
-from .hidden_effects import AmplifierState, HiddenEffect, added_silicon, validate_effects
+from .hidden_effects import (
+    AmplifierState,
+    HiddenEffect,
+    added_silicon,
+    hidden_islands,
+    validate_effects,
+    with_hidden_optics,
+)
 from .raw_files import exposure_time
 from .raw_frames import setup_optics
 from .sensor_signal import SensorSignal
@@ -77,6 +84,16 @@ def _rings(rng: np.random.Generator, size: float) -> dict[str, float]:
     }
 
 
+def _island(rng: np.random.Generator, gap_nm: float) -> dict[str, float]:
+    """An island that lies on a small sensor with most of its area."""
+    return {
+        "void.thickness": gap_nm,
+        "void.centre_x": float(rng.uniform(10.0, 86.0)),
+        "void.centre_y": float(rng.uniform(10.0, 86.0)),
+        "void.radius": float(rng.uniform(5.0, 20.0)),
+    }
+
+
 SIZES: Mapping[str, Draw] = MappingProxyType(
     {
         "bandwidth": lambda r: {"bandwidth.fwhm": STATED_FWHM_NM + _signed(r, -1.3, 0.0) * 0.9},
@@ -101,6 +118,7 @@ SIZES: Mapping[str, Draw] = MappingProxyType(
         "gate_thickness": lambda r: {"gate_thickness.offset": _signed(r, -2.3, -0.8)},
         "black_coating": lambda r: {"black_coating.thickness": _decades(r, -2.0, 0.3)},
         "air_gap": lambda r: {"air_gap.thickness": _decades(r, 0.3, 2.7)},
+        "void": lambda r: _island(r, _decades(r, 1.0, 2.7)),
         "line_wing": lambda r: {"line_wing.fraction": _decades(r, -2.3, -0.3)},
         "line_triangle": lambda r: {"line_triangle.fraction": float(r.uniform(0.1, 1.0))},
         "lamp_lines": lambda r: {"lamp_lines.strength": _decades(r, -1.0, 1.0)},
@@ -262,14 +280,18 @@ def _expose(
 ) -> tuple[FringeCube, dict[str, float]]:
     optics, _ = setup_optics("ts8_e2v")
     active = validate_effects(values)
-    for effect, own in active:
-        if effect.on_optics is not None:
-            optics = effect.on_optics(optics, effect.complete(own))
+    optics = with_hidden_optics(optics, active)
     wavelengths = np.arange(880.0, 991.0, 10.0)
     if rng.random() < 0.3:  # real runs lose exposures
         wavelengths = np.sort(rng.choice(wavelengths, size=10, replace=False))
     shape = (thickness.shape[0], thickness.shape[1])
-    signal = SensorSignal.of(optics, thickness, tuple(wavelengths), added_silicon(shape, active))
+    signal = SensorSignal.of(
+        optics,
+        thickness,
+        tuple(wavelengths),
+        added_silicon(shape, active),
+        hidden_islands(optics, shape, active),
+    )
     response = 1.0 + float(rng.choice([0.0, 0.003, 0.006])) * rng.standard_normal(shape)
     states = _amplifiers(active, rng)
     gain, offset = (

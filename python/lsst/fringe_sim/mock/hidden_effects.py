@@ -26,7 +26,9 @@ __all__ = [
     "HiddenEffect",
     "HiddenParameter",
     "added_silicon",
+    "hidden_islands",
     "validate_effects",
+    "with_hidden_optics",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -102,6 +104,8 @@ class HiddenEffect:
         Its numbers.
     on_optics : callable, optional
         ``(optics, values) -> optics``.
+    on_island : callable, optional
+        ``(shape, values) -> part [y, x]`` of every pixel that sees what `on_optics` makes; by default all do.
     on_silicon : callable, optional
         ``(shape, values) -> thickness [y, x]``, what is added to the detection layer [µm].
     on_light : callable, optional
@@ -116,6 +120,7 @@ class HiddenEffect:
     title: str
     parameters: tuple[HiddenParameter, ...]
     on_optics: Callable[[FlatFieldOptics, Values], FlatFieldOptics] | None = None
+    on_island: Callable[[tuple[int, int], Values], FloatArray] | None = None
     on_silicon: Callable[[tuple[int, int], Values], FloatArray] | None = None
     on_light: Callable[[FloatArray, float, Values], FloatArray] | None = None
     on_charge: Callable[[FloatArray, Values], FloatArray] | None = None
@@ -138,6 +143,10 @@ class HiddenEffect:
     def complete(self, values: Values) -> dict[str, float]:
         """Values of all parameters, null where none is given."""
         return {p.name: values.get(p.name, p.null) for p in self.parameters}
+
+
+_Active = tuple[HiddenEffect, Mapping[str, float]]
+"""An effect and the values given for it."""
 
 
 def validate_effects(
@@ -349,9 +358,39 @@ def _silicon_gradient(shape: tuple[int, int], values: Values) -> FloatArray:
     return np.asarray(0.5 * (values["gradient_x"] * u + values["gradient_y"] * v))
 
 
-def added_silicon(
-    shape: tuple[int, int], active: Iterable[tuple[HiddenEffect, Mapping[str, float]]]
-) -> FloatArray | None:
+def with_hidden_optics(optics: FlatFieldOptics, active: Iterable[_Active]) -> FlatFieldOptics:
+    """Optics with all effects in them that all of the sensor has."""
+    for effect, values in active:
+        if effect.on_optics is not None and effect.on_island is None:
+            optics = effect.on_optics(optics, effect.complete(values))
+    return optics
+
+
+def hidden_islands(
+    optics: FlatFieldOptics, shape: tuple[int, int], active: Iterable[_Active]
+) -> list[tuple[FloatArray, FlatFieldOptics]]:
+    """Part of every pixel that sees other optics than the rest of the sensor, and these optics."""
+    return [
+        (effect.on_island(shape, effect.complete(values)), effect.on_optics(optics, effect.complete(values)))
+        for effect, values in active
+        if effect.on_island is not None and effect.on_optics is not None
+    ]
+
+
+def _disc(shape: tuple[int, int], values: Values) -> FloatArray:
+    """Part of every pixel inside a circle, by 64 × 64 points in each that the circle may cross."""
+    y, x = (np.arange(size, dtype=float) for size in shape)
+    away = np.hypot(y[:, np.newaxis] - values["centre_y"], x[np.newaxis, :] - values["centre_x"])
+    part = (away < values["radius"]).astype(float)
+    point = (np.arange(64) + 0.5) / 64.0 - 0.5
+    for row, column in zip(*np.nonzero(np.abs(away - values["radius"]) < 1.0), strict=True):
+        up = (y[row] + point - values["centre_y"])[:, np.newaxis]
+        along = (x[column] + point - values["centre_x"])[np.newaxis, :]
+        part[row, column] = np.mean(np.hypot(up, along) < values["radius"])
+    return part
+
+
+def added_silicon(shape: tuple[int, int], active: Iterable[_Active]) -> FloatArray | None:
     """What effects add to the detection layer at every pixel [µm]; `None` if they leave it alone."""
     parts = [
         effect.on_silicon(shape, effect.complete(values))
@@ -565,6 +604,18 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
         "gap between adhesive and support",
         (HiddenParameter("thickness", "nm", 0.0, (0.0, 2000.0), "thickness of the gap"),),
         on_optics=_air_gap,
+    ),
+    HiddenEffect(
+        "void",
+        "island on which the adhesive has come off",
+        (
+            HiddenParameter("thickness", "nm", 0.0, (0.0, 2000.0), "thickness of the gap"),
+            HiddenParameter("centre_x", "px", 0.0, (-100.0, 4200.0), "column of its middle"),
+            HiddenParameter("centre_y", "px", 0.0, (-100.0, 4200.0), "row of its middle"),
+            HiddenParameter("radius", "px", 10.0, (1.0, 2000.0), "its radius"),
+        ),
+        on_optics=_air_gap,
+        on_island=_disc,
     ),
     HiddenEffect(
         "support_coherence",

@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.camera import Amplifier, Camera, Detector
 from ..resources import list_resources, read_yaml
-from .hidden_effects import AmplifierState, HiddenEffect, added_silicon, validate_effects
+from .hidden_effects import (
+    AmplifierState,
+    HiddenEffect,
+    added_silicon,
+    hidden_islands,
+    validate_effects,
+    with_hidden_optics,
+)
 from .optics import Film, FlatFieldOptics
 from .raw_files import Clock, primary_header, write_frame
 from .readout import Readout
@@ -387,15 +394,19 @@ def _make_truth(
     sensor_rng: np.random.Generator,
     amplifier_rng: np.random.Generator,
 ) -> MockTruth:
-    for effect, values in active:
-        if effect.on_optics is not None:
-            optics = effect.on_optics(optics, effect.complete(values))
+    optics = with_hidden_optics(optics, active)
     response, excess, defective = _make_defects(sensor, defects, sensor_rng)
     return MockTruth(
         thickness_um=thickness,
         effects={effect.name: dict(values) for effect, values in active},
         optics=optics,
-        signal=SensorSignal.of(optics, thickness, wavelengths, added_silicon(sensor.shape, active)),
+        signal=SensorSignal.of(
+            optics,
+            thickness,
+            wavelengths,
+            added_silicon(sensor.shape, active),
+            hidden_islands(optics, sensor.shape, active),
+        ),
         amplifiers=tuple(_amplifier_state(amp, active, amplifier_rng) for amp in sensor.amplifiers),
         response=response,
         excess_e=excess,

@@ -35,12 +35,15 @@ class SensorSignal:
         The same for the N tables, increasing [µm].
     tables : `tuple` [`SignalTable`, ...]
         Signal against the thickness of the varying layer.
+    islands : `tuple`
+        Part of every pixel [y, x] that sees other optics, and the signal of a sensor that has them everywhere.
     """
 
     area: PixelArea
     thicker_um: FloatArray
     added_um: FloatArray
     tables: tuple[SignalTable, ...]
+    islands: tuple[tuple[FloatArray, SensorSignal], ...] = ()
 
     @classmethod
     def of(
@@ -49,8 +52,13 @@ class SensorSignal:
         thickness_um: FloatArray,
         wavelengths_nm: Sequence[float],
         thicker_um: FloatArray | None = None,
+        islands: Sequence[tuple[FloatArray, FlatFieldOptics]] = (),
     ) -> SensorSignal:
-        """Tabulate what the pixels need; ``thicker_um`` is added to the detection layer, by default nothing."""
+        """Tabulate what the pixels need.
+
+        ``thicker_um`` is added to the detection layer, by default nothing; ``islands`` are parts of the pixels that
+        see other optics.
+        """
         area = PixelArea.of(thickness_um)
         wedge = np.zeros(thickness_um.shape) if thicker_um is None else thicker_um
         low, high = float(wedge.min()), float(wedge.max())
@@ -62,10 +70,20 @@ class SensorSignal:
             )
             for more in added
         )
-        return cls(area, wedge, added, tables)
+        others = tuple(
+            (part, cls.of(inside, thickness_um, wavelengths_nm, thicker_um)) for part, inside in islands
+        )
+        return cls(area, wedge, added, tables, others)
 
     def flat(self, row: int) -> FloatArray:
-        """Signal of one flat, in a straight line between detection layers."""
+        """Signal of one flat."""
+        signal = self._of_all(row)
+        for part, inside in self.islands:
+            signal = signal + part * (inside.flat(row) - signal)
+        return signal
+
+    def _of_all(self, row: int) -> FloatArray:
+        """Signal outside islands, in a straight line between detection layers."""
         if len(self.tables) == 1:
             return self.area.average(partial(self.tables[0].evaluate, row))
         place = (self.thicker_um - self.added_um[0]) / (self.added_um[1] - self.added_um[0])

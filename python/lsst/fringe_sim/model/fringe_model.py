@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -113,8 +113,46 @@ class FringeModel:
             for parameter, value in item.values.items()
         }
 
+    @property
+    def islands(self) -> tuple[tuple[ActiveEffect, FringeModel], ...]:
+        """Effects that are local, each with the model of where it is; this model is that of all other places."""
+        present = [item for item in self.effects if item.effect.local and not item.is_null(self.base_system)]
+        everywhere = tuple(item for item in self.effects if not item.effect.local)
+        return tuple(
+            (
+                item,
+                replace(
+                    self,
+                    base_system=item.effect.change_system(
+                        self.base_system, item.complete_values(self.base_system)
+                    ),
+                    effects=everywhere,
+                ),
+            )
+            for item in present
+        )
+
+    def with_islands(
+        self, evaluate: Callable[[FringeModel], NDArray[Any]], geometry: ImageGeometry
+    ) -> NDArray[Any]:
+        """Images of a sensor with its local effects where they are.
+
+        Parameters
+        ----------
+        evaluate : callable
+            ``(model) -> image``, shape ``(..., ny, nx)``: what it would be if all of the sensor were like ``model``.
+        geometry : `ImageGeometry`
+            Where the samples lie.
+        """
+        image = evaluate(self)
+        for item, inside in self.islands:
+            part = item.effect.coverage(item.complete_values(self.base_system), geometry).astype(image.dtype)
+            if part.any():
+                image = image + part * (evaluate(inside) - image)
+        return image
+
     def response(self, thickness_um: ArrayLike, wavelength_nm: ArrayLike) -> FloatArray:
-        """Response to monochromator flats.
+        """Response to monochromator flats, outside local effects.
 
         Parameters
         ----------
@@ -159,8 +197,8 @@ class FringeModel:
         thickness = np.asarray(thickness_um, dtype=float)
         if thickness.shape != geometry.sample_shape:
             raise InputError("shape of the thickness map", thickness.shape, f"{geometry.sample_shape}")
-        image = self.response(thickness, geometry.wavelength_nm)
-        image /= image.mean(axis=(1, 2), keepdims=True)
+        image = self.with_islands(lambda model: model.response(thickness, geometry.wavelength_nm), geometry)
+        image = image / image.mean(axis=(1, 2), keepdims=True)
         return apply_to_image(self.effects, self.base_system, image, geometry)
 
     def respond(

@@ -14,6 +14,7 @@ from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField
 from lsst.pipe.base.connectionTypes import Input
 
 from ..algorithms.field_response import SensorPlacement, sensor_response
+from ..algorithms.island_response import response_with_islands
 from ..algorithms.sky_frame import Response, sky_response
 from ..algorithms.thickness_stand_in import stand_in_thickness
 from ..errors import InputError
@@ -92,9 +93,13 @@ class SkyModel:
 def _response(sky_model: SkyModel) -> tuple[FringeModel, SkySpectrum, Response]:
     model, sky = sky_model.fringe_model(), sky_model.spectrum()
     span = sky_model.thickness_range_um
-    if sky_model.beams == "centre":
-        return model, sky, sky_response(model, sky, thickness_range_um=span)
-    return model, sky, sensor_response(model, sky, sky_model.placement, span)
+
+    def respond(own: FringeModel) -> Response:
+        if sky_model.beams == "centre":
+            return sky_response(own, sky, thickness_range_um=span)
+        return sensor_response(own, sky, sky_model.placement, span)
+
+    return model, sky, response_with_islands(model, respond)
 
 
 class SkyModelConfig(FringeModelConfig):

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
+from ...effects import ActiveEffect, Effect, ImageGeometry, activate_effects, apply_to_image
 from ...model import FringeModel
 from ...optics.illumination import Illumination
 from .cells import CellData
@@ -124,7 +124,9 @@ class Forward:
     exposures: Exposures | None = None
     scatter_um2: FloatArray | None = None
     places: int = 0
-    _tables: dict[tuple[tuple[str, float], ...], FloatArray] = field(default_factory=dict, repr=False)
+    _tables: dict[tuple[tuple[str, float], ...], tuple[FloatArray, FloatArray]] = field(
+        default_factory=dict, repr=False
+    )
     _rows: dict[tuple[int, float], FloatArray] = field(default_factory=dict, repr=False)
     _rows_of: tuple[tuple[str, float], ...] | None = field(default=None, repr=False)
     place_weight: FloatArray | None = field(init=False, repr=False, default=None)
@@ -184,29 +186,73 @@ class Forward:
         """Response ``(W, D)`` on the grid of thickness, relative to its mean, as flats are.
 
         Light that changes over the field has such rows for each of its places, ``(K * W, D)``.
-        Effects on the image are parts of that mean, whatever effects on the response make of it.
+        Effects on the image are parts of that mean, whatever effects on the response make of it. Local effects are
+        not in it.
         """
-        key = tuple(sorted({**self.model.effect_settings, **self._optical(settings)}.items()))
+        return self._table_and_level(settings)[0]
+
+    def _table_and_level(self, settings: Settings) -> tuple[FloatArray, FloatArray]:
+        """The table, and the level of each of its rows, ``(rows, 1)``."""
+        key = self._key({**self.model.effect_settings, **self._optical(settings)})
         if key not in self._tables:
-            low, high = self.range_um
-            count = int(np.ceil((high - low) / TABLE_STEP_UM)) + 1
+            low, count = self._grid()
             response = self._response(settings, low, count)
             # Tapered, so that a broken fringe order at an end of the table does not count.
             mean = np.average(response, axis=1, weights=np.hanning(count + 2)[1:-1])
             each = mean.reshape(-1, len(self.geometry.wavelength_nm)).mean(axis=0)  # over all places
-            self._tables[key] = table = response / np.resize(each, len(mean))[:, np.newaxis]
-            while len(self._tables) * table.nbytes > MOST_TABLE_BYTES and len(self._tables) > 2:
-                self._tables.pop(next(iter(self._tables)))
+            level = np.resize(each, len(mean))[:, np.newaxis]
+            self._keep(key, (response / level, level))
         return self._tables[key]
 
-    def _response(self, settings: Settings, low_um: float, count: int) -> FloatArray:
-        """Response ``(W, count)`` on the grid; what an exposure sees is kept while only others are moved."""
-        model, wavelength = self.model_with(settings), self.geometry.wavelength_nm
+    def _island_tables(self, settings: Settings) -> list[tuple[ActiveEffect, FloatArray]]:
+        """Local effects, each with the table of where it is, relative to the level of all other places."""
+        found = []
+        for item, model in self.model_with(settings).islands:
+            key = self._key({**model.effect_settings, **self._own(item)})
+            if key not in self._tables:
+                level = self._table_and_level(settings)[1]
+                self._keep(key, (self._fresh_response(model, *self._grid()) / level, level))
+            found.append((item, self._tables[key][0]))
+        return found
+
+    @staticmethod
+    def _own(item: ActiveEffect) -> dict[str, float]:
+        """What a local effect changes where it is."""
+        places = {parameter.name for parameter in item.effect.parameters if parameter.place}
+        return {f"{item.effect.name}.{name}": x for name, x in item.values.items() if name not in places}
+
+    @staticmethod
+    def _key(settings: Settings) -> tuple[tuple[str, float], ...]:
+        return tuple(sorted(settings.items()))
+
+    def _keep(self, key: tuple[tuple[str, float], ...], table: tuple[FloatArray, FloatArray]) -> None:
+        self._tables[key] = table
+        while len(self._tables) * table[0].nbytes > MOST_TABLE_BYTES and len(self._tables) > 2:
+            self._tables.pop(next(iter(self._tables)))
+
+    def _grid(self) -> tuple[float, int]:
+        """First thickness of the tables [µm], and their number of thicknesses."""
+        low, high = self.range_um
+        return low, int(np.ceil((high - low) / TABLE_STEP_UM)) + 1
+
+    def _fresh_response(self, model: FringeModel, low_um: float, count: int) -> FloatArray:
+        """Response ``(W, count)`` of a model on the grid, or of all places of the field."""
+        wavelength = self.geometry.wavelength_nm
         if self.exposures is not None:
             return self.exposures.response(model, low_um, TABLE_STEP_UM, count)
         light = model.system.flat_fields(wavelength, LINE_STEP_NM)
-        rest = tuple(
-            sorted((key, value) for key, value in settings.items() if not self._moves_wavelengths(key))
+        return model.respond_on_grid(
+            light, low_um, TABLE_STEP_UM, count, wavelength, tolerance=TABLE_TOLERANCE
+        )
+
+    def _response(self, settings: Settings, low_um: float, count: int) -> FloatArray:
+        """The same for some effects; what an exposure sees is kept while only others are moved."""
+        model, wavelength = self.model_with(settings), self.geometry.wavelength_nm
+        if self.exposures is not None:
+            return self._fresh_response(model, low_um, count)
+        light = model.system.flat_fields(wavelength, LINE_STEP_NM)
+        rest = self._key(
+            {key: value for key, value in self._optical(settings).items() if not self._moves_wavelengths(key)}
         )
         if rest != self._rows_of:
             self._rows_of = rest
@@ -229,8 +275,11 @@ class Forward:
         return self._effect(key.partition(".")[0]).moves_wavelengths
 
     def model_with(self, settings: Settings) -> FringeModel:
-        """The model with those of some effects that act on the response."""
-        known = {**self.model.effect_settings, **self._optical(settings)}
+        """The model with those of some effects that do not act on the image."""
+        of_response = {
+            key: value for key, value in settings.items() if not self.is_image_effect(key.split(".")[0])
+        }
+        known = {**self.model.effect_settings, **of_response}
         return self.model.with_effects(known, self.catalogue)
 
     def cover(self, thickness_um: FloatArray) -> None:
@@ -258,6 +307,11 @@ class Forward:
             Thickness at the centres of the cells [µm], within the tables.
         """
         value, slope = self._at_cells(self.table(settings), thickness_um)
+        for part, table in self._islands(settings):
+            inside = self._at_cells(table, thickness_um)
+            value, slope = (
+                all_ + part * (own - all_) for all_, own in zip((value, slope), inside, strict=True)
+            )
         image_settings = self._image(settings)
         if not image_settings:
             return Prediction(value, slope)
@@ -268,6 +322,8 @@ class Forward:
 
     def change(self, before: Settings, after: Settings, thickness_um: FloatArray) -> FloatArray:
         """What other settings do to the cells, ``(W, ny, nx)``: the difference of two predictions."""
+        if self._has_islands(before) or self._has_islands(after):
+            return self.predict(after, thickness_um).value - self.predict(before, thickness_um).value
         tables = self.table(before), self.table(after)
         images = self._image(before), self._image(after)
         if any(images):
@@ -283,6 +339,19 @@ class Forward:
         if rows.size:
             result[rows] = self._at_cells(table, thickness_um, rows)[0]
         return result
+
+    def _has_islands(self, settings: Settings) -> bool:
+        known = {**self.model.effect_settings, **settings}
+        return any(self._effect(key.partition(".")[0]).local for key in known)
+
+    def _islands(self, settings: Settings) -> list[tuple[FloatArray, FloatArray]]:
+        """Part of every cell, ``(ny, nx)``, that has a local effect, and the table there."""
+        if not self._has_islands(settings):
+            return []
+        return [
+            (item.effect.coverage(item.complete_values(self.model.base_system), self.geometry), table)
+            for item, table in self._island_tables({**self.model.effect_settings, **settings})
+        ]
 
     def _seen_through(self, table: FloatArray, thickness_um: FloatArray) -> FloatArray:
         """Value at all cells; kept, as derivatives of many effects on the image ask for it at one thickness."""
@@ -337,9 +406,83 @@ class Forward:
 
         Of light that changes over the field, that at its first place.
         """
-        table = self.table(settings)
-        flat, nothing = thickness_um.ravel(), np.zeros(thickness_um.size)
-        both = _interpolate(table, self.range_um[0], TABLE_STEP_UM, flat, nothing, nothing)
+        return self._sampled(self.table(settings), thickness_um)
+
+    def sampled_on_island(self, name: str, settings: Settings, thickness_um: FloatArray) -> Prediction:
+        """The same where a local effect is."""
+        return self._sampled(self._island_table(name, settings), thickness_um)
+
+    def on_and_off_island(
+        self,
+        name: str,
+        settings: Settings,
+        field_um: FloatArray,
+        cells: NDArray[np.intp] | None = None,
+        places_um: FloatArray | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Some cells where a local effect is, and where it is not, as wide as the slopes of a field make them.
+
+        Effects on the image are left out.
+
+        Parameters
+        ----------
+        name : `str`
+            The local effect.
+        settings : mapping
+            All effects.
+        field_um : `numpy.ndarray`, shape ``(ny, nx)``
+            Thickness [µm].
+        cells : `numpy.ndarray`, shape ``(n,)``, optional
+            Numbers of the cells; all by default.
+        places_um : `numpy.ndarray`, shape ``(S, n)``, optional
+            Thicknesses of the cells [µm]; those of the field by default.
+
+        Returns
+        -------
+        on, off : `numpy.ndarray`, shape ``(W, S, n)``
+        """
+        own = np.arange(field_um.size) if cells is None else cells
+        places = field_um.ravel()[own][np.newaxis] if places_um is None else places_um
+        spread = [
+            np.broadcast_to(moment.ravel()[own], places.shape)
+            for moment in self._spread_in_cell(self._gradient(field_um))
+        ]
+        tables = self._island_table(name, settings), self.table(settings)
+        on, off = (self._sampled(table, places, *spread).value for table in tables)
+        return on, off
+
+    def _island_table(self, name: str, settings: Settings) -> FloatArray:
+        (table,) = (table for item, table in self._island_tables(settings) if item.effect.name == name)
+        return table
+
+    def coverage(self, name: str, settings: Settings) -> FloatArray:
+        """Part of every cell that has a local effect, ``(ny, nx)``."""
+        own = {key: value for key, value in settings.items() if key.partition(".")[0] == name}
+        (item,) = activate_effects(own, self.catalogue)
+        return item.effect.coverage(item.complete_values(self.model.base_system), self.geometry)
+
+    def on_islands(self, settings: Settings) -> NDArray[np.bool_]:
+        """Cells with a local effect, shape ``(ny, nx)``."""
+        covered = np.zeros(self.geometry.sample_shape, dtype=bool)
+        for part, _ in self._islands(settings):
+            covered |= part > 0.0
+        return covered
+
+    def is_island(self, name: str) -> bool:
+        """Whether an effect is in a part of the sensor only."""
+        return self._effect(name).local
+
+    def _sampled(
+        self,
+        table: FloatArray,
+        thickness_um: FloatArray,
+        second: FloatArray | None = None,
+        fourth: FloatArray | None = None,
+    ) -> Prediction:
+        spread = (
+            np.zeros(thickness_um.size) if moment is None else moment.ravel() for moment in (second, fourth)
+        )
+        both = _interpolate(table, self.range_um[0], TABLE_STEP_UM, thickness_um.ravel(), *spread)
         value, slope = (
             part.reshape(len(table), *thickness_um.shape)[: len(self.geometry.wavelength_nm)] for part in both
         )
@@ -391,7 +534,12 @@ class Forward:
         return self._by_name[name]
 
     def _optical(self, settings: Settings) -> dict[str, float]:
-        return {key: value for key, value in settings.items() if not self.is_image_effect(key.split(".")[0])}
+        effects = {key: self._effect(key.split(".")[0]) for key in settings}
+        return {
+            key: value
+            for key, value in settings.items()
+            if effects[key].acts_on != "image" and not effects[key].local
+        }
 
     def _image(self, settings: Settings) -> dict[str, float]:
         known = {**self.model.effect_settings, **settings}

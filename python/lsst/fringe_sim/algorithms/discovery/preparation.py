@@ -351,6 +351,8 @@ def _mended(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[Float
     model = problem.forward.model_with(fit.settings)
     start = mended_thickness(model, problem.cells, thickness_um)
     start = _better_start(problem, fit.settings, start, starting_thickness(model, problem.cells))
+    # Elsewhere the fringes are not those of the island of a local effect.
+    start = np.where(problem.forward.on_islands(fit.settings), thickness_um, start)
     if not any(problem.forward.couples_pixels(item.effect) for item in fit.coordinates):
         return start, dict(fit.settings)
     if _is_blurred(fit.settings):

@@ -641,13 +641,13 @@ class _Search:
         return self._verdict("named", whole, final, chance, decided, {}, steps)
 
     def _spots_instead(self, whole: Selector, final: Hypothesis) -> float:
-        """Log evidence of a few spots in the place of an effect of the image, over that of the effect.
+        """Log evidence of a few spots in the place of an effect of image or island, over that of the effect.
 
         Gains of two amplifiers under a stain are most of the stain.
         """
         gains = [-math.inf]
         for effect in self.effects:
-            if effect.name in final.names and effect.acts_on == "image":
+            if effect.name in final.names and (effect.acts_on == "image" or effect.local):
                 rest = tuple(name for name in final.names if name != effect.name)
                 without = whole.improved(rest, final.fit) if rest else whole.null
                 brought = final.log_evidence - without.log_evidence

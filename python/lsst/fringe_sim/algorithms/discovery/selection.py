@@ -27,6 +27,7 @@ from .fit import (
     linearise_at,
 )
 from .following import ThicknessFollower
+from .islands import IslandStart, followed_on_island, island_starts, placed_on_island
 from .orders import fields_in_other_orders, starts_in_other_orders
 from .spots import log_evidence_of_spots, spot_channel
 from .trends import FEWEST_DRAWS, trend_channel
@@ -270,6 +271,8 @@ class Selector:
 
     def _candidate(self, state: State, fit: Fit, name: str, scan: bool) -> Candidate | None:
         """Score test of an effect; `None` if it is not seen or cannot be combined with those that are in already."""
+        if self.problem.forward.is_island(name):
+            return self._on_some_island(state, fit, name) if scan else None
         if self.is_sought(name):  # at null its place is anywhere, and its derivative says nothing
             return self._sought(state, fit, name) if scan else None
         coordinates = self.coordinates[name]
@@ -303,6 +306,42 @@ class Selector:
         score, information = state.design.project(column, state.residual)
         promise = float(score[0] ** 2 / max(information[0, 0], 1e-300))
         return Candidate(name, 0.0, len(coordinates), start, promise) if score[0] > 0.0 else None
+
+    def _on_some_island(self, state: State, fit: Fit, name: str) -> Candidate | None:
+        """A local effect where it promises most, if it promises anything."""
+        starts = self._on_islands(state, fit, name)
+        if not starts:
+            return None
+        return Candidate(name, 0.0, len(self.coordinates[name]), starts[0].position, starts[0].promise)
+
+    def _on_islands(self, state: State, fit: Fit, name: str) -> list[IslandStart]:
+        """Where a local effect may be, and how large."""
+        level, _ = self.problem.amplitudes(fit.levels)
+        return island_starts(self.problem, state, fit.settings, self.coordinates[name], level)
+
+    def _placed_on_island(
+        self,
+        coordinates: tuple[Coordinate, ...],
+        position: FloatArray,
+        field_start: FloatArray,
+        levels: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Position and field with the last effect, a local one, where it lies best with a thickness in every cell."""
+        if self.problem.field_prior or not self.generic:
+            return position, field_start
+        level, _ = self.problem.amplitudes(levels)
+        thickness = self.problem.basis.expand(field_start)
+        placed, moved = placed_on_island(self.problem, coordinates, position, thickness, level)
+        return placed, self.problem.basis.fit(moved, self.problem.cells.seen.astype(float))
+
+    def _moved_on_island(
+        self, name: str, settings: Mapping[str, float], thickness_um: FloatArray, levels: FloatArray
+    ) -> FloatArray:
+        """Thickness with that on the island of a local effect moved to where the effect wants it."""
+        if self.problem.field_prior:
+            return thickness_um
+        level, _ = self.problem.amplitudes(levels)
+        return followed_on_island(self.problem, name, settings, thickness_um, level)
 
     def _seen(self, state: State, name: str) -> FloatArray | None:
         """Coordinates of an effect where it is seen in what a fit leaves."""
@@ -513,6 +552,11 @@ class Selector:
             if all(item.key in base.settings for item in own):
                 known += [item.coordinate(base.settings[item.key]) for item in own]
                 continue
+            if self.problem.forward.is_island(name):
+                fresh = [one.position for one in self._on_islands(self.state(base), base, name)]
+                fresh = fresh or ([] if start is None else [np.asarray(start, dtype=float)])
+                if fresh:
+                    continue
             small = [0.1 * item.unit_step for item in own]
             if start is None and self.is_sought(name):
                 start = self._seen(self.state(base), name)
@@ -611,8 +655,12 @@ class Selector:
         position = np.where(position == 0.0, nudge, position)
         field_start = base.field if base.coordinates else self.first_field
         rival = min(item.fit.chi2 for key, item in self.fitted.items() if len(key) <= len(names))
-        field_start = self._followed(names[-1], coordinates, position, field_start)
+        field_start = self._followed(names[-1], coordinates, position, field_start, base.levels)
         fit = fit_model(self.problem, coordinates, position, field_start, base.levels, rival=rival)
+        if self.problem.forward.is_island(names[-1]):
+            placed = self._placed_on_island(coordinates, position, field_start, base.levels)
+            other = fit_model(self.problem, coordinates, *placed, base.levels, rival=rival)
+            fit = min(fit, other, key=lambda item: item.chi2)
         if fit.chi2 > base.chi2:
             small = np.array(
                 [x if item.key in base.settings else 0.03 * item.unit_step
@@ -623,7 +671,12 @@ class Selector:
         return fit
 
     def _followed(
-        self, name: str, coordinates: tuple[Coordinate, ...], position: FloatArray, field_start: FloatArray
+        self,
+        name: str,
+        coordinates: tuple[Coordinate, ...],
+        position: FloatArray,
+        field_start: FloatArray,
+        levels: FloatArray,
     ) -> FloatArray:
         """Field moved to where the effects at their first guess want it, if the last one acts on the response."""
         if not self.generic or self.problem.field_prior or self.problem.forward.is_image_effect(name):
@@ -632,6 +685,10 @@ class Selector:
         self.problem.forward.cover(thickness)
         settings = {item.key: item.value(x) for item, x in zip(coordinates, position, strict=True)}
         cells, forward = self.problem.cells, self.problem.forward
+        if forward.is_island(name):
+            return self.problem.basis.fit(
+                self._moved_on_island(name, settings, thickness, levels), cells.seen.astype(float)
+            )
 
         def misfit(place: FloatArray) -> float:
             return chi2_with_free_levels(forward.predict(settings, place).value, cells.value, cells.weight)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .comparison import chi2_with_free_levels
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
+from .islands import thickness_on_islands
 
 __all__ = ["HeldOut", "held_out_blocks", "misfit_rms", "validate", "whole_thickness"]
 
@@ -85,7 +86,10 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
     moved = problem.basis.expand(fit.field)
     if not held_out.any():
         return moved
-    found = _moved_everywhere(problem, null, moved, held_out)
+    on_islands = problem.forward.on_islands(fit.settings)
+    found = thickness_on_islands(
+        problem, null, fit, _moved_everywhere(problem, null, moved, held_out, on_islands), held_out
+    )
     rest = problem.with_cells(problem.cells.restricted(held_out))
     ratio = rest.cells.n_values / max(problem.cells.n_values - rest.cells.n_values, 1)
     chi2 = _chi2_at(rest, fit, found)
@@ -102,10 +106,13 @@ def _chi2_at(problem: Problem, fit: Fit, thickness_um: FloatArray) -> float:
     return chi2_with_free_levels(value, problem.cells.value, problem.cells.weight)
 
 
-def _moved_everywhere(problem: Problem, null: Fit, moved: FloatArray, held_out: BoolArray) -> FloatArray:
+def _moved_everywhere(
+    problem: Problem, null: Fit, moved: FloatArray, held_out: BoolArray, on_islands: BoolArray
+) -> FloatArray:
     """Thickness without effects, moved in all cells as a function of itself as a fit moved it in a part."""
     before = problem.basis.expand(null.field)
-    seen = ~held_out & problem.cells.seen
+    # An island has a thickness of its own for the same fringes.
+    seen = ~held_out & problem.cells.seen & ~on_islands
     middle, half = before.mean(), max(0.5 * float(np.ptp(before)), 1e-6)
     depth = (before - middle) / half
     columns = np.stack([depth**power for power in range(3)], axis=-1)

@@ -19,6 +19,7 @@ from .amplitudes import Amplitudes
 from .cells import run_threaded, sample_pixels
 from .global_fit import global_fit, normalise_to_cells, spans_orders
 from .guo2022 import walk_fit
+from .islands import fit_islands
 from .joint import joint_fit
 from .nuisances import Nuisances
 from .pixels import PixelFit
@@ -163,7 +164,8 @@ def fit_thickness(
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
         notes["CONTRAST"] = round(float(np.mean(found.nuisance.contrast)), 6)
-    return _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes, workers)
+    everywhere = _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes, workers)
+    return fit_islands(everywhere, cube, model if observable is None else with_observable(model, observable))
 
 
 def amplitudes_from_cube(cube: FringeCube, noise_correlation_px: float | None = None) -> Amplitudes:

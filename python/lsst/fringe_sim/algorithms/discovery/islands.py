@@ -1,0 +1,442 @@
+"""Where on a sensor, and how large, an effect may be that is in a part of it only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+from scipy.optimize import minimize
+from scipy.signal import fftconvolve
+
+from .cells import CellData
+from .channels import State, beside_thickness
+from .comparison import chi2_with_free_fringes, local_minima
+from .fit import Coordinate, Fit, Problem
+
+__all__ = ["IslandStart", "followed_on_island", "island_starts", "placed_on_island", "thickness_on_islands"]
+
+FloatArray = NDArray[np.float64]
+
+SIZES_TRIED = (0.01, 0.02, 0.04)
+SIZES_PER_REPETITION = 12
+"""Sizes of the effect that are tried: small ones, in units of where it repeats, and so many between repetitions."""
+
+SMALLEST_RADIUS, LARGEST_PART, RADIUS_RATIO = 2.0, 0.35, 1.2
+"""Radii that are tried: the smallest [cells], the largest over the shorter side, and one over the one before."""
+
+LEAST_SEEN = 0.3
+"""Part of a disc that must lie on cells with data."""
+
+MOST_DISCS, MOST_STARTS = 2, 3
+WORTH_TRYING = 0.5
+"""Discs that are followed, minima in size for each, and what a disc must promise of what the best one does."""
+
+RIM_REACH, RIM_STEP, RIM_TOLERANCE, MOST_TRIALS = 3, 0.7, 0.003, 200
+"""How far beyond an island cells are compared, the first step of its rim and the last [cells], and steps at most."""
+
+SHIFTS_PER_ORDER = 20
+COMPARED_THICKNESSES = 120
+ISLAND_CELLS = 400
+"""Shifts of the thickness in a fringe order, and the thicknesses or cells on which they are compared."""
+
+
+_Disc = tuple[float, float, float, float]
+"""Fall of χ² that a disc promises, its row, column and radius [cells]."""
+
+
+@dataclass(frozen=True, eq=False)
+class IslandStart:
+    """Values from which to fit a local effect.
+
+    Attributes
+    ----------
+    position : `numpy.ndarray`
+        Its coordinates.
+    promise : `float`
+        Expected fall of χ².
+    """
+
+    position: FloatArray
+    promise: float
+
+
+def island_starts(
+    problem: Problem,
+    state: State,
+    settings: Mapping[str, float],
+    coordinates: Sequence[Coordinate],
+    level: FloatArray,
+) -> list[IslandStart]:
+    """Places and sizes of a local effect that would explain most, best first.
+
+    For every size, what the effect would do to each cell is compared with what the fit leaves there, beside a
+    thickness of the cell; sums of both over discs of all radii at all places tell where it promises most. The
+    thickness of the fit has followed the phase that the effect changes, by as much as their fringes are apart. In the
+    best discs, all sizes are compared with the data themselves.
+
+    Parameters
+    ----------
+    problem : `Problem`
+        Data and model.
+    state : `State`
+        Fit without the effect.
+    settings : mapping
+        Effects of the fit.
+    coordinates : sequence of `Coordinate`
+        Those of the effect: its size, and the places called ``centre_x``, ``centre_y`` and ``radius``.
+    level : `numpy.ndarray`
+        Level of every wavelength in the fit; broadcasts to the cells.
+    """
+    (size,) = (item for item in coordinates if not item.place)
+    sizes = _sizes(size)
+    discs = []
+    for value in sizes:
+        active = _active(settings, coordinates, size, value)
+        changed = _change(problem, state, size.effect, settings, active)
+        signature = beside_thickness(state, state.whiten(level * changed))
+        score = (signature * state.residual).sum(axis=0)
+        discs.append(_best_disc(score, (signature**2).sum(axis=0), problem.cells.seen))
+    found: list[IslandStart] = []
+    for disc in _apart(discs):
+        places = [_position(problem, coordinates, size, value, disc) for value in sizes]
+        misfits = [
+            _on_island(problem, size.effect, _active(settings, coordinates, size, value, place),
+                       state.thickness_um, level)[1]
+            for value, place in zip(sizes, places, strict=True)
+        ]  # fmt: skip
+        best = sorted(map(int, local_minima(np.array(misfits))), key=lambda number: misfits[number])
+        found += [IslandStart(places[number], disc[0]) for number in best[:MOST_STARTS]]
+    return found
+
+
+def followed_on_island(
+    problem: Problem,
+    name: str,
+    settings: Mapping[str, float],
+    thickness_um: FloatArray,
+    level: FloatArray,
+) -> FloatArray:
+    """Thickness moved on the island of a local effect to where the fringes there lie on the data [µm].
+
+    Parameters
+    ----------
+    problem : `Problem`
+        Data and model.
+    name : `str`
+        The effect.
+    settings : mapping
+        All effects, this one among them.
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness of a fit without it [µm].
+    level : `numpy.ndarray`
+        Level of every wavelength; broadcasts to the cells.
+    """
+    shift = _on_island(problem, name, settings, thickness_um, level)[0]
+    return np.asarray(thickness_um + shift * problem.forward.coverage(name, settings))
+
+
+def placed_on_island(
+    problem: Problem,
+    coordinates: Sequence[Coordinate],
+    position: FloatArray,
+    thickness_um: FloatArray,
+    level: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """A local effect where it lies best on the data if every cell on it and about it has a thickness of its own.
+
+    A rim that moves over a cell changes its phase, and steps of all parameters at once leave its thickness where it
+    was. Here every place is judged with the thickness that each cell then wants.
+
+    Parameters
+    ----------
+    problem : `Problem`
+        Data and model.
+    coordinates : sequence of `Coordinate`
+        Effects of a fit, the local one last.
+    position : `numpy.ndarray`
+        Coordinates from which to start.
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness that lies well on the data in the middle of the island [µm].
+    level : `numpy.ndarray`
+        Level of every wavelength; broadcasts to the cells.
+
+    Returns
+    -------
+    position : `numpy.ndarray`
+        Coordinates.
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness [µm].
+    """
+    name = coordinates[-1].effect
+    settings = {item.key: item.value(x) for item, x in zip(coordinates, position, strict=True)}
+    free = [number for number, item in enumerate(coordinates) if item.effect == name and item.place]
+    about = _Surroundings.of(problem, name, settings, thickness_um, level)
+    if about is None:
+        return position, thickness_um
+    cell = float(np.mean(problem.cells.geometry.cell_px))
+
+    def misfit(place: FloatArray) -> float:
+        return about.chi2(_moved(coordinates, position, free, place))[0]
+
+    first = position[free]
+    simplex = np.vstack([first, first + RIM_STEP * cell * np.eye(len(free))])
+    found = minimize(
+        misfit, first, method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": MOST_TRIALS, "xatol": RIM_TOLERANCE * cell, "fatol": 0.1},
+    )  # fmt: skip
+    placed = position.copy()
+    placed[free] = [coordinates[number].clip(x) for number, x in zip(free, found.x, strict=True)]
+    return placed, about.chi2(_moved(coordinates, position, free, placed[free]))[1]
+
+
+def thickness_on_islands(
+    problem: Problem, null: Fit, fit: Fit, thickness_um: FloatArray, held_out: NDArray[np.bool_]
+) -> FloatArray:
+    """Thickness of cells on islands that took no part in a fit, from where the fit moved the others there [µm].
+
+    Parameters
+    ----------
+    problem : `Problem`
+        All data.
+    null, fit : `Fit`
+        Fit of the unchanged model, and one with the effects to a part of the data.
+    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness so far, returned for all other cells.
+    held_out : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
+        Cells that took no part.
+    """
+    level, _ = problem.amplitudes(fit.levels)
+    before, after = (problem.basis.expand(each.field) for each in (null, fit))
+    found = thickness_um
+    for name in dict.fromkeys(
+        item.effect for item in fit.coordinates if problem.forward.is_island(item.effect)
+    ):
+        covered = problem.forward.coverage(name, fit.settings) > 0.0
+        known, unknown = covered & ~held_out & problem.cells.seen, covered & held_out
+        if not unknown.any():
+            continue
+        moved = found.copy()
+        moved[unknown] = before[unknown] + (float(np.median((after - before)[known])) if known.any() else 0.0)
+        about = _Surroundings.of(problem, name, fit.settings, moved, level)
+        if about is not None:
+            found = np.where(unknown, about.chi2(fit.settings)[1], found)
+    return found
+
+
+def _moved(
+    coordinates: Sequence[Coordinate], position: FloatArray, free: Sequence[int], place: FloatArray
+) -> dict[str, float]:
+    """All effects with some coordinates elsewhere, within their bounds."""
+    moved = position.copy()
+    moved[free] = place
+    return {item.key: item.value(item.coordinate(item.value(item.clip(x))))
+            for item, x in zip(coordinates, moved, strict=True)}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Surroundings:
+    """Cells on an island and about it, with what they would be on and off it at many thicknesses.
+
+    Attributes
+    ----------
+    own : `numpy.ndarray`
+        The cells.
+    places : `numpy.ndarray`, shape ``(S, n)``
+        Thicknesses [µm].
+    outside, inside : `numpy.ndarray`, shape ``(W, S, n)``
+        Signal at its level.
+    """
+
+    problem: Problem
+    name: str
+    thickness_um: FloatArray
+    own: NDArray[np.intp]
+    places: FloatArray
+    outside: FloatArray
+    inside: FloatArray
+    value: FloatArray
+    weight: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        name: str,
+        settings: Mapping[str, float],
+        thickness_um: FloatArray,
+        level: FloatArray,
+    ) -> _Surroundings | None:
+        forward, cells = problem.forward, problem.cells
+        part = forward.coverage(name, settings)
+        near = binary_dilation(part > 0.0, iterations=RIM_REACH)
+        own = np.flatnonzero((near & cells.seen).ravel())
+        if not own.size:
+            return None
+        shifts = _shifts(problem)
+        for shift in (shifts[0], shifts[-1]):
+            forward.cover(thickness_um + shift)
+        places = thickness_um.ravel()[own] + shifts[:, np.newaxis]
+        value, weight, level = _of_cells(cells, level, own)
+        inside, outside = (
+            level * light for light in forward.on_and_off_island(name, settings, thickness_um, own, places)
+        )
+        return cls(problem, name, thickness_um, own, places, outside, inside, value, weight)
+
+    def chi2(self, settings: Mapping[str, float]) -> tuple[float, FloatArray]:
+        """χ² of the cells with the island elsewhere, and the thickness of all cells with which it is reached."""
+        part = self.problem.forward.coverage(self.name, settings).ravel()[self.own]
+        model = self.outside + part * (self.inside - self.outside)
+        chi2 = (self.weight * (self.value - model) ** 2).sum(axis=0)
+        least, place = _parabolic_minimum(chi2)
+        thickness = self.thickness_um.copy()
+        step = self.places[1] - self.places[0]
+        thickness.ravel()[self.own] = self.places[0] + place * step
+        return float(least.sum()), thickness
+
+
+def _parabolic_minimum(curves: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Minimum of each column, by a parabola through the least value and its neighbours, and its place in rows."""
+    best, each = np.argmin(curves, axis=0), np.arange(curves.shape[1])
+    middle = np.clip(best, 1, len(curves) - 2)
+    below, at, above = (curves[middle + step, each] for step in (-1, 0, 1))
+    bend = below - 2.0 * at + above
+    away = np.clip(np.divide(0.5 * (below - above), bend, out=np.zeros_like(at), where=bend > 0.0), -1.0, 1.0)
+    inner = best == middle
+    least = np.where(inner, at - 0.25 * (below - above) * away, curves[best, each])
+    return least, np.where(inner, middle + away, best)
+
+
+def _of_cells(cells: CellData, level: FloatArray, own: NDArray[np.intp]) -> tuple[FloatArray, ...]:
+    """Value, weight and level of some cells, each ``(W, 1, n)``."""
+    return tuple(
+        np.broadcast_to(each, cells.shape).reshape(cells.shape[0], 1, -1)[..., own]
+        for each in (cells.value, cells.weight, level)
+    )
+
+
+def _on_island(
+    problem: Problem,
+    name: str,
+    settings: Mapping[str, float],
+    thickness_um: FloatArray,
+    level: FloatArray,
+) -> tuple[float, float]:
+    """Shift of the thickness [µm] with which a local effect lies best on the data, and χ² of some cells there."""
+    cells, part = problem.cells, problem.forward.coverage(name, settings)
+    own = np.flatnonzero(((part > 0.5) & cells.seen).ravel())
+    if not own.size:
+        return 0.0, math.inf
+    own = own[:: max(1, own.size // ISLAND_CELLS)]
+    shifts = _shifts(problem)
+    for shift in (shifts[0], shifts[-1]):
+        problem.forward.cover(thickness_um + shift)
+    places = thickness_um.ravel()[own] + shifts[:, np.newaxis]
+    model = problem.forward.on_and_off_island(name, settings, thickness_um, own, places)[0]
+    value, weight, level = _of_cells(cells, level, own)
+    chi2 = (weight * (value - level * model) ** 2).sum(axis=(0, 2))
+    least, away = _parabolic_minimum(chi2[:, np.newaxis])
+    return float(np.interp(away[0], np.arange(len(shifts)), shifts)), float(least[0])
+
+
+def _active(
+    settings: Mapping[str, float],
+    coordinates: Sequence[Coordinate],
+    size: Coordinate,
+    value: float,
+    position: FloatArray | None = None,
+) -> dict[str, float]:
+    """Effects with the local one of some size, by default wherever its null is."""
+    places = np.zeros(len(coordinates)) if position is None else position
+    own = {item.key: item.value(x) for item, x in zip(coordinates, places, strict=True)}
+    return {**settings, **own, size.key: value}
+
+
+def _apart(discs: list[_Disc]) -> list[_Disc]:
+    """The best discs that promise anything, none in the middle of a better one."""
+    kept: list[_Disc] = []
+    for disc in sorted(discs, key=lambda each: -each[0]):
+        away = all(math.hypot(disc[1] - other[1], disc[2] - other[2]) > 0.5 * other[3] for other in kept)
+        if away and disc[0] > (WORTH_TRYING * kept[0][0] if kept else 0.0) and len(kept) < MOST_DISCS:
+            kept.append(disc)
+    return kept
+
+
+def _shifts(problem: Problem) -> FloatArray:
+    """Shifts of the thickness up to half an order on both sides [µm]."""
+    order = float(problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm))))
+    return np.linspace(-0.5, 0.5, SHIFTS_PER_ORDER + 1) * order
+
+
+def _sizes(size: Coordinate) -> list[float]:
+    """Sizes that are tried, increasing."""
+    many = np.arange(1, math.floor(SIZES_PER_REPETITION * size.high / size.neighbour) + 1)
+    return [size.neighbour * float(part) for part in (*SIZES_TRIED, *(many / SIZES_PER_REPETITION))]
+
+
+def _change(
+    problem: Problem,
+    state: State,
+    name: str,
+    settings: Mapping[str, float],
+    active: Mapping[str, float],
+) -> FloatArray:
+    """What a local effect would do to every cell, were it there; the thickness follows."""
+    forward, thickness = problem.forward, state.thickness_um
+    shifts = _shifts(problem)
+    for shift in (shifts[0], shifts[-1]):
+        forward.cover(thickness + shift)
+    seen = thickness[problem.cells.seen]
+    few = np.linspace(float(seen.min()), float(seen.max()), COMPARED_THICKNESSES)[np.newaxis]
+    inside = forward.sampled_on_island(name, active, few + shifts[:, np.newaxis, np.newaxis]).value
+    outside = forward.sampled(active, few).value
+    misfit = chi2_with_free_fringes(inside, outside, np.ones_like(outside))
+    shift = np.interp(_parabolic_minimum(misfit[:, np.newaxis])[1][0], np.arange(len(shifts)), shifts)
+    on, _ = forward.on_and_off_island(name, active, thickness, None, (thickness + shift).reshape(1, -1))
+    _, off = forward.on_and_off_island(name, active, thickness)
+    return (on - off).reshape(-1, *thickness.shape)
+
+
+def _best_disc(score: FloatArray, information: FloatArray, seen: NDArray[np.bool_]) -> _Disc:
+    """Fall of χ² of the best disc, and its row, column and radius [cells]."""
+    best = (0.0, 0.0, 0.0, SMALLEST_RADIUS)
+    radius = SMALLEST_RADIUS
+    while radius <= LARGEST_PART * min(score.shape):
+        reach = math.ceil(radius)
+        offset = np.arange(-reach, reach + 1)
+        disc = (np.hypot(offset[:, np.newaxis], offset[np.newaxis, :]) <= radius).astype(float)
+        amount, variance, area = (
+            fftconvolve(values, disc, mode="same") for values in (score, information, seen.astype(float))
+        )
+        usable = (area > LEAST_SEEN * disc.sum()) & (variance > 1e-6 * float(information.sum()))
+        strength = np.divide(amount, variance, out=np.zeros_like(amount), where=usable)
+        # A finite signature may be scaled only a little.
+        fall = np.where((strength > 0.2) & (strength < 3.0), amount * strength, 0.0)
+        row, column = np.unravel_index(int(np.argmax(fall)), fall.shape)
+        if fall[row, column] > best[0]:
+            best = (float(fall[row, column]), float(row), float(column), radius)
+        radius *= RADIUS_RATIO
+    return best
+
+
+def _position(
+    problem: Problem,
+    coordinates: Sequence[Coordinate],
+    size: Coordinate,
+    value: float,
+    disc: _Disc,
+) -> FloatArray:
+    geometry = problem.cells.geometry
+    rows, columns = geometry.cell_px
+    _, row, column, radius = disc
+    place = {
+        "centre_y": float(geometry.y_px[0]) + rows * row,
+        "centre_x": float(geometry.x_px[0]) + columns * column,
+        "radius": 0.5 * (rows + columns) * radius,
+    }
+    return np.array(
+        [item.coordinate(value if item is size else place[item.parameter]) for item in coordinates]
+    )
