@@ -7,7 +7,9 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from lsst.fringe_sim.algorithms.discovery import discover, preparation
+from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
+from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.mock import random_field
@@ -102,3 +104,22 @@ def test_places_beside_the_blur_that_they_lack_are_areas(places: int, blur: dict
     settings = {"epoxy_index.cauchy": -0.005, **blur}
     kept = preparation._without_rest_of_area(settings, forward)
     assert kept == (settings if taken else {"epoxy_index.cauchy": -0.005})
+
+
+@pytest.mark.parametrize(("points", "places"), [(False, 2), (True, 1)])
+def test_a_blur_that_makes_areas_of_few_places_is_none(points: bool, places: int) -> None:
+    """Areas taken as four places each need a blur, and explain as much as areas without; real points do not."""
+    rng = np.random.default_rng(47)
+    thickness = random_field((48, 48), rng, mean=15.0, span=3.0)
+    cells = bin_cube(_cube(thickness, rng, points=points), 1)
+    forward = Forward.of_cells(MODEL, EFFECTS, cells, (11.0, 19.0)).with_places(places)
+    basis = SplineBasis.of_grid((48, 48), 2.0)
+    problem = Problem(cells, forward, basis, np.eye(len(cells.wavelength_nm)))
+    field = basis.fit(thickness, np.ones(thickness.shape))
+    (blur,) = (effect for effect in EFFECTS if effect.name == "charge_diffusion")
+    coordinates = coordinates_of(blur, forward, thickness)
+    first = np.array([coordinates[0].coordinate(0.14)])
+    fit = fit_model(problem, coordinates, first, field)
+    assert preparation.sees_areas(problem, fit) != points
+    found = fit.settings["charge_diffusion.sigma"]
+    assert (found == pytest.approx(preparation.PIXEL_RMS / 2.0, rel=0.15)) != points

@@ -23,7 +23,7 @@ from lsst.fringe_sim.products.challenge_result import CASE_KINDS
 from lsst.fringe_sim.products.fringe_cube import FringeCube
 
 SIZE = (48, 64)
-LATER = ("dark_current", "insulation", "silicon_gradient")
+LATER = ("dark_current", "insulation", "silicon_gradient", "void")
 """Effects that challenges drew not yet when the hidden cases of these tests were; they would change what is drawn."""
 MODEL = FringeModel.from_setup("ts8_e2v")
 
@@ -100,11 +100,9 @@ def test_a_hidden_effect_is_named(name: str, tmp_path) -> None:
 def test_what_a_strong_pedestal_leaves_is_another_effect() -> None:
     """Electrons cannot be described wrongly; a fainter index of the adhesive beside them is no flaw of their form."""
     parts = np.random.default_rng([20331123, CASE_KINDS.index("two"), 16]).spawn(2)
-    # A case of a challenge that did not draw wedges of silicon yet.
-    case, rng = (
-        draw_case("two", parts[0], only=[name for name in SIZES if name != "silicon_gradient"]),
-        parts[1],
-    )
+    # A case of a challenge that drew neither wedges of silicon nor voids yet.
+    drawn = [name for name in SIZES if name not in ("silicon_gradient", "void")]
+    case, rng = draw_case("two", parts[0], only=drawn), parts[1]
     assert set(case.names) == {"dark_pedestal", "epoxy_index"}
     verdict = discover(case.cube, case.setup, rng=rng)
     found = {effect.name: effect for effect in verdict.effects}

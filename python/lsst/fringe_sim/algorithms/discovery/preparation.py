@@ -57,6 +57,9 @@ PIXEL_RMS = 1.0 / math.sqrt(12.0)
 SAME_AREA = 0.5
 """Part by which the variance of a blur may differ from what few places lack of an area, to be taken for it."""
 
+AREA_LOSS = 9.0
+"""Rise of χ² for which pixels are taken to see their area instead of few places and a blur."""
+
 BLURS = ("charge_diffusion", "brighter_fatter")
 """Effects that blur the light."""
 
@@ -344,6 +347,31 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended
+
+
+def sees_areas(problem: Problem, fit: Fit) -> bool:
+    """Whether pixels that see their area explain as much without the blurs of a fit as few places in each with them.
+
+    Real pixels see their area.
+    """
+    names = {item.effect for item in fit.coordinates} & set(BLURS)
+    if not problem.forward.places or not names:
+        return False
+    rest = fit
+    for name in names:
+        rest = rest.without(name)
+    areas = replace(problem, forward=problem.forward.with_places(0))
+    other = fit_model(areas, rest.coordinates, rest.position, fit.field, fit.levels)
+    return other.chi2 < fit.chi2 + AREA_LOSS * len(names)
+
+
+def prepare_with_areas(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> Prepared:
+    """Field and noise with pixels that see their area, and the effects of a fit but blurs."""
+    settings = {key: value for key, value in fit.settings.items() if key.partition(".")[0] not in BLURS}
+    problem = replace(prepared.problem, forward=prepared.problem.forward.with_places(0))
+    seen, fitted = _choose_field(problem, thickness_um, settings)
+    refined = _settle(seen, fitted, prepared.stated, prepared.index)
+    return replace(refined, null=_better_null(refined, prepared), guess=settings)
 
 
 def _mended(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[FloatArray, dict[str, float]]:

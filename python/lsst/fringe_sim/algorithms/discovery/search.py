@@ -30,6 +30,8 @@ from .preparation import (
     prepare,
     prepare_again,
     prepare_finer,
+    prepare_with_areas,
+    sees_areas,
     why_too_poor,
 )
 from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
@@ -208,7 +210,7 @@ class _Search:
         self.headers = headers_apart(cube, model)
         self.next_measurements: tuple[dict[str, Any], ...] = ()
         self.unseen: HeldOut | None = None
-        self._may_judge_orders = True
+        self._may_judge_orders = self._may_take_areas = True
         self._take_other_cells(prepared)
 
     def _take_other_cells(self, prepared: Prepared) -> None:
@@ -268,6 +270,11 @@ class _Search:
         if len(chosen.names) == PAIR:
             chosen = self._enlarge(whole, training, chosen, steps, self.options.most_effects)
         chosen = self._finished(training, chosen, steps)
+        if self._may_take_areas and sees_areas(training.problem, chosen.fit):
+            self._may_take_areas = self._may_judge_orders = False
+            self.say("pixels see their area, and the blur is what few places lacked of it")
+            self._take(prepare_with_areas(self.prepared, chosen.fit, self._thickness(whole, chosen.fit)))
+            return self.run(refinements=0)
         return self._conclude(whole, training, chosen, steps, chance)
 
     # Stages -------------------------------------------------------------------------------------------------
