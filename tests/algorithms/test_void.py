@@ -67,6 +67,17 @@ def test_a_flat_has_the_gap_on_the_island_and_nowhere_else() -> None:
     assert np.abs(other - one)[:, part == 1.0].max() > 0.01
 
 
+def test_a_gap_everywhere_is_wider_on_the_island() -> None:
+    thickness = np.linspace(14.0, 15.0, 30 * 40).reshape(30, 40)
+    wavelength = np.array([900.0, 960.0])
+    both = FringeModel.from_setup("ts8_e2v", {"air_gap.thickness": 50.0, "void.thickness": 80.0, **PLACE})
+    ((_, inside),) = both.islands
+    wider = FringeModel.from_setup("ts8_e2v", {"air_gap.thickness": 130.0})
+    np.testing.assert_allclose(
+        inside.response(thickness, wavelength), wider.response(thickness, wavelength), rtol=1e-9
+    )
+
+
 def sealed(gap_nm: float, seed: int) -> SealedCase:
     """A case of the challenge with a void of about the wanted gap."""
     rng = np.random.default_rng(seed)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
+from ..optics import Layer, get_medium
 from ..optics.system import OpticalSystem
-from .air_gap import AirGap
 from .base import FloatArray, Parameter, PlainNullEffect
 from .image_geometry import ImageGeometry
 
@@ -38,7 +39,8 @@ class Void(PlainNullEffect):
 
     def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
         """Insert the gap."""
-        return AirGap().change_system(system, values)
+        gap = Layer("void", get_medium("vacuum"), 1e-3 * values["thickness"])
+        return replace(system, stack=system.stack.with_inserted(gap, before="support"))
 
     def coverage(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
         """Part of the area of every sample that lies on the island."""

@@ -308,8 +308,11 @@ class Selector:
         return Candidate(name, 0.0, len(coordinates), start, promise) if score[0] > 0.0 else None
 
     def _on_some_island(self, state: State, fit: Fit, name: str) -> Candidate | None:
-        """A local effect where it promises most, if it promises anything."""
-        starts = self._on_islands(state, fit, name)
+        """A local effect where it promises most, if it promises anything and can be combined with those of the fit."""
+        try:
+            starts = self._on_islands(state, fit, name)
+        except InputError:
+            return None
         if not starts:
             return None
         return Candidate(name, 0.0, len(self.coordinates[name]), starts[0].position, starts[0].promise)
