@@ -357,12 +357,17 @@ def sees_areas(problem: Problem, fit: Fit) -> bool:
     names = {item.effect for item in fit.coordinates} & set(BLURS)
     if not problem.forward.places or not names:
         return False
-    rest = fit
-    for name in names:
-        rest = rest.without(name)
+    rest = without_blurs(fit)
     areas = replace(problem, forward=problem.forward.with_places(0))
     other = fit_model(areas, rest.coordinates, rest.position, fit.field, fit.levels)
     return other.chi2 < fit.chi2 + AREA_LOSS * len(names)
+
+
+def without_blurs(fit: Fit) -> Fit:
+    """The same place without effects that blur the light; not a minimum."""
+    for name in BLURS:
+        fit = fit.without(name)
+    return fit
 
 
 def prepare_with_areas(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> Prepared:

@@ -33,6 +33,7 @@ from .preparation import (
     prepare_with_areas,
     sees_areas,
     why_too_poor,
+    without_blurs,
 )
 from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
 from .validation import HeldOut, held_out_blocks, misfit_rms, validate, whole_thickness
@@ -227,8 +228,11 @@ class _Search:
         """Places along a pixel's side that see the thickness, 0 for its area; effects may have looked like a few."""
         return self.prepared.problem.forward.places
 
-    def run(self, refinements: int = 2) -> Verdict:
-        """Search; start again if a named effect shows that field or noise were misjudged without it."""
+    def run(self, refinements: int = 2, known: Fit | None = None) -> Verdict:
+        """Search; start again if a named effect shows that field or noise were misjudged without it.
+
+        Effects of a fit that are known to be needed are in the first set.
+        """
         whole = Selector(
             self.prepared.problem,
             self.effects,
@@ -245,6 +249,10 @@ class _Search:
         if chance > self.options.significance:
             return self._verdict("no_discrepancy", whole, whole.null, chance, (), {})
         training = self._training(whole)
+        if known is not None and known.coordinates:
+            chosen, steps = self._resumed(training, known)
+            chosen = self._enlarge(whole, training, chosen, steps, self.options.most_effects)
+            return self._conclude(whole, training, self._finished(training, chosen, steps), steps, chance)
         singles = self._refit(training, training.null)
         if singles and singles[0].log_evidence > self.options.least_evidence and refinements > 0:
             refined, _ = self._refined(whole, singles[0])
@@ -274,8 +282,20 @@ class _Search:
             self._may_take_areas = self._may_judge_orders = False
             self.say("pixels see their area, and the blur is what few places lacked of it")
             self._take(prepare_with_areas(self.prepared, chosen.fit, self._thickness(whole, chosen.fit)))
-            return self.run(refinements=0)
+            return self.run(refinements=0, known=without_blurs(chosen.fit))
         return self._conclude(whole, training, chosen, steps, chance)
+
+    def _resumed(self, selector: Selector, known: Fit) -> tuple[Hypothesis, list[Step]]:
+        """The effects of a fit to data that were judged otherwise."""
+        names = tuple(dict.fromkeys(item.effect for item in known.coordinates))
+        field = self.prepared.undistorted_field
+        base = replace(
+            known,
+            field=self.prepared.null.field if field is None else field,
+            levels=known.levels[: selector.problem.n_levels],
+        )
+        found = selector.with_channels(selector.hypothesis(names, None, base))
+        return found, [self._step(selector, selector.null, found)]
 
     # Stages -------------------------------------------------------------------------------------------------
 

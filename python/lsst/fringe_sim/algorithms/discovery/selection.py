@@ -308,7 +308,7 @@ class Selector:
         return Candidate(name, 0.0, len(coordinates), start, promise) if score[0] > 0.0 else None
 
     def _on_some_island(self, state: State, fit: Fit, name: str) -> Candidate | None:
-        """A local effect where it promises most, if it promises anything and can be combined with those of the fit."""
+        """A local effect where it promises most; `None` if nowhere, or if it does not go with those of the fit."""
         try:
             starts = self._on_islands(state, fit, name)
         except InputError:
