@@ -101,7 +101,9 @@ def island_starts(
         score = (signature * state.residual).sum(axis=0)
         discs.append(_best_disc(score, (signature**2).sum(axis=0), problem.cells.seen))
     found: list[IslandStart] = []
-    for disc in _apart(discs):
+    # The best of so many places and sizes promises as much where there is only noise.
+    by_chance = 2.0 * math.log(state.value[0].size * len(sizes))
+    for disc in _apart([disc for disc in discs if disc[0] > by_chance]):
         places = [_position(problem, coordinates, size, value, disc) for value in sizes]
         misfits = [
             _on_island(problem, size.effect, _active(settings, coordinates, size, value, place),
@@ -109,7 +111,7 @@ def island_starts(
             for value, place in zip(sizes, places, strict=True)
         ]  # fmt: skip
         best = sorted(map(int, local_minima(np.array(misfits))), key=lambda number: misfits[number])
-        found += [IslandStart(places[number], disc[0]) for number in best[:MOST_STARTS]]
+        found += [IslandStart(places[number], disc[0] - by_chance) for number in best[:MOST_STARTS]]
     return found
 
 

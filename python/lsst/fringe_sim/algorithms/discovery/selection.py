@@ -64,6 +64,9 @@ PLACES_REFITTED = 10
 LEAST_MOVE_UM = 0.005
 """Move of the thickness that a fit finds by itself [µm]."""
 
+PLACES_TRIED = 4
+"""How often a local effect is placed anew, and fitted from there."""
+
 STEPS_PER_MINIMUM = 5
 MINIMA_REFITTED = 4
 MINIMA_WALKED = 8
@@ -321,6 +324,26 @@ class Selector:
         """Where a local effect may be, and how large."""
         level, _ = self.problem.amplitudes(fit.levels)
         return island_starts(self.problem, state, fit.settings, self.coordinates[name], level)
+
+    def _best_place(
+        self, fit: Fit, position: FloatArray, field_start: FloatArray, levels: FloatArray, rival: float
+    ) -> Fit:
+        """The best fit with the last effect, a local one, in several places; how far they are is in its uncertainty.
+
+        With a thickness in every cell, each cell of the rim may be settled in several ways.
+        """
+        found = [fit]
+        for _ in range(PLACES_TRIED):
+            placed = self._placed_on_island(fit.coordinates, position, field_start, levels)
+            found.append(fit_model(self.problem, fit.coordinates, *placed, levels, rival=rival))
+            best = min(found, key=lambda item: item.chi2)
+            if len(found) > 2 and found[-1].chi2 > min(item.chi2 for item in found[:-1]) - 1.0:
+                break
+            position, field_start, levels = best.position, best.field, best.levels
+        weight = np.exp(-0.5 * np.array([item.chi2 - best.chi2 for item in found]))
+        away = np.stack([item.position - best.position for item in found])
+        spread = np.sqrt((weight[:, np.newaxis] * away**2).sum(axis=0) / weight.sum())
+        return replace(best, spread=np.hypot(best.spread, spread))
 
     def _placed_on_island(
         self,
@@ -661,9 +684,7 @@ class Selector:
         field_start = self._followed(names[-1], coordinates, position, field_start, base.levels)
         fit = fit_model(self.problem, coordinates, position, field_start, base.levels, rival=rival)
         if self.problem.forward.is_island(names[-1]):
-            placed = self._placed_on_island(coordinates, position, field_start, base.levels)
-            other = fit_model(self.problem, coordinates, *placed, base.levels, rival=rival)
-            fit = min(fit, other, key=lambda item: item.chi2)
+            fit = self._best_place(fit, position, field_start, base.levels, rival)
         if fit.chi2 > base.chi2:
             small = np.array(
                 [x if item.key in base.settings else 0.03 * item.unit_step
