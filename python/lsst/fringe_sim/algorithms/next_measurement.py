@@ -362,7 +362,7 @@ def rank_measurements(
     -------
     ranked : `tuple` [`RankedMeasurement`, ...]
         Largest separation of the hardest pair first. Empty if fewer than two of the effects can be forecast: those
-        that couple neighbouring pixels cannot.
+        that couple neighbouring pixels, or are in a part of the sensor only, cannot.
 
     Raises
     ------
@@ -379,7 +379,7 @@ def rank_measurements(
     if unknown:
         raise UnknownNameError("effect", unknown[0], known)
     tested = [_Tested.of(known[name], values, model) for name, values in effects.items()]
-    tested = [item for item in tested if not item.effect.couples_pixels]
+    tested = [item for item in tested if not (item.effect.couples_pixels or item.effect.local)]
     if len(tested) < 2:
         return ()
     further = [_Tested.of(known[name], {}, model) for name in nuisance_effects if name not in effects]

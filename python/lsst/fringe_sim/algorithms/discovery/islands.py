@@ -12,6 +12,7 @@ from scipy.ndimage import binary_dilation
 from scipy.optimize import minimize
 from scipy.signal import fftconvolve
 
+from ..parabola import parabolic_minimum
 from .cells import CellData
 from .channels import State, beside_thickness
 from .comparison import chi2_with_free_fringes, local_minima
@@ -293,23 +294,11 @@ class _Surroundings:
         part = self.problem.forward.coverage(self.name, settings).ravel()[self.own]
         model = self.outside + part * (self.inside - self.outside)
         chi2 = (self.weight * (self.value - model) ** 2).sum(axis=0)
-        least, place = _parabolic_minimum(chi2)
+        found = parabolic_minimum(chi2)
         thickness = self.thickness_um.copy()
         step = self.places[1] - self.places[0]
-        thickness.ravel()[self.own] = self.places[0] + place * step
-        return float(least.sum()), thickness
-
-
-def _parabolic_minimum(curves: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Minimum of each column, by a parabola through the least value and its neighbours, and its place in rows."""
-    best, each = np.argmin(curves, axis=0), np.arange(curves.shape[1])
-    middle = np.clip(best, 1, len(curves) - 2)
-    below, at, above = (curves[middle + step, each] for step in (-1, 0, 1))
-    bend = below - 2.0 * at + above
-    away = np.clip(np.divide(0.5 * (below - above), bend, out=np.zeros_like(at), where=bend > 0.0), -1.0, 1.0)
-    inner = best == middle
-    least = np.where(inner, at - 0.25 * (below - above) * away, curves[best, each])
-    return least, np.where(inner, middle + away, best)
+        thickness.ravel()[self.own] = self.places[0] + found.place * step
+        return float(found.value.sum()), thickness
 
 
 def _of_cells(cells: CellData, level: FloatArray, own: NDArray[np.intp]) -> tuple[FloatArray, ...]:
@@ -340,8 +329,8 @@ def _on_island(
     model = problem.forward.on_and_off_island(name, settings, thickness_um, own, places)[0]
     value, weight, level = _of_cells(cells, level, own)
     chi2 = (weight * (value - level * model) ** 2).sum(axis=(0, 2))
-    least, away = _parabolic_minimum(chi2[:, np.newaxis])
-    return float(np.interp(away[0], np.arange(len(shifts)), shifts)), float(least[0])
+    found = parabolic_minimum(chi2[:, np.newaxis])
+    return float(np.interp(found.place[0], np.arange(len(shifts)), shifts)), float(found.value[0])
 
 
 def _active(
@@ -396,7 +385,7 @@ def _change(
     inside = forward.sampled_on_island(name, active, few + shifts[:, np.newaxis, np.newaxis]).value
     outside = forward.sampled(active, few).value
     misfit = chi2_with_free_fringes(inside, outside, np.ones_like(outside))
-    shift = np.interp(_parabolic_minimum(misfit[:, np.newaxis])[1][0], np.arange(len(shifts)), shifts)
+    shift = np.interp(parabolic_minimum(misfit[:, np.newaxis]).place[0], np.arange(len(shifts)), shifts)
     on, _ = forward.on_and_off_island(name, active, thickness, None, (thickness + shift).reshape(1, -1))
     _, off = forward.on_and_off_island(name, active, thickness)
     return (on - off).reshape(-1, *thickness.shape)

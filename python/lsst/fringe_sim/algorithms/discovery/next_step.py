@@ -54,7 +54,7 @@ def with_next_measurements(
         report(f"which measurement would tell {effect.name} from {', '.join(effect.ambiguous_with)}")
         others = {name: rivals[effect.name][name] for name in effect.ambiguous_with[:MOST_RIVALS]}
         ranked: tuple[RankedMeasurement, ...] = ()
-        reason = "the effects couple neighbouring pixels"
+        reason = "an effect couples neighbouring pixels, or is in a part of the sensor only"
         try:
             ranked = rank(effect, others)
         except FringeSimError as error:  # an effect at the edge of its bounds has no derivative there

@@ -12,6 +12,7 @@ from scipy.ndimage import binary_dilation
 from ...effects import ImageGeometry
 from ...model import FringeModel, ResponseTable
 from ...products import FringeCube, ThicknessMap, mask_bits
+from ..parabola import parabolic_minimum
 from .rescue import chi2_limits
 
 __all__ = ["fit_islands"]
@@ -132,11 +133,11 @@ class _Pixels:
             weight = np.where(good, 1.0 / np.asarray(self.cube.variance[:, y, x], float), 0.0)
             data = np.where(good, np.asarray(self.cube.image[:, y, x], float), 0.0)
             curve = (weight[:, None] * (data[:, None] - signal) ** 2).sum(axis=0)
-            place, least, bend = _parabolic_minimum(curve)
+            minimum = parabolic_minimum(curve)
             used[own] = good.sum(axis=0)
-            value[own] = start[own] + (place - number) * step
-            sigma[own] = step * np.sqrt(2.0 / np.maximum(bend, 1e-30))
-            chi2[own] = least / np.maximum(used[own] - 1, 1)
+            value[own] = start[own] + (minimum.place - number) * step
+            sigma[own] = step * np.sqrt(2.0 / np.maximum(minimum.bend, 1e-30))
+            chi2[own] = minimum.value / np.maximum(used[own] - 1, 1)
         return _Found(value, sigma, chi2, used)
 
 
@@ -151,16 +152,6 @@ def _middle_of_neighbours(thickness_um: FloatArray, usable: NDArray[np.bool_]) -
         y, x = (place[own, None, None] + NEIGHBOURS for place in (rows, columns))
         middle[own] = np.nanmedian(padded[y + reach[:, None], x + reach], axis=(1, 2))
     return middle
-
-
-def _parabolic_minimum(curve: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Place of the minimum of each column, its value, and the second difference there."""
-    best, each = np.argmin(curve, axis=0), np.arange(curve.shape[1])
-    middle = np.clip(best, 1, len(curve) - 2)
-    below, at, above = (curve[middle + step, each] for step in (-1, 0, 1))
-    bend = below - 2.0 * at + above
-    away = np.clip(np.divide(0.5 * (below - above), bend, out=np.zeros_like(at), where=bend > 0.0), -1.0, 1.0)
-    return middle + away, at - 0.25 * (below - above) * away, bend
 
 
 def _joining_shift(
