@@ -468,6 +468,10 @@ class Forward:
             covered |= part > 0.0
         return covered
 
+    def has_island(self, name: str, settings: Settings) -> bool:
+        """Whether a local effect is anywhere, and not at its null."""
+        return any(item.effect.name == name for item, _ in self._island_tables(settings))
+
     def is_island(self, name: str) -> bool:
         """Whether an effect is in a part of the sensor only."""
         return self._effect(name).local

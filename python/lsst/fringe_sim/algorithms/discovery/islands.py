@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import binary_dilation
 from scipy.optimize import minimize
-from scipy.signal import fftconvolve
 
 from ..parabola import parabolic_minimum
 from .cells import CellData
@@ -74,10 +74,10 @@ def island_starts(
 ) -> list[IslandStart]:
     """Places and sizes of a local effect that would explain most, best first.
 
-    For every size, what the effect would do to each cell is compared with what the fit leaves there, beside a
-    thickness of the cell; sums of both over discs of all radii at all places tell where it promises most. The
-    thickness of the fit has followed the phase that the effect changes, by as much as their fringes are apart. In the
-    best discs, all sizes are compared with the data themselves.
+    For every size up to where it repeats, what the effect would do to each cell is compared with what the fit leaves
+    there, beside a thickness of the cell; sums of both over discs of all radii at all places tell where it promises
+    most. The thickness of the fit has followed the phase that the effect changes, by as much as their fringes are
+    apart. In the best discs, all sizes are compared with the data themselves.
 
     Parameters
     ----------
@@ -94,13 +94,15 @@ def island_starts(
     """
     (size,) = (item for item in coordinates if not item.place)
     sizes = _sizes(size)
-    discs = []
+    discs, about = [], _Discs.of(problem.cells.seen)
     for value in sizes:
+        if value > size.neighbour:  # it looks like a smaller one
+            break
         active = _active(settings, coordinates, size, value)
         changed = _change(problem, state, size.effect, settings, active)
         signature = beside_thickness(state, state.whiten(level * changed))
         score = (signature * state.residual).sum(axis=0)
-        discs.append(_best_disc(score, (signature**2).sum(axis=0), problem.cells.seen))
+        discs.append(about.best(score, (signature**2).sum(axis=0)))
     found: list[IslandStart] = []
     # The best of so many places and sizes promises as much where there is only noise.
     by_chance = 2.0 * math.log(state.value[0].size * len(sizes))
@@ -138,6 +140,8 @@ def followed_on_island(
     level : `numpy.ndarray`
         Level of every wavelength; broadcasts to the cells.
     """
+    if not problem.forward.has_island(name, settings):
+        return thickness_um
     shift = _on_island(problem, name, settings, thickness_um, level)[0]
     return np.asarray(thickness_um + shift * problem.forward.coverage(name, settings))
 
@@ -176,6 +180,8 @@ def placed_on_island(
     """
     name = coordinates[-1].effect
     settings = {item.key: item.value(x) for item, x in zip(coordinates, position, strict=True)}
+    if not problem.forward.has_island(name, settings):
+        return position, thickness_um
     free = [number for number, item in enumerate(coordinates) if item.effect == name and item.place]
     about = _Surroundings.of(problem, name, settings, thickness_um, level)
     if about is None:
@@ -218,6 +224,8 @@ def thickness_on_islands(
     for name in dict.fromkeys(
         item.effect for item in fit.coordinates if problem.forward.is_island(item.effect)
     ):
+        if not problem.forward.has_island(name, fit.settings):
+            continue
         covered = problem.forward.coverage(name, fit.settings) > 0.0
         known, unknown = covered & ~held_out & problem.cells.seen, covered & held_out
         if not unknown.any():
@@ -391,26 +399,71 @@ def _change(
     return (on - off).reshape(-1, *thickness.shape)
 
 
-def _best_disc(score: FloatArray, information: FloatArray, seen: NDArray[np.bool_]) -> _Disc:
-    """Fall of χ² of the best disc, and its row, column and radius [cells]."""
-    best = (0.0, 0.0, 0.0, SMALLEST_RADIUS)
-    radius = SMALLEST_RADIUS
-    while radius <= LARGEST_PART * min(score.shape):
-        reach = math.ceil(radius)
-        offset = np.arange(-reach, reach + 1)
-        disc = (np.hypot(offset[:, np.newaxis], offset[np.newaxis, :]) <= radius).astype(float)
-        amount, variance, area = (
-            fftconvolve(values, disc, mode="same") for values in (score, information, seen.astype(float))
+@dataclass(frozen=True, eq=False)
+class _Discs:
+    """Discs of all radii about every cell.
+
+    Attributes
+    ----------
+    shape : `tuple` [`int`, `int`]
+        Rows and columns of cells.
+    padded : `tuple` [`int`, `int`]
+        The same with room for the largest disc.
+    radii : `list` [`float`]
+        Radii [cells].
+    transforms : `list` [`numpy.ndarray`]
+        Fourier transform of a disc of each radius.
+    usable : `list` [`numpy.ndarray`]
+        Cells about which enough of a disc of each radius has data.
+    """
+
+    shape: tuple[int, int]
+    padded: tuple[int, int]
+    radii: list[float]
+    transforms: list[NDArray[np.complex128]]
+    usable: list[NDArray[np.bool_]]
+
+    @classmethod
+    def of(cls, seen: NDArray[np.bool_]) -> _Discs:
+        """Discs about the cells with and without data."""
+        shape = (seen.shape[0], seen.shape[1])
+        largest = LARGEST_PART * min(shape)
+        number = math.floor(math.log(max(largest / SMALLEST_RADIUS, 0.5)) / math.log(RADIUS_RATIO)) + 1
+        radii = [SMALLEST_RADIUS * RADIUS_RATIO**step for step in range(max(number, 0))]
+        rows, columns = (next_fast_len(side + math.ceil(largest), real=True) for side in shape)
+        from_row, from_column = (
+            np.minimum(np.arange(side), side - np.arange(side)) for side in (rows, columns)
         )
-        usable = (area > LEAST_SEEN * disc.sum()) & (variance > 1e-6 * float(information.sum()))
-        strength = np.divide(amount, variance, out=np.zeros_like(amount), where=usable)
-        # A finite signature may be scaled only a little.
-        fall = np.where((strength > 0.2) & (strength < 3.0), amount * strength, 0.0)
-        row, column = np.unravel_index(int(np.argmax(fall)), fall.shape)
-        if fall[row, column] > best[0]:
-            best = (float(fall[row, column]), float(row), float(column), radius)
-        radius *= RADIUS_RATIO
-    return best
+        away = np.hypot(from_row[:, np.newaxis], from_column[np.newaxis, :])
+        transforms = [rfft2((away <= radius).astype(float)) for radius in radii]
+        discs = cls(shape, (rows, columns), radii, transforms, [])
+        parts = discs.sums(seen.astype(float))
+        discs.usable.extend(
+            part > LEAST_SEEN * math.pi * radius**2 for part, radius in zip(parts, radii, strict=True)
+        )
+        return discs
+
+    def sums(self, values: FloatArray) -> Iterator[FloatArray]:
+        """Sums over the discs of every radius."""
+        transform = rfft2(values, self.padded)
+        for disc in self.transforms:
+            yield irfft2(transform * disc, self.padded)[: self.shape[0], : self.shape[1]]
+
+    def best(self, score: FloatArray, information: FloatArray) -> _Disc:
+        """The disc that promises most, from derivative and curvature of the likelihood in every cell."""
+        best = (0.0, 0.0, 0.0, SMALLEST_RADIUS)
+        least = 1e-6 * float(information.sum())
+        each = zip(self.radii, self.usable, self.sums(score), self.sums(information), strict=True)
+        for radius, usable, amount, variance in each:
+            strength = np.divide(
+                amount, variance, out=np.zeros(self.shape), where=usable & (variance > least)
+            )
+            # A finite signature may be scaled only a little.
+            fall = np.where((strength > 0.2) & (strength < 3.0), amount * strength, 0.0)
+            row, column = np.unravel_index(int(np.argmax(fall)), fall.shape)
+            if fall[row, column] > best[0]:
+                best = (float(fall[row, column]), float(row), float(column), radius)
+        return best
 
 
 def _position(
