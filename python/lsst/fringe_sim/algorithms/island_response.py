@@ -112,6 +112,6 @@ class IslandTable:
         image = self.outside.frame(thickness)
         geometry = ImageGeometry.of_pixels((image.shape[0], image.shape[1]), self.wavelength_nm)
         for item, inside in self.islands:
-            part = item.effect.coverage(item.complete_values(self.model.base_system), geometry)
+            part = item.coverage(self.model.base_system, geometry)
             image = image + part.astype(np.float32) * (inside.frame(thickness) - image)
         return image

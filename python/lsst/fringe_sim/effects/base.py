@@ -247,6 +247,10 @@ class ActiveEffect:
         """Values of all parameters, null where none is given."""
         return {**self.effect.null_values(system), **self.values}
 
+    def coverage(self, system: OpticalSystem, geometry: ImageGeometry) -> FloatArray:
+        """Part of every sample that has the effect (`Effect.coverage`); ``system`` is the one before any effect."""
+        return self.effect.coverage(self.complete_values(system), geometry)
+
     def is_null(self, system: OpticalSystem) -> bool:
         """Whether every value equals its null, but those that only say where the effect would be."""
         nulls, places = self.effect.null_values(system), {p.name for p in self.effect.parameters if p.place}

@@ -28,14 +28,7 @@ from ..errors import UnknownNameError
 from ..products.challenge_result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
 from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
-from .hidden_effects import (
-    AmplifierState,
-    HiddenEffect,
-    added_silicon,
-    hidden_islands,
-    validate_effects,
-    with_hidden_optics,
-)
+from .hidden_effects import AmplifierState, HiddenEffect, validate_effects, with_hidden_optics
 from .raw_files import exposure_time
 from .raw_frames import setup_optics
 from .sensor_signal import SensorSignal
@@ -285,13 +278,7 @@ def _expose(
     if rng.random() < 0.3:  # real runs lose exposures
         wavelengths = np.sort(rng.choice(wavelengths, size=10, replace=False))
     shape = (thickness.shape[0], thickness.shape[1])
-    signal = SensorSignal.of(
-        optics,
-        thickness,
-        tuple(wavelengths),
-        added_silicon(shape, active),
-        hidden_islands(optics, shape, active),
-    )
+    signal = SensorSignal.with_effects(optics, thickness, tuple(wavelengths), active)
     response = 1.0 + float(rng.choice([0.0, 0.003, 0.006])) * rng.standard_normal(shape)
     states = _amplifiers(active, rng)
     gain, offset = (

@@ -22,6 +22,7 @@ from .optics import Film, FlatFieldOptics
 
 __all__ = [
     "HIDDEN_EFFECTS",
+    "ActiveHiddenEffect",
     "AmplifierState",
     "HiddenEffect",
     "HiddenParameter",
@@ -145,7 +146,7 @@ class HiddenEffect:
         return {p.name: values.get(p.name, p.null) for p in self.parameters}
 
 
-_Active = tuple[HiddenEffect, Mapping[str, float]]
+ActiveHiddenEffect = tuple[HiddenEffect, Mapping[str, float]]
 """An effect and the values given for it."""
 
 
@@ -358,7 +359,7 @@ def _silicon_gradient(shape: tuple[int, int], values: Values) -> FloatArray:
     return np.asarray(0.5 * (values["gradient_x"] * u + values["gradient_y"] * v))
 
 
-def with_hidden_optics(optics: FlatFieldOptics, active: Iterable[_Active]) -> FlatFieldOptics:
+def with_hidden_optics(optics: FlatFieldOptics, active: Iterable[ActiveHiddenEffect]) -> FlatFieldOptics:
     """Optics with all effects in them that all of the sensor has."""
     for effect, values in active:
         if effect.on_optics is not None and effect.on_island is None:
@@ -367,7 +368,7 @@ def with_hidden_optics(optics: FlatFieldOptics, active: Iterable[_Active]) -> Fl
 
 
 def hidden_islands(
-    optics: FlatFieldOptics, shape: tuple[int, int], active: Iterable[_Active]
+    optics: FlatFieldOptics, shape: tuple[int, int], active: Iterable[ActiveHiddenEffect]
 ) -> list[tuple[FloatArray, FlatFieldOptics]]:
     """Part of every pixel that sees other optics than the rest of the sensor, and these optics."""
     return [
@@ -390,7 +391,7 @@ def _disc(shape: tuple[int, int], values: Values) -> FloatArray:
     return part
 
 
-def added_silicon(shape: tuple[int, int], active: Iterable[_Active]) -> FloatArray | None:
+def added_silicon(shape: tuple[int, int], active: Iterable[ActiveHiddenEffect]) -> FloatArray | None:
     """What effects add to the detection layer at every pixel [µm]; `None` if they leave it alone."""
     parts = [
         effect.on_silicon(shape, effect.complete(values))

@@ -20,14 +20,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.camera import Amplifier, Camera, Detector
 from ..resources import list_resources, read_yaml
-from .hidden_effects import (
-    AmplifierState,
-    HiddenEffect,
-    added_silicon,
-    hidden_islands,
-    validate_effects,
-    with_hidden_optics,
-)
+from .hidden_effects import AmplifierState, HiddenEffect, validate_effects, with_hidden_optics
 from .optics import Film, FlatFieldOptics
 from .raw_files import Clock, primary_header, write_frame
 from .readout import Readout
@@ -400,13 +393,7 @@ def _make_truth(
         thickness_um=thickness,
         effects={effect.name: dict(values) for effect, values in active},
         optics=optics,
-        signal=SensorSignal.of(
-            optics,
-            thickness,
-            wavelengths,
-            added_silicon(sensor.shape, active),
-            hidden_islands(optics, sensor.shape, active),
-        ),
+        signal=SensorSignal.with_effects(optics, thickness, wavelengths, active),
         amplifiers=tuple(_amplifier_state(amp, active, amplifier_rng) for amp in sensor.amplifiers),
         response=response,
         excess_e=excess,

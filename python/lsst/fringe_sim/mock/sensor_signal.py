@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from .hidden_effects import ActiveHiddenEffect, added_silicon, hidden_islands
 from .optics import FlatFieldOptics, SignalTable
 from .thickness import PixelArea
 
@@ -74,6 +75,19 @@ class SensorSignal:
             (part, cls.of(inside, thickness_um, wavelengths_nm, thicker_um)) for part, inside in islands
         )
         return cls(area, wedge, added, tables, others)
+
+    @classmethod
+    def with_effects(
+        cls,
+        optics: FlatFieldOptics,
+        thickness_um: FloatArray,
+        wavelengths_nm: Sequence[float],
+        active: Sequence[ActiveHiddenEffect],
+    ) -> SensorSignal:
+        """The same with what hidden effects do to parts of the sensor; ``optics`` has what they do to all of it."""
+        shape = (thickness_um.shape[0], thickness_um.shape[1])
+        silicon, islands = added_silicon(shape, active), hidden_islands(optics, shape, active)
+        return cls.of(optics, thickness_um, wavelengths_nm, silicon, islands)
 
     def flat(self, row: int) -> FloatArray:
         """Signal of one flat."""

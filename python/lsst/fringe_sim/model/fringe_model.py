@@ -146,7 +146,7 @@ class FringeModel:
         """
         image = evaluate(self)
         for item, inside in self.islands:
-            part = item.effect.coverage(item.complete_values(self.base_system), geometry).astype(image.dtype)
+            part = item.coverage(self.base_system, geometry).astype(image.dtype)
             if part.any():
                 image = image + part * (evaluate(inside) - image)
         return image
@@ -198,7 +198,7 @@ class FringeModel:
         if thickness.shape != geometry.sample_shape:
             raise InputError("shape of the thickness map", thickness.shape, f"{geometry.sample_shape}")
         image = self.with_islands(lambda model: model.response(thickness, geometry.wavelength_nm), geometry)
-        image = image / image.mean(axis=(1, 2), keepdims=True)
+        image /= image.mean(axis=(1, 2), keepdims=True)
         return apply_to_image(self.effects, self.base_system, image, geometry)
 
     def respond(

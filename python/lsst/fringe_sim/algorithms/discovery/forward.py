@@ -349,8 +349,8 @@ class Forward:
         if not self._has_islands(settings):
             return []
         return [
-            (item.effect.coverage(item.complete_values(self.model.base_system), self.geometry), table)
-            for item, table in self._island_tables({**self.model.effect_settings, **settings})
+            (item.coverage(self.model.base_system, self.geometry), table)
+            for item, table in self._island_tables(settings)
         ]
 
     def _seen_through(self, table: FloatArray, thickness_um: FloatArray) -> FloatArray:
@@ -459,7 +459,7 @@ class Forward:
         """Part of every cell that has a local effect, ``(ny, nx)``."""
         own = {key: value for key, value in settings.items() if key.partition(".")[0] == name}
         (item,) = activate_effects(own, self.catalogue)
-        return item.effect.coverage(item.complete_values(self.model.base_system), self.geometry)
+        return item.coverage(self.model.base_system, self.geometry)
 
     def on_islands(self, settings: Settings) -> NDArray[np.bool_]:
         """Cells with a local effect, shape ``(ny, nx)``."""
@@ -470,7 +470,7 @@ class Forward:
 
     def has_island(self, name: str, settings: Settings) -> bool:
         """Whether a local effect is anywhere, and not at its null."""
-        return any(item.effect.name == name for item, _ in self._island_tables(settings))
+        return any(item.effect.name == name for item, _ in self.model_with(settings).islands)
 
     def is_island(self, name: str) -> bool:
         """Whether an effect is in a part of the sensor only."""

@@ -244,7 +244,7 @@ def _moved(
     """All effects with some coordinates elsewhere, within their bounds."""
     moved = position.copy()
     moved[free] = place
-    return {item.key: item.value(item.coordinate(item.value(item.clip(x))))
+    return {item.key: item.value(item.clip(x))
             for item, x in zip(coordinates, moved, strict=True)}  # fmt: skip
 
 
@@ -287,9 +287,7 @@ class _Surroundings:
         own = np.flatnonzero((near & cells.seen).ravel())
         if not own.size:
             return None
-        shifts = _shifts(problem)
-        for shift in (shifts[0], shifts[-1]):
-            forward.cover(thickness_um + shift)
+        shifts = _covered_shifts(problem, thickness_um)
         places = thickness_um.ravel()[own] + shifts[:, np.newaxis]
         value, weight, level = _of_cells(cells, level, own)
         inside, outside = (
@@ -330,9 +328,7 @@ def _on_island(
     if not own.size:
         return 0.0, math.inf
     own = own[:: max(1, own.size // ISLAND_CELLS)]
-    shifts = _shifts(problem)
-    for shift in (shifts[0], shifts[-1]):
-        problem.forward.cover(thickness_um + shift)
+    shifts = _covered_shifts(problem, thickness_um)
     places = thickness_um.ravel()[own] + shifts[:, np.newaxis]
     model = problem.forward.on_and_off_island(name, settings, thickness_um, own, places)[0]
     value, weight, level = _of_cells(cells, level, own)
@@ -364,10 +360,13 @@ def _apart(discs: list[_Disc]) -> list[_Disc]:
     return kept
 
 
-def _shifts(problem: Problem) -> FloatArray:
-    """Shifts of the thickness up to half an order on both sides [µm]."""
+def _covered_shifts(problem: Problem, thickness_um: FloatArray) -> FloatArray:
+    """Shifts of a thickness up to half an order on both sides [µm], within the tables."""
     order = float(problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm))))
-    return np.linspace(-0.5, 0.5, SHIFTS_PER_ORDER + 1) * order
+    shifts = np.linspace(-0.5, 0.5, SHIFTS_PER_ORDER + 1) * order
+    for shift in (shifts[0], shifts[-1]):
+        problem.forward.cover(thickness_um + shift)
+    return shifts
 
 
 def _sizes(size: Coordinate) -> list[float]:
@@ -385,9 +384,7 @@ def _change(
 ) -> FloatArray:
     """What a local effect would do to every cell, were it there; the thickness follows."""
     forward, thickness = problem.forward, state.thickness_um
-    shifts = _shifts(problem)
-    for shift in (shifts[0], shifts[-1]):
-        forward.cover(thickness + shift)
+    shifts = _covered_shifts(problem, thickness)
     seen = thickness[problem.cells.seen]
     few = np.linspace(float(seen.min()), float(seen.max()), COMPARED_THICKNESSES)[np.newaxis]
     inside = forward.sampled_on_island(name, active, few + shifts[:, np.newaxis, np.newaxis]).value

@@ -372,7 +372,7 @@ def without_blurs(fit: Fit) -> Fit:
 
 def prepare_with_areas(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> Prepared:
     """Field and noise with pixels that see their area, and the effects of a fit but blurs."""
-    settings = {key: value for key, value in fit.settings.items() if key.partition(".")[0] not in BLURS}
+    settings = without_blurs(fit).settings
     problem = replace(prepared.problem, forward=prepared.problem.forward.with_places(0))
     seen, fitted = _choose_field(problem, thickness_um, settings)
     refined = _settle(seen, fitted, prepared.stated, prepared.index)

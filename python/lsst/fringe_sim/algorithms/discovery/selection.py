@@ -188,6 +188,7 @@ class Selector:
         self._searched: dict[frozenset[str], Fit] = {}
         # Sets are enlarged, swapped and compared from the same fits.
         self._scores: dict[tuple[Fit, bool], dict[str, Candidate | None]] = {}
+        self._island_starts: dict[tuple[Fit, str], list[IslandStart]] = {}
 
     def state(self, fit: Fit) -> State:
         """Everything the tests need at a fit."""
@@ -322,8 +323,12 @@ class Selector:
 
     def _on_islands(self, state: State, fit: Fit, name: str) -> list[IslandStart]:
         """Where a local effect may be, and how large."""
-        level, _ = self.problem.amplitudes(fit.levels)
-        return island_starts(self.problem, state, fit.settings, self.coordinates[name], level)
+        if (fit, name) not in self._island_starts:
+            level, _ = self.problem.amplitudes(fit.levels)
+            self._island_starts[fit, name] = island_starts(
+                self.problem, state, fit.settings, self.coordinates[name], level
+            )
+        return self._island_starts[fit, name]
 
     def _best_place(
         self, fit: Fit, position: FloatArray, field_start: FloatArray, levels: FloatArray, rival: float

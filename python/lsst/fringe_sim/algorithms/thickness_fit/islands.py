@@ -62,7 +62,7 @@ def fit_islands(fitted: ThicknessMap, cube: FringeCube, model: FringeModel) -> T
     """
     geometry = ImageGeometry.of_pixels((fitted.value.shape[0], fitted.value.shape[1]), cube.wavelength_nm)
     for item, inside in model.islands:
-        part = item.effect.coverage(item.complete_values(model.base_system), geometry)
+        part = item.coverage(model.base_system, geometry)
         usable = (part > 0.0) & np.isfinite(fitted.value) & (cube.mask == 0).any(axis=0)
         if usable.any():
             fitted = _fit_island(fitted, cube, model, inside, part, usable)
