@@ -32,6 +32,23 @@ def test_a_parabola_has_its_slopes_up_to_the_rim_and_beside_holes() -> None:
     assert not found[:, ~seen].any()
 
 
+@pytest.mark.parametrize("hidden", [[1], [22], [28], [1, 3], [1, 29], [26, 28]])
+def test_a_cell_that_a_bad_column_cuts_off_takes_those_beyond(hidden: list[int]) -> None:
+    """Cells at the edge beside a bad column were flat, and their fringes had the full contrast."""
+    field = 3.0 + X - 1.5 * Y + 0.01 * X**2
+    seen = np.ones(field.shape, bool)
+    seen[:, hidden] = False
+    found = slopes(np.where(seen, field, 1e6), seen)
+    np.testing.assert_allclose(found[1][seen], (1.0 + 0.02 * X)[seen], atol=0.021)
+    np.testing.assert_allclose(found[0][seen], -1.5, atol=1e-9)
+
+
+def test_behind_two_bad_columns_the_slope_is_that_across_them() -> None:
+    seen = np.ones(X.shape, bool)
+    seen[:, 1:3] = False
+    np.testing.assert_allclose(slopes(np.where(seen, X, 1e6), seen)[1][:, 0], 1.0, atol=1e-9)
+
+
 def test_a_cell_in_a_wrong_order_makes_no_slopes_two_cells_away() -> None:
     field = 0.05 * X
     field[12, 15] += 1.0

@@ -13,17 +13,29 @@ __all__ = ["Slopes"]
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-NEIGHBOURS = ({-1: -0.5, 1: 0.5}, {0: -1.0, 1: 1.0}, {0: 1.0, -1: -1.0})
-"""Weights of cells along an axis, best first; they make a wave of ten cells flatter by 6 %."""
+BESIDE = ({-1: -0.5, 1: 0.5}, {0: -1.0, 1: 1.0}, {0: 1.0, -1: -1.0})
+BEYOND = ({-2: -0.25, 2: 0.25}, {0: -0.5, 2: 0.5}, {0: 0.5, -2: -0.5})
+FAR_BEYOND = ({0: -1.0 / 3.0, 3: 1.0 / 3.0}, {0: 1.0 / 3.0, -3: -1.0 / 3.0})
+NEIGHBOURS = (*BESIDE, *BEYOND, *FAR_BEYOND)
+"""Weights of cells along an axis, best first; they make a wave of ten cells flatter by 6 %. Behind a gap of a cell or
+two, as a bad column beside the edge leaves it, it takes those beyond."""
 
 CURVED = (
     {-2: 1.0 / 12.0, -1: -2.0 / 3.0, 1: 2.0 / 3.0, 2: -1.0 / 12.0},
     {-1: -0.5, 1: 0.5},
     {0: -1.5, 1: 2.0, 2: -0.5},
     {0: 1.5, -1: -2.0, -2: 0.5},
-    *NEIGHBOURS[1:],
+    *BESIDE[1:],
+    BEYOND[0],
+    {0: -5.0 / 6.0, 2: 1.5, 3: -2.0 / 3.0},
+    {0: 5.0 / 6.0, -2: -1.5, -3: 2.0 / 3.0},
+    *BEYOND[1:],
+    *FAR_BEYOND,
 )
 """The same to fourth order, at the rim to second."""
+
+REACH = 3
+"""Farthest neighbour of a cell."""
 
 LARGEST_CORRECTION = 0.2
 """Part of the slope to the neighbours by which that to fourth order may differ: beyond it the field is no smooth one
@@ -36,7 +48,7 @@ class Slopes:
     Parameters
     ----------
     seen : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
-        Cells where the field is known; slopes of others, and of those alone, are 0.
+        Cells where the field is known; slopes of others, and of those farther than three from the next, are 0.
     """
 
     def __init__(self, seen: BoolArray) -> None:
@@ -61,13 +73,13 @@ def _along_first(
 ) -> csr_matrix:
     """Slopes along the first axis, of cells with these numbers."""
     size = len(seen)
-    padded = np.pad(seen, ((2, 2), (0, 0)))
+    padded = np.pad(seen, ((REACH, REACH), (0, 0)))
     open_cells = seen.copy()
     rows, columns, weights = [], [], []
     for stencil in stencils:
         usable = open_cells.copy()
         for step in stencil:
-            usable &= padded[2 + step : 2 + step + size]
+            usable &= padded[REACH + step : REACH + step + size]
         place, other = np.nonzero(usable)
         for step, weight in stencil.items():
             rows.append(number[place, other])
