@@ -11,7 +11,8 @@ import pytest
 from lsst.fringe_sim.algorithms.discovery import Verdict
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, Where
 from lsst.fringe_sim.errors import UnknownNameError
-from lsst.fringe_sim.mock.challenge import SealedCase, draw_case, judge, run_challenge
+from lsst.fringe_sim.mock.challenge import judge, run_challenge
+from lsst.fringe_sim.mock.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.products.challenge_result import VISIBLE, CaseResult
 
 

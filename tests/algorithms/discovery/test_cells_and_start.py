@@ -22,7 +22,7 @@ from lsst.fringe_sim.algorithms.discovery.start import _mend_patches, mended_thi
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.effects.image_geometry import AMPLIFIERS
 from lsst.fringe_sim.mock import challenge
-from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.mock.thickness import PixelArea, random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube

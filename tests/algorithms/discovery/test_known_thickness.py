@@ -12,7 +12,7 @@ from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.noise import map_variance_share
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.effects.image_geometry import ImageGeometry
-from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 
 STATED_UM = 0.01

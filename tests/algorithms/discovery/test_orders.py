@@ -13,7 +13,7 @@ from lsst.fringe_sim.algorithms.discovery.orders import fields_in_other_orders
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
 from lsst.fringe_sim.effects import EFFECTS
-from lsst.fringe_sim.mock.challenge import draw_case
+from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 
 JITTER, CAUSE, RIVAL = "wavelength_jitter", "dark_pedestal", "contrast_loss"

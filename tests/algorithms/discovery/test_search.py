@@ -17,7 +17,7 @@ from lsst.fringe_sim.algorithms.discovery import (
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.mock.challenge import SIZES, SealedCase, draw_case
+from lsst.fringe_sim.mock.sealed_cases import SIZES, SealedCase, draw_case
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.challenge_result import CASE_KINDS
 from lsst.fringe_sim.products.fringe_cube import FringeCube

@@ -18,7 +18,7 @@ from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.algorithms.discovery.spots import DEPTHS, RADII, log_evidence_of_spots, spot_channel
 from lsst.fringe_sim.effects import EFFECTS
-from lsst.fringe_sim.mock.challenge import SealedCase, draw_case
+from lsst.fringe_sim.mock.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.model import FringeModel
 
 SHAPE = (40, 48)
