@@ -12,6 +12,7 @@ from lsst.fringe_sim.algorithms.discovery import Verdict
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, Where
 from lsst.fringe_sim.errors import UnknownNameError
 from lsst.fringe_sim.mock.challenge import judge, run_challenge
+from lsst.fringe_sim.mock.oracle import Oracle, Visibility
 from lsst.fringe_sim.mock.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.products.challenge_result import VISIBLE, CaseResult
 
@@ -21,8 +22,12 @@ def _verdict(*effects: NamedEffect) -> Verdict:
     return Verdict("named" if effects else "unexplained", effects, Where(), gap, (), {}, "ts8_e2v", 0.0)
 
 
-def _effect(name: str, *others: str, significance: float = 50.0) -> NamedEffect:
-    return NamedEffect(name, {}, 0.99, others, "", 1.0, significance)
+def _effect(name: str, *others: str) -> NamedEffect:
+    return NamedEffect(name, {}, 0.99, others, "", 1.0, 50.0)
+
+
+def _oracle(**each: float) -> Oracle:
+    return Oracle(Visibility(max(each.values()), each), _verdict())
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +37,7 @@ def pair() -> SealedCase:
 
 
 def test_a_pair_is_right_in_any_order_and_within_classes(pair: SealedCase) -> None:
-    oracle = _verdict(_effect("vignetting"), _effect("roughness"))
+    oracle = _oracle(vignetting=50.0, roughness=50.0)
     for named in (
         (_effect("roughness"), _effect("vignetting")),
         (_effect("epoxy_absorption", "roughness"), _effect("vignetting")),
@@ -46,7 +51,7 @@ def test_a_pair_is_right_in_any_order_and_within_classes(pair: SealedCase) -> No
 
 
 def test_a_faint_second_effect_need_not_be_named_but_no_other_may(pair: SealedCase) -> None:
-    oracle = _verdict(_effect("vignetting"), _effect("roughness", significance=0.5 * VISIBLE))
+    oracle = _oracle(vignetting=50.0, roughness=0.5 * VISIBLE)
     result = judge(pair, _verdict(_effect("vignetting")), 0, 1.0, oracle)
     assert result.right_class
     assert not result.exact

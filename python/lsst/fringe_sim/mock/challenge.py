@@ -21,6 +21,7 @@ import numpy as np
 from ..algorithms.discovery import SearchOptions, Verdict, discover
 from ..effects import EFFECTS
 from ..products.challenge_result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
+from .oracle import Oracle, visibility
 from .sealed_cases import SealedCase, draw_case
 
 __all__ = ["judge", "run_challenge"]
@@ -103,27 +104,24 @@ def _run_case(
     return judge(case, verdict, number, seconds, _ask_oracle(case, options))
 
 
-def _ask_oracle(case: SealedCase, options: SearchOptions | None) -> Verdict | None:
-    """Verdict of the search when it is told which effects can be in."""
+def _ask_oracle(case: SealedCase, options: SearchOptions | None) -> Oracle | None:
+    """What is seen of the effects of a case, and the verdict of a search that is told which can be in."""
     known = [effect for effect in EFFECTS if effect.name in case.names]
     if not known:
         return None
     trusting = replace(options or SearchOptions(), significance=1.0, least_evidence=-math.inf)
-    return discover(case.cube, case.setup, known, rng=np.random.default_rng(0), options=trusting)
+    verdict = discover(case.cube, case.setup, known, rng=np.random.default_rng(0), options=trusting)
+    return Oracle(visibility(case, most_cells=trusting.most_cells), verdict)
 
 
 def judge(
-    case: SealedCase, verdict: Verdict, number: int, seconds: float, oracle: Verdict | None
+    case: SealedCase, verdict: Verdict, number: int, seconds: float, oracle: Oracle | None
 ) -> CaseResult:
     """Compare a verdict with the truth."""
     found = tuple(effect.name for effect in verdict.effects)
     classes = [{effect.name, *effect.ambiguous_with} for effect in verdict.effects]
-    own_significance = {effect.name: effect.significance for effect in oracle.effects} if oracle else {}
-    if oracle and not own_significance:
-        own_significance = {
-            item["name"]: item["significance"] for item in oracle.unexplained.get("partial", ())
-        }
-    seen = [name for name in case.names if own_significance.get(name, 0.0) >= VISIBLE]
+    visible = oracle.visibility.each if oracle else {}
+    seen = [name for name in case.names if visible.get(name, 0.0) >= VISIBLE]
     wanted = {case.names} if len(case.names) < 2 else {case.names, tuple(seen)}
     right = (
         case.kind in ("one", "two")
@@ -140,8 +138,8 @@ def judge(
                     pulls[key] = (parameter.value - case.values[key]) / parameter.sigma
     strength, shrinkage = math.nan, math.nan
     if oracle is not None:
-        strength = math.sqrt(max(sum(step.delta_chi2 for step in oracle.steps), 0.0))
-        whole = oracle.gap.heldout_before**2 - oracle.gap.heldout_after**2
+        strength, gap = oracle.visibility.all, oracle.verdict.gap
+        whole = gap.heldout_before**2 - gap.heldout_after**2
         own = verdict.gap.heldout_before**2 - verdict.gap.heldout_after**2
         shrinkage = own / whole if whole > 0.0 else math.nan
     return CaseResult(
@@ -155,7 +153,7 @@ def judge(
         right,
         exact,
         strength,
-        min((own_significance.get(name, 0.0) for name in case.names), default=math.nan),
+        min(visible.values(), default=math.nan),
         min((effect.probability for effect in verdict.effects), default=0.0),
         math.prod(e.probability * e.share for e in verdict.effects) if verdict.effects else 0.0,
         pulls,

@@ -48,9 +48,9 @@ class CaseResult:
     exact : `bool`
         The named effects are those that are in.
     signal_to_noise : `float`
-        Square root of what the oracle takes off χ².
+        Square root of what the true effects take off χ².
     weakest : `float`
-        Signal to noise of the weakest of several effects beside the others, as the oracle finds it.
+        Signal to noise of the weakest of several effects beside the others, at their true sizes.
     probability : `float`
         Smallest probability that was stated for a class; 0 if nothing was named.
     name_probability : `float`

@@ -1,0 +1,116 @@
+"""What could be reached on a sealed case: an oracle that is told its effects, their sizes and the thickness."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from ..algorithms.discovery import Verdict
+from ..algorithms.discovery.cells import CellData
+from ..algorithms.discovery.fit import Fit, Problem, coordinates_of, fit_model
+from ..algorithms.discovery.preparation import prepare
+from ..effects import EFFECTS
+from ..model import FringeModel
+from .sealed_cases import SealedCase
+
+__all__ = ["Oracle", "Visibility", "visibility"]
+
+FloatArray = NDArray[np.float64]
+
+ORDERS = (0.0, -1.0, 1.0)
+"""Fringe orders by which the thickness is shifted for a fit that lacks an effect: it may be likelier there."""
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """How clearly the effects of a case are in its data.
+
+    Attributes
+    ----------
+    all : `float`
+        Signal to noise of all effects together.
+    each : `dict` [`str`, `float`]
+        That of each beside the others.
+    """
+
+    all: float
+    each: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """What could be reached on a case.
+
+    Attributes
+    ----------
+    visibility : `Visibility`
+        How clearly its effects are seen.
+    verdict : `Verdict`
+        Of the search, told which effects can be in.
+    """
+
+    visibility: Visibility
+    verdict: Verdict
+
+
+def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
+    """Signal to noise of the effects of a case, from fits that begin at their true sizes and the true thickness.
+
+    A search may miss a minimum that is there, and would call faint what it has missed.
+
+    Parameters
+    ----------
+    case : `SealedCase`
+        With one effect of the catalogue or more.
+    most_cells : `int`, optional
+        Cells that the data are averaged to, as in the search.
+    """
+    known = {
+        f"{effect.name}.{parameter.name}": case.values[f"{effect.name}.{parameter.name}"]
+        for effect in EFFECTS
+        for parameter in effect.parameters
+        if f"{effect.name}.{parameter.name}" in case.values
+    }
+    model = FringeModel.from_setup(case.setup).with_effects(known)
+    problem = prepare(case.cube, model, EFFECTS, most_cells).problem
+    thickness = _at_cells(case.thickness_um, problem.cells)
+    complete = _fit_with(problem, case, case.names, thickness)
+    order = float(model.fringe_order_um(float(np.median(problem.cells.wavelength_nm))))
+
+    def gain_over(names: tuple[str, ...]) -> float:
+        shifted = (_fit_with(problem, case, names, thickness + number * order) for number in ORDERS)
+        return math.sqrt(max(min(fit.chi2 for fit in shifted) - complete.chi2, 0.0))
+
+    each = {name: gain_over(tuple(n for n in case.names if n != name)) for name in case.names}
+    return Visibility(gain_over(()), each)
+
+
+def _at_cells(image: FloatArray, cells: CellData) -> FloatArray:
+    """An image of the whole sensor at the middle of cells."""
+    places = np.meshgrid(cells.geometry.y_px, cells.geometry.x_px, indexing="ij")
+    return np.asarray(map_coordinates(image, places, order=1, mode="nearest"))
+
+
+def _fit_with(problem: Problem, case: SealedCase, names: tuple[str, ...], thickness_um: FloatArray) -> Fit:
+    """Fit with some effects of a case, all others absent."""
+    effects = [effect for effect in EFFECTS if effect.name in case.names]
+    absent = {
+        f"{effect.name}.{name}": null
+        for effect in effects
+        if effect.name not in names
+        for name, null in effect.null_values(problem.forward.model.base_system).items()
+    }
+    coordinates = tuple(
+        item
+        for effect in effects
+        if effect.name in names
+        for item in coordinates_of(effect, problem.forward, thickness_um)
+    )
+    # Gains of amplifiers, say, are drawn: the case knows their spread alone.
+    start = np.array([item.coordinate(case.values.get(item.key, item.null)) for item in coordinates])
+    field = problem.basis.fit(thickness_um, problem.cells.seen.astype(float))
+    return fit_model(problem, coordinates, start, field, None, absent)

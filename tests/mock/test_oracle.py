@@ -1,0 +1,43 @@
+"""How clearly effects are seen in sealed cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.mock.oracle import visibility
+from lsst.fringe_sim.mock.sealed_cases import SealedCase, _expose
+from lsst.fringe_sim.mock.thickness import random_field
+
+
+def sealed(seed: int = 3, **values: float) -> SealedCase:
+    """A case with effects of given sizes; the same sensor and the same noise for each."""
+    rng = np.random.default_rng(seed)
+    thickness = random_field((48, 48), rng, mean=16.0, span=1.5)
+    sizes = {key.replace("__", "."): value for key, value in values.items()}
+    names = tuple(dict.fromkeys(key.partition(".")[0] for key in sizes))
+    cube, _ = _expose(thickness, sizes, "", 1.0, rng)
+    return SealedCase(cube, "ts8_e2v", "two", names, sizes, thickness, 1.0)
+
+
+def test_signal_to_noise_grows_with_the_effect() -> None:
+    """A loss of contrast of a fifth is seen twice as clearly as one of a tenth."""
+    small, large = (
+        visibility(sealed(contrast_loss__factor=1.0 - loss)).each["contrast_loss"] for loss in (0.1, 0.2)
+    )
+    assert small > 3.0
+    assert large / small == pytest.approx(2.0, rel=0.25)
+
+
+def test_an_effect_in_another_valley_is_seen() -> None:
+    """An index of the support comes back after a fringe: a fit that begins without it may not find it."""
+    seen = visibility(sealed(insulation__offset=0.022, support_index__offset=-0.06))
+    assert min(seen.each.values()) > 10.0
+    assert seen.all > max(seen.each.values())
+
+
+def test_what_takes_the_place_of_the_other_is_not_seen_beside_it() -> None:
+    """Two pedestals that fill each other's part: one alone is plain, beside the other it is not."""
+    alone = visibility(sealed(dark_pedestal__electrons=1500.0)).each["dark_pedestal"]
+    both = visibility(sealed(dark_pedestal__electrons=1500.0, ghost_pedestal__fraction=0.05)).each
+    assert both["dark_pedestal"] < 0.5 * alone
