@@ -20,7 +20,7 @@ BoolArray = NDArray[np.bool_]
 KNOTS, TURNS = (8.0, 6.0), 3
 """Spacings of the spline that is fitted [cells], and how often each is tried: one may succeed where another fails."""
 
-GAIN = 0.98
+GAIN = 0.995
 """Part of χ² to which a growth must lower it."""
 
 SIDE = 3
@@ -29,7 +29,7 @@ SIDE = 3
 STEP, STEPS_ACROSS = 3, 32
 """Cells that a round goes further, and rounds that cross a large sensor at least."""
 
-GOOD, BAD, FEW_BAD = 1.7, 5.0, 0.005
+GOOD, BAD, FEW_BAD = 1.7, 3.0, 0.001
 """Misfit over that of the better cells, up to which the model fits and from which it does not; the part of the cells
 that may be so."""
 

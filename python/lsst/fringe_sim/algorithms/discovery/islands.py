@@ -36,6 +36,9 @@ MOST_DISCS, MOST_STARTS = 2, 3
 WORTH_TRYING = 0.5
 """Discs that are followed, minima in size for each, and what a disc must promise of what the best one does."""
 
+LEAST_KEPT = 0.3
+"""Part of what a disc promises that a size must take off χ² there."""
+
 RIM_REACH, RIM_STEP, RIM_TOLERANCE, MOST_TRIALS = 3, 0.7, 0.003, 200
 """How far beyond an island cells are compared, the first step of its rim and the last [cells], and steps at most."""
 
@@ -77,7 +80,8 @@ def island_starts(
     For every size up to where it repeats, what the effect would do to each cell is compared with what the fit leaves
     there, beside a thickness of the cell; sums of both over discs of all radii at all places tell where it promises
     most. The thickness of the fit has followed the phase that the effect changes, by as much as their fringes are
-    apart. In the best discs, all sizes are compared with the data themselves.
+    apart. In the best discs, all sizes are compared with the data themselves: what anything else has done there may
+    promise much along the effect, and the data are farther from all of it than from nothing.
 
     Parameters
     ----------
@@ -107,14 +111,16 @@ def island_starts(
     # The best of so many places and sizes promises as much where there is only noise.
     by_chance = 2.0 * math.log(state.value[0].size * len(sizes))
     for disc in _apart([disc for disc in discs if disc[0] > by_chance]):
+        promise = disc[0] - by_chance
         places = [_position(problem, coordinates, size, value, disc) for value in sizes]
-        misfits = [
+        gains = [
             _on_island(problem, size.effect, _active(settings, coordinates, size, value, place),
-                       state.thickness_um, level)[1]
+                       state.thickness_um, level).gain
             for value, place in zip(sizes, places, strict=True)
         ]  # fmt: skip
-        best = sorted(map(int, local_minima(np.array(misfits))), key=lambda number: misfits[number])
-        found += [IslandStart(places[number], disc[0] - by_chance) for number in best[:MOST_STARTS]]
+        best = sorted(map(int, local_minima(-np.array(gains))), key=lambda number: -gains[number])
+        kept = [number for number in best[:MOST_STARTS] if gains[number] > LEAST_KEPT * promise]
+        found += [IslandStart(places[number], promise) for number in kept]
     return found
 
 
@@ -142,7 +148,7 @@ def followed_on_island(
     """
     if not problem.forward.has_island(name, settings):
         return thickness_um
-    shift = _on_island(problem, name, settings, thickness_um, level)[0]
+    shift = _on_island(problem, name, settings, thickness_um, level).shift_um
     return np.asarray(thickness_um + shift * problem.forward.coverage(name, settings))
 
 
@@ -315,26 +321,45 @@ def _of_cells(cells: CellData, level: FloatArray, own: NDArray[np.intp]) -> tupl
     )
 
 
+@dataclass(frozen=True)
+class _Compared:
+    """A local effect on its island, compared with the data there.
+
+    Attributes
+    ----------
+    shift_um : `float`
+        Shift of the thickness with which it lies best.
+    gain : `float`
+        Fall of χ² from the best shift without the effect.
+    """
+
+    shift_um: float
+    gain: float
+
+
 def _on_island(
     problem: Problem,
     name: str,
     settings: Mapping[str, float],
     thickness_um: FloatArray,
     level: FloatArray,
-) -> tuple[float, float]:
-    """Shift of the thickness [µm] with which a local effect lies best on the data, and χ² of some cells there."""
+) -> _Compared:
+    """How a local effect lies on the data where it is, from some of the cells there."""
     cells, part = problem.cells, problem.forward.coverage(name, settings)
-    own = np.flatnonzero(((part > 0.5) & cells.seen).ravel())
-    if not own.size:
-        return 0.0, math.inf
-    own = own[:: max(1, own.size // ISLAND_CELLS)]
+    covered = np.flatnonzero(((part > 0.5) & cells.seen).ravel())
+    if not covered.size:
+        return _Compared(0.0, -math.inf)
+    own = covered[:: max(1, covered.size // ISLAND_CELLS)]
     shifts = _covered_shifts(problem, thickness_um)
     places = thickness_um.ravel()[own] + shifts[:, np.newaxis]
-    model = problem.forward.on_and_off_island(name, settings, thickness_um, own, places)[0]
     value, weight, level = _of_cells(cells, level, own)
-    chi2 = (weight * (value - level * model) ** 2).sum(axis=(0, 2))
-    found = parabolic_minimum(chi2[:, np.newaxis])
-    return float(np.interp(found.place[0], np.arange(len(shifts)), shifts)), float(found.value[0])
+    chi2 = [
+        (weight * (value - level * light) ** 2).sum(axis=(0, 2))
+        for light in problem.forward.on_and_off_island(name, settings, thickness_um, own, places)
+    ]
+    found = parabolic_minimum(np.stack(chi2, axis=1))
+    shift = float(np.interp(found.place[0], np.arange(len(shifts)), shifts))
+    return _Compared(shift, float(found.value[1] - found.value[0]) * covered.size / own.size)
 
 
 def _active(
