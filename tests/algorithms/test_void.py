@@ -126,9 +126,12 @@ def test_it_goes_along_to_the_sky() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "gap_nm"), [(1, 173.0), (12, 27.0)])
+@pytest.mark.parametrize(("seed", "gap_nm"), [(2, 205.0), (4, 22.5), (3, 13.0)])
 def test_it_is_found_where_it_is(seed: int, gap_nm: float) -> None:
-    """Strong ones and faint ones, in the right one of many sizes that look nearly alike."""
+    """Strong ones and faint ones, in the right one of many sizes that look nearly alike.
+
+    Beside a thickness of every cell a rim is known to 0.1 px at 22 nm; it goes on smoothly, and tells ten times more.
+    """
     parts = np.random.default_rng([seed, 77]).spawn(2)
     case = draw_case("one", parts[0], only=["void"])
     assert case.values["void.thickness"] == pytest.approx(gap_nm, abs=1.0)
@@ -136,7 +139,7 @@ def test_it_is_found_where_it_is(seed: int, gap_nm: float) -> None:
     assert [effect.name for effect in verdict.effects] == ["void"], verdict.summary()
     for name, found in verdict.effects[0].parameters.items():
         assert abs(found.value - case.values[f"void.{name}"]) < 4.0 * found.sigma, name
-        assert found.sigma < 1.0
+        assert found.sigma < (1.0 if name == "thickness" else 0.05), name
 
 
 def test_two_islands_of_one_effect_are_two_effects() -> None:

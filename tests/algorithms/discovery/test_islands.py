@@ -6,6 +6,12 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import islands
+from lsst.fringe_sim.algorithms.discovery.fit import coordinates_of
+from lsst.fringe_sim.algorithms.discovery.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.selection import Selector
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.mock.sealed_cases import draw_case
+from lsst.fringe_sim.model import FringeModel
 
 SHAPE = (40, 56)
 
@@ -53,3 +59,22 @@ def test_a_sensor_too_small_for_discs_has_none() -> None:
     discs = islands._Discs.of(np.ones((4, 4), bool))
     assert discs.radii == []
     assert discs.best(np.ones((4, 4)), np.ones((4, 4)))[0] == 0.0
+
+
+@pytest.mark.parametrize(("kind", "cause", "found"), [("outsider", "stains", False), ("one", "void", True)])
+def test_stains_are_no_islands(monkeypatch: pytest.MonkeyPatch, kind: str, cause: str, found: bool) -> None:
+    """Along a void they promise much, and the data are farther from one of any size than from none."""
+    case = draw_case(kind, np.random.default_rng([7, 77]).spawn(2)[0], only=[cause])
+    prepared = prepare(case.cube, FringeModel.from_setup(case.setup), EFFECTS, 20_000)
+    problem, null = prepared.problem, prepared.null
+    state = Selector(problem, EFFECTS, null, prepared.index).state(null)
+    (void,) = (effect for effect in EFFECTS if effect.name == "void")
+    coordinates = coordinates_of(void, problem.forward, state.thickness_um)
+    level, _ = problem.amplitudes(null.levels)
+
+    def is_offered() -> bool:
+        return bool(islands.island_starts(problem, state, {}, coordinates, level))
+
+    assert is_offered() == found
+    monkeypatch.setattr(islands, "DOUBT", np.inf)
+    assert is_offered()

@@ -464,9 +464,13 @@ class Forward:
     def on_islands(self, settings: Settings) -> NDArray[np.bool_]:
         """Cells with a local effect, shape ``(ny, nx)``."""
         covered = np.zeros(self.geometry.sample_shape, dtype=bool)
-        for part, _ in self._islands(settings):
+        for part in self.island_parts(settings):
             covered |= part > 0.0
         return covered
+
+    def island_parts(self, settings: Settings) -> list[FloatArray]:
+        """Part of every cell that is on the island of each local effect, each ``(ny, nx)``."""
+        return [part for part, _ in self._islands(settings)]
 
     def has_island(self, name: str, settings: Settings) -> bool:
         """Whether a local effect is anywhere, and not at its null."""

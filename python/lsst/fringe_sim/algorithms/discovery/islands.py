@@ -36,8 +36,8 @@ MOST_DISCS, MOST_STARTS = 2, 3
 WORTH_TRYING = 0.5
 """Discs that are followed, minima in size for each, and what a disc must promise of what the best one does."""
 
-LEAST_KEPT = 0.3
-"""Part of what a disc promises that a size must take off χ² there."""
+LEAST_KEPT, DOUBT = 0.3, 9.0
+"""Part of what the best size takes off χ² that another one must, and by how much the best may raise it."""
 
 RIM_REACH, RIM_STEP, RIM_TOLERANCE, MOST_TRIALS = 3, 0.7, 0.003, 200
 """How far beyond an island cells are compared, the first step of its rim and the last [cells], and steps at most."""
@@ -119,8 +119,10 @@ def island_starts(
             for value, place in zip(sizes, places, strict=True)
         ]  # fmt: skip
         best = sorted(map(int, local_minima(-np.array(gains))), key=lambda number: -gains[number])
-        kept = [number for number in best[:MOST_STARTS] if gains[number] > LEAST_KEPT * promise]
-        found += [IslandStart(places[number], promise) for number in kept]
+        least = max(0.0, LEAST_KEPT * gains[best[0]]) - DOUBT
+        found += [
+            IslandStart(places[number], promise) for number in best[:MOST_STARTS] if gains[number] > least
+        ]
     return found
 
 
@@ -209,36 +211,30 @@ def placed_on_island(
 
 
 def thickness_on_islands(
-    problem: Problem, null: Fit, fit: Fit, thickness_um: FloatArray, held_out: NDArray[np.bool_]
+    problem: Problem, fit: Fit, thickness_um: FloatArray, held_out: NDArray[np.bool_]
 ) -> FloatArray:
-    """Thickness of cells on islands that took no part in a fit, from where the fit moved the others there [µm].
+    """Thickness of cells on islands that took no part in a fit, from those within half an order [µm].
 
     Parameters
     ----------
     problem : `Problem`
         All data.
-    null, fit : `Fit`
-        Fit of the unchanged model, and one with the effects to a part of the data.
+    fit : `Fit`
+        Fit to a part of the data.
     thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
         Thickness so far, returned for all other cells.
     held_out : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
         Cells that took no part.
     """
     level, _ = problem.amplitudes(fit.levels)
-    before, after = (problem.basis.expand(each.field) for each in (null, fit))
     found = thickness_um
     for name in dict.fromkeys(
         item.effect for item in fit.coordinates if problem.forward.is_island(item.effect)
     ):
         if not problem.forward.has_island(name, fit.settings):
             continue
-        covered = problem.forward.coverage(name, fit.settings) > 0.0
-        known, unknown = covered & ~held_out & problem.cells.seen, covered & held_out
-        if not unknown.any():
-            continue
-        moved = found.copy()
-        moved[unknown] = before[unknown] + (float(np.median((after - before)[known])) if known.any() else 0.0)
-        about = _Surroundings.of(problem, name, fit.settings, moved, level)
+        unknown = (problem.forward.coverage(name, fit.settings) > 0.0) & held_out
+        about = _Surroundings.of(problem, name, fit.settings, found, level) if unknown.any() else None
         if about is not None:
             found = np.where(unknown, about.chi2(fit.settings)[1], found)
     return found
@@ -330,7 +326,7 @@ class _Compared:
     shift_um : `float`
         Shift of the thickness with which it lies best.
     gain : `float`
-        Fall of χ² from the best shift without the effect.
+        Fall of χ² from none, with the thickness that suits each cell.
     """
 
     shift_um: float
@@ -354,12 +350,13 @@ def _on_island(
     places = thickness_um.ravel()[own] + shifts[:, np.newaxis]
     value, weight, level = _of_cells(cells, level, own)
     chi2 = [
-        (weight * (value - level * light) ** 2).sum(axis=(0, 2))
+        (weight * (value - level * light) ** 2).sum(axis=0)
         for light in problem.forward.on_and_off_island(name, settings, thickness_um, own, places)
     ]
-    found = parabolic_minimum(np.stack(chi2, axis=1))
-    shift = float(np.interp(found.place[0], np.arange(len(shifts)), shifts))
-    return _Compared(shift, float(found.value[1] - found.value[0]) * covered.size / own.size)
+    place = parabolic_minimum(chi2[0].sum(axis=1, keepdims=True)).place[0]
+    each, without = (float(parabolic_minimum(curves).value.sum()) for curves in chi2)
+    shift = float(np.interp(place, np.arange(len(shifts)), shifts))
+    return _Compared(shift, (without - each) * covered.size / own.size)
 
 
 def _active(

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import binary_dilation
 
 from ...effects import Effect
 from ...effects.brighter_fatter import FULL_PIXEL_E
@@ -59,6 +60,9 @@ SAME_AREA = 0.5
 
 AREA_LOSS = 9.0
 """Rise of χ² for which pixels are taken to see their area instead of few places and a blur."""
+
+RIM_CELLS = 2
+"""Cells on both sides of the rim of a local effect that do not decide how fine the thickness is."""
 
 BLURS = ("charge_diffusion", "brighter_fatter")
 """Effects that blur the light."""
@@ -336,17 +340,30 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     start, settings = _mended(problem, fit, thickness_um)
     half_order = 0.5 * fringe_order_um(problem.cells.wavelength_nm, float(prepared.index.mean()))
     mended = int(np.count_nonzero(np.abs(start - thickness_um) > half_order))
-    seen, fitted = _choose_field(problem, start, settings)
+    rim = _rims(problem, settings)
+    seen, fitted = _choose_field(problem.with_cells(problem.cells.restricted(~rim)), start, settings)
     chosen = _choose_pixels(seen, fitted, _without_rest_of_area(settings, problem.forward))
     refined = _settle(*chosen, prepared.stated, prepared.index)
     refined = replace(refined, null=_better_null(refined, prepared), guess=settings)
     change = np.abs(refined.noise.factor / prepared.noise.factor - 1.0).max()
     scatter = abs(refined.noise.response_scatter - prepared.noise.response_scatter)
     same_pixels = refined.problem.forward.places == problem.forward.places
-    same_field = refined.problem.basis.size <= problem.basis.size and not mended and same_pixels
+    size, before = refined.problem.basis.size, problem.basis.size
+    # Across a rim the thickness goes on as it is, and tells more the smoother it may be.
+    same_field = (
+        (0.5 * before < size if rim.any() else True) and size <= before and not mended and same_pixels
+    )
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended
+
+
+def _rims(problem: Problem, settings: Mapping[str, float]) -> NDArray[np.bool_]:
+    """Cells at the rim of local effects: one that is a little off would ask for a thickness of each of them."""
+    found = np.zeros(problem.cells.shape[1:], dtype=bool)
+    for part in problem.forward.island_parts(settings):
+        found |= binary_dilation((part > 0.0) & (part < 1.0), iterations=RIM_CELLS)
+    return found
 
 
 def sees_areas(problem: Problem, fit: Fit) -> bool:

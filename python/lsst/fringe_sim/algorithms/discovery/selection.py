@@ -314,12 +314,21 @@ class Selector:
     def _on_some_island(self, state: State, fit: Fit, name: str) -> Candidate | None:
         """A local effect where it promises most; `None` if nowhere, or if it does not go with those of the fit."""
         try:
-            starts = self._on_islands(state, fit, name)
+            starts = [*self._on_islands(state, fit, name), *self._on_known_island(fit, name)]
         except InputError:
             return None
         if not starts:
             return None
-        return Candidate(name, 0.0, len(self.coordinates[name]), starts[0].position, starts[0].promise)
+        best = max(starts, key=lambda item: item.promise)
+        return Candidate(name, 0.0, len(self.coordinates[name]), best.position, best.promise)
+
+    def _on_known_island(self, fit: Fit, name: str) -> list[IslandStart]:
+        """Where a local effect is with which the field was chosen: a smooth field hides it from the rest."""
+        guessed = self._guessed(self.coordinates[name])
+        if fit.coordinates or not guessed:
+            return []
+        there = fit_model(self.problem, (), np.zeros(0), self.first_field, fit.levels, self.guess)
+        return [IslandStart(position, fit.chi2 - there.chi2) for position in guessed]
 
     def _on_islands(self, state: State, fit: Fit, name: str) -> list[IslandStart]:
         """Where a local effect may be, and how large."""
@@ -586,17 +595,24 @@ class Selector:
             if self.problem.forward.is_island(name):
                 fresh = [one.position for one in self._on_islands(self.state(base), base, name)]
                 fresh = fresh or ([] if start is None else [np.asarray(start, dtype=float)])
+                fresh += self._guessed(own)
                 if fresh:
                     continue
             small = [0.1 * item.unit_step for item in own]
             if start is None and self.is_sought(name):
                 start = self._seen(self.state(base), name)
             fresh = [np.array(small) if start is None else np.asarray(start, dtype=float)]
-            if all(item.key in self.guess for item in own) and not base.coordinates:
-                fresh.append(np.array([item.coordinate(self.guess[item.key]) for item in own]))
+            if not base.coordinates:
+                fresh += self._guessed(own)
         if not fresh:
             return [np.array(known)]
         return [np.concatenate([known, one]) for one in fresh]
+
+    def _guessed(self, own: Sequence[Coordinate]) -> list[FloatArray]:
+        """Coordinates of an effect with which the field was chosen; none if it was without."""
+        if not all(item.key in self.guess for item in own):
+            return []
+        return [np.array([item.coordinate(self.guess[item.key]) for item in own])]
 
     def _deepest(self, fit: Fit) -> Fit:
         """The fit, or a better one in neighbouring minima of the coordinates that have many."""

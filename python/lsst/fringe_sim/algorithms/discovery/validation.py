@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from .comparison import chi2_with_free_levels
 from .continuation import continued
@@ -24,6 +25,9 @@ FEWEST_ROWS = 12
 
 MUCH_WORSE = 4.0
 """χ² of the cells held out over that of the others, from which on their thickness may be another."""
+
+NEAR_ISLAND = 8
+"""Cells about an island into which a smooth thickness may be bent."""
 
 FEWEST_WAVELENGTHS = 8
 """Wavelengths from which on every fourth is left out at once."""
@@ -86,17 +90,41 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
     moved = problem.basis.expand(fit.field)
     if not held_out.any():
         return moved
-    on_islands = problem.forward.on_islands(fit.settings)
-    found = thickness_on_islands(
-        problem, null, fit, _moved_everywhere(problem, null, moved, held_out, on_islands), held_out
-    )
     rest = problem.with_cells(problem.cells.restricted(held_out))
+    on_islands = problem.forward.on_islands(fit.settings)
+    everywhere = _moved_everywhere(problem, null, moved, held_out, on_islands)
+    if on_islands.any():
+        return _best_with_islands(problem, rest, fit, everywhere, moved, held_out, on_islands)
     ratio = rest.cells.n_values / max(problem.cells.n_values - rest.cells.n_values, 1)
-    chi2 = _chi2_at(rest, fit, found)
+    chi2 = _chi2_at(rest, fit, everywhere)
     if chi2 < MUCH_WORSE * ratio * fit.chi2:
-        return found
-    beyond = np.where(held_out, continued(moved, ~held_out & problem.cells.seen), moved)
-    return beyond if _chi2_at(rest, fit, beyond) < chi2 else found
+        return everywhere
+    beyond = _beyond(problem, moved, held_out)
+    return beyond if _chi2_at(rest, fit, beyond) < chi2 else everywhere
+
+
+def _beyond(problem: Problem, thickness_um: FloatArray, held_out: BoolArray) -> FloatArray:
+    """Thickness that is continued into the cells held out."""
+    return np.where(held_out, continued(thickness_um, ~held_out & problem.cells.seen), thickness_um)
+
+
+def _best_with_islands(
+    problem: Problem,
+    rest: Problem,
+    fit: Fit,
+    everywhere: FloatArray,
+    moved: FloatArray,
+    held_out: BoolArray,
+    on_islands: BoolArray,
+) -> FloatArray:
+    """Thickness of all cells where local effects are in; a smooth one is bent about an island without the effect."""
+    beyond = _beyond(problem, moved, held_out)
+    near = binary_dilation(on_islands, iterations=NEAR_ISLAND)
+    trials = [
+        thickness_on_islands(problem, fit, first, held_out)
+        for first in (everywhere, np.where(near, beyond, everywhere), beyond)
+    ]
+    return min(trials, key=lambda thickness: _chi2_at(rest, fit, thickness))
 
 
 def _chi2_at(problem: Problem, fit: Fit, thickness_um: FloatArray) -> float:
@@ -117,7 +145,9 @@ def _moved_everywhere(
     depth = (before - middle) / half
     columns = np.stack([depth**power for power in range(3)], axis=-1)
     solution = np.linalg.lstsq(columns[seen], (moved - before)[seen], rcond=None)[0]
-    return before + columns @ solution
+    known = on_islands & ~held_out & problem.cells.seen
+    there = float(np.median((moved - before)[known])) if known.any() else 0.0
+    return np.asarray(before + np.where(on_islands, there, columns @ solution))
 
 
 def validate(problem: Problem, null: Fit, final: Fit, held_out: BoolArray, *, rich: bool) -> HeldOut:
