@@ -68,6 +68,20 @@ def test_the_prior_draws_a_large_effect_by_a_part_of_its_uncertainty_only(tilted
     assert abs(fit.position[0] - free.position[0]) < 0.2 * fit.sigma[0]
 
 
+def test_a_part_does_not_lean_on_the_thickness_of_the_rest(tilted) -> None:
+    """What a spline does where it is held by nothing made the fringes of the cells beside it too weak."""
+    problem, fit = tilted
+    thickness = problem.basis.expand(fit.field)
+    out = np.zeros(thickness.shape, bool)
+    out[:12, 8:20] = out[20:, 30:] = True
+    part = problem.without_cells(out)
+    wild = np.where(out, thickness + 0.3, thickness)
+    for forward, same in ((part.forward, True), (problem.forward, False)):
+        known, other = (forward.predict(fit.settings, each).value[:, ~out] for each in (thickness, wild))
+        assert np.array_equal(known, other) == same
+    assert not part.cells.weight[:, out].any()
+
+
 @pytest.mark.parametrize("at", [0.3, 4.0, 200.0])
 @pytest.mark.parametrize("quadratic", [False, True])
 def test_derivatives_are_central(at: float, quadratic: bool) -> None:

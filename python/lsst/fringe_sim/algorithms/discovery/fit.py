@@ -413,6 +413,11 @@ class Problem:
         """Same problem with other data on the same cells."""
         return replace(self, cells=cells)
 
+    def without_cells(self, out: NDArray[np.bool_]) -> Problem:
+        """Same problem without the data of some cells, of shape ``(ny, nx)``: their thickness is not known either."""
+        cells = self.cells.restricted(~out)
+        return replace(self, cells=cells, forward=self.forward.with_seen(cells.seen))
+
 
 @dataclass(frozen=True, eq=False)
 class Design:

@@ -169,6 +169,10 @@ class Forward:
         """The same with pixels that see their area (0), or so many places on each side; tables are kept."""
         return replace(self, places=places, _tables=dict(self._tables), _rows=dict(self._rows))
 
+    def with_seen(self, seen: NDArray[np.bool_]) -> Forward:
+        """The same with data in fewer cells; tables are kept."""
+        return replace(self, seen=seen, _tables=dict(self._tables), _rows=dict(self._rows))
+
     def with_scatter(self, scatter_um2: FloatArray | None) -> Forward:
         """The same with thicknesses that scatter so much about the true ones; tables are kept."""
         return replace(self, scatter_um2=scatter_um2, _tables=dict(self._tables), _rows=dict(self._rows))

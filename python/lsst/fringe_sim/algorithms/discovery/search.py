@@ -321,7 +321,7 @@ class _Search:
         """Selector that does not see the part held out."""
         if not self.heldout.any():
             return whole
-        problem = whole.problem.with_cells(self.cells.restricted(~self.heldout))
+        problem = whole.problem.without_cells(self.heldout)
         null = fit_model(problem, (), np.zeros(0), self.prepared.null.field, self.prepared.null.levels)
         self.say("ranking effects")
         return Selector(

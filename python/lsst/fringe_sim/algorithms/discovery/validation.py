@@ -179,7 +179,7 @@ def _without_blocks(
 ) -> tuple[float, float, float]:
     if not held_out.any():
         return 0.0, misfit_rms(problem, null), misfit_rms(problem, final)
-    seen = problem.with_cells(problem.cells.restricted(~held_out))
+    seen = problem.without_cells(held_out)
     fitted = fit_model(seen, final.coordinates, final.position, final.field, final.levels)
     unseen = problem.with_cells(problem.cells.restricted(held_out))
     before = fit_model(unseen, (), np.zeros(0), null.field, null.levels)
