@@ -21,7 +21,7 @@ from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector
 from lsst.fringe_sim.algorithms.discovery.start import _mend_patches, mended_thickness, starting_thickness
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.effects.image_geometry import AMPLIFIERS
-from lsst.fringe_sim.mock import challenge
+from lsst.fringe_sim.mock import sealed_cases
 from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.mock.thickness import PixelArea, random_field
 from lsst.fringe_sim.model import FringeModel
@@ -172,7 +172,7 @@ def test_fringes_that_diffusion_takes_away_in_places_do_not_hide_it(monkeypatch:
         return {"charge_diffusion.sigma": 10.0 ** rng.uniform(-0.7, 0.5)}
 
     # A case of a challenge that went wrong, which drew from so many effects.
-    monkeypatch.setattr(challenge, "SIZES", {str(number): diffusion for number in range(37)})
+    monkeypatch.setattr(sealed_cases, "SIZES", {str(number): diffusion for number in range(37)})
     streams = np.random.default_rng([20270405, 1, 3]).spawn(2)
     case = draw_case("one", streams[0])
     assert case.values["charge_diffusion.sigma"] == pytest.approx(1.446, abs=1e-3)
