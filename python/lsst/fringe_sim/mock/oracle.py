@@ -69,12 +69,9 @@ def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
     most_cells : `int`, optional
         Cells that the data are averaged to, as in the search.
     """
-    known = {
-        f"{effect.name}.{parameter.name}": case.values[f"{effect.name}.{parameter.name}"]
-        for effect in EFFECTS
-        for parameter in effect.parameters
-        if f"{effect.name}.{parameter.name}" in case.values
-    }
+    keys = {f"{effect.name}.{parameter.name}" for effect in EFFECTS for parameter in effect.parameters}
+    # Gains of amplifiers, say, are drawn: the case knows their spread alone.
+    known = {key: value for key, value in case.values.items() if key in keys}
     model = FringeModel.from_setup(case.setup).with_effects(known)
     problem = prepare(case.cube, model, EFFECTS, most_cells).problem
     thickness = _at_cells(case.thickness_um, problem.cells)
@@ -85,8 +82,11 @@ def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
         shifted = (_fit_with(problem, case, names, thickness + number * order) for number in ORDERS)
         return math.sqrt(max(min(fit.chi2 for fit in shifted) - complete.chi2, 0.0))
 
+    together = gain_over(())
+    if len(case.names) == 1:
+        return Visibility(together, {case.names[0]: together})
     each = {name: gain_over(tuple(n for n in case.names if n != name)) for name in case.names}
-    return Visibility(gain_over(()), each)
+    return Visibility(together, each)
 
 
 def _at_cells(image: FloatArray, cells: CellData) -> FloatArray:
@@ -110,7 +110,6 @@ def _fit_with(problem: Problem, case: SealedCase, names: tuple[str, ...], thickn
         if effect.name in names
         for item in coordinates_of(effect, problem.forward, thickness_um)
     )
-    # Gains of amplifiers, say, are drawn: the case knows their spread alone.
     start = np.array([item.coordinate(case.values.get(item.key, item.null)) for item in coordinates])
     field = problem.basis.fit(thickness_um, problem.cells.seen.astype(float))
     return fit_model(problem, coordinates, start, field, None, absent)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numba
 import numpy as np
@@ -167,15 +167,19 @@ class Forward:
 
     def with_places(self, places: int) -> Forward:
         """The same with pixels that see their area (0), or so many places on each side; tables are kept."""
-        return replace(self, places=places, _tables=dict(self._tables), _rows=dict(self._rows))
+        return self._with(places=places)
 
     def with_seen(self, seen: NDArray[np.bool_]) -> Forward:
         """The same with data in fewer cells; tables are kept."""
-        return replace(self, seen=seen, _tables=dict(self._tables), _rows=dict(self._rows))
+        return self._with(seen=seen)
 
     def with_scatter(self, scatter_um2: FloatArray | None) -> Forward:
         """The same with thicknesses that scatter so much about the true ones; tables are kept."""
-        return replace(self, scatter_um2=scatter_um2, _tables=dict(self._tables), _rows=dict(self._rows))
+        return self._with(scatter_um2=scatter_um2)
+
+    def _with(self, **changes: Any) -> Forward:
+        """The same with changes that leave the tables as they are."""
+        return replace(self, _tables=dict(self._tables), _rows=dict(self._rows), **changes)
 
     def scatter_of(self, thickness_um: FloatArray, errors_um: FloatArray) -> FloatArray:
         """Variance of a thickness that has such errors, ``(K, ny, nx)``, and what their slopes do to the cells [µm²].

@@ -119,7 +119,7 @@ def island_starts(
             for value, place in zip(sizes, places, strict=True)
         ]  # fmt: skip
         best = sorted(map(int, local_minima(-np.array(gains))), key=lambda number: -gains[number])
-        least = max(0.0, LEAST_KEPT * gains[best[0]]) - DOUBT
+        least = max(0.0, LEAST_KEPT * max(gains)) - DOUBT
         found += [
             IslandStart(places[number], promise) for number in best[:MOST_STARTS] if gains[number] > least
         ]

@@ -350,9 +350,8 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     same_pixels = refined.problem.forward.places == problem.forward.places
     size, before = refined.problem.basis.size, problem.basis.size
     # Across a rim the thickness goes on as it is, and tells more the smoother it may be.
-    same_field = (
-        (0.5 * before < size if rim.any() else True) and size <= before and not mended and same_pixels
-    )
+    much_smoother = rim.any() and size <= 0.5 * before
+    same_field = size <= before and not much_smoother and not mended and same_pixels
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended

@@ -34,7 +34,7 @@ CURVED = (
 )
 """The same to fourth order, at the rim to second."""
 
-REACH = 3
+REACH = max(abs(step) for stencil in CURVED for step in stencil)
 """Farthest neighbour of a cell."""
 
 LARGEST_CORRECTION = 0.2

@@ -94,7 +94,11 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
     on_islands = problem.forward.on_islands(fit.settings)
     everywhere = _moved_everywhere(problem, null, moved, held_out, on_islands)
     if on_islands.any():
-        return _best_with_islands(problem, rest, fit, everywhere, moved, held_out, on_islands)
+        # A smooth thickness is bent about an island without the effect.
+        beyond = _beyond(problem, moved, held_out)
+        near = np.where(binary_dilation(on_islands, iterations=NEAR_ISLAND), beyond, everywhere)
+        trials = [thickness_on_islands(problem, fit, first, held_out) for first in (everywhere, near, beyond)]
+        return min(trials, key=lambda thickness: _chi2_at(rest, fit, thickness))
     ratio = rest.cells.n_values / max(problem.cells.n_values - rest.cells.n_values, 1)
     chi2 = _chi2_at(rest, fit, everywhere)
     if chi2 < MUCH_WORSE * ratio * fit.chi2:
@@ -106,25 +110,6 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
 def _beyond(problem: Problem, thickness_um: FloatArray, held_out: BoolArray) -> FloatArray:
     """Thickness that is continued into the cells held out."""
     return np.where(held_out, continued(thickness_um, ~held_out & problem.cells.seen), thickness_um)
-
-
-def _best_with_islands(
-    problem: Problem,
-    rest: Problem,
-    fit: Fit,
-    everywhere: FloatArray,
-    moved: FloatArray,
-    held_out: BoolArray,
-    on_islands: BoolArray,
-) -> FloatArray:
-    """Thickness of all cells where local effects are in; a smooth one is bent about an island without the effect."""
-    beyond = _beyond(problem, moved, held_out)
-    near = binary_dilation(on_islands, iterations=NEAR_ISLAND)
-    trials = [
-        thickness_on_islands(problem, fit, first, held_out)
-        for first in (everywhere, np.where(near, beyond, everywhere), beyond)
-    ]
-    return min(trials, key=lambda thickness: _chi2_at(rest, fit, thickness))
 
 
 def _chi2_at(problem: Problem, fit: Fit, thickness_um: FloatArray) -> float:
