@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lsst.fringe_sim.algorithms.discovery import discs as discs_module
 from lsst.fringe_sim.algorithms.discovery import islands
+from lsst.fringe_sim.algorithms.discovery.discs import Discs
 from lsst.fringe_sim.algorithms.discovery.fit import coordinates_of
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
@@ -23,9 +25,13 @@ def _disc(row: float, column: float, radius: float) -> np.ndarray:
 
 def test_sums_over_discs_are_those_of_their_cells() -> None:
     values = np.random.default_rng(3).standard_normal(SHAPE)
-    discs = islands._Discs.of(np.ones(SHAPE, bool))
-    assert discs.radii[0] == islands.SMALLEST_RADIUS
-    assert islands.LARGEST_PART * 40 / islands.RADIUS_RATIO < discs.radii[-1] <= islands.LARGEST_PART * 40
+    discs = Discs.of(np.ones(SHAPE, bool))
+    assert discs.radii[0] == discs_module.SMALLEST_RADIUS
+    assert (
+        discs_module.LARGEST_PART * 40 / discs_module.RADIUS_RATIO
+        < discs.radii[-1]
+        <= discs_module.LARGEST_PART * 40
+    )
     for radius, sums in zip(discs.radii, discs.sums(values), strict=True):
         for row, column in ((20, 30), (0, 0), (39, 2), (5, 55)):
             assert sums[row, column] == pytest.approx(values[_disc(row, column, radius)].sum(), abs=1e-9)
@@ -33,7 +39,7 @@ def test_sums_over_discs_are_those_of_their_cells() -> None:
 
 @pytest.mark.parametrize("strength", [0.5, 1.0])
 def test_a_disc_is_found_with_what_it_promises(strength: float) -> None:
-    discs = islands._Discs.of(np.ones(SHAPE, bool))
+    discs = Discs.of(np.ones(SHAPE, bool))
     radius = discs.radii[6]
     own = _disc(18, 33, radius)
     information = np.full(SHAPE, 2.0)
@@ -46,17 +52,15 @@ def test_what_cannot_be_the_effect_promises_nothing() -> None:
     """Not where it would have to be its own opposite, and not where hardly any data are."""
     seen = np.ones(SHAPE, bool)
     own, information = _disc(18, 47, 5.0), np.full(SHAPE, 2.0)
-    assert islands._Discs.of(seen).best(np.where(own, -2.0, 0.0), information)[0] == pytest.approx(
-        0.0, abs=1e-6
-    )
-    assert islands._Discs.of(seen).best(np.where(own, 2.0, 0.0), information)[0] > 100.0
+    assert Discs.of(seen).best(np.where(own, -2.0, 0.0), information)[0] == pytest.approx(0.0, abs=1e-6)
+    assert Discs.of(seen).best(np.where(own, 2.0, 0.0), information)[0] > 100.0
     seen[:, 20:] = False
-    found = islands._Discs.of(seen).best(np.where(own, 2.0, 0.0), information)
+    found = Discs.of(seen).best(np.where(own, 2.0, 0.0), information)
     assert found[0] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_sensor_too_small_for_discs_has_none() -> None:
-    discs = islands._Discs.of(np.ones((4, 4), bool))
+    discs = Discs.of(np.ones((4, 4), bool))
     assert discs.radii == []
     assert discs.best(np.ones((4, 4)), np.ones((4, 4)))[0] == 0.0
 

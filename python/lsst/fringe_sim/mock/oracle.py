@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from ..algorithms.discovery import Verdict
+from ..algorithms.discovery.basis import CellBasis
 from ..algorithms.discovery.cells import CellData
 from ..algorithms.discovery.fit import Fit, Problem, coordinates_of, fit_model
 from ..algorithms.discovery.preparation import prepare
@@ -60,7 +61,8 @@ class Oracle:
 def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
     """Signal to noise of the effects of a case, from fits that begin at their true sizes and the true thickness.
 
-    A search may miss a minimum that is there, and would call faint what it has missed.
+    A search may miss a minimum that is there, and would call faint what it has missed. What is in a part of the
+    sensor only may look like a thickness that steps there: it is as clear as it is beside a thickness of each cell.
 
     Parameters
     ----------
@@ -80,7 +82,16 @@ def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
 
     def gain_over(names: tuple[str, ...]) -> float:
         shifted = (_fit_with(problem, case, names, thickness + number * order) for number in ORDERS)
-        return math.sqrt(max(min(fit.chi2 for fit in shifted) - complete.chi2, 0.0))
+        gain = min(fit.chi2 for fit in shifted) - complete.chi2
+        if any(effect.local for effect in EFFECTS if effect.name in set(case.names) - set(names)):
+            gain = min(gain, beside_fine_thickness(names))
+        return math.sqrt(max(gain, 0.0))
+
+    def beside_fine_thickness(names: tuple[str, ...]) -> float:
+        # Data without noise, which a fine thickness would follow.
+        noiseless = replace(problem.cells, value=problem.expected_of(complete))
+        fine = replace(problem.with_cells(noiseless), basis=CellBasis(noiseless.shape[1:]))
+        return _fit_with(fine, case, names, problem.basis.expand(complete.field)).chi2
 
     together = gain_over(())
     if len(case.names) == 1:

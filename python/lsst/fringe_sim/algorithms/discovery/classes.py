@@ -17,8 +17,10 @@ MIMICKED = 0.05
 HIDDEN_CHI2 = 25.0
 """χ² that a residual may hold and still look like noise to tests that share their power among many patterns."""
 
-DECADES_OF_CHANCE = 200.0
-"""Powers of ten by which a residual of signal to noise 30 is improbable."""
+DECADES_OF_CHANCE, CHI2_PER_DECADE = 200.0, 14.0
+"""Powers of ten by which a residual of signal to noise 30 is improbable; and what effects take off χ², of a cause
+outside the catalogue, for each power of ten by which what they leave is improbable. It is 17 to 36 where they take off
+500 to 9000, for ghost images, stains and columns of other seeds than the recorded ones."""
 
 RIVALS_REFITTED = 3
 MUCH_OF_IT = 0.9
@@ -211,9 +213,9 @@ def outsider_probability(
 
     An effect of the catalogue leaves noise: any chance is as likely as any other. A cause outside it either is
     mimicked, and leaves noise as well, or leaves a residual whose chance may lie anywhere down to that of a signal to
-    noise of 30, each power of ten as likely as the other. What share of it effects cannot mimic may be anything, and
-    is seen if it is not too weak: nearly nothing is known of the cause of a signal to noise of 5, and one effect more
-    mimics as much more.
+    noise of 30, or of a third of what is explained, each power of ten as likely as the other. What share of it effects
+    cannot mimic may be anything, and is seen if it is not too weak: nearly nothing is known of the cause of a signal
+    to noise of 5, and one effect more mimics as much more.
 
     Parameters
     ----------
@@ -229,6 +231,9 @@ def outsider_probability(
     hidden = HIDDEN_CHI2 * max(len(hypothesis.names), 1) / max(explained, 1e-300)
     mimicked = min(max(MIMICKED, hidden), 1.0)
     p = min(max(hypothesis.probability_of_noise, 1e-100), 1.0)
-    density = mimicked + (1.0 - mimicked) / (p * math.log(10.0) * DECADES_OF_CHANCE)
+    decades = (
+        max(DECADES_OF_CHANCE, explained / CHI2_PER_DECADE) if math.isfinite(explained) else DECADES_OF_CHANCE
+    )
+    density = mimicked + (1.0 - mimicked) / (p * math.log(10.0) * decades)
     odds = prior / (1.0 - prior) * (density + math.exp(min(spots, 100.0)))
     return odds / (1.0 + odds)

@@ -577,11 +577,15 @@ class Fit:
 
     @property
     def sigma(self) -> FloatArray:
-        """Uncertainty of the coordinates, weak prior and neighbouring minima included."""
+        """Uncertainty of the coordinates, neighbouring minima included.
+
+        What the data hardly see is drawn to null by the weak prior, and off by as much as it really scatters.
+        """
         if not self.coordinates:
             return np.zeros(0)
-        total = self.information + np.diag(_precision_beside(self.coordinates, self.position))
-        variance = np.maximum(np.diag(np.linalg.pinv(total, hermitian=True)), 0.0)
+        drawn = np.diag(_ridge(self.coordinates, self.position))
+        errors = self.information + drawn @ np.diag(_scatter(self.coordinates, self.position)) @ drawn
+        variance = np.maximum(np.diag(self.covariance @ errors @ self.covariance), 0.0)
         return np.asarray(np.sqrt(variance + self.spread**2))
 
     def without(self, name: str) -> Fit:
@@ -611,18 +615,19 @@ def _ridge(coordinates: Sequence[Coordinate], position: FloatArray) -> FloatArra
     return np.asarray(1.0 / (_prior_widths(coordinates) ** 2 + position**2))
 
 
-def _precision_beside(coordinates: Sequence[Coordinate], position: FloatArray) -> FloatArray:
-    """Precision of what is known besides the data, once they are fitted: how far draws from one distribution scatter.
+def _scatter(coordinates: Sequence[Coordinate], position: FloatArray) -> FloatArray:
+    """Variance of the coordinates besides the data, once they are fitted: draws from one distribution tell its width.
 
     A few of them hardly say so.
     """
-    precision = _ridge(coordinates, position)
+    variance = 1.0 / _ridge(coordinates, position)
     owners = np.array([item.effect if item.exchangeable else "" for item in coordinates])
     for name in set(owners) - {""}:
         own = owners == name
-        square = float((position[own] ** 2).sum())
-        precision[own] = np.maximum(precision[own], max(own.sum() - 2, 0) / max(square, 1e-300))
-    return precision
+        if own.sum() > 2:
+            width = float((position[own] ** 2).sum()) / (own.sum() - 2)
+            variance[own] = np.minimum(variance[own], width)
+    return variance
 
 
 @dataclass(eq=False)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import binary_dilation
 from scipy.optimize import minimize
 
@@ -16,21 +15,24 @@ from ..parabola import parabolic_minimum
 from .cells import CellData
 from .channels import State, beside_thickness
 from .comparison import chi2_with_free_fringes, local_minima
+from .discs import Disc, Discs
 from .fit import Coordinate, Fit, Problem
+from .thickness_steps import best_thickness_step
 
-__all__ = ["IslandStart", "followed_on_island", "island_starts", "placed_on_island", "thickness_on_islands"]
+__all__ = [
+    "IslandStart",
+    "followed_on_island",
+    "island_starts",
+    "placed_on_island",
+    "start_at_step",
+    "thickness_on_islands",
+]
 
 FloatArray = NDArray[np.float64]
 
 SIZES_TRIED = (0.01, 0.02, 0.04)
 SIZES_PER_REPETITION = 12
 """Sizes of the effect that are tried: small ones, in units of where it repeats, and so many between repetitions."""
-
-SMALLEST_RADIUS, LARGEST_PART, RADIUS_RATIO = 2.0, 0.35, 1.2
-"""Radii that are tried: the smallest [cells], the largest over the shorter side, and one over the one before."""
-
-LEAST_SEEN = 0.3
-"""Part of a disc that must lie on cells with data."""
 
 MOST_DISCS, MOST_STARTS = 2, 3
 WORTH_TRYING = 0.5
@@ -46,10 +48,6 @@ SHIFTS_PER_ORDER = 20
 COMPARED_THICKNESSES = 120
 ISLAND_CELLS = 400
 """Shifts of the thickness in a fringe order, and the thicknesses or cells on which they are compared."""
-
-
-_Disc = tuple[float, float, float, float]
-"""Fall of χ² that a disc promises, its row, column and radius [cells]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +96,7 @@ def island_starts(
     """
     (size,) = (item for item in coordinates if not item.place)
     sizes = _sizes(size)
-    discs, about = [], _Discs.of(problem.cells.seen)
+    discs, about = [], Discs.of(problem.cells.seen)
     for value in sizes:
         if value > size.neighbour:  # it looks like a smaller one
             break
@@ -124,6 +122,29 @@ def island_starts(
             IslandStart(places[number], promise) for number in best[:MOST_STARTS] if gains[number] > least
         ]
     return found
+
+
+def start_at_step(
+    problem: Problem, state: State, settings: Mapping[str, float], coordinates: Sequence[Coordinate]
+) -> IslandStart | None:
+    """Where a local effect would explain most if all that it did looked like a thickness; `None` if nowhere.
+
+    A thin gap moves the fringes, and does little else. A thickness for every cell takes that up, which a smooth one
+    cannot. Parameters as of `island_starts`, the field of the ``problem`` smooth.
+    """
+    (size,) = (item for item in coordinates if not item.place)
+    sizes = [value for value in _sizes(size) if value <= size.neighbour]
+    disc, step_um = best_thickness_step(state)
+    promise = disc[0] - 2.0 * math.log(state.value[0].size * len(sizes))
+    if promise <= 0.0:
+        return None
+    # With the effect the thickness is what it is around.
+    apart = [
+        abs(_suited_shift(problem, state, size.effect, _active(settings, coordinates, size, value)) + step_um)
+        for value in sizes
+    ]
+    best = sizes[int(np.argmin(apart))]
+    return IslandStart(_position(problem, coordinates, size, best, disc), promise)
 
 
 def followed_on_island(
@@ -372,9 +393,9 @@ def _active(
     return {**settings, **own, size.key: value}
 
 
-def _apart(discs: list[_Disc]) -> list[_Disc]:
+def _apart(discs: list[Disc]) -> list[Disc]:
     """The best discs that promise anything, none in the middle of a better one."""
-    kept: list[_Disc] = []
+    kept: list[Disc] = []
     for disc in sorted(discs, key=lambda each: -each[0]):
         away = all(math.hypot(disc[1] - other[1], disc[2] - other[2]) > 0.5 * other[3] for other in kept)
         if away and disc[0] > (WORTH_TRYING * kept[0][0] if kept else 0.0) and len(kept) < MOST_DISCS:
@@ -406,83 +427,23 @@ def _change(
 ) -> FloatArray:
     """What a local effect would do to every cell, were it there; the thickness follows."""
     forward, thickness = problem.forward, state.thickness_um
+    shift = _suited_shift(problem, state, name, active)
+    on, _ = forward.on_and_off_island(name, active, thickness, None, (thickness + shift).reshape(1, -1))
+    _, off = forward.on_and_off_island(name, active, thickness)
+    return (on - off).reshape(-1, *thickness.shape)
+
+
+def _suited_shift(problem: Problem, state: State, name: str, active: Mapping[str, float]) -> float:
+    """Shift of the thickness with which the fringes of a local effect lie on those without it [µm]."""
+    forward, thickness = problem.forward, state.thickness_um
     shifts = _covered_shifts(problem, thickness)
     seen = thickness[problem.cells.seen]
     few = np.linspace(float(seen.min()), float(seen.max()), COMPARED_THICKNESSES)[np.newaxis]
     inside = forward.sampled_on_island(name, active, few + shifts[:, np.newaxis, np.newaxis]).value
     outside = forward.sampled(active, few).value
     misfit = chi2_with_free_fringes(inside, outside, np.ones_like(outside))
-    shift = np.interp(parabolic_minimum(misfit[:, np.newaxis]).place[0], np.arange(len(shifts)), shifts)
-    on, _ = forward.on_and_off_island(name, active, thickness, None, (thickness + shift).reshape(1, -1))
-    _, off = forward.on_and_off_island(name, active, thickness)
-    return (on - off).reshape(-1, *thickness.shape)
-
-
-@dataclass(frozen=True, eq=False)
-class _Discs:
-    """Discs of all radii about every cell.
-
-    Attributes
-    ----------
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of cells.
-    padded : `tuple` [`int`, `int`]
-        The same with room for the largest disc.
-    radii : `list` [`float`]
-        Radii [cells].
-    transforms : `list` [`numpy.ndarray`]
-        Fourier transform of a disc of each radius.
-    usable : `list` [`numpy.ndarray`]
-        Cells about which enough of a disc of each radius has data.
-    """
-
-    shape: tuple[int, int]
-    padded: tuple[int, int]
-    radii: list[float]
-    transforms: list[NDArray[np.complex128]]
-    usable: list[NDArray[np.bool_]]
-
-    @classmethod
-    def of(cls, seen: NDArray[np.bool_]) -> _Discs:
-        """Discs about the cells with and without data."""
-        shape = (seen.shape[0], seen.shape[1])
-        largest = LARGEST_PART * min(shape)
-        number = math.floor(math.log(max(largest / SMALLEST_RADIUS, 0.5)) / math.log(RADIUS_RATIO)) + 1
-        radii = [SMALLEST_RADIUS * RADIUS_RATIO**step for step in range(max(number, 0))]
-        rows, columns = (next_fast_len(side + math.ceil(largest), real=True) for side in shape)
-        from_row, from_column = (
-            np.minimum(np.arange(side), side - np.arange(side)) for side in (rows, columns)
-        )
-        away = np.hypot(from_row[:, np.newaxis], from_column[np.newaxis, :])
-        transforms = [rfft2((away <= radius).astype(float)) for radius in radii]
-        discs = cls(shape, (rows, columns), radii, transforms, [])
-        parts = discs.sums(seen.astype(float))
-        discs.usable.extend(
-            part > LEAST_SEEN * math.pi * radius**2 for part, radius in zip(parts, radii, strict=True)
-        )
-        return discs
-
-    def sums(self, values: FloatArray) -> Iterator[FloatArray]:
-        """Sums over the discs of every radius."""
-        transform = rfft2(values, self.padded)
-        for disc in self.transforms:
-            yield irfft2(transform * disc, self.padded)[: self.shape[0], : self.shape[1]]
-
-    def best(self, score: FloatArray, information: FloatArray) -> _Disc:
-        """The disc that promises most, from derivative and curvature of the likelihood in every cell."""
-        best = (0.0, 0.0, 0.0, SMALLEST_RADIUS)
-        least = 1e-6 * float(information.sum())
-        each = zip(self.radii, self.usable, self.sums(score), self.sums(information), strict=True)
-        for radius, usable, amount, variance in each:
-            strength = np.divide(
-                amount, variance, out=np.zeros(self.shape), where=usable & (variance > least)
-            )
-            # A finite signature may be scaled only a little.
-            fall = np.where((strength > 0.2) & (strength < 3.0), amount * strength, 0.0)
-            row, column = np.unravel_index(int(np.argmax(fall)), fall.shape)
-            if fall[row, column] > best[0]:
-                best = (float(fall[row, column]), float(row), float(column), radius)
-        return best
+    (place,) = parabolic_minimum(misfit[:, np.newaxis]).place
+    return float(np.interp(place, np.arange(len(shifts)), shifts))
 
 
 def _position(
@@ -490,7 +451,7 @@ def _position(
     coordinates: Sequence[Coordinate],
     size: Coordinate,
     value: float,
-    disc: _Disc,
+    disc: Disc,
 ) -> FloatArray:
     geometry = problem.cells.geometry
     rows, columns = geometry.cell_px

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,14 +29,20 @@ from .start import mended_thickness, starting_thickness
 __all__ = [
     "Prepared",
     "check_setup",
+    "field_bases",
     "headers_apart",
     "prepare",
     "prepare_again",
     "prepare_finer",
+    "smoother",
     "why_too_poor",
 ]
 
 FloatArray = NDArray[np.float64]
+
+SPACINGS = (8.0, 4.0, 2.0)
+MUCH_SMOOTHER = 0.5
+"""Knots that a field is tried with [cells], and the part of its coefficients that a much smoother one has at most."""
 
 SMOOTH_SPACING = 8.0
 MUCH_BETTER = 0.7
@@ -350,11 +356,31 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     same_pixels = refined.problem.forward.places == problem.forward.places
     size, before = refined.problem.basis.size, problem.basis.size
     # Across a rim the thickness goes on as it is, and tells more the smoother it may be.
-    much_smoother = rim.any() and size <= 0.5 * before
+    much_smoother = rim.any() and size <= MUCH_SMOOTHER * before
     same_field = size <= before and not much_smoother and not mended and same_pixels
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended
+
+
+def field_bases(shape: tuple[int, int]) -> list[FieldBasis]:
+    """Parametrisations of the field that are tried on so many rows and columns, smoothest first."""
+    splines: list[FieldBasis] = [SplineBasis.of_grid(shape, spacing) for spacing in SPACINGS]
+    return [basis for basis in splines if basis.size <= math.prod(shape)] + [CellBasis(shape)]
+
+
+def smoother(prepared: Prepared) -> Iterator[Prepared]:
+    """The same data and noise with a field that may not be as fine, smoothest first."""
+    problem = prepared.problem
+    thickness = problem.basis.expand(prepared.null.field)
+    for basis in field_bases((thickness.shape[0], thickness.shape[1])):
+        if basis.size > MUCH_SMOOTHER * problem.basis.size:
+            break
+        trial = replace(problem, basis=basis)
+        field = basis.fit(thickness, problem.cells.seen.astype(float))
+        yield replace(
+            prepared, problem=trial, null=fit_model(trial, (), np.zeros(0), field, prepared.null.levels)
+        )
 
 
 def _rims(problem: Problem, settings: Mapping[str, float]) -> NDArray[np.bool_]:
@@ -538,10 +564,7 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
     weight = cells.seen.astype(float)
     forward = problem.forward.with_scatter(None)
     best: tuple[Problem, Fit] | None = None
-    for spacing in (8.0, 4.0, 2.0, 0.0):
-        basis: FieldBasis = SplineBasis.of_grid(start.shape, spacing) if spacing else CellBasis(start.shape)
-        if spacing and basis.size > start.size:
-            continue
+    for basis in field_bases((start.shape[0], start.shape[1])):
         trial = replace(problem, basis=basis, free_contrast=True, forward=forward)
         first = [start] if best is None else [best[0].basis.expand(best[1].field), start]
         fits = [

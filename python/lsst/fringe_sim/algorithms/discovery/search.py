@@ -21,6 +21,7 @@ from .classes import EffectClass, classes_in_all_data, classes_of, outsider_prob
 from .describe import describe_residual, disagreement
 from .fit import Fit, fit_model
 from .forward import Exposures
+from .hidden_islands import hidden_island
 from .next_frames import FrameForecast
 from .next_step import Ranking, flats_ranked, with_next_measurements
 from .preparation import (
@@ -211,7 +212,7 @@ class _Search:
         self.headers = headers_apart(cube, model)
         self.next_measurements: tuple[dict[str, Any], ...] = ()
         self.unseen: HeldOut | None = None
-        self._may_judge_orders = self._may_take_areas = True
+        self._may_judge_orders = self._may_take_areas = self._may_look_for_islands = True
         self._take_other_cells(prepared)
 
     def _take_other_cells(self, prepared: Prepared) -> None:
@@ -247,7 +248,9 @@ class _Search:
         chance = self._chance(whole, whole.null)
         self.say(f"chance that noise alone disagrees as much: {chance:.3g}")
         if chance > self.options.significance:
-            return self._verdict("no_discrepancy", whole, whole.null, chance, (), {})
+            return self._with_hidden_island(whole.null) or self._verdict(
+                "no_discrepancy", whole, whole.null, chance, (), {}
+            )
         training = self._training(whole)
         if known is not None and known.coordinates:
             chosen, steps = self._resumed(training, known)
@@ -283,6 +286,10 @@ class _Search:
             self.say("pixels see their area, and the blur is what few places lacked of it")
             self._take(prepare_with_areas(self.prepared, chosen.fit, self._thickness(whole, chosen.fit)))
             return self.run(refinements=0, known=without_blurs(chosen.fit))
+        if chosen.names and self._consistent(chosen):
+            verdict = self._with_hidden_island(self._of_all_data(whole, chosen))
+            if verdict is not None:
+                return verdict
         return self._conclude(whole, training, chosen, steps, chance)
 
     def _resumed(self, selector: Selector, known: Fit) -> tuple[Hypothesis, list[Step]]:
@@ -316,6 +323,24 @@ class _Search:
         self.scores = scores
         both = min(hypothesis.probability_of_noise, catalogue)
         return float(-np.expm1(2.0 * np.log1p(-min(both, 1.0 - 1e-16))))
+
+    def _with_hidden_island(self, found: Hypothesis) -> Verdict | None:
+        """Verdict with a local effect that the thickness had taken up.
+
+        `None` if there is none, or none that is clear; the verdict tells of that.
+        """
+        if not self._may_look_for_islands:
+            return None
+        self._may_look_for_islands = False
+        hidden = hidden_island(self.prepared, self.effects, found)
+        if hidden is None:
+            return None
+        if hidden.prepared is None:
+            self.notes.append(hidden.told)
+            return None
+        self.say(f"the thickness is smooth beside {hidden.effect.name}, and not without")
+        self._take(hidden.prepared)
+        return self.run(refinements=0, known=hidden.fit if found.names else None)
 
     def _training(self, whole: Selector) -> Selector:
         """Selector that does not see the part held out."""

@@ -27,7 +27,7 @@ from .fit import (
     linearise_at,
 )
 from .following import ThicknessFollower
-from .islands import IslandStart, followed_on_island, island_starts, placed_on_island
+from .islands import IslandStart, followed_on_island, island_starts, placed_on_island, start_at_step
 from .orders import fields_in_other_orders, starts_in_other_orders
 from .spots import log_evidence_of_spots, spot_channel
 from .trends import FEWEST_DRAWS, trend_channel
@@ -276,7 +276,7 @@ class Selector:
     def _candidate(self, state: State, fit: Fit, name: str, scan: bool) -> Candidate | None:
         """Score test of an effect; `None` if it is not seen or cannot be combined with those that are in already."""
         if self.problem.forward.is_island(name):
-            return self._on_some_island(state, fit, name) if scan else None
+            return self._on_some_island(state, fit, name) if scan else self._found_island(fit, name)
         if self.is_sought(name):  # at null its place is anywhere, and its derivative says nothing
             return self._sought(state, fit, name) if scan else None
         coordinates = self.coordinates[name]
@@ -322,6 +322,14 @@ class Selector:
         best = max(starts, key=lambda item: item.promise)
         return Candidate(name, 0.0, len(self.coordinates[name]), best.position, best.promise)
 
+    def _found_island(self, fit: Fit, name: str) -> Candidate | None:
+        """A local effect where it is with which the field was chosen; it might have been anywhere."""
+        by_chance = 2.0 * math.log(self.problem.cells.value[0].size)
+        for start in self._on_known_island(fit, name):
+            gain = max(start.promise - by_chance, 0.0)
+            return Candidate(name, gain, len(self.coordinates[name]), start.position, gain)
+        return None
+
     def _on_known_island(self, fit: Fit, name: str) -> list[IslandStart]:
         """Where a local effect is with which the field was chosen: a smooth field hides it from the rest."""
         guessed = self._guessed(self.coordinates[name])
@@ -338,6 +346,17 @@ class Selector:
                 self.problem, state, fit.settings, self.coordinates[name], level
             )
         return self._island_starts[fit, name]
+
+    def at_step(self, name: str, fit: Fit, least: float) -> Hypothesis | None:
+        """A local effect beside those of a fit, where it explains a step of the thickness best.
+
+        `None` if it promises less than ``least``.
+        """
+        start = start_at_step(self.problem, self.state(fit), fit.settings, self.coordinates[name])
+        if start is None or start.promise < least:
+            return None
+        names = tuple(dict.fromkeys(item.effect for item in fit.coordinates))
+        return self.hypothesis((*names, name), start.position, fit)
 
     def _best_place(
         self, fit: Fit, position: FloatArray, field_start: FloatArray, levels: FloatArray, rival: float
