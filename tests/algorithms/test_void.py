@@ -126,11 +126,12 @@ def test_it_goes_along_to_the_sky() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "gap_nm"), [(2, 205.0), (4, 22.5), (3, 13.0)])
+@pytest.mark.parametrize(("seed", "gap_nm"), [(2, 205.0), (4, 22.5), (3, 13.0), (14, 11.8)])
 def test_it_is_found_where_it_is(seed: int, gap_nm: float) -> None:
     """Strong ones and faint ones, in the right one of many sizes that look nearly alike.
 
     Beside a thickness of every cell a rim is known to 0.1 px at 22 nm; it goes on smoothly, and tells ten times more.
+    The thickness takes the faintest one up, and no test sees a disagreement.
     """
     parts = np.random.default_rng([seed, 77]).spawn(2)
     case = draw_case("one", parts[0], only=["void"])

@@ -41,3 +41,11 @@ def test_what_takes_the_place_of_the_other_is_not_seen_beside_it() -> None:
     alone = visibility(sealed(dark_pedestal__electrons=1500.0)).each["dark_pedestal"]
     both = visibility(sealed(dark_pedestal__electrons=1500.0, ghost_pedestal__fraction=0.05)).each
     assert both["dark_pedestal"] < 0.5 * alone
+
+
+def test_what_a_step_of_the_thickness_explains_is_not_seen() -> None:
+    """A thin gap moves the fringes, and so does a thickness that steps at its rim."""
+    place = {"void__centre_x": 22.0, "void__centre_y": 25.0, "void__radius": 8.0}
+    thin, thick = (visibility(sealed(void__thickness=gap, **place)).each["void"] for gap in (6.0, 130.0))
+    assert thin < 5.0
+    assert thick > 100.0

@@ -7,7 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery.classes import EffectClass, classes_in_all_data
+from lsst.fringe_sim.algorithms.discovery.channels import Channel
+from lsst.fringe_sim.algorithms.discovery.classes import (
+    EffectClass,
+    classes_in_all_data,
+    outsider_probability,
+)
 from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit
 from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis
 
@@ -64,3 +69,13 @@ def test_a_wider_class_is_no_likelier_than_in_the_part_that_chose_it() -> None:
         {"roughness": unsure}, chosen, fitted("roughness", 80.0), lambda _: fitted(NEAR, 80.0), WIDTH
     )
     assert found["roughness"].probability == 0.9
+
+
+def test_a_cause_outside_the_catalogue_leaves_the_more_the_stronger_it_is() -> None:
+    """Noise of one sensor in two hundred is no reason to doubt an effect of signal to noise 160, but one of 30."""
+    left = replace(fitted("roughness", 60.0), channels=(Channel("amplifiers", 50.0, 20.0, 0.005),))
+    strong, weak = (outsider_probability(left, 0.15, signal_to_noise**2) for signal_to_noise in (160.0, 30.0))
+    assert strong < 0.03
+    assert weak > 0.05
+    much = replace(left, channels=(Channel("amplifiers", 90.0, 20.0, 1e-9),))
+    assert outsider_probability(much, 0.15, 160.0**2) > 0.99

@@ -114,3 +114,24 @@ def test_what_data_do_not_say_of_draws_is_as_wide_as_they_scatter(exchangeable: 
     np.testing.assert_allclose(fit.sigma, expected, rtol=0.3)
     few = Fit({}, coordinates[:2], position[:2], nothing, nothing, 0.0, information[:2, :2])
     assert few.sigma.min() > 5e-4
+
+
+@pytest.mark.parametrize("known", [0.0, 0.3, 1.0, 3.0, 30.0])
+def test_uncertainty_of_draws_is_how_far_fits_are_off(known: float) -> None:
+    """What the data half know is off by their noise, not by less for the draws having a width."""
+    number, width, draws = 12, 0.1, 4000
+    rng = np.random.default_rng(7)
+    truth = width * rng.standard_normal((draws, number))
+    common = np.full((number, number), 1.0 / number)
+    information = 1e6 * (np.eye(number) - common) + (known / width) ** 2 * common
+    coordinates = tuple(
+        Coordinate("gain", f"C{i}", 0.0, -9.0, 9.0, 0.2, False, exchangeable=True) for i in range(number)
+    )
+    ridge = (fit_module.PRIOR_WIDTH * 0.2) ** -2.0
+    root = np.linalg.cholesky(information + 1e-9 * np.eye(number))
+    score = truth @ information + rng.standard_normal((draws, number)) @ root.T
+    found = score @ np.linalg.inv(information + ridge * np.eye(number))
+    nothing = np.zeros(0)
+    stated = [Fit({}, coordinates, x, nothing, nothing, 0.0, information).sigma for x in found[:200]]
+    error = np.sqrt(((found - truth) ** 2).mean())
+    assert np.sqrt(np.mean(np.square(stated))) == pytest.approx(error, rel=0.1)

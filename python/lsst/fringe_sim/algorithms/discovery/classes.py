@@ -19,8 +19,8 @@ HIDDEN_CHI2 = 25.0
 
 DECADES_OF_CHANCE, CHI2_PER_DECADE = 200.0, 14.0
 """Powers of ten by which a residual of signal to noise 30 is improbable; and what effects take off χ², of a cause
-outside the catalogue, for each power of ten by which what they leave is improbable. It is 17 to 36 where they take off
-500 to 9000, for ghost images, stains and columns of other seeds than the recorded ones."""
+outside the catalogue, for each power of ten by which what they leave is improbable. It is 17 to 36 where they take
+off 500 to 9000, for ghost images, stains and columns of other seeds than the recorded ones."""
 
 RIVALS_REFITTED = 3
 MUCH_OF_IT = 0.9
@@ -213,9 +213,9 @@ def outsider_probability(
 
     An effect of the catalogue leaves noise: any chance is as likely as any other. A cause outside it either is
     mimicked, and leaves noise as well, or leaves a residual whose chance may lie anywhere down to that of a signal to
-    noise of 30, or of a third of what is explained, each power of ten as likely as the other. What share of it effects
-    cannot mimic may be anything, and is seen if it is not too weak: nearly nothing is known of the cause of a signal
-    to noise of 5, and one effect more mimics as much more.
+    noise of 30, or of a third of what is explained, each power of ten as likely as the other. What share of it
+    effects cannot mimic may be anything, and is seen if it is not too weak: nearly nothing is known of the cause of a
+    signal to noise of 5, and one effect more mimics as much more.
 
     Parameters
     ----------
