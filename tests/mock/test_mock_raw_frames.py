@@ -239,7 +239,7 @@ def test_itl_sensor_with_varying_silicon(tmp_path: Path) -> None:
 
 def test_sizes_are_columns_by_rows() -> None:
     assert parse_size("256x128") == (128, 256)
-    for text in ("256", "256x", "axb", "-8x8", "1.5x2"):
+    for text in ("256", "256x", "axb", "-8x8", "1.5x2", "0x3", "3x0"):
         with pytest.raises(InputError, match="NXxNY"):
             parse_size(text)
 

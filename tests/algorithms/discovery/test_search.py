@@ -136,6 +136,15 @@ def test_poor_data_are_told_to_be_poor() -> None:
     assert "nan" not in verdict.summary()
 
 
+def test_the_mean_of_a_few_pixels_is_no_level() -> None:
+    """Twenty pixels in electrons, a third of a fringe, were named black coating; nothing was missing."""
+    cube = draw_case("none", np.random.default_rng(3), size=(4, 5)).cube
+    assert cube.unit == "electron"
+    verdict = discover(cube, "ts8_e2v", rng=np.random.default_rng(0))
+    assert verdict.verdict == "unexplained"
+    assert "20 pixel(s) in electrons" in verdict.unexplained["reason"]
+
+
 def test_contradicting_set_up_is_refused() -> None:
     cube = draw_case("none", np.random.default_rng(3), size=SIZE).cube
     with pytest.raises(InputError, match="bandwidth"):

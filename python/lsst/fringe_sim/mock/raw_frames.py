@@ -179,10 +179,10 @@ def parse_size(size: str) -> tuple[int, int]:
     Raises
     ------
     InputError
-        The text is not two whole numbers with an ``x`` between them.
+        The text is not two whole numbers above 0 with an ``x`` between them.
     """
     first, _, second = size.lower().partition("x")
-    if not (first.isdecimal() and second.isdecimal()):
+    if not all(number.isdecimal() and int(number) > 0 for number in (first, second)):
         raise InputError("size", size, "NXxNY, as 256x256")
     return int(second), int(first)
 

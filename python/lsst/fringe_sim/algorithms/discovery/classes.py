@@ -20,7 +20,7 @@ HIDDEN_CHI2 = 25.0
 DECADES_OF_CHANCE, CHI2_PER_DECADE = 200.0, 14.0
 """Powers of ten by which a residual of signal to noise 30 is improbable; and what effects take off χ², of a cause
 outside the catalogue, for each power of ten by which what they leave is improbable. It is 17 to 36 where they take
-off 500 to 9000, for ghost images, stains and columns of other seeds than the recorded ones."""
+off 500 to 5000, for seven ghost images and stains of other seeds than the recorded ones."""
 
 RIVALS_REFITTED = 3
 MUCH_OF_IT = 0.9

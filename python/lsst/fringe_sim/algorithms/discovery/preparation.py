@@ -76,6 +76,9 @@ BLURS = ("charge_diffusion", "brighter_fatter")
 FEWEST_ROWS = 6
 """Rows and columns of cells from which on noise and levels can be measured."""
 
+FEWEST_OF_A_MEAN = 500
+"""Pixels in fewer rows or columns than that from which on their mean is about that of a fringe."""
+
 ORDERS_TRIED = 6
 """Fringe orders on both sides of the first one in which a few pixels are fitted."""
 
@@ -214,6 +217,11 @@ def why_too_poor(cube: FringeCube, model: FringeModel) -> str:
     ]
     if constant:
         return f"the frame is constant at {', '.join(constant)}: no fringes and no noise, so not data"
+    if cube.unit == "electron" and min(cube.shape[1:]) < FEWEST_ROWS and pixels < FEWEST_OF_A_MEAN:
+        return (
+            f"{pixels} pixel(s) in electrons: their mean is not the level of the flats; give counts relative to the "
+            "mean of the whole sensor, or more pixels"
+        )
     waves = int(np.unique(cube.wavelength_nm).size)
     if cube.thickness is None:
         if waves < 3:
