@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lsst.fringe_sim.mock import oracle
 from lsst.fringe_sim.mock.oracle import visibility
-from lsst.fringe_sim.mock.sealed_cases import SealedCase, _expose
+from lsst.fringe_sim.mock.sealed_cases import CASE_KINDS, SealedCase, _expose, draw_case
 from lsst.fringe_sim.mock.thickness import random_field
 
 
@@ -49,3 +50,14 @@ def test_what_a_step_of_the_thickness_explains_is_not_seen() -> None:
     thin, thick = (visibility(sealed(void__thickness=gap, **place)).each["void"] for gap in (6.0, 130.0))
     assert thin < 5.0
     assert thick > 100.0
+
+
+@pytest.mark.slow
+def test_what_another_valley_of_the_other_explains_is_not_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An index of the support goes five minima away and does what a gap of 7 nm did."""
+    streams = np.random.default_rng([20411125, CASE_KINDS.index("two"), 12]).spawn(2)
+    case = draw_case("two", streams[0])
+    assert set(case.names) == {"support_index", "air_gap"}
+    assert visibility(case).each["air_gap"] < 5.0
+    monkeypatch.setattr(oracle, "VALLEYS", 0)
+    assert visibility(case).each["air_gap"] > 10.0

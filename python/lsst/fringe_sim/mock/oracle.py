@@ -25,6 +25,9 @@ FloatArray = NDArray[np.float64]
 ORDERS = (0.0, -1.0, 1.0)
 """Fringe orders by which the thickness is shifted for a fit that lacks an effect: it may be likelier there."""
 
+VALLEYS = 8
+"""Minima on both sides that are tried for a parameter that comes back after a fringe."""
+
 
 @dataclass(frozen=True)
 class Visibility:
@@ -82,7 +85,8 @@ def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
 
     def gain_over(names: tuple[str, ...]) -> float:
         shifted = (_fit_with(problem, case, names, thickness + number * order) for number in ORDERS)
-        gain = min(fit.chi2 for fit in shifted) - complete.chi2
+        best = min(shifted, key=lambda fit: fit.chi2)
+        gain = _deepest(problem, case, names, best).chi2 - complete.chi2
         if any(effect.local for effect in EFFECTS if effect.name in set(case.names) - set(names)):
             gain = min(gain, beside_fine_thickness(names))
         return math.sqrt(max(gain, 0.0))
@@ -106,8 +110,28 @@ def _at_cells(image: FloatArray, cells: CellData) -> FloatArray:
     return np.asarray(map_coordinates(image, places, order=1, mode="nearest"))
 
 
-def _fit_with(problem: Problem, case: SealedCase, names: tuple[str, ...], thickness_um: FloatArray) -> Fit:
-    """Fit with some effects of a case, all others absent."""
+def _deepest(problem: Problem, case: SealedCase, names: tuple[str, ...], fit: Fit) -> Fit:
+    """The fit, or a better one in the valleys beside it: one effect may go there to do what another did."""
+    for number, item in enumerate(fit.coordinates):
+        for side in (-1.0, 1.0) if item.neighbour else ():
+            last = fit
+            for _ in range(VALLEYS):
+                start = last.position.copy()
+                start[number] = item.clip(start[number] + side * item.neighbour)
+                thickness = problem.basis.expand(last.field)
+                last = _fit_with(problem, case, names, thickness, start)
+                fit = min(fit, last, key=lambda each: each.chi2)
+    return fit
+
+
+def _fit_with(
+    problem: Problem,
+    case: SealedCase,
+    names: tuple[str, ...],
+    thickness_um: FloatArray,
+    start: FloatArray | None = None,
+) -> Fit:
+    """Fit with some effects of a case, from their true sizes by default, all others absent."""
     effects = [effect for effect in EFFECTS if effect.name in case.names]
     absent = {
         f"{effect.name}.{name}": null
@@ -121,6 +145,7 @@ def _fit_with(problem: Problem, case: SealedCase, names: tuple[str, ...], thickn
         if effect.name in names
         for item in coordinates_of(effect, problem.forward, thickness_um)
     )
-    start = np.array([item.coordinate(case.values.get(item.key, item.null)) for item in coordinates])
+    if start is None:
+        start = np.array([item.coordinate(case.values.get(item.key, item.null)) for item in coordinates])
     field = problem.basis.fit(thickness_um, problem.cells.seen.astype(float))
     return fit_model(problem, coordinates, start, field, None, absent)
