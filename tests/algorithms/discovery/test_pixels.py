@@ -13,6 +13,7 @@ from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fi
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.mock import random_field
+from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
 
@@ -123,3 +124,14 @@ def test_a_blur_that_makes_areas_of_few_places_is_none(points: bool, places: int
     assert preparation.sees_areas(problem, fit) != points
     found = fit.settings["charge_diffusion.sigma"]
     assert (found == pytest.approx(preparation.PIXEL_RMS / 2.0, rel=0.15)) != points
+
+
+@pytest.mark.slow
+def test_fringes_hardly_wider_than_a_cell_do_not_make_pixels_sharp() -> None:
+    """Where they are three pixels wide, cells of two were a little off, pixels were taken as 3 by 3 points, and what
+    these lack of an area was a disagreement.
+    """
+    case = draw_case("none", np.random.default_rng([20411125, 0, 119]).spawn(2)[0])
+    prepared = preparation.prepare(case.cube, FringeModel.from_setup(case.setup), EFFECTS, 20_000)
+    assert prepared.problem.forward.places == 0
+    assert prepared.problem.cells.cell_px == 1

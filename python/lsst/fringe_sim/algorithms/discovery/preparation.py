@@ -246,7 +246,25 @@ def prepare(
 
     The thickness must be known where the light of the ``exposures`` is not that of flats.
     """
-    cells = _cells_of(cube, finest_useful_cell(cube, most_cells=most_cells), most_cells)
+    size = finest_useful_cell(cube, most_cells=most_cells)
+    prepared = _prepare_in_cells(cube, model, effects, size, most_cells, exposures)
+    while prepared.problem.forward.places and size > 1:
+        # Fringes hardly wider than a cell may look sharper in it than they are.
+        size //= 2
+        prepared = _prepare_in_cells(cube, model, effects, size, most_cells, exposures)
+    return prepared
+
+
+def _prepare_in_cells(
+    cube: FringeCube,
+    model: FringeModel,
+    effects: Sequence[Effect],
+    size: int,
+    most_cells: int,
+    exposures: Exposures | None,
+) -> Prepared:
+    """The same in cells of so many pixels."""
+    cells = _cells_of(cube, size, most_cells)
     stack = model.system.stack
     medium = stack.layers[stack.position(model.system.varying)].medium
     index = np.real(medium.index(cells.wavelength_nm, model.system.temperature_k))
