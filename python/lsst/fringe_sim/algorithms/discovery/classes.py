@@ -207,7 +207,7 @@ def _values_of(name: str, fit: Fit) -> dict[str, float]:
 
 
 def outsider_probability(
-    hypothesis: Hypothesis, prior: float, explained: float = math.inf, spots: float = -math.inf
+    hypothesis: Hypothesis, prior: float, explained: float, spots: float = -math.inf
 ) -> float:
     """Probability of a cause outside the catalogue, from the chance of noise in what is left.
 
@@ -223,7 +223,7 @@ def outsider_probability(
         The set that was found.
     prior : `float`
         Probability of such a cause before the data are seen.
-    explained : `float`, optional
+    explained : `float`
         χ² that the set takes off the unchanged model.
     spots : `float`, optional
         Log evidence of spots, which no effect is, in the place of an effect, over that of the effect.
@@ -231,9 +231,7 @@ def outsider_probability(
     hidden = HIDDEN_CHI2 * max(len(hypothesis.names), 1) / max(explained, 1e-300)
     mimicked = min(max(MIMICKED, hidden), 1.0)
     p = min(max(hypothesis.probability_of_noise, 1e-100), 1.0)
-    decades = (
-        max(DECADES_OF_CHANCE, explained / CHI2_PER_DECADE) if math.isfinite(explained) else DECADES_OF_CHANCE
-    )
+    decades = max(DECADES_OF_CHANCE, explained / CHI2_PER_DECADE)
     density = mimicked + (1.0 - mimicked) / (p * math.log(10.0) * decades)
     odds = prior / (1.0 - prior) * (density + math.exp(min(spots, 100.0)))
     return odds / (1.0 + odds)

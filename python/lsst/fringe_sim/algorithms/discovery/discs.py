@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-__all__ = ["Disc", "Discs", "disc_radii"]
+__all__ = ["Disc", "Discs"]
 
 FloatArray = NDArray[np.float64]
 
@@ -52,9 +52,10 @@ class Discs:
     def of(cls, seen: NDArray[np.bool_]) -> Discs:
         """Discs about the cells with and without data."""
         shape = (seen.shape[0], seen.shape[1])
-        radii = disc_radii(shape)
-        room = math.ceil(LARGEST_PART * min(shape))
-        rows, columns = (next_fast_len(side + room, real=True) for side in shape)
+        largest = LARGEST_PART * min(shape)
+        number = math.floor(math.log(max(largest / SMALLEST_RADIUS, 0.5)) / math.log(RADIUS_RATIO)) + 1
+        radii = [SMALLEST_RADIUS * RADIUS_RATIO**step for step in range(max(number, 0))]
+        rows, columns = (next_fast_len(side + math.ceil(largest), real=True) for side in shape)
         from_row, from_column = (
             np.minimum(np.arange(side), side - np.arange(side)) for side in (rows, columns)
         )
@@ -88,10 +89,3 @@ class Discs:
             if fall[row, column] > best[0]:
                 best = (float(fall[row, column]), float(row), float(column), radius)
         return best
-
-
-def disc_radii(shape: tuple[int, int]) -> list[float]:
-    """Radii of the discs that are tried [cells]."""
-    largest = LARGEST_PART * min(shape)
-    number = math.floor(math.log(max(largest / SMALLEST_RADIUS, 0.5)) / math.log(RADIUS_RATIO)) + 1
-    return [SMALLEST_RADIUS * RADIUS_RATIO**step for step in range(max(number, 0))]

@@ -583,9 +583,9 @@ class Fit:
         """
         if not self.coordinates:
             return np.zeros(0)
-        drawn = np.diag(_ridge(self.coordinates, self.position))
-        errors = self.information + drawn @ np.diag(_scatter(self.coordinates, self.position)) @ drawn
-        variance = np.maximum(np.diag(self.covariance @ errors @ self.covariance), 0.0)
+        drawn = _ridge(self.coordinates, self.position) ** 2 * _scatter(self.coordinates, self.position)
+        covariance = self.covariance
+        variance = np.maximum(np.diag(covariance @ (self.information + np.diag(drawn)) @ covariance), 0.0)
         return np.asarray(np.sqrt(variance + self.spread**2))
 
     def without(self, name: str) -> Fit:

@@ -79,32 +79,32 @@ def hidden_island(prepared: Prepared, catalogue: Sequence[Effect], found: Hypoth
     if not local or not prepared.rich or prepared.problem.field_prior:
         return None
     chosen = [effect for effect in catalogue if effect.name in found.names] + local
+    thickness = prepared.problem.basis.expand(found.fit.field)
     for smooth in smoother(prepared):
-        problem = smooth.problem
-        thickness = prepared.problem.basis.expand(found.fit.field)
-        field = problem.basis.fit(thickness, problem.cells.seen.astype(float))
-        base = fit_model(problem, found.fit.coordinates, found.fit.position, field, found.fit.levels)
+        problem, base = smooth.problem, smooth.null
+        if found.names:
+            field = problem.basis.fit(thickness, problem.cells.seen.astype(float))
+            base = fit_model(problem, found.fit.coordinates, found.fit.position, field, found.fit.levels)
         missing = base.chi2 - found.fit.chi2 - (prepared.problem.basis.size - problem.basis.size)
         selector = Selector(problem, chosen, smooth.null, smooth.index)
         for effect in local:
             beside = selector.at_step(effect.name, base, LEAST_PROMISED * missing)
             if beside is not None and base.chi2 - beside.fit.chi2 > LEAST_EXPLAINED * missing:
-                clear = _fall_beside_steps(smooth.problem, found.fit, thickness, beside.fit) > CLEAR
-                refined = (
-                    prepare_again(prepared, beside.fit, problem.basis.expand(beside.fit.field))[0]
-                    if clear
-                    else None
-                )
+                smooth_um = problem.basis.expand(beside.fit.field)
+                refined = None
+                if _fall_beside_steps(problem, found.fit, thickness, beside.fit, smooth_um) > CLEAR:
+                    refined, _ = prepare_again(prepared, beside.fit, smooth_um)
                 return HiddenIsland(effect, beside.fit, refined)
     return None
 
 
-def _fall_beside_steps(problem: Problem, found: Fit, thickness_um: FloatArray, beside: Fit) -> float:
+def _fall_beside_steps(
+    problem: Problem, found: Fit, thickness_um: FloatArray, beside: Fit, smooth_um: FloatArray
+) -> float:
     """Fall of χ² that an island brings beside a thickness of each cell, which may step anywhere."""
     free = replace(problem, basis=CellBasis((thickness_um.shape[0], thickness_um.shape[1])))
-    without = fit_model(free, found.coordinates, found.position, thickness_um.ravel(), found.levels)
-    smooth = problem.basis.expand(beside.field)
-    return (
-        without.chi2
-        - fit_model(free, beside.coordinates, beside.position, smooth.ravel(), beside.levels).chi2
-    )
+    fits = [
+        fit_model(free, fit.coordinates, fit.position, thickness.ravel(), fit.levels)
+        for fit, thickness in ((found, thickness_um), (beside, smooth_um))
+    ]
+    return fits[0].chi2 - fits[1].chi2
