@@ -43,3 +43,12 @@ def test_a_record_of_another_challenge_is_left_alone(
 def test_dry_run_writes_nothing(tmp_path: Path) -> None:
     assert challenge(tmp_path / "a", "--dry-run") == 0
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("size", ["0x3", "3x0", "12"])
+def test_sensors_without_pixels_are_refused_before_the_folder_is_made(
+    size: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert challenge(tmp_path / "out", "--none", "1", "--size", size) == 2
+    assert "is not columns x rows" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

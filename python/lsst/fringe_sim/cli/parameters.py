@@ -12,6 +12,7 @@ from click.shell_completion import CompletionItem
 
 from ..effects import EFFECTS, Parameter
 from ..errors import InputError
+from ..mock.raw_frames import parse_size
 from ..model import Setup, setup_names
 
 __all__ = [
@@ -107,10 +108,11 @@ class _Size(click.ParamType):
     ) -> tuple[int, int]:
         if isinstance(value, tuple):
             return value
-        match = re.fullmatch(r"(\d+)[xX](\d+)", str(value).strip())
-        if match is None:
+        try:
+            rows, columns = parse_size(str(value).strip())
+        except InputError:
             self.fail(f"{value!r} is not columns x rows, such as 512x512", param, ctx)
-        return int(match.group(1)), int(match.group(2))
+        return columns, rows
 
 
 class SetupType(click.ParamType):
