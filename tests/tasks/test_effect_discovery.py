@@ -13,6 +13,7 @@ from lsst.daf.butler import Butler
 from task_commands import WAVELENGTHS_NM, Command, Outcome
 
 from lsst.fringe_sim.algorithms.discovery import Verdict
+from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.mock.raw_frames import MockRun, write_mock_flats
@@ -113,6 +114,27 @@ def maps(command: Command, searched: Path) -> dict[tuple[str, bool], ThicknessMa
             for name, detector in DETECTORS.items()
             for known in (False, True)
         }
+
+
+def test_one_sensor_of_a_repository_is_chosen_by_its_number_or_its_name(
+    searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No collection, no sensor and several sensors are one sentence each."""
+
+    def told(*options: str) -> str:
+        run(["discover", str(searched), *options, "--dry-run", "--out", str(tmp_path / "out")])
+        printed = capsys.readouterr()
+        return printed.out + printed.err
+
+    for name, detector in DETECTORS.items():
+        for chosen in (name, str(detector.id)):
+            assert "would search" in told("--collections", "u/found", "--detector", chosen)
+    every = told("--collections", "u/found")
+    assert "choose with --detector" in every
+    assert all(name in every for name in DETECTORS)
+    assert f"LSST-TS8 {next(iter(DETECTORS.values())).id}" in told("--detector", "R99_S99")
+    assert "nosuch" in told("--collections", "nosuch")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", HIDDEN)

@@ -168,27 +168,34 @@ def _read(
 
 def _from_repository(path: str, collections: str, detector: str | None) -> FringeCube:
     """Cube from the prepared flats of one sensor of a repository."""
-    from lsst.daf.butler import Butler, EmptyQueryResultError, MissingDatasetTypeError
+    from lsst.daf.butler import ButlerUserError
 
-    where = ""
-    bind: dict[str, int | str] = {}
-    if detector is not None:
-        if detector.isdecimal():
-            where, bind = "detector = chosen", {"chosen": int(detector)}
-        else:
-            where, bind = "detector.full_name = chosen", {"chosen": detector}
-    with Butler.from_config(path) as butler:
+    from ..middleware.repository import open_repository
+
+    with open_repository(path) as butler:
         try:
             refs: list[Any] = butler.query_datasets(
-                "fringeFlat", collections=collections.split(","), where=where, bind=bind, find_first=False
+                "fringeFlat",
+                collections=collections.split(","),
+                find_first=False,
+                with_dimension_records=True,
             )
-        except (EmptyQueryResultError, MissingDatasetTypeError) as error:
+        except ButlerUserError as error:
             message = str(error).split("\n")[0]
             raise InputError(
                 "repository", message, "one with fringeFlat datasets (task isrFlatPrep)", source=path
             ) from None
-        latest = {(ref.dataId["detector"], ref.dataId["exposure"]): ref for ref in refs}
-        sensors = sorted({key[0] for key in latest})
-        if len(sensors) != 1:
-            raise InputError("sensors", sensors, "one; choose with --detector", source=path)
+        # A number alone is no sensor to the registry: each instrument has its own.
+        known = {
+            ref: (ref.dataId["instrument"], ref.dataId["detector"], ref.dataId.records["detector"].full_name)
+            for ref in refs
+        }
+        listed = ", ".join(" ".join(map(str, sensor)) for sensor in sorted(set(known.values())))
+        if detector is not None:
+            known = {ref: sensor for ref, sensor in known.items() if detector in map(str, sensor[1:])}
+            if not known:
+                raise InputError("detector", detector, f"number or name of one of: {listed}", source=path)
+        if len(set(known.values())) != 1:
+            raise InputError("sensors", listed, "one; choose with --detector", source=path)
+        latest = {ref.dataId["exposure"]: ref for ref in sorted(known, key=lambda ref: str(ref.run))}
         return FringeCube.from_flats((butler.get(ref) for ref in latest.values()), number=len(latest))
