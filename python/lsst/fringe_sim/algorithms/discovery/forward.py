@@ -186,8 +186,8 @@ class Forward:
 
         Cells average the fringes over their slope, which has errors too.
         """
-        plain = self._spread_of_pixels(self._gradient(thickness_um))[0]
-        spreads = [self._spread_of_pixels(self._gradient(thickness_um + error))[0] for error in errors_um]
+        plain = self._spread_of_pixels(self.gradient(thickness_um))[0]
+        spreads = [self._spread_of_pixels(self.gradient(thickness_um + error))[0] for error in errors_um]
         return np.asarray((errors_um**2).mean(axis=0) + np.mean(spreads, axis=0) - plain)
 
     def table(self, settings: Settings) -> FloatArray:
@@ -377,7 +377,7 @@ class Forward:
         self, table: FloatArray, thickness_um: FloatArray, rows: NDArray[np.intp] | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Value and slope of some rows of a table, averaged over the cells; shape ``(R, ny, nx)``."""
-        gradient = self._gradient(thickness_um)
+        gradient = self.gradient(thickness_um)
         second, fourth = self._spread_in_cell(gradient)
         place, rest = self._at_centroids(thickness_um, gradient)
         used = table if rows is None else table[rows]
@@ -397,7 +397,7 @@ class Forward:
             )  # fmt: skip
         return value, slope
 
-    def _gradient(self, thickness_um: FloatArray) -> FloatArray:
+    def gradient(self, thickness_um: FloatArray) -> FloatArray:
         """Change of the thickness from cell to cell along rows and columns, ``(2, ny, nx)``."""
         if self._slopes is None:
             self._slopes = Slopes(np.ones(thickness_um.shape, bool) if self.seen is None else self.seen)
@@ -453,7 +453,7 @@ class Forward:
         places = field_um.ravel()[own][np.newaxis] if places_um is None else places_um
         spread = [
             np.broadcast_to(moment.ravel()[own], places.shape)
-            for moment in self._spread_in_cell(self._gradient(field_um))
+            for moment in self._spread_in_cell(self.gradient(field_um))
         ]
         tables = self._island_table(name, settings), self.table(settings)
         on, off = (self._sampled(table, places, *spread).value for table in tables)

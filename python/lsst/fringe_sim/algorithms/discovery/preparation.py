@@ -95,6 +95,10 @@ FEW_SPOILED = 1e-5
 """How often spoiled cells are looked for, and the part of the data that need not be looked at again: each draws the
 thickness of its surroundings."""
 
+WIDE_FRINGE, STEEP = 4.0, 0.95
+"""Cells over which a fringe is described well by slopes, and the part of the cells that are less steep than those
+where that is asked."""
+
 NOISE_DRAWS, LARGEST_ERROR = 24, 0.1
 """Draws of noise from which the scatter of the thickness is found; the part of an order to which it is believed."""
 
@@ -248,11 +252,20 @@ def prepare(
     """
     size = finest_useful_cell(cube, most_cells=most_cells)
     prepared = _prepare_in_cells(cube, model, effects, size, most_cells, exposures)
-    while prepared.problem.forward.places and size > 1:
+    finer = prepared
+    while size > 1 and finer.problem.forward.places and _narrowest_fringe(finer) < WIDE_FRINGE:
         # Fringes hardly wider than a cell may look sharper in it than they are.
         size //= 2
-        prepared = _prepare_in_cells(cube, model, effects, size, most_cells, exposures)
-    return prepared
+        finer = _prepare_in_cells(cube, model, effects, size, most_cells, exposures)
+    return prepared if finer.problem.forward.places else finer
+
+
+def _narrowest_fringe(prepared: Prepared) -> float:
+    """Width of a fringe where the thickness is steep [cells]."""
+    forward, seen = prepared.problem.forward, prepared.problem.cells.seen
+    slope = np.hypot(*forward.gradient(prepared.problem.basis.expand(prepared.null.field)))[seen]
+    order = forward.model.fringe_order_um(float(np.median(prepared.problem.cells.wavelength_nm)))
+    return order / max(float(np.quantile(slope, STEEP)), 1e-300)
 
 
 def _prepare_in_cells(
