@@ -114,6 +114,19 @@ def test_what_a_strong_pedestal_leaves_is_another_effect() -> None:
 
 
 @pytest.mark.slow
+def test_less_than_a_hundredth_is_an_effect_where_nothing_else_is_left() -> None:
+    """The form of the coating may be wrong by as much, but hardly so that it lacks dark current alone."""
+    parts = np.random.default_rng([20411125, CASE_KINDS.index("two"), 9]).spawn(2)
+    case = draw_case("two", parts[0])
+    verdict = discover(case.cube, case.setup, rng=parts[1])
+    found = {effect.name: effect for effect in verdict.effects}
+    assert set(found) == set(case.names) == {"dark_current", "black_coating"}
+    assert found["dark_current"].significance < 0.01 * found["black_coating"].significance
+    rate = found["dark_current"].parameters["rate"]
+    assert abs(rate.value - case.values["dark_current.rate"]) < 4.0 * rate.sigma
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("outsider", "least"), [("annealing", 0.004), ("wandering_light", 0.007)])
 def test_where_the_catalogue_explains_next_to_nothing_no_pairs_are_tried(outsider: str, least: float) -> None:
     rng, size = np.random.default_rng(22), 0.0

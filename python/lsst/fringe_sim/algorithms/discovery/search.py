@@ -468,23 +468,34 @@ class _Search:
     def _surely_better(self, selector: Selector, current: Hypothesis) -> Hypothesis | None:
         """The set with one effect more that no noise explains, though the tests without a catalogue see only noise.
 
-        Those tests share their power among many patterns; one effect has a single one.
+        Those tests share their power among many patterns; one effect has a single one. What it brings may be no more
+        than what is wrong with the form of the others: then nothing else may be left, though nothing is allowed for
+        that.
         """
-        least = IMPRECISION**2 * self._explained_by_guesses(selector, current)
+        wrong = IMPRECISION**2 * self._explained_by_guesses(selector, current)
         worth = [
             candidate
             for candidate in selector.score(current.fit, selector.others(current))
-            if _chance_of(candidate.gain - least, candidate.degrees, selector.undescribed(candidate.name))
-            < SURELY
+            if _surely_gains(selector, candidate)
         ]
         found = []
         for candidate in worth[: self.options.parents]:
-            found.append(selector.hypothesis((*current.names, candidate.name), candidate.start, current.fit))
-            self._say_refit(current, found[-1])
+            larger = selector.hypothesis((*current.names, candidate.name), candidate.start, current.fit)
+            self._say_refit(current, larger)
+            if _surely_gains(selector, candidate, wrong) or self._is_all(selector, larger):
+                found.append(larger)
         best = max(found, key=lambda item: item.log_evidence, default=None)
         if best is None or best.log_evidence < current.log_evidence + self.options.least_evidence:
             return None
         return selector.with_channels(best)
+
+    def _is_all(self, selector: Selector, hypothesis: Hypothesis) -> bool:
+        """Whether a set leaves noise though the form of its effects is taken for exact."""
+        return self._consistent(self._taken_for_exact(selector, hypothesis))
+
+    @staticmethod
+    def _taken_for_exact(selector: Selector, hypothesis: Hypothesis) -> Hypothesis:
+        return replace(hypothesis, channels=selector.criticise(hypothesis.fit, imprecision=0.0))
 
     @staticmethod
     def _explained_by_guesses(selector: Selector, current: Hypothesis) -> float:
@@ -684,6 +695,7 @@ class _Search:
         )
         if reasons:
             return self._unexplained(whole, final, chance, steps, "; ".join(reasons), partial=named)
+        self.notes.extend(self._what_may_be_form(training, chosen))
         decided, self.next_measurements = with_next_measurements(
             named,
             {name: group.values for name, group in classes.items()},
@@ -713,6 +725,19 @@ class _Search:
             f"with {', '.join(found.names)} a residual{where} remains in '{worst.name}' "
             f"(chance {worst.probability:.2g})"
         )
+
+    def _what_may_be_form(self, selector: Selector, chosen: Hypothesis) -> list[str]:
+        """That more than noise is left, though no more than what may be wrong with the form of the effects."""
+        strict = self._taken_for_exact(selector, chosen)
+        if self._consistent(strict):
+            return []
+        worst = min(strict.channels, key=lambda channel: channel.probability)
+        told = (
+            f"less than {IMPRECISION:.0%} of what {', '.join(chosen.names)} explains is left in '{worst.name}' "
+            f"(chance {worst.probability:.2g}): its form may be wrong by as much, or a fainter effect be there"
+        )
+        alike = selector.score(chosen.fit, selector.others(chosen))[:1]
+        return [told + "".join(f", most like {one.name} (gain {one.gain:.0f})" for one in alike)]
 
     def _ranking(self, whole: Selector, final: Hypothesis, named: Sequence[NamedEffect]) -> Ranking:
         """What ranks further data: flats beside flats, frames and flats beside frames of the sky."""
@@ -828,6 +853,12 @@ class _Search:
             verdict, effects, self.where, gap, tuple(steps), unexplained, self.model.setup.name, chance, candidates,
             self.next_measurements, tuple(self.notes), data,
         )  # fmt: skip
+
+
+def _surely_gains(selector: Selector, candidate: Candidate, wrong: float = 0.0) -> bool:
+    """Whether an effect gains more than noise, what the description of the fringes lacks, and ``wrong``."""
+    undescribed = selector.undescribed(candidate.name)
+    return _chance_of(candidate.gain - wrong, candidate.degrees, undescribed) < SURELY
 
 
 def _chance_of(gain: float, degrees: int, undescribed: float) -> float:

@@ -205,14 +205,14 @@ class Selector:
         changed = self.problem.expected(fit.levels, self.problem.forward.predict(settings, place).value)
         return state.whiten(changed - state.value)
 
-    def criticise(self, fit: Fit) -> tuple[Channel, ...]:
-        """Tests without a catalogue."""
+    def criticise(self, fit: Fit, *, imprecision: float = IMPRECISION) -> tuple[Channel, ...]:
+        """Tests without a catalogue; effects are described but for so small a part."""
         if not self.generic:
             return (self._total(fit),)
         explained = max(self.null.fit.chi2 - fit.chi2, 0.0)
         state, correlation = self.state(fit), self.problem.forward.noise_correlation(fit.settings)
-        imprecision = IMPRECISION**2 * explained + self._undescribed
-        channels = measure_channels(state, self.problem.cells.geometry, self.index, imprecision, correlation)
+        undescribed = imprecision**2 * explained + self._undescribed
+        channels = measure_channels(state, self.problem.cells.geometry, self.index, undescribed, correlation)
         return (*channels, spot_channel(state, correlation), *self._trends(fit))
 
     def _trends(self, fit: Fit) -> list[Channel]:
