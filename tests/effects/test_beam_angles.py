@@ -37,6 +37,18 @@ def test_a_source_and_a_lens_may_change_places() -> None:
     assert one.weight @ np.cos(one.theta) == pytest.approx(cosine, rel=1e-12)
 
 
+@pytest.mark.parametrize("aperture", [0.02, 0.2, 0.7])
+def test_hardly_a_tilt_is_none(aperture: float) -> None:
+    """Rays of all azimuths are one ray, and there are fewer of them than nodes."""
+    wide = {"converging_beam.numerical_aperture": aperture}
+    model, thickness = FringeModel.from_setup("ts8_e2v", wide), np.linspace(14.0, 14.6, 30)
+    expected = model.response(thickness, [880.0, 960.0])
+    for angle in (1e-16, 1e-13, 1e-9, 1e-6):
+        hardly = model.with_effects({**wide, "tilt.angle": angle})
+        assert hardly.system.beam.theta.max() < math.asin(aperture) + 1e-6
+        np.testing.assert_allclose(hardly.response(thickness, [880.0, 960.0]), expected, atol=1e-8)
+
+
 def test_tilt_and_converging_beam_together() -> None:
     """A tilt of a narrow cone is nearly that of parallel light; the cone lowers the contrast a little."""
     thickness = np.linspace(14.0, 14.6, 60)

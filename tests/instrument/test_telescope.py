@@ -165,6 +165,18 @@ def test_gauss_rule_of_few_points_is_those_points():
     assert mass.sum() == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("apart", [0.0, 1e-17, 1e-15, 1e-12])
+def test_gauss_rule_has_nodes_only_where_places_are(apart):
+    """Eight points, each as a group of eight in nearly the same place, and more nodes wanted than eight."""
+    place, rng = np.linspace(0.1, 0.4, 8), np.random.default_rng(1)
+    value = (place[:, np.newaxis] + apart * rng.standard_normal(8)).ravel()
+    node, mass = gauss_rule(value, np.full(64, 1 / 64), 14)
+    assert node.min() >= value.min()
+    assert node.max() <= value.max()
+    np.testing.assert_allclose(node[mass > 1e-9], place, atol=1e-9)
+    np.testing.assert_allclose(mass[mass > 1e-9], 1 / 8, atol=1e-9)
+
+
 def test_quantiles_keep_the_mean_whatever_the_number_of_groups():
     bundle = COARSE.trace(1.0, 0.0)
     for groups in (7, 64, 1000):

@@ -44,6 +44,9 @@ At the edge of the LSST field, 64 would do for the round trip through 265 µm of
 and its second harmonic; the third makes an error of 4 % of the peak-to-peak of a sky frame, with 96 of 0.2 %.
 """
 
+SAME_PLACE = 1e-10
+"""Distance of points, relative to half the range of all, at which a Gauss rule takes them for one."""
+
 QUANTILES = 4096
 """Groups of equal light into which the rays are gathered before the Gauss rule is formed."""
 
@@ -473,7 +476,8 @@ def gauss_rule(value: ArrayLike, weight: ArrayLike, nodes: int) -> tuple[FloatAr
     """Gauss quadrature with respect to a discrete measure.
 
     The rule integrates polynomials up to degree ``2 nodes - 1`` over the measure exactly (Lanczos process with full
-    reorthogonalisation, Golub & Welsch 1969). Where the measure has no more points than that, it is returned as is.
+    reorthogonalisation, Golub & Welsch 1969). Where the measure has no more points than that, it is returned as is;
+    where many are in the same places, the rule has a node in each of these.
 
     Parameters
     ----------
@@ -485,7 +489,8 @@ def gauss_rule(value: ArrayLike, weight: ArrayLike, nodes: int) -> tuple[FloatAr
     Returns
     -------
     node, node_weight : `numpy.ndarray`
-        Ascending nodes inside the range of ``value``, and weights that sum to the sum of ``weight``.
+        At most ``nodes`` ascending nodes inside the range of ``value``, and weights that sum to the sum of
+        ``weight``.
     """
     if nodes < 1:
         raise OutOfRangeError("number of beam angles", nodes, "1 or more")
@@ -505,11 +510,12 @@ def gauss_rule(value: ArrayLike, weight: ArrayLike, nodes: int) -> tuple[FloatAr
         diagonal[step] = basis[step] @ vector
         for _ in range(2):  # twice is enough
             vector -= basis[: step + 1].T @ (basis[: step + 1] @ vector)
-        if step + 1 < nodes:
-            off_diagonal[step] = np.linalg.norm(vector)
-            basis[step + 1] = vector / off_diagonal[step]
-    eigenvalues, eigenvectors = scipy.linalg.eigh_tridiagonal(diagonal, off_diagonal[: nodes - 1])
-    return centre + half * eigenvalues, total * eigenvectors[0] ** 2
+        off_diagonal[step] = np.linalg.norm(vector)
+        if step + 1 == nodes or off_diagonal[step] < SAME_PLACE:  # so many nodes are all of the places
+            break
+        basis[step + 1] = vector / off_diagonal[step]
+    eigenvalues, eigenvectors = scipy.linalg.eigh_tridiagonal(diagonal[: step + 1], off_diagonal[:step])
+    return centre + half * np.clip(eigenvalues, -1.0, 1.0), total * eigenvectors[0] ** 2
 
 
 def reduce_beam(beam: Beam, nodes: int) -> Beam:
