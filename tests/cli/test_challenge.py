@@ -37,7 +37,10 @@ def test_a_record_of_another_challenge_is_left_alone(
     before = (tmp_path / "cases.jsonl").read_text()
     assert challenge(tmp_path, "--seed", "4") == 1
     assert '"seed": 3' in capsys.readouterr().err
+    assert challenge(tmp_path, "--setup", "ts8_itl") == 1
     assert (tmp_path / "cases.jsonl").read_text() == before
+    assert challenge(tmp_path / "sky", "--setup", "lsst_e2v") == 1
+    assert not (tmp_path / "sky").exists()
 
 
 def test_dry_run_writes_nothing(tmp_path: Path) -> None:

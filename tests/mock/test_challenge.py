@@ -10,7 +10,7 @@ import pytest
 
 from lsst.fringe_sim.algorithms.discovery import Verdict
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, Where
-from lsst.fringe_sim.errors import UnknownNameError
+from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.mock.challenge import judge, run_challenge
 from lsst.fringe_sim.mock.oracle import Oracle, Visibility
 from lsst.fringe_sim.mock.sealed_cases import SealedCase, draw_case
@@ -63,6 +63,32 @@ def test_a_faint_second_effect_need_not_be_named_but_no_other_may(pair: SealedCa
 def test_unknown_kind_is_refused() -> None:
     with pytest.raises(UnknownNameError, match="kind of case"):
         draw_case("three", np.random.default_rng(1))
+
+
+@pytest.mark.parametrize(
+    ("setup", "limits_um", "fwhm_nm"),
+    [("ts8_e2v", (5.0, 30.0), 2.0), ("bnl_ts8_e2v", (5.0, 30.0), 1.0), ("ts8_itl", (95.0, 105.0), 1.0)],
+)
+def test_cases_are_of_the_set_up(setup: str, limits_um: tuple[float, float], fwhm_nm: float) -> None:
+    case = draw_case("one", np.random.default_rng(5), size=(16, 16), only=["bandwidth"], setup=setup)
+    assert case.setup == setup
+    assert limits_um[0] < case.thickness_um.min() < case.thickness_um.max() < limits_um[1]
+    np.testing.assert_array_equal(case.cube.exposures.bandwidth_fwhm_nm, fwhm_nm)
+    assert 0.0 < abs(case.values["bandwidth.fwhm"] - fwhm_nm) < 1.0
+
+
+def test_a_thickness_is_not_hidden_where_it_varies() -> None:
+    only = ["silicon_thickness", "silicon_gradient", "vignetting"]
+    cases = [
+        draw_case("one", np.random.default_rng(n), size=(8, 8), only=only, setup="ts8_itl") for n in range(9)
+    ]
+    assert {case.names for case in cases} == {("vignetting",)}
+
+
+@pytest.mark.parametrize("setup", ["lsst_e2v", "nosuch"])
+def test_set_ups_without_a_monochromator_are_refused(setup: str) -> None:
+    with pytest.raises(InputError, match=r"monochromator|nosuch"):
+        draw_case("none", np.random.default_rng(1), setup=setup)
 
 
 def test_probability_of_a_name_is_that_of_its_class_and_its_share(pair: SealedCase) -> None:

@@ -81,6 +81,19 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("setup", ["bnl_ts8_e2v", "ts8_itl"])
+def test_other_sensors_are_searched(setup: str) -> None:
+    """Light of 1 nm shows fringes of the support; behind a black coating those of the silicon, 0.13 µm each."""
+    null = draw_case("none", np.random.default_rng(14), size=SIZE, setup=setup)
+    assert discover(null.cube, setup, rng=np.random.default_rng(0)).verdict == "no_discrepancy"
+    case = draw_case("one", np.random.default_rng(14), size=SIZE, only=["ghost_pedestal"], setup=setup)
+    verdict = discover(case.cube, setup, rng=np.random.default_rng(0))
+    (found,) = verdict.effects
+    assert "ghost_pedestal" in {found.name, *found.ambiguous_with}
+    assert found.significance > 10.0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["illumination", "amplifier_gain", "wavelength_jitter"])
 def test_a_hidden_effect_is_named(name: str, tmp_path) -> None:
     case = draw_case("one", np.random.default_rng(21), size=SIZE, only=[name])

@@ -12,7 +12,7 @@ from ..mock.challenge import run_challenge
 from ..products.challenge_result import CASE_KINDS, CaseResult
 from ..report.challenge_page import write_challenge_report
 from .inputs import prepare_folder
-from .parameters import SIZE
+from .parameters import LABORATORY, SIZE
 
 __all__ = ["challenge"]
 
@@ -40,6 +40,14 @@ RECORD = "cases.jsonl"
     show_default=True,
     help="Cases with a cause that the catalogue lacks.",
 )
+@click.option(
+    "--setup",
+    default="ts8_e2v",
+    metavar=LABORATORY.name,
+    show_default=True,
+    shell_complete=LABORATORY.shell_complete,
+    help="Laboratory set-up: name or file.",
+)
 @click.option("--size", type=SIZE, default="96x96", show_default=True, help="Columns x rows of the sensors.")
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Cases at the same time.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done, write nothing.")
@@ -50,26 +58,28 @@ def challenge(
     one: int,
     two: int,
     outsider: int,
+    setup: str,
     size: tuple[int, int],
     jobs: int,
     dry_run: bool,
 ) -> None:
     """Hide random effects in simulated sensors, search each, and count how often the search is right.
 
-    Every case is written as soon as it ends: started again with the same seed and size, the command goes on where it
-    was. Hundreds of cases take hours.
+    Every case is written as soon as it ends: started again with the same seed, set-up and size, the command goes on
+    where it was. Hundreds of cases take hours.
 
     \b
     Example:
       fringe-sim challenge --seed 7 --none 20 --one 20 --two 10 --outsider 10 --out challenge
     """
+    LABORATORY.convert(setup, None, None)
     counts = dict(zip(CASE_KINDS, (none, one, two, outsider), strict=True))
     total = sum(counts.values())
     if dry_run:
-        click.echo(f"would run {total} cases of {size[0]} x {size[1]} pixels: {counts}")
+        click.echo(f"would run {total} cases of {size[0]} x {size[1]} pixels of {setup}: {counts}")
         return
     record = prepare_folder(out) / RECORD
-    known = _earlier_cases(record, {"seed": seed, "columns": size[0], "rows": size[1]})
+    known = _earlier_cases(record, {"seed": seed, "setup": setup, "columns": size[0], "rows": size[1]})
     done = sum(case.number < counts[case.kind] for case in known)
     if done:
         click.echo(f"{done} of {total} cases are there from before", err=True)
@@ -82,14 +92,16 @@ def challenge(
         truth, found = "+".join(result.truth) or "none", "+".join(result.found) or result.verdict
         click.echo(f"{done} of {total}: {truth} -> {found} ({result.seconds:.0f} s)", err=True)
 
-    result = run_challenge(counts, seed, size=(size[1], size[0]), known=known, jobs=jobs, progress=keep)
+    result = run_challenge(
+        counts, seed, size=(size[1], size[0]), setup=setup, known=known, jobs=jobs, progress=keep
+    )
     path = result.write(out)
     write_challenge_report(out / "challenge.html", result)
     click.echo(json.dumps(result.summary(), indent=2))
     click.echo(str(path))
 
 
-def _earlier_cases(record: Path, identity: dict[str, int]) -> list[CaseResult]:
+def _earlier_cases(record: Path, identity: dict[str, int | str]) -> list[CaseResult]:
     """Cases that ran before; a new record starts with what they have in common.
 
     Raises

@@ -34,6 +34,7 @@ def run_challenge(
     size: tuple[int, int] = (96, 96),
     options: SearchOptions | None = None,
     only: Sequence[str] = (),
+    setup: str = "ts8_e2v",
     known: Sequence[CaseResult] = (),
     jobs: int = 1,
     progress: Callable[[CaseResult], None] | None = None,
@@ -52,8 +53,11 @@ def run_challenge(
         Thresholds of the search.
     only : sequence of `str`, optional
         Effects from which to draw.
+    setup : `str`, optional
+        Laboratory set-up.
     known : sequence of `CaseResult`, optional
-        Results of cases that ran before with the same seed, size, options and effects; they are not run again.
+        Results of cases that ran before with the same seed, size, options, effects and set-up; they are not run
+        again.
     jobs : `int`, optional
         Cases that run at the same time, each in a process of its own.
     progress : callable, optional
@@ -62,7 +66,7 @@ def run_challenge(
     ready = {(result.kind, result.number): result for result in known}
     wanted = [(kind, number) for number in range(max(counts.values(), default=0)) for kind in CASE_KINDS
               if number < counts.get(kind, 0)]  # fmt: skip
-    work = partial(_run_case, seed=seed, size=size, options=options, only=tuple(only))
+    work = partial(_run_case, seed=seed, size=size, options=options, only=tuple(only), setup=setup)
     for result in _results(work, [case for case in wanted if case not in ready], jobs):
         ready[result.kind, result.number] = result
         if progress is not None:
@@ -95,9 +99,11 @@ def _run_case(
     size: tuple[int, int],
     options: SearchOptions | None,
     only: Sequence[str],
+    setup: str,
 ) -> CaseResult:
     streams = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)
-    case = draw_case(kind, streams[0], size=size, only=only if kind in ("one", "two") else ())
+    effects = only if kind in ("one", "two") else ()
+    case = draw_case(kind, streams[0], size=size, only=effects, setup=setup)
     began = time.process_time()
     verdict = discover(case.cube, case.setup, rng=streams[1], options=options)
     seconds = time.process_time() - began

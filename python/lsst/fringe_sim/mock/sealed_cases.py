@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from ..errors import UnknownNameError
+from ..errors import InputError, UnknownNameError
 from ..products.challenge_result import CASE_KINDS
 from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
 from .hidden_effects import AmplifierState, HiddenEffect, validate_effects, with_hidden_optics
+from .optics import FlatFieldOptics
 from .raw_files import exposure_time
 from .raw_frames import setup_optics
 from .sensor_signal import SensorSignal
@@ -31,6 +32,17 @@ FULL_SPAN_PX = 96
 """Side from which on a sensor has the full range of thickness [px]: smaller ones get no finer fringes."""
 
 STATED_FWHM_NM, STATED_KELVIN = 2.0, 183.15
+"""What the sizes of bandwidth and temperature are about; other set-ups move them with what they state."""
+
+THICKNESS_UM: Mapping[str, tuple[tuple[float, float], tuple[float, float]]] = MappingProxyType(
+    {"adhesive": ((13.0, 20.0), (1.5, 5.0)), "detection": ((97.0, 103.0), (0.6, 2.0))}
+)
+"""Limits of mean and span of the layer that varies: five to sixteen fringes of adhesive or of silicon [µm]."""
+
+OF_THE_LAYER = {"detection": ("silicon_thickness", "silicon_gradient")}
+"""Effects that are nothing but the thickness of a layer, where that layer varies."""
+
+
 READ_NOISE_E = 6.0
 
 
@@ -214,7 +226,12 @@ class SealedCase:
 
 
 def draw_case(
-    kind: str, rng: np.random.Generator, *, size: tuple[int, int] = (96, 96), only: Sequence[str] = ()
+    kind: str,
+    rng: np.random.Generator,
+    *,
+    size: tuple[int, int] = (96, 96),
+    only: Sequence[str] = (),
+    setup: str = "ts8_e2v",
 ) -> SealedCase:
     """Draw a sensor, its effects and its noise.
 
@@ -228,35 +245,58 @@ def draw_case(
         Rows and columns.
     only : sequence of `str`, optional
         Effects of `SIZES` (or of `OUTSIDERS`) from which to draw; all by default.
+    setup : `str`, optional
+        Laboratory set-up.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such kind of case, or no such set-up.
+    InputError
+        It is not illuminated by a monochromator, or another layer than adhesive or silicon varies.
     """
     if kind not in CASE_KINDS:
         raise UnknownNameError("kind of case", kind, CASE_KINDS)
+    optics, _ = setup_optics(setup)
+    if optics.varying not in THICKNESS_UM:
+        raise InputError("varying", optics.varying, " or ".join(THICKNESS_UM), source=setup)
+    means, spans = THICKNESS_UM[optics.varying]
     values: dict[str, float] = {}
     outsider = ""
     if kind in ("one", "two"):
-        pool = list(only) or list(SIZES)
+        pool = [name for name in only or SIZES if name not in OF_THE_LAYER.get(optics.varying, ())]
         for name in rng.choice(pool, size=1 if kind == "one" else 2, replace=False):
             values.update(SIZES[str(name)](rng))
     elif kind == "outsider":
         outsider = str(rng.choice(list(only) or list(OUTSIDERS)))
-    mean, span = float(rng.uniform(13.0, 20.0)), float(rng.uniform(1.5, 5.0))
+    mean, span = float(rng.uniform(*means)), float(rng.uniform(*spans))
     thickness = random_field(size, rng, mean=mean, span=span * min(1.0, min(size) / FULL_SPAN_PX))
     noise_factor = float(rng.uniform(0.8, 1.2) ** 2)
-    cube, sizes = _expose(thickness, values, outsider, noise_factor, rng)
+    values = _about_stated(values, optics)
+    cube, sizes = _expose(optics, thickness, values, outsider, noise_factor, rng)
     names = tuple(dict.fromkeys(key.split(".")[0] for key in values)) or ((outsider,) if outsider else ())
-    return SealedCase(cube, "ts8_e2v", kind, names, {**values, **sizes}, thickness, noise_factor)
+    return SealedCase(cube, setup, kind, names, {**values, **sizes}, thickness, noise_factor)
+
+
+def _about_stated(values: Mapping[str, float], optics: FlatFieldOptics) -> dict[str, float]:
+    """Sizes of effects that are about what a set-up states."""
+    moves = {
+        "bandwidth.fwhm": optics.bandwidth_fwhm_nm - STATED_FWHM_NM,
+        "temperature.kelvin": optics.temperature_k - STATED_KELVIN,
+    }
+    return {key: value + moves.get(key, 0.0) for key, value in values.items()}
 
 
 def _expose(
+    stated: FlatFieldOptics,
     thickness: FloatArray,
     values: Mapping[str, float],
     outsider: str,
     noise_factor: float,
     rng: np.random.Generator,
 ) -> tuple[FringeCube, dict[str, float]]:
-    optics, _ = setup_optics("ts8_e2v")
     active = validate_effects(values)
-    optics = with_hidden_optics(optics, active)
+    optics = with_hidden_optics(stated, active)
     wavelengths = np.arange(880.0, 991.0, 10.0)
     if rng.random() < 0.3:  # real runs lose exposures
         wavelengths = np.sort(rng.choice(wavelengths, size=10, replace=False))
@@ -297,7 +337,10 @@ def _expose(
         np.array(variances, dtype=np.float32),
         mask,
         FlatExposures(
-            wavelengths, np.array(STATED_FWHM_NM), np.array(STATED_KELVIN), dark_time_s=np.array(seconds)
+            wavelengths,
+            np.array(stated.bandwidth_fwhm_nm),
+            np.array(stated.temperature_k),
+            dark_time_s=np.array(seconds),
         ),
         "electron",
         detector="sealed",

@@ -265,7 +265,7 @@ def _narrowest_fringe(prepared: Prepared) -> float:
     forward, seen = prepared.problem.forward, prepared.problem.cells.seen
     slope = np.hypot(*forward.gradient(prepared.problem.basis.expand(prepared.null.field)))[seen]
     order = forward.model.fringe_order_um(float(np.median(prepared.problem.cells.wavelength_nm)))
-    return order / max(float(np.quantile(slope, STEEP)), 1e-300)
+    return float(order) / max(float(np.quantile(slope, STEEP)), 1e-300)
 
 
 def _prepare_in_cells(
