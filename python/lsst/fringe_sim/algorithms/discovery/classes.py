@@ -31,6 +31,10 @@ LEAST_PROMISE = 4.0
 ALIKE = 0.8
 """Fall of χ² and cosine of signatures from which on a replacement is fitted."""
 
+AS_MUCH, AS_MUCH_TRIED = 0.8, 5
+"""Part of what an effect brings that others must promise to be fitted however they look, and how many of them: the
+signature of a size that goes through many fringes is not the derivative."""
+
 WIDTHS_BEHIND = 3.0
 """How far a rival may be behind in the part of the data that is searched and still be compared in all data."""
 
@@ -169,17 +173,19 @@ def _refit_rivals(selector: Selector, chosen: Hypothesis, found: dict[str, Hypot
 def _replacements(
     selector: Selector, chosen: Hypothesis, name: str, without: Hypothesis
 ) -> dict[str, Hypothesis]:
-    """Sets with another effect in the place of one, where they were fitted before or look like it."""
+    """Sets with another effect in the place of one: they were fitted before, look like it, or promise as much."""
     own = selector.features(selector.state(chosen.fit), chosen.fit, name)
     bare = selector.state(without.fit)
+    much = AS_MUCH * (without.fit.chi2 - chosen.fit.chi2)
     found = {}
-    for candidate in selector.score(without.fit, selector.others(chosen), scan=True):
+    for number, candidate in enumerate(selector.score(without.fit, selector.others(chosen), scan=True)):
+        as_much = number < AS_MUCH_TRIED and candidate.promise > max(much, LEAST_PROMISE)
         alike = 0.0
         if candidate.promise > LEAST_PROMISE:
             features = selector.features(bare, without.fit, candidate.name)
             alike = similarity(bare.design, own, features)
         names = (*without.names, candidate.name)
-        if frozenset(names) in selector.fitted or alike > ALIKE:
+        if frozenset(names) in selector.fitted or alike > ALIKE or as_much:
             rival = selector.hypothesis(names, candidate.start, without.fit)
             # What was fitted before may be in another order, which promises nothing more here.
             if without.fit.chi2 - rival.fit.chi2 < MOST_OF_PROMISE * candidate.promise:
