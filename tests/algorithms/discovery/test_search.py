@@ -140,6 +140,17 @@ def test_less_than_a_hundredth_is_an_effect_where_nothing_else_is_left() -> None
 
 
 @pytest.mark.slow
+def test_what_a_wrong_effect_leaves_is_not_named_beside_it() -> None:
+    """Black coating of 1.4 µm takes all fringes away but a thousandth, and a spread of the thickness nearly does."""
+    parts = np.random.default_rng([20431125, CASE_KINDS.index("one"), 1]).spawn(2)
+    case = draw_case("one", parts[0])
+    assert case.names == ("black_coating",)
+    verdict = discover(case.cube, case.setup, rng=parts[1])
+    assert verdict.steps[0].added == ("thickness_spread",)
+    assert [effect.name for effect in verdict.effects] == ["black_coating"]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("outsider", "least"), [("annealing", 0.004), ("wandering_light", 0.007)])
 def test_where_the_catalogue_explains_next_to_nothing_no_pairs_are_tried(outsider: str, least: float) -> None:
     rng, size = np.random.default_rng(22), 0.0

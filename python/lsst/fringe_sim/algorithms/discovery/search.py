@@ -446,12 +446,26 @@ class _Search:
             better = self._surely_better(selector, current)
             if better is None:
                 break
-            steps.append(self._step(selector, current, better))
-            current = better
+            other = self._other_member(selector, current, steps)
+            if other is None:
+                steps.append(self._step(selector, current, better))
+            current = other or better
         complete = selector.with_channels(self._completed(selector, current))
         if complete.names != current.names:
             steps.append(self._step(selector, current, complete))
         return self._pruned(selector, complete)
+
+    def _other_member(self, selector: Selector, current: Hypothesis, steps: list[Step]) -> Hypothesis | None:
+        """The set with another effect in the place of one, if that is clearly likelier and leaves noise as well.
+
+        What a wrong effect leaves is another form, which two or three more make up for.
+        """
+        taken = list(steps)
+        likelier = selector.with_channels(self._classified(selector, current, taken)[0])
+        if likelier.names == current.names or not self._consistent(likelier):
+            return None
+        steps[:] = taken
+        return likelier
 
     def _one_more(self, selector: Selector, current: Hypothesis) -> Hypothesis | None:
         """The most credible set with one effect more, if it is likelier."""
