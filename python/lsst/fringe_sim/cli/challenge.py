@@ -12,7 +12,7 @@ from ..mock.challenge import run_challenge
 from ..products.challenge_result import CASE_KINDS, CaseResult
 from ..report.challenge_page import write_challenge_report
 from .inputs import prepare_folder
-from .parameters import LABORATORY, SIZE
+from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
 
 __all__ = ["challenge"]
 
@@ -40,14 +40,7 @@ RECORD = "cases.jsonl"
     show_default=True,
     help="Cases with a cause that the catalogue lacks.",
 )
-@click.option(
-    "--setup",
-    default="ts8_e2v",
-    metavar=LABORATORY.name,
-    show_default=True,
-    shell_complete=LABORATORY.shell_complete,
-    help="Laboratory set-up: name or file.",
-)
+@laboratory_of_the_mock
 @click.option("--size", type=SIZE, default="96x96", show_default=True, help="Columns x rows of the sensors.")
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Cases at the same time.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done, write nothing.")

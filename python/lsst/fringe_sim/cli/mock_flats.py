@@ -15,7 +15,15 @@ from ..mock.raw_frames import Defects, write_mock_flats
 from ..mock.thickness import e2v_321, fit_to_sensor, random_field
 from ..model import Setup
 from .inputs import prepare_folder, read_settings, read_thickness
-from .parameters import EFFECT, LABORATORY, SIZE, WAVELENGTHS, Quantity, effect_settings
+from .parameters import (
+    EFFECT,
+    LABORATORY,
+    SIZE,
+    WAVELENGTHS,
+    Quantity,
+    effect_settings,
+    laboratory_of_the_mock,
+)
 from .progress import progress
 
 __all__ = ["mock_flats"]
@@ -29,14 +37,7 @@ BLEMISHES = Defects(bad_columns=6, hot_pixels=200, prnu_rms=0.003)
 
 @click.command("mock-flats")
 @click.argument("outdir", type=click.Path(path_type=Path))
-@click.option(
-    "--setup",
-    default="ts8_e2v",
-    metavar=LABORATORY.name,
-    show_default=True,
-    shell_complete=LABORATORY.shell_complete,
-    help="Laboratory set-up: name or file.",
-)
+@laboratory_of_the_mock
 @click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
 @click.option(
     "--thickness",

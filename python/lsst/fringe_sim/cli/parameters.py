@@ -26,6 +26,7 @@ __all__ = [
     "Quantity",
     "SetupType",
     "effect_settings",
+    "laboratory_of_the_mock",
 ]
 
 
@@ -212,6 +213,16 @@ EFFECT = _EffectSetting()
 LABORATORY = SetupType("monochromator", "a laboratory set-up with a monochromator")
 ANY_LIGHT = SetupType("", "a set-up")
 SKY = SetupType("sky", "one behind a telescope, as lsst_e2v, monocam or hsc")
+
+laboratory_of_the_mock = click.option(
+    "--setup",
+    default="ts8_e2v",
+    metavar=LABORATORY.name,
+    show_default=True,
+    shell_complete=LABORATORY.shell_complete,
+    help="Laboratory set-up: name or file.",
+)
+"""Set-up that the mock reads itself: the command gets it as it was written."""
 
 
 def effect_settings(settings: tuple[tuple[str, float], ...]) -> dict[str, float]:
