@@ -7,7 +7,7 @@ import pytest
 
 from lsst.fringe_sim.mock import oracle
 from lsst.fringe_sim.mock.oracle import visibility
-from lsst.fringe_sim.mock.sealed_cases import CASE_KINDS, SealedCase, _expose, draw_case
+from lsst.fringe_sim.mock.sealed_cases import CASE_KINDS, SealedCase, draw_case, expose
 from lsst.fringe_sim.mock.thickness import random_field
 
 
@@ -17,7 +17,7 @@ def sealed(seed: int = 3, **values: float) -> SealedCase:
     thickness = random_field((48, 48), rng, mean=16.0, span=1.5)
     sizes = {key.replace("__", "."): value for key, value in values.items()}
     names = tuple(dict.fromkeys(key.partition(".")[0] for key in sizes))
-    cube, _ = _expose(thickness, sizes, "", 1.0, rng)
+    cube, _ = expose(thickness, sizes, rng)
     return SealedCase(cube, "ts8_e2v", "two", names, sizes, thickness, 1.0)
 
 

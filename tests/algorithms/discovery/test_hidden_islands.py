@@ -10,7 +10,7 @@ import pytest
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.thickness_steps import best_thickness_step
-from lsst.fringe_sim.mock.sealed_cases import _expose
+from lsst.fringe_sim.mock.sealed_cases import expose
 from lsst.fringe_sim.mock.thickness import random_field
 
 SHAPE = (48, 60)
@@ -52,7 +52,7 @@ def test_cells_without_data_do_not_count() -> None:
 
 
 def searched(thickness: np.ndarray, rng: np.random.Generator) -> Verdict:
-    cube, _ = _expose(thickness, {}, "", 1.0, rng)
+    cube, _ = expose(thickness, {}, rng)
     return discover(cube, "ts8_e2v", rng=np.random.default_rng(1))
 
 

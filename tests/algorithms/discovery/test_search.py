@@ -16,6 +16,7 @@ from lsst.fringe_sim.algorithms.discovery import (
 )
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
+from lsst.fringe_sim.algorithms.discovery.selection import IMPRECISION
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.mock.sealed_cases import SIZES, SealedCase, draw_case
 from lsst.fringe_sim.model import FringeModel
@@ -134,7 +135,8 @@ def test_less_than_a_hundredth_is_an_effect_where_nothing_else_is_left() -> None
     verdict = discover(case.cube, case.setup, rng=parts[1])
     found = {effect.name: effect for effect in verdict.effects}
     assert set(found) == set(case.names) == {"dark_current", "black_coating"}
-    assert found["dark_current"].significance < 0.01 * found["black_coating"].significance
+    coating, dark = verdict.steps
+    assert dark.delta_chi2 < IMPRECISION**2 * coating.delta_chi2 + 16.0  # no more, at four sigma
     rate = found["dark_current"].parameters["rate"]
     assert abs(rate.value - case.values["dark_current.rate"]) < 4.0 * rate.sigma
 

@@ -23,7 +23,7 @@ from .raw_frames import setup_optics
 from .sensor_signal import SensorSignal
 from .thickness import random_field
 
-__all__ = ["OUTSIDERS", "SIZES", "SealedCase", "draw_case"]
+__all__ = ["OUTSIDERS", "SIZES", "SealedCase", "draw_case", "expose"]
 
 FloatArray = NDArray[np.float64]
 Draw = Callable[[np.random.Generator], dict[str, float]]
@@ -273,7 +273,7 @@ def draw_case(
     thickness = random_field(size, rng, mean=mean, span=span * min(1.0, min(size) / FULL_SPAN_PX))
     noise_factor = float(rng.uniform(0.8, 1.2) ** 2)
     values = _about_stated(values, optics)
-    cube, sizes = _expose(optics, thickness, values, outsider, noise_factor, rng)
+    cube, sizes = expose(thickness, values, rng, outsider=outsider, noise_factor=noise_factor, setup=setup)
     names = tuple(dict.fromkeys(key.split(".")[0] for key in values)) or ((outsider,) if outsider else ())
     return SealedCase(cube, setup, kind, names, {**values, **sizes}, thickness, noise_factor)
 
@@ -287,14 +287,40 @@ def _about_stated(values: Mapping[str, float], optics: FlatFieldOptics) -> dict[
     return {key: value + moves.get(key, 0.0) for key, value in values.items()}
 
 
-def _expose(
-    stated: FlatFieldOptics,
+def expose(
     thickness: FloatArray,
     values: Mapping[str, float],
-    outsider: str,
-    noise_factor: float,
     rng: np.random.Generator,
+    *,
+    outsider: str = "",
+    noise_factor: float = 1.0,
+    setup: str = "ts8_e2v",
 ) -> tuple[FringeCube, dict[str, float]]:
+    """Expose one sensor in a run of flats.
+
+    Parameters
+    ----------
+    thickness : `numpy.ndarray`, shape (ny, nx)
+        Thickness of the layer that varies [µm].
+    values : mapping [`str`, `float`]
+        Parameters of hidden effects, by ``effect.parameter``.
+    rng : `numpy.random.Generator`
+        Decides noise, exposures that are lost, bad pixels and the size of an outsider.
+    outsider : `str`, optional
+        Name of a cause of `OUTSIDERS`.
+    noise_factor : `float`, optional
+        True over stated variance.
+    setup : `str`, optional
+        Laboratory set-up.
+
+    Returns
+    -------
+    cube : `FringeCube`
+        Exposures, in electrons.
+    sizes : `dict` [`str`, `float`]
+        Size of the outsider, by ``outsider.size``.
+    """
+    stated, _ = setup_optics(setup)
     active = validate_effects(values)
     optics = with_hidden_optics(stated, active)
     wavelengths = np.arange(880.0, 991.0, 10.0)
