@@ -142,6 +142,16 @@ def test_less_than_a_hundredth_is_an_effect_where_nothing_else_is_left() -> None
 
 
 @pytest.mark.slow
+def test_weak_fringes_held_out_may_be_in_a_wrong_order() -> None:
+    """Coating of 1.3 µm leaves so little of the fringes that those held out hardly tell an order from the next."""
+    parts = np.random.default_rng([20441125, CASE_KINDS.index("two"), 3]).spawn(2)
+    case = draw_case("two", parts[0])
+    assert set(case.names) == {"tilt", "black_coating"}
+    verdict = discover(case.cube, case.setup, rng=parts[1])
+    assert {effect.name for effect in verdict.effects} == set(case.names), verdict.summary()
+
+
+@pytest.mark.slow
 def test_what_a_wrong_effect_leaves_is_not_named_beside_it() -> None:
     """Black coating of 1.4 µm takes all fringes away but a thousandth, and a spread of the thickness nearly does."""
     parts = np.random.default_rng([20431125, CASE_KINDS.index("one"), 1]).spawn(2)

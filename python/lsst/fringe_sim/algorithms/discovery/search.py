@@ -37,7 +37,14 @@ from .preparation import (
     without_blurs,
 )
 from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
-from .validation import HeldOut, held_out_blocks, misfit_rms, validate, whole_thickness
+from .validation import (
+    HeldOut,
+    continued_thickness,
+    held_out_blocks,
+    misfit_rms,
+    validate,
+    whole_thickness,
+)
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
 
 __all__ = ["SearchOptions", "discover"]
@@ -785,7 +792,17 @@ class _Search:
         return chosen, classes
 
     def _of_all_data(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
-        return whole.with_channels(whole.settled(self._transfer(whole, chosen)))
+        """The chosen set fitted to all data.
+
+        The cells held out may be in a wrong fringe order, which weak fringes hardly tell: if only all data show a
+        residual, the thickness of the part searched is continued into them.
+        """
+        final = whole.with_channels(whole.settled(self._transfer(whole, chosen)))
+        if self._consistent(final) or not self._consistent(chosen) or whole.problem.field_prior:
+            return final
+        thickness = continued_thickness(whole.problem, chosen.fit, self.heldout)
+        field = whole.problem.basis.fit(thickness, self.cells.seen.astype(float))
+        return whole.with_channels(whole.improved(final.names, replace(final.fit, field=field)))
 
     def _transfer(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
         """The chosen set fitted to all data."""

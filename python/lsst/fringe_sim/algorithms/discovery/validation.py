@@ -14,7 +14,14 @@ from .continuation import continued
 from .fit import Fit, Problem, fit_model
 from .islands import thickness_on_islands
 
-__all__ = ["HeldOut", "held_out_blocks", "misfit_rms", "validate", "whole_thickness"]
+__all__ = [
+    "HeldOut",
+    "continued_thickness",
+    "held_out_blocks",
+    "misfit_rms",
+    "validate",
+    "whole_thickness",
+]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -95,7 +102,7 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
     everywhere = _moved_everywhere(problem, null, moved, held_out, on_islands)
     if on_islands.any():
         # A smooth thickness is bent about an island without the effect.
-        beyond = _beyond(problem, moved, held_out)
+        beyond = continued_thickness(problem, fit, held_out)
         near = np.where(binary_dilation(on_islands, iterations=NEAR_ISLAND), beyond, everywhere)
         trials = [thickness_on_islands(problem, fit, first, held_out) for first in (everywhere, near, beyond)]
         return min(trials, key=lambda thickness: _chi2_at(rest, fit, thickness))
@@ -103,12 +110,13 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
     chi2 = _chi2_at(rest, fit, everywhere)
     if chi2 < MUCH_WORSE * ratio * fit.chi2:
         return everywhere
-    beyond = _beyond(problem, moved, held_out)
+    beyond = continued_thickness(problem, fit, held_out)
     return beyond if _chi2_at(rest, fit, beyond) < chi2 else everywhere
 
 
-def _beyond(problem: Problem, thickness_um: FloatArray, held_out: BoolArray) -> FloatArray:
-    """Thickness that is continued into the cells held out."""
+def continued_thickness(problem: Problem, fit: Fit, held_out: BoolArray) -> FloatArray:
+    """Thickness of a fit to a part of the cells, continued into those held out."""
+    thickness_um = problem.basis.expand(fit.field)
     return np.where(held_out, continued(thickness_um, ~held_out & problem.cells.seen), thickness_um)
 
 
