@@ -801,14 +801,16 @@ class _Search:
         if self._consistent(final) or not self._consistent(chosen) or whole.problem.field_prior:
             return final
         thickness = continued_thickness(whole.problem, chosen.fit, self.heldout)
-        field = whole.problem.basis.fit(thickness, self.cells.seen.astype(float))
-        return whole.with_channels(whole.improved(final.names, replace(final.fit, field=field)))
+        start = replace(final.fit, field=self._field_of(whole, thickness))
+        return whole.with_channels(whole.improved(final.names, start))
 
     def _transfer(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
         """The chosen set fitted to all data."""
-        weight = self.cells.seen.astype(float)
-        field = whole.problem.basis.fit(self._thickness(whole, chosen.fit), weight)
+        field = self._field_of(whole, self._thickness(whole, chosen.fit))
         return whole.hypothesis(chosen.names, None, replace(chosen.fit, field=field))
+
+    def _field_of(self, whole: Selector, thickness_um: FloatArray) -> FloatArray:
+        return whole.problem.basis.fit(thickness_um, self.cells.seen.astype(float))
 
     def _named(self, final: Hypothesis, name: str, group: EffectClass, probability: float) -> NamedEffect:
         parameters = {}
