@@ -165,6 +165,24 @@ def test_a_wedge_of_silicon_is_that_of_every_column() -> None:
     assert np.ptp(signal.flat(1)[0]) > 0.002 * signal.flat(1).mean()
 
 
+def test_light_that_comes_back_incoherently_leaves_a_wedge_as_it_is() -> None:
+    """No fringes are left, and silicon that is thicker absorbs as much more as it does with them."""
+    optics, _ = setup_optics("ts8_e2v")
+    order = 0.98 / (2.0 * optics.films[optics.position("adhesive")].index(np.array([980.0]), 183.15)[0].real)
+    thickness = 15.0 + order * np.arange(8)[:, np.newaxis] / 8.0 * np.ones(6)
+    added = np.linspace(-0.5, 0.5, 6) * np.ones((8, 1))
+    loss = BY_NAME["contrast_loss"].on_optics
+    with_fringes = SensorSignal.of(optics, thickness, [980.0], added).flat(0)
+    without, half = (
+        SensorSignal.of(loss(optics, {"factor": part}), thickness, [980.0], added).flat(0)
+        for part in (0.0, 0.5)
+    )
+    np.testing.assert_allclose(without, np.ones((8, 1)) * with_fringes.mean(axis=0), rtol=1e-4)
+    np.testing.assert_allclose(half, 0.5 * (with_fringes + without), rtol=1e-6)
+    assert np.ptp(with_fringes[:, 0]) > 0.05 * with_fringes.mean()
+    assert np.ptp(without[0]) > 0.002 * without.mean()
+
+
 def test_an_island_sees_its_own_optics() -> None:
     optics, _ = setup_optics("ts8_e2v")
     thickness = np.linspace(15.0, 15.4, 20)[:, np.newaxis] * np.ones(30)

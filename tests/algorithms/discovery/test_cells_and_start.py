@@ -12,7 +12,7 @@ import pytest
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
-from lsst.fringe_sim.algorithms.discovery.channels import echo_channel, measure_channels
+from lsst.fringe_sim.algorithms.discovery.channels import Channel, echo_channel, measure_channels
 from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import MOST_ROWS, Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
@@ -425,6 +425,27 @@ def test_a_misfit_of_the_field_is_no_echo() -> None:
     assert echo_channel(bent).statistic == pytest.approx(plain.statistic)
     copy = 0.1 * state.whiten(state.value - 1.0)[:, ::-1, ::-1]  # type: ignore[operator]
     assert echo_channel(replace(state, residual=state.residual + copy)).probability < 1e-6
+
+
+def test_a_faint_copy_mirrored_about_the_middle_is_an_echo() -> None:
+    """Of the same χ², a copy where reflections along the axis fall is seen, and one moved aside is not."""
+    truth = _smooth_field(32, 32)
+    cells = bin_cube(_cube(truth, {}, 2e4, 5), 1)
+    problem, start = _problem(cells, truth)
+    null = fit_model(problem, (), np.zeros(0), start)
+    state = Selector(problem, EFFECTS[:1], null, np.full(len(WAVELENGTHS), 1.6)).state(null)
+    pattern = state.value - state.value.mean(axis=(1, 2), keepdims=True)
+
+    def channel_of(copy: np.ndarray) -> Channel:
+        one = replace(state, residual=state.whiten(copy))
+        faint = np.sqrt(22.0 / echo_channel(one).statistic)
+        return echo_channel(replace(state, residual=faint * one.residual))
+
+    mirrored, aside = (
+        channel_of(copy) for copy in (pattern[:, ::-1, ::-1], np.roll(pattern[:, ::-1, ::-1], 9, axis=1))
+    )
+    assert mirrored.statistic == pytest.approx(22.0) == aside.statistic
+    assert mirrored.probability < 1e-4 < 1e-3 < aside.probability
 
 
 def test_a_window_keeps_places_and_levels(rng: np.random.Generator) -> None:

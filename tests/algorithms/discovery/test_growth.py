@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from lsst.fringe_sim.algorithms.discovery.continuation import continued
 from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.growth import grown_thickness
-from lsst.fringe_sim.algorithms.discovery.validation import whole_thickness
+from lsst.fringe_sim.algorithms.discovery.validation import thickness_starts, whole_thickness
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
@@ -113,6 +114,26 @@ def test_cells_held_out_follow_a_fit_whose_field_is_another_than_without_effects
     found = whole_thickness(problem, null, fit, held_out)
     assert not _is_wrong(found, truth).any()
     np.testing.assert_array_equal(found[~held_out], fit.field.reshape(truth.shape)[~held_out])
+
+
+def test_cells_held_out_have_a_second_start_where_their_order_is_open(blurred) -> None:
+    """One block of the unchanged model is an order off, which such weak fringes hardly tell before it is fitted."""
+    strong, truth, sigma = blurred
+    cells, rng = strong.cells, np.random.default_rng(6)
+    noise = 0.1 * rng.standard_normal(cells.value.shape)
+    weight = np.where(cells.weight > 0.0, 0.1**-2.0, 0.0)
+    problem = strong.with_cells(replace(cells, value=cells.value + noise, weight=weight))
+    held_out = np.zeros(truth.shape, dtype=bool)
+    held_out[8:16, 24:32] = held_out[32:40, 40:48] = True
+    spoiled = truth.copy()
+    spoiled[8:16, 24:32] += ORDER_UM
+    seen = problem.with_cells(problem.cells.restricted(~held_out))
+    fit = fit_model(seen, (), np.zeros(0), truth.ravel(), None, {f"{BLUR}.sigma": sigma})
+    right, wrong = (fit_model(problem, (), np.zeros(0), f.ravel(), iterations=0) for f in (truth, spoiled))
+    assert len(thickness_starts(problem, right, fit, held_out)) == 1
+    first, second = thickness_starts(problem, wrong, fit, held_out)
+    assert _is_wrong(first, truth)[8:16, 24:32].all()
+    assert not _is_wrong(second, truth).any()
 
 
 def test_a_plane_is_continued_as_a_plane() -> None:

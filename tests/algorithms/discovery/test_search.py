@@ -152,6 +152,28 @@ def test_weak_fringes_held_out_may_be_in_a_wrong_order() -> None:
 
 
 @pytest.mark.slow
+def test_two_effects_are_named_where_errors_of_all_wavelengths_explain_as_much() -> None:
+    """Neither silicon that absorbs more nor a triangular line is likely by itself, and both are fewer parameters."""
+    case, rng = hidden_case(20451125, "two", 5)
+    assert set(case.names) == {"silicon_absorption", "line_triangle"}
+    told: list[str] = []
+    verdict = discover(case.cube, case.setup, rng=rng, report=told.append)
+    assert any("with wavelength_jitter:" in line for line in told)
+    assert {effect.name for effect in verdict.effects} == set(case.names), verdict.summary()
+
+
+@pytest.mark.slow
+def test_a_residual_is_judged_in_all_data() -> None:
+    """The part searched has one of chance 4e-5 in this draw of the noise, and all data have none."""
+    case, rng = hidden_case(20451125, "one", 14)
+    verdict = discover(case.cube, case.setup, rng=rng)
+    assert [effect.name for effect in verdict.effects] == list(case.names) == ["black_coating"], (
+        verdict.summary()
+    )
+    assert not verdict.steps[-1].consistent
+
+
+@pytest.mark.slow
 def test_what_a_wrong_effect_leaves_is_not_named_beside_it() -> None:
     """Black coating of 1.4 µm takes all fringes away but a thousandth, and a spread of the thickness nearly does."""
     parts = np.random.default_rng([20431125, CASE_KINDS.index("one"), 1]).spawn(2)

@@ -325,15 +325,15 @@ def _converging_beam(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics
     return replace(optics, theta=tuple(theta.tolist()), theta_weight=tuple((0.5 * weight).tolist()))
 
 
+def _contrast_loss(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
+    return replace(optics, coherent_part=optics.coherent_part * values["factor"])
+
+
 # Light ----------------------------------------------------------------------------------------------------
 
 
 def _ghost_pedestal(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
     return light + values["fraction"]
-
-
-def _contrast_loss(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
-    return 1.0 + values["factor"] * (light - 1.0)
 
 
 def _illumination(light: FloatArray, wavelength_nm: float, values: Values) -> FloatArray:
@@ -680,7 +680,7 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
         "contrast_loss",
         "constant contrast loss",
         (HiddenParameter("factor", "", 1.0, (0.0, 1.5), "factor on the departure from the mean"),),
-        on_light=_contrast_loss,
+        on_optics=_contrast_loss,
     ),
     HiddenEffect(
         "illumination",

@@ -97,6 +97,10 @@ class Film:
         return n + 1j * (table.imag * self.extinction_scale + self.extinction_shift)
 
 
+PHASES = 16
+"""Thicknesses within a fringe over which the part that all phases have in common is averaged."""
+
+
 @dataclass(frozen=True)
 class FlatFieldOptics:
     """Sensor and light of a monochromatic flat field.
@@ -133,6 +137,9 @@ class FlatFieldOptics:
         Shapes of the same width, ``"lorentzian"`` too, each with the part that it takes of the light before it.
     lamp_lines : `tuple` [`tuple` [`float`, `float`, `float`], ...]
         Lines of the lamp: centre [nm], peak over the continuum, full width at half maximum [nm].
+    coherent_part : `float`
+        Part of the fringes that is left where only so much of the light comes back coherently; what all phases of
+        the varying layer have in common stays.
     line_step_nm, height_step_nm : `float`
         Largest spacing of the nodes over wavelength and over the thicknesses inside a pixel [nm].
 
@@ -163,6 +170,7 @@ class FlatFieldOptics:
     support_spread_um: float = 0.0
     other_lines: tuple[tuple[str, float], ...] = ()
     lamp_lines: tuple[tuple[float, float, float], ...] = ()
+    coherent_part: float = 1.0
     line_step_nm: float = LINE_STEP_NM
     height_step_nm: float = HEIGHT_STEP_NM
 
@@ -266,7 +274,22 @@ class FlatFieldOptics:
             Detected over incident photons.
         """
         thickness = np.atleast_1d(np.asarray(thickness_um, dtype=float))
-        wavelength, line_weight = self._line(float(wavelength_nm))
+        signal = self._coherent(thickness, float(wavelength_nm))
+        if self.coherent_part == 1.0:
+            return signal
+        mean = self._coherent(self._one_order_um(float(wavelength_nm)), float(wavelength_nm)).mean()
+        return np.asarray(mean + self.coherent_part * (signal - mean))
+
+    def _one_order_um(self, nominal_nm: float) -> FloatArray:
+        """Thicknesses of the varying layer that go evenly through one fringe [µm]."""
+        wavelength, film = self.true_wavelength(nominal_nm), self.films[self.position(self.varying)]
+        index = film.index(np.array([wavelength]), self.temperature_k)[0].real
+        order = 1e-3 * wavelength / (2.0 * index)
+        return np.asarray(film.thickness_um + order * np.arange(PHASES) / PHASES)
+
+    def _coherent(self, thickness: FloatArray, nominal_nm: float) -> FloatArray:
+        """Detected fraction where all light comes back coherently."""
+        wavelength, line_weight = self._line(nominal_nm)
         total = np.zeros(thickness.shape)
         for support_um, part in _heights(self.support_spread_um, 1e-3 * self.height_step_nm):
             for weight, theta, s_wave, height_um in self._modes():

@@ -319,7 +319,14 @@ def expose(
         Exposures, in electrons.
     sizes : `dict` [`str`, `float`]
         Size of the outsider, by ``outsider.size``.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such outsider, effect or set-up.
     """
+    if outsider and outsider not in OUTSIDERS:
+        raise UnknownNameError("outsider", outsider, OUTSIDERS)
     stated, _ = setup_optics(setup)
     active = validate_effects(values)
     optics = with_hidden_optics(stated, active)

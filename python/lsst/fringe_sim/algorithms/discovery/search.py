@@ -24,6 +24,7 @@ from .forward import Exposures
 from .hidden_islands import hidden_island
 from .next_frames import FrameForecast
 from .next_step import Ranking, flats_ranked, with_next_measurements
+from .pairs import fitted_pair, likely_pairs
 from .preparation import (
     Prepared,
     check_setup,
@@ -39,9 +40,9 @@ from .preparation import (
 from .selection import IMPRECISION, Candidate, Hypothesis, Selector, similarity
 from .validation import (
     HeldOut,
-    continued_thickness,
     held_out_blocks,
     misfit_rms,
+    thickness_starts,
     validate,
     whole_thickness,
 )
@@ -71,6 +72,9 @@ SHIFTING_SETS = 3
 
 CONTAINED = 0.9
 """Cosine of the signatures from which on an effect may be hidden in another of many parameters."""
+
+MOST_OF_MANY = 0.8
+"""Part of what an effect of many parameters brings that two others must promise to be fitted in its place."""
 
 _METRIC = "rms of data minus model, relative counts"
 
@@ -457,6 +461,10 @@ class _Search:
             if other is None:
                 steps.append(self._step(selector, current, better))
             current = other or better
+        other = self._pair_instead(selector, current)
+        if other is not current:
+            steps.append(self._step(selector, current, other))
+            current = other
         complete = selector.with_channels(self._completed(selector, current))
         if complete.names != current.names:
             steps.append(self._step(selector, current, complete))
@@ -473,6 +481,28 @@ class _Search:
             return None
         steps[:] = taken
         return likelier
+
+    def _pair_instead(self, selector: Selector, current: Hypothesis) -> Hypothesis:
+        """The set with two effects in the place of one of many parameters, where they are likelier and leave noise.
+
+        Errors of all wavelengths take in what an absorbing silicon and a wider line do together, neither of which is
+        likely by itself.
+        """
+        best = current
+        if not self._consistent(current) or len(current.names) >= self.options.most_effects:
+            return best
+        for name in filter(selector.has_many, current.names):
+            left = tuple(other for other in current.names if other != name)
+            rest = selector.improved(left, current.fit) if left else selector.null
+            least = MOST_OF_MANY * (rest.fit.chi2 - current.fit.chi2)
+            pairs = likely_pairs(selector, rest.fit, selector.others(current))[: self.options.refits]
+            for pair in (pair for pair in pairs if pair.gain > max(least, WORTH_FITTING)):
+                found = fitted_pair(selector, rest, pair)
+                self._say_refit(rest, found)
+                likelier = found.log_evidence > best.log_evidence + self.options.least_evidence
+                if likelier and self._consistent(selector.with_channels(found)):
+                    best = selector.with_channels(found)
+        return best
 
     def _one_more(self, selector: Selector, current: Hypothesis) -> Hypothesis | None:
         """The most credible set with one effect more, if it is likelier."""
@@ -693,11 +723,8 @@ class _Search:
         self.unseen = validate(
             whole.problem, whole.null.fit, final.fit, self.heldout, rich=self.prepared.rich
         )
-        reasons = [
-            self._what_remains(item, where)
-            for item, where in ((final, ""), (chosen, " of the part searched"))
-            if not self._consistent(item)
-        ][:1]
+        # All data decide: they hold the part searched, and a cause that is there stands out more clearly in them.
+        reasons = [] if self._consistent(final) else [self._what_remains(final)]
         if not self.unseen.better:
             reasons.append("data held out are not predicted better")
         explained = whole.null.fit.chi2 - final.fit.chi2
@@ -740,10 +767,10 @@ class _Search:
         return max(gains)
 
     @staticmethod
-    def _what_remains(found: Hypothesis, where: str) -> str:
+    def _what_remains(found: Hypothesis) -> str:
         worst = min(found.channels, key=lambda channel: channel.probability)
         return (
-            f"with {', '.join(found.names)} a residual{where} remains in '{worst.name}' "
+            f"with {', '.join(found.names)} a residual remains in '{worst.name}' "
             f"(chance {worst.probability:.2g})"
         )
 
@@ -792,22 +819,17 @@ class _Search:
         return chosen, classes
 
     def _of_all_data(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
-        """The chosen set fitted to all data.
-
-        The cells held out may be in a wrong fringe order, which weak fringes hardly tell: if only all data show a
-        residual, the thickness of the part searched is continued into them.
-        """
-        final = whole.with_channels(whole.settled(self._transfer(whole, chosen)))
-        if self._consistent(final) or not self._consistent(chosen) or whole.problem.field_prior:
-            return final
-        thickness = continued_thickness(whole.problem, chosen.fit, self.heldout)
-        start = replace(final.fit, field=self._field_of(whole, thickness))
-        return whole.with_channels(whole.improved(final.names, start))
+        """The chosen set fitted to all data, and tested there."""
+        return whole.with_channels(whole.settled(self._transfer(whole, chosen)))
 
     def _transfer(self, whole: Selector, chosen: Hypothesis) -> Hypothesis:
-        """The chosen set fitted to all data."""
-        field = self._field_of(whole, self._thickness(whole, chosen.fit))
-        return whole.hypothesis(chosen.names, None, replace(chosen.fit, field=field))
+        """The chosen set fitted to all data, the cells held out in the likelier fringe order."""
+        starts = thickness_starts(whole.problem, whole.null.fit, chosen.fit, self.heldout)
+        first, *others = [replace(chosen.fit, field=self._field_of(whole, thickness)) for thickness in starts]
+        found = whole.hypothesis(chosen.names, None, first)
+        for other in others:
+            found = whole.improved(chosen.names, other)
+        return found
 
     def _field_of(self, whole: Selector, thickness_um: FloatArray) -> FloatArray:
         return whole.problem.basis.fit(thickness_um, self.cells.seen.astype(float))

@@ -285,7 +285,7 @@ class Selector:
         except InputError:
             return None
         score, information = state.design.project(FullColumns(features), state.residual)
-        start, gain, degrees = _bounded_minimum(score, information, coordinates)
+        start, gain, degrees = bounded_minimum(score, information, coordinates)
         candidate = Candidate(name, gain, degrees, start, gain)
         of_the_image = self.problem.forward.is_image_effect(name)
         far_from_linear = not of_the_image or self.problem.forward.couples_pixels(name)
@@ -789,7 +789,7 @@ class Selector:
         )
 
 
-def _bounded_minimum(
+def bounded_minimum(
     score: FloatArray, information: FloatArray, coordinates: Sequence[Coordinate]
 ) -> tuple[FloatArray, float, int]:
     """Minimum of the quadratic expansion within the bounds, its depth and the number of parameters used."""

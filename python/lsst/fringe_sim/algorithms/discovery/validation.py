@@ -19,6 +19,7 @@ __all__ = [
     "continued_thickness",
     "held_out_blocks",
     "misfit_rms",
+    "thickness_starts",
     "validate",
     "whole_thickness",
 ]
@@ -32,6 +33,9 @@ FEWEST_ROWS = 12
 
 MUCH_WORSE = 4.0
 """χ² of the cells held out over that of the others, from which on their thickness may be another."""
+
+ANOTHER_ORDER = 0.5
+"""Fringe orders from which on the thickness of a cell is another one, to which no fit gets by itself."""
 
 NEAR_ISLAND = 8
 """Cells about an island into which a smooth thickness may be bent."""
@@ -114,6 +118,21 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
     return beyond if _chi2_at(rest, fit, beyond) < chi2 else everywhere
 
 
+def thickness_starts(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) -> list[FloatArray]:
+    """Thicknesses of all cells from which a fit to all of them may begin, after one to a part of them.
+
+    The first is `whole_thickness`. Where the part, continued with little curvature, comes to another fringe order in
+    some of the rest, that is the second: weak fringes hardly tell which is right before both are fitted.
+    """
+    first = whole_thickness(problem, null, fit, held_out)
+    rest = held_out & problem.cells.seen
+    if not rest.any() or problem.field_prior:
+        return [first]
+    beyond = continued_thickness(problem, fit, held_out)
+    order = float(problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm))))
+    return [first, beyond] if np.abs(beyond - first)[rest].max() > ANOTHER_ORDER * order else [first]
+
+
 def continued_thickness(problem: Problem, fit: Fit, held_out: BoolArray) -> FloatArray:
     """Thickness of a fit to a part of the cells, continued into those held out."""
     thickness_um = problem.basis.expand(fit.field)
@@ -176,9 +195,10 @@ def _without_blocks(
     fitted = fit_model(seen, final.coordinates, final.position, final.field, final.levels)
     unseen = problem.with_cells(problem.cells.restricted(held_out))
     before = fit_model(unseen, (), np.zeros(0), null.field, null.levels)
-    thickness = whole_thickness(problem, null, fitted, held_out)
-    start = problem.basis.fit(thickness, np.ones(held_out.shape))
-    after = fit_model(unseen, (), np.zeros(0), start, fitted.levels, fitted.settings)
+    starts = thickness_starts(problem, null, fitted, held_out)
+    fields = [problem.basis.fit(thickness, np.ones(held_out.shape)) for thickness in starts]
+    ends = [fit_model(unseen, (), np.zeros(0), field, fitted.levels, fitted.settings) for field in fields]
+    after = min(ends, key=lambda fit: fit.chi2)
     return before.chi2 - after.chi2, misfit_rms(unseen, before), misfit_rms(unseen, after)
 
 
