@@ -16,8 +16,7 @@ from lsst.fringe_sim.algorithms.discovery.channels import Channel, echo_channel,
 from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import MOST_ROWS, Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
-from lsst.fringe_sim.algorithms.discovery.search import _chance_of
-from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector
+from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector, chance_of
 from lsst.fringe_sim.algorithms.discovery.start import _mend_patches, mended_thickness, starting_thickness
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.effects.image_geometry import AMPLIFIERS
@@ -332,9 +331,9 @@ def test_cells_beside_cells_without_data_do_not_lean_on_them() -> None:
 
 def test_what_the_description_lacks_counts_on_whole_sensors_alone() -> None:
     """A gain of 23 in χ² is a discovery of a weak effect in a small image, and none where fringes have S/N 90 000."""
-    assert _chance_of(23.0, 1, 0.05) < 1e-5
-    assert _chance_of(23.0, 1, PRECISION**2 * 9e4**2) > 0.3
-    assert _chance_of(23.0, 1, 0.0) == pytest.approx(1.6e-6, rel=0.1)
+    assert chance_of(23.0, 1, 0.05) < 1e-5
+    assert chance_of(23.0, 1, PRECISION**2 * 9e4**2) > 0.3
+    assert chance_of(23.0, 1, 0.0) == pytest.approx(1.6e-6, rel=0.1)
     cells = bin_cube(_cube(_smooth_field(32, 32), {}, 2e4, 4), 1)
     start = _smooth_field(32, 32)
     forward = Forward.of_cells(FringeModel.from_setup("ts8_e2v"), EFFECTS[:3], cells, (12.0, 18.0))

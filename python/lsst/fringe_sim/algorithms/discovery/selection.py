@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import ncx2
 
 from ...effects import Effect
 from ...errors import InputError
@@ -32,7 +33,7 @@ from .orders import fields_in_other_orders, starts_in_other_orders
 from .spots import log_evidence_of_spots, spot_channel
 from .trends import FEWEST_DRAWS, trend_channel
 
-__all__ = ["Candidate", "Hypothesis", "Selector"]
+__all__ = ["Candidate", "Hypothesis", "Selector", "bounded_minimum", "chance_of", "similarity"]
 
 FloatArray = NDArray[np.float64]
 
@@ -838,3 +839,9 @@ def _inverse_root(matrix: FloatArray) -> FloatArray:
     keep = values > 1e-9 * max(float(values.max()), 1e-300)
     root: FloatArray = (vectors[:, keep] / np.sqrt(values[keep])) @ vectors[:, keep].T
     return root
+
+
+def chance_of(gain: float, degrees: int, undescribed: float) -> float:
+    """Chance that noise, and what the description of the fringes lacks, give as large a gain in χ²."""
+    noise = ncx2(degrees, undescribed) if undescribed > 0.0 else chi2_distribution(degrees)
+    return float(noise.sf(gain))

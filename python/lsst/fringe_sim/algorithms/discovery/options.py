@@ -1,0 +1,59 @@
+"""Thresholds and sizes of a search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .selection import Hypothesis
+
+__all__ = ["SearchOptions"]
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Thresholds and sizes of a search; the defaults were chosen on other seeds than those of the recorded challenge.
+
+    Attributes
+    ----------
+    most_cells : `int`
+        Cells that the data are averaged to, if the pattern allows it.
+    significance : `float`
+        Chance of noise below which the unchanged model is held to disagree.
+    consistency : `float`
+        Chance of noise above which a residual is held to be noise.
+    least_evidence : `float`
+        Gain in log evidence that an added effect must bring.
+    class_width : `float`
+        Difference in log evidence within which effects are one class.
+    least_probability : `float`
+        Probability of a class with which it is named.
+    most_effects : `int`
+        Largest number of effects named together.
+    refits : `int`
+        Effects that are refitted in each round, best scores first; twice as many pairs.
+    credit : `float`
+        Log evidence that a set may lack if what it leaves is noise and what the other leaves is not.
+    parents : `int`
+        Sets of nearly equal evidence from which larger ones are made.
+    heldout_fraction : `float`
+        Part of the sensor that no selection sees.
+    outsider_prior : `float`
+        Prior probability of a cause that is not in the catalogue.
+    """
+
+    most_cells: int = 20_000
+    significance: float = 1e-3
+    consistency: float = 1e-3
+    least_evidence: float = 6.0
+    class_width: float = 5.0
+    least_probability: float = 0.95
+    most_effects: int = 3
+    refits: int = 10
+    credit: float = 20.0
+    parents: int = 5
+    heldout_fraction: float = 0.25
+    outsider_prior: float = 0.15
+
+    def is_noise(self, found: Hypothesis) -> bool:
+        """Whether a set leaves what noise may be."""
+        return found.probability_of_noise > self.consistency
