@@ -69,6 +69,19 @@ def null_of(effect: Effect, name: str, base: FringeModel) -> float:
     return effect.null_values(base.base_system)[name]
 
 
+def test_natural_bounds_are_bounds() -> None:
+    natural = {
+        f"{effect.name}.{parameter.name}": (parameter.natural_bounds, parameter.bounds)
+        for effect in EFFECTS
+        for parameter in effect.parameters
+        if parameter.natural_bounds
+    }
+    assert natural["line_triangle.fraction"][0] == (1.0,)
+    assert "ar_coating.scale" not in natural
+    for found, bounds in natural.values():
+        assert set(found) <= set(bounds)
+
+
 def test_names_are_unique() -> None:
     names = [effect.name for effect in EFFECTS]
     assert len(set(names)) == len(names)

@@ -98,6 +98,28 @@ def test_derivatives_are_central(at: float, quadratic: bool) -> None:
     np.testing.assert_allclose(found, np.cos(at + phase), atol=0.01)
 
 
+def test_derivatives_are_central_about_any_null(rng: np.random.Generator) -> None:
+    """Sums with a null of 1.0 or 183.15 are rounded, which is no bound that has been reached."""
+    for null, low, high, scale in ((1.0, 0.5, 1.5, 0.05), (183.15, 120.0, 320.0, 3.0)):
+        item = Coordinate("coating", "scale", null, low, high, scale, False)
+        places: list[tuple[float, float]] = []
+
+        def change(
+            below: dict[str, float], above: dict[str, float], thickness: np.ndarray, places: list = places
+        ) -> np.ndarray:
+            places.append((below["coating.scale"], above["coating.scale"]))
+            return np.array(above["coating.scale"] - below["coating.scale"])
+
+        inner = rng.uniform(0.9 * (low - null), 0.9 * (high - null), 200)
+        for at in (*inner, low - null, high - null):
+            slope = coordinate_derivative(SimpleNamespace(change=change), item, at, {}, inner)  # type: ignore[arg-type]
+            assert slope == pytest.approx(1.0, rel=1e-6)
+        middle = np.array([0.5 * (below + above) for below, above in places])
+        np.testing.assert_allclose(middle[:-2], null + inner, atol=1e-6 * scale)
+        assert middle[-2] > low
+        assert middle[-1] < high
+
+
 @pytest.mark.parametrize("exchangeable", [True, False])
 def test_what_data_do_not_say_of_draws_is_as_wide_as_they_scatter(exchangeable: bool) -> None:
     """The level common to sixteen gains does not show; it is that of sixteen draws."""

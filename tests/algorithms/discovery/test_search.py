@@ -17,8 +17,11 @@ from lsst.fringe_sim.algorithms.discovery import (
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
 from lsst.fringe_sim.algorithms.discovery.selection import IMPRECISION
+from lsst.fringe_sim.effects.ar_coating import ArCoating
+from lsst.fringe_sim.effects.line_triangle import LineTriangle
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.mock.sealed_cases import SIZES, SealedCase, draw_case
+from lsst.fringe_sim.mock.sealed_cases import SIZES, SealedCase, draw_case, expose
+from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.challenge_result import CASE_KINDS
 from lsst.fringe_sim.products.fringe_cube import FringeCube
@@ -196,6 +199,28 @@ def test_where_the_catalogue_explains_next_to_nothing_no_pairs_are_tried(outside
     assert verdict.verdict == "unexplained"
     assert any("next to nothing" in line for line in told)
     assert max((len(step.added) for step in verdict.steps), default=0) <= 1
+
+
+class _NarrowCoating(ArCoating):
+    parameters = (replace(ArCoating.parameters[0], bounds=(0.9, 1.1)),)
+
+
+@pytest.mark.parametrize(
+    ("effect", "key", "value", "named"),
+    [
+        (_NarrowCoating(), "ar_coating.scale", 1.103, False),
+        (ArCoating(), "ar_coating.scale", 1.103, True),
+        (LineTriangle(), "line_triangle.fraction", 1.0, True),
+    ],
+)
+def test_what_is_at_the_end_of_what_a_model_is_meant_for_is_not_named(effect, key, value, named) -> None:
+    """All the light may be in a triangle, and no coating that is made is a tenth off."""
+    rng = np.random.default_rng(17)
+    cube, _ = expose(random_field(SIZE, rng, mean=15.0, span=2.0), {key: value}, rng)
+    verdict = discover(cube, "ts8_e2v", [effect], rng=np.random.default_rng(0))
+    assert (verdict.verdict == "named") == named, verdict.summary()
+    if not named:
+        assert verdict.unexplained["reason"] == "ar_coating.scale is at the end of its range (1.1)"
 
 
 def test_poor_data_are_told_to_be_poor() -> None:

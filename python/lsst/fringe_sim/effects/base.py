@@ -62,6 +62,9 @@ class Parameter:
     refinement : `int`
         0 for what the effect surely has. Parameters of 1, 2, ... may be absent, each with all of a higher number: the
         effect is judged as if it had those up to a number, any of which is as likely.
+    natural_bounds : `tuple` [`float`, ...]
+        Those of the bounds that nature has: no more than all light is in a line. What is found at any other may be
+        beyond what the model is meant for.
     """
 
     name: str
@@ -75,6 +78,7 @@ class Parameter:
     place: bool = False
     step: float = 0.0
     refinement: int = 0
+    natural_bounds: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

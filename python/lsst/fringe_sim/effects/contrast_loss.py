@@ -17,7 +17,15 @@ class ContrastLoss(PlainNullEffect):
     acts_on = "response"
     reference = "needed at the measured pixel of Guo, Walter, Lage & Lupton 2022, Fig. 4 (factor about 0.13)"
     parameters = (
-        Parameter("factor", "", 1.0, (0.0, 1.5), 0.3, "factor on the departure from the phase mean"),
+        Parameter(
+            "factor",
+            "",
+            1.0,
+            (0.0, 1.5),
+            0.3,
+            "factor on the departure from the phase mean",
+            natural_bounds=(0.0,),
+        ),
     )
 
     def change_response(

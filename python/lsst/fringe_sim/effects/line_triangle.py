@@ -21,7 +21,11 @@ class LineTriangle(PlainNullEffect):
     acts_on = "illumination"
     laboratory_only = True
     reference = "James & Sternberg 1969, The Design of Optical Spectrometers: equal entrance and exit slits"
-    parameters = (Parameter("fraction", "", 0.0, (0.0, 1.0), 0.5, "part of the light in the triangle"),)
+    parameters = (
+        Parameter(
+            "fraction", "", 0.0, (0.0, 1.0), 0.5, "part of the light in the triangle", natural_bounds=(1.0,)
+        ),
+    )
 
     def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
         """Mix the triangle in."""

@@ -25,7 +25,17 @@ class LineWing(PlainNullEffect):
     reference = (
         "Woods, Wrigley, Rottman & Haring 1994, doi 10.1364/AO.33.004273 (scattered light of gratings)"
     )
-    parameters = (Parameter("fraction", "", 0.0, (0.0, 1.0), 0.05, "part of the light in the Lorentzian"),)
+    parameters = (
+        Parameter(
+            "fraction",
+            "",
+            0.0,
+            (0.0, 1.0),
+            0.05,
+            "part of the light in the Lorentzian",
+            natural_bounds=(1.0,),
+        ),
+    )
 
     def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
         """Mix the Lorentzian in."""

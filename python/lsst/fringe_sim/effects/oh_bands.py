@@ -22,7 +22,15 @@ class OHBands(PlainNullEffect):
     acts_on = "spectrum"
     reference = "Guo, Walter, Lage & Lupton 2022, section 4.1 (bands change through a night)"
     parameters = tuple(
-        Parameter(f"band_{band.replace('-', '_')}", "", 1.0, (0.0, 10.0), 0.2, f"factor on the band {band}")
+        Parameter(
+            f"band_{band.replace('-', '_')}",
+            "",
+            1.0,
+            (0.0, 10.0),
+            0.2,
+            f"factor on the band {band}",
+            natural_bounds=(0.0,),
+        )
         for band in BANDS
     )
 

@@ -20,7 +20,11 @@ class SkyContinuum(PlainNullEffect):
     reference = (
         "Noll et al. 2025, Geosci. Model Dev. 18, 4353: the airglow continuum varies by tens of per cent"
     )
-    parameters = (Parameter("scale", "", 1.0, (0.0, 20.0), 0.3, "factor on all terms of the continuum"),)
+    parameters = (
+        Parameter(
+            "scale", "", 1.0, (0.0, 20.0), 0.3, "factor on all terms of the continuum", natural_bounds=(0.0,)
+        ),
+    )
 
     def change_sky(self, sky: SkySpectrum, values: Mapping[str, float]) -> SkySpectrum:
         """Multiply every term."""

@@ -26,6 +26,7 @@ class WaterVapour(PlainNullEffect):
             (0.0, 8.0),
             0.5,
             "column over that of the line list",
+            natural_bounds=(0.0,),
         ),
     )
 

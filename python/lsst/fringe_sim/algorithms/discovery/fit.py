@@ -135,6 +135,10 @@ class Coordinate:
         """Nearest coordinate within the bounds."""
         return self.coordinate(self.value(coordinate))
 
+    def is_inside(self, coordinate: float) -> bool:
+        """Whether a coordinate is within the bounds, but for rounding."""
+        return abs(self.clip(coordinate) - coordinate) <= 1e-9 * max(abs(coordinate), self.unit_step)
+
     def value_sigma(self, coordinate: float, sigma: float) -> float:
         """Uncertainty of the value from that of the coordinate."""
         if not self.quadratic:
@@ -848,14 +852,11 @@ def coordinate_derivative(
     degenerate parameters look well measured.
     """
     size = coordinate.step or 1e-3 * coordinate.unit_step
-    points = [at - size, at + size]
     if coordinate.quadratic:
         size = max(size, 1e-3 * at)
-        points = [max(at - size, 0.0), at + size]
-    elif coordinate.clip(points[0]) != points[0]:
-        points[0] = at
-    elif coordinate.clip(points[1]) != points[1]:
-        points[1] = at
+    points = [point if coordinate.is_inside(point) else at for point in (at - size, at + size)]
+    if coordinate.quadratic:
+        points[0] = max(at - size, 0.0)
     low, high = ({**settings, coordinate.key: coordinate.value(point)} for point in points)
     return forward.change(low, high, thickness_um) / (points[1] - points[0])
 

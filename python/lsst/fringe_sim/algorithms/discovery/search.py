@@ -376,6 +376,10 @@ class _Search:
         )
         # All data decide: they hold the part searched, and a cause that is there stands out more clearly in them.
         reasons = [] if self.options.is_noise(final) else [self._what_remains(final)]
+        reasons.extend(
+            f"{key} is at the end of its range ({final.fit.settings[key]:g})"
+            for key in whole.at_end_of_range(final.fit)
+        )
         if not self.unseen.better:
             reasons.append("data held out are not predicted better")
         explained = whole.null.fit.chi2 - final.fit.chi2

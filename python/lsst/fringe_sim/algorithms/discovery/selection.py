@@ -46,6 +46,9 @@ with the fourth power (a beam whose onset is taken for thickness)."""
 IMPRECISION = 0.01
 """Part of what an effect does to the fringes in which our description of it may be wrong, and not the effect."""
 
+WANTS_TO_GO_ON = 9.0
+"""Fall of χ² beyond a natural end of its range that a parameter does not promise by noise."""
+
 PRECISION = 5e-5
 """Part of the fringes to which cells are described: tables, and what the thickness does within a cell. It is below
 the noise but on whole sensors."""
@@ -643,14 +646,7 @@ class Selector:
 
     def _deepest_along(self, fit: Fit, number: int) -> Fit:
         """The fit, or a better one in a neighbouring minimum of one coordinate; the others follow."""
-        item, others = fit.coordinates[number], np.arange(len(fit.coordinates)) != number
-        held = replace(
-            fit,
-            coordinates=fit.coordinates[:number] + fit.coordinates[number + 1 :],
-            position=fit.position[others],
-            information=fit.information[np.ix_(others, others)],
-        )
-        state = self.state(held)
+        item, state = fit.coordinates[number], self.state(_holding(fit, number))
         reach = np.arange(-MINIMA_TRIED * STEPS_PER_MINIMUM, MINIMA_TRIED * STEPS_PER_MINIMUM + 1)
         around = fit.position[number] + reach * (item.neighbour / STEPS_PER_MINIMUM)
         places = np.unique([item.clip(x) for x in around])
@@ -687,6 +683,32 @@ class Selector:
         best = replace(hypothesis, fit=fit, log_evidence=log_evidence(fit, self.null.fit.chi2))
         self.fitted[frozenset(hypothesis.names)] = best
         return best
+
+    def at_end_of_range(self, fit: Fit) -> list[str]:
+        """Parameters at the end of what the model is meant for, or beyond what nature allows.
+
+        Where nature ends the range the truth may be there, which wants to go on no more than noise does.
+        """
+        found = []
+        for number, item in enumerate(fit.coordinates):
+            outwards = 1e-3 * item.unit_step * float(np.sign(fit.position[number]))
+            if outwards == 0.0 or item.is_inside(fit.position[number] + outwards):
+                continue
+            natural = self.effects[item.effect].parameter(item.parameter).natural_bounds
+            end = item.value(float(fit.position[number]))
+            if end not in natural or self._gain_beyond(fit, number, outwards) > WANTS_TO_GO_ON:
+                found.append(item.key)
+        return found
+
+    def _gain_beyond(self, fit: Fit, number: int, outwards: float) -> float:
+        """Fall of χ² that a coordinate at the end of its range would bring beyond it."""
+        item, state = fit.coordinates[number], self.state(_holding(fit, number))
+        level, _ = self.problem.amplitudes(fit.levels)
+        at = float(fit.position[number])
+        slope = coordinate_derivative(self.problem.forward, item, at, fit.settings, state.thickness_um)
+        column = FullColumns(state.whiten(level * slope)[np.newaxis])
+        score, information = state.design.project(column, state.residual)
+        return float(score[0] ** 2 / max(information[0, 0], 1e-300)) if score[0] * outwards > 0.0 else 0.0
 
     def _among_minima(self, fit: Fit, number: int) -> Fit:
         """The deepest minimum along one coordinate with the mean square distance of the others that data allow."""
@@ -805,7 +827,7 @@ def bounded_minimum(
             break
         position[free] = np.linalg.solve(matrix[np.ix_(free, free)], right[free])
         outside = np.array(
-            [item.one_sided and item.clip(x * s) != x * s and abs(x) > 1e-9 and np.sign(x) != _inward(item)
+            [item.one_sided and not item.is_inside(x * s) and abs(x) > 1e-9 and np.sign(x) != _inward(item)
              for item, x, s in zip(coordinates, position, scale, strict=True)]
         )  # fmt: skip
         if not (outside & free).any():
@@ -815,6 +837,18 @@ def bounded_minimum(
     seen = int((np.diag(matrix)[free] > 1.0).sum())
     clipped = np.array([item.clip(x * s) for item, x, s in zip(coordinates, position, scale, strict=True)])
     return clipped, max(gain, 0.0), max(seen, 1)
+
+
+def _holding(fit: Fit, number: int) -> Fit:
+    """The fit with one coordinate held where it is."""
+    others = np.arange(len(fit.coordinates)) != number
+    return replace(
+        fit,
+        coordinates=fit.coordinates[:number] + fit.coordinates[number + 1 :],
+        position=fit.position[others],
+        information=fit.information[np.ix_(others, others)],
+        spread=fit.spread[others],
+    )
 
 
 def _inward(item: Coordinate) -> float:
