@@ -28,7 +28,7 @@ LAYERS = (
 """Layers of the e2v sensor under vacuum, from the light on, with their thickness [µm]; the support lies below."""
 
 SUPPORT = "Si3N4"
-DETECTION, EPOXY = 2, 6
+DETECTION, INSULATION, EPOXY = 2, 5, 6
 
 
 @dataclass(frozen=True)

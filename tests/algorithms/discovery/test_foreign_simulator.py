@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from field_matrices import DETECTION, ForeignSensor
+from click.testing import CliRunner
+from field_matrices import DETECTION, INSULATION, ForeignSensor
 
-from lsst.fringe_sim.algorithms.discovery import discover
+from lsst.fringe_sim.algorithms.discovery import Verdict, discover
+from lsst.fringe_sim.cli.discover import discover as discover_command
+from lsst.fringe_sim.instrument.camera import Camera
+from lsst.fringe_sim.mock.hidden_effects import AmplifierState
+from lsst.fringe_sim.mock.raw_files import Clock, primary_header, write_frame
+from lsst.fringe_sim.mock.raw_frames import FIRST_EXPOSURE
+from lsst.fringe_sim.mock.readout import Readout
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
 
@@ -81,3 +90,50 @@ def test_nothing_is_found_in_another_simulators_plain_flats(places: int) -> None
     """Pixels that average over three places by three see a ninth less of their area than real ones."""
     cube = exposed(ForeignSensor(), np.random.default_rng(42), places)
     assert discover(cube, "ts8_e2v", rng=np.random.default_rng(0)).verdict == "no_discrepancy"
+
+
+def write_raw_frames(folder: Path, flats: np.ndarray, level_e: float, rng: np.random.Generator) -> None:
+    """Five bias frames and one flat of each wavelength, in the layout of the test stand."""
+    rows, columns = flats.shape[1:]
+    sensor = Camera.from_name("ts8").detector("E2V-CCD250-321").cut_down((rows, columns))
+    states = tuple(
+        AmplifierState(amp.name, amp.gain, float(rng.uniform(5.0, 8.0)), amp.gain * amp.saturation)
+        for amp in sensor.amplifiers
+    )
+    readout, clock = Readout.of(sensor, states, rng), Clock(FIRST_EXPOSURE)
+    response = 1.0 + 0.003 * rng.standard_normal((rows, columns))
+    for number, wavelength in enumerate([None] * 5 + list(WAVELENGTHS)):
+        start, seconds = clock.next(wavelength)
+        header = primary_header("ts8", sensor, -90.0, wavelength, number, start, seconds)
+        light = np.zeros((rows, columns)) if wavelength is None else level_e * flats[number - 5] * response
+        write_frame(folder / str(header["FILENAME"]), header, sensor, readout.read(light, seconds, [], rng))
+
+
+def broad_map(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    """A bent plane [µm], four or five fringes over the sensor."""
+    y, x = np.meshgrid(*(np.linspace(-1.0, 1.0, size) for size in shape), indexing="ij")
+    a = rng.normal(size=5)
+    plane = a[0] * x + a[1] * y + a[2] * x * x + a[3] * y * y + a[4] * np.sin(3.0 * x + 2.0 * y)
+    plane = (plane - plane.min()) / np.ptp(plane)
+    return np.asarray(rng.uniform(12.0, 18.0) + rng.uniform(1.0, 1.5) * plane)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("thicker_um", [0.0, 0.03])
+def test_raw_frames_of_another_simulator(thicker_um: float, tmp_path: Path) -> None:
+    rng, places = np.random.default_rng(44), 7
+    shape = (96, 128)
+    sensor = ForeignSensor(thicker_um={INSULATION: thicker_um})
+    flats = sensor.flats(WAVELENGTHS, broad_map(rng, (shape[0] * places, shape[1] * places)), places)
+    write_raw_frames(tmp_path, flats, 30_000.0, rng)
+    out = tmp_path / "verdict"
+    result = CliRunner().invoke(discover_command, [str(tmp_path), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    (path,) = out.glob("*.json")
+    verdict = Verdict.from_json(path.read_text())
+    if not thicker_um:
+        assert verdict.verdict == "no_discrepancy", verdict.summary()
+        return
+    assert [effect.name for effect in verdict.effects] == ["insulation"], verdict.summary()
+    found = verdict.effects[0].parameters["offset"]
+    assert abs(found.value - thicker_um) < 4.0 * found.sigma
