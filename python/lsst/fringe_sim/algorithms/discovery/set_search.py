@@ -223,6 +223,8 @@ class SetSearch:
         lie far on one side of zero is likelier with both.
         """
         best = current
+        if len(current.names) >= self.options.most_effects:
+            return best
         for name in current.names:
             if (
                 not self.selector.has_many(name)
