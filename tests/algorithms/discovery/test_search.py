@@ -133,9 +133,8 @@ def test_what_a_strong_pedestal_leaves_is_another_effect() -> None:
 @pytest.mark.slow
 def test_less_than_a_hundredth_is_an_effect_where_nothing_else_is_left() -> None:
     """The form of the coating may be wrong by as much, but hardly so that it lacks dark current alone."""
-    parts = np.random.default_rng([20411125, CASE_KINDS.index("two"), 9]).spawn(2)
-    case = draw_case("two", parts[0])
-    verdict = discover(case.cube, case.setup, rng=parts[1])
+    case, rng = recorded_case(20411125, "two", 9)
+    verdict = discover(case.cube, case.setup, rng=rng)
     found = {effect.name: effect for effect in verdict.effects}
     assert set(found) == set(case.names) == {"dark_current", "black_coating"}
     coating, dark = verdict.steps
@@ -147,17 +146,16 @@ def test_less_than_a_hundredth_is_an_effect_where_nothing_else_is_left() -> None
 @pytest.mark.slow
 def test_weak_fringes_held_out_may_be_in_a_wrong_order() -> None:
     """Coating of 1.3 µm leaves so little of the fringes that those held out hardly tell an order from the next."""
-    parts = np.random.default_rng([20441125, CASE_KINDS.index("two"), 3]).spawn(2)
-    case = draw_case("two", parts[0])
+    case, rng = recorded_case(20441125, "two", 3)
     assert set(case.names) == {"tilt", "black_coating"}
-    verdict = discover(case.cube, case.setup, rng=parts[1])
+    verdict = discover(case.cube, case.setup, rng=rng)
     assert {effect.name for effect in verdict.effects} == set(case.names), verdict.summary()
 
 
 @pytest.mark.slow
 def test_two_effects_are_named_where_errors_of_all_wavelengths_explain_as_much() -> None:
     """Neither silicon that absorbs more nor a triangular line is likely by itself, and both are fewer parameters."""
-    case, rng = hidden_case(20451125, "two", 5)
+    case, rng = recorded_case(20451125, "two", 5)
     assert set(case.names) == {"silicon_absorption", "line_triangle"}
     told: list[str] = []
     verdict = discover(case.cube, case.setup, rng=rng, report=told.append)
@@ -168,7 +166,7 @@ def test_two_effects_are_named_where_errors_of_all_wavelengths_explain_as_much()
 @pytest.mark.slow
 def test_a_residual_is_judged_in_all_data() -> None:
     """The part searched has one of chance 4e-5 in this draw of the noise, and all data have none."""
-    case, rng = hidden_case(20451125, "one", 14)
+    case, rng = recorded_case(20451125, "one", 14)
     verdict = discover(case.cube, case.setup, rng=rng)
     assert [effect.name for effect in verdict.effects] == list(case.names) == ["black_coating"], (
         verdict.summary()
@@ -179,10 +177,9 @@ def test_a_residual_is_judged_in_all_data() -> None:
 @pytest.mark.slow
 def test_what_a_wrong_effect_leaves_is_not_named_beside_it() -> None:
     """Black coating of 1.4 µm takes all fringes away but a thousandth, and a spread of the thickness nearly does."""
-    parts = np.random.default_rng([20431125, CASE_KINDS.index("one"), 1]).spawn(2)
-    case = draw_case("one", parts[0])
+    case, rng = recorded_case(20431125, "one", 1)
     assert case.names == ("black_coating",)
-    verdict = discover(case.cube, case.setup, rng=parts[1])
+    verdict = discover(case.cube, case.setup, rng=rng)
     assert verdict.steps[0].added == ("thickness_spread",)
     assert [effect.name for effect in verdict.effects] == ["black_coating"]
 
@@ -316,6 +313,12 @@ def test_cells_get_finer_where_a_blur_hid_how_fine_the_light_was() -> None:
     found = verdict.effects[0].parameters["sigma"]
     assert abs(found.value - case.values["charge_diffusion.sigma"]) < 4.0 * found.sigma
     assert verdict.data["cell_px"] == 1
+
+
+def recorded_case(seed: int, kind: str, number: int) -> tuple[SealedCase, np.random.Generator]:
+    """A case as `fringe-sim challenge` draws it."""
+    parts = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)
+    return draw_case(kind, parts[0]), parts[1]
 
 
 def hidden_case(seed: int, kind: str, number: int) -> tuple[SealedCase, np.random.Generator]:
