@@ -12,7 +12,7 @@ import pytest
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
-from lsst.fringe_sim.algorithms.discovery.channels import Channel, echo_channel, measure_channels
+from lsst.fringe_sim.algorithms.discovery.channels import Channel, State, echo_channel, measure_channels
 from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import MOST_ROWS, Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
@@ -410,13 +410,17 @@ def test_only_parameters_of_exposures_that_there_are_are_free() -> None:
         assert [item.parameter for item in coordinates_of(effect, forward, thickness)] == names
 
 
-def test_a_misfit_of_the_field_is_no_echo() -> None:
-    """What a thickness can do leaves the test for copies as it is; a faint mirrored copy is seen all the same."""
+def _state_without_effects() -> State:
     truth = _smooth_field(32, 32)
     cells = bin_cube(_cube(truth, {}, 2e4, 5), 1)
     problem, start = _problem(cells, truth)
     null = fit_model(problem, (), np.zeros(0), start)
-    state = Selector(problem, EFFECTS[:1], null, np.full(len(WAVELENGTHS), 1.6)).state(null)
+    return Selector(problem, EFFECTS[:1], null, np.full(len(WAVELENGTHS), 1.6)).state(null)
+
+
+def test_a_misfit_of_the_field_is_no_echo() -> None:
+    """What a thickness can do leaves the test for copies as it is; a faint mirrored copy is seen all the same."""
+    state = _state_without_effects()
     plain = echo_channel(state)
     assert plain.probability > 1e-3
     bumps = 0.02 * np.cos(np.arange(32) / 3.0) * np.ones((32, 1))
@@ -428,11 +432,7 @@ def test_a_misfit_of_the_field_is_no_echo() -> None:
 
 def test_a_faint_copy_mirrored_about_the_middle_is_an_echo() -> None:
     """Of the same χ², a copy where reflections along the axis fall is seen, and one moved aside is not."""
-    truth = _smooth_field(32, 32)
-    cells = bin_cube(_cube(truth, {}, 2e4, 5), 1)
-    problem, start = _problem(cells, truth)
-    null = fit_model(problem, (), np.zeros(0), start)
-    state = Selector(problem, EFFECTS[:1], null, np.full(len(WAVELENGTHS), 1.6)).state(null)
+    state = _state_without_effects()
     pattern = state.value - state.value.mean(axis=(1, 2), keepdims=True)
 
     def channel_of(copy: np.ndarray) -> Channel:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -116,10 +117,8 @@ def test_a_hidden_effect_is_named(name: str, tmp_path) -> None:
 @pytest.mark.slow
 def test_what_a_strong_pedestal_leaves_is_another_effect() -> None:
     """Electrons cannot be described wrongly; a fainter index of the adhesive beside them is no flaw of their form."""
-    parts = np.random.default_rng([20331123, CASE_KINDS.index("two"), 16]).spawn(2)
     # A case of a challenge that drew neither wedges of silicon nor voids yet.
-    drawn = [name for name in SIZES if name not in ("silicon_gradient", "void")]
-    case, rng = draw_case("two", parts[0], only=drawn), parts[1]
+    case, rng = recorded_case(20331123, "two", 16, ("silicon_gradient", "void"))
     assert set(case.names) == {"dark_pedestal", "epoxy_index"}
     verdict = discover(case.cube, case.setup, rng=rng)
     found = {effect.name: effect for effect in verdict.effects}
@@ -276,7 +275,7 @@ def test_no_more_effects_are_named_than_may_be() -> None:
 @pytest.mark.slow
 def test_a_rival_in_a_deeper_valley_is_preferred() -> None:
     """Behind 1.56 µm of black coating the fringes are as faint as behind a thickness that varies in every pixel."""
-    case, rng = hidden_case(20261122, "one", 8)
+    case, rng = recorded_case(20261122, "one", 8, LATER)
     verdict = discover(case.cube, case.setup, rng=rng)
     assert [effect.name for effect in verdict.effects] == ["black_coating"]
     found = verdict.effects[0].parameters["thickness"]
@@ -285,7 +284,7 @@ def test_a_rival_in_a_deeper_valley_is_preferred() -> None:
 
 @pytest.mark.slow
 def test_a_gradient_of_the_light_is_no_wide_ring() -> None:
-    case, rng = hidden_case(20261122, "one", 33)
+    case, rng = recorded_case(20261122, "one", 33, LATER)
     verdict = discover(case.cube, case.setup, rng=rng)
     assert [effect.name for effect in verdict.effects] == ["illumination"]
 
@@ -315,16 +314,12 @@ def test_cells_get_finer_where_a_blur_hid_how_fine_the_light_was() -> None:
     assert verdict.data["cell_px"] == 1
 
 
-def recorded_case(seed: int, kind: str, number: int) -> tuple[SealedCase, np.random.Generator]:
-    """A case as `fringe-sim challenge` draws it."""
+def recorded_case(
+    seed: int, kind: str, number: int, without: Sequence[str] = ()
+) -> tuple[SealedCase, np.random.Generator]:
+    """A case as `fringe-sim challenge` draws it, or drew it without some effects, and the generator of its search."""
     parts = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)
-    return draw_case(kind, parts[0]), parts[1]
-
-
-def hidden_case(seed: int, kind: str, number: int) -> tuple[SealedCase, np.random.Generator]:
-    """A case of a challenge, and the generator of its search."""
-    parts = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)
-    return draw_case(kind, parts[0], only=[name for name in SIZES if name not in LATER]), parts[1]
+    return draw_case(kind, parts[0], only=[name for name in SIZES if name not in without]), parts[1]
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ __all__ = [
     "beside_thickness",
     "combined_probability",
     "fringe_phase",
+    "in_looks",
     "measure_channels",
     "project_test",
 ]
@@ -144,7 +145,12 @@ def measure_channels(
 def combined_probability(channels: Sequence[Channel]) -> float:
     """Chance that noise alone gives so small a smallest probability among the channels."""
     smallest = min((channel.probability for channel in channels), default=1.0)
-    return float(-np.expm1(len(channels) * np.log1p(-min(smallest, 1.0 - 1e-16))))
+    return in_looks(smallest, len(channels))
+
+
+def in_looks(chance: float, looks: float) -> float:
+    """Chance that the smallest of so many independent chances is as small (Šidák)."""
+    return float(-np.expm1(looks * np.log1p(-min(chance, 1.0 - 1e-16))))
 
 
 def _feature_channel(name: str, columns: Columns, state: State, imprecision: float = 0.0) -> Channel:
@@ -219,11 +225,7 @@ def texture_channels(state: State, correlation: float = 0.0) -> list[Channel]:
     shared[0, 0] = 0.0
     top = shared / np.median(shared[shared > 0]) * chi2_distribution.ppf(0.5, 1)
     single = float(chi2_distribution.sf(top.max(), 1))
-    result.append(
-        Channel(
-            "achromatic peak", float(top.max()), 1.0, float(-np.expm1(top.size * np.log1p(-min(single, 0.5))))
-        )
-    )
+    result.append(Channel("achromatic peak", float(top.max()), 1.0, in_looks(single, top.size)))
     return result
 
 
@@ -249,9 +251,7 @@ def _band_channel(name: str, power: FloatArray, planes: int, filled: float) -> C
         chance = float(f_distribution.sf(ratio, count, base_count))
         if chance < smallest:
             smallest, statistic, degrees = chance, ratio * count, count
-    return Channel(
-        name, statistic, degrees, float(-np.expm1((BANDS - 1) * np.log1p(-min(smallest, 1 - 1e-16))))
-    )
+    return Channel(name, statistic, degrees, in_looks(smallest, BANDS - 1))
 
 
 def echo_channel(state: State) -> Channel:
@@ -291,7 +291,7 @@ def _largest(groups: Sequence[FloatArray]) -> tuple[float, float]:
     looks = sum(values.size for values in groups)
     largest = max((float(values.max()) for values in groups if values.size), default=0.0)
     single = float(chi2_distribution.sf(largest, 1))
-    return largest, float(-np.expm1(looks * np.log1p(-min(single, 1.0 - 1e-16))))
+    return largest, in_looks(single, looks)
 
 
 def beside_thickness(state: State, whitened: FloatArray) -> FloatArray:

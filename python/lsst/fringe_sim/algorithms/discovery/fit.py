@@ -595,19 +595,27 @@ class Fit:
     def without(self, name: str) -> Fit:
         """The same place with one effect taken out; not a minimum."""
         kept = [number for number, item in enumerate(self.coordinates) if item.effect != name]
+        settings = {key: value for key, value in self.settings.items() if key.partition(".")[0] != name}
+        return replace(self._with_free(kept), settings=settings)
+
+    def holding(self, number: int) -> Fit:
+        """The same place with one coordinate held."""
+        return self._with_free([other for other in range(len(self.coordinates)) if other != number])
+
+    def _with_free(self, kept: Sequence[int]) -> Fit:
+        """The same place with some of the coordinates free."""
+        numbers = list(kept)
         return replace(
             self,
-            settings={key: value for key, value in self.settings.items() if key.partition(".")[0] != name},
-            coordinates=tuple(self.coordinates[number] for number in kept),
-            position=self.position[kept],
-            information=self.information[np.ix_(kept, kept)],
-            spread=self.spread[kept],
+            coordinates=tuple(self.coordinates[number] for number in numbers),
+            position=self.position[numbers],
+            information=self.information[np.ix_(numbers, numbers)],
+            spread=self.spread[numbers],
         )
 
     def held(self) -> Fit:
         """The same place with all effects held."""
-        nothing = np.zeros(0)
-        return replace(self, coordinates=(), position=nothing, information=np.zeros((0, 0)), spread=nothing)
+        return self._with_free(())
 
 
 def _prior_widths(coordinates: Sequence[Coordinate]) -> FloatArray:

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from ...effects import EFFECTS, Effect
 from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
-from .channels import Channel
+from .channels import Channel, in_looks
 from .classes import EffectClass, classes_in_all_data, outsider_probability
 from .describe import describe_residual, disagreement
 from .fit import Fit, fit_model
@@ -259,10 +259,10 @@ class _Search:
             (chance_of(c.gain, c.degrees, selector.undescribed(c.name)) for c in scores), default=1.0
         )
         # Effects are alike in groups; counting each as a look of its own errs on the safe side.
-        catalogue = float(-np.expm1(len(scores) * np.log1p(-min(smallest, 1 - 1e-16)))) if scores else 1.0
+        catalogue = in_looks(smallest, len(scores)) if scores else 1.0
         self.scores = scores
         both = min(hypothesis.probability_of_noise, catalogue)
-        return float(-np.expm1(2.0 * np.log1p(-min(both, 1.0 - 1e-16))))
+        return in_looks(both, 2)
 
     def _with_hidden_island(self, found: Hypothesis) -> Verdict | None:
         """Verdict with a local effect that the thickness had taken up.

@@ -424,7 +424,7 @@ class Selector:
             for size in FINE_SCAN if item.quadratic else SCAN:
                 for sign in (1.0,) if item.quadratic else (1.0, -1.0):
                     departure = (size * item.scale) ** 2 if item.quadratic else sign * size * item.scale
-                    if abs(item.clip(departure) - departure) > 1e-9 * abs(departure):
+                    if not item.is_inside(departure):
                         continue
                     settings = {**fit.settings, item.key: item.value(departure)}
                     for thickness in follower.places(settings) if follower else [state.thickness_um]:
@@ -457,15 +457,15 @@ class Selector:
         InputError
             The effect cannot be combined with those of the fit.
         """
-        coordinates = self.coordinates[name]
-        forward = self.problem.forward
+        return np.stack([self._slope(state, fit, item) for item in self.coordinates[name]])
+
+    def _slope(self, state: State, fit: Fit, item: Coordinate) -> FloatArray:
+        """Whitened derivative with respect to one coordinate at a fit."""
         level, _ = self.problem.amplitudes(fit.levels)
-        columns = []
-        for item in coordinates:
-            at = item.coordinate(fit.settings.get(item.key, item.null))
-            slope = coordinate_derivative(forward, item, at, fit.settings, state.thickness_um)
-            columns.append(state.whiten(level * slope))
-        return np.stack(columns)
+        at = item.coordinate(fit.settings.get(item.key, item.null))
+        return state.whiten(
+            level * coordinate_derivative(self.problem.forward, item, at, fit.settings, state.thickness_um)
+        )
 
     def hypothesis(
         self, names: Sequence[str], start: FloatArray | None = None, base: Fit | None = None
@@ -646,7 +646,7 @@ class Selector:
 
     def _deepest_along(self, fit: Fit, number: int) -> Fit:
         """The fit, or a better one in a neighbouring minimum of one coordinate; the others follow."""
-        item, state = fit.coordinates[number], self.state(_holding(fit, number))
+        item, state = fit.coordinates[number], self.state(fit.holding(number))
         reach = np.arange(-MINIMA_TRIED * STEPS_PER_MINIMUM, MINIMA_TRIED * STEPS_PER_MINIMUM + 1)
         around = fit.position[number] + reach * (item.neighbour / STEPS_PER_MINIMUM)
         places = np.unique([item.clip(x) for x in around])
@@ -702,11 +702,8 @@ class Selector:
 
     def _gain_beyond(self, fit: Fit, number: int, outwards: float) -> float:
         """Fall of χ² that a coordinate at the end of its range would bring beyond it."""
-        item, state = fit.coordinates[number], self.state(_holding(fit, number))
-        level, _ = self.problem.amplitudes(fit.levels)
-        at = float(fit.position[number])
-        slope = coordinate_derivative(self.problem.forward, item, at, fit.settings, state.thickness_um)
-        column = FullColumns(state.whiten(level * slope)[np.newaxis])
+        state = self.state(fit.holding(number))
+        column = FullColumns(self._slope(state, fit, fit.coordinates[number])[np.newaxis])
         score, information = state.design.project(column, state.residual)
         return float(score[0] ** 2 / max(information[0, 0], 1e-300)) if score[0] * outwards > 0.0 else 0.0
 
@@ -837,18 +834,6 @@ def bounded_minimum(
     seen = int((np.diag(matrix)[free] > 1.0).sum())
     clipped = np.array([item.clip(x * s) for item, x, s in zip(coordinates, position, scale, strict=True)])
     return clipped, max(gain, 0.0), max(seen, 1)
-
-
-def _holding(fit: Fit, number: int) -> Fit:
-    """The fit with one coordinate held where it is."""
-    others = np.arange(len(fit.coordinates)) != number
-    return replace(
-        fit,
-        coordinates=fit.coordinates[:number] + fit.coordinates[number + 1 :],
-        position=fit.position[others],
-        information=fit.information[np.ix_(others, others)],
-        spread=fit.spread[others],
-    )
 
 
 def _inward(item: Coordinate) -> float:
