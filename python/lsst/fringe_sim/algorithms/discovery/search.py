@@ -198,7 +198,7 @@ class _Search:
             return self._conclude(whole, sets, sets.finished(chosen, steps), steps, chance)
         singles = sets.refits(sets.selector.null)
         if singles and singles[0].log_evidence > self.options.least_evidence and refinements > 0:
-            refined, _ = self._refined(whole, singles[0])
+            refined, _ = self._refined(whole, sets.to_judge_with(singles))
             if refined is not None:
                 self.say("field and noise are judged again with the best effect in the model")
                 self._take(refined)

@@ -97,6 +97,22 @@ class SetSearch:
         best = self.rescued(best)
         return best, [self.step(self.selector.null, best)]
 
+    def to_judge_with(self, singles: list[Hypothesis]) -> Hypothesis:
+        """The single effect with which field and noise are judged again.
+
+        Where all leave much, those that shift the phase are looked for in other fringe orders first: what is likely
+        in the wrong one would tear the thickness to where it suits.
+        """
+        noise = self.selector.problem.cells.n_values
+        if singles[0].fit.chi2 - noise < MUCH_LEFT * noise:
+            return singles[0]
+        elsewhere = (
+            self.selector.improved(single.names, self.selector.null.fit, scan=True)
+            for single in singles
+            if self.selector.shifts_phase(single)
+        )
+        return max((*singles, *elsewhere), key=lambda item: item.log_evidence)
+
     def enlarged(self, current: Hypothesis, steps: list[Step], most: int) -> Hypothesis:
         """Add effects, up to so many, while a residual remains and they help."""
         while steps and not steps[-1].consistent and len(current.names) < most:
