@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recorded_cases import recorded_case
 
+from lsst.fringe_sim.algorithms.discovery import SearchOptions
 from lsst.fringe_sim.algorithms.discovery.classes import classes_of
 from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, fit_model
 from lsst.fringe_sim.algorithms.discovery.orders import fields_in_other_orders
-from lsst.fringe_sim.algorithms.discovery.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
+from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
@@ -96,6 +99,32 @@ def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
     found = selector.improved(("gate_thickness",), prepared.null, scan=True)
     error = found.fit.settings["gate_thickness.offset"] - case.values["gate_thickness.offset"]
     assert abs(error) < 5.0 * max(found.fit.sigma[0], 1e-4)
+
+
+@pytest.mark.slow
+def test_field_is_judged_again_with_an_effect_in_its_right_order() -> None:
+    """A gate that moves the fringes by three orders tears the thickness, which suits errors of all wavelengths."""
+    case, _ = recorded_case(20461126, "two", 1)
+    assert set(case.names) == {"gate_thickness", "non_linearity"}
+    prepared = prepare(case.cube, FringeModel.from_setup(case.setup), EFFECTS, 20_000)
+    selector = Selector(
+        prepared.problem, EFFECTS, prepared.null, prepared.index, first_field=prepared.undistorted_field
+    )
+    sets = SetSearch(selector, SearchOptions(), lambda text: None, lambda found: found)
+    singles = sets.refits(selector.null)
+    best = sets.to_judge_with(singles)
+    assert singles[0].names == (JITTER,)
+    assert best.names == ("gate_thickness",)
+    order = prepared.problem.forward.model.fringe_order_um(float(np.median(case.cube.wavelength_nm)))
+
+    def torn(judged: Prepared) -> float:
+        away = judged.problem.basis.expand(judged.undistorted_field) - case.thickness_um
+        return float(np.mean(np.abs(away) > 0.5 * order))
+
+    refined, mended = prepare_again(prepared, best.fit, prepared.problem.basis.expand(best.fit.field))
+    assert mended > 1000
+    assert torn(prepared) > 0.9
+    assert torn(refined) == 0.0
 
 
 def test_a_set_is_not_looked_for_twice_from_the_same_fit(selector, monkeypatch) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from recorded_cases import recorded_case
 
 from lsst.fringe_sim.algorithms.discovery import (
     SearchOptions,
@@ -21,10 +21,9 @@ from lsst.fringe_sim.algorithms.discovery.selection import IMPRECISION
 from lsst.fringe_sim.effects.ar_coating import ArCoating
 from lsst.fringe_sim.effects.line_triangle import LineTriangle
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.mock.sealed_cases import SIZES, SealedCase, draw_case, expose
+from lsst.fringe_sim.mock.sealed_cases import draw_case, expose
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products.challenge_result import CASE_KINDS
 from lsst.fringe_sim.products.fringe_cube import FringeCube
 
 SIZE = (48, 64)
@@ -312,14 +311,6 @@ def test_cells_get_finer_where_a_blur_hid_how_fine_the_light_was() -> None:
     found = verdict.effects[0].parameters["sigma"]
     assert abs(found.value - case.values["charge_diffusion.sigma"]) < 4.0 * found.sigma
     assert verdict.data["cell_px"] == 1
-
-
-def recorded_case(
-    seed: int, kind: str, number: int, without: Sequence[str] = ()
-) -> tuple[SealedCase, np.random.Generator]:
-    """A case as `fringe-sim challenge` draws it, or drew it without some effects, and the generator of its search."""
-    parts = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)
-    return draw_case(kind, parts[0], only=[name for name in SIZES if name not in without]), parts[1]
 
 
 @pytest.mark.slow
