@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from .fit import Fit
-from .selection import Hypothesis, Selector, similarity
+from .selection import MOST_OF_PROMISE, Hypothesis, Selector, similarity
 
 __all__ = ["EffectClass", "classes_in_all_data", "classes_of", "outsider_probability"]
 
@@ -37,9 +37,6 @@ signature of a size that goes through many fringes is not the derivative."""
 
 WIDTHS_BEHIND = 3.0
 """How far a rival may be behind in the part of the data that is searched and still be compared in all data."""
-
-MOST_OF_PROMISE = 0.9
-"""Part of the promised fall of χ² that a fit must bring, to be believed to be in the same valley as the set."""
 
 CHI2_PER_PARAMETER = 6.0
 """Fall of χ² that a further parameter must bring, for a fit to be as good as another."""

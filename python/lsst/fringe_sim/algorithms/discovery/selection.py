@@ -59,8 +59,12 @@ LIKE_THICKNESS = 0.5
 MANY_PARAMETERS = 8
 """Parameters from which on an effect may hide another; one at a time of so many is not tried at other sizes."""
 
-MINIMA_TRIED = 12
-"""Neighbouring minima on both sides of the first one found among which the deepest is looked for."""
+MINIMA_TRIED, MOVES_AMONG_MINIMA, AT_THE_EDGE = 12, 8, 0.7
+"""Neighbouring minima on both sides among which the deepest is looked for, how often, and the part of that reach from
+which on it is looked for once more."""
+
+MOST_OF_PROMISE = 0.9
+"""Part of the promised fall of χ² that a fit must bring, to be believed to be in the same valley as its base."""
 
 PLACES_REFITTED = 10
 """Minima in size and thickness from which a few pixels are fitted."""
@@ -499,6 +503,19 @@ class Selector:
         self.fitted[key] = hypothesis
         return hypothesis
 
+    def with_candidate(self, base: Hypothesis, candidate: Candidate) -> Hypothesis:
+        """A set with one effect more, from the fit of the others; remembered.
+
+        What was fitted before may be in another order, and is fitted again from here if it lacks most of what is
+        promised.
+        """
+        names = (*base.names, candidate.name)
+        known = frozenset(names) in self.fitted
+        found = self.hypothesis(names, candidate.start, base.fit)
+        if known and base.fit.chi2 - found.fit.chi2 < MOST_OF_PROMISE * candidate.promise:
+            found = self.improved(names, base.fit)
+        return found
+
     def _best_order(self, fit: Fit) -> Fit:
         """The fit, or a better one with another thickness of all pixels and another size of the last effect."""
         if not fit.coordinates or not len(self.shifts_um):
@@ -640,11 +657,14 @@ class Selector:
     def _deepest(self, fit: Fit) -> Fit:
         """The fit, or a better one in neighbouring minima of the coordinates that have many."""
         for number, item in enumerate(fit.coordinates):
-            if item.neighbour:
-                fit = self._deepest_along(fit, number)
+            reach = MINIMA_TRIED * item.neighbour
+            for _ in range(MOVES_AMONG_MINIMA if item.neighbour else 0):
+                before, fit = fit.position[number], self._deeper_along(fit, number)
+                if abs(fit.position[number] - before) < AT_THE_EDGE * reach:
+                    break
         return fit
 
-    def _deepest_along(self, fit: Fit, number: int) -> Fit:
+    def _deeper_along(self, fit: Fit, number: int) -> Fit:
         """The fit, or a better one in a neighbouring minimum of one coordinate; the others follow."""
         item, state = fit.coordinates[number], self.state(fit.holding(number))
         reach = np.arange(-MINIMA_TRIED * STEPS_PER_MINIMUM, MINIMA_TRIED * STEPS_PER_MINIMUM + 1)

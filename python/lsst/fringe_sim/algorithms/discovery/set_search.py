@@ -31,7 +31,7 @@ HARDLY_LESS = 0.5
 """Part of that excess which one effect must take off, or further ones promise, for sets of several to be tried."""
 
 SHIFTING_SETS = 3
-"""Sets of several effects that are looked for in other fringe orders."""
+"""Effects that are looked for in other fringe orders, each with the set with which it is likeliest."""
 
 CONTAINED = 0.9
 """Cosine of the signatures from which on an effect may be hidden in another of many parameters."""
@@ -78,7 +78,7 @@ class SetSearch:
             missing = base.fit.chi2 - rival.fit.chi2 if rival else 0.0
             least = max(WORTH_FITTING, missing / MORE_THAN_PROMISED)
             worth = [c for c in scores if c.promise > least][: self.options.refits]
-        refitted = [self.selector.hypothesis((*base.names, c.name), c.start, base.fit) for c in worth]
+        refitted = [self.selector.with_candidate(base, c) for c in worth]
         for hypothesis in refitted:
             self._say_refit(base, hypothesis)
         return sorted(refitted, key=lambda item: -item.log_evidence)
@@ -295,9 +295,7 @@ class SetSearch:
         best = sorted(promised.values(), key=lambda item: item[0])[: 2 * self.options.refits]
         found = []
         for _, parent, candidate in best:
-            found.append(
-                self.selector.hypothesis((*parent.names, candidate.name), candidate.start, parent.fit)
-            )
+            found.append(self.selector.with_candidate(parent, candidate))
             self._say_refit(parent, found[-1])
         return found
 
@@ -332,10 +330,23 @@ class SetSearch:
         return [self.selector.improved(h.names, self.selector.null.fit, scan=True) for h in near]
 
     def _in_other_orders(self, found: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """The sets, the best of those that shift the phase looked for in other fringe orders too."""
+        """The sets, the best with each of some effects that shift the phase looked for in other fringe orders too.
+
+        Where an effect is found with one set, it may be with the others as well.
+        """
         ranked = sorted(found, key=lambda h: -h.log_evidence)
-        shifting = [h for h in ranked if self.selector.shifts_phase(h)][:SHIFTING_SETS]
-        return [self.selector.improved(h.names, h.fit, scan=True) if h in shifting else h for h in ranked]
+        looked: dict[str, Hypothesis] = {}
+        for item in ranked:
+            if len(looked) == SHIFTING_SETS:
+                break
+            if item.names[-1] not in looked and self.selector.shifts_phase(item):
+                looked[item.names[-1]] = self.selector.improved(item.names, item.fit, scan=True)
+        improved = {frozenset(other.names): other for other in looked.values()}
+        for item in ranked:
+            other = looked.get(item.names[-1])
+            if other is not None and frozenset(item.names) not in improved:
+                improved[frozenset(item.names)] = self.selector.improved(item.names, other.fit)
+        return [improved.get(frozenset(item.names), item) for item in ranked]
 
     def _most_credible(self, found: Sequence[Hypothesis]) -> Hypothesis:
         """Best of some sets by their evidence and by what they leave: a residual that is no noise speaks against."""
