@@ -101,6 +101,26 @@ def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
     assert abs(error) < 5.0 * max(found.fit.sigma[0], 1e-4)
 
 
+@pytest.mark.parametrize("seed", [302, 305])
+def test_the_deepest_of_many_minima_is_found_from_far_away(seed: int) -> None:
+    """A support has fringes of its own: its index has a minimum every 0.003, and the deepest is a hundred away."""
+    case = draw_case("one", np.random.default_rng(seed), size=(48, 48), only=["support_index"])
+    hidden = case.values["support_index.offset"]
+    support = [effect for effect in EFFECTS if effect.name == "support_index"]
+    prepared = prepare(case.cube, FringeModel.from_setup(case.setup), support, 20_000)
+    selector = Selector(
+        prepared.problem, support, prepared.null, prepared.index, first_field=prepared.undistorted_field
+    )
+    found = selector.hypothesis(("support_index",)).fit
+    (item,) = found.coordinates
+    assert abs(hidden) > 80 * item.neighbour
+    true = fit_model(
+        prepared.problem, (item,), np.array([item.coordinate(hidden)]), found.field, found.levels
+    )
+    assert found.chi2 < true.chi2 + 9.0
+    assert abs(found.settings[item.key] - hidden) < 2.5 * item.neighbour
+
+
 @pytest.mark.slow
 def test_field_is_judged_again_with_an_effect_in_its_right_order() -> None:
     """A gate that moves the fringes by three orders tears the thickness, which suits errors of all wavelengths."""
