@@ -136,7 +136,7 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
     for message in [*refused, *(str(error) for error in bad)]:
         click.echo(f"refused: {message}", err=True)
     if refused and not frames:
-        raise InputError("paths", " ".join(paths), "raw frames, or folders that hold some")
+        raise InputError("PATH", " ".join(paths), "raw frames, or folders that hold some")
     if (bad or refused) and not skip_bad:
         raise FrameFormatError(
             "raw frames", f"{len(bad) + len(refused)} unusable", "complete raw frames, or --skip-bad to go on"
