@@ -118,6 +118,14 @@ def test_cases_do_not_depend_on_what_else_runs() -> None:
     assert _comparable(alone.cases[2]) == _comparable(more.cases[2])
 
 
+@pytest.mark.slow
+def test_the_oracle_holds_out_what_the_search_does() -> None:
+    """One effect, named alone, is what the oracle fits; elsewhere on the sensor its gap would be another."""
+    (case,) = run_challenge({"one": 1}, 4, size=(48, 48), only=["vignetting"]).cases
+    assert case.exact
+    assert case.shrinkage == pytest.approx(1.0, abs=1e-6)
+
+
 def _comparable(result: CaseResult) -> str:
     return replace(result, seconds=0.0).to_json()
 
