@@ -30,7 +30,7 @@ MUCH_LEFT = 0.05
 HARDLY_LESS = 0.5
 """Part of that excess which one effect must take off, or further ones promise, for sets of several to be tried."""
 
-SHIFTING_SETS = 3
+SHIFTING_EFFECTS = 3
 """Effects that are looked for in other fringe orders, each with the set with which it is likeliest."""
 
 CONTAINED = 0.9
@@ -337,16 +337,15 @@ class SetSearch:
         ranked = sorted(found, key=lambda h: -h.log_evidence)
         looked: dict[str, Hypothesis] = {}
         for item in ranked:
-            if len(looked) == SHIFTING_SETS:
+            if len(looked) == SHIFTING_EFFECTS:
                 break
             if item.names[-1] not in looked and self.selector.shifts_phase(item):
                 looked[item.names[-1]] = self.selector.improved(item.names, item.fit, scan=True)
-        improved = {frozenset(other.names): other for other in looked.values()}
         for item in ranked:
             other = looked.get(item.names[-1])
-            if other is not None and frozenset(item.names) not in improved:
-                improved[frozenset(item.names)] = self.selector.improved(item.names, other.fit)
-        return [improved.get(frozenset(item.names), item) for item in ranked]
+            if other is not None and other.names != item.names:
+                self.selector.improved(item.names, other.fit)
+        return [self.selector.hypothesis(item.names) for item in ranked]
 
     def _most_credible(self, found: Sequence[Hypothesis]) -> Hypothesis:
         """Best of some sets by their evidence and by what they leave: a residual that is no noise speaks against."""
