@@ -7,14 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recorded_cases import recorded_case
 
-from lsst.fringe_sim.algorithms.discovery import preparation
+from lsst.fringe_sim.algorithms.discovery import discover, preparation
 from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
 from lsst.fringe_sim.algorithms.discovery.continuation import continued
 from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.growth import grown_thickness
+from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.algorithms.discovery.validation import thickness_starts, whole_thickness
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.mock.sealed_cases import draw_case
@@ -141,3 +143,47 @@ def test_a_plane_is_continued_as_a_plane() -> None:
     plane = 14.0 + 0.02 * x - 0.03 * y
     known = (x - 20) ** 2 + (y - 15) ** 2 < 100
     np.testing.assert_allclose(continued(np.where(known, plane, np.nan), known), plane, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def hidden_gap():
+    """A sensor of which a blur of 2.2 px leaves no fringes in a band, with a corner behind it, and its generator."""
+    case, rng = recorded_case(20491128, "two", 3)
+    assert set(case.names) == {BLUR, "bandwidth"}
+    return case, rng
+
+
+def test_judged_with_the_blur_most_of_the_thickness_is_right(hidden_gap) -> None:
+    case, _ = hidden_gap
+    blur = [effect for effect in EFFECTS if effect.name == BLUR]
+    prepared = preparation.prepare(case.cube, FringeModel.from_setup(case.setup), blur, 20_000)
+    selector = Selector(prepared.problem, blur, prepared.null, prepared.index)
+    fit = selector.hypothesis((BLUR,)).fit
+    judged, _ = preparation.prepare_again(prepared, fit, prepared.problem.basis.expand(fit.field))
+    assert judged is not None
+    rows, columns = prepared.problem.cells.shape[1:]
+    px = prepared.problem.cells.cell_px
+    truth = case.thickness_um.reshape(rows, px, columns, px).mean(axis=(1, 3))
+    before, after = (each.problem.basis.expand(each.undistorted_field) for each in (prepared, judged))
+    assert _is_wrong(before, truth).mean() > 0.2
+    assert _is_wrong(after, truth).mean() < 0.1
+    assert preparation.is_judged_better(judged, prepared)
+    assert not preparation.is_judged_better(prepared, judged)
+
+
+@pytest.mark.slow
+def test_a_blur_that_takes_fringes_away_is_named_with_what_else_is_there(hidden_gap) -> None:
+    """With the thickness of the unchanged model, effects that weaken all fringes explain more than it does."""
+    case, rng = hidden_gap
+    catalogue = [effect for effect in EFFECTS if effect.name in (BLUR, "bandwidth", "roughness")]
+    said: list[str] = []
+    verdict = discover(case.cube, case.setup, catalogue, rng=rng, report=said.append)
+    first = next(line for line in said if "judged again" in line)
+    before = " ".join(said[: said.index(first)])
+    assert "with roughness" in before
+    assert "with charge_diffusion" in before
+    assert verdict.verdict == "named"
+    assert {effect.name for effect in verdict.effects} == {BLUR, "bandwidth"}
+    for effect in verdict.effects:
+        for name, found in effect.parameters.items():
+            assert abs(found.value - case.values[f"{effect.name}.{name}"]) < 4.0 * found.sigma

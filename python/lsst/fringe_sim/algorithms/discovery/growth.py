@@ -45,6 +45,13 @@ CONTINUED_SIGMA_UM = 0.03
 ROUNDS, IDLE_ROUNDS, ROUND_GAIN = 60, 2, 1.003
 """Rounds of one growth, how many of them may add nearly nothing, and the growth that is more than that."""
 
+CLIFF, FEWEST_CELLS = 0.4, 12
+"""Step from one cell to the next that is none of the thickness [fringe orders], and the cells without one that are
+believed together."""
+
+VISIBLE, WIDE_SIDE = 2.0, 5
+"""Power over that of noise from which on fringes are seen, and the side of the area of its mean [cells]."""
+
 
 @dataclass(frozen=True, eq=False)
 class Grown:
@@ -84,6 +91,9 @@ def grown_thickness(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Gro
         `None` if nothing fits better, or the model fits everywhere.
     """
     first = best = _fitted(problem, fit, thickness_um, KNOTS[-1])
+    bridged = _bridged(first, thickness_um)
+    if bridged is not None and bridged.fit.chi2 < GAIN * first.fit.chi2:
+        best, thickness_um = bridged, bridged.problem.basis.expand(bridged.fit.field)
     failed = 0
     for knots in KNOTS * TURNS:
         begin = _fitted(problem, best.fit, thickness_um, knots)
@@ -121,16 +131,39 @@ def _fitted(problem: Problem, fit: Fit, thickness_um: FloatArray, knots: float) 
     return _Fitted(stiff, fit_model(stiff, fit.coordinates, fit.position, start))
 
 
+def _bridged(first: _Fitted, thickness_um: FloatArray) -> _Fitted | None:
+    """Fit from a thickness that is continued with little curvature across where no fringes are seen.
+
+    What is beyond may be in the right order all the same: every cell knows it where its fringes are clear.
+    """
+    problem = first.problem
+    cells = _with_fringes(problem, _unit(_misfit(problem, first.fit)))
+    order_um = problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm)))
+    for axis in (0, 1):
+        cliff = np.abs(np.diff(thickness_um, axis=axis)) > CLIFF * order_um
+        for end in (0, thickness_um.shape[axis] - 1):  # the cells on both sides
+            cells &= ~np.insert(cliff, end, False, axis=axis)
+    parts, _ = label(cells)
+    cells &= np.bincount(parts.ravel())[parts] >= FEWEST_CELLS
+    if not cells.any() or cells.all():
+        return None
+    return _fitted(problem, first.fit, continued(thickness_um, cells), KNOTS[-1])
+
+
 def _grown(problem: Problem, fit: Fit, misfit: FloatArray) -> Fit | None:
-    """Fit of all cells after growth from the largest area that the model fits."""
+    """Fit of all cells after growth from the largest area that the model fits.
+
+    Cells without fringes fit wherever they are steep: they are grown through, and nothing is continued from them.
+    """
     unit = _unit(misfit)
     known = _largest(binary_erosion(misfit < GOOD * unit))
-    if not known.any():
+    bright = _with_fringes(problem, unit)
+    if not (known & bright).any():
         return None
     step = max(STEP, max(known.shape) // STEPS_ACROSS)
     idle = 0
     for _ in range(ROUNDS):
-        centre = _centre(problem, fit, known)
+        centre = _centre(problem, fit, known & bright)
         reached = binary_dilation(known, iterations=step)
         part = replace(
             problem.with_cells(problem.cells.restricted(reached)),
@@ -140,10 +173,20 @@ def _grown(problem: Problem, fit: Fit, misfit: FloatArray) -> Fit | None:
         fit = fit_model(part, fit.coordinates, fit.position, centre, fit.levels)
         larger = _largest(reached & ~(_misfit(problem, fit) > GOOD * unit))  # through cells without data
         idle = idle + 1 if larger.sum() <= ROUND_GAIN * known.sum() else 0
-        if idle == IDLE_ROUNDS or not larger.any():
+        if idle == IDLE_ROUNDS or not (larger & bright).any():
             break
         known = larger
-    return fit_model(problem, fit.coordinates, fit.position, _centre(problem, fit, known), fit.levels)
+    centre = _centre(problem, fit, known & bright)
+    return fit_model(problem, fit.coordinates, fit.position, centre, fit.levels)
+
+
+def _with_fringes(problem: Problem, unit: float) -> BoolArray:
+    """Cells about which more is seen than noise: the others do not tell their thickness."""
+    value, weight = problem.cells.value, problem.cells.weight
+    level = (weight * value).sum(axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)), 1e-300)
+    square = weight * (value - level[:, np.newaxis, np.newaxis]) ** 2
+    seen = uniform_filter((weight > 0).mean(axis=0), WIDE_SIDE)
+    return np.asarray(uniform_filter(square.mean(axis=0), WIDE_SIDE) > VISIBLE * unit * seen)
 
 
 def _centre(problem: Problem, fit: Fit, known: BoolArray) -> FloatArray:

@@ -31,6 +31,7 @@ __all__ = [
     "check_setup",
     "field_bases",
     "headers_apart",
+    "is_judged_better",
     "prepare",
     "prepare_again",
     "prepare_finer",
@@ -400,6 +401,18 @@ def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tup
     if same_field and change < NOISE_CHANGE and scatter < SCATTER_CHANGE * problem.cells.noise_rms:
         return None, mended
     return refined, mended
+
+
+def is_judged_better(prepared: Prepared, other: Prepared) -> bool:
+    """Whether the field of one, and the effects it was judged with, lie much better on the data than another's."""
+    return _misfit_as_judged(prepared) < MUCH_BETTER * _misfit_as_judged(other)
+
+
+def _misfit_as_judged(prepared: Prepared) -> float:
+    """χ² by the stated noise, contrasts free."""
+    assert prepared.undistorted_field is not None
+    problem = replace(prepared.problem, cells=prepared.stated, free_contrast=True)
+    return fit_model(problem, (), np.zeros(0), prepared.undistorted_field, None, prepared.guess).chi2
 
 
 def field_bases(shape: tuple[int, int]) -> list[FieldBasis]:

@@ -27,6 +27,7 @@ from .preparation import (
     Prepared,
     check_setup,
     headers_apart,
+    is_judged_better,
     prepare,
     prepare_again,
     prepare_finer,
@@ -198,7 +199,7 @@ class _Search:
             return self._conclude(whole, sets, sets.finished(chosen, steps), steps, chance)
         singles = sets.refits(sets.selector.null)
         if singles and singles[0].log_evidence > self.options.least_evidence and refinements > 0:
-            refined, _ = self._refined(whole, sets.to_judge_with(singles))
+            refined = self._judged_again(whole, sets, singles)
             if refined is not None:
                 self.say("field and noise are judged again with the best effect in the model")
                 self._take(refined)
@@ -316,6 +317,19 @@ class _Search:
         if mended:
             self.say(f"{mended} cells change their fringe order with {', '.join(best.names)}")
         return refined, mended
+
+    def _judged_again(self, whole: Selector, sets: SetSearch, singles: list[Hypothesis]) -> Prepared | None:
+        """Field and noise as judged with the best single effect, or with one that takes fringes away.
+
+        Where these are not seen the thickness is any, and a fit to it explains less than effects that weaken all of
+        them. Once it is continued from where they are, it explains more.
+        """
+        best, _ = self._refined(whole, sets.to_judge_with(singles))
+        for blur in sets.that_may_hide_fringes(singles):
+            other, _ = self._refined(whole, blur)
+            if other is not None and is_judged_better(other, best or self.prepared):
+                best = other
+        return best
 
     def _is_too_coarse(self, selector: Selector, found: Hypothesis) -> bool:
         """Whether a blur explains much, but not all, in cells that were chosen for the image that it left."""

@@ -30,6 +30,9 @@ MUCH_LEFT = 0.05
 HARDLY_LESS = 0.5
 """Part of that excess which one effect must take off, or further ones promise, for sets of several to be tried."""
 
+HIDES_FRINGES, MUCH_OF_THE_BEST = ("charge_diffusion",), 0.3
+"""Effects that may take narrow fringes away, and the part of what the best single effect explains that one must."""
+
 SHIFTING_EFFECTS = 3
 """Effects that are looked for in other fringe orders, each with the set with which it is likeliest."""
 
@@ -103,8 +106,7 @@ class SetSearch:
         Where all leave much, those that shift the phase are looked for in other fringe orders first: what is likely
         in the wrong one would tear the thickness to where it suits.
         """
-        noise = self.selector.problem.cells.n_values
-        if singles[0].fit.chi2 - noise < MUCH_LEFT * noise:
+        if not self._leaves_much(singles[0]):
             return singles[0]
         elsewhere = (
             self.selector.improved(single.names, self.selector.null.fit, scan=True)
@@ -112,6 +114,26 @@ class SetSearch:
             if self.selector.shifts_phase(single)
         )
         return max((*singles, *elsewhere), key=lambda item: item.log_evidence)
+
+    def that_may_hide_fringes(self, singles: list[Hypothesis]) -> list[Hypothesis]:
+        """Single effects that blur, and explain much though not most, where all leave much."""
+        best = singles[0]
+        if self.order_open or not self._leaves_much(best):
+            return []
+        blurs = [
+            self.selector.hypothesis((name,)) for name in HIDES_FRINGES if name in self.selector.coordinates
+        ]
+        explained = self.selector.null.fit.chi2 - best.fit.chi2
+        return [
+            blur
+            for blur in blurs
+            if blur.names != best.names
+            and self.selector.null.fit.chi2 - blur.fit.chi2 > MUCH_OF_THE_BEST * explained
+        ]
+
+    def _leaves_much(self, hypothesis: Hypothesis) -> bool:
+        noise = self.selector.problem.cells.n_values
+        return hypothesis.fit.chi2 - noise > MUCH_LEFT * noise
 
     def enlarged(self, current: Hypothesis, steps: list[Step], most: int) -> Hypothesis:
         """Add effects, up to so many, while a residual remains and they help."""
