@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
@@ -53,6 +55,24 @@ class FieldBasis(ABC):
     @abstractmethod
     def fit(self, field: FloatArray, weight: FloatArray) -> FloatArray:
         """Weighted least-squares coefficients of a field, which must not be NaN anywhere."""
+
+    def gather_changes(self, fields: FloatArray) -> FloatArray:
+        """Transpose of the change per cell along rows and columns: ``(2, K, ny, nx)`` to ``(M, K)``."""
+        raise NotImplementedError
+
+    def normal_matrix_with_changes(
+        self, curvature: FloatArray, prior: FloatArray | float = 0.0
+    ) -> NormalMatrix:
+        """Normal matrix where the data see the field and its changes per cell along rows and columns.
+
+        ``curvature`` is that in the three of them, ``(3, 3, ny, nx)``.
+        """
+        raise NotImplementedError
+
+    @property
+    def sees_changes(self) -> bool:
+        """Whether there are a `gather_changes` and a `normal_matrix_with_changes`."""
+        return False
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +120,45 @@ class SplineBasis(FieldBasis):
     def normal_matrix(self, curvature: FloatArray, prior: FloatArray | float = 0.0) -> NormalMatrix:
         """Banded matrix; see `FieldBasis.normal_matrix`."""
         return self._normal(curvature, prior, 0.0)
+
+    @property
+    def sees_changes(self) -> bool:
+        """See `FieldBasis.sees_changes`."""
+        return min(len(self.along_y), len(self.along_x)) > 1
+
+    @cached_property
+    def _changes(self) -> tuple[SplineBasis, SplineBasis]:
+        """Change per cell of the basis functions along rows and columns."""
+        return (
+            SplineBasis(_change_within(self.along_y), self.along_x),
+            SplineBasis(self.along_y, _change_within(self.along_x)),
+        )
+
+    def gather_changes(self, fields: FloatArray) -> FloatArray:
+        """Sums over cells; see `FieldBasis.gather_changes`."""
+        return np.asarray(sum(basis.gather(part) for basis, part in zip(self._changes, fields, strict=True)))
+
+    def normal_matrix_with_changes(
+        self, curvature: FloatArray, prior: FloatArray | float = 0.0
+    ) -> NormalMatrix:
+        """Banded matrix; see `FieldBasis.normal_matrix_with_changes`."""
+        parts = [
+            sparse.kron(sparse.csr_array(basis.along_y), sparse.csr_array(basis.along_x), format="csr")
+            for basis in (self, *self._changes)
+        ]
+        weighted = [
+            sum(sparse.diags_array(curvature[row, column].ravel()) @ parts[column] for column in range(3))
+            for row in range(3)
+        ]
+        normal = sum(part.T @ product for part, product in zip(parts, weighted, strict=True))
+        rows, columns = self.along_y.shape[1], self.along_x.shape[1]
+        reach = (min(4, rows) - 1) * columns + min(4, columns) - 1
+        band = np.zeros((reach + 1, rows * columns))
+        for away in range(reach + 1):
+            diagonal = normal.diagonal(-away)
+            band[away, : len(diagonal)] = diagonal
+        band[0] += RIDGE * max(float(band[0].max()), 1e-300) + prior
+        return _Banded(cholesky_banded(band, lower=True, overwrite_ab=True))
 
     def _normal(self, curvature: FloatArray, prior: FloatArray | float, stiffness: float) -> NormalMatrix:
         first_y, first_x = _first_nonzero(self.along_y), _first_nonzero(self.along_x)
@@ -183,6 +242,11 @@ def _uniform_splines(size: int, spacing: float) -> FloatArray:
     # Rounding may leave the last knot of the interior a little before the last cell.
     at = np.clip(np.arange(size, dtype=float), knots[degree], knots[-degree - 1])
     return np.asarray(BSpline.design_matrix(at, knots, degree).toarray())
+
+
+def _change_within(along: FloatArray) -> FloatArray:
+    """Change of the basis functions per cell where they are not 0, so that the normal matrix is as narrow."""
+    return np.where(along != 0.0, np.gradient(along, axis=0), 0.0)
 
 
 def _first_nonzero(basis: FloatArray) -> NDArray[np.int64]:

@@ -41,6 +41,9 @@ PRIOR_WIDTH = 3.0
 LARGEST_PHASE_STEP_UM = 0.06
 """Largest step of the fringe phase, as a thickness: a fifth of a fringe order."""
 
+WIDE_BLUR = 0.5
+"""Rms radius of a blur [cells] from which on a cell sees the thickness beside it."""
+
 MOST_ITERATIONS = 25
 CONVERGED = 0.02
 """Change of χ² at which a fit stops."""
@@ -447,6 +450,7 @@ class Design:
     effects: FullColumns
     pull: FloatArray
     normal: NormalMatrix
+    slope_changes: FloatArray | None
     _coupling: FloatArray
     _curvature: FloatArray
 
@@ -459,14 +463,19 @@ class Design:
         effects: FullColumns,
         prior: float,
         pull: FloatArray,
+        slope_changes: FloatArray | None = None,
     ) -> Design:
         """Assemble normal matrices; ``prior`` is the precision of a field that is known."""
-        normal = basis.normal_matrix((slope**2).sum(axis=0), prior)
-        coupling = basis.gather(np.concatenate([levels.along(slope), effects.along(slope)]))
+        if slope_changes is None:
+            normal = basis.normal_matrix((slope**2).sum(axis=0), prior)
+        else:
+            both = np.concatenate([slope[np.newaxis], slope_changes])
+            normal = basis.normal_matrix_with_changes(np.einsum("iwyx,jwyx->ijyx", both, both), prior)
+        coupling = _against_field(basis, (levels, effects), slope, slope_changes)
         cross = effects.against(levels)
         curvature = np.block([[levels.gram, cross.T], [cross, effects.gram]])
         curvature = curvature - coupling.T @ normal.solve(coupling)
-        return cls(basis, slope, levels, effects, pull, normal, coupling, curvature)
+        return cls(basis, slope, levels, effects, pull, normal, slope_changes, coupling, curvature)
 
     @property
     def curvature(self) -> FloatArray:
@@ -475,7 +484,13 @@ class Design:
 
     def _field_score(self, residual: FloatArray) -> FloatArray:
         """Half the fall of χ² along each coefficient of the field; none at a minimum."""
-        return self.basis.gather((self.slope * residual).sum(axis=0)[np.newaxis])[:, 0] - self.pull
+        return self._along_field(residual) - self.pull
+
+    def _along_field(self, values: FloatArray) -> FloatArray:
+        """Products of the derivatives with respect to the field with whitened ``(W, ny, nx)``."""
+        return _against_field(self.basis, (FullColumns(values[np.newaxis]),), self.slope, self.slope_changes)[
+            :, 0
+        ]
 
     def _products(self, values: FloatArray) -> FloatArray:
         """Products of levels and effects with whitened ``(W, ny, nx)``."""
@@ -502,8 +517,8 @@ class Design:
 
     def field_errors(self, draws: Iterable[FloatArray]) -> FloatArray:
         """What draws of whitened noise ``(W, ny, nx)`` make of the field, levels and effects held, in its unit."""
-        moved = [self.basis.gather((self.slope * noise).sum(axis=0)[np.newaxis]) for noise in draws]
-        solved = self.normal.solve(np.concatenate(moved, axis=1))
+        moved = [self._along_field(noise) for noise in draws]
+        solved = self.normal.solve(np.stack(moved, axis=1))
         return np.stack([self.basis.expand(one) for one in solved.T])
 
     def project(self, columns: Columns, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -521,7 +536,7 @@ class Design:
         score : `numpy.ndarray`, shape ``(F,)``
         information : `numpy.ndarray`, shape ``(F, F)``
         """
-        coupling = self.basis.gather(columns.along(self.slope))
+        coupling = _against_field(self.basis, (columns,), self.slope, self.slope_changes)
         solved = self.normal.solve(coupling)
         cross = np.concatenate([columns.against(self.levels).T, columns.dot(self.effects.values)])
         cross = cross - self._coupling.T @ solved
@@ -532,6 +547,20 @@ class Design:
         within = self._inverse_curvature @ cross
         score = columns.dot(residual) - solved.T @ field_side - within.T @ own_score
         return score, columns.gram - coupling.T @ solved - cross.T @ within
+
+
+def _against_field(
+    basis: FieldBasis, columns: Sequence[Columns], slope: FloatArray, slope_changes: FloatArray | None
+) -> FloatArray:
+    """Products of the derivatives with respect to a field with others, ``(M, F)``."""
+
+    def along(part: FloatArray) -> FloatArray:
+        return np.concatenate([each.along(part) for each in columns])
+
+    products = basis.gather(along(slope))
+    if slope_changes is not None:
+        products = products + basis.gather_changes(np.stack([along(part) for part in slope_changes]))
+    return products
 
 
 @dataclass(frozen=True, eq=False)
@@ -776,9 +805,22 @@ class _Solver:
         for number in range(len(columns)):
             columns[number] = self.whiten(level * self.derivative(point, thickness, number))
         slope = self.whiten(level * point.prediction.slope)
+        changes = None
+        if problem.basis.sees_changes and self._is_blurred(point.position):
+            parts = problem.forward.slope_changes(
+                self.settings(point.position), thickness, point.prediction.slope
+            )
+            changes = np.stack([self.whiten(level * part) for part in parts])
         levels = problem.level_columns(point.prediction.value, self.whiten)
         pull = problem.field_pull(point.coefficients)
-        return Design.build(problem.basis, slope, levels, FullColumns(columns), problem.field_prior, pull)
+        return Design.build(
+            problem.basis, slope, levels, FullColumns(columns), problem.field_prior, pull, changes
+        )
+
+    def _is_blurred(self, position: FloatArray) -> bool:
+        """Whether light is carried so far that a cell sees how the thickness changes from cell to cell."""
+        width = self.settings(position).get("charge_diffusion.sigma", 0.0)
+        return width > WIDE_BLUR * self.problem.cells.cell_px
 
     def derivative(self, point: _Point, thickness: FloatArray, number: int) -> FloatArray:
         """Derivative of the prediction with respect to one coordinate, by a difference."""
