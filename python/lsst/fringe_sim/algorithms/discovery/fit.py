@@ -442,6 +442,9 @@ class Design:
         What draws the coefficients of the field besides the residual: half a gradient of χ².
     normal : `NormalMatrix`
         Curvature in the coefficients of the thickness field.
+    slope_changes : `numpy.ndarray`, shape ``(2, W, ny, nx)``, optional
+        Whitened derivatives with respect to the change of the thickness per cell along rows and columns, where a
+        blur lets cells see that.
     """
 
     basis: FieldBasis
