@@ -58,7 +58,7 @@ def test_a_tilt_is_exact_and_a_bump_nearly(blurred) -> None:
     problem, truth, settings = blurred
     forward, rows = problem.forward, np.arange(len(truth)) - 40.0
     before = forward.predict(settings, truth)
-    along_y, along_x = forward.slope_changes(settings, truth, before.slope)
+    along_y, along_x = forward.slope_changes(settings, truth)
 
     def change(shape: np.ndarray) -> np.ndarray:
         return (forward.predict(settings, truth + 1e-7 * shape).value - before.value) / 1e-7

@@ -157,12 +157,15 @@ class SplineBasis(FieldBasis):
         for away in range(reach + 1):
             diagonal = normal.diagonal(-away)
             band[away, : len(diagonal)] = diagonal
-        band[0] += RIDGE * max(float(band[0].max()), 1e-300) + prior
-        return _Banded(cholesky_banded(band, lower=True, overwrite_ab=True))
+        return self._factored(band, prior)
 
     def _normal(self, curvature: FloatArray, prior: FloatArray | float, stiffness: float) -> NormalMatrix:
         first_y, first_x = _first_nonzero(self.along_y), _first_nonzero(self.along_x)
         band = _assemble(self.along_y, self.along_x, first_y, first_x, np.ascontiguousarray(curvature))
+        return self._factored(band, prior, stiffness)
+
+    def _factored(self, band: FloatArray, prior: FloatArray | float, stiffness: float = 0.0) -> NormalMatrix:
+        """Matrix of a lower band, which is overwritten."""
         largest = max(float(band[0].max()), 1e-300)
         band[0] += RIDGE * largest + prior
         if stiffness:

@@ -363,6 +363,11 @@ class Problem:
     free_contrast: bool = False
     reference: FloatArray | None = None
 
+    @property
+    def order_um(self) -> float:
+        """Thickness from one fringe to the next at the middle wavelength [µm]."""
+        return float(self.forward.model.fringe_order_um(float(np.median(self.cells.wavelength_nm))))
+
     def whitener(self, value: FloatArray) -> Whitener:
         """Whitener for the noise about `reference`, or about the prediction ``value`` if there is none."""
         if self.reference is not None:
@@ -491,9 +496,8 @@ class Design:
 
     def _along_field(self, values: FloatArray) -> FloatArray:
         """Products of the derivatives with respect to the field with whitened ``(W, ny, nx)``."""
-        return _against_field(self.basis, (FullColumns(values[np.newaxis]),), self.slope, self.slope_changes)[
-            :, 0
-        ]
+        one = (FullColumns(values[np.newaxis]),)
+        return _against_field(self.basis, one, self.slope, self.slope_changes)[:, 0]
 
     def _products(self, values: FloatArray) -> FloatArray:
         """Products of levels and effects with whitened ``(W, ny, nx)``."""
@@ -809,10 +813,8 @@ class _Solver:
             columns[number] = self.whiten(level * self.derivative(point, thickness, number))
         slope = self.whiten(level * point.prediction.slope)
         changes = None
-        if problem.basis.sees_changes and self._is_blurred(point.position):
-            parts = problem.forward.slope_changes(
-                self.settings(point.position), thickness, point.prediction.slope
-            )
+        if problem.basis.sees_changes and self._is_blurred(point):
+            parts = problem.forward.slope_changes(self.settings(point.position), thickness)
             changes = np.stack([self.whiten(level * part) for part in parts])
         levels = problem.level_columns(point.prediction.value, self.whiten)
         pull = problem.field_pull(point.coefficients)
@@ -820,10 +822,9 @@ class _Solver:
             problem.basis, slope, levels, FullColumns(columns), problem.field_prior, pull, changes
         )
 
-    def _is_blurred(self, position: FloatArray) -> bool:
+    def _is_blurred(self, point: _Point) -> bool:
         """Whether light is carried so far that a cell sees how the thickness changes from cell to cell."""
-        width = self.settings(position).get("charge_diffusion.sigma", 0.0)
-        return width > WIDE_BLUR * self.problem.cells.cell_px
+        return diffusion_px(self.settings(point.position)) > WIDE_BLUR * self.problem.cells.cell_px
 
     def derivative(self, point: _Point, thickness: FloatArray, number: int) -> FloatArray:
         """Derivative of the prediction with respect to one coordinate, by a difference."""
@@ -890,6 +891,11 @@ class _Solver:
                 return trial, 0.2 * damping if damping > 1e-6 else 0.0
             damping = max(10.0 * damping, 1e-3)
         return None, damping
+
+
+def diffusion_px(settings: Mapping[str, float]) -> float:
+    """Rms radius of the diffusion among some effects, along one axis [px]."""
+    return settings.get("charge_diffusion.sigma", 0.0)
 
 
 def coordinate_derivative(

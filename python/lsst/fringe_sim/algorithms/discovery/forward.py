@@ -49,8 +49,8 @@ LEAST_SPREAD = 1e-12
 _BLOCK = 256
 """Cells that a core interpolates at a time."""
 
-FAR_REACHING = ("crosstalk", "ghost_image")
-"""Effects that carry light farther than the thickness changes evenly."""
+FAR_REACHING = ("crosstalk",)
+"""Effects that carry signal farther than the thickness changes evenly."""
 
 FARTHEST_UM = 3.0
 """Thickness by which a field may leave the first range [µm]: ten fringe orders. What goes farther does not fit."""
@@ -331,7 +331,7 @@ class Forward:
         beside = self._on_image(image_settings, value + nudge * slope)
         return Prediction(changed, (beside - changed) / nudge)
 
-    def slope_changes(self, settings: Settings, thickness_um: FloatArray, slope: FloatArray) -> FloatArray:
+    def slope_changes(self, settings: Settings, thickness_um: FloatArray) -> FloatArray:
         """Derivative with respect to the change of the thickness per cell along rows and columns, ``(2, W, ny, nx)``.
 
         A blur carries what the thickness does beside a cell into it. Together with the slope of `predict`, which is
@@ -339,7 +339,9 @@ class Forward:
         """
         nearby = {key: value for key, value in settings.items() if key.partition(".")[0] not in FAR_REACHING}
         nudge = 1e-7  # µm from one cell to the next: linear over the whole field
-        before = self.predict(nearby, thickness_um)
+        before = self.predict(
+            nearby, thickness_um
+        )  # from the tables of the tilted ones: other tables are too far off
         found = []
         for place in np.meshgrid(
             *(np.arange(size) - 0.5 * size for size in thickness_um.shape), indexing="ij"

@@ -138,9 +138,8 @@ def _bridged(first: _Fitted, thickness_um: FloatArray) -> _Fitted | None:
     """
     problem = first.problem
     cells = _with_fringes(problem, _unit(_misfit(problem, first.fit)))
-    order_um = problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm)))
     for axis in (0, 1):
-        cliff = np.abs(np.diff(thickness_um, axis=axis)) > CLIFF * order_um
+        cliff = np.abs(np.diff(thickness_um, axis=axis)) > CLIFF * problem.order_um
         for end in (0, thickness_um.shape[axis] - 1):  # the cells on both sides
             cells &= ~np.insert(cliff, end, False, axis=axis)
     parts, _ = label(cells)
@@ -185,8 +184,7 @@ def _with_fringes(problem: Problem, unit: float) -> BoolArray:
     value, weight = problem.cells.value, problem.cells.weight
     level = (weight * value).sum(axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)), 1e-300)
     square = weight * (value - level[:, np.newaxis, np.newaxis]) ** 2
-    seen = uniform_filter((weight > 0).mean(axis=0), WIDE_SIDE)
-    return np.asarray(uniform_filter(square.mean(axis=0), WIDE_SIDE) > VISIBLE * unit * seen)
+    return np.asarray(_mean_around(square, problem, WIDE_SIDE) > VISIBLE * unit)
 
 
 def _centre(problem: Problem, fit: Fit, known: BoolArray) -> FloatArray:
@@ -199,9 +197,14 @@ def _misfit(problem: Problem, fit: Fit) -> FloatArray:
     """Mean square of the whitened residuals of each cell and its neighbours; NaN where none of them has data."""
     expected = problem.expected_of(fit)
     residual = problem.whitener(expected)(problem.cells.value - expected)
-    seen = uniform_filter((problem.cells.weight > 0).mean(axis=0), SIDE)
-    square = uniform_filter((residual**2).mean(axis=0), SIDE)
-    return np.where(seen > NO_DATA, square / np.maximum(seen, NO_DATA), np.nan)
+    return _mean_around(residual**2, problem, SIDE)
+
+
+def _mean_around(values: FloatArray, problem: Problem, side: int) -> FloatArray:
+    """Mean over the data, 0 elsewhere, of each cell and those around it; NaN where none of them has data."""
+    seen = uniform_filter((problem.cells.weight > 0).mean(axis=0), side)
+    total = uniform_filter(values.mean(axis=0), side)
+    return np.where(seen > NO_DATA, total / np.maximum(seen, NO_DATA), np.nan)
 
 
 def _unit(misfit: FloatArray) -> float:

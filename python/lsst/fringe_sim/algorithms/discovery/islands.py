@@ -405,7 +405,7 @@ def _apart(discs: list[Disc]) -> list[Disc]:
 
 def _covered_shifts(problem: Problem, thickness_um: FloatArray) -> FloatArray:
     """Shifts of a thickness up to half an order on both sides [µm], within the tables."""
-    order = float(problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm))))
+    order = problem.order_um
     shifts = np.linspace(-0.5, 0.5, SHIFTS_PER_ORDER + 1) * order
     for shift in (shifts[0], shifts[-1]):
         problem.forward.cover(thickness_um + shift)

@@ -19,7 +19,7 @@ from ...products.fringe_cube import FringeCube
 from .basis import CellBasis, FieldBasis, SplineBasis
 from .cells import CellData, bin_cube, finest_useful_cell
 from .comparison import chi2_with_free_fringes, fringe_order_um
-from .fit import Fit, Problem, fit_model, linearise_at
+from .fit import Fit, Problem, diffusion_px, fit_model, linearise_at
 from .forward import Exposures, Forward
 from .growth import grown_thickness
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share, noise_ratio
@@ -265,8 +265,7 @@ def _narrowest_fringe(prepared: Prepared) -> float:
     """Width of a fringe where the thickness is steep [cells]."""
     forward, seen = prepared.problem.forward, prepared.problem.cells.seen
     slope = np.hypot(*forward.gradient(prepared.problem.basis.expand(prepared.null.field)))[seen]
-    order = forward.model.fringe_order_um(float(np.median(prepared.problem.cells.wavelength_nm)))
-    return float(order) / max(float(np.quantile(slope, STEEP)), 1e-300)
+    return prepared.problem.order_um / max(float(np.quantile(slope, STEEP)), 1e-300)
 
 
 def _prepare_in_cells(
@@ -634,7 +633,7 @@ def _choose_field(problem: Problem, start: FloatArray, settings: Mapping[str, fl
 def _in_different_orders(fields: Sequence[FloatArray], problem: Problem) -> Sequence[FloatArray]:
     """The fields that are not in the same fringe order as the first one everywhere, and the first."""
     maps = [problem.basis.expand(field) for field in fields]
-    order = problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm)))
+    order = problem.order_um
     seen = problem.cells.seen
     return [
         field
@@ -694,7 +693,7 @@ def _noise_of(problem: Problem, fit: Fit) -> float:
 
 def _is_blurred(settings: Mapping[str, float]) -> bool:
     """Whether effects blur the light by at least as much as the area of a pixel does."""
-    return settings.get("charge_diffusion.sigma", 0.0) >= PIXEL_RMS
+    return diffusion_px(settings) >= PIXEL_RMS
 
 
 def _without_rest_of_area(settings: Mapping[str, float], forward: Forward) -> Mapping[str, float]:
@@ -703,7 +702,7 @@ def _without_rest_of_area(settings: Mapping[str, float], forward: Forward) -> Ma
         return settings
     missing = (PIXEL_RMS / forward.places) ** 2
     level = float(forward.geometry.level_e.mean())
-    variance = settings.get("charge_diffusion.sigma", 0.0) ** 2
+    variance = diffusion_px(settings) ** 2
     variance += settings.get("brighter_fatter.variance", 0.0) * level / FULL_PIXEL_E
     if abs(variance - missing) > SAME_AREA * missing:
         return settings
@@ -761,7 +760,7 @@ def _follow_noise(problem: Problem, fit: Fit) -> _Following:
     errors = design.field_errors(noise)
     left = (each - design.slope * error for each, error in zip(noise, errors, strict=True))
     taken = 1.0 - noise_ratio(problem.cells, left, noise)
-    order = problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm)))
+    order = problem.order_um
     errors = np.clip(errors, -LARGEST_ERROR * order, LARGEST_ERROR * order)
     return _Following(problem.forward.scatter_of(thickness, errors), taken)
 

@@ -129,7 +129,7 @@ def thickness_starts(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray)
     if not rest.any() or problem.field_prior:
         return [first]
     beyond = continued_thickness(problem, fit, held_out)
-    order = float(problem.forward.model.fringe_order_um(float(np.median(problem.cells.wavelength_nm))))
+    order = problem.order_um
     return [first, beyond] if np.abs(beyond - first)[rest].max() > ANOTHER_ORDER * order else [first]
 
 
