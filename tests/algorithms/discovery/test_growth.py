@@ -16,6 +16,7 @@ from lsst.fringe_sim.algorithms.discovery.continuation import continued
 from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.growth import grown_thickness
+from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.algorithms.discovery.validation import thickness_starts, whole_thickness
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.mock.sealed_cases import draw_case
@@ -150,6 +151,24 @@ def hidden_gap():
     case, rng = recorded_case(20491128, "two", 3)
     assert set(case.names) == {BLUR, "bandwidth"}
     return case, rng
+
+
+def test_a_field_judged_with_the_blur_lies_better_on_the_data(hidden_gap) -> None:
+    case, _ = hidden_gap
+    blur = [effect for effect in EFFECTS if effect.name == BLUR]
+    prepared = preparation.prepare(case.cube, FringeModel.from_setup(case.setup), blur, 20_000)
+    selector = Selector(prepared.problem, blur, prepared.null, prepared.index)
+    fit = selector.hypothesis((BLUR,)).fit
+    judged, _ = preparation.prepare_again(prepared, fit, prepared.problem.basis.expand(fit.field))
+    assert judged is not None
+    rows, columns = prepared.problem.cells.shape[1:]
+    px = prepared.problem.cells.cell_px
+    truth = case.thickness_um.reshape(rows, px, columns, px).mean(axis=(1, 3))
+    before, after = (each.problem.basis.expand(each.undistorted_field) for each in (prepared, judged))
+    assert _is_wrong(before, truth).mean() > 0.2
+    assert _is_wrong(after, truth).mean() < _is_wrong(before, truth).mean()
+    assert preparation.is_judged_better(judged, prepared)
+    assert not preparation.is_judged_better(prepared, judged)
 
 
 @pytest.mark.slow
