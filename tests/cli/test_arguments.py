@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -156,12 +157,30 @@ def test_what_a_search_has_found_goes_into_fit_and_sky(tmp_path: Path, capsys) -
     assert not [key for key in image if key.startswith("WCSNAME")]  # nobody says where 64 by 64 pixels lie
 
 
-@pytest.mark.parametrize("line", ["import os", 'config.effects["bandwidth.fwhm"] = 2.0; import os', "x = 1"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import os",
+        "x = 1",
+        'config.effects["bandwidth.fwhm"] = 2.0; import os',
+        'config.effects["bandwidth.fwhm"] = open("executed", "w").fileno()',
+        'config.effects["bandwidth.fwhm"] = ',
+        'config.effects["',
+        "config.effects[\"bandwidth.fwhm'] = 2.0",
+    ],
+)
 def test_overrides_with_anything_else_are_refused(line: str, tmp_path: Path) -> None:
     path = tmp_path / "effects.py"
     path.write_text(f"{OVERRIDE}{line}\n", encoding="utf-8")
-    with pytest.raises((InputError, ValueError)):
+    with pytest.raises(InputError, match=re.escape(str(path))) as caught:
         read_settings(path)
+    assert caught.value.value == line.strip()
+
+
+def test_overrides_may_be_written_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "effects.py"
+    path.write_text("\n# mine\nconfig.effects['bandwidth.fwhm']=2.6  # nm\n", encoding="utf-8")
+    assert read_settings(path) == {"bandwidth.fwhm": 2.6}
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

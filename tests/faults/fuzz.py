@@ -470,7 +470,11 @@ def line_file(data: st.DataObject, folder: Path) -> None:
 
 def effects_override(data: st.DataObject, folder: Path) -> None:
     """A Python override as a search leaves it: read, never executed."""
-    valid = "# found\nconfig.effects['roughness.sigma'] = 4.0\nconfig.effects['bandwidth.fwhm'] = 2.1\n"
+    quote = data.draw(st.sampled_from("\"'"))
+    valid = (
+        f"# found\nconfig.effects[{quote}roughness.sigma{quote}] = 4.0\n"
+        f"config.effects[{quote}bandwidth.fwhm{quote}] = 2.1\n"
+    )
     text = _alter_text(data, valid)
     if not data.draw(st.integers(0, 3)):
         text += data.draw(st.sampled_from(CODE)).format(folder)

@@ -114,10 +114,10 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises
     ------
     InputError
-        The file is not YAML, not a mapping, or an override with more in it than effects.
+        The file is not YAML, not a mapping, or an override with anything in it but effects and their numbers.
     """
     if Path(path).suffix == ".py":
-        return _read_override(_text_of(path), str(path))
+        return dict(read_effects_override(_text_of(path), str(path)))
     content = read_user_yaml(path, "settings file")
     if content is None:
         return {}
@@ -131,15 +131,6 @@ def _text_of(path: str | os.PathLike[str]) -> str:
         return Path(path).read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise InputError("override file", str(error), "text in UTF-8", source=str(path)) from None
-
-
-def _read_override(text: str, source: str) -> dict[str, Any]:
-    """Effects of an override file; it is not executed, so that nothing else may be in it."""
-    effects: dict[str, Any] = dict(read_effects_override(text))
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if len(lines) != len(effects):
-        raise InputError("override file", f"{len(lines)} statements", "effects alone", source=source)
-    return effects
 
 
 def sky_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

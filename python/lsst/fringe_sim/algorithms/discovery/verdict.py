@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from astropy.table import Table
+
+from ...errors import InputError
 
 __all__ = [
     "Gap",
@@ -314,13 +317,41 @@ class Verdict:
         return "\n".join(lines)
 
 
-def read_effects_override(text: str) -> dict[str, float]:
-    """Effects in the text of an override file written by `Verdict.override`; nothing is executed."""
+_STATEMENT = re.compile(r"""config\.effects\[(["'])([\w.]+)\1\]\s*=\s*([^#]+?)\s*(?:#.*)?""")
+
+
+def read_effects_override(text: str, source: str | None = None) -> dict[str, float]:
+    """Effects in the text of an override file written by `Verdict.override`; nothing is executed.
+
+    Parameters
+    ----------
+    text : `str`
+        Lines that each set one effect to a number; empty lines and comments are passed over.
+    source : `str`, optional
+        File that the text is from, for the error.
+
+    Returns
+    -------
+    effects : `dict` [`str`, `float`]
+        Values by ``effect.parameter``.
+
+    Raises
+    ------
+    InputError
+        A line that is anything else.
+    """
     found: dict[str, float] = {}
-    for line in text.splitlines():
-        if line.startswith('config.effects["'):
-            key, _, value = line.removeprefix('config.effects["').partition('"] = ')
-            found[key] = float(value)
+    for line in map(str.strip, text.splitlines()):
+        if not line or line.startswith("#"):
+            continue
+        statement = _STATEMENT.fullmatch(line)
+        try:
+            if statement is None:
+                raise ValueError
+            found[statement[2]] = float(statement[3])
+        except ValueError:
+            allowed = 'lines of config.effects["effect.parameter"] = number'
+            raise InputError("statement", line, allowed, source=source) from None
     return found
 
 
