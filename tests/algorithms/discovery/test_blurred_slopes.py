@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from recorded_cases import recorded_case
@@ -73,6 +75,17 @@ def test_a_tilt_is_exact_and_a_bump_nearly(blurred) -> None:
     alone = before.slope * bump
     both = alone + along_y * np.gradient(bump, axis=0) + along_x * np.gradient(bump, axis=1)
     assert size(change(bump) - both) < 0.4 * size(change(bump) - alone)
+
+
+def test_effects_of_the_model_itself_count_as_those_that_are_looked_for(blurred) -> None:
+    problem, truth, settings = blurred
+    known = {"charge_diffusion.sigma": settings["charge_diffusion.sigma"], "crosstalk.from_left": 1e-3}
+    own = replace(problem.forward, model=problem.forward.model.with_effects(known))
+    assert own.blur_px({}) == problem.forward.blur_px(settings) == known["charge_diffusion.sigma"]
+    nearby = {"charge_diffusion.sigma": known["charge_diffusion.sigma"]}
+    expected = problem.forward.slope_changes(nearby, truth)
+    # Crosstalk reaches too far for a change that is even.
+    np.testing.assert_allclose(own.slope_changes({}, truth), expected, atol=1e-6 * np.abs(expected).max())
 
 
 def test_a_fit_from_nearby_ends_where_one_from_the_truth_does(blurred) -> None:

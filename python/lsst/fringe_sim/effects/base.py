@@ -114,6 +114,8 @@ class Effect(ABC):
     """Whether it belongs to lamp, bench or cryostat, which a sensor does not take along to the telescope."""
     couples_pixels: ClassVar[bool] = False
     """Whether the signal of a pixel depends on other pixels, so that scattered samples of an image cannot show it."""
+    blurs: ClassVar[bool] = False
+    """Whether those other pixels are all near: no farther than the thickness changes evenly."""
     moves_wavelengths: ClassVar[bool] = False
     """Whether all that it does is to move the wavelengths of exposures."""
     exact: ClassVar[bool] = False
@@ -152,6 +154,10 @@ class Effect(ABC):
     ) -> FloatArray:
         """Like `change_image`, for an effect that depends on the sensor; ``system`` is the one before any effect."""
         return self.change_image(image, values, geometry)
+
+    def blur_px(self, values: Mapping[str, float]) -> float:
+        """Rms radius along one axis by which all signal is spread alike [px]."""
+        return 0.0
 
     def dark_charge(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
         """Electrons of every sample that are not light, a part of the mean level; shape ``(W, 1, 1)``.

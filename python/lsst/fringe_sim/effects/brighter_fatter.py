@@ -29,6 +29,7 @@ class BrighterFatter(PlainNullEffect):
     title = "brighter-fatter effect"
     acts_on = "image"
     couples_pixels = True
+    blurs = True
     reference = "Antilogus et al. 2014, doi 10.1088/1748-0221/9/03/C03048"
     parameters = (
         Parameter("variance", "px2", 0.0, (0.0, 0.5), 0.1, "spread along one axis behind 100 000 electrons"),

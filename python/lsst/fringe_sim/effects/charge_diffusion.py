@@ -20,6 +20,7 @@ class ChargeDiffusion(PlainNullEffect):
     title = "charge diffusion"
     acts_on = "image"
     couples_pixels = True
+    blurs = True
     reference = "Lage 2019, doi 10.48550/arXiv.1911.09577 (a few um rms in 100 um of silicon)"
     parameters = (Parameter("sigma", "px", 0.0, (0.0, 5.0), 0.4, "rms radius along one axis"),)
 
@@ -33,3 +34,7 @@ class ChargeDiffusion(PlainNullEffect):
                     image, geometry, axis, lambda frequency: np.exp(-0.5 * (values["sigma"] * frequency) ** 2)
                 )
         return image
+
+    def blur_px(self, values: Mapping[str, float]) -> float:
+        """The rms radius."""
+        return values["sigma"]

@@ -824,7 +824,8 @@ class _Solver:
 
     def _is_blurred(self, point: _Point) -> bool:
         """Whether light is carried so far that a cell sees how the thickness changes from cell to cell."""
-        return diffusion_px(self.settings(point.position)) > WIDE_BLUR * self.problem.cells.cell_px
+        blur_px = self.problem.forward.blur_px(self.settings(point.position))
+        return blur_px > WIDE_BLUR * self.problem.cells.cell_px
 
     def derivative(self, point: _Point, thickness: FloatArray, number: int) -> FloatArray:
         """Derivative of the prediction with respect to one coordinate, by a difference."""
@@ -891,11 +892,6 @@ class _Solver:
                 return trial, 0.2 * damping if damping > 1e-6 else 0.0
             damping = max(10.0 * damping, 1e-3)
         return None, damping
-
-
-def diffusion_px(settings: Mapping[str, float]) -> float:
-    """Rms radius of the diffusion among some effects, along one axis [px]."""
-    return settings.get("charge_diffusion.sigma", 0.0)
 
 
 def coordinate_derivative(

@@ -49,9 +49,6 @@ LEAST_SPREAD = 1e-12
 _BLOCK = 256
 """Cells that a core interpolates at a time."""
 
-FAR_REACHING = ("crosstalk",)
-"""Effects that carry signal farther than the thickness changes evenly."""
-
 FARTHEST_UM = 3.0
 """Thickness by which a field may leave the first range [µm]: ten fringe orders. What goes farther does not fit."""
 
@@ -337,11 +334,10 @@ class Forward:
         A blur carries what the thickness does beside a cell into it. Together with the slope of `predict`, which is
         that of a field that moves as a whole, they are exact where it changes evenly.
         """
-        nearby = {key: value for key, value in settings.items() if key.partition(".")[0] not in FAR_REACHING}
+        nearby = {**settings, **self._without_far_reaching(settings)}
         nudge = 1e-7  # µm from one cell to the next: linear over the whole field
-        before = self.predict(
-            nearby, thickness_um
-        )  # from the tables of the tilted ones: other tables are too far off
+        # Not what is known already: other tables than those of the tilted ones are too far off.
+        before = self.predict(nearby, thickness_um)
         found = []
         for place in np.meshgrid(
             *(np.arange(size) - 0.5 * size for size in thickness_um.shape), indexing="ij"
@@ -349,6 +345,15 @@ class Forward:
             tilted = self.predict(nearby, thickness_um + nudge * place).value
             found.append((tilted - before.value) / nudge - place * before.slope)
         return np.stack(found)
+
+    def _without_far_reaching(self, settings: Settings) -> dict[str, float]:
+        """Null values of the effects that carry signal farther than the thickness changes evenly."""
+        found = {}
+        for key in self._image(settings):
+            name, _, parameter = key.partition(".")
+            if self.couples_pixels(name) and not self.blurs(name):
+                found[key] = self._effect(name).parameter(parameter).null
+        return found
 
     def change(self, before: Settings, after: Settings, thickness_um: FloatArray) -> FloatArray:
         """What other settings do to the cells, ``(W, ny, nx)``: the difference of two predictions."""
@@ -567,6 +572,15 @@ class Forward:
     def couples_pixels(self, name: str) -> bool:
         """Whether an effect carries signal from cell to cell."""
         return self._effect(name).couples_pixels
+
+    def blurs(self, name: str) -> bool:
+        """Whether an effect spreads signal over the nearest cells."""
+        return self._effect(name).blurs
+
+    def blur_px(self, settings: Settings) -> float:
+        """Rms radius along one axis by which effects, those of the model among them, spread all light [px]."""
+        active = activate_effects(self._image(settings), self.catalogue)
+        return math.hypot(*(item.effect.blur_px(item.values) for item in active))
 
     def _effect(self, name: str) -> Effect:
         return self._by_name[name]

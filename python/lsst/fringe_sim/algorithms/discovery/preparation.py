@@ -19,7 +19,7 @@ from ...products.fringe_cube import FringeCube
 from .basis import CellBasis, FieldBasis, SplineBasis
 from .cells import CellData, bin_cube, finest_useful_cell
 from .comparison import chi2_with_free_fringes, fringe_order_um
-from .fit import Fit, Problem, diffusion_px, fit_model, linearise_at
+from .fit import Fit, Problem, fit_model, linearise_at
 from .forward import Exposures, Forward
 from .growth import grown_thickness
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share, noise_ratio
@@ -70,9 +70,6 @@ AREA_LOSS = 9.0
 
 RIM_CELLS = 2
 """Cells on both sides of the rim of a local effect that do not decide how fine the thickness is."""
-
-BLURS = ("charge_diffusion", "brighter_fatter")
-"""Effects that blur the light."""
 
 FEWEST_ROWS = 6
 """Rows and columns of cells from which on noise and levels can be measured."""
@@ -447,26 +444,32 @@ def sees_areas(problem: Problem, fit: Fit) -> bool:
 
     Real pixels see their area.
     """
-    names = {item.effect for item in fit.coordinates} & set(BLURS)
+    names = _blurs_of(fit, problem.forward)
     if not problem.forward.places or not names:
         return False
-    rest = without_blurs(fit)
+    rest = without_blurs(fit, problem.forward)
     areas = replace(problem, forward=problem.forward.with_places(0))
     other = fit_model(areas, rest.coordinates, rest.position, fit.field, fit.levels)
     return other.chi2 < fit.chi2 + AREA_LOSS * len(names)
 
 
-def without_blurs(fit: Fit) -> Fit:
+def without_blurs(fit: Fit, forward: Forward) -> Fit:
     """The same place without effects that blur the light; not a minimum."""
-    for name in BLURS:
+    for name in _blurs_of(fit, forward):
         fit = fit.without(name)
     return fit
 
 
+def _blurs_of(fit: Fit, forward: Forward) -> set[str]:
+    """Effects of a fit that blur the light."""
+    return {item.effect for item in fit.coordinates if forward.blurs(item.effect)}
+
+
 def prepare_with_areas(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> Prepared:
     """Field and noise with pixels that see their area, and the effects of a fit but blurs."""
-    settings = without_blurs(fit).settings
-    problem = replace(prepared.problem, forward=prepared.problem.forward.with_places(0))
+    forward = prepared.problem.forward
+    settings = without_blurs(fit, forward).settings
+    problem = replace(prepared.problem, forward=forward.with_places(0))
     seen, fitted = _choose_field(problem, thickness_um, settings)
     refined = _settle(seen, fitted, prepared.stated, prepared.index)
     return replace(refined, null=_better_null(refined, prepared), guess=settings)
@@ -481,7 +484,7 @@ def _mended(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[Float
     start = np.where(problem.forward.on_islands(fit.settings), thickness_um, start)
     if not any(problem.forward.couples_pixels(item.effect) for item in fit.coordinates):
         return start, dict(fit.settings)
-    if _is_blurred(fit.settings):
+    if _is_blurred(problem.forward, fit.settings):
         problem = replace(problem, forward=problem.forward.with_places(0))
     grown = grown_thickness(problem, fit, start)
     return (start, dict(fit.settings)) if grown is None else (grown.thickness_um, grown.settings)
@@ -650,7 +653,7 @@ def _choose_pixels(problem: Problem, fit: Fit, settings: Mapping[str, float]) ->
     something else blurs by more than that are not told from areas that it blurs by less, which are taken.
     """
     forward = problem.forward
-    if _is_blurred(settings):
+    if _is_blurred(forward, settings):
         if forward.places:
             problem = replace(problem, forward=forward.with_places(0))
             fit = fit_model(problem, (), np.zeros(0), fit.field, fit.levels, settings)
@@ -691,9 +694,9 @@ def _noise_of(problem: Problem, fit: Fit) -> float:
     return float(np.average(noise.factor**2 + response, weights=used))
 
 
-def _is_blurred(settings: Mapping[str, float]) -> bool:
+def _is_blurred(forward: Forward, settings: Mapping[str, float]) -> bool:
     """Whether effects blur the light by at least as much as the area of a pixel does."""
-    return diffusion_px(settings) >= PIXEL_RMS
+    return forward.blur_px(settings) >= PIXEL_RMS
 
 
 def _without_rest_of_area(settings: Mapping[str, float], forward: Forward) -> Mapping[str, float]:
@@ -702,11 +705,11 @@ def _without_rest_of_area(settings: Mapping[str, float], forward: Forward) -> Ma
         return settings
     missing = (PIXEL_RMS / forward.places) ** 2
     level = float(forward.geometry.level_e.mean())
-    variance = diffusion_px(settings) ** 2
+    variance = forward.blur_px(settings) ** 2
     variance += settings.get("brighter_fatter.variance", 0.0) * level / FULL_PIXEL_E
     if abs(variance - missing) > SAME_AREA * missing:
         return settings
-    return {key: value for key, value in settings.items() if key.partition(".")[0] not in BLURS}
+    return {key: value for key, value in settings.items() if not forward.blurs(key.partition(".")[0])}
 
 
 def _settle(

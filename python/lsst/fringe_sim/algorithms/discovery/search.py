@@ -226,7 +226,7 @@ class _Search:
             self._may_take_areas = self._may_judge_orders = False
             self.say("pixels see their area, and the blur is what few places lacked of it")
             self._take(prepare_with_areas(self.prepared, chosen.fit, self._thickness(whole, chosen.fit)))
-            return self.run(refinements=0, known=without_blurs(chosen.fit))
+            return self.run(refinements=0, known=without_blurs(chosen.fit, self.prepared.problem.forward))
         if chosen.names and self.options.is_noise(chosen):
             verdict = self._with_hidden_island(self._of_all_data(whole, chosen))
             if verdict is not None:
