@@ -150,7 +150,7 @@ def test_field_is_judged_again_with_an_effect_in_its_right_order() -> None:
 def test_a_set_is_not_looked_for_twice_from_the_same_fit(selector, monkeypatch) -> None:
     found = selector.improved((JITTER,), selector.null.fit, scan=True)
     tried = []
-    monkeypatch.setattr(Selector, "_starts_in_other_orders", lambda self, fit: tried.append(fit) or [])
+    monkeypatch.setattr(Selector, "_starts_in_other_orders", lambda self, fit, name: tried.append(fit) or [])
     assert selector.improved((JITTER,), selector.null.fit, scan=True) is found
     assert not tried
     # A better fit is a new place to look from.

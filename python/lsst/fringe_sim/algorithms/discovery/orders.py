@@ -64,7 +64,7 @@ def starts_in_other_orders(
     fit : `Fit`
         What is known of the effects so far.
     moved : sequence of `int`
-        Coordinates of the last effect that shift the phase.
+        Coordinates of one effect that shift the phase.
     first_field : `numpy.ndarray`, shape ``(M,)``
         Field that is moved.
     index : `float`
@@ -216,8 +216,8 @@ def _sizes(item: Coordinate) -> FloatArray:
 
 
 def _single_step(fit: Fit, number: int, size: float) -> FloatArray:
-    """Position in which one coordinate of the last effect has another size, its others none."""
-    own = np.array([item.effect == fit.coordinates[-1].effect for item in fit.coordinates])
+    """Position in which one coordinate has another size, and others of its effect none."""
+    own = np.array([item.effect == fit.coordinates[number].effect for item in fit.coordinates])
     position = np.where(own, 0.0, fit.position)
     position[number] = fit.coordinates[number].clip(fit.coordinates[number].coordinate(float(size)))
     return position

@@ -560,8 +560,8 @@ class Selector:
         base : `Fit`
             Where to start.
         scan : `bool`, optional
-            Try sizes from the smallest to the largest of the last effect as well: a strong effect may have
-            several minima.
+            Try sizes from the smallest to the largest of the last effect as well, and of all that shift the phase: a
+            strong effect may have several minima, and one of a pair takes that which suits it alone.
         """
         known = self.hypothesis(names, None, base)
         coordinates = known.fit.coordinates
@@ -571,9 +571,11 @@ class Selector:
         trials = [(start, base.field) for start in starts]
         key = frozenset(names)
         if scan and self._searched.get(key) is not known.fit:
-            trials += self._starts_in_other_orders(known.fit) or [
+            trials += self._starts_in_other_orders(known.fit, known.names[-1]) or [
                 (start, base.field) for start in self._spread_starts(known.fit)
             ]
+            for name in known.names[:-1]:
+                trials += self._starts_in_other_orders(known.fit, name)
         for start, thickness in trials:
             trial = fit_model(self.problem, coordinates, start, thickness, base.levels, rival=known.fit.chi2)
             if trial.chi2 < known.fit.chi2 - 1.0:
@@ -584,21 +586,20 @@ class Selector:
             self._searched[key] = known.fit
         return known
 
-    def _starts_in_other_orders(self, fit: Fit) -> list[tuple[FloatArray, FloatArray]]:
-        """Positions and fields from which the last effect may be found in another fringe order."""
-        moved, index = self._shifts_of_phase(fit), float(self.index.mean())
-        if moved and self.has_many(fit.coordinates[-1].effect):
+    def _starts_in_other_orders(self, fit: Fit, name: str) -> list[tuple[FloatArray, FloatArray]]:
+        """Positions and fields from which one effect of a fit may be found in another fringe order."""
+        moved, index = self._shifts_of_phase(fit, name), float(self.index.mean())
+        if moved and self.has_many(name):
             fields = fields_in_other_orders(self.problem, fit.field, index)
             return [(fit.position, field) for field in fields]
         return starts_in_other_orders(self.problem, fit, moved, self.first_field, index)
 
     def shifts_phase(self, hypothesis: Hypothesis) -> bool:
         """Whether the last effect of a set shifts the phase of the fringes: its fit may be in the wrong order."""
-        return bool(self._shifts_of_phase(hypothesis.fit))
+        return bool(self._shifts_of_phase(hypothesis.fit, hypothesis.names[-1]))
 
-    def _shifts_of_phase(self, fit: Fit) -> list[int]:
-        """Coordinates of the last effect that do, at each wavelength by itself, what a change of thickness does."""
-        name = fit.coordinates[-1].effect
+    def _shifts_of_phase(self, fit: Fit, name: str) -> list[int]:
+        """Coordinates of one effect that do, at each wavelength by itself, what a change of thickness does."""
         if not self.generic or self.problem.forward.is_image_effect(name):
             return []
         without = fit.without(name).held()
@@ -607,8 +608,8 @@ class Selector:
         along = np.einsum("kwyx,wyx->kw", features, slope) ** 2 / (slope**2).sum(axis=(1, 2))
         whole = (features**2).sum(axis=(1, 2, 3))
         part = np.divide(along.sum(axis=1), whole, out=np.zeros(len(whole)), where=whole > 0.0)
-        first = len(fit.coordinates) - len(features)
-        return [first + int(place) for place in np.flatnonzero(part > LIKE_THICKNESS)]
+        own = [number for number, item in enumerate(fit.coordinates) if item.effect == name]
+        return [own[place] for place in np.flatnonzero(part > LIKE_THICKNESS)]
 
     def _spread_starts(self, fit: Fit, *, both_sides: bool = False) -> list[FloatArray]:
         """The fit with its last effect moved to other sizes, from near the null to near the bound."""
