@@ -121,6 +121,23 @@ def test_the_deepest_of_many_minima_is_found_from_far_away(seed: int) -> None:
     assert abs(found.settings[item.key] - hidden) < 2.5 * item.neighbour
 
 
+def test_a_pair_is_found_where_the_first_by_itself_was_in_another_order() -> None:
+    """Insulation makes up for the wavelengths from an order away, and so does the thickness: both have to move back."""
+    case, _ = recorded_case(20501129, "two", 18)
+    assert set(case.names) == {"insulation", "wavelength_scale"}
+    both = [effect for effect in EFFECTS if effect.name in case.names]
+    prepared = prepare(case.cube, FringeModel.from_setup(case.setup), both, 20_000)
+    selector = Selector(
+        prepared.problem, both, prepared.null, prepared.index, first_field=prepared.undistorted_field
+    )
+    alone = selector.improved(("insulation",), prepared.null, scan=True)
+    first = selector.hypothesis(("insulation", "wavelength_scale"), None, alone.fit)
+    found = selector.improved(first.names, first.fit, scan=True)
+    assert found.fit.chi2 < first.fit.chi2 - 1000.0
+    for item, position, sigma in zip(found.fit.coordinates, found.fit.position, found.fit.sigma, strict=True):
+        assert abs(position - item.coordinate(case.values[item.key])) < 4.0 * sigma
+
+
 @pytest.mark.slow
 def test_field_is_judged_again_with_an_effect_in_its_right_order() -> None:
     """A gate that moves the fringes by three orders tears the thickness, which suits errors of all wavelengths."""
