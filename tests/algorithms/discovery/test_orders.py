@@ -122,7 +122,7 @@ def test_the_deepest_of_many_minima_is_found_from_far_away(seed: int) -> None:
 
 
 def test_a_pair_is_found_where_the_first_by_itself_was_in_another_order() -> None:
-    """Insulation makes up for the wavelengths from an order away, and so does the thickness: both have to move back."""
+    """Insulation makes up for the wavelengths from an order away, as the thickness does: both have to move back."""
     case, _ = recorded_case(20501129, "two", 18)
     assert set(case.names) == {"insulation", "wavelength_scale"}
     both = [effect for effect in EFFECTS if effect.name in case.names]

@@ -227,8 +227,9 @@ class _Search:
             self.say("pixels see their area, and the blur is what few places lacked of it")
             self._take(prepare_with_areas(self.prepared, chosen.fit, self._thickness(whole, chosen.fit)))
             return self.run(refinements=0, known=without_blurs(chosen.fit, self.prepared.problem.forward))
-        if chosen.names and self.options.is_noise(chosen):
-            verdict = self._with_hidden_island(self._of_all_data(whole, chosen))
+        if not chosen.names or self.options.is_noise(chosen):
+            found = self._of_all_data(whole, chosen) if chosen.names else whole.null
+            verdict = self._with_hidden_island(found)
             if verdict is not None:
                 return verdict
         return self._conclude(whole, sets, chosen, steps, chance)
