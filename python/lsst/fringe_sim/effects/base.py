@@ -133,13 +133,6 @@ class Effect(ABC):
         """Part of every sample that has the effect, if it is local; shape ``(ny, nx)``."""
         return np.ones(geometry.sample_shape)
 
-    def coverage_moment(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
-        """First moment of that part about the middle of the sample, along rows and columns [samples].
-
-        Shape ``(2, ny, nx)``: the coverage times the place of the middle of what is covered.
-        """
-        return np.zeros((2, *geometry.sample_shape))
-
     def change_response(
         self, response: FloatArray, values: Mapping[str, float], context: ResponseContext
     ) -> FloatArray:
@@ -267,10 +260,6 @@ class ActiveEffect:
     def coverage(self, system: OpticalSystem, geometry: ImageGeometry) -> FloatArray:
         """Part of every sample that has the effect (`Effect.coverage`); ``system`` is the one before any effect."""
         return self.effect.coverage(self.complete_values(system), geometry)
-
-    def coverage_moment(self, system: OpticalSystem, geometry: ImageGeometry) -> FloatArray:
-        """First moment of that part (`Effect.coverage_moment`)."""
-        return self.effect.coverage_moment(self.complete_values(system), geometry)
 
     def is_null(self, system: OpticalSystem) -> bool:
         """Whether every value equals its null, but those that only say where the effect would be."""

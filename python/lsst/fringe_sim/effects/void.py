@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -45,38 +44,17 @@ class Void(PlainNullEffect):
 
     def coverage(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
         """Part of the area of every sample that lies on the island."""
-        edge, _, across = _rim(values, geometry)
+        down = (geometry.y_px - values["centre_y"])[:, np.newaxis]
+        along = (geometry.x_px - values["centre_x"])[np.newaxis, :]
+        distance = np.hypot(down, along)
+        safe = np.maximum(distance, LEAST_SLANT)
+        sides = geometry.cell_px
+        across = [np.maximum(side * np.abs(part) / safe, LEAST_SLANT)
+                  for side, part in zip(sides, (down, along), strict=True)]  # fmt: skip
+        # The rim bends away from a straight edge by half the square of the distance along it, over the radius.
+        square = ((sides[0] * along) ** 2 + (sides[1] * down) ** 2) / (12.0 * safe**2)
+        edge = values["radius"] - distance - 0.5 * square / values["radius"]
         return _below(edge, *across)
-
-    def coverage_moment(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
-        """Its first moment about the middle of every sample, along y and x [samples]."""
-        edge, outward, (down, along) = _rim(values, geometry)
-        return np.stack([
-            np.sign(outward[0]) * _moment_below(edge, down, along) / down,
-            np.sign(outward[1]) * _moment_below(edge, along, down) / along,
-        ])  # fmt: skip
-
-
-def _rim(
-    values: Mapping[str, float], geometry: ImageGeometry
-) -> tuple[FloatArray, tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
-    """How far the rim lies beyond the middle of every sample, and its sides y and x across the rim [px].
-
-    In between, the direction in which it lies, in pixels from the middle of the disc.
-    """
-    down = (geometry.y_px - values["centre_y"])[:, np.newaxis]
-    along = (geometry.x_px - values["centre_x"])[np.newaxis, :]
-    distance = np.hypot(down, along)
-    safe = np.maximum(distance, LEAST_SLANT)
-    sides = geometry.cell_px
-    across = (
-        np.maximum(sides[0] * np.abs(down) / safe, LEAST_SLANT),
-        np.maximum(sides[1] * np.abs(along) / safe, LEAST_SLANT),
-    )
-    # The rim bends away from a straight edge by half the square of the distance along it, over the radius.
-    square = ((sides[0] * along) ** 2 + (sides[1] * down) ** 2) / (12.0 * safe**2)
-    edge = values["radius"] - distance - 0.5 * square / values["radius"]
-    return edge, (down, along), across
 
 
 def _below(edge: FloatArray, one: FloatArray, two: FloatArray) -> FloatArray:
@@ -84,22 +62,9 @@ def _below(edge: FloatArray, one: FloatArray, two: FloatArray) -> FloatArray:
 
     Seen across the edge, its sides ``one`` and ``two`` are a sum of two uniform distributions.
     """
-    half_sum = 0.5 * (one + two)
-    part = (_ramp(edge + 0.5 * one, two, 2) - _ramp(edge - 0.5 * one, two, 2)) / one
+    half_sum, half_difference = 0.5 * (one + two), 0.5 * (one - two)
+    squares = [np.maximum(edge + shift, 0.0) ** 2
+               for shift in (half_sum, half_difference, -half_difference, -half_sum)]  # fmt: skip
+    part = (squares[0] - squares[1] - squares[2] + squares[3]) / (2.0 * one * two)
     # Far inside, differences of large squares have lost their digits.
     return np.asarray(np.where(edge >= half_sum, 1.0, np.clip(part, 0.0, 1.0)))
-
-
-def _moment_below(edge: FloatArray, one: FloatArray, two: FloatArray) -> FloatArray:
-    """Mean of the first of the two distances across the edge, where their sum is below it; 0 where it is not."""
-    ends = edge + 0.5 * one, edge - 0.5 * one
-    inner = (_ramp(ends[0], two, 3) - _ramp(ends[1], two, 3)) / one
-    moment = inner - 0.5 * (_ramp(ends[0], two, 2) + _ramp(ends[1], two, 2))
-    crossed = np.abs(edge) < 0.5 * (one + two)
-    return np.asarray(np.where(crossed, np.minimum(moment, 0.0), 0.0))
-
-
-def _ramp(place: FloatArray, width: FloatArray, order: int) -> FloatArray:
-    """Repeated integral of a uniform distribution about 0: of second order, that of its cumulative distribution."""
-    ends = np.maximum(place + 0.5 * width, 0.0), np.maximum(place - 0.5 * width, 0.0)
-    return np.asarray((ends[0] ** order - ends[1] ** order) / (math.factorial(order) * width))

@@ -46,9 +46,6 @@ MOST_ROWS = 8
 LEAST_SPREAD = 1e-12
 """Variance of the thickness in a cell that is rounding [steps of the table squared]."""
 
-LEAST_PART = 1e-6
-"""Part of a cell that is rounding."""
-
 _BLOCK = 256
 """Cells that a core interpolates at a time."""
 
@@ -317,11 +314,9 @@ class Forward:
         thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
             Thickness at the centres of the cells [µm], within the tables.
         """
-        islands = self._islands(settings)
-        outside_um, inside_um = self._parted(islands, thickness_um)
-        value, slope = self._at_cells(self.table(settings), thickness_um, away_um=outside_um)
-        for (part, _, table), away_um in zip(islands, inside_um, strict=True):
-            inside = self._at_cells(table, thickness_um, away_um=away_um)
+        value, slope = self._at_cells(self.table(settings), thickness_um)
+        for part, table in self._islands(settings):
+            inside = self._at_cells(table, thickness_um)
             value, slope = (
                 all_ + part * (own - all_) for all_, own in zip((value, slope), inside, strict=True)
             )
@@ -384,30 +379,13 @@ class Forward:
         known = {**self.model.effect_settings, **settings}
         return any(self._effect(key.partition(".")[0]).local for key in known)
 
-    def _islands(self, settings: Settings) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-        """Part of every cell, ``(ny, nx)``, that has a local effect, its first moment, and the table there."""
+    def _islands(self, settings: Settings) -> list[tuple[FloatArray, FloatArray]]:
+        """Part of every cell, ``(ny, nx)``, that has a local effect, and the table there."""
         if not self._has_islands(settings):
             return []
         return [
-            (
-                item.coverage(self.model.base_system, self.geometry),
-                item.coverage_moment(self.model.base_system, self.geometry),
-                table,
-            )
+            (item.coverage(self.model.base_system, self.geometry), table)
             for item, table in self._island_tables(settings)
-        ]
-
-    def _parted(
-        self, islands: Sequence[tuple[FloatArray, FloatArray, FloatArray]], thickness_um: FloatArray
-    ) -> tuple[FloatArray | None, list[FloatArray]]:
-        """How much thicker than a cell its part outside all islands is [µm], and its part on each."""
-        if not islands:
-            return None, []
-        gradient = self.gradient(thickness_um)
-        moved = [(gradient * moment).sum(axis=0) for _, moment, _ in islands]
-        rest = 1.0 - np.sum([part for part, _, _ in islands], axis=0)
-        return _over(-np.sum(moved, axis=0), rest), [
-            _over(each, part) for each, (part, _, _) in zip(moved, islands, strict=True)
         ]
 
     def _seen_through(self, table: FloatArray, thickness_um: FloatArray) -> FloatArray:
@@ -423,21 +401,12 @@ class Forward:
         return apply_to_image(active, self.model.base_system, value, self.geometry)
 
     def _at_cells(
-        self,
-        table: FloatArray,
-        thickness_um: FloatArray,
-        rows: NDArray[np.intp] | None = None,
-        away_um: FloatArray | None = None,
+        self, table: FloatArray, thickness_um: FloatArray, rows: NDArray[np.intp] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Value and slope of some rows of a table, averaged over the cells; shape ``(R, ny, nx)``.
-
-        ``away_um`` is by how much the part of the cells that is asked for is thicker than the whole.
-        """
+        """Value and slope of some rows of a table, averaged over the cells; shape ``(R, ny, nx)``."""
         gradient = self.gradient(thickness_um)
         second, fourth = self._spread_in_cell(gradient)
         place, rest = self._at_centroids(thickness_um, gradient)
-        if away_um is not None:
-            place = place + away_um
         used = table if rows is None else table[rows]
         value, slope = (
             part.reshape(len(used), *thickness_um.shape)
@@ -536,7 +505,7 @@ class Forward:
 
     def island_parts(self, settings: Settings) -> list[FloatArray]:
         """Part of every cell that is on the island of each local effect, each ``(ny, nx)``."""
-        return [part for part, _, _ in self._islands(settings)]
+        return [part for part, _ in self._islands(settings)]
 
     def has_island(self, name: str, settings: Settings) -> bool:
         """Whether a local effect is anywhere, and not at its null."""
@@ -627,11 +596,6 @@ class Forward:
     def _image(self, settings: Settings) -> dict[str, float]:
         known = {**self.model.effect_settings, **settings}
         return {key: value for key, value in known.items() if self.is_image_effect(key.split(".")[0])}
-
-
-def _over(moment: FloatArray, part: FloatArray) -> FloatArray:
-    """Mean in a part of the cells; 0 where there is none of it."""
-    return np.divide(moment, part, out=np.zeros(part.shape), where=part > LEAST_PART)
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
