@@ -36,7 +36,7 @@ def reach(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
         touched.append(effect.on_optics(optics, complete).flat_field([15.0, 15.1, 19.0], exposure_of(values)))
     light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
     if effect.on_island is not None:
-        touched.append(effect.on_island((16, 24), complete))
+        touched.append(effect.on_island((16, 24), complete).part)
     if effect.on_silicon is not None:
         touched.append(effect.on_silicon((16, 24), complete))
     if effect.on_light is not None:
@@ -52,7 +52,7 @@ def untouched(effect: HiddenEffect, values: dict[str, float]) -> list[object]:
     light = 1.0 + 0.05 * np.sin(e2v_321((16, 24)) / 0.05)
     everything: list[tuple[object, object]] = [
         (effect.on_optics, setup_optics("ts8_e2v")[0].flat_field([15.0, 15.1, 19.0], exposure_of(values))),
-        (effect.on_island, effect.on_island and effect.on_island((16, 24), effect.complete({}))),
+        (effect.on_island, effect.on_island and effect.on_island((16, 24), effect.complete({})).part),
         (effect.on_silicon, np.zeros((16, 24))),
         (effect.on_light, light),
         (effect.on_charge, 20_000.0 * light),
@@ -190,7 +190,9 @@ def test_an_island_sees_its_own_optics() -> None:
     active = [(BY_NAME["void"], values)]
     assert with_hidden_optics(optics, active) is optics
     islands = hidden_islands(optics, thickness.shape, active)
-    ((part, inside),) = islands
+    ((island, inside),) = islands
+    part, whole = island.part, np.ones(thickness.shape, bool)
+    whole[island.rows, island.columns] = False
     assert part.sum() == pytest.approx(np.pi * 25.0, rel=0.01)
     mixed, outside, gap = (
         SensorSignal.of(*stack).flat(0)
@@ -200,5 +202,21 @@ def test_an_island_sees_its_own_optics() -> None:
             (inside, thickness, [960.0]),
         )
     )
-    np.testing.assert_allclose(mixed, outside + part * (gap - outside), rtol=1e-12)
+    np.testing.assert_allclose(mixed[whole], (outside + part * (gap - outside))[whole], rtol=1e-12)
     assert np.abs(gap - outside).max() > 0.01 * outside.mean()
+
+
+def test_pixels_of_a_rim_see_each_stack_at_the_thickness_of_their_own_part_of_it() -> None:
+    optics, _ = setup_optics("ts8_e2v")
+    values, finer = {"thickness": 120.0, "centre_x": 7.3, "centre_y": 9.1, "radius": 4.6}, 15
+    place = {key: finer * value + finer // 2 for key, value in values.items() if key.startswith("centre")}
+    fine = {"thickness": 120.0, **place, "radius": finer * values["radius"]}
+
+    def flat(size: int, step_um: float, values: dict[str, float]) -> np.ndarray:
+        rows = np.arange(20 * size) - size // 2
+        thickness = 15.0 + step_um / size * np.add.outer(rows, 0.3 * rows)
+        islands = hidden_islands(optics, thickness.shape, [(BY_NAME["void"], values)])
+        return SensorSignal.of(optics, thickness, [960.0], None, islands).flat(0)
+
+    true = flat(finer, 0.05, fine).reshape(20, finer, 20, finer).mean(axis=(1, 3))
+    np.testing.assert_allclose(flat(1, 0.05, values), true, rtol=5e-4)

@@ -133,6 +133,14 @@ class Effect(ABC):
         """Part of every sample that has the effect, if it is local; shape ``(ny, nx)``."""
         return np.ones(geometry.sample_shape)
 
+    def coverage_moments(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
+        """Moments of that part about the middle of the sample, along rows y and columns x [samples, samples²].
+
+        Shape ``(5, ny, nx)``: means over the sample of y, x, y², yx and x² where it is covered, and of 0 elsewhere.
+        """
+        even = np.array([0.0, 0.0, 1.0, 0.0, 1.0]) / 12.0
+        return even[:, np.newaxis, np.newaxis] * self.coverage(values, geometry)
+
     def change_response(
         self, response: FloatArray, values: Mapping[str, float], context: ResponseContext
     ) -> FloatArray:
@@ -260,6 +268,10 @@ class ActiveEffect:
     def coverage(self, system: OpticalSystem, geometry: ImageGeometry) -> FloatArray:
         """Part of every sample that has the effect (`Effect.coverage`); ``system`` is the one before any effect."""
         return self.effect.coverage(self.complete_values(system), geometry)
+
+    def coverage_moments(self, system: OpticalSystem, geometry: ImageGeometry) -> FloatArray:
+        """Moments of that part (`Effect.coverage_moments`)."""
+        return self.effect.coverage_moments(self.complete_values(system), geometry)
 
     def is_null(self, system: OpticalSystem) -> bool:
         """Whether every value equals its null, but those that only say where the effect would be."""

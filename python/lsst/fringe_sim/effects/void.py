@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -44,17 +45,40 @@ class Void(PlainNullEffect):
 
     def coverage(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
         """Part of the area of every sample that lies on the island."""
-        down = (geometry.y_px - values["centre_y"])[:, np.newaxis]
-        along = (geometry.x_px - values["centre_x"])[np.newaxis, :]
-        distance = np.hypot(down, along)
-        safe = np.maximum(distance, LEAST_SLANT)
-        sides = geometry.cell_px
-        across = [np.maximum(side * np.abs(part) / safe, LEAST_SLANT)
-                  for side, part in zip(sides, (down, along), strict=True)]  # fmt: skip
-        # The rim bends away from a straight edge by half the square of the distance along it, over the radius.
-        square = ((sides[0] * along) ** 2 + (sides[1] * down) ** 2) / (12.0 * safe**2)
-        edge = values["radius"] - distance - 0.5 * square / values["radius"]
+        edge, _, across = _rim(values, geometry)
         return _below(edge, *across)
+
+    def coverage_moments(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
+        """Its moments about the middle of every sample: y, x, y², yx, x² [samples]."""
+        edge, outward, (down, along) = _rim(values, geometry)
+        first, second, product = _moments_below(edge, down, along)
+        signs = np.sign(outward[0]), np.sign(outward[1])
+        return np.stack([
+            signs[0] * first[0] / down, signs[1] * first[1] / along,
+            second[0] / down**2, signs[0] * signs[1] * product / (down * along), second[1] / along**2,
+        ])  # fmt: skip
+
+
+def _rim(
+    values: Mapping[str, float], geometry: ImageGeometry
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """How far the rim lies beyond the middle of every sample, and its sides y and x across the rim [px].
+
+    In between, the direction in which it lies, in pixels from the middle of the disc.
+    """
+    down = (geometry.y_px - values["centre_y"])[:, np.newaxis]
+    along = (geometry.x_px - values["centre_x"])[np.newaxis, :]
+    distance = np.hypot(down, along)
+    safe = np.maximum(distance, LEAST_SLANT)
+    sides = geometry.cell_px
+    across = (
+        np.maximum(sides[0] * np.abs(down) / safe, LEAST_SLANT),
+        np.maximum(sides[1] * np.abs(along) / safe, LEAST_SLANT),
+    )
+    # The rim bends away from a straight edge by half the square of the distance along it, over the radius.
+    square = ((sides[0] * along) ** 2 + (sides[1] * down) ** 2) / (12.0 * safe**2)
+    edge = values["radius"] - distance - 0.5 * square / values["radius"]
+    return edge, (down, along), across
 
 
 def _below(edge: FloatArray, one: FloatArray, two: FloatArray) -> FloatArray:
@@ -62,9 +86,54 @@ def _below(edge: FloatArray, one: FloatArray, two: FloatArray) -> FloatArray:
 
     Seen across the edge, its sides ``one`` and ``two`` are a sum of two uniform distributions.
     """
-    half_sum, half_difference = 0.5 * (one + two), 0.5 * (one - two)
-    squares = [np.maximum(edge + shift, 0.0) ** 2
-               for shift in (half_sum, half_difference, -half_difference, -half_sum)]  # fmt: skip
-    part = (squares[0] - squares[1] - squares[2] + squares[3]) / (2.0 * one * two)
+    half_sum = 0.5 * (one + two)
+    part = (_ramp(edge + 0.5 * one, two, 2) - _ramp(edge - 0.5 * one, two, 2)) / one
     # Far inside, differences of large squares have lost their digits.
     return np.asarray(np.where(edge >= half_sum, 1.0, np.clip(part, 0.0, 1.0)))
+
+
+def _moments_below(
+    edge: FloatArray, one: FloatArray, two: FloatArray
+) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray], FloatArray]:
+    """Means of two uniform distances, their squares and their product where their sum is below an edge.
+
+    Their widths are ``one`` and ``two``; means over all of the rectangle, which have 0 beyond the edge.
+    """
+    first = _first_below(edge, one, two), _first_below(edge, two, one)
+    second = _second_below(edge, one, two), _second_below(edge, two, one)
+    below = _below(edge, one, two)
+    once, twice = (
+        (_ramp(edge + 0.5 * one, two, order) - _ramp(edge - 0.5 * one, two, order)) / one for order in (3, 4)
+    )
+    product = 0.5 * (edge**2 * below - 2.0 * (edge * once - twice) - second[0] - second[1])
+    # Where the edge is far away, differences of large numbers have lost their digits.
+    crossed, inside = np.abs(edge) < 0.5 * (one + two), edge > 0.0
+    return (
+        (np.where(crossed, first[0], 0.0), np.where(crossed, first[1], 0.0)),
+        (
+            np.where(crossed, second[0], np.where(inside, one**2 / 12.0, 0.0)),
+            np.where(crossed, second[1], np.where(inside, two**2 / 12.0, 0.0)),
+        ),
+        np.where(crossed, product, 0.0),
+    )
+
+
+def _first_below(edge: FloatArray, one: FloatArray, two: FloatArray) -> FloatArray:
+    """Mean of the first of two uniform distances where their sum is below the edge."""
+    ends = edge + 0.5 * one, edge - 0.5 * one
+    once = (_ramp(ends[0], two, 3) - _ramp(ends[1], two, 3)) / one
+    return np.asarray(once - 0.5 * (_ramp(ends[0], two, 2) + _ramp(ends[1], two, 2)))
+
+
+def _second_below(edge: FloatArray, one: FloatArray, two: FloatArray) -> FloatArray:
+    """Mean of the square of the first of two uniform distances where their sum is below the edge."""
+    ends = edge + 0.5 * one, edge - 0.5 * one
+    twice = 2.0 * (_ramp(ends[0], two, 4) - _ramp(ends[1], two, 4)) / one
+    once = _ramp(ends[0], two, 3) + _ramp(ends[1], two, 3)
+    return np.asarray(0.25 * one * (_ramp(ends[0], two, 2) - _ramp(ends[1], two, 2)) - once + twice)
+
+
+def _ramp(place: FloatArray, width: FloatArray, order: int) -> FloatArray:
+    """Repeated integral of a uniform distribution about 0: of second order, that of its cumulative distribution."""
+    ends = np.maximum(place + 0.5 * width, 0.0), np.maximum(place - 0.5 * width, 0.0)
+    return np.asarray((ends[0] ** order - ends[1] ** order) / (math.factorial(order) * width))

@@ -26,6 +26,7 @@ __all__ = [
     "AmplifierState",
     "HiddenEffect",
     "HiddenParameter",
+    "Island",
     "added_silicon",
     "hidden_islands",
     "validate_effects",
@@ -38,6 +39,9 @@ Values = Mapping[str, float]
 AMPLIFIER_NAMES = tuple(f"C{row}{column}" for row in (1, 0) for column in range(8))
 REFERENCE_CHARGE_E = 100_000.0
 """Charge at which the coefficient of the non-linearity is stated [electrons]."""
+
+RIM_SQUARES, RIM_POINTS = 8, 8
+"""Squares along a side of a pixel that a rim crosses, and points along the side of each."""
 
 COLOUR_PIVOT_NM, COLOUR_REACH_NM = 935.0, 50.0
 """Wavelength at which a chromatic illumination is even, and distance to that at which its numbers are stated [nm]."""
@@ -93,6 +97,26 @@ class AmplifierState:
         return self.dark_e + self.dark_rate_e * seconds
 
 
+@dataclass(frozen=True, eq=False)
+class Island:
+    """Where on a sensor something is.
+
+    Attributes
+    ----------
+    part : `numpy.ndarray` [y, x]
+        Part of every pixel that lies on it.
+    rows, columns : `numpy.ndarray`, shape ``(N,)``
+        Pixels that its rim may cross.
+    squares : `numpy.ndarray`, shape ``(N, RIM_SQUARES, RIM_SQUARES)``
+        Part of each of the equal squares in these pixels, along y and x, that lies on it.
+    """
+
+    part: FloatArray
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    squares: FloatArray
+
+
 @dataclass(frozen=True)
 class HiddenEffect:
     """An effect and the one or two places at which it acts.
@@ -106,7 +130,7 @@ class HiddenEffect:
     on_optics : callable, optional
         ``(optics, values) -> optics``.
     on_island : callable, optional
-        ``(shape, values) -> part [y, x]`` of every pixel that sees what `on_optics` makes; by default all do.
+        ``(shape, values) -> island``, the part of the sensor that sees what `on_optics` makes; by default all does.
     on_silicon : callable, optional
         ``(shape, values) -> thickness [y, x]``, what is added to the detection layer [µm].
     on_light : callable, optional
@@ -121,7 +145,7 @@ class HiddenEffect:
     title: str
     parameters: tuple[HiddenParameter, ...]
     on_optics: Callable[[FlatFieldOptics, Values], FlatFieldOptics] | None = None
-    on_island: Callable[[tuple[int, int], Values], FloatArray] | None = None
+    on_island: Callable[[tuple[int, int], Values], Island] | None = None
     on_silicon: Callable[[tuple[int, int], Values], FloatArray] | None = None
     on_light: Callable[[FloatArray, float, Values], FloatArray] | None = None
     on_charge: Callable[[FloatArray, Values], FloatArray] | None = None
@@ -369,8 +393,8 @@ def with_hidden_optics(optics: FlatFieldOptics, active: Iterable[ActiveHiddenEff
 
 def hidden_islands(
     optics: FlatFieldOptics, shape: tuple[int, int], active: Iterable[ActiveHiddenEffect]
-) -> list[tuple[FloatArray, FlatFieldOptics]]:
-    """Part of every pixel that sees other optics than the rest of the sensor, and these optics."""
+) -> list[tuple[Island, FlatFieldOptics]]:
+    """What sees other optics than the rest of the sensor, and these optics."""
     return [
         (effect.on_island(shape, effect.complete(values)), effect.on_optics(optics, effect.complete(values)))
         for effect, values in active
@@ -378,17 +402,22 @@ def hidden_islands(
     ]
 
 
-def _disc(shape: tuple[int, int], values: Values) -> FloatArray:
-    """Part of every pixel inside a circle, by 64 × 64 points in each that the circle may cross."""
+def _disc(shape: tuple[int, int], values: Values) -> Island:
+    """What lies inside a circle, by points in each pixel that the circle may cross."""
     y, x = (np.arange(size, dtype=float) for size in shape)
     away = np.hypot(y[:, np.newaxis] - values["centre_y"], x[np.newaxis, :] - values["centre_x"])
     part = (away < values["radius"]).astype(float)
-    point = (np.arange(64) + 0.5) / 64.0 - 0.5
-    for row, column in zip(*np.nonzero(np.abs(away - values["radius"]) < 1.0), strict=True):
+    rows, columns = np.nonzero(np.abs(away - values["radius"]) < 1.0)
+    number = RIM_SQUARES * RIM_POINTS
+    point = (np.arange(number) + 0.5) / number - 0.5
+    squares = np.empty((len(rows), RIM_SQUARES, RIM_SQUARES))
+    for place, (row, column) in enumerate(zip(rows, columns, strict=True)):
         up = (y[row] + point - values["centre_y"])[:, np.newaxis]
         along = (x[column] + point - values["centre_x"])[np.newaxis, :]
-        part[row, column] = np.mean(np.hypot(up, along) < values["radius"])
-    return part
+        inside = np.hypot(up, along) < values["radius"]
+        squares[place] = inside.reshape(RIM_SQUARES, RIM_POINTS, RIM_SQUARES, RIM_POINTS).mean(axis=(1, 3))
+    part[rows, columns] = squares.mean(axis=(1, 2))
+    return Island(part, rows, columns, squares)
 
 
 def added_silicon(shape: tuple[int, int], active: Iterable[ActiveHiddenEffect]) -> FloatArray | None:

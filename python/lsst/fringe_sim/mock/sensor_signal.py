@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from .hidden_effects import ActiveHiddenEffect, added_silicon, hidden_islands
+from .hidden_effects import RIM_SQUARES, ActiveHiddenEffect, Island, added_silicon, hidden_islands
 from .optics import FlatFieldOptics, SignalTable
 from .thickness import PixelArea
 
@@ -37,14 +37,14 @@ class SensorSignal:
     tables : `tuple` [`SignalTable`, ...]
         Signal against the thickness of the varying layer.
     islands : `tuple`
-        Part of every pixel [y, x] that sees other optics, and the signal of a sensor that has them everywhere.
+        What sees other optics, and the signal of a sensor that has them everywhere.
     """
 
     area: PixelArea
     thicker_um: FloatArray
     added_um: FloatArray
     tables: tuple[SignalTable, ...]
-    islands: tuple[tuple[FloatArray, SensorSignal], ...] = ()
+    islands: tuple[tuple[Island, SensorSignal], ...] = ()
 
     @classmethod
     def of(
@@ -53,11 +53,11 @@ class SensorSignal:
         thickness_um: FloatArray,
         wavelengths_nm: Sequence[float],
         thicker_um: FloatArray | None = None,
-        islands: Sequence[tuple[FloatArray, FlatFieldOptics]] = (),
+        islands: Sequence[tuple[Island, FlatFieldOptics]] = (),
     ) -> SensorSignal:
         """Tabulate what the pixels need.
 
-        ``thicker_um`` is added to the detection layer, by default nothing; ``islands`` are parts of the pixels that
+        ``thicker_um`` is added to the detection layer, by default nothing; ``islands`` are parts of the sensor that
         see other optics.
         """
         area = PixelArea.of(thickness_um)
@@ -72,7 +72,7 @@ class SensorSignal:
             for more in added
         )
         others = tuple(
-            (part, cls.of(inside, thickness_um, wavelengths_nm, thicker_um)) for part, inside in islands
+            (island, cls.of(inside, thickness_um, wavelengths_nm, thicker_um)) for island, inside in islands
         )
         return cls(area, wedge, added, tables, others)
 
@@ -90,11 +90,32 @@ class SensorSignal:
         return cls.of(optics, thickness_um, wavelengths_nm, silicon, islands)
 
     def flat(self, row: int) -> FloatArray:
-        """Signal of one flat."""
+        """Signal of one flat.
+
+        Pixels that the rim of an island crosses see each stack at the thickness of their own part of it.
+        """
         signal = self._of_all(row)
-        for part, inside in self.islands:
-            signal = signal + part * (inside.flat(row) - signal)
+        for island, inside in self.islands:
+            difference = island.part * (inside.flat(row) - signal)
+            rim = island.rows, island.columns
+            there = inside._in_squares(row, *rim) - self._in_squares(row, *rim)
+            difference[rim] = (island.squares * there).mean(axis=(1, 2))
+            signal = signal + difference
         return signal
+
+    def _in_squares(self, row: int, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> FloatArray:
+        """Signal in the middle of the equal squares of some pixels, without islands."""
+        middle = (np.arange(RIM_SQUARES) + 0.5) / RIM_SQUARES - 0.5
+        rim = rows, columns
+        thickness, slope_y, slope_x = (
+            values[rim][:, np.newaxis, np.newaxis]
+            for values in (self.area.thickness_um, self.area.slope_y, self.area.slope_x)
+        )
+        within = thickness + slope_y * middle[:, np.newaxis] + slope_x * middle
+        added = np.broadcast_to(self.thicker_um[rim][:, np.newaxis, np.newaxis], within.shape)
+        flat = np.zeros(within.shape)
+        points = SensorSignal(PixelArea(within, flat, flat), added, self.added_um, self.tables)
+        return points._of_all(row)
 
     def _of_all(self, row: int) -> FloatArray:
         """Signal outside islands, in a straight line between detection layers."""

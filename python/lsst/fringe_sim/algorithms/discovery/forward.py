@@ -46,6 +46,12 @@ MOST_ROWS = 8
 LEAST_SPREAD = 1e-12
 """Variance of the thickness in a cell that is rounding [steps of the table squared]."""
 
+UNIFORM = 1.8
+"""Fourth moment of what is uniform, over the square of its second."""
+
+LEAST_PART = 1e-6
+"""Part of a cell that is rounding."""
+
 _BLOCK = 256
 """Cells that a core interpolates at a time."""
 
@@ -83,6 +89,31 @@ class Exposures(Protocol):
 
     def further(self) -> Sequence[tuple[str, str, Exposures]]:
         """Exposures that could be taken: a key, what to take, the present ones with as many of those behind them."""
+
+
+@dataclass(frozen=True, eq=False)
+class _PartOfCells:
+    """Thickness in a part of every cell, relative to that of the cell.
+
+    Attributes
+    ----------
+    away_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Its mean [µm].
+    second, fourth : `numpy.ndarray`, shape ``(ny, nx)``
+        Its moments about that [µm², µm⁴].
+    """
+
+    away_um: FloatArray
+    second: FloatArray
+    fourth: FloatArray
+
+    @classmethod
+    def of(cls, part: FloatArray, moments: FloatArray, whole: tuple[FloatArray, FloatArray]) -> _PartOfCells:
+        """From the means over the cells of the thickness and its square in the part, and the moments of the whole."""
+        some = (part > LEAST_PART) & (part < 1.0 - LEAST_PART)
+        away, square = (np.divide(each, part, out=np.zeros(part.shape), where=some) for each in moments)
+        second = np.where(some, np.maximum(square - away**2, 0.0), whole[0])
+        return cls(away, second, np.where(some, UNIFORM * second**2, whole[1]))
 
 
 @dataclass(eq=False)
@@ -314,9 +345,11 @@ class Forward:
         thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
             Thickness at the centres of the cells [µm], within the tables.
         """
-        value, slope = self._at_cells(self.table(settings), thickness_um)
-        for part, table in self._islands(settings):
-            inside = self._at_cells(table, thickness_um)
+        islands = self._islands(settings)
+        outside, *on = self._parted(islands, thickness_um)
+        value, slope = self._at_cells(self.table(settings), thickness_um, seen=outside)
+        for (part, _, table), seen in zip(islands, on, strict=True):
+            inside = self._at_cells(table, thickness_um, seen=seen)
             value, slope = (
                 all_ + part * (own - all_) for all_, own in zip((value, slope), inside, strict=True)
             )
@@ -379,13 +412,34 @@ class Forward:
         known = {**self.model.effect_settings, **settings}
         return any(self._effect(key.partition(".")[0]).local for key in known)
 
-    def _islands(self, settings: Settings) -> list[tuple[FloatArray, FloatArray]]:
-        """Part of every cell, ``(ny, nx)``, that has a local effect, and the table there."""
+    def _islands(self, settings: Settings) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+        """Part of every cell, ``(ny, nx)``, that has a local effect, its moments, and the table there."""
         if not self._has_islands(settings):
             return []
         return [
-            (item.coverage(self.model.base_system, self.geometry), table)
+            (
+                item.coverage(self.model.base_system, self.geometry),
+                item.coverage_moments(self.model.base_system, self.geometry),
+                table,
+            )
             for item, table in self._island_tables(settings)
+        ]
+
+    def _parted(
+        self, islands: Sequence[tuple[FloatArray, FloatArray, FloatArray]], thickness_um: FloatArray
+    ) -> list[_PartOfCells | None]:
+        """Thickness in what lies outside all islands, and on each of them."""
+        if not islands:
+            return [None]
+        gradient = self.gradient(thickness_um)
+        whole = self._spread_of_pixels(gradient)
+        parts = [part for part, _, _ in islands]
+        moments = [_along(gradient, moment) for _, moment, _ in islands]
+        rest = 1.0 - np.sum(parts, axis=0)
+        left = np.stack([np.zeros(rest.shape), whole[0]]) - np.sum(moments, axis=0)
+        return [
+            _PartOfCells.of(part, moment, whole)
+            for part, moment in zip([rest, *parts], [left, *moments], strict=True)
         ]
 
     def _seen_through(self, table: FloatArray, thickness_um: FloatArray) -> FloatArray:
@@ -401,12 +455,19 @@ class Forward:
         return apply_to_image(active, self.model.base_system, value, self.geometry)
 
     def _at_cells(
-        self, table: FloatArray, thickness_um: FloatArray, rows: NDArray[np.intp] | None = None
+        self,
+        table: FloatArray,
+        thickness_um: FloatArray,
+        rows: NDArray[np.intp] | None = None,
+        seen: _PartOfCells | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Value and slope of some rows of a table, averaged over the cells; shape ``(R, ny, nx)``."""
+        """Value and slope of some rows of a table, averaged over the cells or a part; shape ``(R, ny, nx)``."""
         gradient = self.gradient(thickness_um)
-        second, fourth = self._spread_in_cell(gradient)
+        spread = self._spread_of_pixels(gradient)
         place, rest = self._at_centroids(thickness_um, gradient)
+        if seen is not None:
+            place, spread = place + seen.away_um, (seen.second, seen.fourth)
+        second, fourth = self._without_scatter(*spread)
         used = table if rows is None else table[rows]
         value, slope = (
             part.reshape(len(used), *thickness_um.shape)
@@ -505,7 +566,7 @@ class Forward:
 
     def island_parts(self, settings: Settings) -> list[FloatArray]:
         """Part of every cell that is on the island of each local effect, each ``(ny, nx)``."""
-        return [part for part, _ in self._islands(settings)]
+        return [part for part, _, _ in self._islands(settings)]
 
     def has_island(self, name: str, settings: Settings) -> bool:
         """Whether a local effect is anywhere, and not at its null."""
@@ -546,7 +607,10 @@ class Forward:
         Pixels of a cell average the fringes. A thickness that is known only so well averages them once more, in the
         mean over many cells: as much is taken off before.
         """
-        second, fourth = self._spread_of_pixels(gradient)
+        return self._without_scatter(*self._spread_of_pixels(gradient))
+
+    def _without_scatter(self, second: FloatArray, fourth: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Moments of the thickness less those of the scatter of its place."""
         if self.scatter_um2 is None:
             return second, fourth
         scatter = self.scatter_um2
@@ -596,6 +660,14 @@ class Forward:
     def _image(self, settings: Settings) -> dict[str, float]:
         known = {**self.model.effect_settings, **settings}
         return {key: value for key, value in known.items() if self.is_image_effect(key.split(".")[0])}
+
+
+def _along(gradient: FloatArray, moments: FloatArray) -> FloatArray:
+    """First and second moment of the thickness, ``(2, ny, nx)``, from those of the places ``(5, ny, nx)``."""
+    down, along = gradient
+    first = down * moments[0] + along * moments[1]
+    second = down**2 * moments[2] + 2.0 * down * along * moments[3] + along**2 * moments[4]
+    return np.stack([first, second])
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
