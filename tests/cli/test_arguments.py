@@ -167,6 +167,7 @@ def test_what_a_search_has_found_goes_into_fit_and_sky(tmp_path: Path, capsys) -
         'config.effects["bandwidth.fwhm"] = ',
         'config.effects["',
         "config.effects[\"bandwidth.fwhm'] = 2.0",
+        '    config.effects["bandwidth.fwhm"] = 2.0',
     ],
 )
 def test_overrides_with_anything_else_are_refused(line: str, tmp_path: Path) -> None:
@@ -174,7 +175,7 @@ def test_overrides_with_anything_else_are_refused(line: str, tmp_path: Path) -> 
     path.write_text(f"{OVERRIDE}{line}\n", encoding="utf-8")
     with pytest.raises(InputError, match=re.escape(str(path))) as caught:
         read_settings(path)
-    assert caught.value.value == line.strip()
+    assert caught.value.value == line.rstrip()
 
 
 def test_overrides_may_be_written_by_hand(tmp_path: Path) -> None:

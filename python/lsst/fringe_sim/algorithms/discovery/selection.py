@@ -589,7 +589,9 @@ class Selector:
     def _starts_in_other_orders(self, fit: Fit, name: str) -> list[tuple[FloatArray, FloatArray]]:
         """Positions and fields from which one effect of a fit may be found in another fringe order."""
         moved, index = self._shifts_of_phase(fit, name), float(self.index.mean())
-        if moved and self.has_many(name):
+        if not moved:
+            return []
+        if self.has_many(name):
             fields = fields_in_other_orders(self.problem, fit.field, index)
             return [(fit.position, field) for field in fields]
         return starts_in_other_orders(self.problem, fit, moved, self.first_field, index)

@@ -341,8 +341,8 @@ def read_effects_override(text: str, source: str | None = None) -> dict[str, flo
         A line that is anything else.
     """
     found: dict[str, float] = {}
-    for line in map(str.strip, text.splitlines()):
-        if not line or line.startswith("#"):
+    for line in map(str.rstrip, text.splitlines()):
+        if not line or line.lstrip().startswith("#"):
             continue
         statement = _STATEMENT.fullmatch(line)
         try:
