@@ -7,8 +7,11 @@ import pytest
 
 from lsst.fringe_sim.algorithms.discovery import discs as discs_module
 from lsst.fringe_sim.algorithms.discovery import islands
+from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
+from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
 from lsst.fringe_sim.algorithms.discovery.discs import Discs
-from lsst.fringe_sim.algorithms.discovery.fit import coordinates_of
+from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, coordinates_of, fit_model
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.effects import EFFECTS
@@ -82,3 +85,37 @@ def test_stains_are_no_islands(monkeypatch: pytest.MonkeyPatch, kind: str, cause
     assert is_offered() == found
     monkeypatch.setattr(islands, "DOUBT", np.inf)
     assert is_offered()
+
+
+@pytest.fixture(scope="module")
+def steep() -> tuple[Problem, Fit, np.ndarray]:
+    """A strong void, its fit at the truth, and the true thickness."""
+    rng = np.random.default_rng([3, 9001]).spawn(2)[0]
+    case = draw_case("one", rng, size=(96, 96), only=["void"])
+    cells, truth = bin_cube(case.cube, 1), case.thickness_um
+    limits = (float(truth.min()) - 1.0, float(truth.max()) + 1.0)
+    forward = Forward.of_cells(FringeModel.from_setup(case.setup), EFFECTS, cells, limits)
+    problem = Problem(cells, forward, CellBasis(truth.shape), np.eye(len(cells.value)))
+    (void,) = (effect for effect in EFFECTS if effect.name == "void")
+    own = coordinates_of(void, forward, truth)
+    position = np.array([item.coordinate(case.values[item.key]) for item in own])
+    return problem, fit_model(problem, own, position, truth.ravel(), iterations=0), truth
+
+
+def test_an_island_that_is_torn_between_orders_is_mended(steep) -> None:
+    problem, fit, truth = steep
+    on = problem.forward.on_islands(fit.settings)
+    right = on & (np.arange(truth.shape[1]) > np.flatnonzero(on.any(axis=0)).mean())
+    torn = np.where(right, truth - problem.order_um, truth)
+    found = islands.mended_on_islands(problem, fit, torn, truth)
+    assert right.sum() > 100
+    assert np.abs(found - truth).max() < 0.5 * problem.order_um
+    assert np.median(np.abs(found - truth)[right]) < 0.02 * problem.order_um
+    np.testing.assert_array_equal(found[~right], truth[~right])
+
+
+def test_an_island_stays_as_it_is_where_its_order_suits_the_data_better(steep, monkeypatch) -> None:
+    """What is about it may lead to another order."""
+    problem, fit, truth = steep
+    monkeypatch.setattr(islands, "continued", lambda field, known: field - problem.order_um)
+    np.testing.assert_array_equal(islands.mended_on_islands(problem, fit, truth, truth), truth)

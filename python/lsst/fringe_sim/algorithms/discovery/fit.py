@@ -15,6 +15,7 @@ from scipy.linalg import block_diag
 from ...effects import Effect, Parameter
 from .basis import FieldBasis, NormalMatrix
 from .cells import CellData
+from .comparison import chi2_with_free_levels
 from .forward import Forward, Prediction
 
 __all__ = [
@@ -399,6 +400,12 @@ class Problem:
         """Data that a fit says."""
         value = self.forward.predict(fit.settings, self.basis.expand(fit.field)).value
         return self.expected(fit.levels, value)
+
+    def chi2_at(self, settings: Mapping[str, float], thickness_um: FloatArray) -> float:
+        """χ² of effects at a thickness of every cell [µm], with the best level at each wavelength."""
+        self.forward.cover(thickness_um)
+        value = self.forward.predict(settings, thickness_um).value
+        return chi2_with_free_levels(value, self.cells.value, self.cells.weight)
 
     def level_columns(self, value: FloatArray, whiten: Whitener) -> PlaneColumns:
         """Derivatives of the expected data with respect to the levels."""

@@ -15,6 +15,7 @@ from ..parabola import parabolic_minimum
 from .cells import CellData
 from .channels import State, beside_thickness
 from .comparison import chi2_with_free_fringes, local_minima
+from .continuation import continued
 from .discs import Disc, Discs
 from .fit import Coordinate, Fit, Problem
 from .thickness_steps import best_thickness_step
@@ -23,6 +24,7 @@ __all__ = [
     "IslandStart",
     "followed_on_island",
     "island_starts",
+    "mended_on_islands",
     "placed_on_island",
     "start_at_step",
     "thickness_on_islands",
@@ -48,6 +50,9 @@ SHIFTS_PER_ORDER = 20
 COMPARED_THICKNESSES = 120
 ISLAND_CELLS = 400
 """Shifts of the thickness in a fringe order, and the thicknesses or cells on which they are compared."""
+
+ANOTHER_ORDER = 0.5
+"""Fringe orders from which on a thickness is another one, to which no fit gets by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,6 +264,33 @@ def thickness_on_islands(
         if about is not None:
             found = np.where(unknown, about.chi2(fit.settings)[1], found)
     return found
+
+
+def mended_on_islands(
+    problem: Problem, fit: Fit, thickness_um: FloatArray, around_um: FloatArray
+) -> FloatArray:
+    """Thickness with islands in the fringe order of what is about them, if that lies better on the data [µm].
+
+    Without the local effect the fringes there belong to another thickness, and where they are narrow a fit leaves
+    part of an island in another order than the rest.
+
+    Parameters
+    ----------
+    problem : `Problem`
+        Data and model.
+    fit : `Fit`
+        Fit with the local effects.
+    thickness_um, around_um : `numpy.ndarray`, shape ``(ny, nx)``
+        Thickness of the fit, for cells on islands, and one for all others [µm].
+    """
+    on = problem.forward.on_islands(fit.settings)
+    torn = np.where(on, thickness_um, around_um)
+    known = ~on & problem.cells.seen
+    if not on.any() or not known.any():
+        return torn
+    whole = thickness_on_islands(problem, fit, np.where(on, continued(around_um, known), around_um), on)
+    mended = np.where(np.abs(whole - torn) > ANOTHER_ORDER * problem.order_um, whole, torn)
+    return min(torn, mended, key=lambda thickness: problem.chi2_at(fit.settings, thickness))
 
 
 def _moved(

@@ -22,6 +22,7 @@ from .comparison import chi2_with_free_fringes, fringe_order_um
 from .fit import Fit, Problem, fit_model, linearise_at
 from .forward import Exposures, Forward
 from .growth import grown_thickness
+from .islands import mended_on_islands
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share, noise_ratio
 from .outliers import spoiled_cells
 from .start import mended_thickness, starting_thickness
@@ -481,7 +482,7 @@ def _mended(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[Float
     start = mended_thickness(model, problem.cells, thickness_um)
     start = _better_start(problem, fit.settings, start, starting_thickness(model, problem.cells))
     # Elsewhere the fringes are not those of the island of a local effect.
-    start = np.where(problem.forward.on_islands(fit.settings), thickness_um, start)
+    start = mended_on_islands(problem, fit, thickness_um, start)
     if not any(problem.forward.couples_pixels(item.effect) for item in fit.coordinates):
         return start, dict(fit.settings)
     if _is_blurred(problem.forward, fit.settings):

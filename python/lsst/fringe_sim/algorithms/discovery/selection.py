@@ -14,7 +14,7 @@ from scipy.stats import ncx2
 from ...effects import Effect
 from ...errors import InputError
 from .channels import Channel, State, combined_probability, measure_channels
-from .comparison import chi2_with_free_levels, local_minima
+from .comparison import local_minima
 from .evidence import log_evidence, prior_cost
 from .fit import (
     Coordinate,
@@ -791,20 +791,14 @@ class Selector:
         thickness = self.problem.basis.expand(field_start)
         self.problem.forward.cover(thickness)
         settings = {item.key: item.value(x) for item, x in zip(coordinates, position, strict=True)}
-        cells, forward = self.problem.cells, self.problem.forward
-        if forward.is_island(name):
-            return self.problem.basis.fit(
-                self._moved_on_island(name, settings, thickness, levels), cells.seen.astype(float)
-            )
-
-        def misfit(place: FloatArray) -> float:
-            return chi2_with_free_levels(forward.predict(settings, place).value, cells.value, cells.weight)
-
-        moved = min(self._follower(thickness).places(settings), key=misfit)
+        seen = self.problem.cells.seen.astype(float)
+        if self.problem.forward.is_island(name):
+            return self.problem.basis.fit(self._moved_on_island(name, settings, thickness, levels), seen)
+        places = self._follower(thickness).places(settings)
+        moved = min(places, key=lambda place: self.problem.chi2_at(settings, place))
         if np.abs(moved - thickness).max() < LEAST_MOVE_UM:
             return field_start
-        forward.cover(moved)
-        return self.problem.basis.fit(moved, cells.seen.astype(float))
+        return self.problem.basis.fit(moved, seen)
 
     def with_channels(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis with its residual tested."""

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from .comparison import chi2_with_free_levels
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
 from .islands import thickness_on_islands
@@ -109,13 +108,13 @@ def whole_thickness(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) 
         beyond = continued_thickness(problem, fit, held_out)
         near = np.where(binary_dilation(on_islands, iterations=NEAR_ISLAND), beyond, everywhere)
         trials = [thickness_on_islands(problem, fit, first, held_out) for first in (everywhere, near, beyond)]
-        return min(trials, key=lambda thickness: _chi2_at(rest, fit, thickness))
+        return min(trials, key=lambda thickness: rest.chi2_at(fit.settings, thickness))
     ratio = rest.cells.n_values / max(problem.cells.n_values - rest.cells.n_values, 1)
-    chi2 = _chi2_at(rest, fit, everywhere)
+    chi2 = rest.chi2_at(fit.settings, everywhere)
     if chi2 < MUCH_WORSE * ratio * fit.chi2:
         return everywhere
     beyond = continued_thickness(problem, fit, held_out)
-    return beyond if _chi2_at(rest, fit, beyond) < chi2 else everywhere
+    return beyond if rest.chi2_at(fit.settings, beyond) < chi2 else everywhere
 
 
 def thickness_starts(problem: Problem, null: Fit, fit: Fit, held_out: BoolArray) -> list[FloatArray]:
@@ -137,13 +136,6 @@ def continued_thickness(problem: Problem, fit: Fit, held_out: BoolArray) -> Floa
     """Thickness of a fit to a part of the cells, continued into those held out."""
     thickness_um = problem.basis.expand(fit.field)
     return np.where(held_out, continued(thickness_um, ~held_out & problem.cells.seen), thickness_um)
-
-
-def _chi2_at(problem: Problem, fit: Fit, thickness_um: FloatArray) -> float:
-    """χ² of a thickness with the effects of a fit, levels free."""
-    problem.forward.cover(thickness_um)
-    value = problem.forward.predict(fit.settings, thickness_um).value
-    return chi2_with_free_levels(value, problem.cells.value, problem.cells.weight)
 
 
 def _moved_everywhere(
@@ -257,4 +249,4 @@ def _field_freedom(problem: Problem) -> int:
 
 def _predicted_chi2(problem: Problem, fit: Fit) -> float:
     """χ² of data that took no part in a fit, with their levels adjusted."""
-    return _chi2_at(problem, fit, problem.basis.expand(fit.field))
+    return problem.chi2_at(fit.settings, problem.basis.expand(fit.field))
