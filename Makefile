@@ -33,7 +33,7 @@ types: $(VENV)/.ready-test
 
 # Two workers share the processors: threads of one that wait by spinning would keep the other from them.
 unit: $(VENV)/.ready-test
-	OMP_WAIT_POLICY=passive OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal $(PYTEST_ARGS)
+	OMP_WAIT_POLICY=passive OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal --durations=40 --durations-min=20 $(PYTEST_ARGS)
 
 docs: $(VENV)/.ready-test
 	$(BIN)/python -m sphinx -b html -W --keep-going -q doc doc/_build
