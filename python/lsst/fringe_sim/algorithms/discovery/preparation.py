@@ -25,6 +25,7 @@ from .growth import grown_thickness
 from .islands import mended_on_islands
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share, noise_ratio
 from .outliers import spoiled_cells
+from .planes import is_torn, joined_planes
 from .start import mended_thickness, starting_thickness
 
 __all__ = [
@@ -47,8 +48,9 @@ MUCH_SMOOTHER = 0.5
 """Knots that a field is tried with [cells], and the part of its coefficients that a much smoother one has at most."""
 
 SMOOTH_SPACING = 8.0
-MUCH_BETTER = 0.7
-"""Knots with which two thicknesses are compared [cells], and the χ² for which one is taken for the other."""
+MUCH_BETTER, CLEARLY_BETTER = 0.7, 0.995
+"""Knots with which two thicknesses are compared [cells], and the part of χ² for which one is taken for the other: as
+they are, and once fitted."""
 
 FARTHEST_K, SAME_K = 5.0, 0.5
 """How far the temperature of flats may be from that of the set-up, and how far it is taken to be the same [K]."""
@@ -285,7 +287,9 @@ def _prepare_in_cells(
     forward = Forward.of_cells(model, effects, cells, (float(start.min()) - 0.5, float(start.max()) + 0.5))
     if not _is_rich(cells):
         return _prepare_few(cells, forward, start, index)
-    return _prepare_rich(cells, forward, start, index, {})
+    problem = Problem(cells, forward, CellBasis(start.shape), _free_levels(cells))
+    joined = _joined(problem, fit_model(problem, (), np.zeros(0), start.ravel(), iterations=0), start)
+    return _prepare_rich(cells, forward, start if joined is None else joined[0], index, {})
 
 
 def prepare_finer(
@@ -481,6 +485,9 @@ def _mended(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[Float
     model = problem.forward.model_with(fit.settings)
     start = mended_thickness(model, problem.cells, thickness_um)
     start = _better_start(problem, fit.settings, start, starting_thickness(model, problem.cells))
+    joined = _joined(problem, fit, start)
+    if joined is not None:
+        start, fit = joined
     # Elsewhere the fringes are not those of the island of a local effect.
     start = mended_on_islands(problem, fit, thickness_um, start)
     if not any(problem.forward.couples_pixels(item.effect) for item in fit.coordinates):
@@ -489,6 +496,29 @@ def _mended(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[Float
         problem = replace(problem, forward=problem.forward.with_places(0))
     grown = grown_thickness(problem, fit, start)
     return (start, dict(fit.settings)) if grown is None else (grown.thickness_um, grown.settings)
+
+
+def _joined(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[FloatArray, Fit] | None:
+    """Thickness through planes on the fringes of many cells each, where one that is torn lies worse on the data.
+
+    Both are fitted with as few knots, effects included: what single cells add to a torn one is noise.
+    """
+    if not is_torn(thickness_um, problem.cells.seen, problem.order_um):
+        return None
+    planes = joined_planes(problem.forward.model_with(fit.settings), problem.cells, thickness_um)
+    if planes is None:
+        return None
+    rows, columns = thickness_um.shape
+    smooth = replace(problem, basis=SplineBasis.of_grid((rows, columns), SMOOTH_SPACING))
+    torn, joined = (_fitted_smooth(smooth, fit, thickness) for thickness in (thickness_um, planes))
+    if joined.chi2 > CLEARLY_BETTER * torn.chi2:
+        return None
+    return smooth.basis.expand(joined.field), replace(fit, settings=joined.settings, position=joined.position)
+
+
+def _fitted_smooth(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Fit:
+    field = problem.basis.fit(thickness_um, problem.cells.seen.astype(float))
+    return fit_model(problem, fit.coordinates, fit.position, field)
 
 
 def _with_other_pixels(prepared: Prepared, fit: Fit) -> Prepared | None:

@@ -17,7 +17,7 @@ from .basis import SplineBasis
 from .cells import CellData
 from .comparison import chi2_with_free_fringes
 
-__all__ = ["mended_thickness", "starting_thickness"]
+__all__ = ["SEARCH_STEP_UM", "mended_thickness", "robust_surface", "search_template", "starting_thickness"]
 
 FloatArray = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     -------
     thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
     """
-    low, template = _template(model, cells)
+    low, template = search_template(model, cells)
     order = _order_steps(model, cells)
     templates = [template]
     if min(cells.shape[1:]) >= FEWEST_ROWS:
@@ -210,7 +210,7 @@ def mended_thickness(model: FringeModel, cells: CellData, thickness_um: FloatArr
     -------
     thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
     """
-    low, template = _template(model, cells)
+    low, template = search_template(model, cells)
     order, count = _order_steps(model, cells), template.shape[1]
     score = _correlate(template, cells)
     first = np.clip(np.rint((thickness_um.ravel() - low) / SEARCH_STEP_UM).astype(np.int64), 0, count - 1)
@@ -220,8 +220,8 @@ def mended_thickness(model: FringeModel, cells: CellData, thickness_um: FloatArr
     return mended.reshape(thickness_um.shape)
 
 
-def _template(model: FringeModel, cells: CellData) -> tuple[float, FloatArray]:
-    """First thickness [µm] and fringes on the grid of the search, ``(W, D)``."""
+def search_template(model: FringeModel, cells: CellData) -> tuple[float, FloatArray]:
+    """First thickness [µm] and fringes on the grid of the search, ``(W, D)``, in steps of `SEARCH_STEP_UM`."""
     low, high = model.setup.thickness_range_um
     count = round((high - low) / SEARCH_STEP_UM) + 1
     response = model.response_on_grid(cells.wavelength_nm, low, SEARCH_STEP_UM, count)
@@ -444,21 +444,21 @@ def _near_surface(
     score: NDArray[np.float32], current: NDArray[np.int64], cells: CellData, spacing: float, order: float
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Steps with those more than half an order from a smooth surface moved to their best less far from it; which."""
-    surface = _surface(current.reshape(cells.shape[1:]), cells.seen, spacing, order)
+    surface = robust_surface(current.reshape(cells.shape[1:]).astype(float), cells.seen, spacing, order)
     middle = np.clip(np.rint(surface.ravel()).astype(np.int64), 0, score.shape[1] - 1)
     away = np.abs(current - middle) > 0.5 * order
     reach = int(HALF_WINDOW_UM / SEARCH_STEP_UM)
     return np.where(away, _nearby_peak(score, middle, reach), current), away
 
 
-def _surface(field: NDArray[np.int64], seen: NDArray[np.bool_], spacing: float, order: float) -> FloatArray:
-    """Spline through most cells of a field; those that lie orders away do not count."""
+def robust_surface(field: FloatArray, seen: NDArray[np.bool_], spacing: float, order: float) -> FloatArray:
+    """Spline through most cells of a field ``(ny, nx)``; those that lie orders away do not count."""
     basis = SplineBasis.of_grid((field.shape[0], field.shape[1]), spacing)
     weight = seen.astype(float)
-    surface = median_filter(field, MEDIAN_SIDE).astype(float)
+    surface = median_filter(field, MEDIAN_SIDE)
     for _ in range(SURFACE_ROUNDS):
         departure = (field - surface) / (0.3 * order)
-        surface = basis.expand(basis.fit(field.astype(float), weight / (1.0 + departure**2) ** 2))
+        surface = basis.expand(basis.fit(field, weight / (1.0 + departure**2) ** 2))
     return surface
 
 
