@@ -140,7 +140,7 @@ def test_a_pair_is_found_where_the_first_by_itself_was_in_another_order() -> Non
 
 @pytest.mark.slow
 def test_field_is_judged_again_with_an_effect_in_its_right_order() -> None:
-    """A gate that moves the fringes by three orders tears the thickness, which suits errors of all wavelengths."""
+    """A gate that moves the fringes moves the thickness by three orders, which suits errors of all wavelengths."""
     case, _ = recorded_case(20461126, "two", 1)
     assert set(case.names) == {"gate_thickness", "non_linearity"}
     prepared = prepare(case.cube, FringeModel.from_setup(case.setup), EFFECTS, 20_000)
@@ -154,14 +154,14 @@ def test_field_is_judged_again_with_an_effect_in_its_right_order() -> None:
     assert best.names == ("gate_thickness",)
     order = prepared.problem.forward.model.fringe_order_um(float(np.median(case.cube.wavelength_nm)))
 
-    def torn(judged: Prepared) -> float:
-        away = judged.problem.basis.expand(judged.undistorted_field) - case.thickness_um
-        return float(np.mean(np.abs(away) > 0.5 * order))
+    def away(judged: Prepared) -> float:
+        error = judged.problem.basis.expand(judged.undistorted_field) - case.thickness_um
+        return float(np.mean(np.abs(error) > 0.5 * order))
 
-    refined, mended = prepare_again(prepared, best.fit, prepared.problem.basis.expand(best.fit.field))
-    assert mended > 1000
-    assert torn(prepared) > 0.9
-    assert torn(refined) == 0.0
+    refined, _ = prepare_again(prepared, best.fit, prepared.problem.basis.expand(best.fit.field))
+    assert refined is not None
+    assert away(prepared) > 0.9
+    assert away(refined) == 0.0
 
 
 def test_a_set_is_not_looked_for_twice_from_the_same_fit(selector, monkeypatch) -> None:
