@@ -12,7 +12,7 @@ from .basis import SplineBasis
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
 
-__all__ = ["Grown", "grown_thickness"]
+__all__ = ["Grown", "SmoothFit", "fitted_smooth", "grown_thickness"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -90,20 +90,20 @@ def grown_thickness(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Gro
     grown : `Grown` or `None`
         `None` if nothing fits better, or the model fits everywhere.
     """
-    first = best = _fitted(problem, fit, thickness_um, KNOTS[-1])
+    first = best = fitted_smooth(problem, fit, thickness_um, KNOTS[-1])
     bridged = _bridged(first, thickness_um)
     if bridged is not None and bridged.fit.chi2 < GAIN * first.fit.chi2:
         best, thickness_um = bridged, bridged.problem.basis.expand(bridged.fit.field)
     failed = 0
     for knots in KNOTS * TURNS:
-        begin = _fitted(problem, best.fit, thickness_um, knots)
+        begin = fitted_smooth(problem, best.fit, thickness_um, knots)
         misfit = _misfit(begin.problem, begin.fit)
         if np.mean(misfit[~np.isnan(misfit)] > BAD * _unit(misfit)) < FEW_BAD:
             best = min(best, begin, key=lambda item: item.fit.chi2)
             break
         grown = _grown(begin.problem, begin.fit, misfit)
         if grown is not None and grown.chi2 < GAIN * best.fit.chi2:
-            best, failed = _Fitted(begin.problem, grown), 0
+            best, failed = SmoothFit(begin.problem, grown), 0
             thickness_um = best.problem.basis.expand(grown.field)
         else:
             failed += 1
@@ -115,23 +115,23 @@ def grown_thickness(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Gro
 
 
 @dataclass(frozen=True, eq=False)
-class _Fitted:
-    """A fit, and the data and model that it was made to."""
+class SmoothFit:
+    """A fit with a smooth field, and the data and model that it was made to."""
 
     problem: Problem
     fit: Fit
 
 
-def _fitted(problem: Problem, fit: Fit, thickness_um: FloatArray, knots: float) -> _Fitted:
+def fitted_smooth(problem: Problem, fit: Fit, thickness_um: FloatArray, knots: float) -> SmoothFit:
     """Fit with a spline of so many cells from knot to knot."""
     rows, columns = problem.cells.shape[1:]
     basis = SplineBasis.of_grid((rows, columns), knots)
     stiff = replace(problem, basis=basis)
     start = basis.fit(thickness_um, problem.cells.seen.astype(float))
-    return _Fitted(stiff, fit_model(stiff, fit.coordinates, fit.position, start))
+    return SmoothFit(stiff, fit_model(stiff, fit.coordinates, fit.position, start))
 
 
-def _bridged(first: _Fitted, thickness_um: FloatArray) -> _Fitted | None:
+def _bridged(first: SmoothFit, thickness_um: FloatArray) -> SmoothFit | None:
     """Fit from a thickness that is continued with little curvature across where no fringes are seen.
 
     What is beyond may be in the right order all the same: every cell knows it where its fringes are clear.
@@ -146,7 +146,7 @@ def _bridged(first: _Fitted, thickness_um: FloatArray) -> _Fitted | None:
     cells &= np.bincount(parts.ravel())[parts] >= FEWEST_CELLS
     if not cells.any() or cells.all():
         return None
-    return _fitted(problem, first.fit, continued(thickness_um, cells), KNOTS[-1])
+    return fitted_smooth(problem, first.fit, continued(thickness_um, cells), KNOTS[-1])
 
 
 def _grown(problem: Problem, fit: Fit, misfit: FloatArray) -> Fit | None:

@@ -21,6 +21,7 @@ from .fit import Coordinate, Fit, Problem
 from .thickness_steps import best_thickness_step
 
 __all__ = [
+    "ANOTHER_ORDER",
     "IslandStart",
     "followed_on_island",
     "island_starts",

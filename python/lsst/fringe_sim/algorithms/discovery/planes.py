@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from ...model import FringeModel
 from .cells import CellData
-from .start import SEARCH_STEP_UM, robust_surface, search_template
+from .start import SEARCH_STEP_UM, order_steps, robust_surface, search_template
 
 __all__ = ["is_torn", "joined_planes"]
 
@@ -85,7 +85,7 @@ def joined_planes(model: FringeModel, cells: CellData, thickness_um: FloatArray)
     if min(rows, columns) < 2 * SIDE:
         return None
     low, template = search_template(model, cells)
-    order = float(model.fringe_order_um(float(np.median(cells.wavelength_nm)))) / SEARCH_STEP_UM
+    order = order_steps(model, cells)
     cross, square = _projections(template, cells)
     surface = robust_surface((thickness_um - low) / SEARCH_STEP_UM, cells.seen, SURFACE_SPACING, order)
     blocks = _Blocks.of(rows, columns)

@@ -21,7 +21,7 @@ from .cells import CellData, bin_cube, finest_useful_cell
 from .comparison import chi2_with_free_fringes, fringe_order_um
 from .fit import Fit, Problem, fit_model, linearise_at
 from .forward import Exposures, Forward
-from .growth import grown_thickness
+from .growth import fitted_smooth, grown_thickness
 from .islands import mended_on_islands
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share, noise_ratio
 from .outliers import spoiled_cells
@@ -508,17 +508,11 @@ def _joined(problem: Problem, fit: Fit, thickness_um: FloatArray) -> tuple[Float
     planes = joined_planes(problem.forward.model_with(fit.settings), problem.cells, thickness_um)
     if planes is None:
         return None
-    rows, columns = thickness_um.shape
-    smooth = replace(problem, basis=SplineBasis.of_grid((rows, columns), SMOOTH_SPACING))
-    torn, joined = (_fitted_smooth(smooth, fit, thickness) for thickness in (thickness_um, planes))
-    if joined.chi2 > CLEARLY_BETTER * torn.chi2:
+    torn, joined = (fitted_smooth(problem, fit, each, SMOOTH_SPACING) for each in (thickness_um, planes))
+    if joined.fit.chi2 > CLEARLY_BETTER * torn.fit.chi2:
         return None
-    return smooth.basis.expand(joined.field), replace(fit, settings=joined.settings, position=joined.position)
-
-
-def _fitted_smooth(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Fit:
-    field = problem.basis.fit(thickness_um, problem.cells.seen.astype(float))
-    return fit_model(problem, fit.coordinates, fit.position, field)
+    thickness = joined.problem.basis.expand(joined.fit.field)
+    return thickness, replace(fit, settings=joined.fit.settings, position=joined.fit.position)
 
 
 def _with_other_pixels(prepared: Prepared, fit: Fit) -> Prepared | None:

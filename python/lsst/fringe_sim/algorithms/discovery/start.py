@@ -17,7 +17,14 @@ from .basis import SplineBasis
 from .cells import CellData
 from .comparison import chi2_with_free_fringes
 
-__all__ = ["SEARCH_STEP_UM", "mended_thickness", "robust_surface", "search_template", "starting_thickness"]
+__all__ = [
+    "SEARCH_STEP_UM",
+    "mended_thickness",
+    "order_steps",
+    "robust_surface",
+    "search_template",
+    "starting_thickness",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -83,7 +90,7 @@ def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
     """
     low, template = search_template(model, cells)
-    order = _order_steps(model, cells)
+    order = order_steps(model, cells)
     templates = [template]
     if min(cells.shape[1:]) >= FEWEST_ROWS:
         templates.append(template * _contrast(template, cells))
@@ -211,7 +218,7 @@ def mended_thickness(model: FringeModel, cells: CellData, thickness_um: FloatArr
     thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
     """
     low, template = search_template(model, cells)
-    order, count = _order_steps(model, cells), template.shape[1]
+    order, count = order_steps(model, cells), template.shape[1]
     score = _correlate(template, cells)
     first = np.clip(np.rint((thickness_um.ravel() - low) / SEARCH_STEP_UM).astype(np.int64), 0, count - 1)
     best = _mended(score, first, cells, order)
@@ -274,14 +281,14 @@ def _contrast(template: FloatArray, cells: CellData) -> FloatArray:
 
 def _running_mean(response: FloatArray, model: FringeModel, cells: CellData) -> FloatArray:
     """Mean of the response over a fringe order around each thickness."""
-    width = max(3, 2 * int(_order_steps(model, cells) / 2) + 1)
+    width = max(3, 2 * int(order_steps(model, cells) / 2) + 1)
     padded = np.pad(response, ((0, 0), (width // 2, width // 2)), mode="reflect")
     total = np.cumsum(np.pad(padded, ((0, 0), (1, 0))), axis=1)
     mean: FloatArray = (total[:, width:] - total[:, :-width]) / width
     return mean
 
 
-def _order_steps(model: FringeModel, cells: CellData) -> float:
+def order_steps(model: FringeModel, cells: CellData) -> float:
     """Fringe order at the middle wavelength in search steps."""
     return float(model.fringe_order_um(np.median(cells.wavelength_nm))) / SEARCH_STEP_UM
 

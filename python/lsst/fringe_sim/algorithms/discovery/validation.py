@@ -11,7 +11,7 @@ from scipy.ndimage import binary_dilation
 
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
-from .islands import thickness_on_islands
+from .islands import ANOTHER_ORDER, thickness_on_islands
 
 __all__ = [
     "HeldOut",
@@ -32,9 +32,6 @@ FEWEST_ROWS = 12
 
 MUCH_WORSE = 4.0
 """χ² of the cells held out over that of the others, from which on their thickness may be another."""
-
-ANOTHER_ORDER = 0.5
-"""Fringe orders from which on the thickness of a cell is another one, to which no fit gets by itself."""
 
 NEAR_ISLAND = 8
 """Cells about an island into which a smooth thickness may be bent."""
