@@ -383,6 +383,7 @@ def test_changes_are_differences_of_predictions(rng: np.random.Generator) -> Non
     first, second = 15.0 + 0.3 * _smooth_field(12, 16) / 15.0, 14.8 + 0.02 * rng.standard_normal((12, 16))
     gain, offset = {"amplifier_gain.C03": 0.01}, {"amplifier_offset.C11": 40.0}
     beam = {**gain, "tilt.angle": 12.0}
+    void = {"void.thickness": 200.0, "void.centre_x": 8.3, "void.centre_y": 5.1, "void.radius": 3.7}
     for thickness, scatter in (
         (first, None),
         (second, None),
@@ -390,11 +391,24 @@ def test_changes_are_differences_of_predictions(rng: np.random.Generator) -> Non
         (first, None),
     ):
         forward.scatter_um2 = scatter
-        for before, after in (({}, gain), (gain, beam), (beam, offset), (gain, offset)):
+        for before, after in (
+            ({}, gain),
+            (gain, beam),
+            (beam, offset),
+            (gain, offset),
+            (void, {**void, **gain}),
+            ({**void, **beam}, {**void, **offset}),
+            ({**void, **gain}, {**void, "void.centre_x": 8.9, **gain}),
+            (void, {**void, "void.thickness": 100.0}),
+            (gain, {**void, **gain}),
+        ):
             seen = [forward.predict(settings, thickness).value for settings in (before, after)]
             changed = forward.change(before, after, thickness)
             np.testing.assert_allclose(changed, seen[1] - seen[0], rtol=0.0, atol=1e-13)
             assert np.abs(changed).max() > 1e-4
+    forward.cover(first + 2.0)  # other tables
+    seen = [forward.predict(settings, first).value for settings in (void, {**void, **gain})]
+    np.testing.assert_array_equal(forward.change(void, {**void, **gain}, first), seen[1] - seen[0])
 
 
 def test_only_parameters_of_exposures_that_there_are_are_free() -> None:

@@ -116,6 +116,20 @@ class _PartOfCells:
         return cls(away, second, np.where(some, UNIFORM * second**2, whole[1]))
 
 
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """Value of all cells before effects on the image, and for what it is."""
+
+    key: tuple[tuple[tuple[str, float], ...], tuple[float, float]]
+    thickness_um: FloatArray
+    scatter_um2: FloatArray | None
+    value: FloatArray
+
+    def is_at(self, thickness_um: FloatArray, scatter_um2: FloatArray | None) -> bool:
+        """Whether it is for these very arrays."""
+        return self.thickness_um is thickness_um and self.scatter_um2 is scatter_um2
+
+
 @dataclass(eq=False)
 class Forward:
     """Model of one sensor on cells.
@@ -163,9 +177,7 @@ class Forward:
     place_weight: FloatArray | None = field(init=False, repr=False, default=None)
     _limits_um: tuple[float, float] = field(init=False, repr=False)
     _by_name: dict[str, Effect] = field(init=False, repr=False)
-    _last_seen: tuple[tuple[FloatArray, FloatArray, FloatArray | None], FloatArray] | None = field(
-        init=False, repr=False, default=None
-    )
+    _last_light: _Light | None = field(init=False, repr=False, default=None)
     _centroids: tuple[FloatArray, FloatArray | None] | None = field(init=False, repr=False, default=None)
     _slopes: Slopes | None = field(init=False, repr=False, default=None)
 
@@ -345,14 +357,7 @@ class Forward:
         thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
             Thickness at the centres of the cells [µm], within the tables.
         """
-        islands = self._islands(settings)
-        outside, *on = self._parted(islands, thickness_um)
-        value, slope = self._at_cells(self.table(settings), thickness_um, seen=outside)
-        for (part, _, table), seen in zip(islands, on, strict=True):
-            inside = self._at_cells(table, thickness_um, seen=seen)
-            value, slope = (
-                all_ + part * (own - all_) for all_, own in zip((value, slope), inside, strict=True)
-            )
+        value, slope = self._light(settings, thickness_um)
         image_settings = self._image(settings)
         if not image_settings:
             return Prediction(value, slope)
@@ -390,15 +395,11 @@ class Forward:
 
     def change(self, before: Settings, after: Settings, thickness_um: FloatArray) -> FloatArray:
         """What other settings do to the cells, ``(W, ny, nx)``: the difference of two predictions."""
-        if self._has_islands(before) or self._has_islands(after):
-            return self.predict(after, thickness_um).value - self.predict(before, thickness_um).value
-        tables = self.table(before), self.table(after)
         images = self._image(before), self._image(after)
-        if any(images):
-            first = self._seen_through(tables[0], thickness_um)
-            second = first if tables[1] is tables[0] else self._at_cells(tables[1], thickness_um)[0]
+        if any(images) or self._has_islands(before) or self._has_islands(after):
+            first, second = (self._kept_light(each, thickness_um) for each in (before, after))
             return self._on_image(images[1], second) - self._on_image(images[0], first)
-        table = tables[1] - tables[0]
+        table = self.table(after) - self.table(before)
         if self.place_weight is not None:
             return self._at_cells(table, thickness_um)[0]
         # Effects on single exposures leave most planes as they are.
@@ -442,12 +443,27 @@ class Forward:
             for part, moment in zip([rest, *parts], [left, *moments], strict=True)
         ]
 
-    def _seen_through(self, table: FloatArray, thickness_um: FloatArray) -> FloatArray:
-        """Value at all cells; kept, as derivatives of many effects on the image ask for it at one thickness."""
-        asked = table, thickness_um, self.scatter_um2
-        if self._last_seen is None or any(a is not b for a, b in zip(self._last_seen[0], asked, strict=True)):
-            self._last_seen = asked, self._at_cells(table, thickness_um)[0]
-        return self._last_seen[1]
+    def _light(self, settings: Settings, thickness_um: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Value and slope at all cells before effects on the image."""
+        islands = self._islands(settings)
+        outside, *on = self._parted(islands, thickness_um)
+        value, slope = self._at_cells(self.table(settings), thickness_um, seen=outside)
+        for (part, _, table), seen in zip(islands, on, strict=True):
+            inside = self._at_cells(table, thickness_um, seen=seen)
+            value, slope = (
+                all_ + part * (own - all_) for all_, own in zip((value, slope), inside, strict=True)
+            )
+        return value, slope
+
+    def _kept_light(self, settings: Settings, thickness_um: FloatArray) -> FloatArray:
+        """Value before effects on the image; kept, as derivatives of many of them ask for it at one thickness."""
+        of_light = {key: x for key, x in settings.items() if not self.is_image_effect(key.partition(".")[0])}
+        key = self._key(of_light), self.range_um
+        last = self._last_light
+        if last is None or last.key != key or not last.is_at(thickness_um, self.scatter_um2):
+            value = self._light(settings, thickness_um)[0]
+            last = self._last_light = _Light(key, thickness_um, self.scatter_um2, value)
+        return last.value
 
     def _on_image(self, settings: Settings, value: FloatArray) -> FloatArray:
         """Cells with effects on the image."""
