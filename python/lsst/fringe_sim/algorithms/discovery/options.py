@@ -34,7 +34,7 @@ class SearchOptions:
     credit : `float`
         Log evidence that a set may lack if what it leaves is noise and what the other leaves is not.
     parents : `int`
-        Sets of nearly equal evidence from which larger ones are made.
+        Sets of nearly equal evidence from which larger ones are made; of single effects all that were refitted.
     heldout_fraction : `float`
         Part of the sensor that no selection sees.
     outsider_prior : `float`

@@ -301,25 +301,38 @@ class SetSearch:
         """Refits of the most promising sets with one effect more.
 
         The best set need not hold the best smaller one: every set nearly as good is scored, and what all of them
-        promise is compared.
+        promise is compared. Once one leaves noise, those that promise far too little to come near it are not fitted.
         """
-        near = 0.3 * max(current.log_evidence, 100.0)
-        parents = [
-            h for h in self.selector.known(len(current.names)) if h.log_evidence > current.log_evidence - near
-        ]
         promised: dict[frozenset[str], tuple[float, Hypothesis, Candidate]] = {}
-        for parent in parents[: self.options.parents]:
+        for parent in self._nearly_as_good(current):
             for candidate in self.selector.score(parent.fit, self.selector.others(parent), scan=True):
                 key = frozenset((*parent.names, candidate.name))
                 left = parent.fit.chi2 - candidate.promise
                 if candidate.promise > WORTH_FITTING and left < promised.get(key, (math.inf,))[0]:
                     promised[key] = (left, parent, candidate)
         best = sorted(promised.values(), key=lambda item: item[0])[: 2 * self.options.refits]
-        found = []
+        found: list[Hypothesis] = []
+        least = reached = math.inf
         for _, parent, candidate in best:
-            found.append(self.selector.with_candidate(parent, candidate))
-            self._say_refit(parent, found[-1])
+            if MORE_THAN_PROMISED * candidate.promise < parent.fit.chi2 - reached:
+                continue
+            larger = self.selector.with_candidate(parent, candidate)
+            self._say_refit(parent, larger)
+            found.append(larger)
+            if larger.fit.chi2 < least:
+                least = larger.fit.chi2
+                reached = least if self.options.is_noise(self.selector.with_channels(larger)) else reached
         return found
+
+    def _nearly_as_good(self, current: Hypothesis) -> list[Hypothesis]:
+        """Sets that may become the best with one effect more: single effects that were fitted, the best larger sets.
+
+        By themselves many single effects explain most of what two do together, and the right one may come last.
+        """
+        near = 0.3 * max(current.log_evidence, 100.0)
+        known = self.selector.known(len(current.names))
+        most = self.options.refits if len(current.names) == 1 else self.options.parents
+        return [found for found in known if found.log_evidence > current.log_evidence - near][:most]
 
     def _say_refit(self, before: Hypothesis, after: Hypothesis) -> None:
         self.say(
