@@ -67,6 +67,19 @@ def test_rings_are_found_in_noise(number: int) -> None:
     assert np.corrcoef(pattern.ravel(), expected.ravel())[0, 1] > 0.8
 
 
+@pytest.mark.parametrize("centre", [(115.0, 178.0), (-60.0, 48.0)])
+def test_rings_hardly_wider_than_two_cells_are_found(centre: tuple[float, float], rng) -> None:
+    """5.5 px in cells of two, which average a third of the wave away."""
+    middle = 2.0 * np.arange(48) + 0.5
+    geometry = ImageGeometry((96, 96), middle, middle, WAVELENGTHS, np.full(len(WAVELENGTHS), 20_000.0))
+    residual, weight = noise_and_weight(geometry.sample_shape, 0.005, rng)
+    true = {"cosine": 0.0016, "sine": 0.0, "centre_x": centre[0], "centre_y": centre[1], "period": 5.51}
+    residual = np.where(weight > 0.0, residual + rings(true, geometry), 0.0)
+    found = TreeRings().look(residual, weight, geometry)
+    pattern, expected = rings(found, geometry)[0], rings(true, geometry)[0]
+    assert np.corrcoef(pattern.ravel(), expected.ravel())[0, 1] > 0.8
+
+
 @pytest.mark.parametrize("number", range(4))
 def test_noise_has_no_rings(number: int) -> None:
     residual, weight = noise_and_weight((90, 110), 0.01, np.random.default_rng([8, number]))

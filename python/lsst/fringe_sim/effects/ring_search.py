@@ -19,8 +19,8 @@ FloatArray = NDArray[np.float64]
 FARTHEST_PX = 8000.0
 """Distance of the centre from the middle of a sensor [px]: the radius of a wafer."""
 
-SHORTEST_CELLS = 3.0
-"""Shortest period that is looked for, in cells."""
+SHORTEST_CELLS = 2.3
+"""Shortest period that is looked for, in cells: with two, rings along rows or columns would be any other wave too."""
 
 CLEARLY = 12.0
 """Power that a pattern must have over what the best of as many places has in noise, and over a plane wave: rings
