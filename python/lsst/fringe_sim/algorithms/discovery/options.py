@@ -34,7 +34,8 @@ class SearchOptions:
     credit : `float`
         Log evidence that a set may lack if what it leaves is noise and what the other leaves is not.
     parents : `int`
-        Sets of nearly equal evidence from which larger ones are made; of single effects all that were refitted.
+        Sets of nearly equal evidence from which larger ones are made; of single effects all that were refitted, the
+        others by the derivatives of what is added alone.
     heldout_fraction : `float`
         Part of the sensor that no selection sees.
     outsider_prior : `float`
