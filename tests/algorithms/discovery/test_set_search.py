@@ -30,9 +30,7 @@ class MadeUpFits:
 
     def __init__(self, promises: dict[tuple[str, str], float], noise_below: float) -> None:
         self.promises, self.noise_below = promises, noise_below
-        self.singles = [
-            fitted((name,), 3000.0 + 100.0 * place, MUCH) for place, name in enumerate(SINGLES)
-        ]  # fmt: skip
+        self.singles = [fitted((name,), 3000.0 + 100.0 * place, MUCH) for place, name in enumerate(SINGLES)]
         self.pairs: list[tuple[str, ...]] = []
 
     def known(self, size: int) -> list[Hypothesis]:

@@ -327,10 +327,7 @@ class Forward:
 
     def model_with(self, settings: Settings) -> FringeModel:
         """The model with those of some effects that do not act on the image."""
-        of_response = {
-            key: value for key, value in settings.items() if not self.is_image_effect(key.split(".")[0])
-        }
-        known = {**self.model.effect_settings, **of_response}
+        known = {**self.model.effect_settings, **self._of_light(settings)}
         return self.model.with_effects(known, self.catalogue)
 
     def cover(self, thickness_um: FloatArray) -> None:
@@ -457,8 +454,7 @@ class Forward:
 
     def _kept_light(self, settings: Settings, thickness_um: FloatArray) -> FloatArray:
         """Value before effects on the image; kept, as derivatives of many of them ask for it at one thickness."""
-        of_light = {key: x for key, x in settings.items() if not self.is_image_effect(key.partition(".")[0])}
-        key = self._key(of_light), self.range_um
+        key = self._key(self._of_light(settings)), self.range_um
         last = self._last_light
         if last is None or last.key != key or not last.is_at(thickness_um, self.scatter_um2):
             value = self._light(settings, thickness_um)[0]
@@ -672,6 +668,10 @@ class Forward:
             for key, value in settings.items()
             if effects[key].acts_on != "image" and not effects[key].local
         }
+
+    def _of_light(self, settings: Settings) -> dict[str, float]:
+        """Those that do not act on the image."""
+        return {key: x for key, x in settings.items() if not self.is_image_effect(key.partition(".")[0])}
 
     def _image(self, settings: Settings) -> dict[str, float]:
         known = {**self.model.effect_settings, **settings}

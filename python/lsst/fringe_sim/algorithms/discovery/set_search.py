@@ -75,12 +75,11 @@ class SetSearch:
     def refits(self, base: Hypothesis, rival: Hypothesis | None = None) -> list[Hypothesis]:
         """Refits of the best-scored additions to a set, likeliest first; none that cannot come near a rival."""
         scores = self.selector.score(base.fit, self.selector.others(base), scan=True)
-        if self.order_open:  # a score in the wrong order says nothing
-            worth = scores
-        else:
-            missing = base.fit.chi2 - rival.fit.chi2 if rival else 0.0
-            least = max(WORTH_FITTING, missing / MORE_THAN_PROMISED)
-            worth = [c for c in scores if c.promise > least][: self.options.refits]
+        worth = scores
+        if not self.order_open:  # a score in the wrong order says nothing
+            goal = rival.fit.chi2 if rival else math.inf
+            able = (c for c in scores if c.promise > WORTH_FITTING and _may_reach(goal, base, c))
+            worth = list(able)[: self.options.refits]
         refitted = [self.selector.with_candidate(base, c) for c in worth]
         for hypothesis in refitted:
             self._say_refit(base, hypothesis)
@@ -315,14 +314,15 @@ class SetSearch:
         found: list[Hypothesis] = []
         least = reached = math.inf
         for _, parent, candidate in best:
-            if MORE_THAN_PROMISED * candidate.promise < parent.fit.chi2 - reached:
+            if not _may_reach(reached, parent, candidate):
                 continue
             larger = self.selector.with_candidate(parent, candidate)
             self._say_refit(parent, larger)
             found.append(larger)
             if larger.fit.chi2 < least:
                 least = larger.fit.chi2
-                reached = least if self.options.is_noise(self.selector.with_channels(larger)) else reached
+                if self.options.is_noise(self.selector.with_channels(larger)):
+                    reached = least
         return found
 
     def _nearly_as_good(self, current: Hypothesis) -> list[Hypothesis]:
@@ -433,6 +433,11 @@ class SetSearch:
             steps.append(self.step(chosen, likelier))
             chosen, classes = likelier, classes_of(self.selector, likelier, self.options.class_width)
         return chosen, classes
+
+
+def _may_reach(chi2: float, base: Hypothesis, candidate: Candidate) -> bool:
+    """Whether a set may come down to a χ² with an effect more, which may bring more than it promises."""
+    return MORE_THAN_PROMISED * candidate.promise > base.fit.chi2 - chi2
 
 
 def _surely_gains(selector: Selector, candidate: Candidate, wrong: float = 0.0) -> bool:
