@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from ..algorithms.island_response import response_with_islands
 from ..algorithms.sky_frame import (
+    Response,
     simulate_night,
     simulate_sky_frame,
     sky_response,
@@ -18,6 +21,7 @@ from ..algorithms.sky_frame import (
 from ..errors import InputError, OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.camera import Camera
+from ..instrument.detector import Detector
 from ..instrument.night import NightHistory
 from ..instrument.sky import SkySpectrum
 from ..mock.thickness import e2v_321
@@ -33,7 +37,11 @@ from .progress import progress
 
 __all__ = ["sky"]
 
+FloatArray = NDArray[np.float64]
+
 PERCENT = 100.0
+BUILT_IN = "e2v_321"
+MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
 
 
 @click.command()
@@ -87,24 +95,14 @@ def sky(
       fringe-sim sky --setup monocam --thickness e2v_321 --noise --exptime 60s --out sky
       fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky
     """
-    if night and exptime is not None:
-        raise InputError(
-            "--exptime", exptime, "nothing beside --night, whose frames have the set-up's exposure"
-        )
-    if exptime is not None and not exptime > 0.0:
-        raise OutOfRangeError("exposure time [s]", exptime, "positive")
+    _check_exposure(exptime, night)
     sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
-    layer = e2v_321() if thickness == "e2v_321" else read_thickness(thickness)
-    shape = (layer.shape[0], layer.shape[1])
-    section = (
-        SensorSection.of_image(sensor, shape, {})
-        if thickness == "e2v_321"
-        else read_section(thickness, sensor, shape)
-    )
-    frames = 11 if night else 1
+    layer, section = _layer(thickness, sensor)
     settings = sky_settings(settings)
+    history = NightHistory.guo2022()
+    frames = len(history) if night else 1
     if dry_run:
         click.echo(
             f"would simulate {frames} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
@@ -113,71 +111,90 @@ def sky(
     model = FringeModel.from_setup(
         setup, settings, field_x_deg=_angle(sensor.field_x_deg), field_y_deg=_angle(sensor.field_y_deg)
     )
-    given = [thickness] if thickness != "e2v_321" else []
-    cards = {**effect_cards(model), **input_cards([*given, *([effects_file] if effects_file else [])])}
+    given: list[str | Path] = [
+        *([thickness] if thickness != BUILT_IN else []),
+        *([effects_file] if effects_file else []),
+    ]
+    cards = {"SETUP": setup.name, "BEAMS": "centre", **effect_cards(model), **input_cards(given)}
     folder = prepare_folder(out)
-    known = layer[np.isfinite(layer)]
     dark = SkySpectrum.dark(airmass=airmass or setup.airmass)
     click.echo("tabulating the response to the sky", err=True)
-    span = float(known.min()) - 1e-6, float(known.max()) + 1e-6
-    response = response_with_islands(model, lambda own: sky_response(own, dark, thickness_range_um=span))
-    read_noise = sensor.read_noise if noise else 0.0
+    response = _response(model, dark, layer)
+    # Bands of each frame, relative to the dark sky.
+    scales = [history.band_scale(hour, response.bands) if night else {} for hour in range(frames)]
+    levels = None
+    if level == "measured":
+        band = Bandpass.from_name(setup.bandpass)
+        skies = [dark.with_band_scale(scale) if scale else dark for scale in scales]
+        levels = [throughput_electrons(each, band, model, exptime) for each in skies]
     common: dict[str, Any] = {
-        "read_noise_e": read_noise,
+        "read_noise_e": sensor.read_noise if noise else 0.0,
+        "seed": seed if noise else None,
         "detector": sensor.name,
         "physical_filter": setup.bandpass,
     }
-    history = NightHistory.guo2022()
-    skies = [dark]
     if night:
-        skies = [
-            dark.with_band_scale(history.band_scale(time, response.bands)) for time in range(len(history))
-        ]
-    band = Bandpass.from_name(setup.bandpass)
-    measured = [throughput_electrons(each, band, model, exptime) for each in skies]
-    levels = measured if level == "measured" else None
-    if night:
-        series = simulate_night(
-            layer,
-            model,
-            response,
-            history,
-            mean_electrons=levels,
-            seed=seed if noise else None,
-            **common,
-        )
+        series = simulate_night(layer, model, response, history, mean_electrons=levels, **common)
     else:
+        mean = None if levels is None else levels[0]
         series = iter(
             [
                 simulate_sky_frame(
-                    layer,
-                    model,
-                    response=response,
-                    exposure_s=exptime,
-                    mean_electrons=None if levels is None else levels[0],
-                    seed=seed if noise else None,
-                    **common,
+                    layer, model, response=response, exposure_s=exptime, mean_electrons=mean, **common
                 )
             ]
         )
-    made: list[SkyFringe] = []
-    with progress("simulating frames", frames) as advance, BackgroundWriter() as writer:
-        for number, frame in enumerate(series):
-            path = folder / f"sky_{sensor.name}_{number:02d}.fits"
-            scale = history.band_scale(number, response.bands) if night else {}
-            sky_cards = {
-                "BEAMS": "centre",
-                **band_cards({name: scale.get(name, 1.0) for name in response.bands}),
-            }
-            writer.write(frame, path, {"SETUP": setup.name, **sky_cards, **cards}, section=section)
-            made.append(frame)
-            advance()
+    made = _written(series, scales, response.bands, folder / f"sky_{sensor.name}", cards, section)
     save_figure(sky_figure(made), folder / "sky.png")
     page = write_sky_report(folder / "report.html", made, setup.name, seed)
     for frame in made:
         click.echo(_describe(frame))
     click.echo(str(folder))
     click.echo(str(page))
+
+
+def _check_exposure(exptime: float | None, night: bool) -> None:
+    if night and exptime is not None:
+        raise InputError(
+            "--exptime", exptime, "nothing beside --night, whose frames have the set-up's exposure"
+        )
+    if exptime is not None and not exptime > 0.0:
+        raise OutOfRangeError("exposure time [s]", exptime, "positive")
+
+
+def _layer(thickness: str, sensor: Detector) -> tuple[FloatArray, SensorSection | None]:
+    """Thickness of the varying layer [µm], and the part of the sensor that it is of."""
+    if thickness == BUILT_IN:
+        layer = e2v_321()
+        return layer, SensorSection.of_image(sensor, (layer.shape[0], layer.shape[1]), {})
+    layer = read_thickness(thickness)
+    return layer, read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
+
+
+def _response(model: FringeModel, sky: SkySpectrum, layer: FloatArray) -> Response:
+    """Response to a sky at every thickness that the layer has."""
+    known = layer[np.isfinite(layer)]
+    span = float(known.min()) - MARGIN_UM, float(known.max()) + MARGIN_UM
+    return response_with_islands(model, lambda own: sky_response(own, sky, thickness_range_um=span))
+
+
+def _written(
+    series: Iterator[SkyFringe],
+    scales: Sequence[Mapping[str, float]],
+    bands: Sequence[str],
+    stem: Path,
+    cards: Mapping[str, str | float],
+    section: SensorSection | None,
+) -> list[SkyFringe]:
+    """Frames, each written while the next one is simulated; headers tell what its bands are."""
+    made: list[SkyFringe] = []
+    with progress("simulating frames", len(scales)) as advance, BackgroundWriter() as writer:
+        for number, (frame, scale) in enumerate(zip(series, scales, strict=True)):
+            of_bands = band_cards({name: scale.get(name, 1.0) for name in bands})
+            writer.write(frame, f"{stem}_{number:02d}.fits", {**cards, **of_bands}, section=section)
+            made.append(frame)
+            advance()
+    return made
 
 
 def _describe(frame: SkyFringe) -> str:
