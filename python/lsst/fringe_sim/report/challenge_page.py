@@ -24,6 +24,7 @@ __all__ = [
 
 LARGEST_PULL = 6.0
 WANTED_SHRINKAGE = 0.95
+MIDDLE = 0.5  # of the colours
 
 
 def write_challenge_report(path: str | Path, result: ChallengeResult) -> Path:
@@ -66,7 +67,10 @@ _KINDS = {
 
 
 def confusion_figure(result: ChallengeResult) -> Figure:
-    """Matrix of hidden causes (single effects, none, outsiders) and verdicts; empty squares are left white."""
+    """Matrix of hidden causes (single effects, none, outsiders) and verdicts; empty squares are left white.
+
+    Numbers are those of the cases; the colour is their part of all with the same cause.
+    """
     single = replace(result, cases=tuple(case for case in result.cases if case.kind != "two"))
     counts = {(_label(row["truth"]), _label(row["found"])): row["cases"] for row in single.confusion()}
     rows, columns = (sorted({pair[side] for pair in counts}) for side in (0, 1))
@@ -75,11 +79,11 @@ def confusion_figure(result: ChallengeResult) -> Figure:
         matrix[rows.index(truth), columns.index(found)] = number
     with figure(3.0 + 0.28 * matrix.shape[1], 2.2 + 0.24 * matrix.shape[0]) as made:
         axes = made.subplots()
-        axes.imshow(matrix, cmap=SEQUENTIAL, aspect="auto", origin="upper", vmin=0.0)
-        middle = 0.5 * float(np.nanmax(matrix)) if counts else 0.0
+        part = matrix / np.maximum(np.nansum(matrix, axis=1, keepdims=True), 1.0)
+        axes.imshow(part, cmap=SEQUENTIAL, aspect="auto", origin="upper", vmin=0.0, vmax=1.0)
         for (row, column), number in np.ndenumerate(matrix):
             if np.isfinite(number):
-                ink = "black" if number > middle else "white"
+                ink = "black" if part[row, column] > MIDDLE else "white"
                 axes.text(column, row, f"{number:.0f}", ha="center", va="center", color=ink, fontsize=8)
         axes.set_xticks(range(len(columns)), columns, rotation=90)
         axes.set_yticks(range(len(rows)), rows)
@@ -122,7 +126,7 @@ def _draw_accuracy(axes: Axes, table: Table) -> None:
     axes.set_ylim(0.0, 1.12)
     axes.set_xlabel("signal to noise [1]")
     axes.set_ylabel("part of the cases (number above)")
-    axes.legend(loc="lower right", frameon=True)
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.92), frameon=True)
 
 
 def pulls_figure(result: ChallengeResult) -> Figure:
