@@ -10,7 +10,7 @@ from astropy.table import Table
 from ..algorithms.amplitude_table import CASES, SkyCase, compare_amplitudes
 from ..errors import FrameFormatError
 from ..mock.thickness import e2v_321
-from .inputs import prepare_folder, read_settings, read_thickness
+from .inputs import BUILT_IN, prepare_folder, read_settings, read_thickness
 from .parameters import EFFECT, effect_settings
 
 __all__ = ["amplitudes", "read_line_list"]
@@ -20,7 +20,7 @@ STEP_PX = 16
 
 @click.command()
 @click.option(
-    "--thickness", default="e2v_321", show_default=True, help="Adhesive: 'e2v_321' or a FITS file [µm]."
+    "--thickness", default=BUILT_IN, show_default=True, help="Adhesive: 'e2v_321' or a FITS file [µm]."
 )
 @click.option(
     "--lines",
@@ -61,7 +61,7 @@ def amplitudes(
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
     skies = [read_line_list(path) for path in lines] + list(SkyCase.palace())
-    adhesive = e2v_321()[::STEP_PX, ::STEP_PX] if thickness == "e2v_321" else read_thickness(thickness)
+    adhesive = e2v_321()[::STEP_PX, ::STEP_PX] if thickness == BUILT_IN else read_thickness(thickness)
     if dry_run:
         click.echo(f"would compute every set-up with {', '.join(sky.name for sky in skies)}")
         return

@@ -24,6 +24,7 @@ from ..products.sensor_section import SECTION_KEYWORDS
 from ..resources import open_user_fits, read_user_yaml, refuse_damage
 
 __all__ = [
+    "BUILT_IN",
     "complete_fits",
     "effect_cards",
     "prepare_folder",
@@ -32,6 +33,9 @@ __all__ = [
     "read_thickness",
     "sky_settings",
 ]
+
+BUILT_IN = "e2v_321"
+"""Name of the thickness map that needs no file."""
 
 
 @contextmanager

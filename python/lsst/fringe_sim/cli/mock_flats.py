@@ -14,7 +14,7 @@ from ..mock.hidden_effects import validate_effects
 from ..mock.raw_frames import Defects, write_mock_flats
 from ..mock.thickness import e2v_321, fit_to_sensor, random_field
 from ..model import Setup
-from .inputs import prepare_folder, read_settings, read_thickness
+from .inputs import BUILT_IN, prepare_folder, read_settings, read_thickness
 from .parameters import (
     EFFECT,
     LABORATORY,
@@ -41,7 +41,7 @@ BLEMISHES = Defects(bad_columns=6, hot_pixels=200, prnu_rms=0.003)
 @click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
 @click.option(
     "--thickness",
-    default="e2v_321",
+    default=BUILT_IN,
     show_default=True,
     help="Map of the varying layer: a FITS file [µm], 'random', or 'e2v_321' (model of a measured sensor).",
 )
@@ -144,7 +144,7 @@ def thickness_map(
             span = 0.2 * (high - low)
             mean = 0.5 * (low + high)
         return random_field(shape, rng, mean=mean, span=span, scale=0.35 * min(shape))
-    if text == "e2v_321":
+    if text == BUILT_IN:
         if setup.varying != "adhesive":
             raise InputError("--thickness", text, f"'random' or a file for the layer {setup.varying}")
         return e2v_321(shape)

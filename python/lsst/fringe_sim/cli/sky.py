@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,15 @@ from ..products import BackgroundWriter, SensorSection, SkyFringe, band_cards
 from ..report.figures import sky_figure
 from ..report.sky_page import write_sky_report
 from ..report.style import save_figure
-from .inputs import effect_cards, prepare_folder, read_section, read_settings, read_thickness, sky_settings
+from .inputs import (
+    BUILT_IN,
+    effect_cards,
+    prepare_folder,
+    read_section,
+    read_settings,
+    read_thickness,
+    sky_settings,
+)
 from .parameters import EFFECT, SKY, Quantity, effect_settings
 from .progress import progress
 
@@ -40,7 +48,6 @@ __all__ = ["sky"]
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
-BUILT_IN = "e2v_321"
 MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
 
 
@@ -121,30 +128,30 @@ def sky(
     click.echo("tabulating the response to the sky", err=True)
     response = _response(model, dark, layer)
     # Bands of each frame, relative to the dark sky.
-    scales = [history.band_scale(hour, response.bands) if night else {} for hour in range(frames)]
+    scales = [dict.fromkeys(response.bands, 1.0)]
+    if night:
+        scales = [history.band_scale(time, response.bands) for time in range(frames)]
     levels = None
     if level == "measured":
         band = Bandpass.from_name(setup.bandpass)
-        skies = [dark.with_band_scale(scale) if scale else dark for scale in scales]
-        levels = [throughput_electrons(each, band, model, exptime) for each in skies]
+        levels = [throughput_electrons(dark.with_band_scale(scale), band, model, exptime) for scale in scales]
     common: dict[str, Any] = {
         "read_noise_e": sensor.read_noise if noise else 0.0,
         "seed": seed if noise else None,
         "detector": sensor.name,
         "physical_filter": setup.bandpass,
     }
+    series: Iterable[SkyFringe]
     if night:
         series = simulate_night(layer, model, response, history, mean_electrons=levels, **common)
     else:
-        mean = None if levels is None else levels[0]
-        series = iter(
-            [
-                simulate_sky_frame(
-                    layer, model, response=response, exposure_s=exptime, mean_electrons=mean, **common
-                )
-            ]
-        )
-    made = _written(series, scales, response.bands, folder / f"sky_{sensor.name}", cards, section)
+        mean = levels[0] if levels else None
+        series = [
+            simulate_sky_frame(
+                layer, model, response=response, exposure_s=exptime, mean_electrons=mean, **common
+            )
+        ]
+    made = _written(series, scales, folder / f"sky_{sensor.name}", cards, section)
     save_figure(sky_figure(made), folder / "sky.png")
     page = write_sky_report(folder / "report.html", made, setup.name, seed)
     for frame in made:
@@ -179,9 +186,8 @@ def _response(model: FringeModel, sky: SkySpectrum, layer: FloatArray) -> Respon
 
 
 def _written(
-    series: Iterator[SkyFringe],
+    series: Iterable[SkyFringe],
     scales: Sequence[Mapping[str, float]],
-    bands: Sequence[str],
     stem: Path,
     cards: Mapping[str, str | float],
     section: SensorSection | None,
@@ -190,8 +196,8 @@ def _written(
     made: list[SkyFringe] = []
     with progress("simulating frames", len(scales)) as advance, BackgroundWriter() as writer:
         for number, (frame, scale) in enumerate(zip(series, scales, strict=True)):
-            of_bands = band_cards({name: scale.get(name, 1.0) for name in bands})
-            writer.write(frame, f"{stem}_{number:02d}.fits", {**cards, **of_bands}, section=section)
+            of_frame = {**cards, **band_cards(scale)}
+            writer.write(frame, f"{stem}_{number:02d}.fits", of_frame, section=section)
             made.append(frame)
             advance()
     return made
