@@ -6,5 +6,3 @@ config.setup = "lsst_e2v"
 for detector in Camera.from_name("lsstCam").science:
     if detector.vendor == "ITL":
         config.rafts[detector.raft] = RaftConfig(setup="lsst_itl")
-# The level that the camera's measured throughput gives: 2700 electrons in 30 s at the zenith.
-config.level = "throughput"

@@ -31,6 +31,7 @@ from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum, airglow_c
 from lsst.fringe_sim.instrument.telescope import reduce_beam, telescope_beam
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.optics import Illumination
+from lsst.fringe_sim.products import SensorSection
 
 RANGE = (15.0, 17.0)
 SCALE = 0.2
@@ -60,6 +61,18 @@ def angular():
 def on_sensor(angular, name: str) -> SensorResponse:
     placement = SensorPlacement.of(Camera.from_name("lsstCam").detector(name), SCALE)
     return field_response(angular, beam_field("LSST"), placement.radius_range_deg).on(placement)
+
+
+@pytest.mark.parametrize("x", [(100, 299), (299, 100)])
+def test_a_part_of_a_sensor_has_its_own_place(x) -> None:
+    """Also one whose columns are counted from the other side, on a sensor that is turned."""
+    detector = replace(Camera.from_name("lsstCam").detector("R14_S02"), yaw_deg=90.0)
+    part = SensorPlacement.of(detector, SCALE, SensorSection(detector, x, (3000, 3399)))
+    whole = SensorPlacement.of(detector, SCALE)
+    columns = np.arange(100, 300)[:: 1 if x[0] < x[1] else -1]
+    expected = whole.radius_at_deg(detector.shape, np.arange(3000, 3400), columns)
+    np.testing.assert_allclose(part.radius_deg((400, 200)), expected, rtol=1e-10)
+    assert part.radius_range_deg == pytest.approx((expected.min(), expected.max()), abs=1e-4)
 
 
 @pytest.mark.parametrize("name", ["R22_S11", "R11_S01", "R14_S02"])

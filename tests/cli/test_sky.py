@@ -10,7 +10,11 @@ from astropy.wcs import WCS
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.mock.thickness import e2v_321
-from lsst.fringe_sim.products import SkyFringe
+from lsst.fringe_sim.products import SkyFringe, ThicknessMap, mask_bits
+from lsst.fringe_sim.tasks import SkyFringeSimTask
+from lsst.fringe_sim.tasks.sky_fringe_sim import SkyExposure
+
+AIRMASS = 1.3
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +35,22 @@ def test_one_frame_is_written_with_its_errors(thickness, tmp_path, capsys) -> No
     assert (tmp_path / "sky.png").read_bytes().startswith(b"\x89PNG")
     assert "Coadds" in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "rms" in capsys.readouterr().out
+
+
+def test_the_sky_of_the_command_is_that_of_the_task(thickness, tmp_path) -> None:
+    """One map has one sky: the beam of every pixel in both."""
+    arguments = ["--detector", "R10_S00", "--airmass", str(AIRMASS), "--out", str(tmp_path)]
+    assert run(["sky", "--thickness", thickness, *arguments]) == 0
+    frame = SkyFringe.read_fits(tmp_path / "sky_R10_S00_00.fits")
+    layer = np.asarray(fits.getdata(thickness), np.float32)
+    known = np.isfinite(layer)
+    sigma, mask = np.where(known, 0.001, np.nan), np.where(known, 0, mask_bits("NO_DATA"))
+    one = np.ones(layer.shape)
+    mapped = ThicknessMap(layer, sigma, one, 0.0 * one, mask, "adhesive", {}, 12 * known, "R10_S00")
+    task = SkyFringeSimTask(config=SkyFringeSimTask.ConfigClass(noise=False, night="steady"))
+    exposure = SkyExposure(1, 20260115, 23.0, 30.0, AIRMASS, "y_10")
+    theirs = task.run(mapped, exposure, Camera.from_name("lsstCam").detector("R10_S00")).sky
+    np.testing.assert_allclose(frame.image[known], theirs.image[known], rtol=2e-6)
 
 
 def test_level_is_that_of_the_measured_quantum_efficiency(thickness, tmp_path) -> None:

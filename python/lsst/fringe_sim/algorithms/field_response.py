@@ -25,6 +25,8 @@ from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
 from ..instrument.telescope import BeamField, Telescope, TracedOptics
 from ..model import FringeModel, ResponseTable
 from ..optics import Illumination
+from ..products import SensorSection
+from .island_response import response_with_islands
 from .sky_frame import (
     Response,
     SkyQuadrature,
@@ -82,7 +84,7 @@ class SensorPlacement:
     field_x_deg, field_y_deg : `float`
         Field angle of the centre [deg].
     width_deg, height_deg : `float`
-        Extent along columns and along rows [deg].
+        Extent along columns and along rows [deg]; negative where the pixels are counted the other way round.
     yaw_deg : `float`
         Rotation of the sensor in the focal plane [deg].
     """
@@ -94,15 +96,27 @@ class SensorPlacement:
     yaw_deg: float = 0.0
 
     @classmethod
-    def of(cls, detector: Detector, pixel_scale_arcsec: float) -> SensorPlacement:
-        """Placement of a sensor of a camera; on the axis where the camera states no field angles."""
-        rows, columns = detector.shape
+    def of(
+        cls, detector: Detector, pixel_scale_arcsec: float, section: SensorSection | None = None
+    ) -> SensorPlacement:
+        """Placement of a sensor of a camera, or of a part of it; on the axis where the camera states no angles."""
+        seen = SensorSection.whole(detector) if section is None else section
+        scale = pixel_scale_arcsec / 3600.0
         on_axis = math.isnan(detector.field_radius_deg)
+        rows, columns = detector.shape
+        x, y = (
+            scale * 0.5 * (first + last + 1 - size)
+            for (first, last), size in ((seen.x, columns), (seen.y, rows))
+        )
+        width, height = (
+            scale * math.copysign(abs(last - first) + 1, last - first) for first, last in (seen.x, seen.y)
+        )
+        turn = math.radians(detector.yaw_deg)
         return cls(
-            0.0 if on_axis else detector.field_x_deg,
-            0.0 if on_axis else detector.field_y_deg,
-            columns * pixel_scale_arcsec / 3600.0,
-            rows * pixel_scale_arcsec / 3600.0,
+            (0.0 if on_axis else detector.field_x_deg) + math.cos(turn) * x - math.sin(turn) * y,
+            (0.0 if on_axis else detector.field_y_deg) + math.sin(turn) * x + math.cos(turn) * y,
+            width,
+            height,
             detector.yaw_deg,
         )
 
@@ -136,7 +150,7 @@ class SensorPlacement:
         turn = math.radians(-self.yaw_deg)
         x = math.cos(turn) * self.field_x_deg - math.sin(turn) * self.field_y_deg
         y = math.sin(turn) * self.field_x_deg + math.cos(turn) * self.field_y_deg
-        half = 0.5 * self.width_deg, 0.5 * self.height_deg
+        half = 0.5 * abs(self.width_deg), 0.5 * abs(self.height_deg)
         near = math.hypot(max(abs(x) - half[0], 0.0), max(abs(y) - half[1], 0.0))
         return near, math.hypot(abs(x) + half[0], abs(y) + half[1])
 
@@ -517,7 +531,9 @@ def sensor_response(
     thickness_range_um: tuple[float, float] | None = None,
     quadrature: SkyQuadrature | None = None,
 ) -> Response:
-    """Response of one sensor with the beam of every pixel, where the telescope has such beams.
+    """Response of one sensor with the beam of every pixel and with its local effects.
+
+    Commands and Tasks make their frames with it, so that one map has one sky.
 
     Parameters
     ----------
@@ -528,15 +544,19 @@ def sensor_response(
 
     Returns
     -------
-    response : `SensorResponse` or `SkyResponse`
-        The latter, with the one beam of the model, behind a cone, and behind a telescope whose beams do not depend
-        on the distance from the axis alone.
+    response : `Response`
+        With the one beam of the model behind a cone, and behind a telescope whose beams do not depend on the
+        distance from the axis alone.
     """
-    beams = beam_field(model.setup.telescope)
-    if beams is None:
-        return sky_response(model, sky, None, thickness_range_um, quadrature)
-    angular = angular_response(model, sky, beam_limits(beams), None, thickness_range_um, quadrature)
-    return field_response(angular, beams, placement.radius_range_deg).on(placement)
+
+    def respond(own: FringeModel) -> Response:
+        beams = beam_field(own.setup.telescope)
+        if beams is None:
+            return sky_response(own, sky, None, thickness_range_um, quadrature)
+        angular = angular_response(own, sky, beam_limits(beams), None, thickness_range_um, quadrature)
+        return field_response(angular, beams, placement.radius_range_deg).on(placement)
+
+    return response_with_islands(model, respond)
 
 
 @functools.lru_cache(maxsize=2)

@@ -10,14 +10,8 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from ..algorithms.island_response import response_with_islands
-from ..algorithms.sky_frame import (
-    Response,
-    simulate_night,
-    simulate_sky_frame,
-    sky_response,
-    throughput_electrons,
-)
+from ..algorithms.field_response import SensorPlacement, sensor_response
+from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, throughput_electrons
 from ..errors import InputError, OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.camera import Camera
@@ -115,18 +109,22 @@ def sky(
             f"would simulate {frames} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
         )
         return
+    centre = SensorPlacement.of(sensor, setup.pixel_scale_arcsec)
     model = FringeModel.from_setup(
-        setup, settings, field_x_deg=_angle(sensor.field_x_deg), field_y_deg=_angle(sensor.field_y_deg)
+        setup, settings, field_x_deg=centre.field_x_deg, field_y_deg=centre.field_y_deg
     )
     given: list[str | Path] = [
         *([thickness] if thickness != BUILT_IN else []),
         *([effects_file] if effects_file else []),
     ]
-    cards = {"SETUP": setup.name, "BEAMS": "centre", **effect_cards(model), **input_cards(given)}
+    cards = {"SETUP": setup.name, "BEAMS": "pixel", **effect_cards(model), **input_cards(given)}
+    if section is not None:
+        cards["DETSEC"] = section.keyword
     folder = prepare_folder(out)
     dark = SkySpectrum.dark(airmass=airmass or setup.airmass)
     click.echo("tabulating the response to the sky", err=True)
-    response = _response(model, dark, layer)
+    place = SensorPlacement.of(sensor, setup.pixel_scale_arcsec, section)
+    response = sensor_response(model, dark, place, _span_um(layer))
     # Bands of each frame, relative to the dark sky.
     scales = [dict.fromkeys(response.bands, 1.0)]
     if night:
@@ -178,11 +176,9 @@ def _layer(thickness: str, sensor: Detector) -> tuple[FloatArray, SensorSection 
     return layer, read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
 
 
-def _response(model: FringeModel, sky: SkySpectrum, layer: FloatArray) -> Response:
-    """Response to a sky at every thickness that the layer has."""
-    known = layer[np.isfinite(layer)]
-    span = float(known.min()) - MARGIN_UM, float(known.max()) + MARGIN_UM
-    return response_with_islands(model, lambda own: sky_response(own, sky, thickness_range_um=span))
+def _span_um(layer: FloatArray) -> tuple[float, float]:
+    """Thicknesses that the layer has [µm], widened so that rounding cannot leave them."""
+    return float(np.nanmin(layer)) - MARGIN_UM, float(np.nanmax(layer)) + MARGIN_UM
 
 
 def _written(
@@ -212,7 +208,3 @@ def _describe(frame: SkyFringe) -> str:
         f"half peak to peak {half:.4f} %, half 1-99 % range {trimmed:.4f} %; "
         f"quadrature error {PERCENT * frame.quadrature_error:.1e} %"
     )
-
-
-def _angle(value: float) -> float:
-    return 0.0 if np.isnan(value) else value

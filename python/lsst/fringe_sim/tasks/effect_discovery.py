@@ -250,7 +250,7 @@ class SkyEffectDiscoveryTask(PipelineTask):
         layer = self.config.map_of(thickness, detector)
         known = known_thickness(layer)
         sky_model = self.config.sky_model(
-            detector, float(np.mean([frame.airmass for frame in frames])), known
+            detector, float(np.mean([frame.airmass for frame in frames])), known, layer.metadata
         )
         model = sky_model.fringe_model()
         verdict = discover_sky(

@@ -34,6 +34,7 @@ from ..instrument.telescope import Telescope
 from ..middleware.night import airmass_of, hour_of_night
 from ..model import FringeModel, Setup
 from ..products import ThicknessMap, band_cards
+from ..products.sensor_section import SECTION_KEYWORDS
 from .quantum import common_header, data_id_of, sensor_of, unusable
 from .sky_model import (
     LINE_LIST,
@@ -130,7 +131,7 @@ class SkyFringeSimConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnections
     )
     level: ChoiceField[str] = ChoiceField(
         dtype=str,
-        default="model",
+        default="throughput",
         doc="Mean level of a frame.",
         allowed={
             "model": "what the stack itself detects",
@@ -218,7 +219,7 @@ class SkyFringeSimTask(PipelineTask):
         if choice.left_out:
             self.log.info("%s: on the sky without %s", detector.name, ", ".join(choice.left_out))
         known = known_thickness(layer)
-        sky_model = self.config.sky_model(detector, exposure.airmass, known)
+        sky_model = self.config.sky_model(detector, exposure.airmass, known, layer.metadata)
         model, sky, response = sky_model.response()
         scale = self._band_scale(exposure, sky.lines)
         frame = simulate_sky_frame(
@@ -238,7 +239,7 @@ class SkyFringeSimTask(PipelineTask):
         metadata = {
             **common_header(self.config),
             **choice.header(),
-            **{key: layer.metadata[key] for key in ("STANDSD",) if key in layer.metadata},
+            **{key: layer.metadata[key] for key in ("STANDSD", *SECTION_KEYWORDS) if key in layer.metadata},
             **({"NIGHTSD": self.config.seed} if self.config.night == "random" else {}),
             "LINELIST": LINE_LIST,
             "NIGHT": self.config.night,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from ..instrument.detector import Detector
 from ..instrument.sky import EmissionLines, SkySpectrum
 from ..model import FringeModel, Setup
 from ..model.provenance import effects_of_header
-from ..products import ThicknessMap, mask_bits
+from ..products import SensorSection, ThicknessMap, mask_bits
 from .model_config import FringeModelConfig, ModelChoice
 
 __all__ = [
@@ -93,13 +94,10 @@ class SkyModel:
 def _response(sky_model: SkyModel) -> tuple[FringeModel, SkySpectrum, Response]:
     model, sky = sky_model.fringe_model(), sky_model.spectrum()
     span = sky_model.thickness_range_um
-
-    def respond(own: FringeModel) -> Response:
-        if sky_model.beams == "centre":
-            return sky_response(own, sky, thickness_range_um=span)
-        return sensor_response(own, sky, sky_model.placement, span)
-
-    return model, sky, response_with_islands(model, respond)
+    if sky_model.beams == "centre":
+        one_beam = response_with_islands(model, lambda own: sky_response(own, sky, thickness_range_um=span))
+        return model, sky, one_beam
+    return model, sky, sensor_response(model, sky, sky_model.placement, span)
 
 
 class SkyModelConfig(FringeModelConfig):
@@ -183,13 +181,21 @@ class SkyModelConfig(FringeModelConfig):
         shape = (self.stand_in_shape[0], self.stand_in_shape[1]) if self.stand_in_shape else None
         return stand_in_thickness(Setup.from_name(choice.setup), detector, self.stand_in_seed, shape)
 
-    def sky_model(self, detector: Detector, airmass: float, thickness_um: NDArray[np.float32]) -> SkyModel:
-        """What the response of a sensor depends on."""
+    def sky_model(
+        self,
+        detector: Detector,
+        airmass: float,
+        thickness_um: NDArray[np.float32],
+        header: Mapping[str, Any] | None = None,
+    ) -> SkyModel:
+        """What the response of a sensor depends on; the header of its map says which part of it the map shows."""
+        rows, columns = thickness_um.shape
+        section = SensorSection.of_image(detector, (rows, columns), header or {})
         choice = self.choice_of(detector)
         setup = Setup.from_name(choice.setup)
         return SkyModel(
             choice=(choice.setup, tuple(sorted(choice.applied_effects.items()))),
-            placement=SensorPlacement.of(detector, setup.pixel_scale_arcsec),
+            placement=SensorPlacement.of(detector, setup.pixel_scale_arcsec, section),
             beams=self.beams,
             airmass=airmass,
             solar_flux_sfu=self.solar_flux_sfu,

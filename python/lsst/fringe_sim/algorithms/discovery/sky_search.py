@@ -21,7 +21,15 @@ from ...instrument.telescope import reduce_beam
 from ...model import FringeModel, Setup
 from ...optics import Beam, Illumination
 from ...optics.phase_response import PhaseResponse
-from ...products import FlatExposures, FringeCube, SkyFringe, bands_of_header, mask_bits, refuse_corrected
+from ...products import (
+    FlatExposures,
+    FringeCube,
+    SensorSection,
+    SkyFringe,
+    bands_of_header,
+    mask_bits,
+    refuse_corrected,
+)
 from ..field_response import SensorPlacement, beam_field
 from ..sky_frame import (
     bandpass_of,
@@ -421,10 +429,20 @@ def discover_sky(
 def placement_in_frames(
     frames: Sequence[SkyFringe], detector: Detector, pixel_scale_arcsec: float
 ) -> SensorPlacement | None:
-    """Placement for `discover_sky`; `None` for frames that were simulated with the beam of the centre only."""
+    """Placement for `discover_sky`; `None` for frames that were simulated with the beam of the centre only.
+
+    Raises
+    ------
+    InputError
+        No frames, or frames of several parts of the sensor.
+    """
+    _check_frames(frames)
     if all(str(frame.metadata.get("BEAMS", "")) == "centre" for frame in frames):
         return None
-    return SensorPlacement.of(detector, pixel_scale_arcsec)
+    sections = {SensorSection.of_image(detector, frame.shape, frame.metadata) for frame in frames}
+    if len(sections) > 1:
+        raise InputError("sections of the sky frames", len(sections), "one part of the sensor")
+    return SensorPlacement.of(detector, pixel_scale_arcsec, sections.pop())
 
 
 def _stated_bands(frames: Sequence[SkyFringe]) -> list[dict[str, float]]:
