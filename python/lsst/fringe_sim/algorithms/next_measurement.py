@@ -379,7 +379,7 @@ def rank_measurements(
     if unknown:
         raise UnknownNameError("effect", unknown[0], known)
     tested = [_Tested.of(known[name], values, model) for name, values in effects.items()]
-    tested = [item for item in tested if not (item.effect.couples_pixels or item.effect.local)]
+    tested = [item for item in tested if item.effect.search.reach == "pixel" and not item.effect.local]
     if len(tested) < 2:
         return ()
     further = [_Tested.of(known[name], {}, model) for name in nuisance_effects if name not in effects]
@@ -480,8 +480,9 @@ class _Tested:
     def neighbours(self, parameter: Parameter) -> tuple[float, float]:
         """Values on both sides, within the bounds, between which a difference is taken."""
         step = DERIVATIVE_STEP * parameter.prior_scale
-        if parameter.repeats_after:
-            step = min(step, 0.1 * DERIVATIVE_STEP * parameter.repeats_after)
+        repeats_after = self.effect.search.repeats_after.get(parameter.name, 0.0)
+        if repeats_after:
+            step = min(step, 0.1 * DERIVATIVE_STEP * repeats_after)
         low, high = parameter.bounds
         value = self.values[parameter.name]
         return max(value - step, low), min(value + step, high)

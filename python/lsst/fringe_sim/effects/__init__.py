@@ -1,63 +1,61 @@
-"""The catalogue of physical effects: one file each, one line in `EFFECTS`."""
+"""The catalogue of physical effects: files by the place where they act, one line each in `EFFECTS`."""
 
-from .air_gap import AirGap
-from .amplifier_gain import AmplifierGain
-from .amplifier_offset import AmplifierOffset
-from .ar_coating import ArCoating
-from .bandwidth import Bandwidth
-from .base import (
+from .active import (
     ActiveEffect,
-    Effect,
-    Parameter,
-    ResponseContext,
     activate_effects,
     apply_to_image,
     apply_to_response,
     apply_to_sky,
     apply_to_system,
 )
-from .black_coating import BlackCoating
-from .brighter_fatter import BrighterFatter
-from .charge_diffusion import ChargeDiffusion
-from .chromatic_illumination import ChromaticIllumination
-from .contrast_loss import ContrastLoss
-from .converging_beam import ConvergingBeam
-from .crosstalk import Crosstalk
-from .dark_current import DarkCurrent
-from .dark_pedestal import DarkPedestal
-from .epoxy_absorption import EpoxyAbsorption
-from .epoxy_index import EpoxyIndex
-from .gate_oxide import GateOxide
-from .gate_thickness import GateThickness
-from .ghost_pedestal import GhostPedestal
-from .hot_rotation import HotRotation
-from .illumination import Illumination
-from .image_geometry import AMPLIFIERS, ImageGeometry
-from .insulation import Insulation
-from .interface_roughness import InterfaceRoughness
-from .lamp_lines import LampLines
-from .line_triangle import LineTriangle
-from .line_wing import LineWing
-from .midline_step import MidlineStep
-from .non_linearity import NonLinearity
-from .oh_bands import OHBands
-from .rotational_temperature import RotationalTemperature
-from .silicon_absorption import SiliconAbsorption
+from .base import Effect, Parameter, Residuals, ResponseContext, SearchHints
+from .geometry import AMPLIFIERS, ImageGeometry
+from .illumination import ChromaticIllumination, IlluminationPattern, Vignetting
+from .light import (
+    Bandwidth,
+    ConvergingBeam,
+    GhostPedestal,
+    LampLines,
+    LineTriangle,
+    LineWing,
+    Tilt,
+    WavelengthJitter,
+    WavelengthOffset,
+    WavelengthScale,
+)
+from .sensor import (
+    AmplifierGain,
+    AmplifierOffset,
+    BrighterFatter,
+    ChargeDiffusion,
+    Crosstalk,
+    DarkCurrent,
+    DarkPedestal,
+    MidlineStep,
+    NonLinearity,
+)
 from .silicon_gradient import SiliconGradient
-from .silicon_thickness import SiliconThickness
-from .sky_continuum import SkyContinuum
-from .support_coherence import SupportCoherence
-from .support_index import SupportIndex
-from .temperature import Temperature
-from .thickness_spread import ThicknessSpread
-from .tilt import Tilt
+from .sky import HotRotation, OHBands, RotationalTemperature, SkyContinuum, WaterVapour
+from .stack import (
+    AirGap,
+    ArCoating,
+    BlackCoating,
+    ContrastLoss,
+    EpoxyAbsorption,
+    EpoxyIndex,
+    GateOxide,
+    GateThickness,
+    Insulation,
+    InterfaceRoughness,
+    SiliconAbsorption,
+    SiliconThickness,
+    SupportCoherence,
+    SupportIndex,
+    Temperature,
+    ThicknessSpread,
+)
 from .tree_rings import TreeRings
-from .vignetting import Vignetting
 from .void import Void
-from .water_vapour import WaterVapour
-from .wavelength_jitter import WavelengthJitter
-from .wavelength_offset import WavelengthOffset
-from .wavelength_scale import WavelengthScale
 
 __all__ = [
     "AMPLIFIERS",
@@ -66,7 +64,9 @@ __all__ = [
     "Effect",
     "ImageGeometry",
     "Parameter",
+    "Residuals",
     "ResponseContext",
+    "SearchHints",
     "activate_effects",
     "apply_to_image",
     "apply_to_response",
@@ -107,7 +107,7 @@ EFFECTS: tuple[Effect, ...] = (
     ContrastLoss(),
     # image, from the light to the file
     SiliconGradient(),
-    Illumination(),
+    IlluminationPattern(),
     ChromaticIllumination(),
     Vignetting(),
     MidlineStep(),

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
 from ..errors import InputError
 from ..optics.system import OpticalSystem
-from .base import FloatArray, Parameter, PlainNullEffect
-from .image_geometry import ImageGeometry
+from .base import FloatArray, Parameter, PlainNullEffect, Values
+from .geometry import ImageGeometry
 
 __all__ = ["SiliconGradient"]
 
@@ -50,7 +49,7 @@ class SiliconGradient(PlainNullEffect):
     )
 
     def change_image_of(
-        self, system: OpticalSystem, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
+        self, system: OpticalSystem, image: FloatArray, values: Values, geometry: ImageGeometry
     ) -> FloatArray:
         """Interpolate between responses of thinner and thicker silicon.
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
-from .base import FloatArray, Parameter, PlainNullEffect
-from .image_geometry import ImageGeometry
+from .base import FloatArray, Parameter, PlainNullEffect, Residuals, SearchHints, Values
+from .geometry import ImageGeometry
 from .ring_search import find_rings
 
 __all__ = ["TreeRings"]
@@ -34,18 +33,17 @@ class TreeRings(PlainNullEffect):
     parameters = (
         Parameter("cosine", "", 0.0, (-0.05, 0.05), 1e-3, "amplitude of the cosine, phase 0 in the middle"),
         Parameter("sine", "", 0.0, (-0.05, 0.05), 1e-3, "amplitude of the sine"),
-        Parameter(
-            "centre_x", "px", 0.0, (-10_000.0, 14_000.0), 3000.0, "column of their centre", place=True, step=0.01
-        ),
-        Parameter(
-            "centre_y", "px", 0.0, (-10_000.0, 14_000.0), 3000.0, "row of their centre", place=True, step=0.01
-        ),
-        Parameter("period", "px", 50.0, (2.0, 500.0), 50.0, "distance of rings", place=True, step=1e-4),
-    )  # fmt: skip
+        Parameter("centre_x", "px", 0.0, (-10_000.0, 14_000.0), 3000.0, "column of their centre"),
+        Parameter("centre_y", "px", 0.0, (-10_000.0, 14_000.0), 3000.0, "row of their centre"),
+        Parameter("period", "px", 50.0, (2.0, 500.0), 50.0, "distance of rings"),
+    )
+    search = SearchHints(
+        sought=True,
+        places=("centre_x", "centre_y", "period"),
+        steps={"centre_x": 0.01, "centre_y": 0.01, "period": 1e-4},
+    )
 
-    def change_image(
-        self, image: FloatArray, values: Mapping[str, float], geometry: ImageGeometry
-    ) -> FloatArray:
+    def change_image(self, image: FloatArray, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Multiply by the pattern over its mean; the phase is 0 in the middle of the sensor."""
         rows, columns = (np.linspace(0.0, size - 1.0, min(size, MEAN_SAMPLES)) for size in geometry.shape)
         middle = _middle(geometry)
@@ -53,18 +51,21 @@ class TreeRings(PlainNullEffect):
         pattern = _pattern(values, middle, geometry.y_px, geometry.x_px, geometry.cell_px)
         return image * ((1.0 + pattern) / (1.0 + mean))
 
-    def look(self, residual: FloatArray, weight: FloatArray, geometry: ImageGeometry) -> dict[str, float]:
+    def propose(self, residuals: Residuals) -> tuple[dict[str, float], ...]:
         """Centre, period and amplitudes of the clearest rings in what all exposures have in common."""
+        weight, geometry = residuals.weight, residuals.geometry
         total = weight.sum(axis=0)
         used = total > 0.0
-        common = np.divide((weight * residual).sum(axis=0), total, out=np.zeros(total.shape), where=used)
+        common = np.divide(
+            (weight * residuals.value).sum(axis=0), total, out=np.zeros(total.shape), where=used
+        )
         rings = find_rings(common, used, geometry.y_px, geometry.x_px, _middle(geometry))
         if rings is None:
-            return {}
-        return {
+            return ()
+        return ({
             "cosine": rings.amplitude.real, "sine": rings.amplitude.imag,
             "centre_x": rings.centre[1], "centre_y": rings.centre[0], "period": rings.period,
-        }  # fmt: skip
+        },)  # fmt: skip
 
     def bounds_on(self, parameter: Parameter, geometry: ImageGeometry) -> tuple[float, float]:
         """A wave longer than the sensor is a gradient of the light."""
@@ -81,7 +82,7 @@ def _middle(geometry: ImageGeometry) -> FloatArray:
 
 
 def _pattern(
-    values: Mapping[str, float],
+    values: Values,
     middle: FloatArray,
     rows: FloatArray,
     columns: FloatArray,

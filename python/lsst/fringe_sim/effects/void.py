@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
-from ..optics import Layer, get_medium
-from ..optics.system import OpticalSystem
-from .base import FloatArray, Parameter, PlainNullEffect
-from .image_geometry import ImageGeometry
+from .base import FloatArray, Parameter, SearchHints, Values
+from .geometry import ImageGeometry
+from .stack import InsertedLayer
 
 __all__ = ["Void"]
 
@@ -19,7 +16,7 @@ LEAST_SLANT = 1e-3
 """Sides of the ramp that the rim of a disc has in a pixel [px], where it runs along the pixel's own side."""
 
 
-class Void(PlainNullEffect):
+class Void(InsertedLayer):
     """A round island of the sensor behind which a thin gap lies between adhesive and support.
 
     Outside it the stack is what it was. Pixels that its rim crosses see both stacks, each with its part of their
@@ -28,27 +25,27 @@ class Void(PlainNullEffect):
 
     name = "void"
     title = "island on which the adhesive has come off"
-    acts_on = "stack"
     local = True
     reference = "Born & Wolf, Principles of Optics, section 1.6 (layered media): a void between two layers"
+    layer, medium, before = "void", "vacuum", "support"
     parameters = (
-        Parameter("thickness", "nm", 0.0, (0.0, 2000.0), 200.0, "thickness of the gap", repeats_after=470.0),
-        Parameter("centre_x", "px", 0.0, (-100.0, 4200.0), 3000.0, "column of its middle", place=True, step=0.02),
-        Parameter("centre_y", "px", 0.0, (-100.0, 4200.0), 3000.0, "row of its middle", place=True, step=0.02),
-        Parameter("radius", "px", 10.0, (1.0, 2000.0), 100.0, "its radius", place=True, step=0.02),
-    )  # fmt: skip
+        Parameter("thickness", "nm", 0.0, (0.0, 2000.0), 200.0, "thickness of the gap"),
+        Parameter("centre_x", "px", 0.0, (-100.0, 4200.0), 3000.0, "column of its middle"),
+        Parameter("centre_y", "px", 0.0, (-100.0, 4200.0), 3000.0, "row of its middle"),
+        Parameter("radius", "px", 10.0, (1.0, 2000.0), 100.0, "its radius"),
+    )
+    search = SearchHints(
+        places=("centre_x", "centre_y", "radius"),
+        repeats_after={"thickness": 470.0},
+        steps={"centre_x": 0.02, "centre_y": 0.02, "radius": 0.02},
+    )
 
-    def change_system(self, system: OpticalSystem, values: Mapping[str, float]) -> OpticalSystem:
-        """Insert the gap."""
-        gap = Layer("void", get_medium("vacuum"), 1e-3 * values["thickness"])
-        return replace(system, stack=system.stack.with_inserted(gap, before="support"))
-
-    def coverage(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
+    def coverage(self, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Part of the area of every sample that lies on the island."""
         edge, _, across = _rim(values, geometry)
         return _below(edge, *across)
 
-    def coverage_moments(self, values: Mapping[str, float], geometry: ImageGeometry) -> FloatArray:
+    def coverage_moments(self, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Its moments about the middle of every sample: y, x, y², yx, x² [samples]."""
         edge, outward, (down, along) = _rim(values, geometry)
         first, second, product = _moments_below(edge, down, along)
@@ -60,7 +57,7 @@ class Void(PlainNullEffect):
 
 
 def _rim(
-    values: Mapping[str, float], geometry: ImageGeometry
+    values: Values, geometry: ImageGeometry
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
     """How far the rim lies beyond the middle of every sample, and its sides y and x across the rim [px].
 

@@ -1,9 +1,9 @@
-"""Raw frames with a known truth, from a simulator that shares only tables with the fitting model.
+"""Raw frames with a known truth, from a simulator that shares tables with the fitting model, and no physics.
 
 Nothing that fits, models or criticises may import this room.
 """
 
-from .hidden_effects import HIDDEN_EFFECTS, HiddenEffect, HiddenParameter, validate_effects
+from .hidden_effects import HIDDEN_EFFECTS, HiddenEffect, validate_effects
 from .optics import Film, FlatFieldOptics, SignalTable, material_index
 from .raw_frames import Defects, MockExposure, MockRun, MockTruth, parse_size, setup_optics, write_mock_flats
 from .thickness import E2V_SHAPE, HARD_MAPS, e2v_321, fit_to_sensor, random_field
@@ -16,7 +16,6 @@ __all__ = [
     "Film",
     "FlatFieldOptics",
     "HiddenEffect",
-    "HiddenParameter",
     "MockExposure",
     "MockRun",
     "MockTruth",

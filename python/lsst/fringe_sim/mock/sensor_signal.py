@@ -10,7 +10,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from .hidden_effects import RIM_SQUARES, ActiveHiddenEffect, Island, added_silicon, hidden_islands
+from .hidden_effect import RIM_SQUARES
+from .hidden_effects import ActiveHiddenEffect, Island, added_silicon, hidden_islands
 from .optics import FlatFieldOptics, SignalTable
 from .thickness import PixelArea
 

@@ -78,13 +78,13 @@ class Coordinate:
     of_one_exposure : `bool`
         Whether it concerns the exposures at one wavelength only.
     place : `bool`
-        Whether it says where an effect is; see `Parameter`.
+        Whether it says where an effect is; see `SearchHints`.
     step : `float`
         Largest step of a derivative; 0 for a thousandth of the scale.
     refinement : `int`
-        0 for what the effect surely has; see `Parameter`.
+        0 for what the effect surely has; see `SearchHints`.
     exchangeable : `bool`
-        Whether it is one of many draws about null; see `Effect`.
+        Whether it is one of many draws about null; see `SearchHints`.
     """
 
     effect: str
@@ -154,17 +154,18 @@ class Coordinate:
 
 def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -> tuple[Coordinate, ...]:
     """Coordinates of an effect; how it starts is found by trying."""
-    nulls = effect.null_values(forward.model.base_system)
+    nulls, hints = effect.null_values(forward.model.base_system), effect.search
     found = []
     for parameter in _seen_parameters(effect, forward.geometry.wavelength_nm):
-        null, (low, high) = nulls[parameter.name], effect.bounds_on(parameter, forward.geometry)
+        name = parameter.name
+        null, (low, high) = nulls[name], effect.bounds_on(parameter, forward.geometry)
         one_sided = null <= low or null >= high
         quadratic = one_sided and _starts_quadratically(effect.name, parameter, null, forward, thickness_um)
         found.append(
             Coordinate(
-                effect.name, parameter.name, null, low, high, parameter.prior_scale, quadratic, parameter.unit,
-                parameter.repeats_after, parameter.wavelength_nm > 0.0, parameter.place, parameter.step,
-                parameter.refinement, effect.exchangeable,
+                effect.name, name, null, low, high, parameter.prior_scale, quadratic, parameter.unit,
+                hints.repeats_after.get(name, 0.0), parameter.wavelength_nm > 0.0, name in hints.places,
+                hints.steps.get(name, 0.0), hints.refinements.get(name, 0), hints.exchangeable,
             )
         )  # fmt: skip
     return tuple(found)

@@ -269,7 +269,7 @@ class Forward:
     @staticmethod
     def _own(item: ActiveEffect) -> dict[str, float]:
         """What a local effect changes where it is."""
-        places = {parameter.name for parameter in item.effect.parameters if parameter.place}
+        places = item.effect.search.places
         return {f"{item.effect.name}.{name}": x for name, x in item.values.items() if name not in places}
 
     @staticmethod
@@ -323,7 +323,7 @@ class Forward:
         return result
 
     def _moves_wavelengths(self, key: str) -> bool:
-        return self._effect(key.partition(".")[0]).moves_wavelengths
+        return self._effect(key.partition(".")[0]).search.moves_wavelengths
 
     def model_with(self, settings: Settings) -> FringeModel:
         """The model with those of some effects that do not act on the image."""
@@ -386,7 +386,7 @@ class Forward:
         found = {}
         for key in self._image(settings):
             name, _, parameter = key.partition(".")
-            if self.couples_pixels(name) and not self.blurs(name):
+            if self._effect(name).search.reach == "far":
                 found[key] = self._effect(name).parameter(parameter).null
         return found
 
@@ -647,16 +647,22 @@ class Forward:
 
     def couples_pixels(self, name: str) -> bool:
         """Whether an effect carries signal from cell to cell."""
-        return self._effect(name).couples_pixels
+        return self._effect(name).search.reach != "pixel"
 
     def blurs(self, name: str) -> bool:
         """Whether an effect spreads signal over the nearest cells."""
-        return self._effect(name).blurs
+        return self._effect(name).search.reach == "near"
 
     def blur_px(self, settings: Settings) -> float:
         """Rms radius along one axis by which effects, those of the model among them, spread all light [px]."""
         active = activate_effects(self._image(settings), self.catalogue)
         return math.hypot(*(item.effect.blur_px(item.values) for item in active))
+
+    def charge_spread_px2(self, settings: Settings) -> float:
+        """Variance along one axis by which effects of the charge spread what arrives last [px²]."""
+        level = float(self.geometry.level_e.mean())
+        active = activate_effects(self._image(settings), self.catalogue)
+        return sum(item.effect.charge_spread_px2(item.values, level) for item in active)
 
     def _effect(self, name: str) -> Effect:
         return self._by_name[name]

@@ -12,7 +12,6 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import binary_dilation
 
 from ...effects import Effect
-from ...effects.brighter_fatter import FULL_PIXEL_E
 from ...errors import InputError
 from ...model import FringeModel
 from ...products.fringe_cube import FringeCube
@@ -729,9 +728,7 @@ def _without_rest_of_area(settings: Mapping[str, float], forward: Forward) -> Ma
     if not forward.places:
         return settings
     missing = (PIXEL_RMS / forward.places) ** 2
-    level = float(forward.geometry.level_e.mean())
-    variance = forward.blur_px(settings) ** 2
-    variance += settings.get("brighter_fatter.variance", 0.0) * level / FULL_PIXEL_E
+    variance = forward.blur_px(settings) ** 2 + forward.charge_spread_px2(settings)
     if abs(variance - missing) > SAME_AREA * missing:
         return settings
     return {key: value for key, value in settings.items() if not forward.blurs(key.partition(".")[0])}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import ncx2
 
-from ...effects import Effect
+from ...effects import Effect, Residuals
 from ...errors import InputError
 from .channels import Channel, State, combined_probability, measure_channels
 from .comparison import local_minima
@@ -303,7 +303,7 @@ class Selector:
 
     def is_sought(self, name: str) -> bool:
         """Whether an effect has to be looked for in what the model leaves, its place not being known."""
-        return type(self.effects[name]).look is not Effect.look
+        return self.effects[name].search.sought
 
     def _sought(self, state: State, fit: Fit, name: str) -> Candidate | None:
         """The effect where it is seen, if it is."""
@@ -413,10 +413,10 @@ class Selector:
     def _seen(self, state: State, name: str) -> FloatArray | None:
         """Coordinates of an effect where it is seen in what a fit leaves."""
         cells, effect = self.problem.cells, self.effects[name]
-        values = effect.look(state.raw_residual, cells.weight, cells.geometry)
-        if not values:
+        seen = effect.propose(Residuals(state.raw_residual, cells.weight, cells.geometry))
+        if not seen:
             return None
-        return np.array([item.coordinate(values[item.parameter]) for item in self.coordinates[name]])
+        return np.array([item.coordinate(seen[0][item.parameter]) for item in self.coordinates[name]])
 
     def _scanned(self, state: State, fit: Fit, candidate: Candidate) -> Candidate:
         """Candidate with the best of its finite signatures, where that promises more than the derivative."""
@@ -717,7 +717,7 @@ class Selector:
             outwards = 1e-3 * item.unit_step * float(np.sign(fit.position[number]))
             if outwards == 0.0 or item.is_inside(fit.position[number] + outwards):
                 continue
-            natural = self.effects[item.effect].parameter(item.parameter).natural_bounds
+            natural = self.effects[item.effect].search.natural_bounds
             end = item.value(float(fit.position[number]))
             if end not in natural or self._gain_beyond(fit, number, outwards) > WANTS_TO_GO_ON:
                 found.append(item.key)

@@ -30,8 +30,8 @@ MUCH_LEFT = 0.05
 HARDLY_LESS = 0.5
 """Part of that excess which one effect must take off, or further ones promise, for sets of several to be tried."""
 
-HIDES_FRINGES, MUCH_OF_THE_BEST = ("charge_diffusion",), 0.3
-"""Effects that may take narrow fringes away, and the part of what the best single effect explains that one must."""
+MUCH_OF_THE_BEST = 0.3
+"""Part of what the best single effect explains that one must which may take narrow fringes away."""
 
 SHIFTING_EFFECTS = 3
 """Effects that are looked for in other fringe orders, each with the set with which it is likeliest."""
@@ -120,7 +120,9 @@ class SetSearch:
         if self.order_open or not self._leaves_much(best):
             return []
         blurs = [
-            self.selector.hypothesis((name,)) for name in HIDES_FRINGES if name in self.selector.coordinates
+            self.selector.hypothesis((name,))
+            for name in self.selector.coordinates
+            if self.selector.effects[name].search.hides_fringes
         ]
         explained = self.selector.null.fit.chi2 - best.fit.chi2
         return [
@@ -247,7 +249,7 @@ class SetSearch:
 
     def _explained_by_guesses(self, current: Hypothesis) -> float:
         """χ² that the effects of a set explain whose form may be wrong."""
-        exact = tuple(name for name in current.names if self.selector.effects[name].exact)
+        exact = tuple(name for name in current.names if self.selector.effects[name].search.exact)
         if exact == current.names:
             return 0.0
         without = self.selector.hypothesis(exact, None, current.fit) if exact else self.selector.null

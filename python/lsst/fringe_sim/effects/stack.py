@@ -1,0 +1,324 @@
+"""Effects on the layers of the sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import ClassVar
+
+from ..optics import Layer, get_medium
+from ..optics.system import OpticalSystem
+from .base import Effect, FloatArray, Parameter, PlainNullEffect, ResponseContext, SearchHints, Values
+
+__all__ = [
+    "AirGap",
+    "ArCoating",
+    "BlackCoating",
+    "ContrastLoss",
+    "EpoxyAbsorption",
+    "EpoxyIndex",
+    "GateOxide",
+    "GateThickness",
+    "InsertedLayer",
+    "Insulation",
+    "InterfaceRoughness",
+    "SiliconAbsorption",
+    "SiliconThickness",
+    "SupportCoherence",
+    "SupportIndex",
+    "Temperature",
+    "ThicknessSpread",
+]
+
+_LAGE = "Lage 2019, doi 10.48550/arXiv.1911.09577"
+
+
+def _layer(system: OpticalSystem, name: str) -> Layer:
+    return system.stack.layers[system.stack.position(name)]
+
+
+class EpoxyIndex(PlainNullEffect):
+    """Another index level and a Cauchy dispersion of the adhesive."""
+
+    name = "epoxy_index"
+    title = "adhesive index and dispersion"
+    acts_on = "stack"
+    reference = (
+        "spread of published epoxies: refractiveindex.info (NOA-61, SU-8, EpoCore); the vendor states none"
+    )
+    parameters = (
+        Parameter("offset", "", 0.0, (-0.3, 0.3), 0.03, "index minus that of the set-up at 960 nm"),
+        Parameter(
+            "cauchy", "um2", 0.0, (-0.05, 0.05), 0.005, "coefficient of 1/wavelength² relative to 960 nm"
+        ),
+    )
+    search = SearchHints(refinements={"cauchy": 1})
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Change the medium of the adhesive."""
+        medium = _layer(system, "adhesive").medium
+        changed = medium.modified(
+            index_offset=medium.index_offset + values["offset"],
+            dispersion_um2=medium.dispersion_um2 + values["cauchy"],
+        )
+        return system.with_layer("adhesive", medium=changed)
+
+
+class EpoxyAbsorption(PlainNullEffect):
+    """The adhesive absorbs: contrast falls with thickness."""
+
+    name = "epoxy_absorption"
+    title = "adhesive absorption"
+    acts_on = "stack"
+    reference = "Guo, Walter, Lage & Lupton 2022 take k = 0; filled epoxies absorb in the near infrared"
+    parameters = (Parameter("k", "", 0.0, (0.0, 0.05), 0.002, "extinction coefficient"),)
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Add to the extinction coefficient of the adhesive."""
+        medium = _layer(system, "adhesive").medium
+        changed = medium.modified(extinction_offset=medium.extinction_offset + values["k"])
+        return system.with_layer("adhesive", medium=changed)
+
+
+class LayerThickness(PlainNullEffect):
+    """A layer is thicker or thinner than the stack states."""
+
+    acts_on = "stack"
+    layer: ClassVar[str]
+    """Name of the layer; an empty one stands for the detection layer."""
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Change the thickness of the layer."""
+        name = self.layer or system.detection
+        return system.with_layer(name, thickness_um=_layer(system, name).thickness_um + values["offset"])
+
+
+def _offset(bounds: tuple[float, float], prior_scale: float) -> tuple[Parameter, ...]:
+    return (Parameter("offset", "um", 0.0, bounds, prior_scale, "thickness minus that of the stack"),)
+
+
+class SiliconThickness(LayerThickness):
+    """The detection layer is thicker or thinner than the stack states."""
+
+    name = "silicon_thickness"
+    title = "silicon thickness"
+    layer = ""
+    reference = "Guo, Walter, Lage & Lupton 2022, Table 1 (100 um, constant)"
+    parameters = _offset((-20.0, 20.0), 1.0)
+    search = SearchHints(repeats_after={"offset": 0.13})
+
+
+class GateOxide(LayerThickness):
+    """The oxide under the gates is thicker or thinner than the stack states."""
+
+    name = "gate_oxide"
+    title = "oxide under the gates"
+    layer = "gate_oxide"
+    reference = f"{_LAGE} (layers of 0.1-1.0 um, measured on single sensors)"
+    parameters = _offset((-0.09, 0.3), 0.02)
+
+
+class GateThickness(LayerThickness):
+    """The gates are thicker or thinner than the stack states."""
+
+    name = "gate_thickness"
+    title = "polysilicon gates"
+    layer = "gates"
+    reference = f"{_LAGE} (0.3-0.34 um)"
+    parameters = _offset((-0.2, 0.3), 0.02)
+
+
+class Insulation(LayerThickness):
+    """The insulation between gates and adhesive is thicker or thinner than the stack states."""
+
+    name = "insulation"
+    title = "insulation behind the gates"
+    layer = "insulation"
+    reference = f"{_LAGE} (layers of 0.1-1.0 um, measured on single sensors)"
+    parameters = _offset((-0.3, 0.5), 0.05)
+
+
+class SiliconAbsorption(PlainNullEffect):
+    """The detection layer absorbs more or less than the tabulated silicon."""
+
+    name = "silicon_absorption"
+    title = "silicon extinction"
+    acts_on = "stack"
+    reference = (
+        "Green 2008 against Schinke et al. 2015, doi 10.1063/1.4923419: tables differ by 10-20 % in the red"
+    )
+    parameters = (Parameter("scale", "", 1.0, (0.5, 2.0), 0.1, "factor on the extinction coefficient"),)
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Scale the extinction coefficient of the detection layer."""
+        medium = _layer(system, system.detection).medium
+        changed = medium.modified(extinction_scale=medium.extinction_scale * values["scale"])
+        return system.with_layer(system.detection, medium=changed)
+
+
+class Temperature(Effect):
+    """The silicon is warmer or colder than the set-up states."""
+
+    name = "temperature"
+    title = "sensor temperature"
+    acts_on = "stack"
+    laboratory_only = True
+    reference = "Green 2008, doi 10.1016/j.solmat.2008.06.009"
+    parameters = (Parameter("kelvin", "K", math.nan, (120.0, 320.0), 5.0, "temperature of the silicon"),)
+
+    def null_values(self, system: OpticalSystem) -> dict[str, float]:
+        """Temperature that the set-up states."""
+        return {"kelvin": system.temperature_k}
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Replace the temperature."""
+        return replace(system, temperature_k=values["kelvin"])
+
+
+class ArCoating(PlainNullEffect):
+    """Both coating layers are thicker or thinner by a common factor."""
+
+    name = "ar_coating"
+    title = "anti-reflection coating"
+    acts_on = "stack"
+    reference = "Rasmussen, LSST Document-8590: thicknesses fitted to a quantum efficiency curve"
+    parameters = (Parameter("scale", "", 1.0, (0.5, 1.5), 0.05, "factor on both thicknesses"),)
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Scale the coating."""
+        for name in ("ar_outer", "ar_inner"):
+            thickness_um = _layer(system, name).thickness_um * values["scale"]
+            system = system.with_layer(name, thickness_um=thickness_um)
+        return system
+
+
+class InterfaceRoughness(PlainNullEffect):
+    """The back surface is rough: the reflected wave loses coherence."""
+
+    name = "roughness"
+    title = "interface roughness"
+    acts_on = "stack"
+    reference = "Beckmann & Spizzichino 1963; Davies 1954, doi 10.1049/pi-3.1954.0067"
+    parameters = (Parameter("sigma", "nm", 0.0, (0.0, 300.0), 50.0, "rms height of the support surface"),)
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Add the roughness in quadrature to the upper face of the support."""
+        sigma = (_layer(system, "support").roughness_nm ** 2 + values["sigma"] ** 2) ** 0.5
+        return system.with_layer("support", roughness_nm=sigma)
+
+
+def _with_spread(system: OpticalSystem, name: str, spread_um: float) -> OpticalSystem:
+    """System with a variation of thickness inside a pixel added in quadrature to that of a layer."""
+    total = (_layer(system, name).thickness_spread_um ** 2 + spread_um**2) ** 0.5
+    return system.with_layer(name, thickness_spread_um=total)
+
+
+class ThicknessSpread(PlainNullEffect):
+    """A pixel sees the mean over a Gaussian distribution of thicknesses: every harmonic loses by its own square."""
+
+    name = "thickness_spread"
+    title = "thickness variation inside a pixel"
+    acts_on = "stack"
+    reference = "Davies 1954, doi 10.1049/pi-3.1954.0067: average over the phase of a rough layer"
+    parameters = (
+        Parameter("sigma", "nm", 0.0, (0.0, 300.0), 30.0, "rms variation of the layer that varies"),
+    )
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Add the variation to that of the varying layer."""
+        return _with_spread(system, system.varying, 1e-3 * values["sigma"])
+
+
+class InsertedLayer(PlainNullEffect):
+    """A layer that the stack has not; where the stack has it, that one becomes thicker."""
+
+    acts_on = "stack"
+    layer: ClassVar[str]
+    medium: ClassVar[str]
+    before: ClassVar[str]
+    """Name and medium of the layer, and the layer of the stack before which it lies."""
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Insert the layer."""
+        thickness_um = values["thickness"] * (1e-3 if self.parameter("thickness").unit == "nm" else 1.0)
+        if self.layer in system.stack.names:
+            return system.with_layer(
+                self.layer, thickness_um=_layer(system, self.layer).thickness_um + thickness_um
+            )
+        inserted = Layer(self.layer, get_medium(self.medium), thickness_um)
+        return replace(system, stack=system.stack.with_inserted(inserted, before=self.before))
+
+
+class AirGap(InsertedLayer):
+    """The adhesive has come off the support: a thin gap, empty in the cryostat, lies between them."""
+
+    name = "air_gap"
+    title = "gap between adhesive and support"
+    layer, medium, before = "air_gap", "vacuum", "support"
+    reference = (
+        "Born & Wolf, Principles of Optics, section 1.6 (layered media): an adhesive that has come off"
+    )
+    parameters = (Parameter("thickness", "nm", 0.0, (0.0, 2000.0), 30.0, "thickness of the gap"),)
+    search = SearchHints(repeats_after={"thickness": 470.0})
+
+
+class BlackCoating(InsertedLayer):
+    """A layer of black resist lies between the gates and the adhesive, as on ITL sensors."""
+
+    name = "black_coating"
+    title = "black coating behind the gates"
+    layer, medium, before = "black_coating", "litho_black", "adhesive"
+    reference = "Guo, Walter, Lage & Lupton 2022, section 2.3 (Litho-Black on ITL sensors)"
+    parameters = (Parameter("thickness", "um", 0.0, (0.0, 3.0), 0.3, "thickness added to that of the stack"),)
+
+
+class SupportIndex(PlainNullEffect):
+    """The support reflects more or less than the tabulated material."""
+
+    name = "support_index"
+    title = "index of the support"
+    acts_on = "stack"
+    reference = "Guo, Walter, Lage & Lupton 2022, Table 1 assumes silicon; ceramics have an index of 1.7-2.2"
+    parameters = (Parameter("offset", "", 0.0, (-2.4, 1.0), 0.3, "index minus that of the set-up"),)
+    # The support is an etalon of its own: its fringes return after half a wavelength in its optical thickness.
+    search = SearchHints(repeats_after={"offset": 0.00285})
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Shift the index of the support."""
+        medium = _layer(system, "support").medium
+        changed = medium.modified(index_offset=medium.index_offset + values["offset"])
+        return system.with_layer("support", medium=changed)
+
+
+class SupportCoherence(PlainNullEffect):
+    """The support varies in thickness inside a pixel; a fraction of a wavelength makes it incoherent."""
+
+    name = "support_coherence"
+    title = "partially incoherent support"
+    acts_on = "stack"
+    reference = "Harbecke 1986, doi 10.1007/BF00616616 (coherent and incoherent multilayers)"
+    parameters = (
+        Parameter("spread", "um", 0.0, (0.0, 2.0), 0.05, "rms thickness variation of the support in a pixel"),
+    )
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Add the variation to that of the support."""
+        return _with_spread(system, "support", values["spread"])
+
+
+class ContrastLoss(PlainNullEffect):
+    """A structured back side returns only a part of the light coherently."""
+
+    name = "contrast_loss"
+    title = "constant contrast loss (structured back side)"
+    acts_on = "response"
+    reference = "needed at the measured pixel of Guo, Walter, Lage & Lupton 2022, Fig. 4 (factor about 0.13)"
+    parameters = (
+        Parameter("factor", "", 1.0, (0.0, 1.5), 0.3, "factor on the departure from the phase mean"),
+    )
+    search = SearchHints(natural_bounds=(0.0,))
+
+    def change_response(self, response: FloatArray, values: Values, context: ResponseContext) -> FloatArray:
+        """Pull the response towards its phase average."""
+        mean = context.phase_mean.reshape((-1,) + (1,) * (response.ndim - 1))
+        return mean + values["factor"] * (response - mean)
