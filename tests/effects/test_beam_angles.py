@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.effects.beam_angles import tilted, widened
+from lsst.fringe_sim.effects.light import tilted, widened
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.optics import Beam
 

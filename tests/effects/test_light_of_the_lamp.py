@@ -9,7 +9,7 @@ import pytest
 from astropy.table import Table
 from scipy.integrate import quad
 
-from lsst.fringe_sim.effects.lamp_lines import xenon_lines
+from lsst.fringe_sim.effects.light import xenon_lines
 from lsst.fringe_sim.effects.line_profiles import LorentzianProfile, MixedProfile, line_width
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.model import FringeModel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.effects import ImageGeometry
+from lsst.fringe_sim.effects import ImageGeometry, Residuals
 from lsst.fringe_sim.effects.tree_rings import TreeRings
 
 WAVELENGTHS = np.array([900.0, 950.0, 980.0])
@@ -61,7 +61,7 @@ def test_rings_are_found_in_noise(number: int) -> None:
         "period": float(rng.uniform(5.0, 20.0)),
     }  # fmt: skip
     residual = np.where(weight > 0.0, residual + rings(true, geometry), 0.0)
-    found = TreeRings().look(residual, weight, geometry)
+    (found,) = TreeRings().propose(Residuals(residual, weight, geometry))
     assert found["period"] == pytest.approx(true["period"], rel=0.05)
     pattern, expected = rings(found, geometry)[0], rings(true, geometry)[0]
     assert np.corrcoef(pattern.ravel(), expected.ravel())[0, 1] > 0.8
@@ -75,7 +75,7 @@ def test_rings_hardly_wider_than_two_cells_are_found(centre: tuple[float, float]
     residual, weight = noise_and_weight(geometry.sample_shape, 0.005, rng)
     true = {"cosine": 0.0016, "sine": 0.0, "centre_x": centre[0], "centre_y": centre[1], "period": 5.51}
     residual = np.where(weight > 0.0, residual + rings(true, geometry), 0.0)
-    found = TreeRings().look(residual, weight, geometry)
+    (found,) = TreeRings().propose(Residuals(residual, weight, geometry))
     pattern, expected = rings(found, geometry)[0], rings(true, geometry)[0]
     assert np.corrcoef(pattern.ravel(), expected.ravel())[0, 1] > 0.8
 
@@ -83,7 +83,7 @@ def test_rings_hardly_wider_than_two_cells_are_found(centre: tuple[float, float]
 @pytest.mark.parametrize("number", range(4))
 def test_noise_has_no_rings(number: int) -> None:
     residual, weight = noise_and_weight((90, 110), 0.01, np.random.default_rng([8, number]))
-    assert TreeRings().look(residual, weight, geometry_of((90, 110))) == {}
+    assert TreeRings().propose(Residuals(residual, weight, geometry_of((90, 110)))) == ()
 
 
 def test_straight_stripes_are_no_rings() -> None:
@@ -91,17 +91,15 @@ def test_straight_stripes_are_no_rings() -> None:
     residual, weight = noise_and_weight((90, 110), 0.01, rng)
     y, x = np.indices((90, 110))
     stripes = 2e-3 * np.cos(2.0 * np.pi * (0.6 * x + 0.8 * y) / 9.0)
-    assert (
-        TreeRings().look(np.where(weight > 0.0, residual + stripes, 0.0), weight, geometry_of((90, 110)))
-        == {}
-    )
+    left = np.where(weight > 0.0, residual + stripes, 0.0)
+    assert TreeRings().propose(Residuals(left, weight, geometry_of((90, 110)))) == ()
 
 
 def test_a_perfect_model_leaves_no_rings() -> None:
     nothing = np.zeros((len(WAVELENGTHS), 90, 110))
-    assert TreeRings().look(nothing, nothing + 1.0, geometry_of((90, 110))) == {}
+    assert TreeRings().propose(Residuals(nothing, nothing + 1.0, geometry_of((90, 110)))) == ()
 
 
 def test_too_few_pixels_show_nothing() -> None:
     residual, weight = noise_and_weight((12, 20), 0.01, np.random.default_rng(1))
-    assert TreeRings().look(residual, weight, geometry_of((12, 20))) == {}
+    assert TreeRings().propose(Residuals(residual, weight, geometry_of((12, 20)))) == ()

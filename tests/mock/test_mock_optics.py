@@ -1,4 +1,4 @@
-"""The mock's own thin-film optics against tmm, against brute force, and against the fitting model."""
+"""The mock's own thin-film optics against tmm, and against brute force (against the model: tests/effects)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 import tmm
 
 from lsst.fringe_sim.errors import ConvergenceError, OutOfRangeError, StackError, UnknownNameError
-from lsst.fringe_sim.mock import Film, FlatFieldOptics, material_index, setup_optics, validate_effects
-from lsst.fringe_sim.model import FringeModel, Setup
+from lsst.fringe_sim.mock import Film, FlatFieldOptics, material_index, setup_optics
+from lsst.fringe_sim.model import Setup
 from lsst.fringe_sim.optics import get_medium, medium_names
 from lsst.fringe_sim.resources import list_resources, read_yaml
 
@@ -139,86 +139,6 @@ def test_any_face_may_be_rough(e2v: FlatFieldOptics, face: str) -> None:
     ours = np.stack([rough.flat_field(thickness, wavelength) for wavelength in (880.0, 970.0)])
     np.testing.assert_allclose(ours, theirs, rtol=2e-6)
     assert np.max(np.abs(ours[1] / e2v.flat_field(thickness, 970.0) - 1.0)) > 1e-5
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "tolerance"),
-    [
-        ("gate_thickness.offset", 0.05, 1e-6),
-        ("gate_oxide.offset", 0.05, 1e-6),
-        ("insulation.offset", 0.05, 1e-6),
-        ("black_coating.thickness", 0.3, 1e-6),
-        ("air_gap.thickness", 120.0, 1e-6),
-        ("support_coherence.spread", 0.02, 1e-6),
-        ("line_wing.fraction", 0.2, 1e-6),
-        ("line_triangle.fraction", 0.5, 1e-6),
-        ("lamp_lines.strength", 2.0, 3e-5),  # the model has the lamp on a grid of 0.1 nm
-        ("tilt.angle", 10.0, 1e-6),
-    ],
-)
-def test_hidden_optics_agree_with_the_model(key: str, value: float, tolerance: float) -> None:
-    """Fringes of two implementations that share nothing but the tables."""
-    thickness, wavelength = np.linspace(12.0, 14.0, 60), np.array([880.0, 980.0])
-    ((effect, values),) = validate_effects({key: value})
-    assert effect.on_optics is not None
-    optics = effect.on_optics(setup_optics("ts8_e2v")[0], effect.complete(values))
-    ours = np.stack([optics.flat_field(thickness, place) for place in wavelength])
-    theirs = FringeModel.from_setup("ts8_e2v", effects={key: value}).response(thickness, wavelength)
-    ours, theirs = (signal / signal.mean(axis=1, keepdims=True) for signal in (ours, theirs))
-    np.testing.assert_allclose(ours, theirs, atol=tolerance)
-
-
-def test_spread_agrees_with_the_model(e2v: FlatFieldOptics) -> None:
-    system = Setup.from_name("ts8_e2v").optical_system().with_layer("adhesive", thickness_spread_um=0.035)
-    thickness = np.linspace(15.0, 15.6, 11)
-    illumination = system.flat_fields(np.array([960.0]))
-    theirs = system.reduce(illumination).averaged(illumination.weight, thickness)[0]
-    ours = dataclasses.replace(e2v, spread_nm=35.0).flat_field(thickness, 960.0)
-    np.testing.assert_allclose(ours, theirs, rtol=2e-6)
-
-
-EFFECTS_OF_OPTICS = {
-    "none": ({}, {}),
-    "bandwidth": ({"bandwidth_fwhm_nm": 3.1}, {"bandwidth.fwhm": 3.1}),
-    "temperature": ({"temperature_k": 205.0}, {"temperature.kelvin": 205.0}),
-    "wavelength offset": ({"wavelength_offset_nm": 0.7}, {"wavelength_offset.offset": 0.7}),
-    "wavelength scale": ({"wavelength_stretch": 0.01}, {"wavelength_scale.stretch": 0.01}),
-    "wavelength jitter": (
-        {"wavelength_errors_nm": ((870.0, 0.0), (880.0, 0.4), (890.0, 0.0), (950.0, 0.2), (965.0, -0.7))},
-        {"wavelength_jitter.at_880": 0.4, "wavelength_jitter.at_960": -0.4, "wavelength_jitter.at_990": -0.7},
-    ),
-    "roughness": ({"roughness_nm": 45.0}, {"roughness.sigma": 45.0}),
-    "tilt": ({"theta": (math.radians(12.0),)}, {"tilt.angle": 12.0}),
-}
-
-
-@pytest.mark.parametrize("case", EFFECTS_OF_OPTICS)
-def test_agrees_with_the_fitting_model(e2v: FlatFieldOptics, case: str) -> None:
-    """Two implementations that share only tables give the same signal."""
-    changes, settings = EFFECTS_OF_OPTICS[case]
-    optics = dataclasses.replace(e2v, **changes)
-    model = FringeModel.from_setup("ts8_e2v", effects=settings)
-    thickness = np.linspace(14.0, 22.0, 23)
-    for wavelength in (880.0, 960.0, 990.0):
-        ours = optics.flat_field(thickness, wavelength)
-        theirs = model.response(thickness, np.array([wavelength]))[0]
-        np.testing.assert_allclose(ours, theirs, rtol=2e-6)
-
-
-def test_agrees_with_the_fitting_model_when_films_change(e2v: FlatFieldOptics) -> None:
-    optics = e2v.with_film("adhesive", index_shift=-0.04, cauchy_um2=0.01, extinction_shift=1e-3)
-    optics = optics.with_film("detection", thickness_um=102.0, extinction_scale=1.1)
-    settings = {
-        "epoxy_index": {"offset": -0.04, "cauchy": 0.01},
-        "epoxy_absorption.k": 1e-3,
-        "silicon_thickness.offset": 2.0,
-        "silicon_absorption.scale": 1.1,
-    }
-    model = FringeModel.from_setup("ts8_e2v", effects=settings)
-    thickness = np.linspace(14.0, 22.0, 23)
-    for wavelength in (880.0, 990.0):
-        theirs = model.response(thickness, np.array([wavelength]))[0]
-        np.testing.assert_allclose(optics.flat_field(thickness, wavelength), theirs, rtol=2e-6)
 
 
 @pytest.mark.parametrize(

@@ -99,8 +99,9 @@ class SensorSignal:
         for island, inside in self.islands:
             difference = island.part * (inside.flat(row) - signal)
             rim = island.rows, island.columns
-            there = inside._in_squares(row, *rim) - self._in_squares(row, *rim)
-            difference[rim] = (island.squares * there).mean(axis=(1, 2))
+            if island.rows.size:  # none where the rim lies outside the sensor
+                there = inside._in_squares(row, *rim) - self._in_squares(row, *rim)
+                difference[rim] = (island.squares * there).mean(axis=(1, 2))
             signal = signal + difference
         return signal
 
