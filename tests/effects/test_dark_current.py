@@ -30,13 +30,6 @@ def image_with(settings: dict[str, float], geometry: ImageGeometry) -> np.ndarra
     return apply_to_image(activate_effects(settings, EFFECTS), system, image, geometry)
 
 
-def test_its_part_of_the_level_grows_with_time() -> None:
-    plain = image_with({}, geometry_of(SECONDS))
-    dark = image_with({"dark_current.rate": 40.0}, geometry_of(SECONDS))
-    left = 1.0 - 40.0 * SECONDS / LEVEL_E
-    np.testing.assert_allclose(dark - 1.0, left[:, np.newaxis, np.newaxis] * (plain - 1.0), rtol=1e-12)
-
-
 def test_beside_a_pedestal_both_are_parts_of_one_level() -> None:
     plain = image_with({}, geometry_of(SECONDS))
     both = image_with({"dark_current.rate": 40.0, "dark_pedestal.electrons": 3000.0}, geometry_of(SECONDS))

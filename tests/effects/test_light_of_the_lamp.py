@@ -61,12 +61,6 @@ def test_shapes_follow_the_width_and_come_together(base: FringeModel) -> None:
     assert np.ptp(model.response(PHASES, [960.0])) < np.ptp(base.response(PHASES, [960.0]))
 
 
-def test_wings_lower_the_contrast(base: FringeModel) -> None:
-    plain, winged = (model.response(PHASES, [960.0]) for model in
-                     (base, base.with_effects({"line_wing.fraction": 0.5})))  # fmt: skip
-    assert np.ptp(winged) < 0.99 * np.ptp(plain)
-
-
 def test_a_triangle_leaves_fringes_of_the_silicon_that_a_gaussian_washes_out(base: FringeModel) -> None:
     """Transform of the line at a fringe per 1.3 nm: 2e-4 for the Gaussian of 2 nm, 4e-2 for the triangle."""
     scatter = {}

@@ -119,15 +119,6 @@ def test_spread_averages_over_thickness(e2v: FlatFieldOptics) -> None:
     np.testing.assert_allclose(spread.flat_field(thickness, 950.0), direct, rtol=1e-6)
 
 
-def test_spread_takes_the_debye_waller_share_of_the_fundamental(e2v: FlatFieldOptics) -> None:
-    thickness = 15.0 + np.arange(64) / 64 * 0.960 / (2 * 1.6)
-    monochromatic = np.abs(np.fft.rfft(e2v.absorbed_fraction(thickness, 960.0)))[1]
-    narrow = dataclasses.replace(e2v, bandwidth_fwhm_nm=1e-3, spread_nm=30.0)
-    damped = np.abs(np.fft.rfft(narrow.flat_field(thickness, 960.0)))[1]
-    expected = math.exp(-0.5 * (4.0 * math.pi * 1.6 * 30.0 / 960.0) ** 2)
-    assert damped / monochromatic == pytest.approx(expected, rel=1e-4)
-
-
 @pytest.mark.parametrize("face", ["ar_outer", "detection", "gate_oxide", "adhesive", "support", "substrate"])
 def test_any_face_may_be_rough(e2v: FlatFieldOptics, face: str) -> None:
     """The model's roughness, in waves and a closed form, is that of the mock, in fields and matrices."""

@@ -1,4 +1,4 @@
-"""Effects in which a pixel hears of others: crosstalk and brighter-fatter."""
+"""Effects of the charge: crosstalk, brighter-fatter, and more than can be counted."""
 
 from __future__ import annotations
 
@@ -21,19 +21,6 @@ LEVEL = 30_000.0
 def _changed(image: np.ndarray, geometry: ImageGeometry, settings: dict[str, float]) -> np.ndarray:
     system = FringeModel.from_setup("ts8_e2v").base_system
     return apply_to_image(activate_effects(settings, EFFECTS), system, image, geometry)
-
-
-def test_crosstalk_moves_a_star_by_one_amplifier() -> None:
-    image = np.ones((1, 8, 80))
-    image[0, 3, 34] = 50.0  # fourth amplifier, fifth column
-    geometry = ImageGeometry.of_pixels((8, 80), np.array([960.0]), LEVEL)
-    left = _changed(image, geometry, {"crosstalk.from_left": 0.01})[0] - image[0]
-    assert left[3, 44] == pytest.approx(0.5)
-    assert np.all(left[:, :10] == 0.0)
-    right = _changed(image, geometry, {"crosstalk.from_right": 0.02})[0] - image[0]
-    assert right[3, 24] == pytest.approx(1.0)
-    assert np.all(right[:, 70:] == 0.0)
-    assert np.count_nonzero(np.isclose(right, 0.02)) == 8 * 70 - 1
 
 
 def test_crosstalk_of_cells_is_the_mean_of_that_of_pixels() -> None:
@@ -81,12 +68,7 @@ def test_brighter_fatter_correlates_the_noise(rng: np.random.Generator, cell_px:
     assert expected > 0.01
 
 
-def test_brighter_fatter_grows_with_the_level() -> None:
-    x = np.arange(64)
-    fringes = np.broadcast_to(1.0 + 0.3 * np.cos(2.0 * np.pi * x / 16.0), (1, 64, 64))
-    contrast = []
-    for level in (1e4, 4e4):
-        geometry = ImageGeometry.of_pixels((64, 64), np.array([960.0]), level)
-        contrast.append(1.0 - np.ptp(_changed(fringes, geometry, {"brighter_fatter.variance": 0.1})) / 0.6)
-    assert contrast[1] == pytest.approx(4.0 * contrast[0], rel=0.02)
-    assert contrast[0] > 0.0
+def test_more_charge_than_can_be_counted_is_finite() -> None:
+    image = np.ones((1, 4, 4))
+    geometry = ImageGeometry.of_pixels((4, 4), np.array([960.0]), 200_000.0)
+    assert np.isfinite(_changed(image, geometry, {"non_linearity.quadratic": 0.2})).all()
