@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.table import Table
@@ -14,9 +15,6 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from ..algorithms.focal_plane import DES_CRITERION
-from ..algorithms.image_correlation import CoaddCorrelation
-from ..algorithms.single_pixel import SinglePixelFit
 from ..errors import InputError
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
 from .style import (
@@ -29,6 +27,10 @@ from .style import (
     finite_range,
     show_image,
 )
+
+if TYPE_CHECKING:
+    from ..algorithms.image_correlation import CoaddCorrelation
+    from ..algorithms.single_pixel import SinglePixelFit
 
 __all__ = [
     "components_figure",
@@ -360,6 +362,8 @@ def focal_plane_figure(cells: Table, sensors: Table) -> Figure:
     sensors : `astropy.table.Table`
         One row per sensor (`summary_table`).
     """
+    from ..algorithms.focal_plane import DES_CRITERION
+
     templates = sum(name.startswith("residual_") for name in sensors.colnames)
     with figure(12.5, 10.5) as made:
         panels = made.subplots(2, 2)
