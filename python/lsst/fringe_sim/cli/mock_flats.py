@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -31,7 +31,7 @@ __all__ = ["mock_flats"]
 STEEPEST_UM = 0.03
 """Range of a random map over the pixels of its shorter side: slopes of 0.05 µm per pixel, a sixth of a fringe."""
 
-BLEMISHES = {"bad_columns": 6, "hot_pixels": 200, "prnu_rms": 0.003}
+BLEMISHES: dict[str, Any] = {"bad_columns": 6, "hot_pixels": 200, "prnu_rms": 0.003}
 """What ``--blemishes`` puts on the sensor: about what a science-grade sensor shows."""
 
 

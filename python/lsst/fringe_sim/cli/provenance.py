@@ -78,6 +78,7 @@ def read_header(path: str) -> dict[str, Any]:
     if not Path(path).is_file():
         raise InputError("file", path, "an existing file, or a repository with --dataset-type")
     suffix = Path(path).suffix
+    damage: tuple[type[Exception], ...] = (*DAMAGE, RecursionError)
     readers = {".ecsv": _table_header, ".json": _document_header}
     try:
         with warnings.catch_warnings():
@@ -85,7 +86,7 @@ def read_header(path: str) -> dict[str, Any]:
             return readers.get(suffix, _fits_header)(path)
     except InputError:
         raise
-    except (*DAMAGE, RecursionError) as error:
+    except damage as error:
         raise FrameFormatError(
             "file", first_line(error), "an undamaged FITS, ECSV or JSON product", source=path
         ) from None
