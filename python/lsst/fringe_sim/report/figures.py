@@ -131,7 +131,7 @@ def flats_figure(
     count = len(wavelength_nm)
     columns = min(6, count)
     rows = -(-count // columns)
-    with figure(2.1 * columns + 0.6, 2.15 * rows + 0.5, "none") as made:
+    with figure(2.1 * columns + 0.6, 2.15 * rows + 0.5, None) as made:
         panels = gallery(made, count, columns, (0.65, 1.0, 0.48, 0.55), 0.3)
         values = PERCENT * np.where(np.asarray(mask) == 0, amplitude, np.nan)
         limits = limits or finite_range(values[:, ::7, ::7], symmetric=True)
@@ -202,7 +202,7 @@ def phase_figure(
     count = len(wavelength_nm)
     columns = min(4, count)
     rows = -(-count // columns)
-    with figure(2.9 * columns, 1.9 * rows + 0.3, "none") as made:
+    with figure(2.9 * columns, 1.9 * rows + 0.3, None) as made:
         panels = gallery(made, count, columns, (0.75, 0.12, 0.55, 0.27), 0.3)
         for panel, measured, modelled, wavelength in zip(panels, data, model, wavelength_nm, strict=False):
             panel.plot(phase, PERCENT * measured, ".", ms=3, color=LINES[0], label="flats")

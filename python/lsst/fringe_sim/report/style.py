@@ -58,7 +58,7 @@ _RC: dict[Any, Any] = {
 
 @contextmanager
 def figure(
-    width: float, height: float, layout: Literal["constrained", "none"] = "constrained"
+    width: float, height: float, layout: Literal["constrained"] | None = "constrained"
 ) -> Iterator[Figure]:
     """A figure in the common style, in inches, that is not known to pyplot."""
     with matplotlib.rc_context(_RC):
@@ -91,7 +91,7 @@ def gallery(
         wspace=BETWEEN_COLUMNS,
         hspace=gap / up,
     )
-    panels = np.atleast_1d(grid.subplots(sharex=True, sharey=True)).ravel()
+    panels = np.ravel(np.asarray(grid.subplots(sharex=True, sharey=True)))
     for panel in panels[count:]:
         panel.set_visible(False)
     return list(panels[:count])
