@@ -19,9 +19,10 @@ from raw_frame_maker import LSSTCAM_HEADER, write_raw
 from toy_repository import Invoke
 
 from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.instrument.raw_files import find_raw_files
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_header
 from lsst.fringe_sim.middleware import get_cli_subcommands, raw_ingest
-from lsst.fringe_sim.middleware.raw_ingest import IngestReport, find_raw_files, ingest_raws
+from lsst.fringe_sim.middleware.raw_ingest import IngestReport, ingest_raws
 from lsst.fringe_sim.middleware.translators import TRANSLATORS
 
 pytestmark = pytest.mark.middleware

@@ -16,11 +16,9 @@ from contextlib import contextmanager
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, TYPE_CHECKING, Any, Literal
 
 import yaml
-from astropy.io import fits
-from astropy.table import Table
 
 from .errors import FrameFormatError, InputError, ResourceError, UnknownNameError
 
@@ -48,7 +46,14 @@ LONGEST_USER_FILE = 1_000_000
 
 DEEPEST_NESTING = 20
 
-DAMAGE = (
+if TYPE_CHECKING:
+    from astropy.io import fits
+    from astropy.table import Table
+
+    DAMAGE: tuple[type[Exception], ...]
+    """What astropy raises when a file is not as its headers say; warnings too, where they are errors."""
+
+_DAMAGE = (
     *(
         OSError,
         EOFError,
@@ -62,9 +67,8 @@ DAMAGE = (
         AssertionError,
         zlib.error,
     ),
-    *(Warning, fits.VerifyError),
+    Warning,
 )
-"""What astropy raises when a file is not as its headers say; warnings, its own and numpy's, where they are errors."""
 
 _CARD, _CHUNK = 80, 1 << 22
 _COUNTS = (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT")
@@ -72,6 +76,20 @@ _ENDLESS = re.compile(
     rb"(?:NAXIS  |TFIELDS) = *[-+]?0*[1-9]\d{3}|(?:NAXIS[1-9 ][\d ]{2}|TFIELDS |[PG]COUNT  )= *-"
 )
 _COMPRESSED = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
+
+
+def __getattr__(name: str) -> Any:
+    """`DAMAGE`, one kind of which is astropy's: its import takes longer than most of what else is read here."""
+    if name == "DAMAGE":
+        return _damage()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+@functools.cache
+def _damage() -> tuple[type[Exception], ...]:
+    from astropy.io.fits import VerifyError
+
+    return (*_DAMAGE, VerifyError)
 
 
 def resource_path(folder: str, name: str) -> Traversable:
@@ -114,6 +132,8 @@ def revision(folder: str, name: str) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _read_table(folder: str, name: str) -> Table:
+    from astropy.table import Table
+
     path = resource_path(folder, name)
     with resources.as_file(path) as file:
         table = Table.read(file, format="ascii.ecsv")
@@ -259,6 +279,8 @@ def open_user_fits(
     Exception
         One of `DAMAGE`.
     """
+    from astropy.io import fits
+
     # The stream is opened here because astropy leaves its own open when it stumbles.
     with warnings.catch_warnings(), open(path, "rb") as stream:
         warnings.simplefilter("error" if warning == "error" else "ignore")
@@ -284,7 +306,7 @@ def refuse_damage(field: str, allowed: str, source: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise (error if error.source else error.in_source(source)) from None
-    except DAMAGE as error:
+    except _damage() as error:
         raise FrameFormatError(field, first_line(error), allowed, source=source) from error
 
 

@@ -10,8 +10,8 @@ from astropy.table import Table
 from ..algorithms.amplitude_table import CASES, SkyCase, compare_amplitudes
 from ..errors import FrameFormatError
 from ..mock.thickness import e2v_321
-from .inputs import BUILT_IN, prepare_folder, read_settings, read_thickness
-from .parameters import EFFECT, effect_settings
+from .inputs import prepare_folder, read_settings, read_thickness
+from .parameters import BUILT_IN, EFFECT, effect_settings
 
 __all__ = ["amplitudes", "read_line_list"]
 

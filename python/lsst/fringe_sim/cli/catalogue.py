@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+from typing import TYPE_CHECKING
 
 import click
 
-from ..effects import EFFECTS, Parameter
-from ..model import Setup, setup_names
+if TYPE_CHECKING:
+    from ..effects import Parameter
 
 __all__ = ["effects", "setups"]
 
@@ -22,6 +23,8 @@ def setups(as_json: bool) -> None:
     Example:
       fringe-sim setups
     """
+    from ..instrument.setup import Setup, setup_names
+
     found = [Setup.from_name(name) for name in setup_names()]
     if as_json:
         rows = [
@@ -64,6 +67,8 @@ def effects(as_json: bool) -> None:
       fringe-sim effects
       fringe-sim mock-flats raws --setup ts8_e2v --effect bandwidth.fwhm=2.6 --seed 1
     """
+    from ..effects import EFFECTS
+
     if as_json:
         rows = [
             {

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ..errors import InputError
-from ..mock.challenge import run_challenge
-from ..products.challenge_result import CASE_KINDS, CaseResult
-from ..report.challenge_page import write_challenge_report
-from .inputs import prepare_folder
 from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
+
+if TYPE_CHECKING:
+    from ..products.challenge_result import CaseResult
 
 __all__ = ["challenge"]
 
@@ -65,6 +65,11 @@ def challenge(
     Example:
       fringe-sim challenge --seed 7 --none 20 --one 20 --two 10 --outsider 10 --out challenge
     """
+    from ..mock.challenge import run_challenge
+    from ..products.challenge_result import CASE_KINDS
+    from ..report.challenge_page import write_challenge_report
+    from .inputs import prepare_folder
+
     LABORATORY.convert(setup, None, None)
     counts = dict(zip(CASE_KINDS, (none, one, two, outsider), strict=True))
     total = sum(counts.values())
@@ -102,6 +107,8 @@ def _earlier_cases(record: Path, identity: dict[str, int | str]) -> list[CaseRes
     InputError
         The record is one of another challenge.
     """
+    from ..products.challenge_result import CaseResult
+
     lines = record.read_text().splitlines() if record.exists() else []
     if not lines:
         record.write_text(json.dumps(identity) + "\n")

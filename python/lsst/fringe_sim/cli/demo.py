@@ -15,17 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from .. import __version__
 from ..errors import FringeSimError, InputError
-from ..instrument.camera import Camera
-from ..middleware.instruments import LsstCamFringe, Ts8Fringe
-from ..mock.raw_frames import write_mock_flats
-from ..mock.thickness import e2v_321
-from ..model import Setup
-from .demo_report import DemoDatasets, write_demo_report
-from .inputs import prepare_folder
 from .parameters import SIZE
 
 __all__ = ["demo"]
@@ -156,12 +148,17 @@ def demo(out: Path, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool
     Example:
       fringe-sim demo --out demo
     """
+    from ..instrument.camera import Camera
+
     text = f"{size[0]}x{size[1]}"
     shape = (size[1], size[0])
     Camera.from_name("ts8").detector(SENSOR).cut_down(shape)
     if dry_run:
         click.echo(f"would simulate {SENSOR} with {text} pixels and process it in {out}/repo")
         return
+    from .demo_report import DemoDatasets, write_demo_report
+    from .inputs import prepare_folder
+
     if fresh and (out / STATE).is_file():
         shutil.rmtree(out)
     folder = prepare_folder(out)
@@ -177,6 +174,14 @@ def demo(out: Path, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool
 
 
 def _laboratory(run: DemoRun, shape: tuple[int, int], size: str, seed: int) -> None:
+    import numpy as np
+
+    from ..instrument.camera import Camera
+    from ..instrument.setup import Setup
+    from ..middleware.instruments import Ts8Fringe
+    from ..mock.raw_frames import write_mock_flats
+    from ..mock.thickness import e2v_321
+
     raws = run.folder / "raws"
     repo = str(run.repo)
 
@@ -218,6 +223,9 @@ def _laboratory(run: DemoRun, shape: tuple[int, int], size: str, seed: int) -> N
 
 
 def _sky(run: DemoRun) -> None:
+    from ..instrument.camera import Camera
+    from ..middleware.instruments import LsstCamFringe
+
     repo, camera = str(run.repo), LsstCamFringe.getName()
     hours = f"{FIRST_HOUR}:{LAST_HOUR}"
     run.step(

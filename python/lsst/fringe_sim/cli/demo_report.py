@@ -32,7 +32,7 @@ from ..report.figures import (
 from ..report.page import Report
 from ..report.sky_page import coadds_of_frames, sky_amplitudes
 from ..report.style import save_figure
-from .fit import phase_folded, residual_of_fit, residual_table
+from ..report.thickness_page import phase_folded, residual_of_fit, residual_table
 
 __all__ = ["DemoDatasets", "write_demo_report"]
 

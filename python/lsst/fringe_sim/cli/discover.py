@@ -4,36 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
-from ..algorithms.discovery import SKY_SEARCH, SearchOptions, Verdict, discover_sky, placement_in_frames
-from ..algorithms.discovery import discover as search
-from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..errors import InputError
-from ..model import FringeModel, Setup
-from ..products import FringeCube
-from ..report.discovery_page import ResidualPair, discovery_page, residual_pair
-from .inputs import prepare_folder, read_settings, sky_settings
-from .lab_frames import find_series, read_cube
 from .parameters import ANY_LIGHT, EFFECT, effect_settings
 from .progress import progress
-from .sky_frames import SkyFrames, read_sky_frames
+
+if TYPE_CHECKING:  # imported by the functions, so that --help is quick
+    from ..algorithms.discovery import Verdict
+    from ..instrument.setup import Setup
+    from ..model import FringeModel
+    from ..products import FringeCube
+    from ..report.discovery_page import ResidualPair
+    from .sky_frames import SkyFrames
 
 __all__ = ["discover"]
 
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
-@click.option(
-    "--setup",
-    type=ANY_LIGHT,
-    default="ts8_e2v",
-    show_default=True,
-    help="Set-up of flats, or of frames of the sky: name or file.",
-)
+@ANY_LIGHT.option("ts8_e2v", "Set-up of flats, or of frames of the sky: name or file.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the verdict.")
 @click.option(
     "--seed", type=int, default=1, show_default=True, help="Which parts of the sensor are held out."
@@ -80,6 +72,15 @@ def discover(
       fringe-sim discover REPO --collections u/me/flats --detector 37 --out verdict
       fringe-sim discover sky --setup lsst_e2v --thickness fit/thickness.fits --out verdict
     """
+    import numpy as np
+
+    from ..algorithms.discovery import SearchOptions
+    from ..algorithms.discovery import discover as search
+    from ..model import FringeModel
+    from ..report.discovery_page import residual_pair
+    from .inputs import prepare_folder, read_settings, sky_settings
+    from .sky_frames import read_sky_frames
+
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
     if setup.kind == "sky":
@@ -107,6 +108,11 @@ def discover(
 
 
 def _search_sky(data: SkyFrames, model: FringeModel, out: Path, seed: int, cells: int) -> None:
+    import numpy as np
+
+    from ..algorithms.discovery import SKY_SEARCH, discover_sky, placement_in_frames
+    from .inputs import prepare_folder
+
     folder = prepare_folder(out)
     verdict = discover_sky(
         data.frames,
@@ -122,6 +128,8 @@ def _search_sky(data: SkyFrames, model: FringeModel, out: Path, seed: int, cells
 
 
 def _write(verdict: Verdict, folder: Path, residuals: ResidualPair | None) -> None:
+    from ..report.discovery_page import discovery_page
+
     path = verdict.write(folder)
     discovery_page(verdict, residuals).write(folder / "report.html")
     _say(verdict)
@@ -144,6 +152,9 @@ def _read(
     dry_run: bool,
 ) -> FringeCube | None:
     """Cube of one sensor, or `None` after a dry run."""
+    from ..algorithms.flat_prep_options import FlatPrepOptions
+    from .lab_frames import find_series, read_cube
+
     if len(paths) == 1:
         cube = read_cube(paths[0])
         if cube is None and (Path(paths[0]) / "butler.yaml").is_file():
@@ -171,6 +182,7 @@ def _from_repository(path: str, collections: str, detector: str | None) -> Fring
     from lsst.daf.butler import ButlerUserError
 
     from ..middleware.repository import open_repository
+    from ..products import FringeCube
 
     with open_repository(path) as butler:
         try:

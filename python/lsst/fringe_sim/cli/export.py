@@ -7,8 +7,6 @@ from pathlib import Path
 import click
 
 from ..errors import InputError
-from ..products.xarray_export import read_exported, to_xarray, write_netcdf
-from .inputs import prepare_folder
 from .progress import progress
 
 __all__ = ["export"]
@@ -30,6 +28,9 @@ def export(files: tuple[Path, ...], out: Path, dry_run: bool) -> None:
       fringe-sim export sky/*.fits --out nc
       python -c 'import xarray; print(xarray.open_dataset("nc/thickness.nc"))'
     """
+    from ..products.xarray_export import read_exported, to_xarray, write_netcdf
+    from .inputs import prepare_folder
+
     targets = [out / f"{file.stem}.nc" for file in files]
     for number, target in enumerate(targets):
         if target in targets[:number]:

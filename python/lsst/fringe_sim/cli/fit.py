@@ -3,42 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
-import numpy as np
-from astropy import units
-from astropy.table import Table
-from numpy.typing import NDArray
 
-from ..algorithms.flat_prep_options import FlatPrepOptions
-from ..algorithms.flat_residual import flat_residual, relative_flats
-from ..algorithms.thickness_fit import (
-    FIT_METHODS,
-    SILICON_FIELDS,
-    Nuisances,
-    SiliconSearch,
-    fit_thickness,
-)
-from ..algorithms.thickness_fit.nuisances import CONTRASTS, ZONES
+from ..algorithms.thickness_fit_options import CONTRASTS, FIT_METHODS, SILICON_FIELDS, ZONES
 from ..errors import InputError, UnknownNameError
-from ..instrument.camera import Camera
-from ..model import FringeModel, Setup
-from ..model.provenance import input_cards
-from ..products import FringeCube, SensorSection, ThicknessMap
-from ..report.figures import flats_figure, phase_figure, residuals_figure, thickness_figure
-from ..report.page import Report
-from .inputs import effect_cards, prepare_folder, read_settings
-from .lab_frames import find_series, read_cube
 from .parameters import EFFECT, LABORATORY, effect_settings
 from .progress import progress
 
-__all__ = ["fit", "phase_folded", "residual_of_fit", "residual_table", "section_of_cube"]
+if TYPE_CHECKING:  # imported by the functions, so that --help is quick
+    from ..instrument.setup import Setup
+    from ..products import FringeCube, SensorSection, ThicknessMap
+
+__all__ = ["fit", "section_of_cube"]
 
 LEAST_WAVELENGTHS = 4
 """Below this the order of the fringe cannot be told."""
-
-PERCENT = 100.0
-PHASE_BINS = 32
 
 SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 """Smoothing of the flats [px]. It lowers the contrast where fringes are dense, so `global` does without."""
@@ -46,9 +27,7 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
-@click.option(
-    "--setup", type=LABORATORY, default="ts8_e2v", show_default=True, help="Laboratory set-up: name or file."
-)
+@LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file.")
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="Folder for map, figures, report."
 )
@@ -119,6 +98,15 @@ def fit(
       fringe-sim fit 'raws/*flat*.fits' 'raws/*bias*.fits' --method guo2022 --out fit_guo
       fringe-sim fit broad_and_narrow.fits --silicon plane --out fit_both
     """
+    import numpy as np
+
+    from ..algorithms.thickness_fit import Nuisances, SiliconSearch, fit_thickness
+    from ..model import FringeModel
+    from ..model.provenance import input_cards
+    from ..report.thickness_page import write_thickness_report
+    from .inputs import effect_cards, prepare_folder, read_settings
+    from .lab_frames import read_cube
+
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
     model = FringeModel.from_setup(setup, settings)
@@ -146,7 +134,7 @@ def fit(
     click.echo("fitting the thickness", err=True)
     fitted = fit_thickness(cube, model, method, nuisances=free, silicon=search)
     fitted.write_fits(folder / "thickness.fits", {"SETUP": setup.name, **cards}, section=section)
-    write_report(folder, cube, fitted, model, method)
+    write_thickness_report(folder, cube, fitted, model, method)
     good = fitted.mask == 0
     if good.any():
         low, high = np.percentile(fitted.value[good], [1.0, 99.0])
@@ -176,6 +164,9 @@ def _prepare(
     paths: tuple[str, ...], setup: Setup, smoothing: float, skip_bad: bool, dry_run: bool
 ) -> tuple[FringeCube | None, tuple[str, ...]]:
     """The cube, `None` in a dry run, and the files that it is made of."""
+    from ..algorithms.flat_prep_options import FlatPrepOptions
+    from .lab_frames import find_series
+
     series = find_series(paths, skip_bad=skip_bad)
     found = ", ".join(f"{w:g}" for w in series.wavelengths_nm)
     click.echo(
@@ -197,6 +188,9 @@ def _prepare(
 
 def section_of_cube(cube: FringeCube, setup: Setup) -> SensorSection | None:
     """Pixels of a sensor of the set-up's camera that a cube shows; `None` if sensor or place are not known."""
+    from ..instrument.camera import Camera
+    from ..products import SensorSection
+
     camera = Camera.from_name(setup.camera)
     name = str(cube.metadata.get("SERIAL") or cube.detector)
     try:
@@ -204,94 +198,3 @@ def section_of_cube(cube: FringeCube, setup: Setup) -> SensorSection | None:
     except UnknownNameError:
         return None
     return SensorSection.of_image(detector, cube.shape[1:], cube.metadata)
-
-
-def write_report(
-    folder: Path, cube: FringeCube, fitted: ThicknessMap, model: FringeModel, method: str
-) -> Path:
-    """One page with the map, the flats and the comparison of both."""
-    wavelength = [float(w) for w in cube.wavelength_nm]
-    report = Report(
-        f"Thickness of {fitted.layer}, {fitted.detector or 'one sensor'}",
-        f"Set-up {model.setup.name}, method {method}, {len(wavelength)} flats.",
-    )
-    order_um = float(model.fringe_order_um(960.0))
-    report.section("Thickness", "One contour is one fringe order at 960 nm.")
-    report.figure(
-        thickness_figure(fitted, order_um), "Fitted thickness, its uncertainty, and the chance of a slip."
-    )
-    report.section("Flats", "Counts over their mean, minus one.")
-    report.figure(
-        flats_figure(relative_flats(cube), cube.mask, wavelength, title="prepared flats"),
-        "All flats on one scale.",
-    )
-    report.section(
-        "Data and model", "Folded on the fitted thickness, modulo one fringe order of each wavelength."
-    )
-    phase, data, modelled = phase_folded(cube, fitted, model)
-    report.figure(
-        phase_figure(phase, data, modelled, wavelength), "Mean of all pixels of equal fringe phase."
-    )
-    left = residual_of_fit(cube, model, fitted)
-    report.section("Residuals", "Flats minus the model at the fitted thickness, where the fit is good.")
-    report.figure(residuals_figure(left, wavelength), "All wavelengths on one scale.")
-    report.table(residual_table(left, cube), "flat_residuals")
-    return report.write(folder / "report.html")
-
-
-def residual_of_fit(cube: FringeCube, model: FringeModel, fitted: ThicknessMap) -> NDArray[np.float32]:
-    """Flats minus model, shape ``(W, ny, nx)``; NaN where flat or thickness are masked."""
-    if not (fitted.mask == 0).any():
-        return np.full(cube.shape, np.nan, np.float32)
-    return flat_residual(cube, model, np.where(fitted.mask == 0, fitted.value, np.nan))
-
-
-def residual_table(residual: NDArray[np.float32], cube: FringeCube) -> Table:
-    """Rms of data minus model at each wavelength, beside the noise that the variances foretell."""
-    rows = []
-    for plane, left in enumerate(residual):
-        good = np.isfinite(left)
-        level = float(cube.image[plane][good].mean(dtype=float)) if good.any() else np.nan
-        noise = float(np.sqrt(cube.variance[plane][good].mean(dtype=float))) / level if good.any() else np.nan
-        rms = float(np.sqrt(np.mean(np.square(left[good], dtype=float)))) if good.any() else np.nan
-        rows.append((float(cube.wavelength_nm[plane]), PERCENT * rms, PERCENT * noise, rms / noise))
-    table = Table(rows=rows, names=("wavelength", "rms of flat − model", "noise", "ratio"))
-    for name, unit in (
-        ("wavelength", units.nm),
-        ("rms of flat − model", units.percent),
-        ("noise", units.percent),
-    ):
-        table[name].unit = unit
-    for name in table.colnames[1:]:
-        table[name].info.format = ".4f"
-    return table
-
-
-def phase_folded(
-    cube: FringeCube, fitted: ThicknessMap, model: FringeModel
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Mean amplitude of data and model in bins of fringe phase; shapes ``(B,)``, ``(W, B)``, ``(W, B)``."""
-    good = (fitted.mask == 0) & (cube.mask == 0).all(axis=0)
-    thickness = np.asarray(fitted.value, dtype=float)[good]
-    if thickness.size == 0:
-        empty = np.full((len(cube.wavelength_nm), PHASE_BINS), np.nan)
-        return (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS, empty, empty
-    low = float(thickness.min())
-    step = 1e-3
-    count = int(np.ceil((float(thickness.max()) - low) / step)) + 2
-    table = model.response_on_grid(cube.wavelength_nm, low, step, count)
-    place = (thickness - low) / step
-    index = np.minimum(place.astype(int), count - 2)
-    fraction = place - index
-    data = relative_flats(cube)
-    measured = np.empty((len(table), PHASE_BINS))
-    modelled = np.empty_like(measured)
-    orders = model.fringe_order_um(cube.wavelength_nm)
-    for row, (values, order_um) in enumerate(zip(table, orders, strict=True)):
-        bins = np.minimum(((thickness / order_um) % 1.0 * PHASE_BINS).astype(int), PHASE_BINS - 1)
-        weight = np.maximum(np.bincount(bins, minlength=PHASE_BINS), 1)
-        predicted = values[index] * (1.0 - fraction) + values[index + 1] * fraction
-        predicted = predicted / predicted.mean() - 1.0
-        measured[row] = np.bincount(bins, data[row][good], PHASE_BINS) / weight
-        modelled[row] = np.bincount(bins, predicted, PHASE_BINS) / weight
-    return (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS, measured, modelled

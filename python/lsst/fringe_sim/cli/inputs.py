@@ -13,18 +13,17 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..algorithms.discovery import read_effects_override
 from ..effects import EFFECTS, activate_effects
 from ..errors import FrameFormatError, InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel
+from ..model.effects_override import read_effects_override
 from ..model.provenance import model_cards, software_cards
 from ..products import SensorSection
 from ..products.sensor_section import SECTION_KEYWORDS
 from ..resources import open_user_fits, read_user_yaml, refuse_damage
 
 __all__ = [
-    "BUILT_IN",
     "complete_fits",
     "effect_cards",
     "prepare_folder",
@@ -33,9 +32,6 @@ __all__ = [
     "read_thickness",
     "sky_settings",
 ]
-
-BUILT_IN = "e2v_321"
-"""Name of the thickness map that needs no file."""
 
 
 @contextmanager

@@ -14,8 +14,8 @@ from ..algorithms.flat_prep import combine_biases, prepare_flat
 from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..errors import FrameFormatError, FringeSimError, InputError
 from ..instrument.camera import Camera, Detector
+from ..instrument.raw_files import find_raw_files
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
-from ..middleware.raw_ingest import find_raw_files
 from ..model import Setup
 from ..products import FringeCube
 from .inputs import complete_fits

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..instrument.camera import Camera
-from ..mock.hidden_effects import validate_effects
-from ..mock.raw_frames import Defects, write_mock_flats
-from ..mock.thickness import e2v_321, fit_to_sensor, random_field
-from ..model import Setup
-from .inputs import BUILT_IN, prepare_folder, read_settings, read_thickness
 from .parameters import (
+    BUILT_IN,
     EFFECT,
     LABORATORY,
     SIZE,
@@ -26,12 +20,18 @@ from .parameters import (
 )
 from .progress import progress
 
+if TYPE_CHECKING:  # imported by the functions, so that --help is quick
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ..instrument.setup import Setup
+
 __all__ = ["mock_flats"]
 
 STEEPEST_UM = 0.03
 """Range of a random map over the pixels of its shorter side: slopes of 0.05 µm per pixel, a sixth of a fringe."""
 
-BLEMISHES = Defects(bad_columns=6, hot_pixels=200, prnu_rms=0.003)
+BLEMISHES: dict[str, Any] = {"bad_columns": 6, "hot_pixels": 200, "prnu_rms": 0.003}
 """What ``--blemishes`` puts on the sensor: about what a science-grade sensor shows."""
 
 
@@ -92,6 +92,13 @@ def mock_flats(
       fringe-sim mock-flats raws --setup ts8_e2v --detector R11_S01 --seed 1 --size 512x500
       fringe-sim mock-flats raws --thickness random --effect bandwidth.fwhm=2.6 --seed 2 --size 512x500
     """
+    import numpy as np
+
+    from ..instrument.camera import Camera
+    from ..mock.hidden_effects import validate_effects
+    from ..mock.raw_frames import Defects, write_mock_flats
+    from .inputs import prepare_folder, read_settings
+
     chosen = LABORATORY.convert(setup, None, None)
     camera = Camera.from_name(chosen.camera)
     sensor = camera.detector(detector or chosen.detector)
@@ -123,7 +130,7 @@ def mock_flats(
             size=f"{shape[1]}x{shape[0]}" if size else None,
             n_bias=bias_frames,
             level_e=level,
-            defects=BLEMISHES if blemishes else None,
+            defects=Defects(**BLEMISHES) if blemishes else None,
             progress=lambda path: advance(),
         )
     click.echo(f"{len(run.paths)} raw frames in {folder}")
@@ -133,6 +140,9 @@ def thickness_map(
     text: str, setup: Setup, shape: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Thickness map of a sensor from the argument of ``--thickness``."""
+    from ..mock.thickness import e2v_321, fit_to_sensor, random_field
+    from .inputs import read_thickness
+
     if text == "random":
         low, high = setup.thickness_range_um
         if setup.varying == "adhesive":

@@ -1,22 +1,28 @@
-"""Types of command-line arguments: quantities with units, ranges, sizes, set-ups, effect settings."""
+"""Types of command-line arguments: quantities with units, ranges, sizes, set-ups, effect settings.
+
+What a conversion needs is imported by it, so that help and complaints about usage come at once.
+"""
 
 from __future__ import annotations
 
+import functools
+import math
 import re
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
-from astropy import units
 from click.shell_completion import CompletionItem
 
-from ..effects import EFFECTS, Parameter
 from ..errors import InputError
-from ..mock.raw_frames import parse_size
-from ..model import Setup, setup_names
+
+if TYPE_CHECKING:  # none of it for --help
+    from ..effects import Parameter
+    from ..instrument.setup import Setup
 
 __all__ = [
     "ANY_LIGHT",
+    "BUILT_IN",
     "EFFECT",
     "LABORATORY",
     "SIZE",
@@ -30,6 +36,10 @@ __all__ = [
 ]
 
 
+BUILT_IN = "e2v_321"
+"""Name of the thickness map that needs no file."""
+
+
 class Quantity(click.ParamType):
     """A number, with or without a unit: ``960``, ``960nm``, ``0.96um``, ``-90degC``.
 
@@ -40,23 +50,25 @@ class Quantity(click.ParamType):
     """
 
     def __init__(self, unit: str) -> None:
-        self.unit = units.Unit(unit)
         self.name = unit
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Number in the unit of this type."""
         if isinstance(value, int | float):
             return float(value)
+        from astropy import units
+
+        wanted = units.Unit(self.name)
         text = str(value).strip().replace("µ", "u").replace("°", "deg")
         match = re.fullmatch(r"([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([A-Za-z_]*)", text)
         if match is None:
-            self.fail(f"{value!r} is not a number with a unit, such as 1{self.unit}", param, ctx)
+            self.fail(f"{value!r} is not a number with a unit, such as 1{wanted}", param, ctx)
         number, suffix = match.groups()
         try:
-            given = units.Unit({"degC": "deg_C", "C": "deg_C"}.get(suffix, suffix)) if suffix else self.unit
-            return float((float(number) * given).to_value(self.unit, equivalencies=units.temperature()))
+            given = units.Unit({"degC": "deg_C", "C": "deg_C"}.get(suffix, suffix)) if suffix else wanted
+            return float((float(number) * given).to_value(wanted, equivalencies=units.temperature()))
         except (ValueError, units.UnitsError):
-            self.fail(f"{value!r} is not in {self.unit} or a unit that converts to it", param, ctx)
+            self.fail(f"{value!r} is not in {wanted} or a unit that converts to it", param, ctx)
 
 
 class _Wavelengths(click.ParamType):
@@ -75,7 +87,7 @@ class _Wavelengths(click.ParamType):
             if len(parts) != 3 or parts[2] <= 0.0 or parts[1] < parts[0]:
                 self.fail(f"{value!r} is not first:last:step with first <= last and step > 0", param, ctx)
             first, last, step = parts
-            count = int(np.floor((last - first) / step + 1e-9)) + 1
+            count = math.floor((last - first) / step + 1e-9) + 1
             if count > 1000:
                 self.fail(f"{value!r} asks for {count} wavelengths; at most 1000", param, ctx)
             return tuple(float(first + i * step) for i in range(count))
@@ -109,11 +121,10 @@ class _Size(click.ParamType):
     ) -> tuple[int, int]:
         if isinstance(value, tuple):
             return value
-        try:
-            rows, columns = parse_size(str(value).strip())
-        except InputError:
+        sides = [int(side) for side in str(value).strip().lower().split("x") if side.isdecimal()]
+        if str(value).strip().lower().count("x") != 1 or len(sides) != 2 or min(sides) < 1:
             self.fail(f"{value!r} is not columns x rows, such as 512x512", param, ctx)
-        return columns, rows
+        return sides[0], sides[1]
 
 
 class SetupType(click.ParamType):
@@ -143,6 +154,8 @@ class SetupType(click.ParamType):
         InputError
             A file that is not a set-up, or a set-up with light of the other kind.
         """
+        from ..instrument.setup import Setup
+
         if isinstance(value, Setup):
             return value
         text = str(value)
@@ -152,10 +165,43 @@ class SetupType(click.ParamType):
             raise InputError("set-up", text, self.wanted)
         return setup
 
+    def option(self, default: str, help_text: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+        """``--setup``, read when all else on the command line is known to be well formed.
+
+        Parameters
+        ----------
+        default, help_text : `str`
+            Set-up without the option, and what it says under ``--help``.
+        """
+
+        def decorate(command: Callable[..., None]) -> Callable[..., None]:
+            @functools.wraps(command)
+            def with_setup(*, setup: str, **others: Any) -> None:
+                command(setup=self.convert(setup, None, None), **others)
+
+            return self.name_option(default, help_text)(with_setup)
+
+        return decorate
+
+    def name_option(
+        self, default: str, help_text: str
+    ) -> Callable[[Callable[..., None]], Callable[..., None]]:
+        """``--setup`` as it was written."""
+        return click.option(
+            "--setup",
+            default=default,
+            metavar=self.name,
+            show_default=True,
+            shell_complete=self.shell_complete,
+            help=help_text,
+        )
+
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
         """Names of this kind; files where none fits."""
+        from ..instrument.setup import Setup, setup_names
+
         fitting = [
             name
             for name in setup_names()
@@ -199,6 +245,8 @@ class _EffectSetting(click.ParamType):
 
 def _parameters() -> list[tuple[str, Parameter]]:
     """All parameters of the catalogue by ``name.parameter``."""
+    from ..effects import EFFECTS
+
     return [
         (f"{effect.name}.{parameter.name}", parameter)
         for effect in EFFECTS
@@ -214,14 +262,7 @@ LABORATORY = SetupType("monochromator", "a laboratory set-up with a monochromato
 ANY_LIGHT = SetupType("", "a set-up")
 SKY = SetupType("sky", "one behind a telescope, as lsst_e2v, monocam or hsc")
 
-laboratory_of_the_mock = click.option(
-    "--setup",
-    default="ts8_e2v",
-    metavar=LABORATORY.name,
-    show_default=True,
-    shell_complete=LABORATORY.shell_complete,
-    help="Laboratory set-up: name or file.",
-)
+laboratory_of_the_mock = LABORATORY.name_option("ts8_e2v", "Laboratory set-up: name or file.")
 """Set-up that the mock reads itself: the command gets it as it was written."""
 
 

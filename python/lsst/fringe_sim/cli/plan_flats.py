@@ -5,26 +5,18 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
-from astropy import units
-from astropy.table import QTable
-from numpy.typing import NDArray
 
-from ..algorithms.flat_plan import (
-    FlatForecast,
-    PlannedFlat,
-    RankedFlat,
-    forecast_flats,
-    nyquist_thickness_um,
-    rank_flats,
-    recommend_flats,
-)
-from ..model import FringeModel, Setup
-from .inputs import read_settings
 from .parameters import EFFECT, LABORATORY, THICKNESS_RANGE, WAVELENGTHS, Quantity, effect_settings
+
+if TYPE_CHECKING:  # imported by the functions, so that --help is quick
+    from astropy.table import QTable
+    from numpy.typing import NDArray
+
+    from ..algorithms.flat_plan import FlatForecast, PlannedFlat, RankedFlat
+    from ..instrument.setup import Setup
 
 __all__ = ["plan_flats"]
 
@@ -33,9 +25,7 @@ RANKED_ROWS = 5
 
 
 @click.command(name="plan-flats")
-@click.option(
-    "--setup", type=LABORATORY, default="ts8_e2v", show_default=True, help="Laboratory set-up: name or file."
-)
+@LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file.")
 @click.option("--thickness", type=THICKNESS_RANGE, help="Thicknesses of the layer, µm; those of the set-up.")
 @click.option("--search", type=THICKNESS_RANGE, help="Thicknesses the fit will search, µm; as 'fit' does.")
 @click.option("--wavelengths", type=WAVELENGTHS, help="Flats, nm: 880:990:10 or a list; those of the set-up.")
@@ -103,6 +93,18 @@ def plan_flats(
       fringe-sim plan-flats --thickness 7um:15um --wavelengths 880:990:10
       fringe-sim plan-flats --thickness 7:15 --effect contrast_loss.factor=0.15 --electrons 50000 --region 1024
     """
+    import numpy as np
+
+    from ..algorithms.flat_plan import (
+        PlannedFlat,
+        forecast_flats,
+        nyquist_thickness_um,
+        rank_flats,
+        recommend_flats,
+    )
+    from ..model import FringeModel
+    from .inputs import read_settings
+
     settings = dict(read_settings(effects_file)) if effects_file else {}
     model = FringeModel.from_setup(setup, {**settings, **effect_settings(effects)})
     nominal = wavelengths or setup.wavelengths_nm
@@ -137,6 +139,9 @@ def plan_flats(
 
 def forecast_table(forecast: FlatForecast) -> QTable:
     """Forecast at every thickness, with units."""
+    from astropy import units
+    from astropy.table import QTable
+
     table = QTable()
     table["thickness"] = forecast.thickness_um * units.um
     table["sigma"] = 1e3 * forecast.sigma_um * units.nm
@@ -158,6 +163,8 @@ def _print(
     slip_limit: float,
     width_nm: float,
 ) -> None:
+    import numpy as np
+
     click.echo(f"{len(now.flats)} flats: {_listed(now, width_nm)}")
     head = ("thickness µm", "σ nm", "rival µm", "orders off", "Δχ² pixel", "slip pixel", "slip region")
     click.echo("  ".join(f"{name:>13}" for name in head))
@@ -195,7 +202,7 @@ def _print(
         )
 
 
-def _print_nyquist(limit_um: NDArray[np.float64], range_um: tuple[float, float]) -> None:
+def _print_nyquist(limit_um: NDArray[Any], range_um: tuple[float, float]) -> None:
     """Up to which thickness neighbouring flats sample the fringe, if there are two of them."""
     if limit_um.size == 0:
         return
@@ -249,7 +256,7 @@ def _summary(forecast: FlatForecast, slip_limit: float) -> dict[str, Any]:
         "flats": [_flat(flat) for flat in forecast.flats],
         "safe": forecast.safe(slip_limit),
         "order_um": forecast.order_um,
-        "sigma_nm": _number(1e3 * math.sqrt(float(np.mean(forecast.sigma_um**2)))),
+        "sigma_nm": _number(1e3 * math.sqrt(float((forecast.sigma_um**2).mean()))),
         "worst": {
             "thickness_um": float(forecast.thickness_um[worst]),
             "rival_um": _number(float(forecast.rival_um[worst])),

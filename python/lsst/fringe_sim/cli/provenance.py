@@ -11,12 +11,8 @@ from typing import Any
 from uuid import UUID
 
 import click
-from astropy.io import fits
-from astropy.table import Table
 
 from ..errors import FrameFormatError, InputError, UnknownNameError
-from ..model.provenance import effects_of_header, inputs_of_header
-from ..resources import DAMAGE, first_line, open_user_fits, revision
 
 __all__ = ["describe", "provenance", "read_header"]
 
@@ -77,9 +73,12 @@ def read_header(path: str) -> dict[str, Any]:
     InputError
         There is no such file, or it is damaged or of another kind; it is named.
     """
+    from ..resources import DAMAGE, first_line
+
     if not Path(path).is_file():
         raise InputError("file", path, "an existing file, or a repository with --dataset-type")
     suffix = Path(path).suffix
+    damage: tuple[type[Exception], ...] = (*DAMAGE, RecursionError)
     readers = {".ecsv": _table_header, ".json": _document_header}
     try:
         with warnings.catch_warnings():
@@ -87,21 +86,25 @@ def read_header(path: str) -> dict[str, Any]:
             return readers.get(suffix, _fits_header)(path)
     except InputError:
         raise
-    except (*DAMAGE, RecursionError) as error:
+    except damage as error:
         raise FrameFormatError(
             "file", first_line(error), "an undamaged FITS, ECSV or JSON product", source=path
         ) from None
 
 
 def _fits_header(path: str) -> dict[str, Any]:
+    from astropy.io.fits.card import Undefined
+
+    from ..resources import open_user_fits
+
     with open_user_fits(path, memmap=True, lazy_load_hdus=True) as hdus:
         header = hdus[0].header
-        return {
-            key: header[key] for key in header if key and not isinstance(header[key], fits.card.Undefined)
-        }
+        return {key: header[key] for key in header if key and not isinstance(header[key], Undefined)}
 
 
 def _table_header(path: str) -> dict[str, Any]:
+    from astropy.table import Table
+
     return {str(key): value for key, value in Table.read(path, format="ascii.ecsv").meta.items()}
 
 
@@ -128,6 +131,8 @@ def describe(header: Mapping[str, Any]) -> dict[str, Any]:
         ``product``, ``software``, ``configuration``, ``setup``, ``effects``, ``tables``, ``seeds``, ``errors``,
         ``dataset``, ``inputs``, and under ``other`` what is left. Plain values, ready for JSON.
     """
+    from ..model.provenance import effects_of_header
+
     software = {
         key.removeprefix("VERSION ").lower(): value
         for key, value in header.items()
@@ -177,6 +182,8 @@ def _tables(header: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _compared(name: str, stated: str) -> str:
+    from ..resources import revision
+
     folder, _, file = name.rpartition("/")
     try:
         return "same" if revision(folder, file) == stated else "differs"
@@ -185,6 +192,8 @@ def _compared(name: str, stated: str) -> str:
 
 
 def _inputs(header: Mapping[str, Any]) -> list[dict[str, str]]:
+    from ..model.provenance import inputs_of_header
+
     found: dict[int, dict[str, str]] = {}
     for key, value in header.items():
         match = _INPUT.fullmatch(key)

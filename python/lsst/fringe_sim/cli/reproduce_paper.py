@@ -8,11 +8,6 @@ from pathlib import Path
 import click
 
 from ..errors import InputError
-from ..mock.thickness import E2V_SHAPE, e2v_321
-from ..paper import SECTIONS, reproduce
-from ..paper.section import Context
-from ..report.paper_page import write_paper_page
-from .inputs import prepare_folder
 from .parameters import SIZE
 from .progress import progress
 
@@ -60,6 +55,12 @@ def reproduce_paper(
       fringe-sim reproduce-paper --out paper
       fringe-sim reproduce-paper --out paper --published ../shared
     """
+    from ..mock.thickness import E2V_SHAPE, e2v_321
+    from ..paper import SECTIONS, reproduce
+    from ..paper.section import Context
+    from ..report.paper_page import write_paper_page
+    from .inputs import prepare_folder
+
     columns, rows = size
     if min(size) < LEAST_SIDE or rows > E2V_SHAPE[0] or columns > E2V_SHAPE[1]:
         raise InputError(

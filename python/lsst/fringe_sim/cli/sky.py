@@ -4,51 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
-from ..algorithms.field_response import SensorPlacement, sensor_response
-from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, throughput_electrons
 from ..errors import InputError, OutOfRangeError
-from ..instrument.bandpass import Bandpass
-from ..instrument.camera import Camera
-from ..instrument.detector import Detector
-from ..instrument.night import NightHistory
-from ..instrument.sky import SkySpectrum
-from ..mock.thickness import e2v_321
-from ..model import FringeModel, Setup
-from ..model.provenance import input_cards
-from ..products import BackgroundWriter, SensorSection, SkyFringe, band_cards
-from ..report.figures import sky_figure
-from ..report.sky_page import write_sky_report
-from ..report.style import save_figure
-from .inputs import (
-    BUILT_IN,
-    effect_cards,
-    prepare_folder,
-    read_section,
-    read_settings,
-    read_thickness,
-    sky_settings,
-)
-from .parameters import EFFECT, SKY, Quantity, effect_settings
+from .parameters import BUILT_IN, EFFECT, SKY, Quantity, effect_settings
 from .progress import progress
 
-__all__ = ["sky"]
+if TYPE_CHECKING:  # imported by the functions, so that --help is quick
+    import numpy as np
+    from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+    from ..instrument.detector import Detector
+    from ..instrument.setup import Setup
+    from ..products import SensorSection, SkyFringe
+
+    FloatArray = NDArray[np.float64]
+
+__all__ = ["sky"]
 
 PERCENT = 100.0
 MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
 
 
 @click.command()
-@click.option(
-    "--setup", type=SKY, default="lsst_e2v", show_default=True, help="Sensor and telescope: name or file."
-)
+@SKY.option("lsst_e2v", "Sensor and telescope: name or file.")
 @click.option(
     "--thickness", required=True, help="Map of the varying layer: a FITS file [µm], or 'e2v_321' (built in)."
 )
@@ -96,6 +77,19 @@ def sky(
       fringe-sim sky --setup monocam --thickness e2v_321 --noise --exptime 60s --out sky
       fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky
     """
+    from ..algorithms.field_response import SensorPlacement, sensor_response
+    from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, throughput_electrons
+    from ..instrument.bandpass import Bandpass
+    from ..instrument.camera import Camera
+    from ..instrument.night import NightHistory
+    from ..instrument.sky import SkySpectrum
+    from ..model import FringeModel
+    from ..model.provenance import input_cards
+    from ..report.figures import sky_figure
+    from ..report.sky_page import write_sky_report
+    from ..report.style import save_figure
+    from .inputs import effect_cards, prepare_folder, read_settings, sky_settings
+
     _check_exposure(exptime, night)
     sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
     settings = dict(read_settings(effects_file)) if effects_file else {}
@@ -169,6 +163,10 @@ def _check_exposure(exptime: float | None, night: bool) -> None:
 
 def _layer(thickness: str, sensor: Detector) -> tuple[FloatArray, SensorSection | None]:
     """Thickness of the varying layer [µm], and the part of the sensor that it is of."""
+    from ..mock.thickness import e2v_321
+    from ..products import SensorSection
+    from .inputs import read_section, read_thickness
+
     if thickness == BUILT_IN:
         layer = e2v_321()
         return layer, SensorSection.of_image(sensor, (layer.shape[0], layer.shape[1]), {})
@@ -178,6 +176,8 @@ def _layer(thickness: str, sensor: Detector) -> tuple[FloatArray, SensorSection 
 
 def _span_um(layer: FloatArray) -> tuple[float, float]:
     """Thicknesses that the layer has [µm], widened so that rounding cannot leave them."""
+    import numpy as np
+
     return float(np.nanmin(layer)) - MARGIN_UM, float(np.nanmax(layer)) + MARGIN_UM
 
 
@@ -189,6 +189,8 @@ def _written(
     section: SensorSection | None,
 ) -> list[SkyFringe]:
     """Frames, each written while the next one is simulated; headers tell what its bands are."""
+    from ..products import BackgroundWriter, band_cards
+
     made: list[SkyFringe] = []
     with progress("simulating frames", len(scales)) as advance, BackgroundWriter() as writer:
         for number, (frame, scale) in enumerate(zip(series, scales, strict=True)):

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import speclite.filters
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, OutOfRangeError, ResourceError, UnknownNameError
@@ -138,6 +137,8 @@ class Bandpass:
         InputError
             The curve transmits where the detector or the air does not.
         """
+        import speclite.filters
+
         known = speclite.filters.filter_group_names
         try:
             curve = speclite.filters.load_filter(filter_name)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
-import galsim
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, OutOfRangeError
 from .bandpass import Bandpass
+
+if TYPE_CHECKING:
+    import galsim
 
 __all__ = [
     "add_photon_noise",
@@ -50,6 +53,8 @@ def add_photon_noise(electrons: ArrayLike, rng: np.random.Generator) -> NDArray[
         An image that is not two-dimensional, or has pixels that are negative or not finite.
     """
     image = _expected(electrons)
+    import galsim
+
     galsim.Image(image, copy=False).addNoise(galsim.PoissonNoise(_deviate(rng)))
     return image
 
@@ -87,6 +92,8 @@ def add_readout(
     if not 0.0 < gain < math.inf:
         raise OutOfRangeError("gain [e/ADU]", gain, "positive")
     adu = _expected(electrons) / gain
+    import galsim
+
     noise = galsim.CCDNoise(_deviate(rng), sky_level=0.0, gain=gain, read_noise=read_noise_e)
     galsim.Image(adu, copy=False).addNoise(noise)
     return adu
@@ -157,4 +164,6 @@ def _expected(electrons: ArrayLike) -> NDArray[np.float64]:
 
 def _deviate(rng: np.random.Generator) -> galsim.BaseDeviate:
     # GalSim takes 0 as "choose a seed"
+    import galsim
+
     return galsim.BaseDeviate(int(rng.integers(1, 2**31 - 1)))

@@ -8,9 +8,8 @@ data id of one that is there, as a second mock series of the same hour has it, i
 from __future__ import annotations
 
 import dataclasses
-import glob
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,18 +29,16 @@ from lsst.daf.butler.registry import ConflictingDefinitionError
 from lsst.resources import ResourcePath
 
 from ..errors import FrameFormatError, InputError
+from ..instrument.raw_files import find_raw_files
 from ..instrument.raw_frame import RawMetadata, read_raw_header
 from .formatters import RawFrameFormatter
 from .instruments import INSTRUMENTS, FringeInstrument
 from .translators import TRANSLATORS
 
-__all__ = ["RAW", "IngestReport", "RawExposure", "find_raw_files", "ingest_raws", "raw_dataset_type"]
+__all__ = ["RAW", "IngestReport", "RawExposure", "ingest_raws", "raw_dataset_type"]
 
 RAW = "raw"
 """Dataset type of raw frames."""
-
-SUFFIXES = (".fits", ".fits.fz", ".fits.gz", ".fz")
-"""Endings of the files that are taken from a directory."""
 
 COMPARED_BLOCKS, COMPARED_BYTES = 64, 8192
 """Blocks in which a file is compared with that in the repository, and their length."""
@@ -110,45 +107,6 @@ def raw_dataset_type(butler: Butler) -> DatasetType:
 
 ATTEMPTS = 3
 """How often frames are looked for and stored, if other processes store them at the same time."""
-
-
-def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[str]]:
-    """Find the files that are meant.
-
-    Parameters
-    ----------
-    paths : iterable of `str`
-        Files, directories (searched with everything below them) and patterns with ``*``, ``?`` and ``[]``.
-
-    Returns
-    -------
-    files : `list` [`str`]
-        Absolute paths, sorted, each once.
-    refused : `list` [`str`]
-        One message for each path that leads to no file.
-    """
-    files: set[str] = set()
-    refused = []
-    for path in paths:
-        found = list(_expand(path))
-        if not found:
-            allowed = (
-                f"a file, a directory that holds {'/'.join(SUFFIXES)} files, or a pattern that matches some"
-            )
-            refused.append(str(InputError("path", path, allowed)))
-        files.update(str(file.absolute()) for file in found)
-    return sorted(files), refused
-
-
-def _expand(path: str) -> Iterator[Path]:
-    entry = Path(path)
-    if entry.is_dir():
-        yield from (file for file in entry.rglob("*") if file.is_file() and file.name.endswith(SUFFIXES))
-    elif entry.is_file():
-        yield entry
-    else:
-        for name in glob.iglob(path, recursive=True):
-            yield from _expand(name)
 
 
 def ingest_raws(

@@ -1,8 +1,8 @@
 """Set-ups and the fringe model."""
 
+from ..instrument.setup import Setup, setup_names
 from .fringe_model import FringeModel
 from .response_table import ResponseTable, response_table, tabulate
-from .setup import Setup, setup_names
 from .table_cache import TableCache
 from .two_layer_table import TwoLayerTable, two_layer_table
 

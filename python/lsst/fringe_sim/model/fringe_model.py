@@ -21,12 +21,12 @@ from ..effects import (
     apply_to_system,
 )
 from ..errors import InputError
+from ..instrument.setup import Setup
 from ..optics.harmonics import ROUNDING
 from ..optics.illumination import DEFAULT_STEP_NM, Illumination
 from ..optics.phase_response import PhaseResponse
 from ..optics.system import OpticalSystem
 from .response_table import DEFAULT_TOLERANCE, ResponseTable, response_table, tabulate
-from .setup import Setup
 from .table_cache import TableCache
 
 __all__ = ["FringeModel"]

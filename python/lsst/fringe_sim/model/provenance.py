@@ -27,10 +27,10 @@ from typing import Any
 from .. import __version__
 from ..effects import EFFECTS, activate_effects, apply_to_system
 from ..errors import FrameFormatError, InputError, UnknownNameError, to_number
+from ..instrument.setup import Setup, setup_names
 from ..optics.stack import LayerStack
 from ..optics.system import OpticalSystem
 from ..resources import REVISION_LENGTH, read_yaml, revision
-from .setup import Setup, setup_names
 
 __all__ = [
     "SKY_TABLES",

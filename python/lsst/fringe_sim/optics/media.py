@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from ..errors import OutOfRangeError, ResourceError, UnknownNameError
 from ..resources import read_table, read_yaml
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline, PchipInterpolator
 
 __all__ = ["Medium", "constant_medium", "get_medium", "medium_names"]
 
@@ -231,6 +233,8 @@ def get_medium(name: str) -> Medium:
 
 
 def _read_tabulated(name: str, entry: dict[str, Any]) -> Medium:
+    from scipy.interpolate import CubicSpline, PchipInterpolator
+
     table = read_table("media", entry["table"])
     wavelength = np.asarray(table["wavelength"].quantity.to_value("nm"), dtype=float)
     if np.any(np.diff(wavelength) <= 0):

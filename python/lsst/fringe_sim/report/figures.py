@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.table import Table
@@ -14,21 +15,22 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from ..algorithms.focal_plane import DES_CRITERION
-from ..algorithms.image_correlation import CoaddCorrelation
-from ..algorithms.single_pixel import SinglePixelFit
 from ..errors import InputError
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
 from .style import (
     DIVERGING,
     LINES,
-    MOST_PIXELS,
     SEQUENTIAL,
     block_mean,
     figure,
     finite_range,
+    gallery,
     show_image,
 )
+
+if TYPE_CHECKING:
+    from ..algorithms.image_correlation import CoaddCorrelation
+    from ..algorithms.single_pixel import SinglePixelFit
 
 __all__ = [
     "components_figure",
@@ -44,6 +46,9 @@ __all__ = [
 ]
 
 PERCENT = 100.0
+
+GALLERY_PIXELS = 250
+"""Frames of a gallery are averaged down to about this many pixels a side, which a panel has."""
 
 RESIDUAL_CELLS = 100
 """Residuals are averaged down to about this many cells a side."""
@@ -103,7 +108,7 @@ def flats_figure(
     title: str,
     unit: str = "fringe amplitude [%]",
     limits: tuple[float, float] | None = None,
-    most_px: int = MOST_PIXELS,
+    most_px: int = GALLERY_PIXELS,
     step_px: float = 1.0,
 ) -> Figure:
     """Gallery of frames ``[wavelength, y, x]`` on one colour scale.
@@ -126,8 +131,8 @@ def flats_figure(
     count = len(wavelength_nm)
     columns = min(6, count)
     rows = -(-count // columns)
-    with figure(2.1 * columns + 0.6, 2.15 * rows + 0.5) as made:
-        panels = np.atleast_1d(made.subplots(rows, columns, sharex=True, sharey=True)).ravel()
+    with figure(2.1 * columns + 0.6, 2.15 * rows + 0.5, None) as made:
+        panels = gallery(made, count, columns, (0.65, 1.0, 0.48, 0.55), 0.3)
         values = PERCENT * np.where(np.asarray(mask) == 0, amplitude, np.nan)
         limits = limits or finite_range(values[:, ::7, ::7], symmetric=True)
         for panel, image, wavelength in zip(panels, values, wavelength_nm, strict=False):
@@ -145,12 +150,12 @@ def flats_figure(
             panel.set_xlabel("")
             panel.set_ylabel("")
             panel.tick_params(labelsize=6)
-        for panel in panels[count:]:
-            panel.set_visible(False)
-        made.supxlabel("column [px]", fontsize=8)
-        made.supylabel("row [px]", fontsize=8)
-        made.colorbar(drawn, ax=list(panels), label=unit, shrink=0.8)
-        made.suptitle(title)
+        width, height = made.get_size_inches()
+        bar = made.add_axes((1.0 - 0.85 / width, 0.5 / height + 0.1, 0.17 / width, 0.8 - 1.0 / height))
+        made.colorbar(drawn, cax=bar, label=unit)
+        made.supxlabel("column [px]", fontsize=8, y=0.07 / height, va="bottom")
+        made.supylabel("row [px]", fontsize=8, x=0.07 / width, ha="left")
+        made.suptitle(title, y=1.0 - 0.08 / height, va="top")
         return made
 
 
@@ -197,8 +202,8 @@ def phase_figure(
     count = len(wavelength_nm)
     columns = min(4, count)
     rows = -(-count // columns)
-    with figure(2.9 * columns, 1.9 * rows + 0.3) as made:
-        panels = np.atleast_1d(made.subplots(rows, columns, sharex=True, sharey=True)).ravel()
+    with figure(2.9 * columns, 1.9 * rows + 0.3, None) as made:
+        panels = gallery(made, count, columns, (0.75, 0.12, 0.55, 0.27), 0.3)
         for panel, measured, modelled, wavelength in zip(panels, data, model, wavelength_nm, strict=False):
             panel.plot(phase, PERCENT * measured, ".", ms=3, color=LINES[0], label="flats")
             panel.plot(
@@ -206,10 +211,9 @@ def phase_figure(
             )
             panel.set_title(f"{wavelength:g} nm")
         panels[0].legend(fontsize=7)
-        for panel in panels[count:]:
-            panel.set_visible(False)
-        made.supxlabel("thickness over one fringe order [1]")
-        made.supylabel("fringe amplitude [%]")
+        width, height = made.get_size_inches()
+        made.supxlabel("thickness over one fringe order [1]", y=0.07 / height, va="bottom")
+        made.supylabel("fringe amplitude [%]", x=0.07 / width, ha="left")
         return made
 
 
@@ -360,6 +364,8 @@ def focal_plane_figure(cells: Table, sensors: Table) -> Figure:
     sensors : `astropy.table.Table`
         One row per sensor (`summary_table`).
     """
+    from ..algorithms.focal_plane import DES_CRITERION
+
     templates = sum(name.startswith("residual_") for name in sensors.colnames)
     with figure(12.5, 10.5) as made:
         panels = made.subplots(2, 2)

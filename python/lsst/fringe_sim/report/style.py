@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -26,6 +26,7 @@ __all__ = [
     "block_mean",
     "figure",
     "finite_range",
+    "gallery",
     "save_figure",
     "show_image",
     "to_png",
@@ -35,6 +36,9 @@ SEQUENTIAL = "cividis"
 DIVERGING = "PuOr_r"
 LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 """Okabe & Ito 2008: distinct for all common kinds of colour vision."""
+
+BETWEEN_COLUMNS = 0.06
+"""Space between the panels of a gallery, in their widths."""
 
 MOST_PIXELS = 600
 """Images are averaged down to about this many pixels a side before drawing."""
@@ -53,12 +57,44 @@ _RC: dict[Any, Any] = {
 
 
 @contextmanager
-def figure(width: float, height: float) -> Iterator[Figure]:
+def figure(
+    width: float, height: float, layout: Literal["constrained"] | None = "constrained"
+) -> Iterator[Figure]:
     """A figure in the common style, in inches, that is not known to pyplot."""
     with matplotlib.rc_context(_RC):
-        made = Figure(figsize=(width, height), layout="constrained")
+        made = Figure(figsize=(width, height), layout=layout)
         FigureCanvasAgg(made)
         yield made
+
+
+def gallery(
+    made: Figure, count: int, most_columns: int, margins: tuple[float, float, float, float], gap: float
+) -> list[Axes]:
+    """Equal panels with common axes, as many as are wanted, in a figure without a layout.
+
+    What a solver finds for dozens of panels after seconds is known beforehand where all are alike.
+
+    ``margins`` are left, right, bottom and top, and ``gap`` is between rows, which have titles, all in inches.
+    """
+    columns = min(most_columns, count)
+    rows = -(-count // columns)
+    width, height = made.get_size_inches()
+    left, right, bottom, top = margins
+    up = (height - bottom - top + gap) / rows - gap
+    grid = made.add_gridspec(
+        rows,
+        columns,
+        left=left / width,
+        right=1.0 - right / width,
+        bottom=bottom / height,
+        top=1.0 - top / height,
+        wspace=BETWEEN_COLUMNS,
+        hspace=gap / up,
+    )
+    panels = np.ravel(np.asarray(grid.subplots(sharex=True, sharey=True)))
+    for panel in panels[count:]:
+        panel.set_visible(False)
+    return list(panels[:count])
 
 
 def finite_range(
@@ -114,7 +150,8 @@ def show_image(
 def to_png(made: Figure) -> bytes:
     """The figure as PNG without time stamps."""
     buffer = io.BytesIO()
-    made.savefig(buffer, format="png", metadata={"Software": None})
+    # `Figure.savefig` would draw everything once more for the sake of the layout.
+    FigureCanvasAgg(made).print_png(buffer, metadata={"Software": None})
     return buffer.getvalue()
 
 

@@ -1,5 +1,6 @@
 """Discovery of missing effects: find the disagreement, name it, add it, show the gap shrink."""
 
+from ...model.effects_override import read_effects_override
 from .search import SearchOptions, discover
 from .sky_search import SKY_SEARCH, discover_sky, placement_in_frames
 from .verdict import (
@@ -10,7 +11,6 @@ from .verdict import (
     Verdict,
     Where,
     probability_text,
-    read_effects_override,
 )
 
 __all__ = [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 from astropy.table import Table
 
-from ...errors import InputError
+from ...model.effects_override import effects_override
 
 __all__ = [
     "Gap",
@@ -22,7 +21,6 @@ __all__ = [
     "Verdict",
     "Where",
     "probability_text",
-    "read_effects_override",
 ]
 
 VERDICTS = ("named", "no_discrepancy", "unexplained")
@@ -274,13 +272,8 @@ class Verdict:
 
     def override(self) -> str:
         """Text of a config override that puts the effects into fit, sky simulation and templates."""
-        lines = [
-            f"# Effects found in data of set-up {self.setup}; verdict: {self.verdict}.",
-            "# Use with -C label:effects.py on any task that reads effects.",
-        ]
-        for key, value in self.settings.items():
-            lines.append(f'config.effects["{key}"] = {value!r}')
-        return "\n".join(lines) + "\n"
+        origin = f"Effects found in data of set-up {self.setup}; verdict: {self.verdict}."
+        return effects_override(self.settings, origin)
 
     def write(self, out_dir: str | Path) -> Path:
         """Write ``discovery.json``, ``discovery.ecsv`` and ``effects.py``; returns the path of the first."""
@@ -315,44 +308,6 @@ class Verdict:
             f"(held out {gap.heldout_before:.6g} -> {gap.heldout_after:.6g}, noise floor {gap.noise_floor:.6g})"
         )
         return "\n".join(lines)
-
-
-_STATEMENT = re.compile(r"""config\.effects\[(["'])([\w.]+)\1\]\s*=\s*([^#]+?)\s*(?:#.*)?""")
-
-
-def read_effects_override(text: str, source: str | None = None) -> dict[str, float]:
-    """Effects in the text of an override file written by `Verdict.override`; nothing is executed.
-
-    Parameters
-    ----------
-    text : `str`
-        Lines that each set one effect to a number; empty lines and comments are passed over.
-    source : `str`, optional
-        File that the text is from, for the error.
-
-    Returns
-    -------
-    effects : `dict` [`str`, `float`]
-        Values by ``effect.parameter``.
-
-    Raises
-    ------
-    InputError
-        A line that is anything else.
-    """
-    found: dict[str, float] = {}
-    for line in map(str.rstrip, text.splitlines()):
-        if not line or line.lstrip().startswith("#"):
-            continue
-        statement = _STATEMENT.fullmatch(line)
-        try:
-            if statement is None:
-                raise ValueError
-            found[statement[2]] = float(statement[3])
-        except ValueError:
-            allowed = 'lines of config.effects["effect.parameter"] = number'
-            raise InputError("statement", line, allowed, source=source) from None
-    return found
 
 
 def _plain(value: Any) -> Any:

@@ -15,6 +15,7 @@ from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ...model import FringeModel
 from ...optics.system import OBSERVABLES
 from ...products import FringeCube, ThicknessMap, mask_bits
+from ..thickness_fit_options import FIT_METHODS
 from .amplitudes import Amplitudes
 from .cells import run_threaded, sample_pixels
 from .global_fit import global_fit, normalise_to_cells, spans_orders
@@ -29,8 +30,6 @@ from .templates import FringeTemplates
 from .uncertainty import lone_slip_probability, slip_probability
 
 __all__ = ["FIT_METHODS", "amplitudes_from_cube", "fit_thickness", "make_templates", "with_observable"]
-
-FIT_METHODS = ("global", "guo2022")
 
 STEPS_PER_ORDER = 300
 """Template thicknesses in one fringe order: 1 nm of epoxy; linear interpolation is then good to 3e-5 of the swing."""

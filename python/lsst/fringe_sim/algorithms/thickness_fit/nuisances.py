@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, OutOfRangeError, UnknownNameError
+from ..thickness_fit_options import CONTRASTS, ZONES
 from .cells import Cells
 from .evidence import refine_cells
 from .templates import FringeTemplates
@@ -34,10 +35,6 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
-ZONES = ("sensor", "halves", "amplifiers")
-"""Areas with a level of their own: all, upper and lower half, or 8 by 2 amplifiers."""
-CONTRASTS = ("fixed", "common", "wavelength")
-"""Contrast as the model has it, one factor for all wavelengths, or one for each."""
 _MOST_CELLS = 8_000
 _ROUNDS = 8
 _TOLERANCE = 1e-5

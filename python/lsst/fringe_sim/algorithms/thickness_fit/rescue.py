@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from .amplitudes import Amplitudes
 from .borders import gather_pixels
@@ -37,7 +37,7 @@ _SAMPLE = 400_000
 def chi2_limits(most: int) -> NDArray[np.float32]:
     """Reduced chi-square that is exceeded with `SUSPECT_PROBABILITY`, by number of wavelengths 0 ... ``most``."""
     degrees = np.maximum(np.arange(most + 1) - 1, 1)
-    return (chi2_distribution.isf(SUSPECT_PROBABILITY, degrees) / degrees).astype(np.float32)
+    return (chdtri(degrees, SUSPECT_PROBABILITY) / degrees).astype(np.float32)
 
 
 def rescue_pixels(
@@ -131,7 +131,7 @@ def typical_misfit(pixels: PixelFit) -> float:
         chi2 = pixels.chi2.ravel()[::stride][pixels.n_wavelengths.ravel()[::stride] == most]
         if chi2.size > 0:
             break
-    expected = chi2_distribution.median(most - 1) / (most - 1)
+    expected = chdtri(most - 1, 0.5) / (most - 1)
     return max(float(np.median(chi2)) / expected, 1.0)
 
 

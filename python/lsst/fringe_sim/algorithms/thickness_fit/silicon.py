@@ -27,6 +27,7 @@ from scipy.special import ndtr
 
 from ...errors import InputError, OutOfRangeError
 from ...model import FringeModel
+from ..thickness_fit_options import SILICON_FIELDS
 from .amplitudes import Amplitudes
 from .borders import gather_pixels
 from .newton import gauss_newton
@@ -45,9 +46,6 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-
-SILICON_FIELDS = {"sensor": 0, "plane": 1, "paraboloid": 2}
-"""Degree of the polynomial over the sensor, by the name under which commands and tasks know it."""
 
 OFFSET = "silicon_thickness.offset"
 _SCAN_PER_ORDER = 12

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, UnknownNameError, to_number
 from ..optics.illumination import (
@@ -17,8 +17,10 @@ from ..optics.illumination import (
     TriangularProfile,
 )
 from ..optics.stack import LayerStack
-from ..optics.system import OpticalSystem
 from ..resources import list_resources, read_user_yaml, read_yaml
+
+if TYPE_CHECKING:
+    from ..optics.system import OpticalSystem
 
 __all__ = ["Setup", "setup_names"]
 
@@ -170,7 +172,7 @@ class Setup:
             return Beam.collimated()
         if self.beam_kind == "cone":
             return Beam.cone(self.f_number, self.obscuration)
-        from ..instrument.telescope import telescope_beam
+        from .telescope import telescope_beam
 
         return telescope_beam(self.telescope, field_x_deg, field_y_deg)
 
@@ -178,6 +180,8 @@ class Setup:
         self, *, field_x_deg: float = 0.0, field_y_deg: float = 0.0, observable: str = "detection"
     ) -> OpticalSystem:
         """Stack and light of this set-up without any further effect."""
+        from ..optics.system import OpticalSystem  # compiled code
+
         return OpticalSystem(
             stack=self.stack,
             temperature_k=self.temperature_k,

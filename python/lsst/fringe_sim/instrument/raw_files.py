@@ -1,0 +1,53 @@
+"""Which files of raw frames are meant by paths, folders and patterns."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from ..errors import InputError
+
+__all__ = ["find_raw_files"]
+
+SUFFIXES = (".fits", ".fits.fz", ".fits.gz", ".fz")
+"""Endings of the files that are taken from a directory."""
+
+
+def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Find the files that are meant.
+
+    Parameters
+    ----------
+    paths : iterable of `str`
+        Files, directories (searched with everything below them) and patterns with ``*``, ``?`` and ``[]``.
+
+    Returns
+    -------
+    files : `list` [`str`]
+        Absolute paths, sorted, each once.
+    refused : `list` [`str`]
+        One message for each path that leads to no file.
+    """
+    files: set[str] = set()
+    refused = []
+    for path in paths:
+        found = list(_expand(path))
+        if not found:
+            allowed = (
+                f"a file, a directory that holds {'/'.join(SUFFIXES)} files, or a pattern that matches some"
+            )
+            refused.append(str(InputError("path", path, allowed)))
+        files.update(str(file.absolute()) for file in found)
+    return sorted(files), refused
+
+
+def _expand(path: str) -> Iterator[Path]:
+    entry = Path(path)
+    if entry.is_dir():
+        yield from (file for file in entry.rglob("*") if file.is_file() and file.name.endswith(SUFFIXES))
+    elif entry.is_file():
+        yield entry
+    else:
+        for name in glob.iglob(path, recursive=True):
+            yield from _expand(name)
