@@ -19,6 +19,7 @@ import numpy as np
 
 from .. import __version__
 from ..errors import FringeSimError, InputError
+from ..files import write_whole
 from ..instrument.camera import Camera
 from ..middleware.instruments import LsstCamFringe, Ts8Fringe
 from ..mock.raw_frames import write_mock_flats
@@ -133,9 +134,7 @@ class DemoRun:
 
     def _remember(self) -> None:
         text = json.dumps({"settings": asdict(self.settings), "done": self._done}, indent=2)
-        temporary = self._state.with_suffix(".part")
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, self._state)
+        write_whole(self._state, text)
 
 
 @click.command()
