@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import tmm
 
-from lsst.fringe_sim.optics import reflection_transmission
+from lsst.fringe_sim.optics import layer_absorption
 
 from ._table import Row, median_time
 
@@ -63,7 +63,7 @@ def by_tmm(n: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 def ours(n: np.ndarray, d: np.ndarray) -> np.ndarray:
     thickness = d.T[:, :, None]
-    return np.array(reflection_transmission(n[:, None, None], thickness, WAVELENGTHS_UM, THETA, "p"))
+    return layer_absorption(n[:, None, None], thickness, WAVELENGTHS_UM, THETA, "p")[[0, -1]]
 
 
 def by_tmm_fast(n: np.ndarray, d: np.ndarray) -> np.ndarray:

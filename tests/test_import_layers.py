@@ -13,6 +13,7 @@ PACKAGE = Path(lsst.fringe_sim.__file__).parent
 ROOT = "lsst.fringe_sim"
 ORDER = (
     "errors",
+    "files",
     "resources",
     "optics",
     "instrument",
@@ -23,11 +24,12 @@ ORDER = (
     "mock",
 )
 ALLOWED: dict[str, set[str]] = {room: set(ORDER[: i + 1]) for i, room in enumerate(ORDER)}
-ALLOWED["middleware"] = {"errors", "resources", "instrument", "products", "middleware"}
+ALLOWED["middleware"] = {"errors", "files", "resources", "instrument", "products", "middleware"}
 ALLOWED["tasks"] = set(ORDER) - {"mock"} | {"middleware", "tasks"}
 ALLOWED["paper"] = set(ORDER) | {"paper"}
 ALLOWED["report"] = {
     "errors",
+    "files",
     "resources",
     "optics",
     "instrument",
@@ -66,7 +68,7 @@ def imported_rooms(path: Path) -> set[str]:
         for name in names:
             if name.startswith(ROOT + "."):
                 rooms.add(name.removeprefix(ROOT + ".").split(".")[0])
-    return rooms & (set(ALLOWED) | {"errors", "resources"})
+    return rooms & (set(ALLOWED) | {"errors", "files", "resources"})
 
 
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from flat_cubes import TEN_NM, relative_flats
+from hard_maps import HARD_MAPS
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.errors import InputError, UnknownNameError
-from lsst.fringe_sim.mock.thickness import HARD_MAPS, random_field
+from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube, mask_bits
 

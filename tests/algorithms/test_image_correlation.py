@@ -12,7 +12,6 @@ from lsst.fringe_sim.algorithms.image_correlation import (
     coadd_correlation,
     coadd_model,
     correlation_function,
-    cross_correlation_function,
     random_cutout,
 )
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
@@ -45,19 +44,6 @@ def test_equals_treecorr(rng, shape, masked):
     # TreeCorr keeps weights in single precision
     np.testing.assert_allclose(found.weight, expected.weight, rtol=1e-7)
     np.testing.assert_allclose(found.separation_px, expected.meanr, rtol=1e-7)
-
-
-def test_cross_correlation_equals_treecorr(rng):
-    one, two = gaussian_filter(rng.standard_normal((2, 30, 30)), (0, 2, 2))
-    weight = (rng.random((30, 30)) > 0.1).astype(float)
-    bins = LogBins(1.5, 12.0, 6)
-    expected = treecorr_oracle(one, weight, bins, two)
-    found = cross_correlation_function(one, two, weight, bins)
-    np.testing.assert_allclose(found.xi, expected.xi, rtol=0, atol=1e-6 * one.std() * two.std())
-    # TreeCorr keeps weights in single precision
-    np.testing.assert_allclose(found.weight, expected.weight, rtol=1e-7)
-    swapped = cross_correlation_function(two, one, weight, bins)
-    np.testing.assert_allclose(swapped.xi, found.xi, rtol=1e-9)
 
 
 def test_masked_and_missing_pixels_do_not_count(rng):
@@ -200,8 +186,6 @@ def test_bad_input_is_named(patterns, rng):
         correlation_function(np.ones((5, 5)), -np.ones((5, 5)))
     with pytest.raises(InputError, match="good pixels"):
         correlation_function(np.full((5, 5), np.nan))
-    with pytest.raises(InputError, match="second image"):
-        cross_correlation_function(np.ones((5, 5)), np.ones((4, 4)))
     with pytest.raises(OutOfRangeError, match="separations"):
         LogBins(5.0, 1.0)
     with pytest.raises(OutOfRangeError, match="number of bins"):

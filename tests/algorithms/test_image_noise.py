@@ -10,7 +10,6 @@ from scipy import stats
 from lsst.fringe_sim.algorithms.image_noise import (
     FEWEST_ELECTRONS,
     add_exposure_noise,
-    smooth_contributions,
 )
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 
@@ -102,17 +101,3 @@ def test_what_is_refused(bad):
         add_exposure_noise(np.ones(3), np.random.default_rng(1))
     with pytest.raises(OutOfRangeError, match="read noise"):
         add_exposure_noise(np.ones((2, 2)), np.random.default_rng(1), -1.0)
-
-
-def test_fringe_and_noise_of_a_smoothed_exposure():
-    """White noise of standard deviation s keeps s / (2 sqrt(pi) sigma) after a Gaussian filter."""
-    x = np.arange(600)
-    fringe = 2717.0 * (1.0 + 2e-3 * np.sin(2 * np.pi * x / 120.0))[None, :] * np.ones((600, 1))
-    found = smooth_contributions(fringe, 6.0, np.random.default_rng(2), 8.0)
-    assert found.noise_rms == pytest.approx(np.sqrt(2717.0 + 64.0) / (2 * np.sqrt(np.pi) * 6.0), rel=0.1)
-    damped = np.exp(-0.5 * (2 * np.pi * 6.0 / 120.0) ** 2)
-    assert found.fringe_rms == pytest.approx(2717.0 * 2e-3 / np.sqrt(2) * damped, rel=0.01)
-    assert found.rms == pytest.approx(np.hypot(found.fringe_rms, found.noise_rms), rel=0.05)
-    assert found.peak_to_peak > max(found.fringe_peak_to_peak, found.noise_peak_to_peak)
-    with pytest.raises(OutOfRangeError, match="width of the filter"):
-        smooth_contributions(fringe, 0.0, np.random.default_rng(2))

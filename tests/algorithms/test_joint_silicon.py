@@ -12,7 +12,6 @@ from lsst.fringe_sim.algorithms.thickness_fit import (
     SiliconModel,
     SiliconSearch,
     find_silicon,
-    forecast_silicon,
 )
 from lsst.fringe_sim.algorithms.thickness_fit.fit import amplitudes_from_cube
 from lsst.fringe_sim.cli.main import run
@@ -136,7 +135,7 @@ def test_the_forecast_holds(rng) -> None:
     for width in (0.3, 0.6, 1.0):
         widths = np.where(cube.exposures.bandwidth_fwhm_nm < 1.0, width, 2.0)
         flats = SiliconModel(model, cube.wavelength_nm, widths)
-        foretold[width] = forecast_silicon(data, truth, flats, search, ORDER_UM)
+        foretold[width] = find_silicon(data, truth, flats, search, ORDER_UM).forecast
     assert foretold[0.3].sigma_um < 0.5 * foretold[0.6].sigma_um < 0.25 * foretold[1.0].sigma_um
     flats = SiliconModel(model, cube.wavelength_nm, cube.exposures.bandwidth_fwhm_nm)
     assert foretold[0.3].fringe[: BROAD.size].max() < 0.05 * foretold[0.3].fringe[BROAD.size :].min()
@@ -152,7 +151,7 @@ def test_the_forecast_holds(rng) -> None:
 def test_what_cannot_be_combined_is_refused(rng) -> None:
     model = FringeModel.from_setup("ts8_e2v")
     _, _, cube = sensor((0.0,), rng, None)
-    for choice in ({"method": "guo2022"}, {"smoothing_px": 2.0}, {"nuisances": Nuisances(level=True)}):
+    for choice in ({"method": "guo2022"}, {"nuisances": Nuisances(level=True)}):
         with pytest.raises(InputError, match="silicon"):
             fit_thickness(cube, model, silicon=SiliconSearch(), **choice)
     with pytest.raises(InputError, match="varying layer"):

@@ -1,4 +1,4 @@
-"""Thickness maps: the measured one, random ones, hard ones."""
+"""Thickness maps: the measured one and random ones."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from astropy.io import fits
 
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
-from lsst.fringe_sim.mock import E2V_SHAPE, HARD_MAPS, e2v_321, fit_to_sensor, random_field
-from lsst.fringe_sim.mock.thickness import PixelArea, closed_islands, steep_gradient, two_halves
+from lsst.fringe_sim.mock import E2V_SHAPE, e2v_321, fit_to_sensor, random_field
+from lsst.fringe_sim.mock.thickness import PixelArea
 from lsst.fringe_sim.resources import read_table
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "fit_e2v_321_thickness.py"
@@ -139,35 +139,6 @@ def test_impossible_random_fields_are_refused(rng: np.random.Generator) -> None:
         random_field((8, 8), rng, scale=0.0)
     with pytest.raises(OutOfRangeError, match="span"):
         random_field((8, 8), rng, mean=2.0, span=5.0)
-
-
-@pytest.mark.parametrize("name", HARD_MAPS)
-def test_hard_maps_are_positive_and_finite(name: str) -> None:
-    thickness = HARD_MAPS[name]((96, 128))
-    assert thickness.shape == (96, 128)
-    assert np.all(np.isfinite(thickness))
-    assert thickness.min() > 5.0
-    assert thickness.max() < 30.0
-
-
-def test_steep_gradient_has_its_fringes() -> None:
-    thickness = steep_gradient((64, 64), fringes=45.0)
-    assert (thickness.max() - thickness.min()) / 0.3 == pytest.approx(45.0)
-
-
-def test_islands_are_closed() -> None:
-    """Every island's peak lies inside and stands at least two orders above (or below) all of the border."""
-    thickness = closed_islands((120, 120))
-    border = np.concatenate([thickness[0], thickness[-1], thickness[:, 0], thickness[:, -1]])
-    assert thickness.max() - border.max() > 0.6
-    assert border.min() - thickness.min() > 0.6
-
-
-def test_halves_are_disconnected() -> None:
-    thickness = two_halves((100, 80))
-    step = thickness[50] - thickness[49]
-    assert step[40] == pytest.approx(1.37, abs=0.15)
-    assert np.abs(np.diff(thickness, axis=0))[:49].max() < 0.1
 
 
 def test_light_is_averaged_over_the_area_of_a_pixel() -> None:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-from pathlib import Path
-
 import numba
 import numpy as np
 import pytest
 
 from lsst.fringe_sim.errors import ConvergenceError, InputError, OutOfRangeError
-from lsst.fringe_sim.model import FringeModel, ResponseTable, TableCache, response_table, tabulate
-from lsst.fringe_sim.model.response_table import content_key
+from lsst.fringe_sim.model import FringeModel, ResponseTable, response_table, tabulate
 from lsst.fringe_sim.optics import Beam, Illumination, LayerStack
 from lsst.fringe_sim.optics.illumination import GaussianProfile
 from lsst.fringe_sim.optics.system import OpticalSystem
@@ -150,40 +146,11 @@ def test_estimated_derivative_serves_any_response(rng: np.random.Generator) -> N
     assert true_error <= table.interpolation_error <= 1e-6
 
 
-def test_key_changes_with_everything_that_enters() -> None:
-    optics = system()
-    light = optics.flat_fields(WAVELENGTHS)
-    span, tolerance, nan = (14.0, 16.0), 1e-7, float("nan")
-    key = content_key(optics, light, span, tolerance, WAVELENGTHS, nan)
-    assert key == content_key(system(), optics.flat_fields(WAVELENGTHS), span, tolerance, WAVELENGTHS, nan)
-    other_medium = optics.stack.layers[optics.stack.position("adhesive")].medium.modified(index_offset=1e-9)
-    variants = [
-        optics.with_layer("support", thickness_um=165.0000001),
-        optics.with_layer("adhesive", medium=other_medium),
-        optics.with_layer("support", roughness_nm=1e-6),
-        dataclasses.replace(optics, temperature_k=183.0001),
-        dataclasses.replace(optics, polarization="s"),
-        dataclasses.replace(optics, observable="total"),
-        dataclasses.replace(optics, varying="detection"),
-    ]
-    keys = {content_key(variant, light, span, tolerance, WAVELENGTHS, nan) for variant in variants}
-    keys.add(content_key(optics, optics.flat_fields(WAVELENGTHS + 1e-6), span, tolerance, WAVELENGTHS, nan))
-    keys.add(content_key(optics, light, (14.0, 16.5), tolerance, WAVELENGTHS, nan))
-    keys.add(content_key(optics, light, span, 2e-7, WAVELENGTHS, nan))
-    keys.add(content_key(optics, light, span, tolerance, WAVELENGTHS + 1.0, nan))
-    keys.add(content_key(optics, light, span, tolerance, WAVELENGTHS, 1e-6))
-    assert key not in keys
-    assert len(keys) == len(variants) + 5
-
-
 @pytest.mark.parametrize("effects", [{}, {"bandwidth.fwhm": 1.5}, {"contrast_loss.factor": 0.3}])
-def test_table_of_a_model_is_its_response(
-    effects: dict[str, float], tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_table_of_a_model_is_its_response(effects: dict[str, float], rng: np.random.Generator) -> None:
     model = FringeModel.from_setup("ts8_e2v", effects=effects)
     thickness = rng.uniform(14.0, 15.0, 200)
-    for _ in range(2):
-        table = model.table((14.0, 15.0), WAVELENGTHS, cache=TableCache(tmp_path))
-        difference = np.abs(table.lookup(thickness) - model.response(thickness, WAVELENGTHS)).max()
-        assert difference <= table.interpolation_error <= 1e-7
-        np.testing.assert_array_equal(table.wavelength_nm, WAVELENGTHS)
+    table = model.table((14.0, 15.0), WAVELENGTHS)
+    difference = np.abs(table.lookup(thickness) - model.response(thickness, WAVELENGTHS)).max()
+    assert difference <= table.interpolation_error <= 1e-7
+    np.testing.assert_array_equal(table.wavelength_nm, WAVELENGTHS)

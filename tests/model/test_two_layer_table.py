@@ -1,15 +1,13 @@
-"""Tables over two thicknesses: stated error, frames, refusals, cache."""
+"""Tables over two thicknesses: stated error, frames, refusals."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
-from lsst.fringe_sim.model import TableCache, TwoLayerTable, two_layer_table
+from lsst.fringe_sim.model import TwoLayerTable, two_layer_table
 from lsst.fringe_sim.optics import Beam, Illumination, LayerStack
 from lsst.fringe_sim.optics.illumination import MonochromaticProfile
 from lsst.fringe_sim.optics.system import OpticalSystem
@@ -83,14 +81,3 @@ def test_ends_are_inside_and_beyond_is_refused(table: TwoLayerTable) -> None:
     ):
         with pytest.raises(OutOfRangeError, match="range"):
             two_layer_table(system, light, lower, upper)
-
-
-def test_cache_keeps_it(tmp_path: Path, table: TwoLayerTable) -> None:
-    cache = TableCache(tmp_path)
-    first = two_layer_table(*sky(), LOWER, UPPER, tolerance=1e-6, cache=cache)
-    again = two_layer_table(*sky(), LOWER, UPPER, tolerance=1e-6, cache=cache)
-    np.testing.assert_array_equal(first.values, again.values)
-    np.testing.assert_array_equal(first.values, table.values)
-    assert len(list(tmp_path.iterdir())) == 1
-    two_layer_table(*sky(), LOWER, (99.9, 100.11), tolerance=1e-6, cache=cache)
-    assert len(list(tmp_path.iterdir())) == 2

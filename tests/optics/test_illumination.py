@@ -1,4 +1,4 @@
-"""Quadratures: normalised, exact on what they claim, and with an error estimate that bounds the true error."""
+"""Quadratures: normalised, and exact on what they claim."""
 
 from __future__ import annotations
 
@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from lsst.fringe_sim.errors import ConvergenceError, InputError, OutOfRangeError
+from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.optics import (
     Beam,
     Illumination,
     LampSpectrum,
     LayerStack,
     SpectralProfile,
-    converged_flat_fields,
-    converged_spectrum,
 )
-from lsst.fringe_sim.optics.convergence import shortest_fringe_nm
 from lsst.fringe_sim.optics.illumination import (
     SIGMA_PER_FWHM,
     GaussianProfile,
@@ -122,37 +119,6 @@ def test_cone_fills_the_pupil_uniformly() -> None:
     assert beam.weight @ np.cos(60.0 * np.cos(beam.theta)) == pytest.approx(exact / width, abs=1e-12)
 
 
-@pytest.mark.parametrize("profile", PROFILES[1:], ids=lambda profile: type(profile).__name__)
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-7])
-def test_estimated_error_of_flats_bounds_the_true_one(profile: SpectralProfile, tolerance: float) -> None:
-    optics = system(profile)
-    span = (14.0, 15.0)
-    light = converged_flat_fields(optics, [900.0, 985.0], span, tolerance=tolerance)
-    assert light.error_estimate <= tolerance
-    thickness = np.linspace(*span, 301)
-    reference = optics.flat_fields([900.0, 985.0], 0.004)
-    exact = optics.reduce(reference).averaged(reference.weight, thickness)
-    error = np.abs(optics.reduce(light).averaged(light.weight, thickness) - exact).max()
-    assert error <= light.error_estimate + 1e-13
-
-
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
-def test_estimated_error_of_the_sky_bounds_the_true_one(tolerance: float) -> None:
-    def cone(nodes: int) -> Beam:
-        return Beam.cone(1.234, 0.61, nodes)
-
-    optics = system(MonochromaticProfile(), cone(8), 173.0)
-    lines, weight, span = np.array([931.0, 972.0, 1003.0]), np.array([1.0, 2.0, 0.5]), (14.0, 15.0)
-    light = converged_spectrum(optics, lines, weight, cone, span, tolerance=tolerance)
-    thickness = np.linspace(*span, 301)
-    reference = Illumination.spectrum(lines, weight, cone(500))
-    exact = optics.reduce(reference).averaged(reference.weight, thickness)
-    error = np.abs(optics.reduce(light).averaged(light.weight, thickness) - exact).max()
-    assert error <= light.error_estimate <= tolerance
-    few = Illumination.spectrum(lines, weight, cone(24))
-    assert np.abs(optics.reduce(few).averaged(few.weight, thickness) - exact).max() > 1e-5
-
-
 def test_coarse_sampling_of_the_bandpass_aliases() -> None:
     """Known trap: 41 samples over a 2 nm bandpass are wrong by about 1e-4, twice as many by some 1e-6."""
     optics = system(GaussianProfile(2.0))
@@ -171,20 +137,7 @@ def test_coarse_sampling_of_the_bandpass_aliases() -> None:
     assert errors[1] < 0.1 * errors[0]
 
 
-def test_shortest_fringe_is_that_of_the_whole_stack() -> None:
-    """265 µm of silicon and 14 µm of epoxy: 0.43 nm at 960 nm."""
-    assert shortest_fringe_nm(system(MonochromaticProfile()), 960.0) == pytest.approx(0.435, abs=0.01)
-
-
-def test_impossible_requests_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    optics = system(GaussianProfile(2.0))
-    with pytest.raises(OutOfRangeError, match="tolerance"):
-        converged_flat_fields(optics, [960.0], (14.0, 15.0), tolerance=0.0)
-    with pytest.raises(OutOfRangeError, match="thickness range"):
-        converged_flat_fields(optics, [960.0], (15.0, 14.0))
-    monkeypatch.setattr("lsst.fringe_sim.optics.convergence._MOST_NODES", 3000)
-    with pytest.raises(ConvergenceError, match="quadrature"):
-        converged_flat_fields(system(TRIANGLE), [880.0, 960.0], (14.0, 15.0), tolerance=1e-18)
+def test_impossible_requests_are_refused() -> None:
     for profile in (
         lambda: GaussianProfile(0.0),
         lambda: TriangularProfile(-1.0),

@@ -27,13 +27,15 @@ from lsst.fringe_sim.optics.system import OpticalSystem
 @given(
     seed=st.integers(0, 2**32 - 1),
     layers=st.integers(3, 9),
+    nodes=st.sampled_from([3, 150]),
     polarization=st.sampled_from(["s", "p", "mixed"]),
+    rough=st.booleans(),
     data=st.data(),
 )
 def test_closed_form_is_the_transfer_matrix(
-    seed: int, layers: int, polarization: str, data: st.DataObject
+    seed: int, layers: int, nodes: int, polarization: str, rough: bool, data: st.DataObject
 ) -> None:
-    """Any varying layer, any set of absorbing layers, above, in and below it."""
+    """Any varying layer, any set of absorbing layers, above, in and below it, smooth and rough interfaces."""
     rng = np.random.default_rng(seed)
     varying = data.draw(st.integers(1, layers - 2))
     chosen = data.draw(st.sets(st.integers(1, layers - 2), min_size=1))
@@ -41,18 +43,21 @@ def test_closed_form_is_the_transfer_matrix(
     n[0] = 1.0
     d = rng.uniform(0.0, 2.0, layers)
     d[[0, -1]] = np.inf
-    wavelength, theta = rng.uniform(0.4, 1.1, 3), rng.uniform(0.0, 1.5)
+    wavelength, theta = rng.uniform(0.4, 1.1, nodes), rng.uniform(0.0, 1.5)
+    roughness = rng.uniform(0.0, 0.05, layers - 1) if rough else np.zeros(layers - 1)
     thickness = np.array([0.0, 0.3, 2.7])
     finite = np.where(np.isinf(d), 0.0, d)
-    index = np.repeat(n[:, None], 3, axis=1)
+    index = np.repeat(n[:, None], nodes, axis=1)
+    chosen = sorted(chosen)
     reduced = reduce_to_phase(
-        index, finite, wavelength, theta, polarization, varying=varying, layers=sorted(chosen)
+        index, finite, wavelength, theta, polarization, varying=varying, layers=chosen, roughness=roughness
     )
     values = reduced.evaluate(thickness[:, None])
     for row, value in enumerate(thickness):
         moved = d.copy()
         moved[varying] = value
-        expected = layer_absorption(index, moved, wavelength, theta, polarization)[sorted(chosen)].sum(axis=0)
+        expected = layer_absorption(index, moved, wavelength, theta, polarization, roughness=roughness)
+        expected = expected[chosen].sum(axis=0)
         np.testing.assert_allclose(values[row], expected, rtol=0.0, atol=2e-13)
 
 

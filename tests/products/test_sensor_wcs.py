@@ -10,8 +10,7 @@ from product_makers import thickness
 
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
-from lsst.fringe_sim.products import ThicknessMap
-from lsst.fringe_sim.products.sensor_wcs import add_sensor_wcs, sensor_wcs
+from lsst.fringe_sim.products import SensorSection, ThicknessMap
 
 CAMERA = Camera.from_name("lsstCam")
 MM_PER_DEG = 180.2
@@ -25,7 +24,7 @@ def corners(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("name", ["R22_S11", "R11_S01", "R43_S21"])
 def test_pixels_and_millimetres(name: str) -> None:
     detector = CAMERA.detector(name)
-    cards = sensor_wcs(detector, detector.shape)
+    cards = SensorSection.whole(detector).cards(detector.shape)
     ny, nx = detector.shape
     assert WCS(cards, key="D").pixel_to_world_values(0, 0) == pytest.approx((0.0, 0.0), abs=1e-9)
     assert WCS(cards, key="D").pixel_to_world_values(nx - 1, 5) == pytest.approx((nx - 1.0, 5.0))
@@ -41,8 +40,10 @@ def test_pixels_and_millimetres(name: str) -> None:
 def test_neighbours_do_not_overlap() -> None:
     """The right edge of a sensor lies left of the left edge of the next, by the gap between them."""
     left, right = CAMERA.detector("R22_S10"), CAMERA.detector("R22_S11")
-    edge = WCS(sensor_wcs(left, left.shape), key="F").pixel_to_world_values(left.shape[1] - 0.5, 0)[0]
-    begin = WCS(sensor_wcs(right, right.shape), key="F").pixel_to_world_values(-0.5, 0)[0]
+    edge = WCS(SensorSection.whole(left).cards(left.shape), key="F").pixel_to_world_values(
+        left.shape[1] - 0.5, 0
+    )[0]
+    begin = WCS(SensorSection.whole(right).cards(right.shape), key="F").pixel_to_world_values(-0.5, 0)[0]
     assert 0.0 < begin - edge < 3.0
 
 
@@ -58,7 +59,7 @@ def test_a_thinned_image_covers_the_same_sensor() -> None:
     for key in "DF":
         spans = []
         for shape in (full, thin):
-            wcs = WCS(sensor_wcs(detector, shape), key=key)
+            wcs = WCS(SensorSection.whole(detector).cards(shape), key=key)
             edges = [
                 wcs.pixel_to_world_values(-0.5, -0.5),
                 wcs.pixel_to_world_values(shape[1] - 0.5, shape[0] - 0.5),
@@ -70,7 +71,7 @@ def test_a_thinned_image_covers_the_same_sensor() -> None:
 def test_a_rotated_sensor_is_rotated() -> None:
     turned = [d for d in CAMERA.detectors if d.yaw_deg == 270.0]
     detector = turned[0]
-    wcs = WCS(sensor_wcs(detector, detector.shape), key="F")
+    wcs = WCS(SensorSection.whole(detector).cards(detector.shape), key="F")
     step = np.subtract(wcs.pixel_to_world_values(1, 0), wcs.pixel_to_world_values(0, 0))
     assert abs(step[0]) < 1e-12
     assert step[1] == pytest.approx(-1e-3 * detector.pixel_um, rel=1e-9)
@@ -78,8 +79,7 @@ def test_a_rotated_sensor_is_rotated() -> None:
 
 def test_a_product_keeps_its_numbers_and_its_checksums(tmp_path) -> None:
     made, path = thickness((6, 8)), tmp_path / "thickness.fits"
-    made.write_fits(path)
-    add_sensor_wcs(path, CAMERA.detector("R22_S11"))
+    made.write_fits(path, section=SensorSection.whole(CAMERA.detector("R22_S11")))
     again = ThicknessMap.read_fits(path)
     assert np.array_equal(again.value, made.value, equal_nan=True)
     assert np.array_equal(again.mask, made.mask)
@@ -93,4 +93,4 @@ def test_a_product_keeps_its_numbers_and_its_checksums(tmp_path) -> None:
 
 def test_an_image_without_pixels_is_refused() -> None:
     with pytest.raises(InputError, match="shape of the image"):
-        sensor_wcs(CAMERA.detector("R22_S11"), (0, 4))
+        SensorSection.whole(CAMERA.detector("R22_S11")).cards((0, 4))

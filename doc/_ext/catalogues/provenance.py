@@ -13,6 +13,7 @@ from .markdown import code, sections, table
 
 REQUIRED = ("source", "doi", "licence")
 CHANGES = Path(__file__).parents[2] / "changes"
+CHANGELOG = Path(__file__).parents[3] / "CHANGELOG.md"
 KINDS = {
     "feature": "New",
     "api": "Changes of interfaces",
@@ -92,13 +93,16 @@ def _constant(entry: dict[str, Any]) -> str:
 
 
 def changes() -> str:
-    """News fragments by kind."""
+    """The changelog, below notes that no version has yet."""
     parts = []
+    notes = [path for path in sorted(CHANGES.iterdir()) if path.name != "README.md"]
     for kind, heading in KINDS.items():
-        notes = [path.read_text(encoding="utf-8").split() for path in sorted(CHANGES.glob(f"*.{kind}.md"))]
-        if notes:
-            parts += [f"## {heading}", "\n".join(f"- {' '.join(note)}" for note in notes)]
-    known = sum(len(list(CHANGES.glob(f"*.{kind}.md"))) for kind in KINDS)
-    if known != len(list(CHANGES.iterdir())):
+        of_kind = [
+            path.read_text(encoding="utf-8").split() for path in notes if path.name.endswith(f".{kind}.md")
+        ]
+        if of_kind:
+            parts += [f"### {heading}", "\n".join(f"- {' '.join(note)}" for note in of_kind)]
+    if any(not path.name.endswith(tuple(f".{kind}.md" for kind in KINDS)) for path in notes):
         raise ValueError(f"a note in {CHANGES} is not named <name>.<{'|'.join(KINDS)}>.md")
-    return sections(parts)
+    _, _, released = CHANGELOG.read_text(encoding="utf-8").partition("<!-- towncrier release notes start -->")
+    return sections([*(["## Next version", *parts] if parts else []), released.strip()])

@@ -21,7 +21,6 @@ __all__ = [
     "OutOfRangeError",
     "ResourceError",
     "StackError",
-    "TableCacheWarning",
     "UnknownNameError",
     "to_number",
 ]
@@ -140,10 +139,6 @@ class ResourceError(FringeSimError):
 
 class ConvergenceError(FringeSimError):
     """A quadrature or an iteration did not reach the tolerance that was asked for."""
-
-
-class TableCacheWarning(UserWarning):
-    """A cached table is damaged or cannot be stored; the result is right, only slower to get."""
 
 
 def to_number(field: str, value: Any, allowed: str = "a number", *, source: str | None = None) -> float:

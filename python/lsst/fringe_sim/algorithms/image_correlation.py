@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +26,6 @@ __all__ = [
     "coadd_correlation",
     "coadd_model",
     "correlation_function",
-    "cross_correlation_function",
     "random_cutout",
 ]
 
@@ -139,21 +137,7 @@ def correlation_function(
         An image without two axes, weights that do not fit or are negative, or no good pixel.
     """
     values, weights = _weighted(image, weight)
-    return _binned(_Lags.of(values, weights, values, weights, _bins_for(values, bins)), 0.5)
-
-
-def cross_correlation_function(
-    one: ArrayLike, two: ArrayLike, weight: ArrayLike | None = None, bins: LogBins | None = None
-) -> CorrelationFunction:
-    """Correlation of two images of the same pixels; parameters as for `correlation_function`.
-
-    Pairs are taken in both senses, so that the result does not depend on the order of the images.
-    """
-    values, weights = _weighted(one, weight)
-    others, other_weights = _weighted(two, weight)
-    if values.shape != others.shape:
-        raise InputError("shape of the second image", others.shape, f"{values.shape}")
-    return _binned(_Lags.of(values, weights, others, other_weights, _bins_for(values, bins)), 1.0)
+    return _autocorrelation(values, weights, _bins_for(values, bins))
 
 
 def coadd_model(single: ArrayLike, floor: ArrayLike, count: int) -> FloatArray:
@@ -282,51 +266,33 @@ def coadd_correlation(
     return CoaddCorrelation(wanted, tuple(coadds), tuple(nulls), models, single, floor)
 
 
-@dataclass(frozen=True, eq=False)
-class _Lags:
-    """Sums of products and of weights at every lag up to the largest separation, dy >= 0 or any, dx any."""
+def _autocorrelation(values: FloatArray, weights: FloatArray, bins: LogBins) -> CorrelationFunction:
+    """Sums of products and of weights over all lags of a bin; every pair is met twice, as +lag and -lag."""
+    reach = [min(side - 1, math.floor(bins.largest_px)) for side in values.shape]
+    # Zeros for as many pixels as the largest lag keep the ends apart.
+    size = [
+        scipy.fft.next_fast_len(side + lag, real=True) for side, lag in zip(values.shape, reach, strict=True)
+    ]
+    rows, columns = (np.arange(-lag, lag + 1) for lag in reach)
 
-    product: FloatArray
-    weight: FloatArray
-    bins: LogBins
+    def lagged(one: FloatArray) -> FloatArray:
+        power = np.abs(scipy.fft.rfft2(one, size, workers=-1)) ** 2
+        return scipy.fft.irfft2(power, size, workers=-1)[np.ix_(rows, columns)]
 
-    @classmethod
-    def of(
-        cls,
-        values: FloatArray,
-        weights: FloatArray,
-        others: FloatArray,
-        other_weights: FloatArray,
-        bins: LogBins,
-    ) -> _Lags:
-        reach = tuple(min(side - 1, math.floor(bins.largest_px)) for side in values.shape)
-        # Zeros for as many pixels as the largest lag keep the ends apart.
-        size = tuple(
-            scipy.fft.next_fast_len(side + lag, real=True)
-            for side, lag in zip(values.shape, reach, strict=True)
-        )
-        rows = np.arange(-reach[0], reach[0] + 1)
-        columns = np.arange(-reach[1], reach[1] + 1)
-
-        def lagged(one: FloatArray, two: FloatArray) -> FloatArray:
-            forward = scipy.fft.rfft2(one, size, workers=-1)
-            spectrum = forward * np.conj(forward if two is one else scipy.fft.rfft2(two, size, workers=-1))
-            return scipy.fft.irfft2(spectrum, size, workers=-1)[np.ix_(rows, columns)]
-
-        same = others is values
-        product = lagged(values, values if same else others)
-        if np.all(weights == 1.0) and np.all(other_weights == 1.0):
-            # all pixels: the number of pairs at a lag is known
-            pairs = np.outer(values.shape[0] - np.abs(rows), values.shape[1] - np.abs(columns)).astype(float)
-        else:
-            pairs = lagged(weights, weights if same else other_weights)
-        return cls(np.ascontiguousarray(product), np.ascontiguousarray(pairs), bins)
-
-
-def _binned(lags: _Lags, pair_factor: float) -> CorrelationFunction:
-    bins = lags.bins
-    product, weight, distance = _bin_lags(
-        lags.product, lags.weight, math.log(bins.smallest_px), bins.size, bins.count
+    if np.all(weights == 1.0):  # all pixels: the number of pairs at a lag is known
+        pairs = np.outer(values.shape[0] - np.abs(rows), values.shape[1] - np.abs(columns)).astype(float)
+    else:
+        pairs = lagged(weights)
+    squared = (rows**2)[:, None] + columns**2
+    squared[reach[0], reach[1]] = 1  # a pixel is no neighbour of its own; its bin is set below
+    # As TreeCorr: half the logarithm of the squared separation, bins closed below.
+    bin_of = np.floor((0.5 * np.log(squared) - math.log(bins.smallest_px)) / bins.size).astype(int)
+    bin_of[reach[0], reach[1]] = -1
+    used = (bin_of >= 0) & (bin_of < bins.count)
+    place, count = bin_of[used], pairs[used]
+    product, weight, distance = (
+        np.bincount(place, each, minlength=bins.count)
+        for each in (lagged(values)[used], count, count * np.sqrt(squared[used]))
     )
     edges = bins.edges_px
     separation = np.sqrt(edges[1:] * edges[:-1])
@@ -335,27 +301,7 @@ def _binned(lags: _Lags, pair_factor: float) -> CorrelationFunction:
     filled = weight > 1e-9 * max(float(weight.max()), np.finfo(float).tiny)
     xi[filled] = product[filled] / weight[filled]
     separation[filled] = distance[filled] / weight[filled]
-    return CorrelationFunction(separation, xi, np.where(filled, pair_factor * weight, 0.0))
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _bin_lags(
-    product: NDArray, weight: NDArray, log_smallest: float, size: float, count: int
-) -> tuple[NDArray, NDArray, NDArray]:  # pragma: no cover - compiled
-    rows, columns = product.shape[0] // 2, product.shape[1] // 2
-    products, weights, distances = np.zeros(count), np.zeros(count), np.zeros(count)
-    for y in range(product.shape[0]):
-        for x in range(product.shape[1]):
-            squared = float((y - rows) ** 2 + (x - columns) ** 2)
-            if squared == 0.0:
-                continue
-            # As TreeCorr: half the logarithm of the squared separation, bins closed below.
-            place = math.floor((0.5 * math.log(squared) - log_smallest) / size)
-            if 0 <= place < count:
-                products[place] += product[y, x]
-                weights[place] += weight[y, x]
-                distances[place] += weight[y, x] * math.sqrt(squared)
-    return products, weights, distances
+    return CorrelationFunction(separation, xi, np.where(filled, 0.5 * weight, 0.0))
 
 
 def _weighted(image: ArrayLike, weight: ArrayLike | None) -> tuple[FloatArray, FloatArray]:

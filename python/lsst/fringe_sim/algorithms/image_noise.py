@@ -10,18 +10,16 @@ electrons are left to GalSim.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
-from scipy.ndimage import gaussian_filter
 
 from ..errors import InputError, OutOfRangeError
 from ..instrument.readout import add_readout
 
-__all__ = ["FEWEST_ELECTRONS", "SmoothedImage", "add_exposure_noise", "smooth_contributions"]
+__all__ = ["FEWEST_ELECTRONS", "add_exposure_noise"]
 
 FloatArray = NDArray[np.float64]
 
@@ -99,60 +97,6 @@ def add_exposure_noise(
         few = add_readout(image[faint][np.newaxis], rng, read_noise_e, gain=1.0)
         noisy[faint] = few[0]
     return noisy
-
-
-@dataclass(frozen=True)
-class SmoothedImage:
-    """What the structure of a smoothed exposure consists of, in the units of the exposure.
-
-    Attributes
-    ----------
-    fringe_rms, fringe_peak_to_peak : `float`
-        Of the noiseless exposure, smoothed.
-    noise_rms, noise_peak_to_peak : `float`
-        Of the noise alone, smoothed.
-    rms, peak_to_peak : `float`
-        Of both together, which is what an image shows.
-    """
-
-    fringe_rms: float
-    fringe_peak_to_peak: float
-    noise_rms: float
-    noise_peak_to_peak: float
-    rms: float
-    peak_to_peak: float
-
-
-def smooth_contributions(
-    electrons: ArrayLike, sigma_px: float, rng: np.random.Generator, read_noise_e: float = 0.0
-) -> SmoothedImage:
-    """Take the structure of a smoothed exposure apart: fringe, noise, both.
-
-    The panel of Fig. 15 of the paper, from which "40 times the limit" is read, is mostly noise.
-
-    Parameters
-    ----------
-    electrons : array_like, shape ``(ny, nx)``
-        Noiseless exposure [e⁻].
-    sigma_px : `float`
-        Standard deviation of the Gaussian filter [px].
-    rng : `numpy.random.Generator`
-        Source of randomness.
-    read_noise_e : `float`, optional
-        Read noise [e⁻ rms].
-
-    Raises
-    ------
-    OutOfRangeError
-        A filter without width.
-    """
-    if not 0.0 < sigma_px < math.inf:
-        raise OutOfRangeError("width of the filter [px]", sigma_px, "positive")
-    clean = np.asarray(electrons, dtype=np.float64)
-    noise = add_exposure_noise(clean, rng, read_noise_e) - clean
-    fringe, noise = (gaussian_filter(each, sigma_px, mode="nearest") for each in (clean, noise))
-    numbers = [(float(each.std()), float(np.ptp(each))) for each in (fringe, noise, fringe + noise)]
-    return SmoothedImage(*numbers[0], *numbers[1], *numbers[2])
 
 
 def _ziggurat() -> tuple[FloatArray, FloatArray]:

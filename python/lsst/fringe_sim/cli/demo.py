@@ -18,6 +18,7 @@ import click
 
 from .. import __version__
 from ..errors import FringeSimError, InputError
+from ..files import write_whole
 from .parameters import SIZE
 
 __all__ = ["demo"]
@@ -125,9 +126,7 @@ class DemoRun:
 
     def _remember(self) -> None:
         text = json.dumps({"settings": asdict(self.settings), "done": self._done}, indent=2)
-        temporary = self._state.with_suffix(".part")
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, self._state)
+        write_whole(self._state, text)
 
 
 @click.command()

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, OutOfRangeError, ResourceError, UnknownNameError
+from ..errors import InputError, MissingPackageError, OutOfRangeError, ResourceError, UnknownNameError
 from ..resources import list_resources, read_table, read_yaml
 
 __all__ = ["Atmosphere", "Bandpass", "bandpass_names"]
@@ -132,13 +132,17 @@ class Bandpass:
 
         Raises
         ------
+        MissingPackageError
+            speclite is not installed.
         UnknownNameError
             speclite has no such filter.
         InputError
             The curve transmits where the detector or the air does not.
         """
-        import speclite.filters
-
+        try:
+            import speclite.filters
+        except ImportError as error:
+            raise MissingPackageError("a filter of speclite", "speclite", "speclite") from error
         known = speclite.filters.filter_group_names
         try:
             curve = speclite.filters.load_filter(filter_name)

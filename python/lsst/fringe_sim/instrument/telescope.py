@@ -29,7 +29,6 @@ __all__ = [
     "RayBundle",
     "Telescope",
     "TracedOptics",
-    "beam_error",
     "gauss_rule",
     "reduce_beam",
     "telescope_beam",
@@ -524,37 +523,6 @@ def reduce_beam(beam: Beam, nodes: int) -> Beam:
         return beam
     sine, weight = gauss_rule(np.sin(beam.theta) ** 2, beam.weight, nodes)
     return Beam(np.arcsin(np.sqrt(np.clip(sine, 0.0, 1.0))), weight / weight.sum())
-
-
-def beam_error(
-    beam: Beam, sin_squared: ArrayLike, index: float, thickness_um: float, wavelength_nm: float
-) -> float:
-    """Error of a beam in the coherence of one layer.
-
-    Parameters
-    ----------
-    beam : `Beam`
-        The quadrature.
-    sin_squared : array_like, shape ``(N,)``
-        ``sin²θ`` of the rays that it stands for.
-    index, thickness_um : `float`
-        Refractive index and thickness [µm] of the layer.
-    wavelength_nm : `float`
-        Wavelength [nm].
-
-    Returns
-    -------
-    error : `float`
-        ``|<exp(i phi)>_beam - <exp(i phi)>_rays|`` with the round-trip phase phi of the layer; fringe contrast is
-        proportional to the coherence, so this is the error relative to the contrast in parallel light.
-    """
-    rate = 4.0 * np.pi * thickness_um / (1e-3 * wavelength_nm)
-
-    def factor(sine: FloatArray) -> NDArray[np.complex128]:
-        return np.exp(1j * rate * np.sqrt(index**2 - sine))
-
-    rays = factor(np.asarray(sin_squared, dtype=float)).mean()
-    return float(abs(beam.weight @ factor(np.sin(beam.theta) ** 2) - rays))
 
 
 def _quantiles(values: FloatArray, groups: int) -> FloatArray:

@@ -6,11 +6,10 @@ Nothing that fits, models or criticises may import this room.
 from .hidden_effects import HIDDEN_EFFECTS, HiddenEffect, validate_effects
 from .optics import Film, FlatFieldOptics, SignalTable, material_index
 from .raw_frames import Defects, MockExposure, MockRun, MockTruth, parse_size, setup_optics, write_mock_flats
-from .thickness import E2V_SHAPE, HARD_MAPS, e2v_321, fit_to_sensor, random_field
+from .thickness import E2V_SHAPE, e2v_321, fit_to_sensor, random_field
 
 __all__ = [
     "E2V_SHAPE",
-    "HARD_MAPS",
     "HIDDEN_EFFECTS",
     "Defects",
     "Film",

@@ -12,6 +12,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from ..files import all_or_nothing
 from ..instrument.camera import Amplifier, Camera, Detector
 from .readout import raw_segment
 
@@ -131,9 +132,8 @@ def write_frame(
     hdus = fits.HDUList([fits.PrimaryHDU(header=header)])
     for amp, image in zip(sensor.amplifiers, images, strict=True):
         hdus.append(fits.ImageHDU(image, header=_amplifier_header(amp, sensor.shape)))
-    part = path.with_suffix(".part")
-    hdus.writeto(part, overwrite=True)
-    part.replace(path)
+    with all_or_nothing(path) as part:
+        hdus.writeto(part, overwrite=True)
 
 
 def _amplifier_header(amp: Amplifier, shape: tuple[int, int]) -> fits.Header:

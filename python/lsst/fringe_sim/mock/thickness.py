@@ -1,4 +1,4 @@
-"""Thickness of the adhesive as a function of position on the sensor: measured, random, and hard to fit.
+"""Thickness of the adhesive as a function of position on the sensor: measured and random.
 
 Every map is an array ``[y, x]`` in µm on the assembled, trimmed sensor, lower-left pixel first.
 """
@@ -6,9 +6,8 @@ Every map is an array ``[y, x]`` in µm on the assembled, trimmed sensor, lower-
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -21,23 +20,15 @@ from ..resources import read_table
 
 __all__ = [
     "E2V_SHAPE",
-    "HARD_MAPS",
     "PixelArea",
     "Sampling",
-    "closed_islands",
     "e2v_321",
     "fit_to_sensor",
     "random_field",
-    "saddle",
-    "steep_gradient",
-    "two_halves",
 ]
 
 E2V_SHAPE = (4004, 4096)
 """Rows and columns of an assembled, trimmed E2V-CCD250."""
-
-FRINGE_ORDER_UM = 0.300
-"""Thickness of one fringe order at 960 nm in an adhesive of index 1.6 [µm]."""
 
 GAUSS_NODES = ((-0.5 * math.sqrt(0.6), 5.0 / 18.0), (0.0, 4.0 / 9.0), (0.5 * math.sqrt(0.6), 5.0 / 18.0))
 """Places along a side of a pixel [px] and their weights: exact to the fifth power."""
@@ -175,83 +166,6 @@ def random_field(
     return _stretch(field, mean, span)
 
 
-def saddle(shape: tuple[int, int], mean: float = 17.0, span: float = 4.0) -> NDArray[np.float64]:
-    """Hyperbolic paraboloid: fringes that meet in a cross [µm]."""
-    v, u = _unit_grid(shape)
-    return _stretch(u * u - v * v + 0.2 * u * v, mean, span)
-
-
-def closed_islands(shape: tuple[int, int], mean: float = 17.0, span: float = 5.0) -> NDArray[np.float64]:
-    """Hills and pits several fringe orders high, surrounded by closed fringes [µm]."""
-    v, u = _unit_grid(shape)
-    hills = (
-        (-0.5, -0.45, 0.22, 1.0),
-        (0.45, 0.5, 0.18, 0.9),
-        (-0.4, 0.55, 0.2, -1.0),
-        (0.5, -0.4, 0.25, -0.8),
-    )
-    height = sum(
-        sign * np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / width**2) for x, y, width, sign in hills
-    )
-    return _stretch(np.asarray(height), mean, span)
-
-
-def steep_gradient(
-    shape: tuple[int, int], mean: float = 17.0, fringes: float = 45.0, angle: float = 0.4
-) -> NDArray[np.float64]:
-    """Wedge with many fringes from corner to corner [µm].
-
-    Parameters
-    ----------
-    shape : `tuple` [`int`, `int`]
-        Rows and columns.
-    mean : `float`, optional
-        Thickness in the middle [µm].
-    fringes : `float`, optional
-        Fringe orders (0.300 µm each) between the extreme corners.
-    angle : `float`, optional
-        Direction of the gradient from the x axis [rad].
-    """
-    v, u = _unit_grid(shape)
-    return _stretch(u * np.cos(angle) + v * np.sin(angle), mean, fringes * FRINGE_ORDER_UM)
-
-
-def two_halves(
-    shape: tuple[int, int], mean: float = 17.0, span: float = 4.0, step: float = 1.37
-) -> NDArray[np.float64]:
-    """Two halves that do not know of each other: another slope and a step at the middle row [µm].
-
-    The step is not a whole number of fringe orders, so neither half can borrow its order from the other.
-
-    Parameters
-    ----------
-    shape : `tuple` [`int`, `int`]
-        Rows and columns.
-    mean, span : `float`, optional
-        Middle and range of each half before the step [µm].
-    step : `float`, optional
-        How much thicker the upper half is at the middle row [µm].
-    """
-    v, u = _unit_grid(shape)
-    lower = _stretch(u + 0.5 * (v + 0.5), mean, span)
-    upper = _stretch(0.6 * v - u + 0.3 * u * v, mean, span)
-    middle = shape[0] // 2
-    seam = shape[1] // 2
-    upper += lower[middle, seam] + step - upper[middle, seam]
-    return np.where(np.arange(shape[0])[:, np.newaxis] < middle, lower, upper)
-
-
-HARD_MAPS: Mapping[str, Callable[[tuple[int, int]], NDArray[np.float64]]] = MappingProxyType(
-    {
-        "saddle": saddle,
-        "closed_islands": closed_islands,
-        "steep_gradient": steep_gradient,
-        "two_halves": two_halves,
-    }
-)
-"""Maps that a thickness fit must master, by name."""
-
-
 @dataclass(frozen=True, eq=False)
 class PixelArea:
     """A thickness map over the area of its pixels: each is a plane through its own thickness.
@@ -324,13 +238,6 @@ def _clamped_basis(position: NDArray[np.float64], size: int, count: int, degree:
     # Resampled onto more pixels than the sensor has, the outermost centres lie up to half a pixel outside.
     inside = np.clip(position, 0.0, size - 1.0)
     return BSpline.design_matrix(inside, knots, degree).toarray()
-
-
-def _unit_grid(shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Coordinates from -1 to 1 along y and x, broadcastable."""
-    v = np.linspace(-1.0, 1.0, shape[0])[:, np.newaxis]
-    u = np.linspace(-1.0, 1.0, shape[1])[np.newaxis, :]
-    return v, u
 
 
 def _stretch(field: NDArray[np.float64], mean: float, span: float) -> NDArray[np.float64]:

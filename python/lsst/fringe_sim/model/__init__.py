@@ -3,14 +3,12 @@
 from ..instrument.setup import Setup, setup_names
 from .fringe_model import FringeModel
 from .response_table import ResponseTable, response_table, tabulate
-from .table_cache import TableCache
 from .two_layer_table import TwoLayerTable, two_layer_table
 
 __all__ = [
     "FringeModel",
     "ResponseTable",
     "Setup",
-    "TableCache",
     "TwoLayerTable",
     "response_table",
     "setup_names",

@@ -27,7 +27,6 @@ from ..optics.illumination import DEFAULT_STEP_NM, Illumination
 from ..optics.phase_response import PhaseResponse
 from ..optics.system import OpticalSystem
 from .response_table import DEFAULT_TOLERANCE, ResponseTable, response_table, tabulate
-from .table_cache import TableCache
 
 __all__ = ["FringeModel"]
 
@@ -243,7 +242,6 @@ class FringeModel:
         wavelength_nm: ArrayLike,
         *,
         tolerance: float = DEFAULT_TOLERANCE,
-        cache: TableCache | None = None,
     ) -> ResponseTable:
         """Response to monochromator flats as a table.
 
@@ -255,14 +253,10 @@ class FringeModel:
             Nominal wavelengths [nm].
         tolerance : `float`, optional
             Largest interpolation error.
-        cache : `TableCache`, optional
-            Where finished tables are kept. Tables with an effect on the response are not kept.
         """
         wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
         illumination = self.system.flat_fields(wavelength)
-        return self.table_of(
-            illumination, thickness_range_um, wavelength_nm=wavelength, tolerance=tolerance, cache=cache
-        )
+        return self.table_of(illumination, thickness_range_um, wavelength_nm=wavelength, tolerance=tolerance)
 
     def table_of(
         self,
@@ -271,7 +265,6 @@ class FringeModel:
         *,
         wavelength_nm: ArrayLike | None = None,
         tolerance: float = DEFAULT_TOLERANCE,
-        cache: TableCache | None = None,
     ) -> ResponseTable:
         """Response to any illumination as a table; parameters as for `table`."""
         if not any(item.effect.acts_on == "response" for item in self.effects):
@@ -281,7 +274,6 @@ class FringeModel:
                 thickness_range_um,
                 wavelength_nm=wavelength_nm,
                 tolerance=tolerance,
-                cache=cache,
             )
         reduced = self.system.reduce(illumination)
 

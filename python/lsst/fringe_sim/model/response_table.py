@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from importlib import resources
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -17,9 +15,8 @@ from scipy.interpolate import CubicSpline
 from ..errors import ConvergenceError, InputError, OutOfRangeError
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
-from .table_cache import TableCache
 
-__all__ = ["DEFAULT_TOLERANCE", "ResponseTable", "content_key", "response_table", "tabulate"]
+__all__ = ["DEFAULT_TOLERANCE", "ResponseTable", "response_table", "tabulate"]
 
 FloatArray = NDArray[np.float64]
 Sampler = Callable[[float, float, int], FloatArray]
@@ -48,10 +45,6 @@ class ResponseTable:
         Nominal (or mean) wavelength of every exposure [nm].
     interpolation_error : `float`
         Largest absolute difference between the interpolated and the tabulated function.
-    quadrature_error : `float`
-        Error estimate of the illumination quadrature behind the values; NaN if it was not estimated.
-    key : `str`
-        Hash of everything that enters; empty for a table that cannot be cached.
 
     Raises
     ------
@@ -64,8 +57,6 @@ class ResponseTable:
     values: FloatArray
     wavelength_nm: FloatArray
     interpolation_error: float
-    quadrature_error: float = math.nan
-    key: str = ""
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or self.values.shape[1] < 4:
@@ -188,8 +179,6 @@ def response_table(
     *,
     wavelength_nm: ArrayLike | None = None,
     tolerance: float = DEFAULT_TOLERANCE,
-    quadrature_error: float = math.nan,
-    cache: TableCache | None = None,
 ) -> ResponseTable:
     """Tabulate the response of an optical system.
 
@@ -205,10 +194,6 @@ def response_table(
         Nominal wavelengths [nm], as labels; the mean wavelength if not given.
     tolerance : `float`, optional
         Largest interpolation error; bounded from the closed form, not only sampled.
-    quadrature_error : `float`, optional
-        Error estimate of the illumination, to be carried along; that which the illumination states, if not given.
-    cache : `TableCache`, optional
-        Where finished tables are kept; nothing is stored if not given.
 
     Returns
     -------
@@ -226,24 +211,15 @@ def response_table(
         wavelength = illumination.mean_wavelength_nm
     else:
         wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
-    if math.isnan(quadrature_error):
-        quadrature_error = illumination.error_estimate
-    key = content_key(system, illumination, (low, high), tolerance, wavelength, quadrature_error)
-
-    def build() -> ResponseTable:
-        reduced = system.reduce(illumination)
-        weight = illumination.weight
-        return tabulate(
-            functools.partial(reduced.averaged_on_grid, weight),
-            (low, high),
-            wavelength,
-            fourth_derivative=float(reduced.derivative_bound(weight, 4, low).max()),
-            tolerance=tolerance,
-            quadrature_error=quadrature_error,
-            key=key,
-        )
-
-    return build() if cache is None else cache.get(key, ResponseTable, build)
+    reduced = system.reduce(illumination)
+    weight = illumination.weight
+    return tabulate(
+        functools.partial(reduced.averaged_on_grid, weight),
+        (low, high),
+        wavelength,
+        fourth_derivative=float(reduced.derivative_bound(weight, 4, low).max()),
+        tolerance=tolerance,
+    )
 
 
 def tabulate(
@@ -253,8 +229,6 @@ def tabulate(
     *,
     fourth_derivative: float | None = None,
     tolerance: float = DEFAULT_TOLERANCE,
-    quadrature_error: float = math.nan,
-    key: str = "",
 ) -> ResponseTable:
     """Tabulate any response that can be sampled on a uniform grid.
 
@@ -269,8 +243,8 @@ def tabulate(
     fourth_derivative : `float`, optional
         Upper bound of the fourth derivative with respect to thickness [1/µm⁴]. Without one it is taken from
         differences of the samples, and the stated error is an estimate.
-    tolerance, quadrature_error, key
-        See `response_table`.
+    tolerance : `float`, optional
+        Largest interpolation error.
 
     Notes
     -----
@@ -295,62 +269,12 @@ def tabulate(
         error = 1.125 * measured + step**4 * fourth_derivative / 1944.0
         # Near 1e-14 only rounding is left, and a finer grid does not reduce it.
         if error <= max(tolerance, 1e-14):
-            return ResponseTable(low, step, table.values, wavelength, error, quadrature_error, key)
+            return ResponseTable(low, step, table.values, wavelength, error)
         step *= max(0.3, min(0.8, 0.9 * (tolerance / error) ** 0.25))
     raise ConvergenceError(
         f"response table over {low:g} to {high:g} um: interpolation error {error:.2g} at a step of "
         f"{step:.2g} um; asked for {tolerance:.2g}"
     )
-
-
-def content_key(
-    system: OpticalSystem,
-    illumination: Illumination,
-    thickness_range_um: tuple[float, float],
-    tolerance: float,
-    wavelength_nm: FloatArray,
-    quadrature_error: float,
-) -> str:
-    """SHA-256 of everything that decides the content of a table, the source code included."""
-    digest = hashlib.sha256()
-
-    def add(name: str, value: object) -> None:
-        array = np.ascontiguousarray(value)
-        if array.dtype.kind == "f":
-            array = array + 0.0  # one representation of zero
-        digest.update(f"{name}:{array.dtype.str}:{array.shape}:".encode())
-        digest.update(array.tobytes())
-
-    add("code", code_version())
-    add("range", [*thickness_range_um, tolerance, quadrature_error])
-    add("labels", wavelength_nm)
-    for item in fields(Illumination):
-        value = getattr(illumination, item.name)
-        if value is not None:
-            add(f"illumination.{item.name}", value)
-    index = system.stack.indices(illumination.wavelength_nm, system.temperature_k)
-    add("index.real", index.real)
-    add("index.imag", index.imag)
-    add("thickness", system.stack.thickness_um)
-    add("roughness", system.stack.roughness_nm)
-    add("spread", system.stack.thickness_spread_um)
-    add("layers", " ".join(system.stack.names))
-    for item in fields(OpticalSystem):
-        # The illumination stands for the light; what is left are plain numbers and names.
-        if item.name not in ("stack", "profile", "beam", "lamp"):
-            add(f"system.{item.name}", repr(getattr(system, item.name)))
-    return digest.hexdigest()
-
-
-@functools.lru_cache(maxsize=1)
-def code_version() -> str:
-    """Hash of the source of the optics and of this module."""
-    digest = hashlib.sha256()
-    base = resources.files("lsst.fringe_sim")
-    sources = [entry for entry in (base / "optics").iterdir() if entry.name.endswith(".py")]
-    for entry in [*sorted(sources, key=lambda item: item.name), base / "model" / "response_table.py"]:
-        digest.update(entry.read_bytes())
-    return digest.hexdigest()
 
 
 def _checked_range(thickness_range_um: tuple[float, float]) -> tuple[float, float]:

@@ -16,8 +16,7 @@ from ..errors import ConvergenceError, InputError, OutOfRangeError
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
 from ..optics.two_phase_response import ThicknessGrid, TwoPhaseResponse
-from .response_table import FloatArray, content_key
-from .table_cache import TableCache
+from .response_table import FloatArray
 
 __all__ = ["TwoLayerTable", "two_layer_table"]
 
@@ -42,10 +41,6 @@ class TwoLayerTable:
         Mean wavelength of every exposure [nm].
     interpolation_error : `float`
         Largest absolute error, measured in the middle of every cell, times 1.3.
-    quadrature_error : `float`
-        Error estimate of the illumination quadrature; NaN if it was not estimated.
-    key : `str`
-        Hash of everything that enters.
     """
 
     start_um: FloatArray
@@ -53,8 +48,6 @@ class TwoLayerTable:
     values: FloatArray
     wavelength_nm: FloatArray
     interpolation_error: float
-    quadrature_error: float = math.nan
-    key: str = ""
 
     def __post_init__(self) -> None:
         if self.values.ndim != 3 or min(self.values.shape[1:]) < 2 * _MARGIN + 2:
@@ -148,8 +141,6 @@ def two_layer_table(
     upper_range_um: tuple[float, float],
     *,
     tolerance: float = 1e-6,
-    quadrature_error: float = math.nan,
-    cache: TableCache | None = None,
 ) -> TwoLayerTable:
     """Tabulate the response over the thickness of the varying layer and of the detection layer above it.
 
@@ -163,10 +154,6 @@ def two_layer_table(
         Thicknesses of the varying and of the detection layer to cover [µm].
     tolerance : `float`, optional
         Largest interpolation error.
-    quadrature_error : `float`, optional
-        Error estimate of the illumination, to be carried along.
-    cache : `TableCache`, optional
-        Where finished tables are kept.
 
     Raises
     ------
@@ -178,18 +165,7 @@ def two_layer_table(
     ranges = np.array([lower_range_um, upper_range_um], dtype=float)
     if not (np.all(np.isfinite(ranges)) and np.all(ranges[:, 0] < ranges[:, 1]) and np.all(ranges >= 0.0)):
         raise OutOfRangeError("thickness ranges [um]", ranges.tolist(), "two increasing pairs, not negative")
-    wavelength = illumination.mean_wavelength_nm
-    if math.isnan(quadrature_error):
-        quadrature_error = illumination.error_estimate
-    flat = (float(ranges[0, 0]), float(ranges[0, 1]))
-    base = content_key(system, illumination, flat, tolerance, wavelength, quadrature_error)
-    key = f"{base}x{np.ascontiguousarray(ranges[1]).tobytes().hex()}"
-
-    def build() -> TwoLayerTable:
-        reduced = system.reduce_two_layers(illumination)
-        return _build(reduced, illumination, ranges, tolerance, quadrature_error, key)
-
-    return build() if cache is None else cache.get(key, TwoLayerTable, build)
+    return _build(system.reduce_two_layers(illumination), illumination, ranges, tolerance)
 
 
 def _build(
@@ -197,8 +173,6 @@ def _build(
     illumination: Illumination,
     ranges: FloatArray,
     tolerance: float,
-    quadrature_error: float,
-    key: str,
 ) -> TwoLayerTable:
     phase = np.array([np.abs(reduced.kappa_lower.real).max(), np.abs(reduced.kappa_upper.real).max()])
     # A wave of 0.1 and its overtones, spline error (kappa h)^4 / 384 each, one half of it per axis.
@@ -215,13 +189,11 @@ def _build(
         nodes = [ThicknessGrid(start[i], step[i], int(cells[i]) + 2 * _MARGIN + 1) for i in range(2)]
         middles = [ThicknessGrid(ranges[i, 0] + 0.5 * step[i], step[i], int(cells[i])) for i in range(2)]
         values = reduced.averaged_on_grid(illumination.weight, *nodes)
-        table = TwoLayerTable(
-            start, step, values, illumination.mean_wavelength_nm, math.nan, quadrature_error, key
-        )
+        table = TwoLayerTable(start, step, values, illumination.mean_wavelength_nm, math.nan)
         exact = reduced.averaged_on_grid(illumination.weight, *middles)
         error = _SAFETY * _middle_error(table, exact)
         if error <= tolerance:
-            return TwoLayerTable(start, step, values, table.wavelength_nm, error, quadrature_error, key)
+            return TwoLayerTable(start, step, values, table.wavelength_nm, error)
         step = step * max(0.3, min(0.8, 0.9 * (tolerance / error) ** 0.25))
     raise ConvergenceError(f"table of two layers: interpolation error {error:.2g}; asked for {tolerance:.2g}")
 

@@ -9,10 +9,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .coherence import partially_coherent_absorption as partially_coherent_absorption
-    from .convergence import converged as converged
-    from .convergence import converged_flat_fields as converged_flat_fields
-    from .convergence import converged_spectrum as converged_spectrum
     from .illumination import Beam as Beam
     from .illumination import Illumination as Illumination
     from .illumination import LampSpectrum as LampSpectrum
@@ -23,12 +19,9 @@ if TYPE_CHECKING:
     from .media import medium_names as medium_names
     from .phase_response import PhaseResponse as PhaseResponse
     from .phase_response import reduce_to_phase as reduce_to_phase
-    from .sensitivity import ResponseGradient as ResponseGradient
-    from .sensitivity import response_gradient as response_gradient
     from .stack import Layer as Layer
     from .stack import LayerStack as LayerStack
     from .transfer_matrix import layer_absorption as layer_absorption
-    from .transfer_matrix import reflection_transmission as reflection_transmission
     from .two_phase_response import ThicknessGrid as ThicknessGrid
     from .two_phase_response import TwoPhaseResponse as TwoPhaseResponse
     from .two_phase_response import reduce_to_two_phases as reduce_to_two_phases
@@ -41,22 +34,15 @@ _LAZY = {
     "LayerStack": ".stack",
     "Medium": ".media",
     "PhaseResponse": ".phase_response",
-    "ResponseGradient": ".sensitivity",
     "SpectralProfile": ".illumination",
     "ThicknessGrid": ".two_phase_response",
     "TwoPhaseResponse": ".two_phase_response",
     "constant_medium": ".media",
-    "converged": ".convergence",
-    "converged_flat_fields": ".convergence",
-    "converged_spectrum": ".convergence",
     "get_medium": ".media",
     "layer_absorption": ".transfer_matrix",
     "medium_names": ".media",
-    "partially_coherent_absorption": ".coherence",
     "reduce_to_phase": ".phase_response",
     "reduce_to_two_phases": ".two_phase_response",
-    "reflection_transmission": ".transfer_matrix",
-    "response_gradient": ".sensitivity",
 }
 
 __all__ = sorted(_LAZY)  # pyright: ignore[reportUnsupportedDunderAll]

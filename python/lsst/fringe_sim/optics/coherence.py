@@ -15,20 +15,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..errors import StackError
 from .transfer_matrix import (
     ComplexArray,
     FloatArray,
-    absorption_of,
-    checked_stack,
     interface_coefficients,
     layer_admittance,
-    pure_polarizations,
 )
 
-__all__ = ["PhaseState", "partially_coherent_absorption", "phase_states"]
+__all__ = ["PhaseState", "phase_states"]
 
 _ERROR = 1e-14
 _FEWEST, _MOST = 8, 512
@@ -48,50 +44,6 @@ class PhaseState:
 
     phases: dict[int, float]
     share: NDArray[np.float64] | float
-
-
-def partially_coherent_absorption(
-    n: ArrayLike,
-    d: ArrayLike,
-    wavelength: ArrayLike,
-    theta: ArrayLike = 0.0,
-    polarization: str = "mixed",
-    *,
-    spread: ArrayLike,
-) -> FloatArray:
-    """Like `layer_absorption` for layers that are not (fully) coherent.
-
-    Parameters
-    ----------
-    n, d, wavelength, theta, polarization
-        See `layer_absorption`.
-    spread : array_like, shape ``(L,)``
-        Rms thickness spread of every layer, in the unit of ``d``; zero for coherent layers and for the ends,
-        infinite for incoherent layers.
-
-    Returns
-    -------
-    fraction : `numpy.ndarray`, shape ``(L, ...)``
-        As for `layer_absorption`; they sum to 1.
-
-    Raises
-    ------
-    StackError
-        A spread that is negative or NaN, or not zero at an end, or of the wrong length; besides the errors of
-        `layer_absorption`.
-    """
-    index, thickness, wave, angle = checked_stack(n, d, wavelength, theta, polarization)
-    width = np.asarray(spread, dtype=float)
-    if width.shape != (len(index),) or not np.all(width >= 0.0) or width[0] or width[-1]:
-        raise StackError("thickness spread", width.tolist(), f"{len(index)} numbers >= 0, zero at the ends")
-    polarizations = pure_polarizations(polarization, angle)
-    total = np.zeros(index.shape)
-    shifted = [int(layer) for layer in np.flatnonzero(width)]
-    for each in polarizations:
-        for state in phase_states(index, thickness, wave, angle, each, shifted, width):
-            share = state.share / len(polarizations)
-            total += share * absorption_of(index, thickness, wave, angle, each, state.phases)
-    return total
 
 
 def phase_states(

@@ -298,14 +298,11 @@ class Illumination:
     ----------
     wavelength_nm, theta, weight : `numpy.ndarray`, shape ``(W, Q)``
         Nodes [nm, rad] and weights of W exposures; the weights of each sum to 1.
-    error_estimate : `float`
-        Estimated error of the response that is left by these nodes (see `convergence`); NaN if it is not known.
     """
 
     wavelength_nm: FloatArray
     theta: FloatArray
     weight: FloatArray
-    error_estimate: float = math.nan
 
     def __post_init__(self) -> None:
         shapes = {self.wavelength_nm.shape, self.theta.shape, self.weight.shape}

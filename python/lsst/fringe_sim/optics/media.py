@@ -85,19 +85,6 @@ class Medium:
         k = k * self.extinction_scale + self.extinction_offset
         return n + 1j * k
 
-    def slopes(
-        self, wavelength_nm: ArrayLike, temperature_k: ArrayLike = 300.0
-    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Derivatives of `index` with respect to wavelength [1/nm] and temperature [1/K]; same errors."""
-        self.index(wavelength_nm, temperature_k)  # refuses what is out of range
-        wavelength, temperature = np.broadcast_arrays(
-            np.asarray(wavelength_nm, dtype=float), np.asarray(temperature_k, dtype=float)
-        )
-        n, k = self._index.slopes(wavelength, temperature)
-        cauchy = -2.0e6 * self.dispersion_um2 / wavelength**3
-        by_wavelength = n[0] * self.index_scale + cauchy + 1j * k[0] * self.extinction_scale
-        return by_wavelength, n[1] * self.index_scale + 1j * k[1] * self.extinction_scale
-
     def modified(self, **changes: float) -> Medium:
         """Return a copy with some of the five modifiers set.
 
@@ -110,12 +97,6 @@ class Medium:
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
-_Slopes = tuple[
-    tuple[NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]
-]
-"""Derivatives of n, and of k, with respect to wavelength and temperature."""
-
-
 @dataclass(frozen=True)
 class _ConstantIndex:
     n: float
@@ -125,10 +106,6 @@ class _ConstantIndex:
         self, wavelength: NDArray[np.float64], temperature: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return np.full(wavelength.shape, self.n), np.full(wavelength.shape, self.k)
-
-    def slopes(self, wavelength: NDArray[np.float64], temperature: NDArray[np.float64]) -> _Slopes:
-        zero = np.zeros(wavelength.shape)
-        return (zero, zero), (zero, zero)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,27 +130,6 @@ class _TabulatedIndex:
         return (
             n * np.exp(self.temperature_n(wavelength) * log_ratio),
             k * np.exp(self.temperature_k(wavelength) * log_ratio),
-        )
-
-    def slopes(self, wavelength: NDArray[np.float64], temperature: NDArray[np.float64]) -> _Slopes:
-        n, k = self(wavelength, temperature)
-        n_slope = self.n(wavelength, 1) / self.n(wavelength)
-        k_slope = np.zeros(wavelength.shape) if self.log_k is None else self.log_k(wavelength, 1)
-        zero = np.zeros(wavelength.shape)
-        if self.temperature_n is None or self.temperature_k is None:
-            return (n * n_slope, zero), (k * k_slope, zero)
-        scale = REFERENCE_TEMPERATURE_K * 1e-4
-        log_ratio = np.log(temperature / REFERENCE_TEMPERATURE_K) * scale
-        per_kelvin = scale / temperature
-        return (
-            (
-                n * (n_slope + self.temperature_n(wavelength, 1) * log_ratio),
-                n * self.temperature_n(wavelength) * per_kelvin,
-            ),
-            (
-                k * (k_slope + self.temperature_k(wavelength, 1) * log_ratio),
-                k * self.temperature_k(wavelength) * per_kelvin,
-            ),
         )
 
 

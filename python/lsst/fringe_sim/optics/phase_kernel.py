@@ -1,7 +1,4 @@
-"""The compiled form of `reduce_polarization`: one node after the other, nothing but a few numbers in memory.
-
-The numpy form also takes dual numbers, and is several times slower; the tests hold the two together.
-"""
+"""Coefficients of the closed form: one node after the other, nothing but a few numbers in memory."""
 
 from __future__ import annotations
 

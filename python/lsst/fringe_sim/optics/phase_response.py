@@ -12,7 +12,7 @@ with six numbers per wavelength, angle and polarisation, however many layers the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -26,12 +26,6 @@ from .phase_kernel import reduce_nodes
 from .transfer_matrix import (
     ComplexArray,
     FloatArray,
-    InterfaceCoefficients,
-    WaveFields,
-    backward_sweep,
-    forward_sweep,
-    interface_coefficients,
-    layer_admittance,
     pure_polarizations,
 )
 
@@ -352,105 +346,6 @@ def reduce_to_phase(
             shares.append(np.broadcast_to(state.share / len(polarizations), trailing))
     a, b, e, c, g, kappa = (np.stack(column) for column in zip(*parts, strict=True))
     return PhaseResponse(a, b, e, c, g, kappa, np.stack(shares), float(spreads[varying]))
-
-
-def reduce_polarization(
-    index: ComplexArray,
-    thickness: FloatArray,
-    wavelength: FloatArray,
-    theta: FloatArray,
-    polarization: str,
-    varying: int,
-    layers: Sequence[int],
-    roughness: FloatArray | None,
-    phases: Mapping[int, float],
-) -> tuple[np.ndarray, ...]:
-    """Coefficients ``a, b, e, c, g, kappa`` for one polarisation; also of dual numbers."""
-    normal, admittance = layer_admittance(index, theta, polarization)
-    column = (-1,) + (1,) * wavelength.ndim
-    heights = None if roughness is None else roughness.reshape(column) / wavelength
-    coefficients = interface_coefficients(admittance, normal, heights)
-    inner = np.where(np.arange(len(thickness)) == varying, 0.0, thickness)[1:-1].reshape(column)
-    propagation = np.exp(1j * (2.0 * np.pi * normal[1:-1] / wavelength) * inner)
-    for layer, phase in phases.items():
-        propagation[layer - 1] *= np.exp(0.5j * phase)
-
-    above = _slice(coefficients, slice(None, varying))
-    from_above, _ = _solve(above, propagation[: varying - 1])
-    from_below, reflect_up = _solve(_upside_down(above), propagation[: varying - 1][::-1])
-    below, reflect_low = _solve(_slice(coefficients, slice(varying, None)), propagation[varying:])
-
-    entering = from_above.forward_top[varying]
-    g = -reflect_up * reflect_low
-    coupling = entering * reflect_low
-    incident = admittance[0].real
-    a, b, e = (np.zeros(wavelength.shape) for _ in range(3))
-    c = np.zeros(wavelength.shape, dtype=complex)
-    for layer in layers:
-        eta = admittance[layer]
-        if layer > varying:
-            under = layer - varying
-            flux = (
-                below.flux_top(admittance[varying:])[under] - below.flux_bottom(admittance[varying:])[under]
-            )
-            e = e + np.abs(entering) ** 2 * flux / incident
-            continue
-        if layer == varying:
-            faces = [((entering, np.zeros_like(entering)), (np.zeros_like(entering), coupling), 1.0)]
-            sum_, difference = 1.0 + reflect_low, eta * (1.0 - reflect_low)
-            e = e - np.abs(entering) ** 2 * (sum_ * np.conj(difference)).real / incident
-        else:
-            mirrored = varying - layer
-            lit, back = from_above, from_below
-            faces = [
-                (
-                    (lit.forward_top[layer], lit.backward_top[layer]),
-                    (
-                        g * lit.forward_top[layer] + coupling * back.backward_bottom[mirrored],
-                        g * lit.backward_top[layer] + coupling * back.forward_bottom[mirrored],
-                    ),
-                    1.0,
-                ),
-                (
-                    (lit.forward_bottom[layer], lit.backward_bottom[layer]),
-                    (
-                        g * lit.forward_bottom[layer] + coupling * back.backward_top[mirrored],
-                        g * lit.backward_bottom[layer] + coupling * back.forward_top[mirrored],
-                    ),
-                    -1.0,
-                ),
-            ]
-        for (u_forward, u_backward), (v_forward, v_backward), sign in faces:
-            u_sum, u_diff = u_forward + u_backward, eta * (u_forward - u_backward)
-            v_sum, v_diff = v_forward + v_backward, eta * (v_forward - v_backward)
-            a = a + sign * (u_sum * np.conj(u_diff)).real / incident
-            b = b + sign * (v_sum * np.conj(v_diff)).real / incident
-            c = c + sign * 0.5 * (np.conj(u_sum) * v_diff + v_sum * np.conj(u_diff)) / incident
-    kappa = 2.0 * (2.0 * np.pi * normal[varying] / wavelength)
-    return a, b, e, c, g, kappa
-
-
-def _solve(coefficients: InterfaceCoefficients, propagation: ComplexArray) -> tuple[WaveFields, ComplexArray]:
-    reflection = backward_sweep(coefficients, propagation)
-    return forward_sweep(coefficients, propagation, reflection), reflection[0]
-
-
-def _slice(coefficients: InterfaceCoefficients, part: slice) -> InterfaceCoefficients:
-    return InterfaceCoefficients(
-        coefficients.reflect_down[part],
-        coefficients.transmit_down[part],
-        coefficients.reflect_up[part],
-        coefficients.transmit_up[part],
-    )
-
-
-def _upside_down(coefficients: InterfaceCoefficients) -> InterfaceCoefficients:
-    return InterfaceCoefficients(
-        coefficients.reflect_up[::-1],
-        coefficients.transmit_up[::-1],
-        coefficients.reflect_down[::-1],
-        coefficients.transmit_down[::-1],
-    )
 
 
 def _check_grid(start_um: float, step_um: float, count: int) -> None:

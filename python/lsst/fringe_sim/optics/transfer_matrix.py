@@ -10,7 +10,6 @@ References: Guo, Walter, Lage & Lupton 2022, section 2.1; Byrnes 2016, arXiv:160
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +26,6 @@ __all__ = [
     "interface_coefficients",
     "layer_absorption",
     "layer_admittance",
-    "reflection_transmission",
 ]
 
 POLARIZATIONS = ("s", "p", "mixed")
@@ -134,18 +132,6 @@ def pure_polarizations(polarization: str, theta: FloatArray) -> tuple[str, ...]:
     if polarization != "mixed":
         return (polarization,)
     return ("s", "p") if np.any(theta) else ("s",)
-
-
-def reflection_transmission(
-    n: ArrayLike,
-    d: ArrayLike,
-    wavelength: ArrayLike,
-    theta: ArrayLike = 0.0,
-    polarization: str = "mixed",
-) -> tuple[FloatArray, FloatArray]:
-    """Reflected and transmitted fraction; arguments and errors as for `layer_absorption`."""
-    fraction = layer_absorption(n, d, wavelength, theta, polarization)
-    return fraction[0], fraction[-1]
 
 
 def layer_admittance(
@@ -271,18 +257,15 @@ def absorption_of(
     wavelength: FloatArray,
     theta: FloatArray,
     polarization: str,
-    phases: Mapping[int, float] | None = None,
     roughness: FloatArray | None = None,
 ) -> FloatArray:
-    """Fractions for one polarisation, with extra round-trip phases [rad] in some layers."""
+    """Fractions for one polarisation."""
     normal, admittance = layer_admittance(index, theta, polarization)
     heights = None
     if roughness is not None and np.any(roughness):
         heights = roughness.reshape(-1, *(1,) * wavelength.ndim) / wavelength
     coefficients = interface_coefficients(admittance, normal, heights)
     propagation = np.exp(1j * (2.0 * np.pi * normal[1:-1] / wavelength) * thickness[1:-1])
-    for layer, phase in (phases or {}).items():
-        propagation[layer - 1] *= np.exp(0.5j * phase)
     reflection = backward_sweep(coefficients, propagation)
     fields = forward_sweep(coefficients, propagation, reflection)
     top, bottom = fields.flux_top(admittance), fields.flux_bottom(admittance)

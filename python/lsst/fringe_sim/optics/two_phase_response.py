@@ -20,10 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from .phase_response import _checked_thickness, _slice, _solve, _upside_down
+from .phase_response import _checked_thickness
 from .transfer_matrix import (
     ComplexArray,
     FloatArray,
+    InterfaceCoefficients,
+    WaveFields,
+    backward_sweep,
+    forward_sweep,
     interface_coefficients,
     layer_admittance,
     pure_polarizations,
@@ -212,6 +216,29 @@ def reduce_to_two_phases(
         kappa = 4.0 * np.pi * normal / wave
         parts.append((scale, admittance[upper], up, p, q, g, kappa[lower], kappa[upper]))
     return TwoPhaseResponse(*(np.stack(each) for each in zip(*parts, strict=True)))
+
+
+def _solve(coefficients: InterfaceCoefficients, propagation: ComplexArray) -> tuple[WaveFields, ComplexArray]:
+    reflection = backward_sweep(coefficients, propagation)
+    return forward_sweep(coefficients, propagation, reflection), reflection[0]
+
+
+def _slice(coefficients: InterfaceCoefficients, part: slice) -> InterfaceCoefficients:
+    return InterfaceCoefficients(
+        coefficients.reflect_down[part],
+        coefficients.transmit_down[part],
+        coefficients.reflect_up[part],
+        coefficients.transmit_up[part],
+    )
+
+
+def _upside_down(coefficients: InterfaceCoefficients) -> InterfaceCoefficients:
+    return InterfaceCoefficients(
+        coefficients.reflect_up[::-1],
+        coefficients.transmit_up[::-1],
+        coefficients.reflect_down[::-1],
+        coefficients.transmit_down[::-1],
+    )
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)

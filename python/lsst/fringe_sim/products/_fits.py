@@ -10,7 +10,6 @@ import contextlib
 import math
 import os
 import re
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -21,6 +20,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError
+from ..files import all_or_nothing
 from ..resources import open_user_fits, refuse_damage
 from ._check import check_mapping
 from .mask import mask_plane_cards, planes_from_header, remap_mask
@@ -264,17 +264,6 @@ def existing_folder(path: str | os.PathLike[str]) -> Path:
     if not target.parent.is_dir():
         raise InputError("folder", str(target.parent), "an existing folder", source=str(target))
     return target
-
-
-@contextlib.contextmanager
-def all_or_nothing(target: Path) -> Iterator[Path]:
-    """Path to write in place of a file; it becomes that file if all goes well, and vanishes if not."""
-    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}.part")
-    try:
-        yield temporary
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _add_world_coordinates(hdus: Sequence[Any], section: SensorSection) -> None:

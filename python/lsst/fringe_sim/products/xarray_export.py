@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, MissingPackageError, UnknownNameError
+from ..files import all_or_nothing
 from ..resources import open_user_fits, refuse_damage
-from ._fits import PRODUCT_KEY, all_or_nothing, existing_folder
+from ._fits import PRODUCT_KEY, existing_folder
 from .fringe_cube import FringeCube
 from .mask import MASK_PLANES
 from .sensor_section import section_pixels

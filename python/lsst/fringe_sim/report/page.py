@@ -13,6 +13,7 @@ from pathlib import Path
 from astropy.table import Table
 from matplotlib.figure import Figure
 
+from ..files import write_whole
 from .style import to_png
 
 __all__ = ["Report"]
@@ -153,8 +154,4 @@ class Report:
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the page; an existing file is replaced when the new one is complete."""
-        target = Path(path)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}")
-        temporary.write_text(self.to_html(), encoding="utf-8")
-        os.replace(temporary, target)
-        return target
+        return write_whole(path, self.to_html())

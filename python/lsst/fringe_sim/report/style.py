@@ -18,6 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
+from ..files import write_whole
+
 __all__ = [
     "DIVERGING",
     "LINES",
@@ -157,11 +159,7 @@ def to_png(made: Figure) -> bytes:
 
 def save_figure(made: Figure, path: str | os.PathLike[str]) -> Path:
     """Write the figure as PNG; an existing file is replaced when the new one is complete."""
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}")
-    temporary.write_bytes(to_png(made))
-    os.replace(temporary, target)
-    return target
+    return write_whole(path, to_png(made))
 
 
 def _thin(values: NDArray[np.float64], most_px: int) -> NDArray[np.float64]:

@@ -13,7 +13,6 @@ from .silicon import (
     SiliconModel,
     SiliconSearch,
     find_silicon,
-    forecast_silicon,
 )
 from .templates import FringeTemplates
 
@@ -32,7 +31,6 @@ __all__ = [
     "SiliconSearch",
     "find_silicon",
     "fit_thickness",
-    "forecast_silicon",
     "global_fit",
     "make_templates",
     "walk_fit",

@@ -50,7 +50,6 @@ def fit_thickness(
     cell_px: int | None = None,
     noise_correlation_px: float | None = None,
     nuisances: Nuisances | None = None,
-    smoothing_px: float = 0.0,
     slip_limit: float = 0.01,
     silicon: SiliconSearch | None = None,
     threads: int | None = None,
@@ -81,14 +80,11 @@ def fit_thickness(
     nuisances : `Nuisances`, optional
         What else than thickness is free: levels, steps between zones, slow illumination, contrast. Nothing by
         default; only with ``global``.
-    smoothing_px : `float`, optional
-        Standard deviation of a Gaussian kernel over which the likelihood of neighbouring pixels is summed [px];
-        for flats that were not smoothed, and only with ``global``. Steep fringes lose nothing by it.
     slip_limit : `float`, optional
         Pixels whose order is wrong with a larger probability are flagged SLIP.
     silicon : `SiliconSearch`, optional
         Fit the thickness of the silicon too, which flats with a narrow line tell. Only with ``global``, and without
-        nuisances and smoothing. If the flats cannot tell, the fringes of the silicon count as noise and the
+        nuisances. If the flats cannot tell, the fringes of the silicon count as noise and the
         keyword ``SIFIT`` of the map is false; ``SIWHY`` says why.
     threads : `int`, optional
         Number of threads; as many as there are processors if not given. Has no influence on the result.
@@ -110,20 +106,8 @@ def fit_thickness(
         raise UnknownNameError("method", method, FIT_METHODS)
     if method == "guo2022" and nuisances is not None and nuisances.any:
         raise InputError("nuisances", nuisances, "none with method guo2022, which has none")
-    if not 0.0 <= smoothing_px < 100.0:
-        raise OutOfRangeError("smoothing [px]", smoothing_px, "0 to 100")
-    if method == "guo2022" and smoothing_px > 0.0:
-        raise InputError(
-            "smoothing [px]", smoothing_px, "0 with method guo2022, which smooths the flats instead"
-        )
-    if silicon is not None and (
-        method == "guo2022" or smoothing_px > 0.0 or (nuisances is not None and nuisances.any)
-    ):
-        raise InputError(
-            "silicon",
-            silicon,
-            "fixed with method guo2022, and beside nuisances or smoothing of the likelihood",
-        )
+    if silicon is not None and (method == "guo2022" or (nuisances is not None and nuisances.any)):
+        raise InputError("silicon", silicon, "fixed with method guo2022, and beside nuisances")
     if not 0.0 < slip_limit <= 1.0:
         raise OutOfRangeError("slip limit", slip_limit, "above 0, at most 1")
     workers = threads if threads is not None else len(os.sched_getaffinity(0))
@@ -155,7 +139,6 @@ def fit_thickness(
             range_um=(low, high),
             cell_px=cell_px,
             nuisances=nuisances,
-            smoothing_px=smoothing_px,
             threads=workers,
         )
         pixels = found.pixels

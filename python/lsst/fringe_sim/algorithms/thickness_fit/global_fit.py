@@ -28,7 +28,6 @@ from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
 from .relaxation import SettledCells, settle_orders
 from .rescue import rescue_pixels
 from .shared_misfit import doubt_from_shared_misfit
-from .smoothing import smooth_likelihood
 from .templates import FringeTemplates
 
 __all__ = ["GlobalFit", "choose_cell_size", "global_fit", "normalise_to_cells", "spans_orders"]
@@ -124,7 +123,6 @@ def global_fit(
     range_um: tuple[float, float],
     cell_px: int | None = None,
     nuisances: Nuisances | None = None,
-    smoothing_px: float = 0.0,
     threads: int = 2,
 ) -> GlobalFit:
     """Fit a sensor.
@@ -141,8 +139,6 @@ def global_fit(
         Size of the cells [px]; chosen from the steepness of the fringes if not given.
     nuisances : `Nuisances`, optional
         What else than thickness is free; nothing by default.
-    smoothing_px : `float`, optional
-        Standard deviation of a Gaussian kernel over which the likelihood of neighbouring pixels is summed [px].
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
@@ -177,11 +173,6 @@ def global_fit(
     pixels = rescue_pixels(
         fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
-    if smoothing_px > 0.0:
-        edges = (cells.y_edges, cells.x_edges)
-        pixels = smooth_likelihood(
-            fringes, state.templates, pixels, calmed, edges, rough, smoothing_px, threads
-        )
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))
         pixels = replace(pixels, sigma=np.asarray(whole, np.float32))

@@ -41,7 +41,6 @@ __all__ = [
     "SiliconSearch",
     "SiliconTables",
     "find_silicon",
-    "forecast_silicon",
     "silicon_free",
 ]
 
@@ -359,32 +358,6 @@ def silicon_free(
     return replace(data, variance=variance), replace(
         templates, response=mean, mean_response=mean.mean(axis=0)
     )
-
-
-def forecast_silicon(
-    data: Amplitudes,
-    thickness_um: NDArray[np.floating],
-    model: SiliconModel,
-    search: SiliconSearch,
-    order_um: float,
-) -> SiliconForecast:
-    """Whether flats tell the thickness of the silicon.
-
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats; only their variances and masks enter.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness of the adhesive [µm]; NaN where a pixel is not to be asked.
-    model : `SiliconModel`
-        The model, at any silicon.
-    search : `SiliconSearch`
-        What is free.
-    order_um : `float`
-        Thickness of one fringe order of the adhesive [µm].
-    """
-    sample = _sample(data, thickness_um, search)
-    return _forecast(model, sample, search, order_um)
 
 
 def find_silicon(
