@@ -46,5 +46,9 @@ def shared_dir() -> Path:
 
 @pytest.fixture
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
-    """Generator seeded from the name of the test: repeatable, and different for every test."""
-    return np.random.default_rng(list(request.node.nodeid.encode()))
+    """Generator seeded by the name in the test's ``@pytest.mark.rng("name")`` and by the values it is run with."""
+    marker = request.node.get_closest_marker("rng")
+    if marker is None:
+        pytest.fail('a test that draws numbers names its draw: @pytest.mark.rng("a name")')
+    case = request.node.callspec.id if hasattr(request.node, "callspec") else ""
+    return np.random.default_rng(list(f"{marker.args[0]} {case}".encode()))

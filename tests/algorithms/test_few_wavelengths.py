@@ -47,12 +47,14 @@ def test_neighbouring_wavelengths_find_the_order(seed, model) -> None:
         ((0, 1, 10, 11), (80, 100), 22.0, 0.6, 0.004),
     ],
 )
+@pytest.mark.rng("any few wavelengths find the order or say so")
 def test_any_few_wavelengths_find_the_order_or_say_so(bands, shape, mean, span, noise, model, rng) -> None:
     truth = random_field(shape, rng, mean=mean, span=span)
     fitted = fit_thickness(relative_flats(truth, model, rng, noise, TEN_NM[list(bands)]), model)
     assert wrong_and_unflagged(fitted, truth) < 1e-3
 
 
+@pytest.mark.rng("a misfit that neighbours share is no certainty")
 def test_a_misfit_that_neighbours_share_is_no_certainty(model, rng) -> None:
     """The true map raises no doubt at any noise; one with a wrong mean response does, however large the sensor."""
     truth = random_field((80, 100), rng, mean=15.0, span=0.5)
@@ -66,6 +68,7 @@ def test_a_misfit_that_neighbours_share_is_no_certainty(model, rng) -> None:
     assert doubt_from_shared_misfit(data, spoilt, thickness, order) > 0.05
 
 
+@pytest.mark.rng("a flat sensor says how sure it is")
 def test_a_flat_sensor_says_how_sure_it_is(model, rng) -> None:
     """Too flat for the noise: what is said to be sure is right, and what is wrong has been said to be likely."""
     said, wrong = [], []

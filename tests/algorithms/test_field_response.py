@@ -125,12 +125,14 @@ def test_too_few_angles_are_confessed():
     assert fine.quadrature_error < 5e-5
 
 
+@pytest.mark.rng("weights of any beam sum to one")
 def test_weights_of_any_beam_sum_to_one(angular, rng):
     low, high = angular.limits
     for rays in (np.array([0.1]), rng.uniform(low, high, 500), beam_field("LSST").sin_squared_at(1.9)[0]):
         assert angular.weights(rays).sum() == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.rng("components add up to the sky")
 def test_components_add_up_to_the_sky(angular, rng):
     sensor = on_sensor(angular, "R11_S01")
     thickness = rng.uniform(*RANGE, (20, 30))
@@ -175,6 +177,7 @@ def test_placement_of_a_turned_sensor():
         assert high - 1e-3 < radius.max() <= high
 
 
+@pytest.mark.rng("sky frames take either response")
 def test_sky_frames_take_either_response(angular, rng):
     sensor = on_sensor(angular, "R22_S11")
     thickness = rng.uniform(*RANGE, (24, 32))

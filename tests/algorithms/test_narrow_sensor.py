@@ -38,6 +38,7 @@ def test_cells_without_a_thickness_are_not_asked() -> None:
 
 
 @pytest.mark.parametrize("span", [0.05, 0.15, 0.3, 0.6, 0.85])
+@pytest.mark.rng("order is found together with the mean")
 def test_order_is_found_together_with_the_mean(span, model, rng) -> None:
     for _ in range(2):
         truth = random_field((64, 64), rng, mean=rng.uniform(7.0, 15.0), span=span)
@@ -49,6 +50,7 @@ def test_order_is_found_together_with_the_mean(span, model, rng) -> None:
         assert np.abs(np.mean((fitted.value - truth)[good] / fitted.sigma[good])) < 3.0
 
 
+@pytest.mark.rng("uncertainty of the common thickness")
 def test_uncertainty_of_the_common_thickness(model, rng) -> None:
     """The mean over a nearly flat sensor errs as much as is stated, and by far more than a mean of pixels."""
     pulls, gain = [], []
@@ -65,6 +67,7 @@ def test_uncertainty_of_the_common_thickness(model, rng) -> None:
     assert np.median(gain) > 3.0
 
 
+@pytest.mark.rng("what cannot be told is said")
 def test_what_cannot_be_told_is_said(model, rng) -> None:
     """Noise that leaves a flat sensor without a fringe: wrong orders are flagged."""
     for span in (0.005, 0.01, 0.02):
@@ -74,6 +77,7 @@ def test_what_cannot_be_told_is_said(model, rng) -> None:
         assert np.mean(wrong & (fitted.mask == 0)) == 0.0
 
 
+@pytest.mark.rng("a piece of a larger sensor keeps its level")
 def test_a_piece_of_a_larger_sensor_keeps_its_level(model, rng) -> None:
     """Flats over the mean of the whole sensor they were cut from are not forced to a mean of one."""
     truth = random_field((256, 256), rng, mean=12.0, span=5.0)

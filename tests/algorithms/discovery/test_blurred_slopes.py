@@ -31,6 +31,7 @@ def blurred():
     return problem, truth, dict(case.values)
 
 
+@pytest.mark.rng("curvature of changes is that of the written out basis")
 def test_curvature_of_changes_is_that_of_the_written_out_basis(rng: np.random.Generator) -> None:
     shape = (21, 17)
     basis = SplineBasis.of_grid(shape, 4.0)

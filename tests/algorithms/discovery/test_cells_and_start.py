@@ -105,6 +105,7 @@ def test_patches_in_a_wrong_order_are_taken_back() -> None:
     assert np.abs(mended - truth).max() < 0.5 * ORDER_UM
 
 
+@pytest.mark.rng("halves of the same size are two patches")
 def test_halves_of_the_same_size_are_two_patches(rng: np.random.Generator) -> None:
     """Neither is larger than the other, and neither small enough to be taken back."""
     steps = np.full((12, 20), 30)
@@ -129,6 +130,7 @@ def test_a_patch_at_the_rim_of_the_data_hangs_on_nothing_beyond_it() -> None:
     assert (mended[seen] == 30).all()
 
 
+@pytest.mark.rng("ragged patches are taken back by the surface around them")
 def test_ragged_patches_are_taken_back_by_the_surface_around_them(rng: np.random.Generator) -> None:
     """Two of five cells of an area in the wrong order, without a border."""
     truth = _smooth_field(48, 48)
@@ -375,6 +377,7 @@ def test_moved_wavelengths_recompute_only_what_they_move(monkeypatch: pytest.Mon
     assert len(forward._rows) <= MOST_ROWS * len(WAVELENGTHS)
 
 
+@pytest.mark.rng("changes are differences of predictions")
 def test_changes_are_differences_of_predictions(rng: np.random.Generator) -> None:
     """Whatever was asked before: another thickness, pixels that are lost, a map known less well."""
     centroid = 0.2 * rng.standard_normal((2, len(WAVELENGTHS), 12, 16))
@@ -461,6 +464,7 @@ def test_a_faint_copy_mirrored_about_the_middle_is_an_echo() -> None:
     assert mirrored.probability < 1e-4 < 1e-3 < aside.probability
 
 
+@pytest.mark.rng("a window keeps places and levels")
 def test_a_window_keeps_places_and_levels(rng: np.random.Generator) -> None:
     """A part of a sensor is seen where it lies: the same amplifiers, the same distance from the middle."""
     case = draw_case("none", rng, size=(96, 128))

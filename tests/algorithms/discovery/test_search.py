@@ -68,6 +68,7 @@ def test_a_field_goes_on_where_it_has_no_weight(spacing: float) -> None:
     np.testing.assert_allclose(basis.expand(basis.fit(np.full((96, 96), 15.0), seen)), 15.0, rtol=1e-9)
 
 
+@pytest.mark.rng("cells that are not seen keep their thickness")
 def test_cells_that_are_not_seen_keep_their_thickness(rng: np.random.Generator) -> None:
     field, basis = 12.0 + rng.random((5, 7)), CellBasis((5, 7))
     np.testing.assert_array_equal(basis.expand(basis.fit(field, rng.integers(0, 2, (5, 7)) * 1.0)), field)
