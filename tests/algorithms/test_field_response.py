@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.field_response import (
     SensorPlacement,
@@ -62,7 +63,7 @@ def on_sensor(angular, name: str) -> SensorResponse:
     return field_response(angular, beam_field("LSST"), placement.radius_range_deg).on(placement)
 
 
-@pytest.mark.parametrize("name", ["R22_S11", "R11_S01", "R14_S02"])
+@pytest.mark.parametrize("name", first_is_quick(["R14_S02", "R22_S11", "R11_S01"]))
 def test_every_pixel_has_its_own_beam(angular, name):
     """Within 0.5 % of peak-to-peak of a model with the traced beam of that place, over all thicknesses."""
     sensor = on_sensor(angular, name)
@@ -112,6 +113,7 @@ def test_one_beam_gives_an_ordinary_response(angular):
     assert ours.quadrature_error < 5e-5
 
 
+@pytest.mark.slow
 def test_too_few_angles_are_confessed():
     model = FringeModel.from_setup("lsst_e2v")
     limits = beam_limits(beam_field("LSST"))
@@ -148,6 +150,7 @@ def test_a_frame_does_not_depend_on_how_finely_the_sensor_is_sampled(angular):
     np.testing.assert_allclose(sensor.sky().frame(fine)[1::3, 1::3], sensor.sky().frame(coarse), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_flat_field_takes_the_thickness_of_silicon_out():
     """Thicker silicon absorbs more of the y band; behind a black coating that is all that a raw frame shows."""
     model = FringeModel.from_setup("lsst_itl", field_x_deg=1.2)

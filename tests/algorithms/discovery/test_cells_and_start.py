@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
@@ -142,7 +143,7 @@ def test_ragged_patches_are_taken_back_by_the_surface_around_them(rng: np.random
     assert (np.abs(mended - truth) > 0.15).mean() < 0.002
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", first_is_quick(range(5)))
 def test_a_sensor_of_less_than_a_fringe_has_levels_of_its_own(seed: int) -> None:
     """Its flats are not relative to the mean of a fringe, as those of a hundred pixels of a real sensor are not."""
     rng = np.random.default_rng(seed)
@@ -166,6 +167,7 @@ def test_a_slope_of_a_fringe_in_four_cells_is_followed_upwards() -> None:
     assert (np.abs(found - case.thickness_um) < 0.15).mean() > 0.999
 
 
+@pytest.mark.slow
 def test_fringes_that_diffusion_takes_away_in_places_do_not_hide_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the fringes is left where the thickness is steep: without diffusion no field is right there."""
 
@@ -252,6 +254,7 @@ def test_a_fit_far_behind_gives_up_and_one_that_is_near_does_not() -> None:
     assert free.chi2 <= behind.chi2 < free.chi2 + 0.05 * (free.chi2 - rival)
 
 
+@pytest.mark.slow
 def test_cells_of_a_large_sensor_are_found_plane_by_plane() -> None:
     """The size of the cells and the memory that finding it takes: a few planes, not the whole cube again."""
     rows, columns = 512, 480
@@ -293,6 +296,7 @@ def test_an_offset_is_a_part_of_flats_that_another_effect_has_made_weaker() -> N
     assert np.abs(ratio[edge] - 1.0).max() < 0.03 * 600.0 / level
 
 
+@pytest.mark.slow
 def test_the_second_judgement_starts_where_the_first_ended() -> None:
     """An index 5 % off moves the thickness by two orders; the unchanged model is not left in the wrong one."""
     truth = _smooth_field(48, 48)
@@ -478,6 +482,7 @@ def test_a_window_keeps_places_and_levels(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(part.geometry.level_e, cells.geometry.level_e)
 
 
+@pytest.mark.slow
 def test_where_fringes_are_narrow_a_part_is_searched_and_that_is_said() -> None:
     """Fringes of six pixels forbid larger cells, and a search of them all would take too long."""
     v, u = np.mgrid[-1.0 : 1.0 : 100 * 1j, -1.0 : 1.0 : 200 * 1j]

@@ -57,6 +57,7 @@ def _is_wrong(field: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.abs(field - truth) > 0.5 * ORDER_UM
 
 
+@pytest.mark.slow
 def test_what_lies_behind_a_blur_gets_its_order_back(blurred) -> None:
     """An order is lost on the way from the middle to a side, as where no fringes are seen."""
     problem, truth, sigma = blurred
@@ -153,6 +154,7 @@ def hidden_gap():
     return case, rng
 
 
+@pytest.mark.slow
 def test_a_field_judged_with_the_blur_lies_better_on_the_data(hidden_gap) -> None:
     case, _ = hidden_gap
     blur = [effect for effect in EFFECTS if effect.name == BLUR]

@@ -59,6 +59,7 @@ def values_of(fit: Fit) -> dict[str, float]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", ["roughness", "sky_continuum"])
 def test_separations_are_those_of_fits(noiseless, other: str) -> None:
     problem, coordinates = noiseless
