@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from flat_cubes import TEN_NM, relative_flats
-from scipy.ndimage import uniform_filter
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.algorithms.thickness_fit import Nuisances
-from lsst.fringe_sim.algorithms.thickness_fit.rescue import _bad_neighbours
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
@@ -131,12 +129,3 @@ def test_unequal_noise_counts(model, rng) -> None:
     assert pull[:80, :90].std() == pytest.approx(1.0, abs=0.1)
     assert pull[80:].std() == pytest.approx(1.0, abs=0.1)
     assert np.median(fitted.sigma[:80, :90]) > 2.0 * np.median(fitted.sigma[80:])
-
-
-@pytest.mark.rng("neighbours that fit badly are counted")
-def test_neighbours_that_fit_badly_are_counted(rng) -> None:
-    """Like a filter over the whole image, but only where it is asked."""
-    bad = rng.random((23, 31)) < 0.4
-    rows, columns = np.nonzero(bad)
-    expected = 25.0 * uniform_filter(bad.astype(float), 5, mode="nearest")
-    np.testing.assert_allclose(_bad_neighbours(bad, rows, columns), expected[bad], atol=1e-9)

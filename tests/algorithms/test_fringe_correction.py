@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from product_makers import sky
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.fringe_correction import (
     CorrectionOptions,
@@ -49,7 +50,7 @@ def with_sources(image, rng, number=150):
     return crowded
 
 
-@pytest.mark.parametrize("sources", [False, True])
+@pytest.mark.parametrize("sources", first_is_quick([True, False]))
 @pytest.mark.rng("scales are recovered within their errors")
 def test_scales_are_recovered_within_their_errors(patterns, rng, sources):
     templates = [as_template(0.01 * pattern) for pattern in patterns]

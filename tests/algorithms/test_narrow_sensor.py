@@ -7,8 +7,6 @@ import pytest
 from flat_cubes import relative_flats
 
 from lsst.fringe_sim.algorithms import fit_thickness
-from lsst.fringe_sim.algorithms.thickness_fit.cells import Cells
-from lsst.fringe_sim.algorithms.thickness_fit.narrow_sensor import _Sample
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube
@@ -20,21 +18,6 @@ HALF_ORDER_UM = 0.15
 @pytest.fixture(scope="module")
 def model() -> FringeModel:
     return FringeModel.from_setup("ts8_e2v")
-
-
-def test_cells_without_a_thickness_are_not_asked() -> None:
-    """Even if they alone have every wavelength; found by ``tests/faults/fuzz.py``."""
-    value = np.arange(12, dtype=np.float32).reshape(1, 3, 4)
-    weight = np.ones_like(value)
-    weight[0, 1:, 3] = 0.0
-    flat = np.zeros_like(value)
-    cells = Cells(value, weight, flat, flat, np.array([0, 8]), np.array([0, 8, 16, 24]))
-    sample, shapes, middles = _Sample.of(cells, [np.array([[np.nan, 13.0, 13.2]], np.float32)], 4, 10)
-    np.testing.assert_array_equal(sample.cell, [1, 2])
-    np.testing.assert_allclose(sample.level[:, 0], np.array([5.0, 9.0]) / 7.0, rtol=1e-6)
-    np.testing.assert_allclose(sample.share[0], 7.0)
-    np.testing.assert_allclose(shapes, [[0.0, 0.0], [-0.1, 0.1]], atol=1e-6)
-    np.testing.assert_allclose(middles, [13.1, 13.1], atol=1e-6)
 
 
 @pytest.mark.parametrize("span", [0.05, 0.15, 0.3, 0.6, 0.85])
@@ -50,6 +33,7 @@ def test_order_is_found_together_with_the_mean(span, model, rng) -> None:
         assert np.abs(np.mean((fitted.value - truth)[good] / fitted.sigma[good])) < 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.rng("uncertainty of the common thickness")
 def test_uncertainty_of_the_common_thickness(model, rng) -> None:
     """The mean over a nearly flat sensor errs as much as is stated, and by far more than a mean of pixels."""

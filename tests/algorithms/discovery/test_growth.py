@@ -178,12 +178,7 @@ def test_a_blur_that_takes_fringes_away_is_named_with_what_else_is_there(hidden_
     """With the thickness of the unchanged model, effects that weaken all fringes explain more than it does."""
     case, rng = hidden_gap
     catalogue = [effect for effect in EFFECTS if effect.name in (BLUR, "bandwidth", "roughness")]
-    said: list[str] = []
-    verdict = discover(case.cube, case.setup, catalogue, rng=rng, report=said.append)
-    first = next(line for line in said if "judged again" in line)
-    before = " ".join(said[: said.index(first)])
-    assert "with roughness" in before
-    assert "with charge_diffusion" in before
+    verdict = discover(case.cube, case.setup, catalogue, rng=rng)
     assert verdict.verdict == "named"
     assert {effect.name for effect in verdict.effects} == {BLUR, "bandwidth"}
     for effect in verdict.effects:
