@@ -200,6 +200,7 @@ def training(response, night):
     return [night.band_scale(time, response.bands) for time in range(len(night))]
 
 
+@pytest.mark.slow
 @pytest.mark.rng("night not used for training is corrected below a tenth of the shot noise")
 def test_night_not_used_for_training_is_corrected_below_a_tenth_of_the_shot_noise(sensor, rng):
     """A projection in every exposure, small minus large apertures in the mean square of a night."""

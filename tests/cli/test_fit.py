@@ -16,7 +16,7 @@ from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.products import FringeCube, ThicknessMap
 
-SIZE = (200, 256)
+SIZE = (500, 512)
 HALF_ORDER_UM = 0.15
 
 

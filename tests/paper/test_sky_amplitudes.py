@@ -50,6 +50,7 @@ def test_continuum_dilutes_the_fringe(shipped_map):
     assert 0.75 * lines < whole < 0.9 * lines
 
 
+@pytest.mark.slow
 @pytest.mark.rng("hsc from a random field of silicon")
 def test_hsc_from_a_random_field_of_silicon(rng):
     """Section 5.2: 1.74 µm of relief in 200 µm of silicon over 1000 px, 10 to 15 fringes."""

@@ -72,6 +72,7 @@ def test_what_lies_behind_a_blur_gets_its_order_back(blurred) -> None:
     assert grown.settings[f"{BLUR}.sigma"] == pytest.approx(sigma, rel=0.02)
 
 
+@pytest.mark.slow
 def test_cells_without_data_do_not_stop_it(blurred) -> None:
     """Two sides are masked, a band that the growth has to pass, and single cells."""
     problem, truth, sigma = blurred

@@ -103,6 +103,7 @@ def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
     assert abs(error) < 5.0 * max(found.fit.sigma[0], 1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [302, 305])
 def test_the_deepest_of_many_minima_is_found_from_far_away(seed: int) -> None:
     """A support has fringes of its own: its index has a minimum every 0.003, and the deepest is a hundred away."""

@@ -204,9 +204,9 @@ class _NarrowCoating(ArCoating):
 @pytest.mark.parametrize(
     ("effect", "key", "value", "named"),
     [
-        (_NarrowCoating(), "ar_coating.scale", 1.103, False),
+        pytest.param(_NarrowCoating(), "ar_coating.scale", 1.103, False, marks=pytest.mark.slow),
         (ArCoating(), "ar_coating.scale", 1.103, True),
-        (LineTriangle(), "line_triangle.fraction", 1.0, True),
+        pytest.param(LineTriangle(), "line_triangle.fraction", 1.0, True, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_at_the_end_of_what_a_model_is_meant_for_is_not_named(effect, key, value, named) -> None:

@@ -76,6 +76,7 @@ def test_the_short_sums_are_the_sky_of_the_simulation(setup: str, settings: dict
         assert change > 1e-5
 
 
+@pytest.mark.slow
 def test_every_pixel_sees_its_own_beam() -> None:
     """Behind a telescope: against frames that are simulated with the beam of every pixel."""
     base = FringeModel.from_setup("lsst_e2v")
