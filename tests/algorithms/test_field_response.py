@@ -180,6 +180,7 @@ def test_placement_of_a_turned_sensor():
         assert high - 1e-3 < radius.max() <= high
 
 
+@pytest.mark.slow
 @pytest.mark.rng("sky frames take either response")
 def test_sky_frames_take_either_response(angular, rng):
     sensor = on_sensor(angular, "R22_S11")

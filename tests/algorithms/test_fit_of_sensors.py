@@ -68,6 +68,7 @@ def test_noise_at_which_single_pixels_slip(model, rng) -> None:
     assert slipped(together.value, truth, good) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.rng("walk of the paper fails where the path is broken")
 def test_walk_of_the_paper_fails_where_the_path_is_broken(model, rng) -> None:
     """A wall of one and a half orders: the walk carries the error on, the global fit does not."""

@@ -123,6 +123,7 @@ def test_coadds_average_fringes_away_down_to_the_floor(patterns, rng):
     np.testing.assert_allclose(result.coadd[-1].xi, result.model[-1], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.rng("coadds of 2600 exposures of nine sensors")
 def test_coadds_of_2600_exposures_of_nine_sensors(rng):
     """The largest coadds of the paper, beside as many exposures of noise, before and after a correction."""

@@ -130,6 +130,7 @@ def test_broad_flats_cannot_tell_and_say_so(rng, tmp_path, capsys) -> None:
     assert np.mean(np.abs(value - truth) > 0.5 * ORDER_UM) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.rng("the forecast holds")
 def test_the_forecast_holds(rng) -> None:
     """Narrower lines tell more, noise tells less, and the uncertainty found is the one foretold."""

@@ -138,6 +138,7 @@ def test_a_damaged_flat_is_one_clear_line(copy, tmp_path, capsys, damage, words)
     assert not (tmp_path / "fit").exists()
 
 
+@pytest.mark.slow
 def test_a_damaged_flat_can_be_left_out(copy, tmp_path) -> None:
     _truncate(flat_at(copy, 930))
     assert run(["fit", str(copy), "--out", str(tmp_path / "fit"), "--skip-bad"]) == 0
@@ -186,6 +187,7 @@ def test_bad_requests_for_mock_flats(tmp_path, capsys, arguments, words) -> None
     assert not list(tmp_path.glob("a/*"))
 
 
+@pytest.mark.slow
 def test_a_cube_can_be_fitted(raws, tmp_path) -> None:
     from lsst.fringe_sim.algorithms.flat_prep_options import FlatPrepOptions
     from lsst.fringe_sim.cli.lab_frames import find_series

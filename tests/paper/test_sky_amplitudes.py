@@ -41,6 +41,7 @@ def test_lsst_with_the_shipped_map(shipped_map, field_deg, rms, tolerance):
     assert PERCENT * found.half_peak_to_peak == pytest.approx(2.1 * rms, rel=0.15)
 
 
+@pytest.mark.slow
 def test_continuum_dilutes_the_fringe(shipped_map):
     """A term that the paper leaves out: a fifth of the light that does not fringe."""
     model = FringeModel.from_setup("lsst_e2v")

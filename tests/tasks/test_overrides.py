@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from lsst.daf.butler import Butler
-from slow_cases import first_is_quick
 from task_commands import Command
 
 pytestmark = pytest.mark.middleware
@@ -24,31 +23,30 @@ def repo(empty_repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verb", "task", "override", "message"),
-    first_is_quick(
-        [
-            (
-                "run",
-                "epoxyFit",
-                "config.rafts['R11'] = RaftConfig()",
-                "ts8: raft is 'R11'; allowed: RTM-020, its name",
-            ),
-            ("qgraph", "isrFlatPrep", "config.raft_setups['RTM-20'] = 'ts8_itl'", "did you mean RTM-020"),
-            (
-                "qgraph",
-                "epoxyFit",
-                "config.sensors['RTM-020_S3'] = SensorConfig(effects={'tilt.deg': 1.0})",
-                "detector is 'RTM-020_S3'; allowed: did you mean RTM-020_S",
-            ),
-            (
-                "qgraph",
-                "epoxyFit",
-                "config.rafts['RTM-020'] = RaftConfig(effects={'bandwith.fwhm': 2.0})",
-                "raft RTM-020: effect is 'bandwith'; allowed: did you mean bandwidth",
-            ),
-        ]
-    ),
+    [
+        (
+            "run",
+            "epoxyFit",
+            "config.rafts['R11'] = RaftConfig()",
+            "ts8: raft is 'R11'; allowed: RTM-020, its name",
+        ),
+        ("qgraph", "isrFlatPrep", "config.raft_setups['RTM-20'] = 'ts8_itl'", "did you mean RTM-020"),
+        (
+            "qgraph",
+            "epoxyFit",
+            "config.sensors['RTM-020_S3'] = SensorConfig(effects={'tilt.deg': 1.0})",
+            "detector is 'RTM-020_S3'; allowed: did you mean RTM-020_S",
+        ),
+        (
+            "qgraph",
+            "epoxyFit",
+            "config.rafts['RTM-020'] = RaftConfig(effects={'bandwith.fwhm': 2.0})",
+            "raft RTM-020: effect is 'bandwith'; allowed: did you mean bandwidth",
+        ),
+    ],
 )
 def test_a_wrong_name_is_refused_before_the_graph(
     command: Command, repo: Path, tmp_path: Path, verb: str, task: str, override: str, message: str

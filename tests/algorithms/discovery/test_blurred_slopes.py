@@ -89,6 +89,7 @@ def test_effects_of_the_model_itself_count_as_those_that_are_looked_for(blurred)
     np.testing.assert_allclose(own.slope_changes({}, truth), expected, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_a_fit_from_nearby_ends_where_one_from_the_truth_does(blurred) -> None:
     """With the slope of a field that moves as a whole, no step lowered the misfit from either."""
     problem, truth, settings = blurred
