@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.effects import EFFECTS
