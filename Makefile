@@ -4,13 +4,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO_DIR ?= demo
 PYTEST_ARGS ?=
+# Part of the slow suite: 2/5 is the second of five shares.
+SHARE ?= 1/1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types unit docs wheel-check bench clean
+.PHONY: help demo test test-all lint types unit slow docs wheel-check bench clean
 
 help:
 	@echo "make demo   install into .venv and run the whole chain on the built-in sensor (a few minutes)"
-	@echo "make test   install into .venv with the test tools and run the whole test suite"
+	@echo "make test   install into .venv with the test tools; lint, types, wheel and the quick tests (ten minutes)"
+	@echo "make test-all  the same, then the slow tests (an hour)"
 	@echo "make docs   the documentation as HTML in doc/_build, every warning an error"
 	@echo "make bench  speed beside the peers, on the same work, in one run"
 	@echo "make clean  remove .venv, demo output and caches"
@@ -32,8 +35,13 @@ types: $(VENV)/.ready-test
 	$(BIN)/mypy
 
 # Two workers share the processors: threads of one that wait by spinning would keep the other from them.
+PYTEST = OMP_WAIT_POLICY=passive OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal --durations=10
+
 unit: $(VENV)/.ready-test
-	OMP_WAIT_POLICY=passive OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal --durations=40 --durations-min=20 $(PYTEST_ARGS)
+	$(PYTEST) -m "not slow" $(PYTEST_ARGS)
+
+slow: $(VENV)/.ready-test
+	$(PYTEST) -m slow --share=$(SHARE) $(PYTEST_ARGS)
 
 docs: $(VENV)/.ready-test
 	$(BIN)/python -m sphinx -b html -W --keep-going -q doc doc/_build
@@ -43,6 +51,9 @@ wheel-check: $(VENV)/.ready-test
 	BIN="$(BIN)" bash scripts/check_wheel.sh
 
 test: lint types wheel-check unit
+
+test-all: test
+	@$(MAKE) slow
 
 bench: $(VENV)/.ready-test
 	$(BIN)/python -m benchmarks

@@ -8,12 +8,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings
+from suite_shares import Share, group_of
 
 # A busy machine is no failure: examples are bounded in number, not in time.
 settings.register_profile("fringe_sim", deadline=None)
 settings.load_profile("fringe_sim")
 
 CHECKOUT = Path(__file__).resolve().parents[1]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--share",
+        type=Share.parse,
+        default=Share(1, 1),
+        metavar="K/N",
+        help="run the K-th of N parts of the suite",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    share: Share = config.getoption("--share")
+    left_out = [item for item in items if not share.has(group_of(item))]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if share.has(group_of(item))]
 
 
 @pytest.fixture(scope="session")
@@ -27,5 +46,9 @@ def shared_dir() -> Path:
 
 @pytest.fixture
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
-    """Generator seeded from the name of the test: repeatable, and different for every test."""
-    return np.random.default_rng(list(request.node.nodeid.encode()))
+    """Generator seeded by the name in the test's ``@pytest.mark.rng("name")`` and by the values it is run with."""
+    marker = request.node.get_closest_marker("rng")
+    if marker is None:
+        pytest.fail('a test that draws numbers names its draw: @pytest.mark.rng("a name")')
+    case = request.node.callspec.id if hasattr(request.node, "callspec") else ""
+    return np.random.default_rng(list(f"{marker.args[0]} {case}".encode()))

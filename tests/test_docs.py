@@ -45,6 +45,9 @@ def names(pages: list[Path]) -> list[str]:
     return [str(page) for page in pages]
 
 
+LONG = ("guide/interoperability.md", "tutorials/discovering_an_effect.md", "tutorials/flats_to_thickness.md")
+"""Pages of which the examples take minutes."""
+
 WITH_EXAMPLES = [page for page in PAGES if any(True for _ in blocks(page, "pycon"))]
 
 
@@ -59,7 +62,13 @@ def test_there_are_executed_examples() -> None:
     assert wanted <= set(names(WITH_EXAMPLES))
 
 
-@pytest.mark.parametrize("page", WITH_EXAMPLES, ids=names(WITH_EXAMPLES))
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=str(page), marks=[pytest.mark.slow] * (str(page) in LONG))
+        for page in WITH_EXAMPLES
+    ],
+)
 def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All examples of a page share their names, as in one session; they may write files."""
     monkeypatch.chdir(tmp_path)

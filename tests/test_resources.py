@@ -6,7 +6,6 @@ import importlib.resources
 
 import pytest
 
-from lsst.fringe_sim import resources
 from lsst.fringe_sim.errors import ResourceError, UnknownNameError
 from lsst.fringe_sim.resources import list_resources, read_table, read_yaml
 
@@ -54,7 +53,5 @@ def test_a_table_without_provenance_is_refused(tmp_path, monkeypatch) -> None:
     )
     (folder / "bare.ecsv").write_text(text)
     monkeypatch.setattr(importlib.resources, "files", lambda package: tmp_path)
-    resources._read_table.cache_clear()
     with pytest.raises(ResourceError, match="source, doi, licence"):
         read_table("media", "bare.ecsv")
-    resources._read_table.cache_clear()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from flat_cubes import TEN_NM, relative_flats
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.algorithms.thickness_fit import make_templates
@@ -26,7 +27,7 @@ def wrong_and_unflagged(fitted, truth) -> float:
     return float(np.mean((np.abs(fitted.value - truth) > HALF_ORDER_UM) & (fitted.mask == 0)))
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3, 4])
+@pytest.mark.parametrize("seed", first_is_quick([0, 1, 3, 4]))
 def test_neighbouring_wavelengths_find_the_order(seed, model) -> None:
     """A mean response that is half a per cent off tears the relief; a torn relief has a wrong mean response."""
     rng = np.random.default_rng(seed)
@@ -40,19 +41,21 @@ def test_neighbouring_wavelengths_find_the_order(seed, model) -> None:
 @pytest.mark.parametrize(
     ("bands", "shape", "mean", "span", "noise"),
     [
-        ((0, 1, 2, 3), (160, 200), 15.0, 1.0, 0.002),
-        ((8, 9, 10, 11), (80, 100), 25.6, 2.5, 0.002),
-        ((3, 4, 5, 6, 7), (80, 100), 7.0, 0.8, 0.002),
+        pytest.param((0, 1, 2, 3), (160, 200), 15.0, 1.0, 0.002, marks=pytest.mark.slow),
+        pytest.param((8, 9, 10, 11), (80, 100), 25.6, 2.5, 0.002, marks=pytest.mark.slow),
+        pytest.param((3, 4, 5, 6, 7), (80, 100), 7.0, 0.8, 0.002, marks=pytest.mark.slow),
         ((0, 1, 2, 3), (48, 64), 8.0, 1.6, 0.005),
         ((0, 1, 10, 11), (80, 100), 22.0, 0.6, 0.004),
     ],
 )
+@pytest.mark.rng("any few wavelengths find the order or say so")
 def test_any_few_wavelengths_find_the_order_or_say_so(bands, shape, mean, span, noise, model, rng) -> None:
     truth = random_field(shape, rng, mean=mean, span=span)
     fitted = fit_thickness(relative_flats(truth, model, rng, noise, TEN_NM[list(bands)]), model)
     assert wrong_and_unflagged(fitted, truth) < 1e-3
 
 
+@pytest.mark.rng("a misfit that neighbours share is no certainty")
 def test_a_misfit_that_neighbours_share_is_no_certainty(model, rng) -> None:
     """The true map raises no doubt at any noise; one with a wrong mean response does, however large the sensor."""
     truth = random_field((80, 100), rng, mean=15.0, span=0.5)
@@ -66,6 +69,8 @@ def test_a_misfit_that_neighbours_share_is_no_certainty(model, rng) -> None:
     assert doubt_from_shared_misfit(data, spoilt, thickness, order) > 0.05
 
 
+@pytest.mark.slow
+@pytest.mark.rng("a flat sensor says how sure it is")
 def test_a_flat_sensor_says_how_sure_it_is(model, rng) -> None:
     """Too flat for the noise: what is said to be sure is right, and what is wrong has been said to be likely."""
     said, wrong = [], []

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.field_response import (
     SensorPlacement,
@@ -75,7 +76,7 @@ def test_a_part_of_a_sensor_has_its_own_place(x) -> None:
     assert part.radius_range_deg == pytest.approx((expected.min(), expected.max()), abs=1e-4)
 
 
-@pytest.mark.parametrize("name", ["R22_S11", "R11_S01", "R14_S02"])
+@pytest.mark.parametrize("name", first_is_quick(["R14_S02", "R22_S11", "R11_S01"]))
 def test_every_pixel_has_its_own_beam(angular, name):
     """Within 0.5 % of peak-to-peak of a model with the traced beam of that place, over all thicknesses."""
     sensor = on_sensor(angular, name)
@@ -125,6 +126,7 @@ def test_one_beam_gives_an_ordinary_response(angular):
     assert ours.quadrature_error < 5e-5
 
 
+@pytest.mark.slow
 def test_too_few_angles_are_confessed():
     model = FringeModel.from_setup("lsst_e2v")
     limits = beam_limits(beam_field("LSST"))
@@ -138,12 +140,14 @@ def test_too_few_angles_are_confessed():
     assert fine.quadrature_error < 5e-5
 
 
+@pytest.mark.rng("weights of any beam sum to one")
 def test_weights_of_any_beam_sum_to_one(angular, rng):
     low, high = angular.limits
     for rays in (np.array([0.1]), rng.uniform(low, high, 500), beam_field("LSST").sin_squared_at(1.9)[0]):
         assert angular.weights(rays).sum() == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.rng("components add up to the sky")
 def test_components_add_up_to_the_sky(angular, rng):
     sensor = on_sensor(angular, "R11_S01")
     thickness = rng.uniform(*RANGE, (20, 30))
@@ -159,6 +163,7 @@ def test_a_frame_does_not_depend_on_how_finely_the_sensor_is_sampled(angular):
     np.testing.assert_allclose(sensor.sky().frame(fine)[1::3, 1::3], sensor.sky().frame(coarse), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_flat_field_takes_the_thickness_of_silicon_out():
     """Thicker silicon absorbs more of the y band; behind a black coating that is all that a raw frame shows."""
     model = FringeModel.from_setup("lsst_itl", field_x_deg=1.2)
@@ -188,6 +193,8 @@ def test_placement_of_a_turned_sensor():
         assert high - 1e-3 < radius.max() <= high
 
 
+@pytest.mark.slow
+@pytest.mark.rng("sky frames take either response")
 def test_sky_frames_take_either_response(angular, rng):
     sensor = on_sensor(angular, "R22_S11")
     thickness = rng.uniform(*RANGE, (24, 32))

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from flat_cubes import TEN_NM, relative_flats
-from scipy.ndimage import uniform_filter
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.algorithms.thickness_fit import Nuisances
-from lsst.fringe_sim.algorithms.thickness_fit.rescue import _bad_neighbours
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
@@ -43,6 +42,7 @@ def pulls_of(fitted, truth: np.ndarray, least: float = 0.95) -> np.ndarray:
     return np.asarray(error / fitted.sigma[good])
 
 
+@pytest.mark.rng("a step between the halves")
 def test_a_step_between_the_halves(model, rng, tmp_path) -> None:
     """As measured: -1.1 % at the midline, a little different at each wavelength."""
     y, _ = places()
@@ -63,6 +63,7 @@ def test_a_step_between_the_halves(model, rng, tmp_path) -> None:
     np.testing.assert_array_equal(value, free.value)
 
 
+@pytest.mark.rng("slow illumination")
 def test_slow_illumination(model, rng) -> None:
     """A gradient and a bowl of a few per cent, free at each wavelength."""
     y, x = places()
@@ -77,6 +78,7 @@ def test_slow_illumination(model, rng) -> None:
     assert pull.std() == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.rng("contrast that the model does not know")
 def test_contrast_that_the_model_does_not_know(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
     weak = model.with_effects({"contrast_loss.factor": 0.4})
@@ -85,7 +87,8 @@ def test_contrast_that_the_model_does_not_know(model, rng) -> None:
     assert pulls_of(fitted, truth).std() == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize("mean", [6.5, 28.0])
+@pytest.mark.parametrize("mean", first_is_quick([28.0, 6.5]))
+@pytest.mark.rng("thin and thick adhesive")
 def test_thin_and_thick_adhesive(mean: float, model, rng) -> None:
     """Both ends of 5 to 30 µm."""
     truth = random_field(SHAPE, rng, mean=mean, span=SPAN_UM)
@@ -93,6 +96,7 @@ def test_thin_and_thick_adhesive(mean: float, model, rng) -> None:
     assert pull.std() == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.rng("a sensor cut in two")
 def test_a_sensor_cut_in_two(model, rng) -> None:
     """Masked rows that no path crosses: both parts find their order, by themselves or together."""
     truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
@@ -108,6 +112,7 @@ def test_a_sensor_cut_in_two(model, rng) -> None:
     assert np.count_nonzero(np.abs(fitted.value - truth)[good] > HALF_ORDER_UM) == 0
 
 
+@pytest.mark.rng("unequal noise counts")
 def test_unequal_noise_counts(model, rng) -> None:
     """A quarter of the sensor and half of the wavelengths are three times noisier; the pulls stay 1 everywhere."""
     truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)
@@ -125,11 +130,3 @@ def test_unequal_noise_counts(model, rng) -> None:
     assert pull[:80, :90].std() == pytest.approx(1.0, abs=0.1)
     assert pull[80:].std() == pytest.approx(1.0, abs=0.1)
     assert np.median(fitted.sigma[:80, :90]) > 2.0 * np.median(fitted.sigma[80:])
-
-
-def test_neighbours_that_fit_badly_are_counted(rng) -> None:
-    """Like a filter over the whole image, but only where it is asked."""
-    bad = rng.random((23, 31)) < 0.4
-    rows, columns = np.nonzero(bad)
-    expected = 25.0 * uniform_filter(bad.astype(float), 5, mode="nearest")
-    np.testing.assert_allclose(_bad_neighbours(bad, rows, columns), expected[bad], atol=1e-9)

@@ -31,6 +31,7 @@ def slipped(value: np.ndarray, truth: np.ndarray, good: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", sorted(HARD_MAPS))
+@pytest.mark.rng("hard maps without a slip")
 def test_hard_maps_without_a_slip(name, model, rng) -> None:
     truth = HARD_MAPS[name](SHAPE)
     known = np.isfinite(truth)
@@ -45,6 +46,7 @@ def test_hard_maps_without_a_slip(name, model, rng) -> None:
     assert slipped(fitted.value, truth, good) == 0.0
 
 
+@pytest.mark.rng("uncertainty holds")
 def test_uncertainty_holds(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=17.0, span=4.0)
     fitted = fit_thickness(relative_flats(truth, model, rng), model)
@@ -55,6 +57,7 @@ def test_uncertainty_holds(model, rng) -> None:
     assert np.median(fitted.chi2[good]) == pytest.approx(0.94, abs=0.1)
 
 
+@pytest.mark.rng("noise at which single pixels slip")
 def test_noise_at_which_single_pixels_slip(model, rng) -> None:
     """Contrast lowered to that of real sensors, noise at which a lone pixel goes wrong every third time."""
     weak = model.with_effects({"contrast_loss.factor": 0.15})
@@ -66,6 +69,8 @@ def test_noise_at_which_single_pixels_slip(model, rng) -> None:
     assert slipped(together.value, truth, good) == 0.0
 
 
+@pytest.mark.slow
+@pytest.mark.rng("walk of the paper fails where the path is broken")
 def test_walk_of_the_paper_fails_where_the_path_is_broken(model, rng) -> None:
     """A wall of one and a half orders: the walk carries the error on, the global fit does not."""
     truth = random_field(SHAPE, rng, mean=17.0, span=2.0)
@@ -79,6 +84,7 @@ def test_walk_of_the_paper_fails_where_the_path_is_broken(model, rng) -> None:
     assert slipped(walk.value, truth, np.isfinite(walk.value)) > 0.1
 
 
+@pytest.mark.rng("walk of the paper is right on a smooth map")
 def test_walk_of_the_paper_is_right_on_a_smooth_map(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=17.0, span=4.0)
     cube = relative_flats(truth, model, rng)
@@ -87,6 +93,7 @@ def test_walk_of_the_paper_is_right_on_a_smooth_map(model, rng) -> None:
         assert slipped(walk.value, truth, walk.mask == 0) == 0.0
 
 
+@pytest.mark.rng("any order of wavelengths")
 def test_any_order_of_wavelengths(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=16.0, span=3.0)
     cube = relative_flats(truth, model, rng)
@@ -96,6 +103,7 @@ def test_any_order_of_wavelengths(model, rng) -> None:
     )
 
 
+@pytest.mark.rng("missing wavelengths cost certainty")
 def test_missing_wavelengths_cost_certainty(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=16.0, span=3.0)
     cube = relative_flats(truth, model, rng)
@@ -107,6 +115,7 @@ def test_missing_wavelengths_cost_certainty(model, rng) -> None:
     assert np.all(few.n_wavelengths[good] == 7)
 
 
+@pytest.mark.rng("bad columns and missing pixels")
 def test_bad_columns_and_missing_pixels(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=17.0, span=4.0)
     cube = relative_flats(truth, model, rng)
@@ -124,6 +133,7 @@ def test_bad_columns_and_missing_pixels(model, rng) -> None:
     assert slipped(fitted.value, truth, good) == 0.0
 
 
+@pytest.mark.rng("threads do not change the result")
 def test_threads_do_not_change_the_result(model, rng) -> None:
     cube = relative_flats(random_field(SHAPE, rng, mean=17.0, span=4.0), model, rng)
     one, two = (fit_thickness(cube, model, threads=number) for number in (1, 2))
@@ -131,6 +141,7 @@ def test_threads_do_not_change_the_result(model, rng) -> None:
     np.testing.assert_array_equal(one.sigma, two.sigma)
 
 
+@pytest.mark.rng("bad requests")
 def test_bad_requests(model, rng) -> None:
     cube = relative_flats(np.full((20, 20), 17.0), model, rng)
     with pytest.raises(UnknownNameError, match="global"):
@@ -162,6 +173,7 @@ def repaired(path: Path) -> np.ndarray:
 @pytest.mark.parametrize(
     "sensor", ["S00_E2V-319", "S01_E2V-321", "S02_E2V-359", "S20_E2V-350", "S22_E2V-361"]
 )
+@pytest.mark.rng("real maps of the raft")
 def test_real_maps_of_the_raft(sensor, shared_dir, model, rng) -> None:
     """Maps of RTM-020 at a sixteenth of their pixels, the absolute thickness drawn anew."""
     relief = repaired(shared_dir / "measured" / f"RTM-020_{sensor}_epoxy_map.fits")

@@ -94,6 +94,7 @@ def wrong_orders(
     ("wavelengths", "electrons", "pixels"),
     [(TEN_NM, 20_000.0, 1), (TEN_NM[::2], 20_000.0, 1), (TEN_NM[::3], 40_000.0, 4)],
 )
+@pytest.mark.rng("forecast of slips is what fits find")
 def test_forecast_of_slips_is_what_fits_find(model, rng, wavelengths, electrons, pixels) -> None:
     forecast = forecast_flats(
         model,
@@ -110,6 +111,7 @@ def test_forecast_of_slips_is_what_fits_find(model, rng, wavelengths, electrons,
     assert found == pytest.approx(said, rel=0.2, abs=5.0 * np.sqrt(said / count))
 
 
+@pytest.mark.rng("safe plans do not slip and ambiguous ones do")
 def test_safe_plans_do_not_slip_and_ambiguous_ones_do(weak, rng) -> None:
     limits = {"search_um": SEARCH_UM, "read_noise_e": READ_NOISE_E}
     safe = forecast_flats(weak, flats_at(TEN_NM), RANGE_UM, region_px=400, **limits)

@@ -149,6 +149,7 @@ def test_overscan_follows_the_drift_of_the_rows(biases: list[RawFrame], method: 
 
 
 @pytest.mark.parametrize("method", ["median", "spline"])
+@pytest.mark.rng("overscan rejects outliers")
 def test_overscan_rejects_outliers(biases: list[RawFrame], method: str, rng: np.random.Generator) -> None:
     def hit(data: Pixels) -> None:
         first = data.shape[1] - 45

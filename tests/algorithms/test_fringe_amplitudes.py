@@ -11,6 +11,7 @@ from lsst.fringe_sim.errors import InputError
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 2), (3, 5), (257, 301)])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int32, ">f4"])
+@pytest.mark.rng("they are numpys")
 def test_they_are_numpys(rng: np.random.Generator, shape: tuple[int, int], dtype: str) -> None:
     image = rng.normal(2700.0, 40.0, shape).astype(dtype)
     exact = image.astype(float)
@@ -22,6 +23,7 @@ def test_they_are_numpys(rng: np.random.Generator, shape: tuple[int, int], dtype
     assert found.mean == pytest.approx(exact.mean(), rel=1e-12)
 
 
+@pytest.mark.rng("pixels that are masked or no number do not count")
 def test_pixels_that_are_masked_or_no_number_do_not_count(rng: np.random.Generator) -> None:
     image = rng.normal(100.0, 1.0, (40, 50)).astype(np.float32)
     mask = rng.random((40, 50)) < 0.2

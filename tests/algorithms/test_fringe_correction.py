@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from product_makers import sky
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.fringe_correction import (
     CorrectionOptions,
@@ -49,7 +50,8 @@ def with_sources(image, rng, number=150):
     return crowded
 
 
-@pytest.mark.parametrize("sources", [False, True])
+@pytest.mark.parametrize("sources", first_is_quick([True, False]))
+@pytest.mark.rng("scales are recovered within their errors")
 def test_scales_are_recovered_within_their_errors(patterns, rng, sources):
     templates = [as_template(0.01 * pattern) for pattern in patterns]
     truth = LEVEL * np.array([1.3, -0.6])
@@ -67,6 +69,7 @@ def test_scales_are_recovered_within_their_errors(patterns, rng, sources):
     assert found.positions_used < 4000 if sources else found.positions_used > 3900
 
 
+@pytest.mark.rng("fringes below the noise are not overcorrected")
 def test_fringes_below_the_noise_are_not_overcorrected(patterns, rng):
     """A tenth of the noise of a pixel: medians of image and template would give scales 16 % too large."""
     template = as_template(0.002 * patterns[0])
@@ -79,6 +82,7 @@ def test_fringes_below_the_noise_are_not_overcorrected(patterns, rng):
     assert np.mean(scales) == pytest.approx(1.0, abs=0.06)
 
 
+@pytest.mark.rng("noiseless exposure is corrected exactly")
 def test_noiseless_exposure_is_corrected_exactly(patterns, rng):
     template = as_template(0.01 * patterns[0])
     image = (LEVEL * (1 + 0.7 * template.image)).astype(np.float32)
@@ -87,6 +91,7 @@ def test_noiseless_exposure_is_corrected_exactly(patterns, rng):
     np.testing.assert_allclose(found.image, LEVEL, rtol=1e-5)
 
 
+@pytest.mark.rng("a corrected exposure is refused")
 def test_a_corrected_exposure_is_refused(patterns, rng):
     template = as_template(0.01 * patterns[0])
     scene = LEVEL * (1 + template.image)
@@ -101,6 +106,7 @@ def test_a_corrected_exposure_is_refused(patterns, rng):
         fit_pca(frames)
 
 
+@pytest.mark.rng("inputs are left alone")
 def test_inputs_are_left_alone(patterns, rng):
     image = rng.poisson(LEVEL * (1 + 0.01 * patterns[0])).astype(np.float32)
     mask = (rng.random(image.shape) < 0.1).astype(np.int32)
@@ -112,6 +118,7 @@ def test_inputs_are_left_alone(patterns, rng):
 
 
 @pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.rng("fully masked exposure is returned as it is")
 def test_fully_masked_exposure_is_returned_as_it_is(patterns, rng, count):
     image = rng.poisson(LEVEL, (400, 500)).astype(np.float32)
     templates = [as_template(pattern) for pattern in patterns[:count]]
@@ -122,6 +129,7 @@ def test_fully_masked_exposure_is_returned_as_it_is(patterns, rng, count):
     assert np.isnan(found.covariance).all()
 
 
+@pytest.mark.rng("identical templates decide nothing")
 def test_identical_templates_decide_nothing(patterns, rng):
     image = rng.poisson(LEVEL * (1 + 0.01 * patterns[0])).astype(np.float32)
     template = as_template(patterns[0])
@@ -129,6 +137,7 @@ def test_identical_templates_decide_nothing(patterns, rng):
     assert not found.solved
 
 
+@pytest.mark.rng("masked pixels are not measured")
 def test_masked_pixels_are_not_measured(patterns, rng):
     image = LEVEL * (1 + 0.01 * patterns[0])
     mask = np.zeros(image.shape, dtype=np.int32)
@@ -142,6 +151,7 @@ def test_masked_pixels_are_not_measured(patterns, rng):
     assert found.scale[0] == pytest.approx(LEVEL, rel=1e-3)
 
 
+@pytest.mark.rng("aperture levels are means of the good pixels")
 def test_aperture_levels_are_means_of_the_good_pixels(rng):
     image = rng.normal(100.0, 1.0, (60, 60)).astype(np.float32)
     good = rng.random((60, 60)) > 0.2
@@ -190,6 +200,8 @@ def training(response, night):
     return [night.band_scale(time, response.bands) for time in range(len(night))]
 
 
+@pytest.mark.slow
+@pytest.mark.rng("night not used for training is corrected below a tenth of the shot noise")
 def test_night_not_used_for_training_is_corrected_below_a_tenth_of_the_shot_noise(sensor, rng):
     """A projection in every exposure, small minus large apertures in the mean square of a night."""
     thickness, model, response = sensor
@@ -265,6 +277,7 @@ def test_component_patterns_are_zero_mean_shares_of_the_fringe(sensor):
     assert np.abs(patterns.mean(axis=(1, 2), dtype=float)).max() < 1e-9
 
 
+@pytest.mark.rng("bad input is named")
 def test_bad_input_is_named(patterns, rng):
     image = np.ones((400, 500))
     with pytest.raises(InputError, match="templates"):

@@ -34,6 +34,7 @@ def treecorr_oracle(image, weight, bins, other=None):
 
 @pytest.mark.parametrize("shape", [(40, 33), (21, 64)])
 @pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.rng("equals treecorr")
 def test_equals_treecorr(rng, shape, masked):
     image = gaussian_filter(rng.standard_normal(shape), 1.5)
     weight = rng.uniform(0.5, 2.0, shape) * (rng.random(shape) > 0.2) if masked else np.ones(shape)
@@ -46,6 +47,7 @@ def test_equals_treecorr(rng, shape, masked):
     np.testing.assert_allclose(found.separation_px, expected.meanr, rtol=1e-7)
 
 
+@pytest.mark.rng("masked and missing pixels do not count")
 def test_masked_and_missing_pixels_do_not_count(rng):
     image = rng.standard_normal((32, 32))
     weight = (rng.random((32, 32)) > 0.3).astype(float)
@@ -73,6 +75,7 @@ def test_empty_bins_are_not_numbers():
     assert not found.weight.any()
 
 
+@pytest.mark.rng("cutout is a rotated piece of the pattern")
 def test_cutout_is_a_rotated_piece_of_the_pattern(rng):
     y, x = np.mgrid[:200, :240]
     slope = 0.3 * x + 0.1 * y
@@ -92,6 +95,7 @@ def patterns():
     ]
 
 
+@pytest.mark.rng("coadds average fringes away down to the floor")
 def test_coadds_average_fringes_away_down_to_the_floor(patterns, rng):
     result = coadd_correlation(patterns, (1, 10, 100), 0.0, rng, region_px=100, bins=LogBins(2.0, 30.0, 6))
     assert result.single.xi[0] == pytest.approx(0.5, rel=0.15)
@@ -104,6 +108,8 @@ def test_coadds_average_fringes_away_down_to_the_floor(patterns, rng):
     np.testing.assert_allclose(result.coadd[-1].xi, result.model[-1], atol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.rng("coadds of 2600 exposures of nine sensors")
 def test_coadds_of_2600_exposures_of_nine_sensors(rng):
     """The largest coadds of the paper, beside as many exposures of noise, before and after a correction."""
     bins = LogBins(2.0, 12.0, 4)
@@ -132,6 +138,7 @@ def test_coadds_of_2600_exposures_of_nine_sensors(rng):
     assert abs(corrected.coadd[-1].xi[0]) < 0.1 * abs(fringed.single.xi[0]) / 100
 
 
+@pytest.mark.rng("floor is what no rotation removes")
 def test_floor_is_what_no_rotation_removes(rng):
     """A radial pattern that fills the region the same way each time does not average out."""
     y, x = np.mgrid[:145, :145] - 72.0
@@ -142,6 +149,7 @@ def test_floor_is_what_no_rotation_removes(rng):
     np.testing.assert_allclose(result.coadd[1].xi, result.single.xi, rtol=0.05)
 
 
+@pytest.mark.rng("null is the noise of as many exposures")
 def test_null_is_the_noise_of_as_many_exposures(patterns, rng):
     result = coadd_correlation(patterns, (1, 4, 16), 0.7, rng, region_px=64, bins=LogBins(1.0, 20.0, 8))
     for count, null in zip(result.counts, result.null, strict=True):
@@ -150,6 +158,7 @@ def test_null_is_the_noise_of_as_many_exposures(patterns, rng):
         assert np.all(np.abs(null.xi + 0.49 / count / 64**2) < 5 * scatter)
 
 
+@pytest.mark.rng("fringes stand out of the null until they are corrected")
 def test_fringes_stand_out_of_the_null_until_they_are_corrected(patterns, rng):
     bins = LogBins(2.0, 8.0, 3)
     fringed = coadd_correlation(
@@ -177,6 +186,7 @@ def test_result_is_repeatable(patterns):
     assert not np.array_equal(runs[0], runs[2])
 
 
+@pytest.mark.rng("bad input is named")
 def test_bad_input_is_named(patterns, rng):
     with pytest.raises(InputError, match="two axes"):
         correlation_function(np.ones(5))

@@ -61,6 +61,7 @@ def test_fringes_are_weaker_at_the_edge_of_the_field(centre, thickness_um) -> No
     assert rms[1] < 0.75 * rms[0]
 
 
+@pytest.mark.slow
 def test_brighter_lines_have_stronger_fringes(centre, thickness_um) -> None:
     """More than the continuum allows they cannot gain: less than the lines themselves."""
     made = CCDFringing(at(-1.0, 0.4), BORESIGHT, 5, True, thickness_um=thickness_um)

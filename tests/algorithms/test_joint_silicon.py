@@ -78,6 +78,7 @@ def pulls(fitted, truth: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
+@pytest.mark.rng("one silicon for the sensor")
 def test_one_silicon_for_the_sensor(rng, tmp_path, capsys) -> None:
     """Nearly three of its orders from the model, found with its uncertainty; without it the adhesive is wrong."""
     model, truth, cube = sensor((0.37,), rng)
@@ -99,6 +100,7 @@ def test_one_silicon_for_the_sensor(rng, tmp_path, capsys) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.rng("tilted silicon")
 def test_tilted_silicon(rng) -> None:
     """A tilt of almost two orders across the sensor."""
     model, truth, cube = sensor((-0.52, 0.11), rng)
@@ -112,6 +114,7 @@ def test_tilted_silicon(rng) -> None:
     assert pull.std() == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.rng("broad flats cannot tell and say so")
 def test_broad_flats_cannot_tell_and_say_so(rng, tmp_path, capsys) -> None:
     """The adhesive is found all the same, with the fringes of the silicon as noise."""
     _, truth, cube = sensor((0.37,), rng, None)
@@ -126,6 +129,8 @@ def test_broad_flats_cannot_tell_and_say_so(rng, tmp_path, capsys) -> None:
     assert np.mean(np.abs(value - truth) > 0.5 * ORDER_UM) == 0.0
 
 
+@pytest.mark.slow
+@pytest.mark.rng("the forecast holds")
 def test_the_forecast_holds(rng) -> None:
     """Narrower lines tell more, noise tells less, and the uncertainty found is the one foretold."""
     model, truth, cube = sensor((0.1,), rng)
@@ -148,6 +153,7 @@ def test_the_forecast_holds(rng) -> None:
     assert np.ptp(offset) == 0.0
 
 
+@pytest.mark.rng("what cannot be combined is refused")
 def test_what_cannot_be_combined_is_refused(rng) -> None:
     model = FringeModel.from_setup("ts8_e2v")
     _, _, cube = sensor((0.0,), rng, None)

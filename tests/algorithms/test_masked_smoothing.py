@@ -60,12 +60,14 @@ def test_agrees_with_brute_force(shape: tuple[int, int], sigma: float, bad: floa
     assert np.all(np.isnan(value[~usable & (weight < 0.0199)]))
 
 
+@pytest.mark.rng("constant image stays constant")
 def test_constant_image_stays_constant(rng: np.random.Generator) -> None:
     good = rng.random((40, 50)) > 0.3
     value, _ = smooth_masked(np.full((40, 50), 7.0), np.ones((40, 50)), good, 3.0)
     np.testing.assert_allclose(value[good], 7.0, rtol=1e-6)
 
 
+@pytest.mark.rng("variance is that of many noisy images")
 def test_variance_is_that_of_many_noisy_images(rng: np.random.Generator) -> None:
     good = rng.random((24, 30)) > 0.15
     good[8:14, 10:20] = False
@@ -84,6 +86,7 @@ def test_variance_is_that_of_many_noisy_images(rng: np.random.Generator) -> None
     assert np.abs(ratio - 1.0).max() < 5.0 * np.sqrt(2.0 / trials)
 
 
+@pytest.mark.rng("noise is reduced and correlated as stated")
 def test_noise_is_reduced_and_correlated_as_stated(rng: np.random.Generator) -> None:
     """White noise: variance / (4 pi sigma²), correlation exp(-lag² / (2 (sqrt(2) sigma)²))."""
     sigma = 3.0
@@ -98,6 +101,7 @@ def test_noise_is_reduced_and_correlated_as_stated(rng: np.random.Generator) -> 
         assert measured == pytest.approx(np.exp(-(lag**2) / (4.0 * sigma**2)), abs=0.05)
 
 
+@pytest.mark.rng("no smoothing leaves good pixels alone")
 def test_no_smoothing_leaves_good_pixels_alone(rng: np.random.Generator) -> None:
     image = rng.normal(size=(5, 6)).astype(np.float32)
     good = rng.random((5, 6)) > 0.3

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from flat_cubes import relative_flats
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms import fit_thickness
-from lsst.fringe_sim.algorithms.thickness_fit.cells import Cells
-from lsst.fringe_sim.algorithms.thickness_fit.narrow_sensor import _Sample
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube
@@ -22,22 +21,8 @@ def model() -> FringeModel:
     return FringeModel.from_setup("ts8_e2v")
 
 
-def test_cells_without_a_thickness_are_not_asked() -> None:
-    """Even if they alone have every wavelength; found by ``tests/faults/fuzz.py``."""
-    value = np.arange(12, dtype=np.float32).reshape(1, 3, 4)
-    weight = np.ones_like(value)
-    weight[0, 1:, 3] = 0.0
-    flat = np.zeros_like(value)
-    cells = Cells(value, weight, flat, flat, np.array([0, 8]), np.array([0, 8, 16, 24]))
-    sample, shapes, middles = _Sample.of(cells, [np.array([[np.nan, 13.0, 13.2]], np.float32)], 4, 10)
-    np.testing.assert_array_equal(sample.cell, [1, 2])
-    np.testing.assert_allclose(sample.level[:, 0], np.array([5.0, 9.0]) / 7.0, rtol=1e-6)
-    np.testing.assert_allclose(sample.share[0], 7.0)
-    np.testing.assert_allclose(shapes, [[0.0, 0.0], [-0.1, 0.1]], atol=1e-6)
-    np.testing.assert_allclose(middles, [13.1, 13.1], atol=1e-6)
-
-
-@pytest.mark.parametrize("span", [0.05, 0.15, 0.3, 0.6, 0.85])
+@pytest.mark.parametrize("span", first_is_quick([0.3, 0.05, 0.15, 0.6, 0.85]))
+@pytest.mark.rng("order is found together with the mean")
 def test_order_is_found_together_with_the_mean(span, model, rng) -> None:
     for _ in range(2):
         truth = random_field((64, 64), rng, mean=rng.uniform(7.0, 15.0), span=span)
@@ -45,10 +30,11 @@ def test_order_is_found_together_with_the_mean(span, model, rng) -> None:
         good = fitted.mask == 0
         assert good.mean() > 0.99
         assert np.mean(np.abs(fitted.value - truth)[good] > HALF_ORDER_UM) == 0.0
-        assert fitted.metadata["NORMALIS"] == "narrow"
         assert np.abs(np.mean((fitted.value - truth)[good] / fitted.sigma[good])) < 3.0
 
 
+@pytest.mark.slow
+@pytest.mark.rng("uncertainty of the common thickness")
 def test_uncertainty_of_the_common_thickness(model, rng) -> None:
     """The mean over a nearly flat sensor errs as much as is stated, and by far more than a mean of pixels."""
     pulls, gain = [], []
@@ -65,6 +51,7 @@ def test_uncertainty_of_the_common_thickness(model, rng) -> None:
     assert np.median(gain) > 3.0
 
 
+@pytest.mark.rng("what cannot be told is said")
 def test_what_cannot_be_told_is_said(model, rng) -> None:
     """Noise that leaves a flat sensor without a fringe: wrong orders are flagged."""
     for span in (0.005, 0.01, 0.02):
@@ -74,6 +61,7 @@ def test_what_cannot_be_told_is_said(model, rng) -> None:
         assert np.mean(wrong & (fitted.mask == 0)) == 0.0
 
 
+@pytest.mark.rng("a piece of a larger sensor keeps its level")
 def test_a_piece_of_a_larger_sensor_keeps_its_level(model, rng) -> None:
     """Flats over the mean of the whole sensor they were cut from are not forced to a mean of one."""
     truth = random_field((256, 256), rng, mean=12.0, span=5.0)

@@ -214,18 +214,6 @@ def test_published_likenesses(
         assert ranked.pairs[0].likeness_after == pytest.approx(after, abs=0.15)
 
 
-def test_bandwidth_and_beam_with_a_narrow_line(model: FringeModel) -> None:
-    """The 0.36 of the same table holds if the thickness of the silicon is known; a free one mimics the beam."""
-    forecast = forecast_of(model, bandwidth={}, converging_beam={})
-    both = [FlatSeries(FLATS), NARROW.series]
-    free = forecast.pairs(both)[0].likeness
-    for series in both:
-        block = forecast._blocks[series]
-        forecast._blocks[series] = replace(block, silicon=np.zeros(block.silicon.shape))
-    assert forecast.pairs(both)[0].likeness == pytest.approx(0.36, abs=0.05)
-    assert 0.85 < free < 0.97
-
-
 def test_the_same_flats_again_bring_the_root_of_two(model: FringeModel, few_samples: None) -> None:
     (ranked,) = rank_measurements(
         model, {"epoxy_absorption": {}, "roughness": {}}, measurements=[AGAIN], significance=20.0
@@ -234,15 +222,6 @@ def test_the_same_flats_again_bring_the_root_of_two(model: FringeModel, few_samp
     assert pair.likeness_after == pytest.approx(pair.likeness_now, abs=1e-3)
     assert ranked.gain == pytest.approx(np.sqrt(2.0), rel=0.02)
     assert pair.separation_now == pytest.approx(20.0 * np.sqrt(1.0 - pair.likeness_now**2), rel=1e-9)
-
-
-def test_a_nuisance_leaves_nothing_of_itself(model: FringeModel, few_samples: None) -> None:
-    """The thickness of the silicon is free, so that no flats show an effect that changes just that."""
-    forecast = forecast_of(model, silicon_thickness={}, bandwidth={})
-    strength = forecast.pairs([FlatSeries(FLATS), NARROW.series])[0].strength
-    for series, block in list(forecast._blocks.items()):
-        forecast._blocks[series] = replace(block, silicon=np.zeros(block.silicon.shape))
-    assert strength < 1e-3 * forecast.pairs([FlatSeries(FLATS), NARROW.series])[0].strength
 
 
 def test_further_unknowns_never_help(model: FringeModel, few_samples: None) -> None:
@@ -328,17 +307,6 @@ def test_a_rival_that_was_fitted_at_null_is_compared_at_its_usual_size(
         for values in ({"sigma": 0.0}, {})
     )
     assert at_null[0].pairs == unknown[0].pairs
-
-
-def test_a_brighter_series_has_the_optics_of_the_present_one(model: FringeModel, few_samples: None) -> None:
-    # Of a loss that is there, the signature grows faster than the level that was counted.
-    forecast = forecast_of(model, ghost_pedestal={"fraction": 0.02}, non_linearity={"quadratic": 0.0})
-    forecast.pairs([FlatSeries(FLATS)])
-    computed = len(forecast._flats)
-    forecast.pairs([FlatSeries(FLATS), BRIGHT.series])
-    assert len(forecast._flats) == computed
-    present, bright = forecast._blocks[FlatSeries(FLATS)], forecast._blocks[BRIGHT.series]
-    np.testing.assert_allclose(bright.tested[1], 4.0 * present.tested[1], rtol=1e-6)
 
 
 def test_the_silicon_may_be_the_layer_that_varies(few_samples: None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from flat_cubes import TEN_NM, relative_flats
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.mock.thickness import random_field
@@ -19,7 +20,8 @@ def model() -> FringeModel:
     return FringeModel.from_setup("ts8_e2v")
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", first_is_quick([3, 1, 2]))
+@pytest.mark.rng("too few wavelengths are not believed")
 def test_too_few_wavelengths_are_not_believed(count: int, model: FringeModel, rng) -> None:
     truth = random_field((48, 64), rng, mean=15.0, span=2.0)
     fitted = fit_thickness(relative_flats(truth, model, rng, 0.002, TEN_NM[[2, 7, 10]][:count]), model)
@@ -27,7 +29,8 @@ def test_too_few_wavelengths_are_not_believed(count: int, model: FringeModel, rn
     assert np.all(fitted.n_wavelengths == count)
 
 
-@pytest.mark.parametrize("count", [4, 5, 23, 200])
+@pytest.mark.parametrize("count", first_is_quick([4, 5, 23, 200]))
+@pytest.mark.rng("every number from four on is enough")
 def test_every_number_from_four_on_is_enough(count: int, model: FringeModel, rng) -> None:
     """Each adds to the certainty; noise is such that the whole of it is about the same."""
     truth = random_field((48, 64), rng, mean=float(rng.uniform(9.0, 18.0)), span=3.0)
@@ -44,6 +47,7 @@ def test_every_number_from_four_on_is_enough(count: int, model: FringeModel, rng
 
 
 @pytest.mark.parametrize("mean", [35.0, 55.0])
+@pytest.mark.rng("adhesive beyond the usual range")
 def test_adhesive_beyond_the_usual_range(mean: float, model: FringeModel, rng) -> None:
     """Steps of 5 nm, since ten are below the sampling that such fringes need."""
     truth = random_field((64, 64), rng, mean=mean, span=3.0)

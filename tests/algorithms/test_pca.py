@@ -58,6 +58,7 @@ def night(thickness, model, response):
 
 
 @pytest.mark.parametrize("tile_bytes", [1, 16 * 9 * 47 * 7, 2**26])
+@pytest.mark.rng("equals the full svd of scikit learn")
 def test_equals_the_full_svd_of_scikit_learn(frames, tile_bytes):
     expected = PCA(svd_solver="full").fit(frames.reshape(9, -1))
     found = fit_pca(list(frames), n_components=8, tile_bytes=tile_bytes)
@@ -70,6 +71,7 @@ def test_equals_the_full_svd_of_scikit_learn(frames, tile_bytes):
     np.testing.assert_allclose(found.scores, expected.transform(frames.reshape(9, -1))[:, :8], atol=1e-6)
 
 
+@pytest.mark.rng("a small pattern on a large level is not lost")
 def test_a_small_pattern_on_a_large_level_is_not_lost(rng):
     """Fractions of 1e-3 in single-precision frames of 3000 electrons: the sums must be made in double precision."""
     pattern = rng.standard_normal((40, 50))
@@ -82,6 +84,7 @@ def test_a_small_pattern_on_a_large_level_is_not_lost(rng):
 
 
 @pytest.mark.parametrize("count", [64, 65, 230])
+@pytest.mark.rng("many frames equal the full svd of scikit learn")
 def test_many_frames_equal_the_full_svd_of_scikit_learn(count, rng):
     """On both sides of the number from which products of a tile are in single precision."""
     patterns = rng.standard_normal((5, 1500))
@@ -100,6 +103,7 @@ def test_many_frames_equal_the_full_svd_of_scikit_learn(count, rng):
     assert not components[:, 700].any()
 
 
+@pytest.mark.rng("rounding is not taken for a component")
 def test_rounding_is_not_taken_for_a_component(rng):
     """Two patterns without noise, in few frames and in many: none but the two stands above the rounding."""
     patterns = rng.standard_normal((2, 3000))
@@ -108,6 +112,7 @@ def test_rounding_is_not_taken_for_a_component(rng):
         assert len(fit_pca(list(frames.reshape(count, 60, 50))).components) == 2
 
 
+@pytest.mark.rng("number formats of files are read")
 def test_number_formats_of_files_are_read(frames):
     expected = fit_pca(list(frames.astype(np.float32)), n_components=3)
     for form in (">f4", ">f8", "f8"):
@@ -118,6 +123,7 @@ def test_number_formats_of_files_are_read(frames):
     np.testing.assert_allclose(whole.explained_variance_ratio, expected.explained_variance_ratio, rtol=1e-3)
 
 
+@pytest.mark.rng("levels of exposures do not hide their fringes")
 def test_levels_of_exposures_do_not_hide_their_fringes(night, rng):
     """Exposures of very different length: their fringes in units of the common sky are what is decomposed."""
     scales = np.linspace(0.2, 5.0, len(night))
@@ -137,6 +143,7 @@ def test_levels_of_exposures_do_not_hide_their_fringes(night, rng):
     np.testing.assert_allclose(found.mean.ravel(), expected.mean_, atol=1e-9)
 
 
+@pytest.mark.rng("masked pixels do not count")
 def test_masked_pixels_do_not_count(frames, rng):
     mask = rng.random((60, 47)) < 0.2
     spoiled = frames.copy()
@@ -156,6 +163,7 @@ def test_masked_pixels_do_not_count(frames, rng):
     assert set(np.unique(found.mask)) == {0, mask_bits("NO_DATA")}
 
 
+@pytest.mark.rng("memory maps and streams give the same")
 def test_memory_maps_and_streams_give_the_same(frames, tmp_path):
     paths = [tmp_path / f"{number}.npy" for number in range(9)]
     for path, frame in zip(paths, frames, strict=True):
@@ -165,6 +173,7 @@ def test_memory_maps_and_streams_give_the_same(frames, tmp_path):
     np.testing.assert_array_equal(mapped.components, held.components)
 
 
+@pytest.mark.rng("memory beside the inputs is bounded")
 def test_memory_beside_the_inputs_is_bounded(rng):
     import tracemalloc
 
@@ -240,6 +249,7 @@ def test_thickness_outside_the_response_is_named(thickness, response):
     assert np.isfinite(decompose_thickness(ends, response, scales).explained_variance).all()
 
 
+@pytest.mark.rng("number of components is chosen against the noise")
 def test_number_of_components_is_chosen_against_the_noise(frames, rng):
     clean = np.tensordot(rng.standard_normal((12, 2)), frames[:2] - 5.0, axes=1)
     for sigma, expected in ((0.01, 2), (1000.0, 1)):
@@ -247,6 +257,7 @@ def test_number_of_components_is_chosen_against_the_noise(frames, rng):
         assert len(fit_pca(list(noisy), noise_variance=sigma**2).components) == expected
 
 
+@pytest.mark.rng("noise edge holds for pure noise")
 def test_noise_edge_holds_for_pure_noise(rng):
     frames, pixels = 20, 4000
     edge = noise_eigenvalue(frames, pixels, 1.0)
@@ -297,6 +308,7 @@ def test_faint_templates_are_left_out(night):
     assert len(fringe_templates(components, NOW, least_rms=1e-7, most=2)) == 2
 
 
+@pytest.mark.rng("projection recovers coefficients with their covariance")
 def test_projection_recovers_coefficients_with_their_covariance(rng):
     basis = rng.standard_normal((2, 30, 40))
     basis[1] += 0.7 * basis[0]
@@ -315,6 +327,7 @@ def test_projection_recovers_coefficients_with_their_covariance(rng):
     assert found.chi2_per_pixel == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.rng("bad input is named")
 def test_bad_input_is_named(frames, response, thickness):
     with pytest.raises(InputError, match="number of frames"):
         fit_pca([frames[0]])

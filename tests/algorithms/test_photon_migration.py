@@ -42,6 +42,7 @@ def test_refraction_obeys_snell():
     assert math.atan2(walk.slope_y[0], walk.slope_x[0]) == pytest.approx(math.radians(30.0))
 
 
+@pytest.mark.rng("normal light stays where it falls")
 def test_normal_light_stays_where_it_falls(rng):
     walk = photon_migration(bundle(0.0), light(900.0, 1000.0), STACK, 173.0)
     assert walk.fraction_inside(1e-6) == 1.0
@@ -50,6 +51,7 @@ def test_normal_light_stays_where_it_falls(rng):
     assert kernel[3, 3] == pytest.approx(1.0)
 
 
+@pytest.mark.rng("sample agrees with the fraction")
 def test_sample_agrees_with_the_fraction(rng):
     rays = RayBundle(rng.normal(0, 0.3, 500), rng.normal(0, 0.3, 500), 1.0)
     walk = photon_migration(rays, light(950.0, 1000.0, 1050.0), STACK, 173.0)
@@ -61,6 +63,7 @@ def test_sample_agrees_with_the_fraction(rng):
     assert photons[:, 2].max() < 100
 
 
+@pytest.mark.rng("kernel is the histogram of photons from a whole pixel")
 def test_kernel_is_the_histogram_of_photons_from_a_whole_pixel(rng):
     rays = RayBundle(rng.normal(0.1, 0.3, 500), rng.normal(0, 0.3, 500), 1.0)
     walk = photon_migration(rays, light(950.0, 1000.0, 1050.0), STACK, 173.0)
@@ -71,6 +74,7 @@ def test_kernel_is_the_histogram_of_photons_from_a_whole_pixel(rng):
     np.testing.assert_allclose(kernel, counts / 300_000, atol=0.004)
 
 
+@pytest.mark.rng("spread keeps electrons and smooths")
 def test_spread_keeps_electrons_and_smooths(rng):
     rays = RayBundle(rng.normal(0, 0.3, 300), rng.normal(0, 0.3, 300), 1.0)
     kernel = photon_migration(rays, light(1000.0), STACK, 173.0).pixel_kernel(10.0)

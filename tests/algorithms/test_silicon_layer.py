@@ -35,6 +35,7 @@ def narrow_line(setup: Setup) -> FringeModel:
     [("ts8_itl", 100.0, 1.0, 0.004), ("ts8_itl", 100.0, 1.0, 0.001), ("hsc", 200.0, 0.5, 0.004)],
     ids=["itl", "itl, little noise", "hsc"],
 )
+@pytest.mark.rng("silicon is fitted like adhesive")
 def test_silicon_is_fitted_like_adhesive(name, mean_um, step_factor, noise, rng) -> None:
     """Nine orders in 120 pixels: steep for the cells, which must not show in the mean response of the sensor."""
     model = narrow_line(Setup.from_name(name))

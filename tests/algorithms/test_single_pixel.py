@@ -23,6 +23,7 @@ def amplitude_of(model: FringeModel, thickness_um: float) -> np.ndarray:
     return model.response(thickness_um, WAVELENGTHS) / mean - 1.0
 
 
+@pytest.mark.rng("recovers thickness contrast and offset")
 def test_recovers_thickness_contrast_and_offset(detection, rng) -> None:
     truth = rng.uniform(6.0, 28.0)
     data = 0.4 * amplitude_of(detection, truth) - 0.003

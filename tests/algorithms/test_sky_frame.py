@@ -105,6 +105,7 @@ def test_coarse_sums_state_a_large_error(monocam, sky):
     assert rough.quadrature_error > 1e-3
 
 
+@pytest.mark.rng("components add up")
 def test_components_add_up(response, thickness):
     """A frame with everything equals the sum of frames with one component each."""
     names = response.component
@@ -118,6 +119,7 @@ def test_components_add_up(response, thickness):
     }
 
 
+@pytest.mark.rng("continuum alone hardly fringes")
 def test_continuum_alone_hardly_fringes(response, thickness):
     dark = dict.fromkeys(response.bands, 0.0)
     lines = {name: 0.0 for name in response.component if name not in response.bands}
@@ -126,6 +128,7 @@ def test_continuum_alone_hardly_fringes(response, thickness):
     assert continuum.rms < 0.3 * emission.rms
 
 
+@pytest.mark.rng("electrons scale with time and level")
 def test_electrons_scale_with_time_and_level(monocam, response, thickness):
     one, two = (simulate_sky_frame(thickness, monocam, response=response, exposure_s=t) for t in (30.0, 90.0))
     np.testing.assert_allclose(two.image, 3 * one.image, rtol=1e-6)
@@ -134,6 +137,7 @@ def test_electrons_scale_with_time_and_level(monocam, response, thickness):
     np.testing.assert_allclose(given.fraction(), one.fraction(), atol=1e-6)
 
 
+@pytest.mark.rng("header states errors and amplitudes")
 def test_header_states_errors_and_amplitudes(monocam, response, thickness):
     frame = simulate_sky_frame(thickness, monocam, response=response, detector="R22_S11", physical_filter="y")
     amplitudes = fringe_amplitudes(frame.image)
@@ -145,6 +149,7 @@ def test_header_states_errors_and_amplitudes(monocam, response, thickness):
     assert (frame.detector, frame.physical_filter, frame.airmass) == ("R22_S11", "y", 1.2)
 
 
+@pytest.mark.rng("unknown thickness is masked")
 def test_unknown_thickness_is_masked(monocam, response, thickness):
     thickness[3, 4] = np.nan
     frame = simulate_sky_frame(thickness, monocam, response=response, seed=1)
@@ -153,6 +158,7 @@ def test_unknown_thickness_is_masked(monocam, response, thickness):
     assert np.all(np.isfinite(frame.image))
 
 
+@pytest.mark.rng("noise is poisson plus read noise and repeatable")
 def test_noise_is_poisson_plus_read_noise_and_repeatable(monocam, response, rng):
     thickness = rng.uniform(*RANGE, (200, 200))
     clean = simulate_sky_frame(thickness, monocam, response=response)
@@ -170,6 +176,7 @@ def test_noise_is_poisson_plus_read_noise_and_repeatable(monocam, response, rng)
     assert noisy.metadata["FRINGRMS"] == clean.metadata["FRINGRMS"]
 
 
+@pytest.mark.rng("airglow level multiplies the image")
 def test_airglow_level_multiplies_the_image(monocam, response, thickness):
     gradient = np.linspace(0.9, 1.1, 50)
     tilted = simulate_sky_frame(thickness, monocam, response=response, airglow_level=gradient)
@@ -177,6 +184,7 @@ def test_airglow_level_multiplies_the_image(monocam, response, thickness):
     np.testing.assert_allclose(tilted.image, flat.image * gradient.astype(np.float32), rtol=1e-6)
 
 
+@pytest.mark.rng("night follows its history")
 def test_night_follows_its_history(monocam, response, thickness):
     night = NightHistory.guo2022()
     frames = list(simulate_night(thickness, monocam, response, night, seed=3, read_noise_e=5.0))
@@ -188,6 +196,7 @@ def test_night_follows_its_history(monocam, response, thickness):
     assert frames[0].mean_electrons > 1.5 * frames[5].mean_electrons
 
 
+@pytest.mark.rng("effects reach the sky")
 def test_effects_reach_the_sky(monocam, sky, thickness):
     lines = SkySpectrum(bright_lines(30), airmass=1.0)
     plain, damped = (
@@ -224,6 +233,7 @@ def test_amplitudes_of_a_sine():
     assert fringe_amplitudes(masked, [0, 0, 1, 0]).half_peak_to_peak == 0.0
 
 
+@pytest.mark.rng("bad input is named")
 def test_bad_input_is_named(monocam, sky, response, thickness):
     with pytest.raises(InputError, match="two axes"):
         simulate_sky_frame(thickness[0], monocam, response=response)

@@ -67,6 +67,7 @@ def check_reliability(said: np.ndarray, wrong: np.ndarray, tolerance: float) -> 
     ("contrast", "step", "electrons", "slope"),
     [(0.15, 1, 8_000.0, 1e-4), (0.15, 1, 8_000.0, 2e-3), (0.3, 2, 20_000.0, 1e-4), (1.0, 3, 20_000.0, 0.0)],
 )
+@pytest.mark.rng("slips of regions")
 def test_regions_slip_as_often_as_said_and_as_forecast(contrast, step, electrons, slope, rng) -> None:
     model = FringeModel.from_setup("ts8_e2v", {"contrast_loss.factor": contrast})
     wavelengths = TEN_NM[::step]
@@ -95,6 +96,7 @@ def test_regions_slip_as_often_as_said_and_as_forecast(contrast, step, electrons
 
 
 @pytest.mark.parametrize(("step", "electrons"), [(1, 20_000.0), (2, 20_000.0)])
+@pytest.mark.rng("lone pixels slip as often as said")
 def test_lone_pixels_slip_as_often_as_said(step, electrons, rng) -> None:
     """Every pixel by itself, without neighbours and without a path: the order of least chi-square."""
     model = FringeModel.from_setup("ts8_e2v")

@@ -150,6 +150,7 @@ def test_its_thickness_is_that_of_the_sensor_once_it_is_known() -> None:
     assert misfits[1] < 1.25  # fringes of the gap are stronger, and the fit takes pixels as points
 
 
+@pytest.mark.slow
 def test_it_goes_along_to_the_sky() -> None:
     thickness = 15.0 + 0.3 * np.linspace(-1.0, 1.0, 30)[:, np.newaxis] * np.ones(40)
     plain, gap, void = (
@@ -203,15 +204,3 @@ def test_two_islands_of_one_effect_are_two_effects() -> None:
     assert len(np.unique(np.round(image[0][[13, 22, 0], [21, 8, 39]], 6))) == 3
     alone = replace(model, effects=model.effects[:1])
     assert len(alone.islands) == 1
-
-
-@pytest.mark.slow
-def test_it_is_looked_for_as_a_step_where_nothing_explains_a_disagreement(monkeypatch) -> None:
-    """Beside a thickness of each cell a thin gap may promise no more than noise does, and still disagree."""
-    monkeypatch.setattr("lsst.fringe_sim.algorithms.discovery.selection.island_starts", lambda *_: [])
-    parts = np.random.default_rng([3, 77]).spawn(2)
-    case = draw_case("one", parts[0], only=["void"])
-    verdict = discover(case.cube, case.setup, [VOID], rng=parts[1])
-    assert [effect.name for effect in verdict.effects] == ["void"], verdict.summary()
-    found = verdict.effects[0].parameters["thickness"]
-    assert abs(found.value - case.values["void.thickness"]) < 4.0 * found.sigma

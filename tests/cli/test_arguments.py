@@ -17,12 +17,13 @@ from click.shell_completion import BashComplete
 
 import lsst.fringe_sim
 from lsst.fringe_sim.cli.inputs import read_settings, sky_settings
-from lsst.fringe_sim.cli.main import _COMMANDS, cli, run
+from lsst.fringe_sim.cli.main import cli, run
 from lsst.fringe_sim.cli.parameters import EFFECT, LABORATORY, SKY
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.instrument.raw_frame import read_raw_metadata
 
 SETUPS = Path(lsst.fringe_sim.__file__).parent / "data" / "setups"
+COMMANDS = cli.list_commands(click.Context(cli))
 PROGRAM = Path(sys.executable).parent / "fringe-sim"
 
 
@@ -36,19 +37,19 @@ def options(name: str) -> set[str]:
     return {option for item in command(name).params for option in item.opts}
 
 
-@pytest.mark.parametrize("name", sorted(_COMMANDS))
+@pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_what_writes_can_be_tried_first(name: str) -> None:
     if options(name) & {"--out", "--ecsv", "outdir"}:
         assert "--dry-run" in options(name)
 
 
-@pytest.mark.parametrize("name", sorted(_COMMANDS))
+@pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_every_option_is_explained(name: str) -> None:
     silent = [item.opts for item in command(name).params if isinstance(item, click.Option) and not item.help]
     assert silent == []
 
 
-@pytest.mark.parametrize("name", sorted(name for name in _COMMANDS if "--setup" in options(name)))
+@pytest.mark.parametrize("name", sorted(name for name in COMMANDS if "--setup" in options(name)))
 def test_a_set_up_may_be_a_file(name: str) -> None:
     (option,) = (item for item in command(name).params if item.name == "setup")
     assert option.make_metavar(click.Context(command(name))).startswith("NAME|FILE")

@@ -56,6 +56,7 @@ def test_thickness_is_recovered(raws, tmp_path, capsys) -> None:
     assert np.all(np.abs(residuals["ratio"] - 1.0) < 0.1), "what is left is the noise"
 
 
+@pytest.mark.slow
 def test_the_walk_of_the_paper_agrees_on_the_demo_sensor(raws, tmp_path) -> None:
     out = tmp_path / "fit"
     assert run(["fit", str(raws), "--out", str(out), "--method", "guo2022", "--smoothing", "1"]) == 0
@@ -66,6 +67,7 @@ def test_the_walk_of_the_paper_agrees_on_the_demo_sensor(raws, tmp_path) -> None
     assert np.mean(np.abs(error[good]) > HALF_ORDER_UM) < 1e-3
 
 
+@pytest.mark.slow
 def test_same_seed_same_frames_and_same_map(raws, tmp_path) -> None:
     other = tmp_path / "again"
     assert run(["mock-flats", str(other), "--size", f"{SIZE[1]}x{SIZE[0]}", "--seed", "11"]) == 0
@@ -134,7 +136,13 @@ def test_a_damaged_flat_is_one_clear_line(copy, tmp_path, capsys, damage, words)
     assert len(lines) == 1
     assert words in lines[0]
     assert not (tmp_path / "fit").exists()
+
+
+@pytest.mark.slow
+def test_a_damaged_flat_can_be_left_out(copy, tmp_path) -> None:
+    _truncate(flat_at(copy, 930))
     assert run(["fit", str(copy), "--out", str(tmp_path / "fit"), "--skip-bad"]) == 0
+    assert ThicknessMap.read_fits(tmp_path / "fit" / "thickness.fits").metadata["NFLATS"] == 11
 
 
 def test_a_saturated_flat_is_refused(copy, tmp_path, capsys) -> None:
@@ -179,6 +187,7 @@ def test_bad_requests_for_mock_flats(tmp_path, capsys, arguments, words) -> None
     assert not list(tmp_path.glob("a/*"))
 
 
+@pytest.mark.slow
 def test_a_cube_can_be_fitted(raws, tmp_path) -> None:
     from lsst.fringe_sim.algorithms.flat_prep_options import FlatPrepOptions
     from lsst.fringe_sim.cli.lab_frames import find_series

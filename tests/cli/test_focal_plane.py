@@ -99,6 +99,7 @@ def test_amplitudes_names_what_it_would_compute(tmp_path, capsys) -> None:
     assert run(["amplitudes", "--lines", str(lines), "--dry-run"]) == 1
 
 
+@pytest.mark.slow
 def test_amplitudes_of_a_given_map(tmp_path, capsys) -> None:
     path = tmp_path / "thickness.fits"
     fits.PrimaryHDU(e2v_321((60, 60)).astype(np.float32)).writeto(path)

@@ -7,11 +7,13 @@ import json
 import click
 import pytest
 
-from lsst.fringe_sim.cli.main import _COMMANDS, cli, run
+from lsst.fringe_sim.cli.main import cli, run
 from lsst.fringe_sim.cli.parameters import EFFECT, SIZE, WAVELENGTHS, Quantity
 
+COMMANDS = cli.list_commands(click.Context(cli))
 
-@pytest.mark.parametrize("name", sorted(_COMMANDS))
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_every_command_explains_itself(name, capsys) -> None:
     assert run([name, "--help"]) == 0
     text = capsys.readouterr().out
@@ -22,8 +24,8 @@ def test_every_command_explains_itself(name, capsys) -> None:
 def test_overview_lists_every_command(capsys) -> None:
     assert run(["--help"]) == 0
     text = capsys.readouterr().out
-    assert all(name in text for name in _COMMANDS)
-    assert cli.list_commands(click.Context(cli)) == list(_COMMANDS)
+    assert all(name in text for name in COMMANDS)
+    assert {"fit", "sky", "discover", "demo", "setups", "effects"} <= set(COMMANDS)
 
 
 def test_unknown_command_is_a_usage_error_with_a_hint(capsys) -> None:

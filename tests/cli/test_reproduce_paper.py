@@ -47,7 +47,6 @@ def out(tmp_path_factory) -> Path:
 def test_every_number_of_the_table_is_recomputed_or_skipped(out) -> None:
     table = Table.read(out / "paper.ecsv")
     assert sorted(table["item"]) == sorted(published_numbers())
-    assert set(table["status"]) <= {"agrees", "erratum", "differs", "skipped"}
     if (SHARED / "measured").is_dir():
         assert "skipped" not in set(table["status"])
 

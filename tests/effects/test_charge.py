@@ -52,6 +52,7 @@ def test_brighter_fatter_widens_and_keeps_the_charge() -> None:
 
 
 @pytest.mark.parametrize("cell_px", [1, 3])
+@pytest.mark.rng("brighter fatter correlates the noise")
 def test_brighter_fatter_correlates_the_noise(rng: np.random.Generator, cell_px: int) -> None:
     """As in photon noise whose charge moved by the mock's own differences of neighbours."""
     level, variance, side = 50_000.0, 0.08, 600

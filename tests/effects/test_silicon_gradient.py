@@ -72,6 +72,7 @@ def test_exposures_of_one_colour_do_not_show_it() -> None:
     effect.check_search(ImageGeometry.of_pixels((4, 4), WAVELENGTHS))
 
 
+@pytest.mark.slow
 def test_it_goes_along_to_the_sky() -> None:
     thickness = np.full((24, 32), 15.0)
     plain, wedge = (

@@ -66,6 +66,7 @@ def test_bands_continuum_and_water_are_factors(sky) -> None:
         np.testing.assert_allclose(term.photon_radiance, 0.5 * before.photon_radiance)
 
 
+@pytest.mark.slow
 def test_the_simulation_of_the_sky_sees_them(sky) -> None:
     """More continuum means a brighter sky and weaker fringes, in the response and in the level."""
     band = Bandpass.from_name("lsst_y")

@@ -68,6 +68,7 @@ def test_rings_are_found_in_noise(number: int) -> None:
 
 
 @pytest.mark.parametrize("centre", [(115.0, 178.0), (-60.0, 48.0)])
+@pytest.mark.rng("rings hardly wider than two cells are found")
 def test_rings_hardly_wider_than_two_cells_are_found(centre: tuple[float, float], rng) -> None:
     """5.5 px in cells of two, which average a third of the wave away."""
     middle = 2.0 * np.arange(48) + 0.5

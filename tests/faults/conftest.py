@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from fault_chain import Chain, Undisturbed, make_template
+from made_once import made_once
 
 
 @pytest.fixture(scope="session")
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_template(tmp_path_factory.mktemp("faults") / "template")
+    return made_once(tmp_path_factory, "fault_template", make_template)
 
 
 @pytest.fixture(scope="session")
 def undisturbed(template: Path, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
-    chain = Chain(template, tmp_path_factory.mktemp("undisturbed"))
-    ended = chain.run()
-    assert ended.code == 0, ended.text
-    return Undisturbed(chain.results(), ended.seconds)
+    def make(folder: Path) -> None:
+        chain = Chain(template, folder)
+        ended = chain.run()
+        assert ended.code == 0, ended.text
+        (folder / "said.json").write_text(json.dumps([chain.results(), ended.seconds]))
+
+    made = made_once(tmp_path_factory, "fault_undisturbed", make)
+    return Undisturbed(made / "repo", *json.loads((made / "said.json").read_text()))
 
 
 @pytest.fixture

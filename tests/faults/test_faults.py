@@ -7,6 +7,7 @@ import datetime
 import os
 import secrets
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fault_chain import OUT, QUANTA, Chain, Undisturbed
+from fault_chain import OUT, QUANTA, Chain, Undisturbed, thickness_um
 from lsst.daf.butler import Butler
 
 sys.path.insert(0, str(Path(__file__).parent))
 from kill_and_resume import check, kill_and_resume
 
-pytestmark = [pytest.mark.middleware, pytest.mark.slow]
+pytestmark = pytest.mark.middleware
 
 KILLS = 4
 
@@ -47,6 +48,24 @@ def mounted(folder: Path, *options: str) -> Iterator[None]:
         subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
+def test_the_chain_finds_the_thickness(undisturbed: Undisturbed) -> None:
+    """Ingest, bias, flats and fit by the real commands: within 3 nm of what the raw frames were made of."""
+    with Butler.from_config(str(undisturbed.repo), collections=OUT) as butler:
+        fitted = butler.get("epoxyThickness", instrument="LSST-TS8", detector=145)
+    good = fitted.mask == 0
+    assert good.mean() > 0.7
+    assert np.median(1e3 * np.abs(fitted.value - thickness_um())[good]) < 3.0
+
+
+def test_killed_in_the_middle(chain: Chain, undisturbed: Undisturbed) -> None:
+    ended = chain.run(kill_at_file=6, kill_after=0.02)
+    assert ended.code == -signal.SIGKILL, ended.text
+    before = check(chain, {}, "killed")
+    assert chain.complete_quanta() < QUANTA
+    finished(chain, undisturbed, before)
+
+
+@pytest.mark.slow
 def test_killed_at_random_moments(new_chain: Callable[[], Chain], undisturbed: Undisturbed) -> None:
     """The same with 50 kills and more: ``python tests/faults/kill_and_resume.py``."""
     seed = secrets.randbits(63)
@@ -57,6 +76,7 @@ def test_killed_at_random_moments(new_chain: Callable[[], Chain], undisturbed: U
     assert report.kills >= KILLS
 
 
+@pytest.mark.slow
 def test_file_system_full(chain: Chain, undisturbed: Undisturbed, tmp_path: Path) -> None:
     """The repository, registry and all, lies on a file system that runs full in the middle of the run."""
     used = sum(path.stat().st_size for path in chain.repo.rglob("*") if path.is_file())
@@ -73,6 +93,7 @@ def test_file_system_full(chain: Chain, undisturbed: Undisturbed, tmp_path: Path
     finished(larger, undisturbed, before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", ["u", "."])
 def test_read_only_output(chain: Chain, undisturbed: Undisturbed, folder: str) -> None:
     """The folder of the outputs, or the whole repository, cannot be written."""
@@ -122,6 +143,7 @@ def flip_bit(path: Path) -> None:
     path.write_bytes(content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", [cut, flip_bit], ids=["truncated", "bit"])
 def test_input_spoiled(chain: Chain, undisturbed: Undisturbed, spoil: Callable[[Path], None]) -> None:
     """One flat cannot be read: it alone fails, with its name, and when it is back the rest is made."""
@@ -138,6 +160,7 @@ def test_input_spoiled(chain: Chain, undisturbed: Undisturbed, spoil: Callable[[
     finished(chain, undisturbed, chain.visible())
 
 
+@pytest.mark.slow
 def test_input_vanished(chain: Chain) -> None:
     """To the middleware a file that is not there is no work: the sensor is fitted to the other flats, and says so."""
     raw_file(chain).unlink()
@@ -149,6 +172,7 @@ def test_input_vanished(chain: Chain) -> None:
     assert int(fitted.n_wavelengths.max()) == QUANTA - 3
 
 
+@pytest.mark.slow
 def test_an_intermediate_product_damaged_on_disk(chain: Chain, undisturbed: Undisturbed) -> None:
     """A flipped bit in a stored flat is seen by its checksum before anything is fitted to it."""
     assert chain.run(subset="#fringeBias,isrFlatPrep").code == 0
@@ -167,6 +191,7 @@ def test_an_intermediate_product_damaged_on_disk(chain: Chain, undisturbed: Undi
     finished(chain, undisturbed, chain.visible())
 
 
+@pytest.mark.slow
 def test_two_runs_at_once(chain: Chain, undisturbed: Undisturbed) -> None:
     """Two processes fill one repository, each with a chain of its own."""
     ended = chain.at_once("u/one", "u/two")
@@ -202,6 +227,7 @@ int gettimeofday(struct timeval *out, void *zone) {
 """A clock that goes wrong for one process, loaded before the C library."""
 
 
+@pytest.mark.slow
 def test_clock_zone_and_language_of_the_machine(
     chain: Chain, undisturbed: Undisturbed, tmp_path: Path
 ) -> None:

@@ -23,7 +23,7 @@ from lsst.fringe_sim.middleware import Ts8Fringe
 sys.path.insert(0, str(Path(__file__).parent))
 from kill_and_resume import check, kill_and_resume
 
-pytestmark = [pytest.mark.middleware, pytest.mark.slow]
+pytestmark = pytest.mark.middleware
 
 KILLS = 2
 
@@ -90,6 +90,7 @@ def test_the_same_comes_out(chain: Chain, undisturbed: Undisturbed) -> None:
     assert chain.results() == undisturbed.results
 
 
+@pytest.mark.slow
 def test_two_writers_at_once(chain: Chain, undisturbed: Undisturbed) -> None:
     """Two processes fill one repository, and register the same dataset types in it, at the same time."""
     ended = chain.at_once("u/one", "u/two")
@@ -98,6 +99,7 @@ def test_two_writers_at_once(chain: Chain, undisturbed: Undisturbed) -> None:
     assert chain.results("u/one") == chain.results("u/two") == undisturbed.results
 
 
+@pytest.mark.slow
 def test_two_processes_ingest_the_same_frames(
     server: PostgresServer, template_here: Path, tmp_path: Path
 ) -> None:
@@ -116,6 +118,7 @@ def test_two_processes_ingest_the_same_frames(
     chain.visible()
 
 
+@pytest.mark.slow
 def test_killed_at_random_moments(new_chain: Callable[[], Chain], undisturbed: Undisturbed) -> None:
     """The server undoes what a killed client has begun; more kills: ``kill_and_resume.py``."""
     seed = secrets.randbits(63)
@@ -131,6 +134,7 @@ def test_killed_at_random_moments(new_chain: Callable[[], Chain], undisturbed: U
     assert report.kills >= KILLS
 
 
+@pytest.mark.slow
 def test_server_that_dies_in_the_middle_of_a_run(
     server: PostgresServer, chain: Chain, undisturbed: Undisturbed
 ) -> None:
@@ -156,6 +160,7 @@ def test_server_that_dies_in_the_middle_of_a_run(
     assert chain.results() == undisturbed.results
 
 
+@pytest.mark.slow
 def test_server_that_is_not_there(
     server: PostgresServer, chain: Chain, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,6 +177,7 @@ def test_server_that_is_not_there(
     assert "Traceback" not in said
 
 
+@pytest.mark.slow
 def test_no_server_stays_behind() -> None:
     """Nor a folder; the server of the other tests has a folder of its own."""
     try:

@@ -24,13 +24,14 @@ from typing import Any, Self
 import numpy as np
 from astropy.io import fits
 from lsst.daf.butler import Butler, Config, DatasetRef
+from numpy.typing import NDArray
 
 from lsst.fringe_sim.middleware import Ts8Fringe
 from lsst.fringe_sim.middleware.raw_ingest import ingest_raws
 from lsst.fringe_sim.middleware.repository import recover_repository
 from lsst.fringe_sim.mock.raw_frames import write_mock_flats
 
-__all__ = ["Chain", "Ended", "Undisturbed", "make_template"]
+__all__ = ["Chain", "Ended", "Undisturbed", "make_template", "thickness_um"]
 
 SEED_CONFIG = "resource://lsst.fringe_sim/configs/butler.yaml"
 PIPELINE = "resource://lsst.fringe_sim/pipelines/ts8/labFlats.yaml"
@@ -53,14 +54,19 @@ class Ended:
     seconds: float
 
 
+def thickness_um() -> NDArray[np.float64]:
+    """What the raw frames are made of."""
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    return np.asarray(13.0 + 0.35 * np.sin(x / 60.0) + 0.3 * np.cos(y / 50.0))
+
+
 def make_template(root: Path, seed_config: str = SEED_CONFIG) -> Path:
     """Repository with the raw frames of one small sensor; not to be changed, copied for each test."""
-    y, x = np.mgrid[:ROWS, :COLUMNS]
     made = write_mock_flats(
         root / "raw",
         setup="ts8_e2v",
         detector=SENSOR,
-        thickness_um=13.0 + 0.35 * np.sin(x / 60.0) + 0.3 * np.cos(y / 50.0),
+        thickness_um=thickness_um(),
         wavelengths_nm=WAVELENGTHS_NM,
         rng=np.random.default_rng(1),
         size=f"{COLUMNS}x{ROWS}",
@@ -77,8 +83,9 @@ def make_template(root: Path, seed_config: str = SEED_CONFIG) -> Path:
 
 @dataclass(frozen=True)
 class Undisturbed:
-    """An undisturbed run: what came out, and how long it took."""
+    """An undisturbed run: the repository it left, what came out, and how long it took."""
 
+    repo: Path
     results: dict[str, str]
     seconds: float
 

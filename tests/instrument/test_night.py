@@ -28,6 +28,7 @@ def test_night_of_the_paper():
         assert scale["7-3"] == pytest.approx(scale["5-2"] / 3 + 2 * scale["8-4"] / 3)
 
 
+@pytest.mark.rng("stochastic nights have the statistics they promise")
 def test_stochastic_nights_have_the_statistics_they_promise(rng):
     process = StochasticNight()
     hours = np.linspace(0, 10, 11)
@@ -51,6 +52,7 @@ def test_stochastic_night_is_repeatable_and_seeded():
     assert not np.array_equal(draw[0], draw[2])
 
 
+@pytest.mark.rng("constant night when nothing varies")
 def test_constant_night_when_nothing_varies(rng):
     night = StochasticNight(0.0, 0.0, 0.0, 0.0).draw([0.0, 3.0], rng)
     np.testing.assert_array_equal(night.intensity, 1.0)
@@ -71,6 +73,7 @@ def test_linear_gradient():
     assert field.at(-1.0, -2.0) == pytest.approx(0.8)
 
 
+@pytest.mark.rng("bad input is named")
 def test_bad_input_is_named(rng):
     night = NightHistory.guo2022()
     with pytest.raises(OutOfRangeError, match="index of the time"):

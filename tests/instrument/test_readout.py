@@ -21,6 +21,7 @@ from lsst.fringe_sim.resources import read_table
 
 
 @pytest.mark.parametrize("mean", [0.0, 0.7, 30.0, 2717.0])
+@pytest.mark.rng("photon noise is poisson")
 def test_photon_noise_is_poisson(mean, rng):
     noisy = add_photon_noise(np.full((300, 300), mean), rng)
     assert np.array_equal(noisy, np.round(noisy))
@@ -34,6 +35,7 @@ def test_photon_noise_is_poisson(mean, rng):
     assert stats.chi2.sf(chi2, common.sum() - 1) > 1e-4
 
 
+@pytest.mark.rng("readout has the variance of photons and amplifier")
 def test_readout_has_the_variance_of_photons_and_amplifier(rng):
     gain, read_noise, level = 1.7, 8.0, 500.0
     adu = add_readout(np.full((400, 400), level), rng, read_noise, gain)
@@ -41,6 +43,7 @@ def test_readout_has_the_variance_of_photons_and_amplifier(rng):
     assert adu.var() * gain**2 == pytest.approx(level + read_noise**2, rel=5 * np.sqrt(2 / adu.size))
 
 
+@pytest.mark.rng("no light leaves the read noise")
 def test_no_light_leaves_the_read_noise(rng):
     adu = add_readout(np.zeros((200, 200)), rng, 5.0, 2.0)
     assert stats.kstest(adu.ravel() * 2.0 / 5.0, "norm").pvalue > 1e-4
@@ -74,6 +77,7 @@ def test_dark_sky_in_all_units():
     assert 0.1 * magnitude_to_microjansky(26.0) == pytest.approx(0.0145, abs=1e-4)
 
 
+@pytest.mark.rng("units are inverse to each other")
 def test_units_are_inverse_to_each_other(rng):
     flux = rng.uniform(0.1, 1e4, 50)
     np.testing.assert_allclose(magnitude_to_microjansky(microjansky_to_magnitude(flux)), flux)
@@ -86,6 +90,7 @@ def test_units_are_inverse_to_each_other(rng):
     assert np.isnan(microjansky_to_magnitude(0.0))
 
 
+@pytest.mark.rng("bad input is named")
 def test_bad_input_is_named(rng):
     with pytest.raises(InputError, match="expected electrons"):
         add_photon_noise(np.array([[1.0, np.nan]]), rng)

@@ -11,6 +11,7 @@ import pytest
 from lsst.daf.butler import Butler, Config
 from lsst.daf.butler.cli.butler import cli
 from lsst.daf.butler.cli.utils import LogCliRunner
+from made_once import made_once
 from toy_repository import Invoke
 
 from lsst.fringe_sim.middleware import HscFringe, LsstCamFringe, MonoCamFringe, Ts8Fringe
@@ -21,12 +22,14 @@ SEED_CONFIG = "resource://lsst.fringe_sim/configs/butler.yaml"
 @pytest.fixture(scope="session")
 def repo_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A repository with all instruments; not to be changed."""
-    root = tmp_path_factory.mktemp("template") / "repo"
-    Butler.makeRepo(str(root), config=Config(SEED_CONFIG))
-    with Butler.from_config(str(root), writeable=True) as butler:
-        for instrument in (LsstCamFringe, Ts8Fringe, MonoCamFringe, HscFringe):
-            instrument().register(butler.registry)
-    return root
+
+    def make(root: Path) -> None:
+        Butler.makeRepo(str(root), config=Config(SEED_CONFIG))
+        with Butler.from_config(str(root), writeable=True) as butler:
+            for instrument in (LsstCamFringe, Ts8Fringe, MonoCamFringe, HscFringe):
+                instrument().register(butler.registry)
+
+    return made_once(tmp_path_factory, "repo_template", make)
 
 
 @pytest.fixture

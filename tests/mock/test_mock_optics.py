@@ -42,6 +42,7 @@ def tmm_absorption(
 
 @pytest.mark.parametrize("stack", list_resources("stacks"))
 @pytest.mark.parametrize("varying", ["adhesive", "detection", "ar_outer", "support"])
+@pytest.mark.rng("absorption agrees with tmm")
 def test_absorption_agrees_with_tmm(stack: str, varying: str, rng: np.random.Generator) -> None:
     worst = 0.0
     for _ in range(60):
@@ -91,6 +92,7 @@ def test_flat_field_is_the_average_over_the_line(e2v: FlatFieldOptics) -> None:
     assert e2v.flat_field(17.3, 960.0)[0] == pytest.approx(direct / weight.sum(), rel=3e-7)
 
 
+@pytest.mark.rng("table states an error that holds")
 def test_table_states_an_error_that_holds(e2v: FlatFieldOptics, rng: np.random.Generator) -> None:
     table = e2v.table((15.0, 16.5), [880.0, 990.0])
     assert table.relative_error < 1e-6

@@ -123,6 +123,7 @@ def everything_but_pixels(path: Path) -> str:
         return path.name + "".join(hdu.header.tostring() for hdu in hdus)
 
 
+@pytest.mark.rng("headers and names do not depend on the truth")
 def test_headers_and_names_do_not_depend_on_the_truth(
     run: MockRun, tmp_path: Path, rng: np.random.Generator
 ) -> None:

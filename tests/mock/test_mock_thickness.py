@@ -114,6 +114,7 @@ def test_impossible_cut_outs_are_refused(call: object, names: str) -> None:
         call()  # type: ignore[operator]
 
 
+@pytest.mark.rng("random field has the range and scale asked for")
 def test_random_field_has_the_range_and_scale_asked_for(rng: np.random.Generator) -> None:
     scale = 12.0
     correlation = []
@@ -134,6 +135,7 @@ def test_random_field_depends_on_the_generator_only() -> None:
     assert not np.allclose(first, random_field((30, 40), np.random.default_rng(6)))
 
 
+@pytest.mark.rng("impossible random fields are refused")
 def test_impossible_random_fields_are_refused(rng: np.random.Generator) -> None:
     with pytest.raises(OutOfRangeError, match="scale"):
         random_field((8, 8), rng, scale=0.0)

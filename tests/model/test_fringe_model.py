@@ -23,6 +23,7 @@ def test_shapes_follow_the_arguments(model) -> None:
     assert model.response_on_grid(WAVELENGTHS, 14.0, 0.01, 7).shape == (12, 7)
 
 
+@pytest.mark.rng("response is the brute force average over the line")
 def test_response_is_the_brute_force_average_over_the_line(model, rng) -> None:
     """An independent sum over the Gaussian line with the general transfer matrix."""
     thickness = rng.uniform(6.0, 28.0)

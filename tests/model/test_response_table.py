@@ -32,6 +32,7 @@ def table() -> ResponseTable:
     ("stack", "varying", "span"),
     [("e2v_ccd250", "adhesive", (5.0, 7.0)), ("hsc_hamamatsu", "detection", (199.8, 200.4))],
 )
+@pytest.mark.rng("stated error bounds the true one")
 def test_stated_error_bounds_the_true_one(
     stack: str, varying: str, span: tuple[float, float], tolerance: float, rng: np.random.Generator
 ) -> None:
@@ -46,6 +47,7 @@ def test_stated_error_bounds_the_true_one(
     assert table.interpolation_error < 100.0 * true_error
 
 
+@pytest.mark.rng("bound of the fourth derivative holds")
 def test_bound_of_the_fourth_derivative_holds(rng: np.random.Generator) -> None:
     # In absorbing silicon, terms of equal phase and opposite sign are bounded one by one: a looser bound.
     cases = (("e2v_ccd250", "adhesive", 5.0, 0.3), ("hsc_hamamatsu", "detection", 30.0, 0.01))
@@ -61,6 +63,7 @@ def test_bound_of_the_fourth_derivative_holds(rng: np.random.Generator) -> None:
         assert sharpness * bound < seen < bound
 
 
+@pytest.mark.rng("derivative is that of the response")
 def test_derivative_is_that_of_the_response(table: ResponseTable, rng: np.random.Generator) -> None:
     optics = system()
     light = optics.flat_fields(WAVELENGTHS)
@@ -69,6 +72,7 @@ def test_derivative_is_that_of_the_response(table: ResponseTable, rng: np.random
     assert np.abs(table.thickness_derivative(thickness) - exact).max() < 1e-4 * np.abs(exact).max()
 
 
+@pytest.mark.rng("frame is lookup in single precision")
 def test_frame_is_lookup_in_single_precision(table: ResponseTable, rng: np.random.Generator) -> None:
     thickness = rng.uniform(14.0, 16.0, (37, 53))
     thickness[3, 4] = np.nan
@@ -80,6 +84,7 @@ def test_frame_is_lookup_in_single_precision(table: ResponseTable, rng: np.rando
         np.testing.assert_allclose(image, expected, rtol=0.0, atol=2e-7)
 
 
+@pytest.mark.rng("frame has the same bits whatever the number of threads")
 def test_frame_has_the_same_bits_whatever_the_number_of_threads(
     table: ResponseTable, rng: np.random.Generator
 ) -> None:
@@ -93,6 +98,7 @@ def test_frame_has_the_same_bits_whatever_the_number_of_threads(
     assert len(set(images)) == 1
 
 
+@pytest.mark.rng("frame accepts views and writes into out")
 def test_frame_accepts_views_and_writes_into_out(table: ResponseTable, rng: np.random.Generator) -> None:
     thickness = rng.uniform(14.0, 16.0, (20, 30))
     out = np.empty((10, 15), dtype=np.float32)
@@ -136,6 +142,7 @@ def test_unreachable_tolerance_is_said() -> None:
         tabulate(kink, (1.0, 2.0), [960.0], tolerance=1e-9, fourth_derivative=1e3)
 
 
+@pytest.mark.rng("estimated derivative serves any response")
 def test_estimated_derivative_serves_any_response(rng: np.random.Generator) -> None:
     def wave(start: float, step: float, count: int) -> np.ndarray:
         return np.sin(20.0 * (start + step * np.arange(count)))[None]
@@ -147,6 +154,7 @@ def test_estimated_derivative_serves_any_response(rng: np.random.Generator) -> N
 
 
 @pytest.mark.parametrize("effects", [{}, {"bandwidth.fwhm": 1.5}, {"contrast_loss.factor": 0.3}])
+@pytest.mark.rng("table of a model is its response")
 def test_table_of_a_model_is_its_response(effects: dict[str, float], rng: np.random.Generator) -> None:
     model = FringeModel.from_setup("ts8_e2v", effects=effects)
     thickness = rng.uniform(14.0, 15.0, 200)

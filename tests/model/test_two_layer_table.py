@@ -30,6 +30,7 @@ def maps(rng: np.random.Generator, shape: tuple[int, int] = (60, 50)) -> tuple[n
     return rng.uniform(*LOWER, shape), rng.uniform(*UPPER, shape)
 
 
+@pytest.mark.rng("stated error bounds the true one")
 def test_stated_error_bounds_the_true_one(table: TwoLayerTable, rng: np.random.Generator) -> None:
     system, light = sky()
     lower, upper = maps(rng)
@@ -42,6 +43,7 @@ def test_stated_error_bounds_the_true_one(table: TwoLayerTable, rng: np.random.G
     assert table.range_um[1] == pytest.approx(UPPER)
 
 
+@pytest.mark.rng("frame does not depend on threads or layout")
 def test_frame_does_not_depend_on_threads_or_layout(table: TwoLayerTable, rng: np.random.Generator) -> None:
     lower, upper = maps(rng)
     lower[3, 4], upper[5, 6] = np.nan, np.nan

@@ -69,6 +69,7 @@ def absorbed(
 @pytest.mark.parametrize("polarization", ["s", "p"])
 @pytest.mark.parametrize("incoherent", [1, 2, 4, 6])
 @pytest.mark.parametrize("extinction", [0.0, 3e-4])
+@pytest.mark.rng("incoherent layer agrees with tmm")
 def test_incoherent_layer_agrees_with_tmm(
     incoherent: int, polarization: str, extinction: float, rng: np.random.Generator
 ) -> None:
@@ -87,6 +88,7 @@ def test_incoherent_layer_agrees_with_tmm(
         np.testing.assert_allclose(ours, expected, rtol=0.0, atol=2e-12)
 
 
+@pytest.mark.rng("two incoherent layers are the mean over both thicknesses")
 def test_two_incoherent_layers_are_the_mean_over_both_thicknesses(rng: np.random.Generator) -> None:
     """Paths that cross both layers equally often in another order keep their phase; tmm.inc_tmm drops that too."""
     n, d = random_lossless(rng, 7)
@@ -105,6 +107,7 @@ def test_two_incoherent_layers_are_the_mean_over_both_thicknesses(rng: np.random
     assert 1e-9 < abs(ours.sum() - sum(tmm.inc_absorp_in_each_layer(intensities)[1:-1])) < 1e-2
 
 
+@pytest.mark.rng("spread goes from coherent to incoherent")
 def test_spread_goes_from_coherent_to_incoherent(rng: np.random.Generator) -> None:
     n, d = random_lossless(rng, 6)
     n[2] += 0.05j
@@ -241,6 +244,7 @@ def test_rough_interface_is_the_mean_amplitude_over_heights() -> None:
     assert rough.sum() < 1.0
 
 
+@pytest.mark.rng("no roughness is exactly the identity")
 def test_no_roughness_is_exactly_the_identity(rng: np.random.Generator) -> None:
     n, d = random_lossless(rng, 6)
     np.testing.assert_array_equal(
@@ -267,6 +271,7 @@ def test_the_independent_references_leave_tables_readable(refnx_reflect) -> None
     assert yaml.safe_load(yaml.safe_dump({1, 2})) == {1, 2}
 
 
+@pytest.mark.rng("rough reflectivity agrees with refnx where both hold")
 def test_rough_reflectivity_agrees_with_refnx_where_both_hold(
     rng: np.random.Generator, refnx_reflect
 ) -> None:

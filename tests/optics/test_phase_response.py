@@ -74,6 +74,7 @@ def random_response(rng: np.random.Generator, ratio: float, loss: float) -> tupl
 
 @pytest.mark.parametrize("ratio", [0.0, 0.2, 0.85])
 @pytest.mark.parametrize("loss", [0.0, 1e-3, 0.3])
+@pytest.mark.rng("series is the closed form")
 def test_series_is_the_closed_form(ratio: float, loss: float, rng: np.random.Generator) -> None:
     response, weight = random_response(rng, ratio, loss)
     arrays, spread, _ = response._grouped(weight)
@@ -89,6 +90,7 @@ def test_series_is_the_closed_form(ratio: float, loss: float, rng: np.random.Gen
 @pytest.mark.parametrize("tolerance", [1e-12, 1e-9, 1e-6, 1e-3])
 @pytest.mark.parametrize("loss", [0.0, 0.02])
 @pytest.mark.parametrize("spread_um", [0.0, 0.01])
+@pytest.mark.rng("a tolerance is kept")
 def test_a_tolerance_is_kept(
     tolerance: float, loss: float, spread_um: float, rng: np.random.Generator
 ) -> None:
@@ -101,6 +103,7 @@ def test_a_tolerance_is_kept(
     assert tolerance < 1e-11 or np.any(found != exact)
 
 
+@pytest.mark.rng("grid is the points")
 def test_grid_is_the_points(rng: np.random.Generator) -> None:
     response, weight = random_response(rng, 0.4, 0.0)
     for count in (1, 5, 200, 3000):
@@ -118,6 +121,7 @@ def test_grid_is_the_points(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.05])
+@pytest.mark.rng("derivatives in thickness")
 def test_derivatives_in_thickness(loss: float, rng: np.random.Generator) -> None:
     """Central differences of fourth order, whose own error is 1e-9 here."""
     response, weight = random_response(rng, 0.4, loss)
@@ -164,6 +168,7 @@ def test_total_is_one_minus_reflected_and_transmitted() -> None:
     assert float(total[0]) == pytest.approx(1.0 - fractions[0] - fractions[-1], abs=1e-12)
 
 
+@pytest.mark.rng("bad arguments are refused")
 def test_bad_arguments_are_refused(rng: np.random.Generator) -> None:
     response, weight = random_response(rng, 0.3, 0.0)
     for thickness in (-0.1, np.nan, np.inf):

@@ -41,6 +41,7 @@ def test_lsst_with_the_shipped_map(shipped_map, field_deg, rms, tolerance):
     assert PERCENT * found.half_peak_to_peak == pytest.approx(2.1 * rms, rel=0.15)
 
 
+@pytest.mark.slow
 def test_continuum_dilutes_the_fringe(shipped_map):
     """A term that the paper leaves out: a fifth of the light that does not fringe."""
     model = FringeModel.from_setup("lsst_e2v")
@@ -50,6 +51,8 @@ def test_continuum_dilutes_the_fringe(shipped_map):
     assert 0.75 * lines < whole < 0.9 * lines
 
 
+@pytest.mark.slow
+@pytest.mark.rng("hsc from a random field of silicon")
 def test_hsc_from_a_random_field_of_silicon(rng):
     """Section 5.2: 1.74 µm of relief in 200 µm of silicon over 1000 px, 10 to 15 fringes."""
     model = FringeModel.from_setup("hsc")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lsst.daf.butler import Butler
+from made_once import made_once
 from numpy.typing import NDArray
 from task_commands import WAVELENGTHS_NM, Command, Outcome
 
@@ -67,9 +68,11 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> dict[str, MockRun]:
 @pytest.fixture(scope="session")
 def empty_repo(tmp_path_factory: pytest.TempPathFactory, command: Command) -> Path:
     """A repository with both instruments: for all modules, which work on copies of it."""
-    root = tmp_path_factory.mktemp("tasks") / "repo"
-    assert command("butler", "create", root, "--seed-config", SEED_CONFIG).code == 0
-    with Butler.from_config(str(root), writeable=True) as butler:
-        for instrument in (LsstCamFringe, Ts8Fringe):
-            instrument().register(butler.registry)
-    return root
+
+    def make(root: Path) -> None:
+        assert command("butler", "create", root, "--seed-config", SEED_CONFIG).code == 0
+        with Butler.from_config(str(root), writeable=True) as butler:
+            for instrument in (LsstCamFringe, Ts8Fringe):
+                instrument().register(butler.registry)
+
+    return made_once(tmp_path_factory, "empty_repo", make)

@@ -103,12 +103,11 @@ def test_the_total_absorption_is_half_an_order_off(flats: list[FringeFlat], fram
     assert 0.1 < np.median(off_um) % 0.3 < 0.2
 
 
-def test_missing_wavelengths_are_listed(flats: list[FringeFlat], caplog: pytest.LogCaptureFixture) -> None:
+def test_missing_wavelengths_are_listed(flats: list[FringeFlat]) -> None:
     kept = [flat for flat in flats if flat.wavelength_nm not in (890.0, 950.0)]
     found = fit(kept)
     assert found.metadata["MISSING"] == "890,950"
     assert found.metadata["NFLATS"] == 10
-    assert "no flats at 890, 950 nm" in caplog.text
 
 
 def test_too_few_wavelengths_are_refused(flats: list[FringeFlat]) -> None:

@@ -23,6 +23,7 @@ def repo(empty_repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verb", "task", "override", "message"),
     [

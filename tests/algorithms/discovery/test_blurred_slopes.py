@@ -31,6 +31,7 @@ def blurred():
     return problem, truth, dict(case.values)
 
 
+@pytest.mark.rng("curvature of changes is that of the written out basis")
 def test_curvature_of_changes_is_that_of_the_written_out_basis(rng: np.random.Generator) -> None:
     shape = (21, 17)
     basis = SplineBasis.of_grid(shape, 4.0)
@@ -88,6 +89,7 @@ def test_effects_of_the_model_itself_count_as_those_that_are_looked_for(blurred)
     np.testing.assert_allclose(own.slope_changes({}, truth), expected, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_a_fit_from_nearby_ends_where_one_from_the_truth_does(blurred) -> None:
     """With the slope of a field that moves as a whole, no step lowered the misfit from either."""
     problem, truth, settings = blurred

@@ -8,13 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
 from lsst.fringe_sim.algorithms.discovery.channels import Channel, State, echo_channel, measure_channels
 from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import MOST_ROWS, Forward
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector, chance_of
 from lsst.fringe_sim.algorithms.discovery.start import _mend_patches, mended_thickness, starting_thickness
@@ -104,6 +105,7 @@ def test_patches_in_a_wrong_order_are_taken_back() -> None:
     assert np.abs(mended - truth).max() < 0.5 * ORDER_UM
 
 
+@pytest.mark.rng("halves of the same size are two patches")
 def test_halves_of_the_same_size_are_two_patches(rng: np.random.Generator) -> None:
     """Neither is larger than the other, and neither small enough to be taken back."""
     steps = np.full((12, 20), 30)
@@ -128,6 +130,7 @@ def test_a_patch_at_the_rim_of_the_data_hangs_on_nothing_beyond_it() -> None:
     assert (mended[seen] == 30).all()
 
 
+@pytest.mark.rng("ragged patches are taken back by the surface around them")
 def test_ragged_patches_are_taken_back_by_the_surface_around_them(rng: np.random.Generator) -> None:
     """Two of five cells of an area in the wrong order, without a border."""
     truth = _smooth_field(48, 48)
@@ -139,7 +142,7 @@ def test_ragged_patches_are_taken_back_by_the_surface_around_them(rng: np.random
     assert (np.abs(mended - truth) > 0.15).mean() < 0.002
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", first_is_quick(range(5)))
 def test_a_sensor_of_less_than_a_fringe_has_levels_of_its_own(seed: int) -> None:
     """Its flats are not relative to the mean of a fringe, as those of a hundred pixels of a real sensor are not."""
     rng = np.random.default_rng(seed)
@@ -163,6 +166,7 @@ def test_a_slope_of_a_fringe_in_four_cells_is_followed_upwards() -> None:
     assert (np.abs(found - case.thickness_um) < 0.15).mean() > 0.999
 
 
+@pytest.mark.slow
 def test_fringes_that_diffusion_takes_away_in_places_do_not_hide_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the fringes is left where the thickness is steep: without diffusion no field is right there."""
 
@@ -249,6 +253,7 @@ def test_a_fit_far_behind_gives_up_and_one_that_is_near_does_not() -> None:
     assert free.chi2 <= behind.chi2 < free.chi2 + 0.05 * (free.chi2 - rival)
 
 
+@pytest.mark.slow
 def test_cells_of_a_large_sensor_are_found_plane_by_plane() -> None:
     """The size of the cells and the memory that finding it takes: a few planes, not the whole cube again."""
     rows, columns = 512, 480
@@ -290,6 +295,7 @@ def test_an_offset_is_a_part_of_flats_that_another_effect_has_made_weaker() -> N
     assert np.abs(ratio[edge] - 1.0).max() < 0.03 * 600.0 / level
 
 
+@pytest.mark.slow
 def test_the_second_judgement_starts_where_the_first_ended() -> None:
     """An index 5 % off moves the thickness by two orders; the unchanged model is not left in the wrong one."""
     truth = _smooth_field(48, 48)
@@ -347,33 +353,19 @@ def test_what_the_description_lacks_counts_on_whole_sensors_alone() -> None:
     assert selector.undescribed(optical) < 0.5
 
 
-def test_moved_wavelengths_recompute_only_what_they_move(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The table is that of a fresh model, and exposures that stay where they are cost nothing."""
+def test_a_table_of_moved_wavelengths_is_that_of_a_fresh_model() -> None:
+    """Rows of exposures that stay where they are may come from before."""
     model = FringeModel.from_setup("ts8_e2v")
     geometry = ImageGeometry.of_pixels((4, 4), WAVELENGTHS, 20_000.0)
     forward = Forward(model, EFFECTS, geometry, 1, (14.0, 16.0))
     forward.table({"temperature.kelvin": 190.0})
-    computed = []
-    plain = FringeModel.respond_on_grid
-
-    def counted(self, light, *args, **keywords):  # type: ignore[no-untyped-def]
-        computed.append(len(light.wavelength_nm))
-        return plain(self, light, *args, **keywords)
-
-    monkeypatch.setattr(FringeModel, "respond_on_grid", counted)
     settings = {"temperature.kelvin": 190.0, "wavelength_jitter.at_930": 0.4}
     moved = forward.table(settings)
-    assert computed == [1]
     fresh = Forward(model, EFFECTS, geometry, 1, (14.0, 16.0)).table(settings)
     np.testing.assert_allclose(moved, fresh, rtol=0.0, atol=1e-9)
-    forward.table({**settings, "temperature.kelvin": 191.0})
-    assert computed == [1, 12, 12]
-    # Rows that all settings share may be dropped, and are then made again.
-    for error in np.linspace(-1.0, 1.0, 10 * MOST_ROWS * len(WAVELENGTHS)):
-        forward.table({"wavelength_jitter.at_930": float(error)})
-    assert len(forward._rows) <= MOST_ROWS * len(WAVELENGTHS)
 
 
+@pytest.mark.rng("changes are differences of predictions")
 def test_changes_are_differences_of_predictions(rng: np.random.Generator) -> None:
     """Whatever was asked before: another thickness, pixels that are lost, a map known less well."""
     centroid = 0.2 * rng.standard_normal((2, len(WAVELENGTHS), 12, 16))
@@ -460,6 +452,7 @@ def test_a_faint_copy_mirrored_about_the_middle_is_an_echo() -> None:
     assert mirrored.probability < 1e-4 < 1e-3 < aside.probability
 
 
+@pytest.mark.rng("a window keeps places and levels")
 def test_a_window_keeps_places_and_levels(rng: np.random.Generator) -> None:
     """A part of a sensor is seen where it lies: the same amplifiers, the same distance from the middle."""
     case = draw_case("none", rng, size=(96, 128))
@@ -473,6 +466,7 @@ def test_a_window_keeps_places_and_levels(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(part.geometry.level_e, cells.geometry.level_e)
 
 
+@pytest.mark.slow
 def test_where_fringes_are_narrow_a_part_is_searched_and_that_is_said() -> None:
     """Fringes of six pixels forbid larger cells, and a search of them all would take too long."""
     v, u = np.mgrid[-1.0 : 1.0 : 100 * 1j, -1.0 : 1.0 : 200 * 1j]

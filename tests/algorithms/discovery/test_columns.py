@@ -34,6 +34,7 @@ def written_out(columns: PlaneColumns) -> FullColumns:
 
 
 @pytest.mark.parametrize("scatter", [0.0, 0.7])
+@pytest.mark.rng("products are those of the columns written out")
 def test_products_are_those_of_the_columns_written_out(rng: np.random.Generator, scatter: float) -> None:
     whiten = random_whitener(rng, scatter)
     columns, levels = random_columns(rng, whiten, 9, 4), random_columns(rng, whiten, 6, 6)
@@ -46,6 +47,7 @@ def test_products_are_those_of_the_columns_written_out(rng: np.random.Generator,
 
 
 @pytest.mark.parametrize("scatter", [0.0, 0.7])
+@pytest.mark.rng("what is left of columns is the fit with all nuisances taken out")
 def test_what_is_left_of_columns_is_the_fit_with_all_nuisances_taken_out(
     rng: np.random.Generator, scatter: float
 ) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.optimize import nnls
 
 from lsst.fringe_sim.algorithms.discovery.comparison import chi2_with_free_fringes
 
 
+@pytest.mark.rng("level and contrast of every wavelength are free")
 def test_level_and_contrast_of_every_wavelength_are_free(rng: np.random.Generator) -> None:
     """The contrast is not negative: fringes upside down do not fit; faint fringes keep their digits."""
     waves, number, shape = 5, 4, (7, 9)

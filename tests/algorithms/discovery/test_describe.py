@@ -18,6 +18,7 @@ def geometry_of(shape: tuple[int, int], waves: int) -> ImageGeometry:
 
 
 @pytest.mark.parametrize("waves", [1, 3, 12])
+@pytest.mark.rng("noise has no places")
 def test_noise_has_no_places(waves: int, rng: np.random.Generator) -> None:
     noise = rng.standard_normal((waves, 300, 200))
     noise[:, rng.random((300, 200)) < 0.01] = 0.0
@@ -26,6 +27,7 @@ def test_noise_has_no_places(waves: int, rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("elsewhere", [1.0, 1.4])
+@pytest.mark.rng("places are found where they are")
 def test_places_are_found_where_they_are(elsewhere: float, rng: np.random.Generator) -> None:
     """Also where the model fits nowhere as well as the noise would let it."""
     shape = (96, 80)
@@ -43,6 +45,7 @@ def test_places_are_found_where_they_are(elsewhere: float, rng: np.random.Genera
     assert first["excess_share"] + second["excess_share"] == pytest.approx(1.0)
 
 
+@pytest.mark.rng("a place behind lost pixels is one place")
 def test_a_place_behind_lost_pixels_is_one_place(rng: np.random.Generator) -> None:
     """Neither a bad column cuts it in two, nor is a sound cell beside it a place of its own."""
     shape = (64, 64)
@@ -59,6 +62,7 @@ def test_a_place_behind_lost_pixels_is_one_place(rng: np.random.Generator) -> No
         assert np.isfinite(list(places[0].values())).all()
 
 
+@pytest.mark.rng("a misfit everywhere has no place")
 def test_a_misfit_everywhere_has_no_place(rng: np.random.Generator) -> None:
     wave = np.sin(np.arange(90) / 5.0)[np.newaxis, np.newaxis, :]
     residual = rng.standard_normal((12, 64, 90)) + 3.0 * wave

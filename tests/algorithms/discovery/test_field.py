@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.effects import EFFECTS
@@ -29,6 +30,7 @@ def binned(fine: np.ndarray, px: int) -> np.ndarray:
     return np.asarray(fine.reshape(*fine.shape[:-2], ny, px, nx, px).mean(axis=(-3, -1)))
 
 
+@pytest.mark.slow
 def test_a_coarse_field_that_slips_does_not_take_the_finer_ones_along() -> None:
     """An adhesive that absorbs weakens the fringes; a coarse field without it loses its order in places."""
     rng = np.random.default_rng(103)

@@ -98,6 +98,7 @@ def test_derivatives_are_central(at: float, quadratic: bool) -> None:
     np.testing.assert_allclose(found, np.cos(at + phase), atol=0.01)
 
 
+@pytest.mark.rng("derivatives are central about any null")
 def test_derivatives_are_central_about_any_null(rng: np.random.Generator) -> None:
     """Sums with a null of 1.0 or 183.15 are rounded, which is no bound that has been reached."""
     for null, low, high, scale in ((1.0, 0.5, 1.5, 0.05), (183.15, 120.0, 320.0, 3.0)):

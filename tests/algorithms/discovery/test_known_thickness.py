@@ -18,6 +18,7 @@ STATED_UM = 0.01
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+@pytest.mark.rng("the errors of a map are measured")
 def test_the_errors_of_a_map_are_measured(rng: np.random.Generator, share: float) -> None:
     """Also where the noise is not what it was taken for."""
     slope = rng.normal(0.0, 100.0, (12, 60, 60))
@@ -26,6 +27,7 @@ def test_the_errors_of_a_map_are_measured(rng: np.random.Generator, share: float
     assert map_variance_share(slope, residual, STATED_UM**2) == pytest.approx(share, rel=0.2, abs=0.01)
 
 
+@pytest.mark.rng("a map is not worse than it states")
 def test_a_map_is_not_worse_than_it_states(rng: np.random.Generator) -> None:
     slope = rng.normal(0.0, 100.0, (12, 30, 30))
     residual = slope * 0.05 * rng.standard_normal((30, 30)) + rng.standard_normal(slope.shape)
@@ -33,12 +35,14 @@ def test_a_map_is_not_worse_than_it_states(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("waves", [1, 2])
+@pytest.mark.rng("few wavelengths cannot tell")
 def test_few_wavelengths_cannot_tell(rng: np.random.Generator, waves: int) -> None:
     slope = rng.normal(0.0, 100.0, (waves, 30, 30))
     assert map_variance_share(slope, rng.standard_normal(slope.shape), STATED_UM**2) == 1.0
     assert map_variance_share(0.0 * slope, rng.standard_normal(slope.shape), STATED_UM**2) == 1.0
 
 
+@pytest.mark.rng("scatter of the thickness leaves the mean of the fringes")
 def test_scatter_of_the_thickness_leaves_the_mean_of_the_fringes(rng: np.random.Generator) -> None:
     """Predictions at places that scatter about the true one have the prediction there as their mean."""
     wavelength, shape = np.array([900.0, 960.0]), (200, 300)

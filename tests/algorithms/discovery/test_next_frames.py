@@ -59,6 +59,7 @@ def values_of(fit: Fit) -> dict[str, float]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", ["roughness", "sky_continuum"])
 def test_separations_are_those_of_fits(noiseless, other: str) -> None:
     problem, coordinates = noiseless
@@ -76,6 +77,7 @@ def test_separations_are_those_of_fits(noiseless, other: str) -> None:
     assert ranked == tuple(sorted(ranked, key=lambda item: -item.separation))
 
 
+@pytest.mark.slow
 def test_flats_of_the_laboratory_know_nothing_of_the_sky(noiseless) -> None:
     """A cause on the sensor against one in the sky: flats show the first in full, and the second not at all."""
     problem, coordinates = noiseless

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded_cases import recorded_case
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions
 from lsst.fringe_sim.algorithms.discovery.classes import classes_of
@@ -59,7 +60,7 @@ def test_fields_lie_whole_orders_away(sensor) -> None:
     np.testing.assert_allclose([(each - whole).mean() / order for each in moved], [-2, -1, 1, 2], atol=0.01)
 
 
-@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize("number", first_is_quick(range(4)))
 def test_wavelengths_that_are_off_are_found_from_another_order(sensor, selector, number: int) -> None:
     """Each wavelength follows a wrong order by itself, to where only the ends of the spectrum tell."""
     problem, known, _ = sensor
@@ -86,6 +87,7 @@ def test_rivals_fitted_in_another_order_are_fitted_again(sensor, selector) -> No
     assert rival.fit.chi2 == pytest.approx(right.chi2, abs=2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first_seed", [0, 1000, 2000])
 def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
     """Its misfit has a minimum for every fringe, in every order of the thickness."""
@@ -101,6 +103,7 @@ def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
     assert abs(error) < 5.0 * max(found.fit.sigma[0], 1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [302, 305])
 def test_the_deepest_of_many_minima_is_found_from_far_away(seed: int) -> None:
     """A support has fringes of its own: its index has a minimum every 0.003, and the deepest is a hundred away."""
@@ -162,32 +165,3 @@ def test_field_is_judged_again_with_an_effect_in_its_right_order() -> None:
     assert refined is not None
     assert away(prepared) > 0.9
     assert away(refined) == 0.0
-
-
-def test_a_set_is_not_looked_for_twice_from_the_same_fit(selector, monkeypatch) -> None:
-    found = selector.improved((JITTER,), selector.null.fit, scan=True)
-    tried = []
-    monkeypatch.setattr(Selector, "_starts_in_other_orders", lambda self, fit, name: tried.append(fit) or [])
-    assert selector.improved((JITTER,), selector.null.fit, scan=True) is found
-    assert not tried
-    # A better fit is a new place to look from.
-    selector.fitted[frozenset((JITTER,))] = replace(found, fit=replace(found.fit, chi2=found.fit.chi2 - 10.0))
-    selector.improved((JITTER,), selector.null.fit, scan=True)
-    assert tried
-
-
-def test_scores_at_a_fit_are_made_once(selector, monkeypatch) -> None:
-    """Without a scan they are others than with one, and one fit's are not another's."""
-    fit = selector.null.fit
-    first = {scan: selector.score(fit, [JITTER, CAUSE, RIVAL], scan=scan) for scan in (False, True)}
-    made = []
-    original = Selector.features
-    monkeypatch.setattr(
-        Selector, "features", lambda self, *given: made.append(given[-1]) or original(self, *given)
-    )
-    for scan, before in first.items():
-        again = selector.score(fit, [RIVAL, JITTER], scan=scan)
-        assert again == [candidate for candidate in before if candidate.name != CAUSE]
-    assert not made
-    selector.score(selector.hypothesis((JITTER,)).fit, [CAUSE])
-    assert made == [CAUSE]

@@ -25,6 +25,7 @@ def used() -> np.ndarray:
     return np.ones(SHAPE, dtype=bool)
 
 
+@pytest.mark.rng("a track is found as far as it goes")
 def test_a_track_is_found_as_far_as_it_goes(residual, used) -> None:
     residual[4, 20, 30:40] += 0.15
     residual[4, 20, 40] += 0.045  # by itself within the noise of many cells
@@ -35,11 +36,13 @@ def test_a_track_is_found_as_far_as_it_goes(residual, used) -> None:
     assert (found & ~expected).sum() <= 2
 
 
+@pytest.mark.rng("noise and response are left alone")
 def test_noise_and_response_are_left_alone(residual, used) -> None:
     residual[:, 10, 10] -= 0.5  # a dead cell is dead in every exposure
     assert not spoiled_cells(residual, used).any()
 
 
+@pytest.mark.rng("a misfit is no accident")
 def test_a_misfit_is_no_accident(residual, used) -> None:
     """Not where it is everywhere in one exposure, nor where it is in all exposures of a few cells."""
     y, x = np.indices(SHAPE[1:])
@@ -48,6 +51,7 @@ def test_a_misfit_is_no_accident(residual, used) -> None:
     assert not spoiled_cells(residual, used).any()
 
 
+@pytest.mark.rng("cells without data say nothing")
 def test_cells_without_data_say_nothing(residual, used) -> None:
     used[:, :, :20] = False
     used[7] = False
@@ -59,6 +63,7 @@ def test_cells_without_data_say_nothing(residual, used) -> None:
 
 
 @pytest.mark.parametrize("waves", [3, 4, 5, 6, 12])
+@pytest.mark.rng("however few exposures there are")
 def test_however_few_exposures_there_are(waves: int, rng: np.random.Generator) -> None:
     """The median of three is one of them, and the spread about it says little: noise was taken for spoiled."""
     residual = rng.normal(0.0, 0.01, (waves, 160, 160)) + rng.normal(0.0, 0.02, (160, 160))
@@ -69,6 +74,7 @@ def test_however_few_exposures_there_are(waves: int, rng: np.random.Generator) -
     assert found.sum() <= 1
 
 
+@pytest.mark.rng("two exposures cannot tell")
 def test_two_exposures_cannot_tell(residual, used) -> None:
     residual[1, 5, 5] += 1.0
     assert not spoiled_cells(residual[:2], used[:2]).any()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import discover, preparation
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
@@ -47,7 +48,7 @@ def _cube(thickness: np.ndarray, rng: np.random.Generator, *, points: bool) -> F
     return FringeCube(counts, counts, np.zeros(counts.shape, np.int32), exposures, "electron")
 
 
-@pytest.mark.parametrize("cell_px", [1, 2])
+@pytest.mark.parametrize("cell_px", first_is_quick([2, 1]))
 def test_the_fringes_are_averaged_over_the_area_of_a_cell(cell_px: int) -> None:
     """Of a plane whose fringes are four cells wide, inside, where the gradient is that of the plane."""
     size = 48

@@ -13,6 +13,8 @@ from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.model import FringeModel
 
+pytestmark = pytest.mark.slow
+
 MODEL = FringeModel.from_setup("ts8_e2v")
 LOSS = next(effect for effect in EFFECTS if effect.name == "contrast_loss")
 SIZE, NOISE, ROUGHNESS_UM = 48, 0.02, 0.008

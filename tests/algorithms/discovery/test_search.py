@@ -67,6 +67,7 @@ def test_a_field_goes_on_where_it_has_no_weight(spacing: float) -> None:
     np.testing.assert_allclose(basis.expand(basis.fit(np.full((96, 96), 15.0), seen)), 15.0, rtol=1e-9)
 
 
+@pytest.mark.rng("cells that are not seen keep their thickness")
 def test_cells_that_are_not_seen_keep_their_thickness(rng: np.random.Generator) -> None:
     field, basis = 12.0 + rng.random((5, 7)), CellBasis((5, 7))
     np.testing.assert_array_equal(basis.expand(basis.fit(field, rng.integers(0, 2, (5, 7)) * 1.0)), field)
@@ -202,9 +203,9 @@ class _NarrowCoating(ArCoating):
 @pytest.mark.parametrize(
     ("effect", "key", "value", "named"),
     [
-        (_NarrowCoating(), "ar_coating.scale", 1.103, False),
+        pytest.param(_NarrowCoating(), "ar_coating.scale", 1.103, False, marks=pytest.mark.slow),
         (ArCoating(), "ar_coating.scale", 1.103, True),
-        (LineTriangle(), "line_triangle.fraction", 1.0, True),
+        pytest.param(LineTriangle(), "line_triangle.fraction", 1.0, True, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_at_the_end_of_what_a_model_is_meant_for_is_not_named(effect, key, value, named) -> None:

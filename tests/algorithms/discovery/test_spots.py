@@ -48,6 +48,7 @@ def _with(state: State, response: np.ndarray, noise: np.ndarray) -> State:
     return replace(state, residual=noise + state.whiten(state.value * response))
 
 
+@pytest.mark.rng("noise makes spots as often as it is said to")
 def test_noise_makes_spots_as_often_as_it_is_said_to(state: State, rng: np.random.Generator) -> None:
     """Hardly more often, and not next to never: the bound counts maxima of all sizes as if they were independent."""
     chances = [
@@ -59,6 +60,7 @@ def test_noise_makes_spots_as_often_as_it_is_said_to(state: State, rng: np.rando
     assert min(chances) > 1e-5
 
 
+@pytest.mark.rng("spots of noise are worth little")
 def test_spots_of_noise_are_worth_little(state: State, rng: np.random.Generator) -> None:
     worth = [
         log_evidence_of_spots(replace(state, residual=rng.standard_normal(state.residual.shape)))
@@ -69,6 +71,7 @@ def test_spots_of_noise_are_worth_little(state: State, rng: np.random.Generator)
 
 
 @pytest.mark.parametrize(("y", "x", "radius"), [(20.0, 25.0, 5.0), (1.0, 46.0, 8.0)])
+@pytest.mark.rng("a spot is seen and a misfit of the thickness is none")
 def test_a_spot_is_seen_and_a_misfit_of_the_thickness_is_none(
     state: State, rng: np.random.Generator, y: float, x: float, radius: float
 ) -> None:
@@ -80,18 +83,21 @@ def test_a_spot_is_seen_and_a_misfit_of_the_thickness_is_none(
     assert spot_channel(bent).statistic == pytest.approx(plain.statistic)
 
 
+@pytest.mark.rng("light that all cells lack is no spot")
 def test_light_that_all_cells_lack_is_no_spot(state: State, rng: np.random.Generator) -> None:
     noise = rng.standard_normal(state.residual.shape)
     plain = spot_channel(replace(state, residual=noise)).statistic
     assert spot_channel(_with(state, np.full(SHAPE, 0.01), noise)).statistic == pytest.approx(plain)
 
 
+@pytest.mark.rng("correlated noise makes no spots")
 def test_correlated_noise_makes_no_spots(state: State, rng: np.random.Generator) -> None:
     noise = rng.standard_normal(state.residual.shape)
     stained = _with(state, 5e-4 * _round(15.0, 20.0, 4.0), noise)
     assert spot_channel(stained, 0.1).statistic == pytest.approx(spot_channel(stained).statistic / 1.4)
 
 
+@pytest.mark.rng("evidence is the integral over place size and depth")
 def test_evidence_is_the_integral_over_place_size_and_depth(state: State, rng: np.random.Generator) -> None:
     """Summed on a grid; over the depth in closed form."""
     stained = _with(state, -0.0015 * _round(21.0, 26.0, 6.0), rng.standard_normal(state.residual.shape))
@@ -115,6 +121,7 @@ def test_evidence_is_the_integral_over_place_size_and_depth(state: State, rng: n
     assert log_evidence_of_spots(stained) == pytest.approx(expected, abs=0.7)
 
 
+@pytest.mark.rng("several spots are worth more than one")
 def test_several_spots_are_worth_more_than_one(state: State, rng: np.random.Generator) -> None:
     noise = rng.standard_normal(state.residual.shape)
     places = [(10.0, 10.0, 5.0), (12.0, 19.0, 4.0), (30.0, 40.0, 7.0)]
@@ -135,6 +142,7 @@ def test_stains_are_not_named_as_gains_and_gains_are() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.rng("one wrong gain is no stain")
 def test_one_wrong_gain_is_no_stain(rng: np.random.Generator) -> None:
     case = _with_gain(rng, 0.006)
     verdict = discover(case.cube, case.setup, rng=np.random.default_rng(1))

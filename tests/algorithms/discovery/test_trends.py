@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from flat_cubes import relative_flats
 from scipy.stats import kstest
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.trends import trend_channel
@@ -32,7 +33,8 @@ def _covariance(rng: np.random.Generator, sigma: float) -> np.ndarray:
     return np.asarray(np.diag(root**2) + (10.0 * sigma) ** 2 * poorly)
 
 
-@pytest.mark.parametrize("sigma", [1e-4, 0.1, 1.0])
+@pytest.mark.parametrize("sigma", first_is_quick([0.1, 1e-4, 1.0]))
+@pytest.mark.rng("draws are draws however well they are known")
 def test_draws_are_draws_however_well_they_are_known(rng: np.random.Generator, sigma: float) -> None:
     chances = []
     for _ in range(300):
@@ -49,12 +51,14 @@ def test_draws_are_draws_however_well_they_are_known(rng: np.random.Generator, s
     [PLACE, PLACE**2, np.sin(np.pi * PLACE), np.exp(1.5 * PLACE)],
     ids=["line", "arc", "wave", "edge"],
 )
+@pytest.mark.rng("a smooth curve is no row of draws")
 def test_a_smooth_curve_is_no_row_of_draws(rng: np.random.Generator, shape: np.ndarray) -> None:
     covariance = 1e-6 * np.eye(len(PLACE))
     error = 0.3 * shape + 0.003 * rng.standard_normal(len(PLACE))
     assert trend_channel("draws", WAVELENGTHS, error, covariance).probability < 1e-4
 
 
+@pytest.mark.rng("a trend that is not known does not count")
 def test_a_trend_that_is_not_known_does_not_count(rng: np.random.Generator) -> None:
     """Another effect of the same set may have any part of it."""
     trend = np.outer(PLACE, PLACE)
