@@ -7,10 +7,10 @@ from pathlib import Path
 
 import click
 
+from ..challenge.page import write_challenge_report
+from ..challenge.result import CASE_KINDS, CaseResult
+from ..challenge.run import run_challenge
 from ..errors import InputError
-from ..mock.challenge import run_challenge
-from ..products.challenge_result import CASE_KINDS, CaseResult
-from ..report.challenge_page import write_challenge_report
 from .inputs import prepare_folder
 from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
 
