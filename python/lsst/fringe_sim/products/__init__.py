@@ -22,6 +22,7 @@ from .sky_frame import (
     bands_of_header,
     refuse_corrected,
 )
+from .sky_frames import SkyFrames
 from .thickness_map import ThicknessMap
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "FringeFlat",
     "FringeFrame",
     "SensorSection",
+    "SkyFrames",
     "SkyFringe",
     "ThicknessMap",
     "band_cards",

@@ -148,7 +148,10 @@ class Image(Extension):
     def read(self, hdus: fits.HDUList, source: str, native: bool) -> dict[str, Any]:  # noqa: D102
         if self.optional and self.name not in hdus:
             return {self.field: None}
-        return {self.field: io.read_image(hdus, self.name, source=source, native=native)}
+        data = io.read_image(hdus, self.name, source=source, native=native)
+        if self.unit and "{" not in self.unit:
+            data = io.in_unit(self.name, data, hdus[self.name].header.get("BUNIT"), self.unit, source=source)
+        return {self.field: data}
 
 
 @dataclass(frozen=True)

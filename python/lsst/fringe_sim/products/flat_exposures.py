@@ -84,7 +84,8 @@ class _Column:
     def read(self, table: fits.FITS_rec, source: str) -> NDArray[Any]:
         names = {str(name).lower(): str(name) for name in table.names}
         if self.name in names:
-            return np.array(table[names[self.name]])
+            column = table.columns[names[self.name]]
+            return io.in_unit(self.name, np.array(table[column.name]), column.unit, self.unit, source=source)
         if self.default is None:
             raise FrameFormatError(
                 "EXPOSURES", f"no column {self.name}", "a column of that name", source=source

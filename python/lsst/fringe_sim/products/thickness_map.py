@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
+from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..errors import FrameFormatError, OutOfRangeError
+from ..errors import FrameFormatError, InputError, OutOfRangeError
+from ..resources import open_user_fits, refuse_damage
 from . import _check as check
+from . import _fits as io
 from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
+from .mask import mask_bits
 
-__all__ = ["ThicknessMap"]
+__all__ = ["THICKNESS_LIMITS_UM", "UNKNOWN_SIGMA_UM", "ThicknessMap"]
+
+UNKNOWN_SIGMA_UM = 0.003
+"""Uncertainty of a map that states none."""
+
+THICKNESS_LIMITS_UM = (0.5, 1000.0)
+"""Layers that make fringes in a sensor: a map in nm or mm that does not say so lies outside."""
 
 
 class _Counts(Image):
@@ -87,6 +99,63 @@ class ThicknessMap(SensorProduct):
         _Counts("n_wavelengths", "N_WAVELENGTHS", optional=True),
     )
 
+    @classmethod
+    def read_any(cls, path: str | os.PathLike[str], layer: str | None = None) -> Self:
+        """Read a thickness map that this package, or anybody else, has written.
+
+        The map is the first image of the file, in the unit of length that its BUNIT states, in µm without BUNIT.
+        Pixels without a positive number, and in a file from elsewhere those that an extension MASK marks, become
+        NO_DATA. Where no extension SIGMA states an uncertainty it is `UNKNOWN_SIGMA_UM`.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        layer : `str`, optional
+            Layer that the map must be of, where the file says which it is (LAYER), and is taken for where not.
+
+        Raises
+        ------
+        InputError
+            No such file.
+        FrameFormatError
+            A damaged file, another product, no two-dimensional image, a unit that is no length, or numbers that are
+            no thickness in it: the median is within `THICKNESS_LIMITS_UM`.
+        """
+        source = str(path)
+        if not Path(path).is_file():
+            raise InputError("file", source, "an existing FITS file")
+        with (
+            refuse_damage("file", "a complete FITS file", source),
+            open_user_fits(path, warning="truncated", memmap=False) as hdus,
+        ):
+            product = hdus[0].header.get(io.PRODUCT_KEY, "")
+            if product == cls.__name__ and _unit_of(hdus, 1) == "um":
+                found = cls.read_fits(path)
+            elif product in ("", cls.__name__):
+                found = cls(**_from_elsewhere(hdus, layer, source))
+            else:
+                raise FrameFormatError(io.PRODUCT_KEY, product, cls.__name__, source=source)
+        return found if layer is None else found.of_layer(layer, source)
+
+    def of_layer(self, layer: str, source: str | None = None) -> Self:
+        """The map itself, if it is of this layer.
+
+        Raises
+        ------
+        InputError
+            It is of another.
+        """
+        if self.layer != layer:
+            where = source or self.detector or None
+            raise InputError("layer of the thickness map", self.layer, layer, source=where)
+        return self
+
+    def known_um(self) -> NDArray[np.float32]:
+        """Thickness [µm], NaN where there is none; what a mask only doubts keeps its value."""
+        missing = self.mask & mask_bits("NO_DATA")
+        return np.where(missing, np.float32(np.nan), self.value).astype(np.float32)
+
     def _check(self) -> None:
         good = self.mask == 0
         if bool(np.any((self.value <= 0) & good)):
@@ -94,3 +163,48 @@ class ThicknessMap(SensorProduct):
         if bool(np.any((self.slip_probability > 1) & good)):
             worst = float(self.slip_probability[good].max())
             raise OutOfRangeError("SLIP_PROBABILITY", worst, "0 to 1")
+
+
+def _unit_of(hdus: fits.HDUList, number: int) -> str:
+    return str(hdus[number].header.get("BUNIT", "")).strip() if number < len(hdus) else ""
+
+
+def _from_elsewhere(hdus: fits.HDUList, layer: str | None, source: str) -> dict[str, Any]:
+    """Fields of a map in a file of any layout."""
+    number = next((k for k, hdu in enumerate(hdus) if hdu.is_image and hdu.data is not None), -1)
+    data = hdus[number].data if number >= 0 else None
+    if data is None or data.ndim != 2:
+        shape = "no image" if data is None else f"shape {data.shape}"
+        raise FrameFormatError("thickness map", shape, "a two-dimensional image in µm", source=source)
+    value = io.in_unit("thickness map", data.astype(float), _unit_of(hdus, number), "um", source=source)
+    mask = hdus["MASK"].data if "MASK" in hdus else None
+    missing = (
+        ~np.isfinite(value)
+        if mask is None or mask.shape != value.shape
+        else ~np.isfinite(value) | (mask != 0)
+    )
+    if missing.all():
+        raise FrameFormatError("thickness map", "no finite pixel", "a thickness in µm", source=source)
+    low, high = THICKNESS_LIMITS_UM
+    middle = float(np.median(value[~missing]))
+    if not low <= middle <= high:
+        allowed = f"{low:g} to {high:g} µm: state the unit in BUNIT"
+        raise FrameFormatError("median of the thickness map [µm]", middle, allowed, source=source)
+    missing |= ~(np.nan_to_num(value, nan=-1.0) > 0.0)
+    sigma = np.full(value.shape, UNKNOWN_SIGMA_UM)
+    if "SIGMA" in hdus and hdus["SIGMA"].shape == value.shape:
+        unit = hdus["SIGMA"].header.get("BUNIT")
+        sigma = io.in_unit("SIGMA", hdus["SIGMA"].data.astype(float), unit, "um", source=source)
+        missing |= ~(np.isfinite(sigma) & (sigma >= 0.0))
+    headers = (hdus[0].header, hdus[number].header)
+    return {
+        "value": value,
+        "sigma": sigma,
+        "chi2": np.zeros(value.shape),
+        "slip_probability": np.zeros(value.shape),
+        "mask": np.where(missing, mask_bits("NO_DATA"), 0),
+        "layer": next(
+            (str(header["LAYER"]) for header in headers if header.get("LAYER")), layer or "unknown"
+        ),
+        "detector": str(hdus[0].header.get("DETNAME", "")),
+    }
