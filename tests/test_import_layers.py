@@ -21,12 +21,12 @@ ORDER = (
     "products",
     "model",
     "algorithms",
-    "mock",
 )
 ALLOWED: dict[str, set[str]] = {room: set(ORDER[: i + 1]) for i, room in enumerate(ORDER)}
+ALLOWED["mock"] = {"errors", "files", "resources", "instrument", "effects", "mock"}
 ALLOWED["middleware"] = {"errors", "files", "resources", "instrument", "products", "middleware"}
-ALLOWED["tasks"] = set(ORDER) - {"mock"} | {"middleware", "tasks"}
-ALLOWED["paper"] = set(ORDER) | {"paper"}
+ALLOWED["tasks"] = set(ORDER) | {"middleware", "tasks"}
+ALLOWED["paper"] = set(ORDER) | {"mock", "paper"}
 ALLOWED["report"] = {
     "errors",
     "files",
@@ -39,7 +39,8 @@ ALLOWED["report"] = {
     "paper",
     "report",
 }
-ALLOWED["cli"] = set(ORDER) | {"middleware", "tasks", "paper", "report", "cli"}
+ALLOWED["challenge"] = set(ORDER) | {"mock", "report", "challenge"}
+ALLOWED["cli"] = set(ORDER) | {"mock", "middleware", "tasks", "paper", "report", "challenge", "cli"}
 ALLOWED["__main__"] = {"cli"}
 
 

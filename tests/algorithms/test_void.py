@@ -11,8 +11,8 @@ from lsst.fringe_sim.algorithms import fit_thickness, simulate_sky_frame
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.flat_residual import flat_residual
+from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
-from lsst.fringe_sim.mock.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.model import FringeModel
 
 (VOID,) = (effect for effect in EFFECTS if effect.name == "void")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import discover
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry, activate_effects, apply_to_image
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 
 WAVELENGTHS = np.array([900.0, 960.0, 985.0])

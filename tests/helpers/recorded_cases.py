@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lsst.fringe_sim.mock.sealed_cases import SIZES, SealedCase, draw_case
-from lsst.fringe_sim.products.challenge_result import CASE_KINDS
+from lsst.fringe_sim.challenge.result import CASE_KINDS
+from lsst.fringe_sim.challenge.sealed_cases import SIZES, SealedCase, draw_case
 
 
 def recorded_case(

@@ -13,7 +13,7 @@ from astropy.table import Table
 
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Step, Where
-from lsst.fringe_sim.mock.sealed_cases import draw_case
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FlatExposures
 from lsst.fringe_sim.report.discovery_figures import candidates_figure, gap_figure, where_figure

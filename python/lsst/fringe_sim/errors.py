@@ -23,6 +23,7 @@ __all__ = [
     "StackError",
     "UnknownNameError",
     "to_number",
+    "without_unit",
 ]
 
 
@@ -171,6 +172,34 @@ def to_number(field: str, value: Any, allowed: str = "a number", *, source: str 
     except OverflowError:
         sign = -math.inf if value < 0 else math.inf
         raise OutOfRangeError(field, sign, f"{allowed} below 1.8e308", source=source) from None
+
+
+def without_unit(field: str, value: Any, unit: str = "") -> Any:
+    """Number or array in a unit: a quantity of astropy is converted, anything else is returned as it is.
+
+    Parameters
+    ----------
+    field : `str`
+        What was given.
+    value : `object`
+        A number, an array, or an `astropy.units.Quantity` or column of a table.
+    unit : `str`, optional
+        Unit that is wanted, as astropy writes it; empty for a number without unit.
+
+    Raises
+    ------
+    InputError
+        A quantity of another kind.
+    """
+    value = getattr(value, "quantity", value) if getattr(value, "unit", None) is not None else value
+    if not hasattr(value, "to_value"):
+        return value
+    try:
+        return value.to_value(unit)
+    except (ValueError, TypeError):
+        raise InputError(
+            field, f"a quantity in {value.unit}", f"one in {unit}, or numbers" if unit else "plain numbers"
+        ) from None
 
 
 def _shorten(names: list[str], most: int = 24) -> str:

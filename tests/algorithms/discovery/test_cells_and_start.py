@@ -19,9 +19,9 @@ from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector, chance_of
 from lsst.fringe_sim.algorithms.discovery.start import _mend_patches, mended_thickness, starting_thickness
+from lsst.fringe_sim.challenge import sealed_cases
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import AMPLIFIERS, EFFECTS, ImageGeometry
-from lsst.fringe_sim.mock import sealed_cases
-from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.mock.thickness import PixelArea, random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube

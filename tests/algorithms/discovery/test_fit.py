@@ -19,8 +19,8 @@ from lsst.fringe_sim.algorithms.discovery.fit import (
     fit_model,
 )
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS
-from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 
 TILT = next(effect for effect in EFFECTS if effect.name == "tilt")

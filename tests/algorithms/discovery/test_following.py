@@ -9,8 +9,8 @@ from slow_cases import first_is_quick
 from lsst.fringe_sim.algorithms.discovery.following import ThicknessFollower
 from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS
-from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 
 INDEX = 1.6

@@ -18,8 +18,8 @@ from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.growth import grown_thickness
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.algorithms.discovery.validation import thickness_starts, whole_thickness
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS
-from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 
 BLUR = "charge_diffusion"

@@ -14,8 +14,8 @@ from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, coordinates_o
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS
-from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 
 SHAPE = (40, 56)

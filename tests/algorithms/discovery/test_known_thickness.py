@@ -10,8 +10,8 @@ import pytest
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.noise import map_variance_share
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
-from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 
 STATED_UM = 0.01

@@ -16,8 +16,8 @@ from lsst.fringe_sim.algorithms.discovery.orders import fields_in_other_orders
 from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
 from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS
-from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 
 JITTER, CAUSE, RIVAL = "wavelength_jitter", "dark_pedestal", "contrast_loss"

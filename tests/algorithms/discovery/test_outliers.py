@@ -9,7 +9,7 @@ import pytest
 
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.outliers import spoiled_cells
-from lsst.fringe_sim.mock.sealed_cases import SealedCase, draw_case
+from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
 
 SHAPE = (12, 60, 70)
 

@@ -12,9 +12,9 @@ from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
 from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.mock import random_field
-from lsst.fringe_sim.mock.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
 

@@ -14,8 +14,8 @@ from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube
 from lsst.fringe_sim.algorithms.discovery.planes import is_torn, joined_planes
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.start import mended_thickness, starting_thickness
+from lsst.fringe_sim.challenge.sealed_cases import expose
 from lsst.fringe_sim.effects import EFFECTS
-from lsst.fringe_sim.mock.sealed_cases import expose
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 

@@ -18,9 +18,9 @@ from lsst.fringe_sim.algorithms.discovery import (
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
 from lsst.fringe_sim.algorithms.discovery.selection import IMPRECISION
+from lsst.fringe_sim.challenge.sealed_cases import draw_case, expose
 from lsst.fringe_sim.effects import ArCoating, LineTriangle
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.mock.sealed_cases import draw_case, expose
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FringeCube

@@ -61,7 +61,9 @@ def amplitudes(
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
     skies = [read_line_list(path) for path in lines] + list(SkyCase.palace())
-    adhesive = e2v_321()[::STEP_PX, ::STEP_PX] if thickness == BUILT_IN else read_thickness(thickness)
+    adhesive = (
+        e2v_321()[::STEP_PX, ::STEP_PX] if thickness == BUILT_IN else read_thickness(thickness, "adhesive")
+    )
     if dry_run:
         click.echo(f"would compute every set-up with {', '.join(sky.name for sky in skies)}")
         return

@@ -12,7 +12,7 @@ from ..errors import InputError
 from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
 
 if TYPE_CHECKING:
-    from ..products.challenge_result import CaseResult
+    from ..challenge.result import CaseResult
 
 __all__ = ["challenge"]
 
@@ -65,9 +65,9 @@ def challenge(
     Example:
       fringe-sim challenge --seed 7 --none 20 --one 20 --two 10 --outsider 10 --out challenge
     """
-    from ..mock.challenge import run_challenge
-    from ..products.challenge_result import CASE_KINDS
-    from ..report.challenge_page import write_challenge_report
+    from ..challenge.page import write_challenge_report
+    from ..challenge.result import CASE_KINDS
+    from ..challenge.run import run_challenge
     from .inputs import prepare_folder
 
     LABORATORY.convert(setup, None, None)
@@ -107,7 +107,7 @@ def _earlier_cases(record: Path, identity: dict[str, int | str]) -> list[CaseRes
     InputError
         The record is one of another challenge.
     """
-    from ..products.challenge_result import CaseResult
+    from ..challenge.result import CaseResult
 
     lines = record.read_text().splitlines() if record.exists() else []
     if not lines:

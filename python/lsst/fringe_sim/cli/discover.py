@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..model import FringeModel
     from ..products import FringeCube
     from ..report.discovery_page import ResidualPair
-    from .sky_frames import SkyFrames
+    from .sky_frames import SkyData
 
 __all__ = ["discover"]
 
@@ -86,7 +86,9 @@ def discover(
     if setup.kind == "sky":
         data = read_sky_frames(paths, setup, thickness)
         if dry_run:
-            click.echo(f"would search {len(data.frames)} frames of {data.shape[1]} x {data.shape[0]} pixels")
+            click.echo(
+                f"would search {len(data.sky.frames)} frames of {data.sky.shape[1]} x {data.sky.shape[0]} pixels"
+            )
             return
         _search_sky(data, data.model(sky_settings(settings)), out, seed, cells)
         return
@@ -107,7 +109,7 @@ def discover(
     _write(verdict, folder, residual_pair(cube, model, verdict))
 
 
-def _search_sky(data: SkyFrames, model: FringeModel, out: Path, seed: int, cells: int) -> None:
+def _search_sky(data: SkyData, model: FringeModel, out: Path, seed: int, cells: int) -> None:
     import numpy as np
 
     from ..algorithms.discovery import SKY_SEARCH, discover_sky, placement_in_frames
@@ -115,11 +117,11 @@ def _search_sky(data: SkyFrames, model: FringeModel, out: Path, seed: int, cells
 
     folder = prepare_folder(out)
     verdict = discover_sky(
-        data.frames,
-        data.thickness_um,
-        data.thickness_sigma_um,
+        data.sky.frames,
+        data.sky.thickness_um,
+        data.sky.thickness_sigma_um,
         model,
-        placement=placement_in_frames(data.frames, data.detector, data.setup.pixel_scale_arcsec),
+        placement=placement_in_frames(data.sky.frames, data.detector, data.setup.pixel_scale_arcsec),
         rng=np.random.default_rng(seed),
         options=replace(SKY_SEARCH, most_cells=cells),
         report=lambda line: click.echo(line, err=True),

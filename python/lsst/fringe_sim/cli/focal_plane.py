@@ -28,7 +28,7 @@ from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 from ..instrument.night import NightHistory, StochasticNight, join_nights
 from ..instrument.sky import SkySpectrum
-from ..model import FringeModel
+from ..model import FringeModel, Setup
 from ..report.figures import focal_plane_figure
 from ..report.page import Report
 from ..report.style import save_figure
@@ -116,7 +116,11 @@ def focal_plane(
         click.echo(FocalPlaneCost(len(chosen), len(NightHistory.guo2022())).describe())
         return
     folder = prepare_folder(out)
-    thickness = {name: read_thickness(path) for name, path in measured.items()}
+    vendors = {item.name: item.vendor for item in Camera.from_name("lsstCam").science}
+    thickness = {
+        name: read_thickness(path, Setup.from_name(SETUPS[vendors[name]]).varying)
+        for name, path in measured.items()
+    }
     observed = join_nights(
         [
             StochasticNight().draw(np.arange(11.0), np.random.default_rng([seed, number]))

@@ -14,12 +14,12 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..effects import EFFECTS, activate_effects
-from ..errors import FrameFormatError, InputError
+from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel
 from ..model.effects_override import read_effects_override
 from ..model.provenance import model_cards, software_cards
-from ..products import SensorSection
+from ..products import SensorSection, ThicknessMap
 from ..products.sensor_section import SECTION_KEYWORDS
 from ..resources import open_user_fits, read_user_yaml, refuse_damage
 
@@ -52,41 +52,9 @@ def complete_fits(
         yield hdus
 
 
-def read_thickness(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Thickness map from a FITS file.
-
-    Parameters
-    ----------
-    path : path-like
-        A map written by this package (its mask is honoured: masked pixels become NaN), or any FITS file whose
-        first image is the thickness in µm.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-
-    Raises
-    ------
-    FrameFormatError
-        The file is not FITS, is truncated, or holds no two-dimensional image.
-    FileNotFoundError
-        There is no such file.
-    """
-    source = str(path)
-    if not Path(path).is_file():
-        raise FileNotFoundError(2, "there is no such file", source)
-    with complete_fits(path, warning="truncated") as hdus:
-        image = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
-        mask = hdus["MASK"].data if "MASK" in hdus else None
-    if image is None or image.ndim != 2:
-        found = "no image" if image is None else f"shape {image.shape}"
-        raise FrameFormatError("thickness map", found, "a two-dimensional image in µm", source=source)
-    thickness = np.asarray(image, dtype=float)
-    if mask is not None and mask.shape == thickness.shape:
-        thickness[mask != 0] = np.nan
-    if not np.any(np.isfinite(thickness)):
-        raise FrameFormatError("thickness map", "no finite pixel", "a thickness in µm", source=source)
-    return thickness
+def read_thickness(path: str | os.PathLike[str], layer: str | None = None) -> NDArray[np.float64]:
+    """Thickness [µm] from a file that `ThicknessMap.read_any` reads; NaN where there is none."""
+    return ThicknessMap.read_any(path, layer).known_um().astype(float)
 
 
 def read_section(

@@ -158,5 +158,5 @@ def thickness_map(
         if setup.varying != "adhesive":
             raise InputError("--thickness", text, f"'random' or a file for the layer {setup.varying}")
         return e2v_321(shape)
-    layer = read_thickness(text)
+    layer = read_thickness(text, setup.varying)
     return layer if layer.shape == shape else fit_to_sensor(layer, shape)

@@ -94,7 +94,7 @@ def sky(
     sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
-    layer, section = _layer(thickness, sensor)
+    layer, section = _layer(thickness, sensor, setup.varying)
     settings = sky_settings(settings)
     history = NightHistory.guo2022()
     frames = len(history) if night else 1
@@ -161,7 +161,7 @@ def _check_exposure(exptime: float | None, night: bool) -> None:
         raise OutOfRangeError("exposure time [s]", exptime, "positive")
 
 
-def _layer(thickness: str, sensor: Detector) -> tuple[FloatArray, SensorSection | None]:
+def _layer(thickness: str, sensor: Detector, name: str) -> tuple[FloatArray, SensorSection | None]:
     """Thickness of the varying layer [µm], and the part of the sensor that it is of."""
     from ..mock.thickness import e2v_321
     from ..products import SensorSection
@@ -170,7 +170,7 @@ def _layer(thickness: str, sensor: Detector) -> tuple[FloatArray, SensorSection 
     if thickness == BUILT_IN:
         layer = e2v_321()
         return layer, SensorSection.of_image(sensor, (layer.shape[0], layer.shape[1]), {})
-    layer = read_thickness(thickness)
+    layer = read_thickness(thickness, name)
     return layer, read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
 
 

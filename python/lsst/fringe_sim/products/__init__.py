@@ -7,8 +7,9 @@ at all, carry checksums, and two writes of one product agree to the byte.
 from ..resources import DAMAGE
 from .background_writer import BackgroundWriter
 from .combined_bias import CombinedBias
+from .flat_exposures import FlatExposures
 from .fringe_components import FringeComponents
-from .fringe_cube import CUBE_UNITS, FlatExposures, FringeCube
+from .fringe_cube import CUBE_UNITS, FringeCube
 from .fringe_flat import FringeFlat
 from .fringe_frame import FringeFrame
 from .mask import MASK_PLANES, describe_mask, mask_bits
@@ -21,6 +22,7 @@ from .sky_frame import (
     bands_of_header,
     refuse_corrected,
 )
+from .sky_frames import SkyFrames
 from .thickness_map import ThicknessMap
 
 __all__ = [
@@ -37,6 +39,7 @@ __all__ = [
     "FringeFlat",
     "FringeFrame",
     "SensorSection",
+    "SkyFrames",
     "SkyFringe",
     "ThicknessMap",
     "band_cards",

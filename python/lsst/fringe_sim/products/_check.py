@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FrameFormatError, InputError, OutOfRangeError, to_number
+from ..errors import FrameFormatError, InputError, OutOfRangeError, to_number, without_unit
 from .mask import ALL_BITS
 
 __all__ = [
@@ -37,7 +37,7 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def as_float_array(
-    field: str, values: ArrayLike, ndim: int, dtype: type[np.floating] = np.float32
+    field: str, values: ArrayLike, ndim: int, dtype: type[np.floating] = np.float32, unit: str = ""
 ) -> NDArray[Any]:
     """Read-only real array of ``ndim`` axes; one that has the type already, in any byte order, is shared.
 
@@ -45,10 +45,14 @@ def as_float_array(
     ------
     FrameFormatError
         Not real numbers, or the wrong number of axes, or no pixels.
+    InputError
+        A quantity that has no such unit.
     """
     try:
-        array = np.asarray(values)
-    except ValueError:
+        array = np.asarray(without_unit(field, values, unit))
+    except InputError:
+        raise
+    except (ValueError, TypeError):  # of sequences of quantities, too
         raise FrameFormatError(field, "ragged nested sequences", f"a real array of {ndim} axes") from None
     if array.dtype.kind not in "fiu":
         raise FrameFormatError(field, f"dtype {array.dtype}", "real numbers")
@@ -70,7 +74,7 @@ def as_mask(
     FrameFormatError
         Not integers, another shape, or a bit that names no plane.
     """
-    array = np.asarray(values)
+    array = np.asarray(without_unit(field, values))
     if array.dtype.kind not in "iub":
         raise FrameFormatError(field, f"dtype {array.dtype}", "integers, one bit for each mask plane")
     check_shape(field, array, shape)
@@ -122,8 +126,9 @@ def check_number(
     high: float = math.inf,
     open_low: bool = False,
     allow_inf: bool = False,
+    unit: str = "",
 ) -> float:
-    """Return ``value`` as a float inside ``[low, high]`` (or ``(low, high]``).
+    """Return ``value``, or a quantity in ``unit``, as a float inside ``[low, high]`` (or ``(low, high]``).
 
     Raises
     ------
@@ -132,6 +137,7 @@ def check_number(
     OutOfRangeError
         Outside the interval.
     """
+    value = without_unit(field, value, unit)
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
         raise InputError(field, value, "a number")
     number = to_number(field, value)

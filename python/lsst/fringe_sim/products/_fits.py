@@ -30,6 +30,7 @@ __all__ = [
     "Scalar",
     "bintable_hdu",
     "image_hdu",
+    "in_unit",
     "mask_hdu",
     "merge_metadata",
     "normalise_metadata",
@@ -375,6 +376,29 @@ def read_image(hdus: fits.HDUList, name: str, *, source: str, native: bool = Tru
     if not isinstance(data, np.ndarray) or data.dtype.names is not None:
         raise FrameFormatError(name, "no image", "an image extension", source=source)
     return np.array(data, dtype=data.dtype.newbyteorder("=")) if native else data
+
+
+def in_unit(
+    field: str, values: NDArray[Any], found: object, unit: str | None, *, source: str
+) -> NDArray[Any]:
+    """Numbers of a file in the unit that is wanted; a file that states none has it.
+
+    Raises
+    ------
+    FrameFormatError
+        A unit that is none, or one of another kind.
+    """
+    if not unit or found is None or str(found).strip() in ("", unit):
+        return values
+    from astropy import units  # rarely needed
+
+    try:
+        factor = units.Unit(str(found).strip()).to(unit)
+    except (ValueError, TypeError):
+        raise FrameFormatError(
+            f"unit of {field}", found, f"{unit}, or one that converts to it", source=source
+        ) from None
+    return values if factor == 1.0 else (values * np.float64(factor)).astype(values.dtype.newbyteorder("="))
 
 
 def read_mask(hdus: fits.HDUList, name: str = "MASK", *, source: str, native: bool = True) -> NDArray[Any]:

@@ -2,28 +2,54 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..errors import FrameFormatError, InputError
+from ..errors import InputError
 from . import _check as check
-from . import _fits as io
-from .fits_product import FitsProduct
+from .fits_product import DETECTOR, MASK, Card, Extension, Image, SensorProduct
 
 __all__ = ["CombinedBias"]
 
-_OWN = ("NFRAMES", "LSST_NUM", "DETNAME")
+
+class _NoiseTable(Extension):
+    """Read noise by amplifier."""
+
+    def check(self, product: Any, known: Mapping[str, Any]) -> dict[str, Any]:
+        given = check.check_mapping(self.field, getattr(product, self.field))
+        noise = {
+            check.check_name("amplifier", name, empty=False): check.check_number(
+                f"noise of {name}", value, low=0, unit="adu"
+            )
+            for name, value in given.items()
+        }
+        if not noise:
+            raise InputError(self.field, "no amplifier", "the noise of one amplifier at least")
+        return {self.field: MappingProxyType(noise)}
+
+    def hdu(self, product: Any) -> fits.BinTableHDU:
+        known = getattr(product, self.field)
+        names, noise = np.array(list(known)), np.array(list(known.values()))
+        columns = [
+            fits.Column(name="amplifier", array=names, format=f"{names.dtype.itemsize // 4}A"),
+            fits.Column(name="noise", array=noise, format="D", unit="adu"),
+        ]
+        return fits.BinTableHDU.from_columns(columns, name=self.name)
+
+    def read(self, hdus: fits.HDUList, source: str, native: bool) -> dict[str, Any]:
+        rows = self.table(hdus, source)
+        pairs = zip(rows["amplifier"], rows["noise"], strict=True)
+        return {self.field: {str(name): float(value) for name, value in pairs}}
 
 
-@dataclass(frozen=True, eq=False)
-class CombinedBias(FitsProduct):
+@dataclass(frozen=True, eq=False, repr=False)
+class CombinedBias(SensorProduct):
     """Mean of overscan-corrected bias frames of one sensor, assembled.
 
     Parameters
@@ -59,83 +85,9 @@ class CombinedBias(FitsProduct):
     metadata: Mapping[str, Any] = field(default_factory=dict)
     detector: str = ""
 
-    def __post_init__(self) -> None:
-        image = check.as_float_array("IMAGE", self.image, 2)
-        check.check_good_pixels("IMAGE", image)
-        noise = {
-            check.check_name("amplifier", name, empty=False): check.check_number(
-                f"noise of {name}", value, low=0
-            )
-            for name, value in check.check_mapping("noise_adu", self.noise_adu).items()
-        }
-        if not noise:
-            raise InputError("noise_adu", "no amplifier", "the noise of one amplifier at least")
-        values = {
-            "image": image,
-            "mask": check.as_mask("MASK", self.mask, image.shape),
-            "noise_adu": MappingProxyType(noise),
-            "n_frames": check.check_whole_number("n_frames", self.n_frames, low=1, high=10**6),
-            "serial": check.check_name("serial", self.serial),
-            "detector": check.check_name("detector", self.detector),
-            "metadata": io.normalise_metadata(self.metadata, _OWN),
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of the sensor."""
-        return (self.image.shape[0], self.image.shape[1])
-
-    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
-        """IMAGE and MASK extensions and the table NOISE."""
-        own: list[tuple[str, io.Scalar, str]] = [
-            ("DETNAME", self.detector, "sensor"),
-            ("LSST_NUM", self.serial, "serial number"),
-            ("NFRAMES", self.n_frames, "bias frames in the mean"),
-        ]
-        hdus = [
-            io.primary_hdu("CombinedBias", own, io.merge_metadata(self.metadata, metadata, _OWN)),
-            io.image_hdu("IMAGE", self.image, unit="adu"),
-            io.mask_hdu(self.mask),
-            self._noise_hdu(),
-        ]
-        return hdus
-
-    def _noise_hdu(self) -> fits.BinTableHDU:
-        names, noise = np.array(list(self.noise_adu)), np.array(list(self.noise_adu.values()))
-        return fits.BinTableHDU.from_columns(
-            [
-                fits.Column(name="amplifier", array=names, format=f"{names.dtype.itemsize // 4}A"),
-                fits.Column(name="noise", array=noise, format="D", unit="adu"),
-            ],
-            name="NOISE",
-        )
-
-    @classmethod
-    def read_fits(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file that `write_fits` wrote.
-
-        Raises
-        ------
-        InputError
-            No such file, another product, or a damaged file; the message names the file.
-        """
-        source = str(path)
-        with io.open_fits(path, "CombinedBias") as hdus:
-            header = hdus[0].header
-            if "NOISE" not in hdus or not isinstance(hdus["NOISE"], fits.BinTableHDU):
-                raise FrameFormatError("extension", "no NOISE", "a binary table named NOISE", source=source)
-            table = hdus["NOISE"].data
-            return cls(
-                image=io.read_image(hdus, "IMAGE", source=source),
-                mask=io.read_mask(hdus, source=source),
-                noise_adu={
-                    str(name): float(value)
-                    for name, value in zip(table["amplifier"], table["noise"], strict=True)
-                },
-                n_frames=io.read_keyword(header, "NFRAMES", source=source),
-                serial=io.read_keyword(header, "LSST_NUM", source=source),
-                detector=header.get("DETNAME", ""),
-                metadata=io.read_metadata(header, _OWN),
-            )
+    CARDS = (
+        DETECTOR,
+        Card("serial", "LSST_NUM", "serial number", kind=str),
+        Card("n_frames", "NFRAMES", "bias frames in the mean", kind=int, low=1, high=10**6),
+    )
+    EXTENSIONS = (Image("image", "IMAGE", "adu", everywhere=True), MASK, _NoiseTable("noise_adu", "NOISE"))

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError
 from . import _check as check
 from . import _fits as io
-from .fits_product import FitsProduct
+from .fits_product import DETECTOR, NARROW_MASK, Card, FitsProduct, Image
+from .flat_exposures import ExposureTable, FlatExposures
 from .fringe_flat import FringeFlat
 from .mask import mask_bits
 
@@ -25,79 +26,19 @@ CUBE_UNITS = ("electron", "relative")
 
 CUBE_MASK = np.int16
 
-_OWN = ("DETNAME", "LAYER")
+
+class _Map(Image):
+    """Thickness, or not a number where it is not known."""
+
+    def check(self, product: Any, known: Mapping[str, Any]) -> dict[str, Any]:
+        values = super().check(product, known)
+        array = values[self.field]
+        if array is not None and bool(np.any(array < 0)):
+            raise OutOfRangeError(self.name, float(np.nanmin(array)), "0 or more, in um")
+        return values
 
 
-@dataclass(frozen=True, eq=False)
-class FlatExposures:
-    """How each plane of a cube was illuminated.
-
-    Parameters
-    ----------
-    wavelength_nm, bandwidth_fwhm_nm, temperature_k : array-like, shape ``(n_wavelengths,)``
-        Wavelength, full width at half maximum, and temperature of the sensor. One number for all wavelengths
-        is enough, except for the wavelength itself.
-    f_number : array-like, shape ``(n_wavelengths,)``, optional
-        Focal ratio; infinite (the default) for a collimated beam.
-    level_e : array-like, shape ``(n_wavelengths,)``, optional
-        Mean level in electrons; 0 (the default) where it is not known.
-    dark_time_s : array-like, shape ``(n_wavelengths,)``, optional
-        Time in which charge was gathered, in seconds; 0 (the default) where it is not known.
-    """
-
-    wavelength_nm: NDArray[np.float64]
-    bandwidth_fwhm_nm: NDArray[np.float64]
-    temperature_k: NDArray[np.float64]
-    f_number: NDArray[np.float64] = field(default_factory=lambda: np.array(np.inf))
-    level_e: NDArray[np.float64] = field(default_factory=lambda: np.array(0.0))
-    dark_time_s: NDArray[np.float64] = field(default_factory=lambda: np.array(0.0))
-
-    def __post_init__(self) -> None:
-        wavelength = check.as_float_array("wavelength", self.wavelength_nm, 1, np.float64)
-        number = wavelength.size
-        values = {
-            "wavelength_nm": _positive("wavelength", wavelength, number),
-            "bandwidth_fwhm_nm": _positive("bandwidth_fwhm", self.bandwidth_fwhm_nm, number, zero=True),
-            "temperature_k": _positive("temperature", self.temperature_k, number),
-            "f_number": _positive("f_number", self.f_number, number, infinite=True),
-            "level_e": _positive("level", self.level_e, number, zero=True),
-            "dark_time_s": _positive("dark_time", self.dark_time_s, number, zero=True),
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
-
-    def __len__(self) -> int:
-        return int(self.wavelength_nm.size)
-
-    def take(self, index: ArrayLike) -> FlatExposures:
-        """Exposures at the given positions, in the given order."""
-        at = np.asarray(index)
-        return FlatExposures(
-            self.wavelength_nm[at],
-            self.bandwidth_fwhm_nm[at],
-            self.temperature_k[at],
-            self.f_number[at],
-            self.level_e[at],
-            self.dark_time_s[at],
-        )
-
-
-def _positive(
-    name: str, values: ArrayLike, number: int, *, zero: bool = False, infinite: bool = False
-) -> NDArray[np.float64]:
-    if np.ndim(values) == 0:
-        values = np.full(number, values)
-    array = check.as_float_array(name, values, 1, np.float64)
-    if array.size != number:
-        raise FrameFormatError(name, f"{array.size} values", f"{number}, one for each wavelength")
-    good = (array >= 0 if zero else array > 0) & (np.isfinite(array) | (infinite & ~np.isnan(array)))
-    if not good.all():
-        sign = "not negative" if zero else "positive"
-        raise OutOfRangeError(name, float(array[~good][0]), f"{sign}{'' if infinite else ' and finite'}")
-    return check.read_only(array.astype(np.float64))
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FringeCube(FitsProduct):
     """Flats of one sensor, one plane for each wavelength, in the order given.
 
@@ -141,37 +82,31 @@ class FringeCube(FitsProduct):
     detector: str = ""
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
+    CARDS = (
+        DETECTOR,
+        Card("layer", "LAYER", "layer of THICKNESS", kind=str, default="", omit=True),
+    )
+    EXTENSIONS = (
+        Image("image", "IMAGE", "{unit}", ndim=3),
+        Image("variance", "VARIANCE", "{unit}2", ndim=3, nonnegative=True),
+        NARROW_MASK,
+        ExposureTable("exposures", "EXPOSURES"),
+        _Map("thickness", "THICKNESS", "um", gaps=True, optional=True),
+        _Map("thickness_sigma", "THICKNESS_SIGMA", "um", gaps=True, optional=True),
+    )
+
     def __post_init__(self) -> None:
         if self.unit not in CUBE_UNITS:
             raise UnknownNameError("BUNIT", self.unit, CUBE_UNITS)
-        if not isinstance(self.exposures, FlatExposures):
-            raise InputError("exposures", type(self.exposures).__name__, "FlatExposures")
-        image = check.as_float_array("IMAGE", self.image, 3)
-        variance = check.as_float_array("VARIANCE", self.variance, 3)
-        mask = check.as_mask("MASK", self.mask, image.shape, CUBE_MASK)
-        check.check_shape("VARIANCE", variance, image.shape)
-        if len(self.exposures) != image.shape[0]:
-            raise FrameFormatError(
-                "EXPOSURES", f"{len(self.exposures)} rows", f"{image.shape[0]}, one for each plane of IMAGE"
-            )
-        check.check_good_pixels("IMAGE", image, mask)
-        check.check_good_pixels("VARIANCE", variance, mask, nonnegative=True)
+        super().__post_init__()
+
+    def _check(self) -> None:
         if self.unit == "relative":
-            _refuse_amplitudes(image, mask)
-        values = {
-            "image": image,
-            "variance": variance,
-            "mask": mask,
-            "thickness": _map("THICKNESS", self.thickness, image.shape[1:]),
-            "thickness_sigma": _map("THICKNESS_SIGMA", self.thickness_sigma, image.shape[1:]),
-            "layer": check.check_name("LAYER", self.layer, empty=self.thickness is None),
-            "detector": check.check_name("detector", self.detector),
-            "metadata": io.normalise_metadata(self.metadata, _OWN),
-        }
-        if self.thickness is None and self.thickness_sigma is not None:
+            _refuse_amplitudes(self.image, self.mask)
+        if self.thickness is not None:
+            check.check_name("LAYER", self.layer, empty=False)
+        elif self.thickness_sigma is not None:
             raise FrameFormatError("THICKNESS", "missing", "a map beside THICKNESS_SIGMA")
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -211,6 +146,64 @@ class FringeCube(FitsProduct):
             self.detector,
             self.metadata,
         )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        images: ArrayLike,
+        wavelength_nm: Any,
+        variance: Any = None,
+        mask: ArrayLike | None = None,
+        *,
+        bandwidth_fwhm_nm: Any = 2.0,
+        temperature_k: Any = 183.15,
+        f_number: Any = np.inf,
+        **fields: Any,
+    ) -> Self:
+        """Cube from plain arrays, or from arrays with astropy units.
+
+        Parameters
+        ----------
+        images : array-like, shape ``(n_wavelengths, ny, nx)``
+            Counts, in ``unit``: electrons unless ``unit="relative"``. Pixels without a number are masked as NO_DATA.
+        wavelength_nm : array-like, shape ``(n_wavelengths,)``
+            Wavelength of each image, in nm; in any order.
+        variance : array-like, shape of ``images``, optional
+            Variance, in the square of ``unit``. By default that of counted electrons, which relative counts do not
+            tell.
+        mask : array-like, integer, optional
+            Planes of `MASK_PLANES`, 0 is good; one ``(ny, nx)`` may stand for all wavelengths.
+        bandwidth_fwhm_nm, temperature_k, f_number : array-like, optional
+            As of `FlatExposures`; by default the light and the sensor of the published flats: 2 nm, 183.15 K,
+            collimated.
+        **fields
+            Further fields of the cube: ``unit``, ``detector``, ``thickness``, ``layer``, ``metadata``.
+
+        Raises
+        ------
+        InputError
+            Shapes that do not belong together, numbers that cannot be, relative counts without their variance.
+        """
+        unit = fields.get("unit", "electron")
+        image = check.as_float_array("images", images, 3, unit="electron" if unit == "electron" else "")
+        if variance is None and unit != "electron":
+            raise InputError("variance", None, f"an array: counts in {unit} do not tell their noise")
+        # Counts below one are read noise: no variance of zero, which would weigh without bound.
+        spread = np.maximum(image, 1.0) if variance is None else variance
+        known = np.zeros(image.shape, CUBE_MASK) if mask is None else np.asarray(mask)
+        if known.shape == image.shape[1:]:
+            known = np.broadcast_to(known, image.shape)
+        return cls(
+            image,
+            spread,
+            _mask_what_is_no_number(image, np.asarray(spread), known),
+            FlatExposures(wavelength_nm, bandwidth_fwhm_nm, temperature_k, f_number),
+            **fields,
+        )
+
+    def __repr__(self) -> str:
+        low, high = self.wavelength_nm.min(), self.wavelength_nm.max()
+        return f"{super().__repr__()[:-1]}, {low:g} to {high:g} nm, {self.unit})"
 
     @classmethod
     def from_flats(
@@ -255,38 +248,8 @@ class FringeCube(FitsProduct):
             metadata={**stack.metadata, **({} if metadata is None else metadata)},
         )
 
-    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
-        """IMAGE, VARIANCE, MASK, EXPOSURES, and THICKNESS, THICKNESS_SIGMA if they are known."""
-        own: list[tuple[str, io.Scalar, str]] = [("DETNAME", self.detector, "sensor")]
-        if self.layer:
-            own.append(("LAYER", self.layer, "layer of THICKNESS"))
-        hdus = [
-            io.primary_hdu("FringeCube", own, io.merge_metadata(self.metadata, metadata, _OWN)),
-            io.image_hdu("IMAGE", self.image, unit=self.unit),
-            io.image_hdu(
-                "VARIANCE", self.variance, unit="electron2" if self.unit == "electron" else "relative2"
-            ),
-            io.mask_hdu(self.mask),
-            self._exposures_hdu(),
-        ]
-        for name, data in (("THICKNESS", self.thickness), ("THICKNESS_SIGMA", self.thickness_sigma)):
-            if data is not None:
-                hdus.append(io.image_hdu(name, data, unit="um", cards=[("LAYER", self.layer, "layer")]))
-        return hdus
-
-    def _exposures_hdu(self) -> fits.BinTableHDU:
-        rows = self.exposures
-        return io.bintable_hdu(
-            "EXPOSURES",
-            [
-                ("wavelength", rows.wavelength_nm, "nm"),
-                ("bandwidth_fwhm", rows.bandwidth_fwhm_nm, "nm"),
-                ("temperature", rows.temperature_k, "K"),
-                ("f_number", rows.f_number, None),
-                ("level", rows.level_e, "electron"),
-                ("dark_time", rows.dark_time_s, "s"),
-            ],
-        )
+    def _extension_cards(self, name: str) -> list[tuple[str, Any, str]]:
+        return [("LAYER", self.layer, "layer")] if name.startswith("THICKNESS") else []
 
     @classmethod
     def read_fits(cls, path: str | os.PathLike[str], *, memmap: bool = False) -> Self:
@@ -307,30 +270,20 @@ class FringeCube(FitsProduct):
         InputError
             No such file, a missing extension or column, a wrong unit; the message names the file.
         """
-        source = str(path)
-        with io.open_fits(path, "FringeCube", memmap=memmap, verify=not memmap) as hdus:
-            header = hdus[0].header
-            image = io.read_image(hdus, "IMAGE", source=source, native=not memmap)
-            variance = io.read_image(hdus, "VARIANCE", source=source, native=not memmap)
-            mask = io.read_mask(hdus, source=source, native=not memmap)
-            if mask.ndim == 2 and image.ndim == 3 and mask.shape == image.shape[1:]:
-                mask = np.broadcast_to(mask, image.shape)
-            maps = {
-                name: io.read_image(hdus, name, source=source) if name in hdus else None
-                for name in ("THICKNESS", "THICKNESS_SIGMA")
-            }
-            return cls(
-                image=image,
-                variance=variance,
-                mask=_mask_what_is_no_number(image, variance, mask),
-                exposures=_read_exposures(hdus, source),
-                unit=io.read_keyword(hdus["IMAGE"].header, "BUNIT", source=source),
-                thickness=maps["THICKNESS"],
-                thickness_sigma=maps["THICKNESS_SIGMA"],
-                layer=_read_layer(hdus),
-                detector=header.get("DETNAME", ""),
-                metadata=io.read_metadata(header, _OWN),
-            )
+        with io.open_fits(path, cls.__name__, memmap=memmap, verify=not memmap) as hdus:
+            return cls(**cls._values(hdus, str(path), native=not memmap))
+
+    @classmethod
+    def _values(cls, hdus: fits.HDUList, source: str, *, native: bool = True) -> dict[str, Any]:
+        values = super()._values(hdus, source, native=native)
+        image, mask = values["image"], values["mask"]
+        if mask.ndim == 2 and image.ndim == 3 and mask.shape == image.shape[1:]:
+            mask = np.broadcast_to(mask, image.shape)
+        return values | {
+            "mask": _mask_what_is_no_number(image, values["variance"], mask),
+            "unit": io.read_keyword(hdus["IMAGE"].header, "BUNIT", source=source),
+            "layer": values["layer"] or _layer_of_map(hdus),
+        }
 
 
 @dataclass
@@ -406,16 +359,6 @@ class _Stack:
         self.mask[plane] = mask
 
 
-def _map(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
-    if values is None:
-        return None
-    array = check.as_float_array(name, values, 2)
-    check.check_shape(name, array, shape)
-    if bool(np.any(array < 0)):
-        raise OutOfRangeError(name, float(np.nanmin(array)), "0 or more, in um")
-    return array
-
-
 def _refuse_amplitudes(image: NDArray[Any], mask: NDArray[Any]) -> None:
     """Refuse counts/mean - 1 where counts/mean belongs: a fit would run on either, and be wrong on one."""
     plane = next((k for k in range(image.shape[0]) if (mask[k] == 0).any()), None)
@@ -439,26 +382,6 @@ def _mask_what_is_no_number(image: NDArray[Any], variance: NDArray[Any], mask: N
     return result
 
 
-def _read_exposures(hdus: fits.HDUList, source: str) -> FlatExposures:
-    if "EXPOSURES" not in hdus or not isinstance(hdus["EXPOSURES"], fits.BinTableHDU):
-        raise FrameFormatError("extension", "no EXPOSURES", "a binary table named EXPOSURES", source=source)
-    table = hdus["EXPOSURES"].data
-    names = {str(name).lower(): str(name) for name in table.names}
-    absent = {"f_number": np.inf, "level": 0.0, "dark_time": 0.0}
-    columns: list[NDArray[Any]] = []
-    for name in ("wavelength", "bandwidth_fwhm", "temperature", "f_number", "level", "dark_time"):
-        if name in names:
-            columns.append(np.array(table[names[name]]))
-        elif name in absent:
-            columns.append(np.array(absent[name]))
-        else:
-            raise FrameFormatError("EXPOSURES", f"no column {name}", "a column of that name", source=source)
-    return FlatExposures(*columns)
-
-
-def _read_layer(hdus: fits.HDUList) -> str:
-    """Name of the layer: from the primary header, or from that of the map."""
-    for header in (hdus[0].header, *(hdus[name].header for name in ("THICKNESS",) if name in hdus)):
-        if "LAYER" in header:
-            return str(header["LAYER"])
-    return ""
+def _layer_of_map(hdus: fits.HDUList) -> str:
+    """Name of the layer where the primary header does not have it."""
+    return str(hdus["THICKNESS"].header.get("LAYER", "")) if "THICKNESS" in hdus else ""

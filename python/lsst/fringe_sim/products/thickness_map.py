@@ -5,23 +5,47 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from astropy.io import fits
+from numpy.typing import NDArray
 
-from ..errors import FrameFormatError, OutOfRangeError
+from ..errors import FrameFormatError, InputError, OutOfRangeError
+from ..resources import open_user_fits, refuse_damage
 from . import _check as check
 from . import _fits as io
-from .fits_product import FitsProduct
+from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
+from .mask import mask_bits
 
-__all__ = ["ThicknessMap"]
+__all__ = ["THICKNESS_LIMITS_UM", "UNKNOWN_SIGMA_UM", "ThicknessMap"]
 
-_OWN = ("DETNAME", "LAYER")
+UNKNOWN_SIGMA_UM = 0.003
+"""Uncertainty of a map that states none."""
+
+THICKNESS_LIMITS_UM = (0.5, 1000.0)
+"""Layers that make fringes in a sensor: a map in nm or mm that does not say so lies outside."""
 
 
-@dataclass(frozen=True, eq=False)
-class ThicknessMap(FitsProduct):
+class _Counts(Image):
+    """Image of whole numbers."""
+
+    def check(self, product: Any, known: Mapping[str, Any]) -> dict[str, Any]:
+        values = getattr(product, self.field)
+        if values is None:
+            return {self.field: None}
+        array = np.asarray(values)
+        if array.dtype.kind not in "iu":
+            raise FrameFormatError(self.name, f"dtype {array.dtype}", "integers")
+        check.check_shape(self.name, array, known["mask"].shape)
+        if bool(np.any(array < 0)) or bool(np.any(array > 2**31 - 1)):
+            raise OutOfRangeError(self.name, int(array.min()), "0 or more")
+        return {self.field: check.read_only(array.astype(np.int32, copy=False))}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ThicknessMap(SensorProduct):
     """Thickness of one layer, pixel by pixel.
 
     Parameters
@@ -65,90 +89,122 @@ class ThicknessMap(FitsProduct):
     n_wavelengths: NDArray[np.int32] | None = None
     detector: str = ""
 
-    def __post_init__(self) -> None:
-        value = check.as_float_array("VALUE", self.value, 2)
-        mask = check.as_mask("MASK", self.mask, value.shape)
-        check.check_good_pixels("VALUE", value, mask)
-        good = mask == 0
-        if bool(np.any((value <= 0) & good)):
-            raise OutOfRangeError("VALUE", float(value[good].min()), "a positive thickness in um")
-        values: dict[str, Any] = {
-            "value": value,
-            "mask": mask,
-            "layer": check.check_name("layer", self.layer, empty=False),
-            "detector": check.check_name("detector", self.detector),
-            "metadata": io.normalise_metadata(self.metadata, _OWN),
-            "n_wavelengths": _counts(self.n_wavelengths, value.shape),
-        }
-        for name in ("sigma", "chi2", "slip_probability"):
-            array = check.as_float_array(name.upper(), getattr(self, name), 2)
-            check.check_shape(name.upper(), array, value.shape)
-            check.check_good_pixels(name.upper(), array, mask, nonnegative=True)
-            values[name] = array
-        if bool(np.any((values["slip_probability"] > 1) & good)):
-            worst = float(values["slip_probability"][good].max())
-            raise OutOfRangeError("SLIP_PROBABILITY", worst, "0 to 1")
-        for name, item in values.items():
-            object.__setattr__(self, name, item)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of the sensor."""
-        return (self.value.shape[0], self.value.shape[1])
-
-    def _hdus(self, metadata: Mapping[str, Any] | None) -> list[Any]:
-        """VALUE, SIGMA, CHI2, SLIP_PROBABILITY, MASK and, if known, N_WAVELENGTHS."""
-        own: list[tuple[str, io.Scalar, str]] = [
-            ("DETNAME", self.detector, "sensor"),
-            ("LAYER", self.layer, "layer"),
-        ]
-        hdus = [
-            io.primary_hdu("ThicknessMap", own, io.merge_metadata(self.metadata, metadata, _OWN)),
-            io.image_hdu("VALUE", self.value, unit="um"),
-            io.image_hdu("SIGMA", self.sigma, unit="um"),
-            io.image_hdu("CHI2", self.chi2, unit=""),
-            io.image_hdu("SLIP_PROBABILITY", self.slip_probability, unit=""),
-            io.mask_hdu(self.mask),
-        ]
-        if self.n_wavelengths is not None:
-            hdus.append(io.image_hdu("N_WAVELENGTHS", self.n_wavelengths, unit=""))
-        return hdus
+    CARDS = (DETECTOR, Card("layer", "LAYER", "layer", kind=str, empty=False))
+    EXTENSIONS = (
+        Image("value", "VALUE", "um"),
+        Image("sigma", "SIGMA", "um", nonnegative=True),
+        Image("chi2", "CHI2", nonnegative=True),
+        Image("slip_probability", "SLIP_PROBABILITY", nonnegative=True),
+        MASK,
+        _Counts("n_wavelengths", "N_WAVELENGTHS", optional=True),
+    )
 
     @classmethod
-    def read_fits(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file that `write_fits` wrote.
+    def read_any(cls, path: str | os.PathLike[str], layer: str | None = None) -> Self:
+        """Read a thickness map that this package, or anybody else, has written.
+
+        The map is the first image of the file, in the unit of length that its BUNIT states, in µm without BUNIT.
+        Pixels without a positive number, and in a file from elsewhere those that an extension MASK marks, become
+        NO_DATA. Where no extension SIGMA states an uncertainty it is `UNKNOWN_SIGMA_UM`.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        layer : `str`, optional
+            Layer that the map must be of, where the file says which it is (LAYER), and is taken for where not.
 
         Raises
         ------
         InputError
-            No such file, another product, or a damaged file; the message names the file.
+            No such file.
+        FrameFormatError
+            A damaged file, another product, no two-dimensional image, a unit that is no length, or numbers that are
+            no thickness in it: the median is within `THICKNESS_LIMITS_UM`.
         """
         source = str(path)
-        with io.open_fits(path, "ThicknessMap") as hdus:
-            header = hdus[0].header
-            counts = None
-            if "N_WAVELENGTHS" in hdus:
-                counts = io.read_image(hdus, "N_WAVELENGTHS", source=source)
-            return cls(
-                value=io.read_image(hdus, "VALUE", source=source),
-                sigma=io.read_image(hdus, "SIGMA", source=source),
-                chi2=io.read_image(hdus, "CHI2", source=source),
-                slip_probability=io.read_image(hdus, "SLIP_PROBABILITY", source=source),
-                mask=io.read_mask(hdus, source=source),
-                layer=io.read_keyword(header, "LAYER", source=source),
-                detector=header.get("DETNAME", ""),
-                n_wavelengths=counts,
-                metadata=io.read_metadata(header, _OWN),
-            )
+        if not Path(path).is_file():
+            raise InputError("file", source, "an existing FITS file")
+        with (
+            refuse_damage("file", "a complete FITS file", source),
+            open_user_fits(path, warning="truncated", memmap=False) as hdus,
+        ):
+            product = hdus[0].header.get(io.PRODUCT_KEY, "")
+            if product == cls.__name__ and _unit_of(hdus, 1) == "um":
+                found = cls.read_fits(path)
+            elif product in ("", cls.__name__):
+                found = cls(**_from_elsewhere(hdus, layer, source))
+            else:
+                raise FrameFormatError(io.PRODUCT_KEY, product, cls.__name__, source=source)
+        return found if layer is None else found.of_layer(layer, source)
+
+    def of_layer(self, layer: str, source: str | None = None) -> Self:
+        """The map itself, if it is of this layer.
+
+        Raises
+        ------
+        InputError
+            It is of another.
+        """
+        if self.layer != layer:
+            where = source or self.detector or None
+            raise InputError("layer of the thickness map", self.layer, layer, source=where)
+        return self
+
+    def known_um(self) -> NDArray[np.float32]:
+        """Thickness [µm], NaN where there is none; what a mask only doubts keeps its value."""
+        missing = self.mask & mask_bits("NO_DATA")
+        return np.where(missing, np.float32(np.nan), self.value).astype(np.float32)
+
+    def _check(self) -> None:
+        good = self.mask == 0
+        if bool(np.any((self.value <= 0) & good)):
+            raise OutOfRangeError("VALUE", float(self.value[good].min()), "a positive thickness in um")
+        if bool(np.any((self.slip_probability > 1) & good)):
+            worst = float(self.slip_probability[good].max())
+            raise OutOfRangeError("SLIP_PROBABILITY", worst, "0 to 1")
 
 
-def _counts(values: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.int32] | None:
-    if values is None:
-        return None
-    array = np.asarray(values)
-    if array.dtype.kind not in "iu":
-        raise FrameFormatError("N_WAVELENGTHS", f"dtype {array.dtype}", "integers")
-    check.check_shape("N_WAVELENGTHS", array, shape)
-    if bool(np.any(array < 0)) or bool(np.any(array > 2**31 - 1)):
-        raise OutOfRangeError("N_WAVELENGTHS", int(array.min()), "0 or more")
-    return check.read_only(array.astype(np.int32, copy=False))
+def _unit_of(hdus: fits.HDUList, number: int) -> str:
+    return str(hdus[number].header.get("BUNIT", "")).strip() if number < len(hdus) else ""
+
+
+def _from_elsewhere(hdus: fits.HDUList, layer: str | None, source: str) -> dict[str, Any]:
+    """Fields of a map in a file of any layout."""
+    number = next((k for k, hdu in enumerate(hdus) if hdu.is_image and hdu.data is not None), -1)
+    data = hdus[number].data if number >= 0 else None
+    if data is None or data.ndim != 2:
+        shape = "no image" if data is None else f"shape {data.shape}"
+        raise FrameFormatError("thickness map", shape, "a two-dimensional image in µm", source=source)
+    value = io.in_unit("thickness map", data.astype(float), _unit_of(hdus, number), "um", source=source)
+    mask = hdus["MASK"].data if "MASK" in hdus else None
+    missing = (
+        ~np.isfinite(value)
+        if mask is None or mask.shape != value.shape
+        else ~np.isfinite(value) | (mask != 0)
+    )
+    if missing.all():
+        raise FrameFormatError("thickness map", "no finite pixel", "a thickness in µm", source=source)
+    low, high = THICKNESS_LIMITS_UM
+    middle = float(np.median(value[~missing]))
+    if not low <= middle <= high:
+        allowed = f"{low:g} to {high:g} µm: state the unit in BUNIT"
+        raise FrameFormatError("median of the thickness map [µm]", middle, allowed, source=source)
+    missing |= ~(np.nan_to_num(value, nan=-1.0) > 0.0)
+    sigma = np.full(value.shape, UNKNOWN_SIGMA_UM)
+    if "SIGMA" in hdus and hdus["SIGMA"].shape == value.shape:
+        unit = hdus["SIGMA"].header.get("BUNIT")
+        sigma = io.in_unit("SIGMA", hdus["SIGMA"].data.astype(float), unit, "um", source=source)
+        missing |= ~(np.isfinite(sigma) & (sigma >= 0.0))
+    headers = (hdus[0].header, hdus[number].header)
+    return {
+        "value": value,
+        "sigma": sigma,
+        "chi2": np.zeros(value.shape),
+        "slip_probability": np.zeros(value.shape),
+        "mask": np.where(missing, mask_bits("NO_DATA"), 0),
+        "layer": next(
+            (str(header["LAYER"]) for header in headers if header.get("LAYER")), layer or "unknown"
+        ),
+        "detector": str(hdus[0].header.get("DETNAME", "")),
+    }

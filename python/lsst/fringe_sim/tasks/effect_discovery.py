@@ -27,7 +27,7 @@ from ..instrument.detector import Detector
 from ..products import FringeCube, FringeFlat, SkyFringe, ThicknessMap
 from .model_config import FringeModelConfig, ModelChoice
 from .quantum import common_header, data_id_of, sensor_of, unusable
-from .sky_model import SkyModelConfig, known_thickness, thickness_input
+from .sky_model import SkyModelConfig, thickness_input
 
 __all__ = [
     "EffectDiscoveryConfig",
@@ -248,7 +248,7 @@ class SkyEffectDiscoveryTask(PipelineTask):
         """
         choice = self.config.choice_of(detector)
         layer = self.config.map_of(thickness, detector)
-        known = known_thickness(layer)
+        known = layer.known_um()
         sky_model = self.config.sky_model(
             detector, float(np.mean([frame.airmass for frame in frames])), known, layer.metadata
         )

@@ -30,7 +30,6 @@ from .quantum import common_header, data_id_of, sensor_of, unusable
 from .sky_model import (
     LINE_LIST,
     SkyModelConfig,
-    known_thickness,
     takes_images,
     thickness_input,
     without_constraint,
@@ -165,7 +164,7 @@ class FringeForecastTask(PipelineTask):
             No map where one is needed; a map of another layer, or fitted with other effects than those configured
             here; a telescope whose beams do not depend on the distance from the axis alone.
         """
-        known = known_thickness(self.config.map_of(thickness, detector))
+        known = self.config.map_of(thickness, detector).known_um()
         model, sky, response = self.config.sky_model(detector, self.config.airmass, known).response()
         if not isinstance(response, SensorResponse):
             raise InputError(

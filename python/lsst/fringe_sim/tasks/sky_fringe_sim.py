@@ -40,7 +40,6 @@ from .sky_model import (
     LINE_LIST,
     SkyModel,
     SkyModelConfig,
-    known_thickness,
     takes_images,
     thickness_input,
     without_constraint,
@@ -218,7 +217,7 @@ class SkyFringeSimTask(PipelineTask):
         layer = self.config.map_of(thickness, detector)
         if choice.left_out:
             self.log.info("%s: on the sky without %s", detector.name, ", ".join(choice.left_out))
-        known = known_thickness(layer)
+        known = layer.known_um()
         sky_model = self.config.sky_model(detector, exposure.airmass, known, layer.metadata)
         model, sky, response = sky_model.response()
         scale = self._band_scale(exposure, sky.lines)

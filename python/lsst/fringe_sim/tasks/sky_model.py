@@ -23,14 +23,13 @@ from ..instrument.detector import Detector
 from ..instrument.sky import EmissionLines, SkySpectrum
 from ..model import FringeModel, Setup
 from ..model.provenance import effects_of_header
-from ..products import SensorSection, ThicknessMap, mask_bits
+from ..products import SensorSection, ThicknessMap
 from .model_config import FringeModelConfig, ModelChoice
 
 __all__ = [
     "LINE_LIST",
     "SkyModel",
     "SkyModelConfig",
-    "known_thickness",
     "takes_images",
     "thickness_input",
     "without_constraint",
@@ -205,12 +204,6 @@ class SkyModelConfig(FringeModelConfig):
         )
 
 
-def known_thickness(thickness: ThicknessMap) -> NDArray[np.float32]:
-    """Thickness [µm], NaN where the map has none."""
-    missing = thickness.mask & mask_bits("NO_DATA")
-    return np.where(missing, np.float32(np.nan), thickness.value).astype(np.float32)
-
-
 def thickness_input() -> Input:
     """Connection to a thickness map of each sensor."""
     return Input(
@@ -247,8 +240,7 @@ def _range_of(thickness_um: NDArray[np.float32]) -> tuple[float, float]:
 def _check_map(thickness: ThicknessMap, choice: ModelChoice) -> None:
     """Refuse a map that means something else than the model takes it for."""
     varying = Setup.from_name(choice.setup).varying
-    if thickness.layer != varying:
-        raise InputError("layer of the thickness map", thickness.layer, varying)
+    thickness.of_layer(varying)
     if "SETUP" not in thickness.metadata:
         return  # not fitted here
     fitted = effects_of_header(thickness.metadata)

@@ -10,11 +10,11 @@ import pytest
 
 from lsst.fringe_sim.algorithms.discovery import Verdict
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, Where
+from lsst.fringe_sim.challenge.oracle import Oracle, Visibility
+from lsst.fringe_sim.challenge.result import VISIBLE, CaseResult
+from lsst.fringe_sim.challenge.run import judge, run_challenge
+from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.errors import InputError, UnknownNameError
-from lsst.fringe_sim.mock.challenge import judge, run_challenge
-from lsst.fringe_sim.mock.oracle import Oracle, Visibility
-from lsst.fringe_sim.mock.sealed_cases import SealedCase, draw_case
-from lsst.fringe_sim.products.challenge_result import VISIBLE, CaseResult
 
 
 def _verdict(*effects: NamedEffect) -> Verdict:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lsst.fringe_sim.products.challenge_result import CaseResult, ChallengeResult
-from lsst.fringe_sim.report.challenge_page import confusion_figure, write_challenge_report
+from lsst.fringe_sim.challenge.page import confusion_figure, write_challenge_report
+from lsst.fringe_sim.challenge.result import CaseResult, ChallengeResult
 
 CASE = CaseResult(
     0, "one", ("roughness",), {}, "named", ("bandwidth",), (("roughness",),), True, False, 50.0, 50.0, 0.99, 0.7,

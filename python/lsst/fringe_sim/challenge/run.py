@@ -21,8 +21,8 @@ import numpy as np
 
 from ..algorithms.discovery import SearchOptions, Verdict, discover
 from ..effects import EFFECTS
-from ..products.challenge_result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
 from .oracle import Oracle, visibility
+from .result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
 from .sealed_cases import SealedCase, draw_case
 
 __all__ = ["judge", "run_challenge"]

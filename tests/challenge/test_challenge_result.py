@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from lsst.fringe_sim.challenge.result import CaseResult, ChallengeResult
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.products.challenge_result import CaseResult, ChallengeResult
 
 RIGHT = CaseResult(
     0, "one", ("roughness",), {"roughness.sigma": 40.0}, "named", ("roughness",), ((),), True, True, 50.0, 50.0,

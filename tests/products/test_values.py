@@ -4,12 +4,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.table import Table
 from hypothesis import given
 from hypothesis import strategies as st
-from product_makers import MAKERS, components, cube, flat, frame, masks, pixels, sky, thickness
+from hypothesis.extra.numpy import arrays
+from product_makers import MAKERS, cube, flat, masks, pixels, sky
 
 from lsst.fringe_sim.errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError
-from lsst.fringe_sim.products import FlatExposures, FringeCube
+from lsst.fringe_sim.products import (
+    MASK_PLANES,
+    FlatExposures,
+    FringeCube,
+    SkyFrames,
+    describe_mask,
+    mask_bits,
+)
+from lsst.fringe_sim.products.mask import ALL_BITS, planes_from_header, remap_mask
 
 GOOD = np.zeros((3, 4), dtype=int)
 
@@ -249,6 +260,131 @@ def test_sky_fraction_is_the_same_from_either_unit() -> None:
     np.testing.assert_allclose(electrons.fraction(), fraction.fraction(), rtol=0, atol=3e-7)
 
 
-def test_every_maker_makes_a_good_product() -> None:
-    for maker in (flat, cube, thickness, frame, components, sky):
-        maker((2, 2), 7)
+@pytest.mark.parametrize(
+    ("changes", "field", "expected"),
+    [
+        ({"wavelength_nm": 0.96 * u.um}, "wavelength_nm", 960.0),
+        ({"dark_time_s": 0.5 * u.min}, "dark_time_s", 30.0),
+        ({"level_e": 2e4 * u.electron}, "level_e", 2e4),
+        ({"f_number": u.Quantity(2.5)}, "f_number", 2.5),
+    ],
+)
+def test_quantities_are_converted(changes: dict[str, Any], field: str, expected: float) -> None:
+    assert getattr(flat(**changes), field) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: flat(wavelength_nm=183.0 * u.K),
+        lambda: flat(f_number=2.5 * u.nm),
+        lambda: flat(image=pixels((3, 4), 1) * u.electron, mask=GOOD),
+        lambda: flat(mask=GOOD * u.nm),
+        lambda: cube(thickness=np.full((3, 4), 14.0) * u.s),
+        lambda: cube(image=np.ones((2, 3, 4)) * u.um),
+        lambda: FlatExposures([960.0] * u.K, 2.0, 183.0),
+        lambda: FlatExposures([960.0 * u.nm, 970.0 * u.nm], 2.0, 183.0),
+    ],
+)
+def test_quantities_of_another_kind_are_refused(make: Any) -> None:
+    with pytest.raises(InputError):
+        make()
+
+
+def test_a_cube_from_arrays() -> None:
+    images = np.full((2, 3, 4), 2e4)
+    images[1, 0, :2] = np.nan
+    rows = Table({"w": [0.96, 0.97] * u.um})
+    made = FringeCube.from_arrays(images, rows["w"], mask=np.eye(3, 4, dtype=int), detector="R11_S01")
+    np.testing.assert_allclose(made.wavelength_nm, [960.0, 970.0])
+    assert list(made.mask[1, 0, :3]) == [mask_bits("BAD"), mask_bits("NO_DATA"), 0]
+    np.testing.assert_array_equal(made.variance[0], images[0])
+    assert repr(made) == "FringeCube(2 x 3 x 4, detector='R11_S01', 960 to 970 nm, electron)"
+    with pytest.raises(InputError, match="do not tell their noise"):
+        FringeCube.from_arrays(np.ones((2, 3, 4)), [960.0, 970.0], unit="relative")
+    with pytest.raises(InputError, match="bandwidth_fwhm"):
+        FringeCube.from_arrays(images, [960.0, 970.0], bandwidth_fwhm_nm=-1.0)
+
+
+def test_sky_frames_from_arrays() -> None:
+    images, layer = np.full((2, 3, 4), 2e3), np.full((3, 4), 14_000.0) * u.nm
+    images[0, 0, 0] = np.nan
+    made = SkyFrames.from_arrays(images, layer, hour=[24.0, 25.0], detector="R22_S11")
+    np.testing.assert_allclose(made.thickness_um, 14.0)
+    assert [frame.hour for frame in made.frames] == [24.0, 25.0]
+    assert made.frames[0].mask[0, 0] == mask_bits("NO_DATA")
+    assert made.frames[1].mean_electrons == pytest.approx(2e3)
+    assert repr(made) == "SkyFrames(2 x 3 x 4, detector='R22_S11', layer='adhesive')"
+    with pytest.raises(FrameFormatError, match="thickness map"):
+        SkyFrames.from_arrays(np.ones((2, 4, 4)), layer)
+    with pytest.raises(InputError, match="one sensor"):
+        SkyFrames([sky(), sky(detector="R11_S01")], made.thickness)
+
+
+AFW_PLANES = {
+    "BAD": 0,
+    "SAT": 1,
+    "INTRP": 2,
+    "CR": 3,
+    "EDGE": 4,
+    "DETECTED": 5,
+    "DETECTED_NEGATIVE": 6,
+    "SUSPECT": 7,
+    "NO_DATA": 8,
+}
+
+
+def test_the_planes_of_afw_keep_their_bits() -> None:
+    assert {name: MASK_PLANES[name] for name in AFW_PLANES} == AFW_PLANES
+    assert len(set(MASK_PLANES.values())) == len(MASK_PLANES)
+    assert min(set(MASK_PLANES.values()) - set(AFW_PLANES.values())) > max(AFW_PLANES.values())
+
+
+def test_every_plane_fits_into_the_narrow_mask_of_a_cube() -> None:
+    assert np.iinfo(np.int16).max >= ALL_BITS
+
+
+def test_bits_add_up_and_repeat_harmlessly() -> None:
+    assert mask_bits() == 0
+    assert mask_bits("SAT", "EDGE", "SAT") == 2 + 16
+
+
+def test_unknown_plane_offers_the_near_one() -> None:
+    with pytest.raises(UnknownNameError, match="did you mean NO_DATA"):
+        mask_bits("NODATA")
+
+
+@given(st.permutations(list(MASK_PLANES)), st.data())
+def test_remap_follows_names_not_bits(order: list[str], data: st.DataObject) -> None:
+    bits = data.draw(st.lists(st.integers(0, 30), min_size=len(order), max_size=len(order), unique=True))
+    planes = dict(zip(order, bits, strict=True))
+    chosen = data.draw(st.lists(st.sampled_from(order), min_size=6, max_size=6))
+    stored = np.array([1 << planes[name] for name in chosen], dtype=np.int32).reshape(2, 3)
+    expected = np.array([mask_bits(name) for name in chosen], dtype=np.int32).reshape(2, 3)
+    np.testing.assert_array_equal(remap_mask(stored, planes), expected)
+
+
+@given(arrays(np.int32, (3, 4), elements=st.integers(0, ALL_BITS)))
+def test_describe_counts_each_plane(mask: np.ndarray) -> None:
+    for name, count in describe_mask(mask).items():
+        assert count == sum(bool(value & mask_bits(name)) for value in mask.flat) > 0
+
+
+def test_a_bit_without_a_name_is_refused() -> None:
+    with pytest.raises(FrameFormatError, match="0x4"):
+        remap_mask(np.array([[4]]), {"BAD": 0, "SAT": 1})
+
+
+@pytest.mark.parametrize(
+    ("header", "error"),
+    [
+        ({"MP_COSMIC": 3}, UnknownNameError),
+        ({"MP_BAD": 31}, FrameFormatError),
+        ({"MP_BAD": True}, FrameFormatError),
+        ({"MP_BAD": "0"}, FrameFormatError),
+        ({"MP_BAD": 1, "MP_SAT": 1}, FrameFormatError),
+    ],
+)
+def test_headers_that_name_planes_badly(header: dict[str, object], error: type[Exception]) -> None:
+    with pytest.raises(error):
+        planes_from_header(header)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.mock.oracle import visibility
-from lsst.fringe_sim.mock.sealed_cases import CASE_KINDS, SealedCase, draw_case, expose
+from lsst.fringe_sim.challenge.oracle import visibility
+from lsst.fringe_sim.challenge.sealed_cases import CASE_KINDS, SealedCase, draw_case, expose
 from lsst.fringe_sim.mock.thickness import random_field
 
 

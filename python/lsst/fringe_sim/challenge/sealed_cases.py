@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from ..errors import InputError, UnknownNameError
-from ..products.challenge_result import CASE_KINDS
+from ..mock.hidden_effects import AmplifierState, HiddenEffect, validate_effects, with_hidden_optics
+from ..mock.optics import FlatFieldOptics
+from ..mock.raw_files import exposure_time
+from ..mock.raw_frames import setup_optics
+from ..mock.sensor_signal import SensorSignal
+from ..mock.thickness import random_field
 from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
-from .hidden_effects import AmplifierState, HiddenEffect, validate_effects, with_hidden_optics
-from .optics import FlatFieldOptics
-from .raw_files import exposure_time
-from .raw_frames import setup_optics
-from .sensor_signal import SensorSignal
-from .thickness import random_field
+from .result import CASE_KINDS
 
 __all__ = ["OUTSIDERS", "SIZES", "SealedCase", "draw_case", "expose"]
 

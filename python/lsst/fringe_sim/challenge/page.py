@@ -10,9 +10,9 @@ from astropy.table import Table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..products.challenge_result import VISIBLE, ChallengeResult
-from .page import Report
-from .style import LINES, SEQUENTIAL, figure
+from ..report.page import Report
+from ..report.style import LINES, SEQUENTIAL, figure
+from .result import VISIBLE, ChallengeResult
 
 __all__ = [
     "accuracy_figure",
