@@ -13,19 +13,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import lsst.fringe_sim
+from lsst.fringe_sim.compiled import subkernel
 
 PACKAGE = Path(lsst.fringe_sim.__file__).parent
 
 
-def compiled(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef, set[str]]]:
-    """Every function of a module that is compiled with numba, and the names of the options."""
+def compiled(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef, str, set[str]]]:
+    """Every function of a module that is compiled, the name of its decorator, and its options."""
     for node in tree.body:
         for decorator in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
             call = decorator.func if isinstance(decorator, ast.Call) else decorator
-            if ast.unparse(call) in ("numba.njit", "njit"):
+            name = ast.unparse(call).rpartition(".")[2]
+            if name in ("njit", "jit", "vectorize", "guvectorize", "kernel", "subkernel"):
                 options = decorator.keywords if isinstance(decorator, ast.Call) else []
                 assert isinstance(node, ast.FunctionDef)
-                yield node, {str(item.arg) for item in options}
+                yield node, name, {str(item.arg) for item in options}
 
 
 def called(function: ast.FunctionDef) -> set[str]:
@@ -48,20 +50,35 @@ def imported(tree: ast.Module) -> set[tuple[str, str]]:
     }
 
 
-def test_freely_rounded_functions_are_parts_of_their_callers() -> None:
-    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+def in_compiled_functions(trees: dict[Path, ast.Module]) -> set[tuple[str, str]]:
+    """Last word of the module, and name, of all that compiled functions call."""
     used: set[tuple[str, str]] = set()
     for path, tree in trees.items():
-        names = {name for function, _ in compiled(tree) for name in called(function)}
+        names = {name for function, _, _ in compiled(tree) for name in called(function)}
         used |= {(path.stem, name) for name in names}
         used |= {(module, name) for module, name in imported(tree) if name in names}
+    return used
+
+
+def test_freely_rounded_functions_are_parts_of_their_callers() -> None:
+    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+    used = in_compiled_functions(trees)
     assert len(used) > 50
     offenders = [
         f"{path.relative_to(PACKAGE)}: {function.name}"
         for path, tree in trees.items()
-        for function, options in compiled(tree)
-        if {"fastmath", "cache"} <= options
-        and not {"inline", "forceinline"} & options
-        and (path.stem, function.name) in used
+        for function, decorator, options in compiled(tree)
+        if (path.stem, function.name) in used
+        and (
+            (decorator == "kernel" and "relaxed" in options)
+            or ({"fastmath", "cache"} <= options and not {"inline", "forceinline"} & options)
+        )
     ]
     assert offenders == []
+
+
+def test_a_relaxed_subkernel_is_put_into_what_calls_it() -> None:
+    for options in ({"relaxed": True}, {"relaxed": True, "expand": True}):
+        compiled_with = subkernel(lambda x: x, **options).targetoptions
+        assert compiled_with["fastmath"]
+        assert compiled_with.get("forceinline") or compiled_with.get("inline") == "always"

@@ -14,6 +14,7 @@ ROOT = "lsst.fringe_sim"
 ORDER = (
     "errors",
     "files",
+    "compiled",
     "resources",
     "optics",
     "instrument",
@@ -23,13 +24,14 @@ ORDER = (
     "algorithms",
 )
 ALLOWED: dict[str, set[str]] = {room: set(ORDER[: i + 1]) for i, room in enumerate(ORDER)}
-ALLOWED["mock"] = {"errors", "files", "resources", "instrument", "effects", "mock"}
+ALLOWED["mock"] = {"errors", "files", "compiled", "resources", "instrument", "effects", "mock"}
 ALLOWED["middleware"] = {"errors", "files", "resources", "instrument", "products", "middleware"}
 ALLOWED["tasks"] = set(ORDER) | {"middleware", "tasks"}
 ALLOWED["paper"] = set(ORDER) | {"mock", "paper"}
 ALLOWED["report"] = {
     "errors",
     "files",
+    "compiled",
     "resources",
     "optics",
     "instrument",

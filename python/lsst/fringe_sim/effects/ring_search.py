@@ -7,10 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+
+from ..compiled import kernel
 
 __all__ = ["Rings", "find_rings"]
 
@@ -196,7 +197,7 @@ def _strongest(part: _Samples, centres: FloatArray) -> tuple[FloatArray, FloatAr
     return power, period
 
 
-@numba.njit(cache=True)
+@kernel
 def _radial_sums(
     y: FloatArray, x: FloatArray, value: FloatArray, centres: FloatArray, width: float, bins: int
 ) -> FloatArray:  # pragma: no cover - compiled

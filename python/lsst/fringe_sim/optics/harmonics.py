@@ -28,6 +28,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from ..compiled import subkernel
+
 __all__ = ["MOST_RATIO", "ROUNDING", "series_at", "series_on_grid"]
 
 FloatArray = NDArray[np.float64]
@@ -194,7 +196,7 @@ def _segment(
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subkernel
 def _harmonic(
     m: int,
     a: float,
@@ -281,7 +283,7 @@ def _gridding_kernel(
         _grid_group(rule, own, spread, where, step, order, grid[group], constant[group])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subkernel
 def _grid_group(
     rule: _Gridding,
     nodes: tuple[NDArray, ...],
@@ -353,7 +355,7 @@ def _grid_group(
                 break
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subkernel
 def _transparent_sum(
     s: float, c: complex, h: complex, kr: float, spread: float, where: float, order: int
 ) -> float:  # pragma: no cover - compiled

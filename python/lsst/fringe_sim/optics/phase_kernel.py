@@ -6,6 +6,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ..compiled import subkernel
+
 __all__ = ["reduce_nodes"]
 
 
@@ -103,14 +105,14 @@ _BLOCKS = 64
 """Shares of the nodes that threads take one after the other."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subkernel
 def _inverse(value: complex) -> complex:  # pragma: no cover - compiled
     """1 / value, of the order of one, where no care for overflow is needed."""
     size = value.real * value.real + value.imag * value.imag
     return complex(value.real / size, -value.imag / size)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subkernel
 def _admittances(
     index: NDArray, theta: float, p_polarized: bool, normal: NDArray, admittance: NDArray
 ) -> None:  # pragma: no cover - compiled
@@ -129,14 +131,14 @@ def _admittances(
         admittance[layer] = squared * _inverse(normal[layer]) if p_polarized else normal[layer]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subkernel
 def _travelled(phase: complex) -> complex:  # pragma: no cover - compiled
     """exp(i phase)."""
     size = 1.0 if phase.imag == 0.0 else np.exp(-phase.imag)
     return complex(size * np.cos(phase.real), size * np.sin(phase.real))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subkernel
 def _interfaces(
     normal: NDArray, admittance: NDArray, roughness: NDArray, wave: float, down: NDArray, up: NDArray
 ) -> None:  # pragma: no cover - compiled
@@ -160,7 +162,7 @@ def _interfaces(
             up[1, face] *= through
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subkernel
 def _sweep(
     along: NDArray,
     against: NDArray,
@@ -204,7 +206,7 @@ def _sweep(
     return seen[0, first]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@subkernel
 def _flux(forward: complex, backward: complex, admittance: complex) -> float:  # pragma: no cover - compiled
     """Energy flow along ``forward``."""
     return ((forward + backward) * np.conj(admittance * (forward - backward))).real

@@ -19,6 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..compiled import kernel
 from ..errors import ConvergenceError, InputError, OutOfRangeError
 from .coherence import phase_states
 from .harmonics import MOST_RATIO, ROUNDING, series_at, series_on_grid
@@ -410,7 +411,7 @@ def _derivative_kernel(
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel
 def _bound_kernel(
     a: NDArray,
     b: NDArray,

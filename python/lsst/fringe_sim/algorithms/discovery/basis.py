@@ -6,12 +6,13 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from ...compiled import kernel
 
 __all__ = ["CellBasis", "FieldBasis", "NormalMatrix", "SplineBasis"]
 
@@ -257,7 +258,7 @@ def _first_nonzero(basis: FloatArray) -> NDArray[np.int64]:
     return first
 
 
-@numba.njit(cache=True)
+@kernel
 def _assemble(
     along_y: FloatArray,
     along_x: FloatArray,

@@ -11,6 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ...compiled import subkernel
 from ...effects import ActiveEffect, Effect, ImageGeometry, activate_effects, apply_to_image
 from ...model import FringeModel
 from ...optics.illumination import Illumination
@@ -749,7 +750,7 @@ def _move_to_centroids(
             value[row, i] += slope[row, i] * moved
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@subkernel(expand=True)
 def _add_lookup(value, slope, column, position, weight, step):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Add the Lagrange polynomial through four nodes, and its derivative, at one place, all wavelengths."""
     # Cells without data may be anywhere; beyond the table they stay at its ends.
@@ -765,7 +766,7 @@ def _add_lookup(value, slope, column, position, weight, step):  # type: ignore[n
         slope[w] += weight * (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@subkernel(expand=True)
 def _add_series(value, slope, column, position, half, rest, step):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """The same with moments that no spread has: they are taken into the nodes, by second and fourth differences."""
     inside = min(max(position, 3.0), column.shape[0] - 4.0)
@@ -787,7 +788,7 @@ def _add_series(value, slope, column, position, half, rest, step):  # type: igno
         slope[w] += (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
 
 
-@numba.njit(cache=True, inline="always")
+@subkernel(expand=True)
 def _spread_node(a, b, c, d, e, half, rest):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Node ``c`` of five averaged over a spread of variance ``2 half`` and fourth moment ``24 rest``."""
     second = (16.0 * (b + d) - a - e - 30.0 * c) / 12.0

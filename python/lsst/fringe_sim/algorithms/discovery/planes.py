@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
+from ...compiled import subkernel
 from ...model import FringeModel
 from .cells import CellData
 from .start import SEARCH_STEP_UM, order_steps, robust_surface, search_template
@@ -198,7 +199,7 @@ def _common_move(curves: NDArray[np.float32], height: FloatArray, reach: int) ->
     return float(int(np.argmax(totals)) - reach)
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@subkernel
 def _gain(
     cross: NDArray[np.float32],
     square: NDArray[np.float32],
@@ -216,7 +217,7 @@ def _gain(
     return one * one / two if one > 0.0 else 0.0
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True)
+@subkernel
 def _plane(
     top: int,
     left: int,

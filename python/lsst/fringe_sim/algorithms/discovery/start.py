@@ -12,6 +12,7 @@ from scipy.ndimage import binary_closing, median, median_filter, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ...compiled import kernel, subkernel
 from ...model import FringeModel
 from .basis import SplineBasis
 from .cells import CellData
@@ -504,7 +505,7 @@ def _cliffs(field: NDArray[np.int64], order: float) -> int:
     return sum(int((np.abs(np.diff(field, 2, axis=axis)) > 0.6 * order).sum()) for axis in (0, 1))
 
 
-@numba.njit(cache=True)
+@kernel
 def _grow(
     score: NDArray[np.float32], rows: int, columns: int, reach: int
 ) -> NDArray[np.int64]:  # pragma: no cover - compiled
@@ -556,7 +557,7 @@ def _grow(
     return best
 
 
-@numba.njit(cache=True)
+@subkernel
 def _choose(
     score: NDArray[np.float32], best: NDArray[np.int64], rows: int, columns: int, i: int, reach: int
 ) -> int:  # pragma: no cover - compiled

@@ -7,10 +7,10 @@ for every neighbour from which it would be torn off.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ...compiled import kernel, subkernel
 from .amplitudes import Amplitudes
 from .newton import gauss_newton
 from .pixels import PixelFit
@@ -98,13 +98,13 @@ def gather_pixels(
     return value, weight
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@subkernel(expand=True)
 def _jump_price(jump, order):  # type: ignore[no-untyped-def]
     share = 2.0 * jump / order
     return _PRICE * min(share * share, 1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sweep(  # type: ignore[no-untyped-def]
     value, weight, freedom, rows, columns, table, start, step, order, temper,
     thickness, sigma, reduced, slip, backwards,

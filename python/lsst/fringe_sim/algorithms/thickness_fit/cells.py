@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...compiled import kernel, run_threaded, subkernel
 from ...errors import InputError
 from .amplitudes import Amplitudes
 from .medians import middle_of
@@ -32,7 +31,6 @@ __all__ = [
     "sample_pixels",
 ]
 
-_MATH = {"reassoc", "contract", "arcp", "nsz"}
 _SPIKE_SIGMA = 6.0
 """A row or column of a cell this many standard deviations off its neighbours is thrown out."""
 _FINEST_PERIOD_PX = 24.0
@@ -268,30 +266,13 @@ def sample_pixels(data: Amplitudes, most: int = 200_000) -> Cells:
     return Cells(value, weight, none, none, np.append(rows, ny), np.append(columns, nx))
 
 
-def run_threaded(work: Any, count: int, threads: int) -> None:
-    """Call ``work(i)`` for every ``i < count``; each call writes to its own place, so order does not matter."""
-    if threads <= 1 or count <= 1:
-        for item in range(count):
-            work(item)
-        return
-    # Interleaved shares: neighbouring strips cost about the same.
-    with ThreadPoolExecutor(threads) as pool:
-        for job in [pool.submit(_share, work, first, count, threads) for first in range(threads)]:
-            job.result()
-
-
-def _share(work: Any, first: int, count: int, threads: int) -> None:
-    for item in range(first, count, threads):
-        work(item)
-
-
 def core(array: NDArray[Any]) -> NDArray[Any]:
     """Contiguous array with broadcast axes shrunk to length 1, which is how kernels know them."""
     part = array[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in array.strides)]
     return np.ascontiguousarray(part)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
+@subkernel(relaxed=True, expand=True)
 def _usable(image, variance, bad, scale, square):  # type: ignore[no-untyped-def]
     """Amplitude and variance of one sample, zeros if it cannot be used; without a branch."""
     amplitude = image * scale - np.float32(1.0)
@@ -301,7 +282,7 @@ def _usable(image, variance, bad, scale, square):  # type: ignore[no-untyped-def
     return (amplitude if good else np.float32(0.0)), (spread if good else np.float32(0.0))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
+@subkernel(relaxed=True, expand=True)
 def load_row(image, variance, bad, scale, value, spread):  # type: ignore[no-untyped-def]
     """Amplitude and variance of one row; variance 0 marks what cannot be used.
 
@@ -323,7 +304,7 @@ def load_row(image, variance, bad, scale, value, spread):  # type: ignore[no-unt
             value[x], spread[x] = _usable(image[x], variance[0], bad[0], scale, square)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@kernel(relaxed=True)
 def _average_strip(  # type: ignore[no-untyped-def]
     image, variance, bad, scale, curvature, x_edges, inflation, correlated, out, out_weight, rise_y, rise_x
 ):
@@ -405,7 +386,7 @@ def _average_strip(  # type: ignore[no-untyped-def]
             out_weight[c, band] = count * count / (var * inflation)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@subkernel(expand=True)
 def _tolerance(noise, count, correlated, curvature):  # type: ignore[no-untyped-def]
     """Second difference of line means up to which no line of a filled cell is rejected.
 
@@ -416,7 +397,7 @@ def _tolerance(noise, count, correlated, curvature):  # type: ignore[no-untyped-
     return np.float32(_SPIKE_SIGMA * sigma * np.sqrt(6.0) + 2.0 * curvature)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@subkernel(expand=True)
 def _bend(line):  # type: ignore[no-untyped-def]
     """Largest second difference."""
     most = np.float32(0.0)
@@ -425,7 +406,7 @@ def _bend(line):  # type: ignore[no-untyped-def]
     return most
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@subkernel(expand=True)
 def _half_slope(line):  # type: ignore[no-untyped-def]
     """Mean of the upper half less mean of the lower half, over the distance of the two."""
     size = line.shape[0]
@@ -439,7 +420,7 @@ def _half_slope(line):  # type: ignore[no-untyped-def]
     return (high - low) / np.float32(half * (size - half))
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _reject(total, count, size, noise, correlated, curvature, keep):  # type: ignore[no-untyped-def]
     """Mark lines whose mean does not lie between its neighbours; returns how many.
 
@@ -473,7 +454,7 @@ def _reject(total, count, size, noise, correlated, curvature, keep):  # type: ig
     return rejected
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _miss_ratio(total, count, size, noise, correlated, curvature, keep, k):  # type: ignore[no-untyped-def]
     """How far a line is from where its neighbours put it, in units of what is tolerated."""
     before = k - 1
@@ -502,7 +483,7 @@ def _miss_ratio(total, count, size, noise, correlated, curvature, keep, k):  # t
     return abs(total[k] / count[k] - predicted) / (_SPIKE_SIGMA * sigma + bend)
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _slope(total, count, size, keep):  # type: ignore[no-untyped-def]
     """Slope of the line means: upper half less lower half, over the distance of the two halves [1/px]."""
     middle = 0.5 * (size - 1.0)
@@ -522,7 +503,7 @@ def _slope(total, count, size, keep):  # type: ignore[no-untyped-def]
     return (high / high_n - low / low_n) / (high_at / high_n - low_at / low_n)
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _median(total, count, size, keep):  # type: ignore[no-untyped-def]
     means = np.empty(size, np.float32)
     number = 0

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from .cells import Cells, run_threaded
+from ...compiled import kernel, run_threaded, subkernel
+from .cells import Cells
 from .newton import gauss_newton
 from .templates import FringeTemplates, arc_length_nodes
 
@@ -28,7 +28,6 @@ __all__ = [
     "refine_row",
 ]
 
-_MATH = {"reassoc", "contract", "arcp", "nsz"}
 NODES_PER_ORDER = 16
 """Templates in one fringe order: the least chi-square from a parabola is then good to 2e-4 of its swing."""
 EVIDENCE_CAP = 30.0
@@ -183,7 +182,7 @@ def _distrust_misfits(evidence: NDArray[np.float32], chi2: NDArray[np.float32]) 
     evidence[worse] *= np.where(inside, (limit / chi2[worse])[:, None] ** 2, np.float32(1))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
+@subkernel(relaxed=True)
 def _chi2_line(value, weight, nodes, chi2):  # type: ignore[no-untyped-def]
     count = chi2.shape[0]
     used = 0
@@ -200,7 +199,7 @@ def _chi2_line(value, weight, nodes, chi2):  # type: ignore[no-untyped-def]
     return used
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _vertex(place, chi2, k):  # type: ignore[no-untyped-def]
     """Place and value of the least of the parabola through nodes ``k-1, k, k+1``."""
     if k == 0 or k == chi2.shape[0] - 1:
@@ -215,7 +214,7 @@ def _vertex(place, chi2, k):  # type: ignore[no-untyped-def]
     return place[k] + move, chi2[k] + move * (slope + curvature * move)
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _minima(place, chi2, marks, where, depth):  # type: ignore[no-untyped-def]
     """Every local least of chi-square; returns how many.
 
@@ -240,7 +239,7 @@ def _minima(place, chi2, marks, where, depth):  # type: ignore[no-untyped-def]
     return number
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _polish(table, start, step, value, weight, item, slack, where, depth, number):  # type: ignore[no-untyped-def]
     """Refine the deepest minima on the full table; returns the deepest of them."""
     done = np.zeros(number, np.bool_)
@@ -261,7 +260,7 @@ def _polish(table, start, step, value, weight, item, slack, where, depth, number
     return best
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _project(table, place, rise, weight, item):  # type: ignore[no-untyped-def]
     """Slope of the thickness that gives a slope of the amplitudes, in steps of the table per pixel."""
     below = min(max(int(place), 0), table.shape[0] - 2)
@@ -273,7 +272,7 @@ def _project(table, place, rise, weight, item):  # type: ignore[no-untyped-def]
     return gain / information if information > 0.0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _search(value, weight, item, nodes, place, table, start, step, low, high, chi2, marks, where, depth):  # type: ignore[no-untyped-def]
     """Minima between two nodes; returns the wavelengths used, the number of minima and the deepest of them."""
     part = chi2[: high - low]
@@ -290,7 +289,7 @@ def _search(value, weight, item, nodes, place, table, start, step, low, high, ch
     return used, number, at
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _evidence_row(  # type: ignore[no-untyped-def]
     value, weight, rise_y, rise_x, nodes, place, table, start, step, order, temper,
     stride, centre, reach, limit,
@@ -381,7 +380,7 @@ def refine_cells(
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def refine_row(value, weight, table, start, step, thickness, out):  # type: ignore[no-untyped-def]
     """Least chi-square of every cell of a row near its thickness."""
     for c in range(value.shape[0]):

@@ -7,17 +7,17 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ...compiled import kernel, run_threaded
 from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ...model import FringeModel
 from ...optics.system import OBSERVABLES
 from ...products import FringeCube, ThicknessMap, mask_bits
 from ..thickness_fit_options import FIT_METHODS
 from .amplitudes import Amplitudes
-from .cells import run_threaded, sample_pixels
+from .cells import sample_pixels
 from .global_fit import global_fit, normalise_to_cells, spans_orders
 from .guo2022 import walk_fit
 from .islands import fit_islands
@@ -279,7 +279,7 @@ def _assemble(
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _flag_rows(used, sigma, chi2, slip, limit, slip_limit, bits, mask):  # type: ignore[no-untyped-def]
     """Mask planes of some rows; ``bits`` are those of NO_DATA, LOW_SIGNAL, SLIP and SUSPECT."""
     for r in range(used.shape[0]):

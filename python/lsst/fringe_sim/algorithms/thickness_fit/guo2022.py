@@ -8,19 +8,16 @@ other way from the first pixel. A pixel that slips takes every later pixel with 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ...compiled import kernel, run_threaded, subkernel
 from ...errors import InputError, OutOfRangeError
 from .amplitudes import Amplitudes
-from .cells import run_threaded
 from .pixels import PixelFit
 from .templates import FringeTemplates
 
 __all__ = ["walk_fit"]
-
-_MATH = {"reassoc", "contract", "arcp", "nsz"}
 
 
 def walk_fit(
@@ -101,7 +98,7 @@ def _paths(ny: int, nx: int, row: int, column: int) -> tuple[NDArray[np.int64], 
     return forward, backward
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
+@subkernel(relaxed=True)
 def _load(image, variance, bad, scale, y, x, value, weight):  # type: ignore[no-untyped-def]
     """Amplitudes and weights of one pixel; returns the number of wavelengths that can be used."""
     used = 0
@@ -118,7 +115,7 @@ def _load(image, variance, bad, scale, y, x, value, weight):  # type: ignore[no-
     return used
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
+@subkernel(relaxed=True)
 def _search(table, value, weight, low, high, chi2):  # type: ignore[no-untyped-def]
     """Row of least chi-square in ``low..high`` (both included); the first of equals."""
     count = high - low + 1
@@ -140,7 +137,7 @@ def _search(table, value, weight, low, high, chi2):  # type: ignore[no-untyped-d
     return low + best, least
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _next_pixel(y, x, dy, dx, ny):  # type: ignore[no-untyped-def]
     """One step of the serpentine: along the column, then into the next column in the same row."""
     if 0 <= y + dy < ny:
@@ -148,7 +145,7 @@ def _next_pixel(y, x, dy, dx, ny):  # type: ignore[no-untyped-def]
     return y, x + dx, -dy
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _seed(image, variance, bad, scale, table, forward, backward, low, high):  # type: ignore[no-untyped-def]
     """Row of the template that fits the first good pixel best, anywhere in the range; -1 if none is good."""
     bands, ny = image.shape[0], image.shape[1]
@@ -163,7 +160,7 @@ def _seed(image, variance, bad, scale, table, forward, backward, low, high):  # 
     return -1
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@kernel(relaxed=True)
 def _walk(  # type: ignore[no-untyped-def]
     image, variance, bad, scale, table, path, seed, half, start, step, thickness, sigma, reduced, used
 ):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
 from .borders import gather_pixels
-from .cells import core, load_row, run_threaded
+from .cells import core, load_row
 from .global_fit import GlobalFit, global_fit
 from .pixels import PixelFit
 from .silicon import (
@@ -167,7 +167,7 @@ def _mean_response(
     return np.asarray(np.divide(model, flat, out=np.ones(bands), where=flat > 0.0))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _joint_band(  # type: ignore[no-untyped-def]
     image, variance, bad, scale, tables, mean, silicon_start, silicon_step, start, step, order, offset, sigma,
     used, thickness, spread, reduced,
@@ -234,7 +234,7 @@ def _joint_band(  # type: ignore[no-untyped-def]
             reduced[r, x] = max(chi2 - gain * move, 0.0) / (count - 1)
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _cubic(place, value, slope):  # type: ignore[no-untyped-def]
     """Weights of nodes 0 to 3 for the value and the derivative of a cubic at a place between them."""
     for k in range(4):

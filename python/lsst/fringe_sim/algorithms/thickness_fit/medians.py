@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import numba
+from ...compiled import subkernel
 
 __all__ = ["middle_of", "sort_first"]
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def sort_first(values, count):  # type: ignore[no-untyped-def]
     """Sort the first ``count`` numbers in place (Shell 1959, gaps of Ciura 2001)."""
     for gap in (701, 301, 132, 57, 23, 10, 4, 1):
@@ -20,7 +20,7 @@ def sort_first(values, count):  # type: ignore[no-untyped-def]
             values[j] = item
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def middle_of(values, count):  # type: ignore[no-untyped-def]
     """Sort the first ``count`` numbers in place and return the middle one (the upper of two)."""
     sort_first(values, count)

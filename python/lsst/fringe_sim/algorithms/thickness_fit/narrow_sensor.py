@@ -19,11 +19,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import Cells, run_threaded
+from ...compiled import kernel, run_threaded, subkernel
+from .cells import Cells
 from .evidence import refine_row
 from .templates import FringeTemplates, pad_wavelengths
 
@@ -293,7 +293,7 @@ class _Sample:
         return middle + shapes_um
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _follow(level, weight, table, origin, step, thickness, rounds, mean):  # type: ignore[no-untyped-def]
     """Refit and renormalise in turn, in place; returns chi-square."""
     value, spread, before = np.empty_like(level), np.empty_like(weight), np.empty_like(thickness)
@@ -320,7 +320,7 @@ def _follow(level, weight, table, origin, step, thickness, rounds, mean):  # typ
     return chi2
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _mean_response(table, origin, step, thickness, mean):  # type: ignore[no-untyped-def]
     mean[:] = 0.0
     for c in range(thickness.shape[0]):
@@ -331,7 +331,7 @@ def _mean_response(table, origin, step, thickness, mean):  # type: ignore[no-unt
     mean /= thickness.shape[0]
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@subkernel(expand=True)
 def _place(table, place):  # type: ignore[no-untyped-def]
     """Node of the table below a place, and the share of the next."""
     inside = min(max(place, 0.0), table.shape[0] - 1.001)

@@ -6,18 +6,18 @@ the two steps that nearly every pixel needs are taken without a branch.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from ...compiled import subkernel
 
 __all__ = ["gauss_newton", "newton_block", "score"]
 
-_MATH = {"reassoc", "contract", "arcp", "nsz"}
 _TINY = np.float32(1e-30)
 _CLOSE = np.float32(1.5)
 """A second step shorter than this, in steps of a table with 300 per order, leaves nothing to a third."""
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
+@subkernel(relaxed=True, expand=True)
 def _score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
     below = np.uint32(min(int(place), table.shape[0] - 2))
     share = np.float32(place - below)
@@ -35,7 +35,7 @@ def _score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
     return gain, information, chi2
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
+@subkernel(relaxed=True)
 def score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
     """Score, information and chi-square at one place of the table, in units of its step.
 
@@ -58,7 +58,7 @@ def score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
     return _score(table, place, value, weight, item)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
+@subkernel(relaxed=True)
 def _go_on(table, place, value, weight, item, step, steps, limit):  # type: ignore[no-untyped-def]
     """Third and further steps."""
     top = table.shape[0] - 1.0
@@ -72,7 +72,7 @@ def _go_on(table, place, value, weight, item, step, steps, limit):  # type: igno
     return place, information, chi2
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
+@subkernel(relaxed=True)
 def newton_block(table, place, value, weight, count, steps, longest, information, chi2, move):  # type: ignore[no-untyped-def]
     """Like `gauss_newton` for the first ``count`` items, in place.
 
@@ -98,7 +98,7 @@ def newton_block(table, place, value, weight, count, steps, longest, information
             place[k] = min(max(place[k] + move[k], 0.0), top)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
+@subkernel(relaxed=True)
 def gauss_newton(table, place, value, weight, item, steps, longest):  # type: ignore[no-untyped-def]
     """Least chi-square near a place of the table.
 

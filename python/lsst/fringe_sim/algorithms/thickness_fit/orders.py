@@ -24,10 +24,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ...compiled import kernel, subkernel
 from .cells import Cells
 from .evidence import IMPOSSIBLE, OrderEvidence
 
@@ -105,12 +105,12 @@ def _centred(evidence: NDArray[np.float32]) -> NDArray[np.float32]:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _wrap(difference, order):  # type: ignore[no-untyped-def]
     return difference - order * np.rint(difference / order)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _links(phase, rise_y, rise_x, order):  # type: ignore[no-untyped-def]
     """Pairs of neighbouring cells, the orders between their phases, and how unreliable each pair is.
 
@@ -157,7 +157,7 @@ def _links(phase, rise_y, rise_x, order):  # type: ignore[no-untyped-def]
     return first[:number], second[:number], turn[:number], key[:number]
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _find(parent, shift, node):  # type: ignore[no-untyped-def]
     """Root of a cell and the order of the cell relative to it; shortens the path."""
     root, total = node, 0
@@ -174,7 +174,7 @@ def _find(parent, shift, node):  # type: ignore[no-untyped-def]
     return root, result
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _gap(evidence):  # type: ignore[no-untyped-def]
     """Best order of a region, and by how much it is better than the next."""
     best, least, second = 0, evidence[0], np.float32(np.inf)
@@ -188,7 +188,7 @@ def _gap(evidence):  # type: ignore[no-untyped-def]
     return best, float(second) - float(least)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _join(evidence, first, second, turn, sure):  # type: ignore[no-untyped-def]
     cells, orders = evidence.shape
     parent = np.arange(cells)

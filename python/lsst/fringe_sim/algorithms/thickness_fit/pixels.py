@@ -9,20 +9,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
-from .cells import core, load_row, run_threaded
+from .cells import core, load_row
 from .medians import middle_of
 from .newton import gauss_newton, newton_block
 from .templates import FringeTemplates
 
 __all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels", "subtract_row"]
 
-_MATH = {"reassoc", "contract", "arcp", "nsz"}
 _STEPS = 5
 """Most Gauss-Newton steps; two are usual."""
 _LONGEST_STEP = 0.1
@@ -148,7 +147,7 @@ def calm_surface(surface: CellSurface, threads: int = 2) -> CellSurface:
     return replace(surface, thickness_um=out)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _calm_row(thickness, slope_y, slope_x, y_centre, x_centre, smooth, row, out):  # type: ignore[no-untyped-def]
     ny, nx = thickness.shape
     guess = np.empty(25, np.float64)
@@ -222,7 +221,7 @@ def bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64]
     return below.astype(np.int64), share.astype(np.float32)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@kernel(relaxed=True)
 def _fit_band(  # type: ignore[no-untyped-def]
     image, variance, bad, scale, table, start, step, order,
     thickness, slope_y, slope_x, y_centre, x_centre, smooth, known, first_row, below_y, share_y, below_x, share_x,
@@ -287,7 +286,7 @@ def _fit_band(  # type: ignore[no-untyped-def]
         _finish_row(value[r], sigma[r], chi2_out[r], used_out[r], np.float32(step))
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def subtract_row(line, offset, x_edges):  # type: ignore[no-untyped-def]
     """Divide one row of flats by the light of each cell; amplitudes are flats less one, and so is the light."""
     for c in range(offset.shape[0]):
@@ -296,7 +295,7 @@ def subtract_row(line, offset, x_edges):  # type: ignore[no-untyped-def]
             line[x] = (line[x] - offset[c]) * per_light
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, inline="always")
+@subkernel(relaxed=True, expand=True)
 def _invert_row(spread, used):  # type: ignore[no-untyped-def]
     """Variance to weight, and one wavelength more where there is one."""
     for x in range(spread.shape[0]):
@@ -306,7 +305,7 @@ def _invert_row(spread, used):  # type: ignore[no-untyped-def]
         spread[x] = np.float32(1.0) / variance if good else np.float32(0.0)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
+@subkernel(relaxed=True)
 def _start_row(thickness, smooth, below, share, below_x, share_x, upright, begin, flat):  # type: ignore[no-untyped-def]
     """Thickness of the surface along one row, and where it is smooth; returns the row of the nearest cells."""
     above = min(below + 1, thickness.shape[0] - 1)
@@ -321,7 +320,7 @@ def _start_row(thickness, smooth, below, share, below_x, share_x, upright, begin
     return own
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH, forceinline=True)
+@subkernel(relaxed=True)
 def _finish_row(value, sigma, chi2, used, step):  # type: ignore[no-untyped-def]
     """Information to standard uncertainty, chi-square to reduced chi-square; NaN where there was nothing to fit."""
     for x in range(sigma.shape[0]):
@@ -335,7 +334,7 @@ def _finish_row(value, sigma, chi2, used, step):  # type: ignore[no-untyped-def]
             chi2[x] = np.float32(np.nan)
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _try_surfaces(  # type: ignore[no-untyped-def]
     table, start, step, order, y, w, item, thickness, slope_y, slope_x, known,
     y_centre, x_centre, row, column, own_y, own_x, longest,

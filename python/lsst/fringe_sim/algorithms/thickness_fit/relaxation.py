@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import Cells, cell_independence, effective_number, run_threaded
+from ...compiled import kernel, run_threaded, subkernel
+from .cells import Cells, cell_independence, effective_number
 from .evidence import EVIDENCE_CAP, IMPOSSIBLE, MISFIT, OrderEvidence
 from .lone_surfaces import settle_lone_surfaces
 from .medians import middle_of, sort_first
@@ -167,7 +167,7 @@ def settle_orders(
     return SettledCells(thickness, segment, segment_slip, cell_slip)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _misfits(value, weight, table, start, step, thickness):  # type: ignore[no-untyped-def]
     """Reduced chi-square of every cell; NaN where there is no data."""
     out = np.full(thickness.shape[0], np.nan, np.float32)
@@ -179,7 +179,7 @@ def _misfits(value, weight, table, start, step, thickness):  # type: ignore[no-u
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _used(weight, item):  # type: ignore[no-untyped-def]
     """Number of wavelengths of a cell."""
     number = 0
@@ -188,21 +188,21 @@ def _used(weight, item):  # type: ignore[no-untyped-def]
     return number
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@subkernel(expand=True)
 def _trust(misfit, temper, limit):  # type: ignore[no-untyped-def]
     """Factor on the chi-square differences of a cell: less for one that fits badly, least beside better ones."""
     share = min(limit / misfit, 1.0) if misfit > 0.0 else 1.0
     return temper / max(1.0, misfit) * share * share
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@subkernel(expand=True)
 def _break_price(jump, order):  # type: ignore[no-untyped-def]
     """Price of a jump between two neighbours: grows as its square, up to half an order."""
     share = 2.0 * jump / order
     return BREAK_PRICE * min(share * share, 1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _surfaces(thickness, rise_y, rise_x, limit):  # type: ignore[no-untyped-def]
     """Number of the connected surface each cell lies on, in the order of their first cells; -1 without data."""
     ny, nx = thickness.shape
@@ -232,7 +232,7 @@ def _surfaces(thickness, rise_y, rise_x, limit):  # type: ignore[no-untyped-def]
     return number.reshape(ny, nx), count
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _top(parent, cell):  # type: ignore[no-untyped-def]
     while parent[cell] != cell:
         parent[cell] = parent[parent[cell]]
@@ -240,7 +240,7 @@ def _top(parent, cell):  # type: ignore[no-untyped-def]
     return cell
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond):  # type: ignore[no-untyped-def]
     """Jumps from the cells of a surface to the cells around it; returns how many there are."""
     ny, nx = thickness.shape
@@ -260,7 +260,7 @@ def _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond):
     return number
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _main_jump(jumps, beyond, number, kept):  # type: ignore[no-untyped-def]
     """Middle jump to the neighbour that shares most of the border."""
     for k in range(number):
@@ -311,7 +311,7 @@ def _mend(
     return moved
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _move_surface(  # type: ignore[no-untyped-def]
     value, weight, table, start, step, thickness, rise_y, rise_x, order, temper, limit, surface, members, own
 ):
@@ -349,7 +349,7 @@ def _move_surface(  # type: ignore[no-untyped-def]
     return 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _ask_row(value, weight, table, start, step, thickness, order, low, high, temper, limit, shifted, cost):  # type: ignore[no-untyped-def]
     """Chi-square of each cell at whole orders around its thickness, above the least of them."""
     top = table.shape[0] - 1.0
@@ -383,7 +383,7 @@ def _ask_row(value, weight, table, start, step, thickness, order, low, high, tem
                 cost[c, k] = IMPOSSIBLE
 
 
-@numba.njit(cache=True, nogil=True)
+@subkernel
 def _border_price(shifted, label, rise_y, rise_x, order, y, x, move, top, bottom, left, right):  # type: ignore[no-untyped-def]
     """Price of the links of one cell that leave a block, if the block moves by some orders."""
     ny, nx = label.shape
@@ -408,7 +408,7 @@ def _border_price(shifted, label, rise_y, rise_x, order, y, x, move, top, bottom
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _relax(cost, shifted, label, rise_y, rise_x, order, size):  # type: ignore[no-untyped-def]
     """Give every block of cells the shift that costs least beside its neighbours; returns how many moved."""
     ny, nx, shifts = cost.shape
@@ -485,7 +485,7 @@ def _segment_prices(
     return price
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _segment_borders(shifted, label, segment, rise_y, rise_x, order, count):  # type: ignore[no-untyped-def]
     """Price of the borders of each surface at each shift."""
     ny, nx, shifts = shifted.shape
@@ -553,7 +553,7 @@ def _far_odds(
     return odds
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cell_slip(cost, shifted, label, rise_y, rise_x, order, y, out):  # type: ignore[no-untyped-def]
     """Probability that a cell of one row has another order, its neighbours staying."""
     _, nx, shifts = cost.shape

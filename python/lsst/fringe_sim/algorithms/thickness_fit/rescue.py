@@ -6,11 +6,11 @@ the pixel lies far from the surface on which its search began.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ...compiled import kernel
 from .amplitudes import Amplitudes
 from .borders import gather_pixels
 from .cells import Cells
@@ -101,7 +101,7 @@ def rescue_pixels(
     return pixels
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _exceeds(chi2, limit, used, out):  # type: ignore[no-untyped-def]
     """Where chi-square is above the limit for its number of wavelengths."""
     for y in range(chi2.shape[0]):
@@ -109,7 +109,7 @@ def _exceeds(chi2, limit, used, out):  # type: ignore[no-untyped-def]
             out[y, x] = chi2[y, x] > limit[used[y, x]]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _bad_neighbours(bad, rows, columns):  # type: ignore[no-untyped-def]
     """Bad pixels among the 5 by 5 around some; the edge of the sensor counts as often as it is met."""
     ny, nx = bad.shape
@@ -135,7 +135,7 @@ def typical_misfit(pixels: PixelFit) -> float:
     return max(float(np.median(chi2)) / expected, 1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _leave_one_out(  # type: ignore[no-untyped-def]
     value,
     weight,

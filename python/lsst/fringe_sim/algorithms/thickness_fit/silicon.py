@@ -20,11 +20,11 @@ import itertools
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ...compiled import kernel
 from ...errors import InputError, OutOfRangeError
 from ...model import FringeModel
 from ..thickness_fit_options import SILICON_FIELDS
@@ -661,7 +661,7 @@ def _lagrange(place: Any) -> tuple[list[FloatArray], list[FloatArray]]:
     return values, slopes
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _scan_pixels(table, places, value, weight, longest, chi2):  # type: ignore[no-untyped-def]
     for k in range(places.shape[0]):
         _, _, chi2[k] = gauss_newton(table, places[k], value, weight, k, 4, longest)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ...compiled import kernel, run_threaded
 from .amplitudes import Amplitudes
-from .cells import core, load_row, run_threaded
+from .cells import core, load_row
 from .global_fit import GlobalFit
 from .newton import gauss_newton
 from .templates import FringeTemplates
 
 __all__ = ["lone_slip_probability", "slip_probability"]
 
-_MATH = {"reassoc", "contract", "arcp", "nsz"}
 _BAND_ROWS = 16
 _SHIFTS = 4
 """Orders on both sides that a lone pixel is compared with."""
@@ -95,7 +94,7 @@ def lone_slip_probability(
     return out
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_MATH)
+@kernel(relaxed=True)
 def _lone_band(image, variance, bad, scale, table, start, step, thickness, order, out):  # type: ignore[no-untyped-def]
     bands, rows, columns = image.shape
     amplitude, spread = np.zeros((bands, columns), np.float32), np.zeros((bands, columns), np.float32)
