@@ -12,13 +12,18 @@ always put into what calls it, and no compiled function may call a relaxed `kern
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numba
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-__all__ = ["kernel", "processors", "run_threaded", "subkernel"]
+__all__ = ["contiguous", "kernel", "limit_threads", "processors", "run_shares", "run_threaded", "subkernel"]
+
+_LOG = logging.getLogger(__name__)
 
 _RELAXED = {"reassoc", "contract", "arcp", "nsz"}
 """Freedom of rounding; NaN and infinity keep their meaning."""
@@ -63,13 +68,42 @@ def subkernel(
 
 
 def _compiled(function: Callable[..., Any] | None, **options: Any) -> Any:
-    decorate = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
+    def decorate(inner: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=_keep[0], nogil=True, error_model="numpy", **options)(inner)
+        except RuntimeError as error:
+            if not _keep[0]:
+                raise
+            _keep[0] = False
+            _LOG.warning(
+                "compiled functions cannot be kept (%s); every process compiles them again, for a minute or so. "
+                "Set NUMBA_CACHE_DIR to a folder that can be written.",
+                error,
+            )
+            return decorate(inner)
+
     return decorate if function is None else decorate(function)
 
 
+_keep = [True]
+
+
+def contiguous(array: ArrayLike, dtype: DTypeLike | None = None) -> NDArray[Any]:
+    """Array as kernels know it, so that each is compiled once: contiguous and writable; a copy if it has to be."""
+    return np.require(array, dtype, ["C", "W"])
+
+
 def processors() -> int:
-    """Number of threads that compiled functions use by default (``NUMBA_NUM_THREADS``)."""
-    return int(numba.config.NUMBA_NUM_THREADS)
+    """Number of threads that compiled functions use by default: ``NUMBA_NUM_THREADS``, or what was set."""
+    return int(_limit[0] or numba.config.NUMBA_NUM_THREADS)
+
+
+def limit_threads(threads: int | None) -> None:
+    """Set how many threads compiled functions use by default in this process; all again with `None`."""
+    _limit[0] = threads
+
+
+_limit: list[int | None] = [None]
 
 
 def run_threaded(work: Callable[[int], object], count: int, threads: int | None = None) -> None:
@@ -98,3 +132,24 @@ def run_threaded(work: Callable[[int], object], count: int, threads: int | None 
 def _share(work: Callable[[int], object], first: int, count: int, threads: int) -> None:
     for item in range(first, count, threads):
         work(item)
+
+
+def run_shares(work: Callable[[int, int], object], count: int, least: int) -> None:
+    """Call ``work(first, last)`` on shares of ``range(count)`` in threads.
+
+    Parameters
+    ----------
+    work : callable
+        As for `run_threaded`; what it does for one item must not depend on the share.
+    count : `int`
+        Number of items.
+    least : `int`
+        Items of a share that are worth a thread.
+    """
+    shares = max(1, min(_SHARES * processors(), count // max(least, 1))) if processors() > 1 else 1
+    edges = [share * count // shares for share in range(shares + 1)]
+    run_threaded(lambda share: work(edges[share], edges[share + 1]), shares)
+
+
+_SHARES = 4
+"""Shares per thread: some cost more than others."""

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...errors import InputError, OutOfRangeError
 
-__all__ = ["Amplitudes"]
+__all__ = ["Amplitudes", "core", "native"]
 
 FloatArray = NDArray[np.float64]
 
@@ -116,17 +116,23 @@ class Amplitudes:
         return np.repeat(np.arange(len(self.y_edges) - 1), np.diff(self.y_edges))
 
     def rows(
-        self, start: int, stop: int
+        self, start: int, stop: int, wavelengths: slice = slice(None)
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int16]]:
         """Image, variance and mask of some rows, in native byte order; without a copy where they are so.
 
         The mask is non-zero where a pixel is not to be used; its bits mean nothing.
         """
         return (
-            native(self.image[:, start:stop], np.float32),
-            native(self.variance[:, start:stop], np.float32),
-            _flags(self.bad[:, start:stop]),
+            native(self.image[wavelengths, start:stop], np.float32),
+            native(self.variance[wavelengths, start:stop], np.float32),
+            _flags(self.bad[wavelengths, start:stop]),
         )
+
+
+def core(array: NDArray[Any]) -> NDArray[Any]:
+    """Contiguous array with broadcast axes shrunk to length 1, which is how kernels know them."""
+    part = array[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in array.strides)]
+    return np.ascontiguousarray(part)
 
 
 def _flags(bad: NDArray[Any]) -> NDArray[np.int16]:

@@ -142,7 +142,7 @@ def _sweep(  # type: ignore[no-untyped-def]
         total = 0.0
         for g in range(count):
             place = min(max((guess[g] - start) / step, 0.0), top)
-            place, information, chi2 = gauss_newton(table, place, value, weight, k, 5, 0.03 / step)
+            place, information, chi2 = gauss_newton(table, place, value, weight, k, np.int64(5), 0.03 / step)
             at = start + step * place
             if g > 0 and abs(at - guess[g]) > _SAME_SURFACE * order:
                 continue

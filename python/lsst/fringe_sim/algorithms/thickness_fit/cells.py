@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...compiled import kernel, run_threaded, subkernel
 from ...errors import InputError
 from .amplitudes import Amplitudes
+from .bands import load_band
 from .medians import middle_of
 from .templates import LANES
 
@@ -35,7 +35,6 @@ _SPIKE_SIGMA = 6.0
 """A row or column of a cell this many standard deviations off its neighbours is thrown out."""
 _FINEST_PERIOD_PX = 24.0
 """Shortest fringe whose curvature is not mistaken for a spike [px]."""
-_HUGE = np.float32(1e30)
 _LEAST_CONTRAST = 0.4
 """Smallest share of the contrast that a steep cell is taken to keep."""
 _LEAST_FILLED = 0.2
@@ -181,16 +180,16 @@ def average_cells(
     curvature = (0.5 * wave**2 * np.asarray(largest_amplitude, dtype=float)).astype(np.float32)
     size = (float(np.diff(y_edges).max()), float(np.diff(x_edges).max()))
     inflation = size[0] * size[1] / effective_number(*size, data.noise_correlation_px)
-    scale = data.scale.astype(np.float32)
 
     def work(strip: int) -> None:
         low, high = int(y_edges[strip]), int(y_edges[strip + 1])
-        image, variance, bad = data.rows(low, high)
-        _average_strip(
-            image, core(variance), core(bad), scale, curvature, x_edges,
-            inflation, data.noise_correlation_px > 0.0, value[strip], weight[strip],
-            rise_y[strip], rise_x[strip],
-        )  # fmt: skip
+        for band in range(wavelengths):  # the strip of one is still in cache when its cells are averaged
+            amplitude, inverse = load_band(data, low, high, slice(band, band + 1))
+            _average_strip(
+                amplitude[0], inverse[0], band, curvature[band], x_edges,
+                inflation, data.noise_correlation_px > 0.0, value[strip], weight[strip],
+                rise_y[strip], rise_x[strip],
+            )  # fmt: skip
 
     run_threaded(work, shape[0], threads)
     return Cells(value, weight, rise_y, rise_x, y_edges, x_edges)
@@ -266,124 +265,77 @@ def sample_pixels(data: Amplitudes, most: int = 200_000) -> Cells:
     return Cells(value, weight, none, none, np.append(rows, ny), np.append(columns, nx))
 
 
-def core(array: NDArray[Any]) -> NDArray[Any]:
-    """Contiguous array with broadcast axes shrunk to length 1, which is how kernels know them."""
-    part = array[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in array.strides)]
-    return np.ascontiguousarray(part)
-
-
-@subkernel(relaxed=True, expand=True)
-def _usable(image, variance, bad, scale, square):  # type: ignore[no-untyped-def]
-    """Amplitude and variance of one sample, zeros if it cannot be used; without a branch."""
-    amplitude = image * scale - np.float32(1.0)
-    spread = variance * square
-    # NaN fails every comparison.
-    good = (abs(amplitude) < _HUGE) & (spread > np.float32(0.0)) & (spread < _HUGE) & (bad == 0)
-    return (amplitude if good else np.float32(0.0)), (spread if good else np.float32(0.0))
-
-
-@subkernel(relaxed=True, expand=True)
-def load_row(image, variance, bad, scale, value, spread):  # type: ignore[no-untyped-def]
-    """Amplitude and variance of one row; variance 0 marks what cannot be used.
-
-    ``variance`` and ``bad`` have one element when they are the same for the whole row.
-    """
-    columns = image.shape[0]
-    square = scale * scale
-    if variance.shape[0] > 1 and bad.shape[0] > 1:
-        for x in range(columns):
-            value[x], spread[x] = _usable(image[x], variance[x], bad[x], scale, square)
-    elif variance.shape[0] > 1:
-        for x in range(columns):
-            value[x], spread[x] = _usable(image[x], variance[x], bad[0], scale, square)
-    elif bad.shape[0] > 1:
-        for x in range(columns):
-            value[x], spread[x] = _usable(image[x], variance[0], bad[x], scale, square)
-    else:
-        for x in range(columns):
-            value[x], spread[x] = _usable(image[x], variance[0], bad[0], scale, square)
-
-
 @kernel(relaxed=True)
 def _average_strip(  # type: ignore[no-untyped-def]
-    image, variance, bad, scale, curvature, x_edges, inflation, correlated, out, out_weight, rise_y, rise_x
+    value, inverse, band, curvature, x_edges, inflation, correlated, out, out_weight, rise_y, rise_x
 ):
-    bands, rows, columns = image.shape
+    """One row of cells at one wavelength."""
+    rows = value.shape[0]
     cells = x_edges.shape[0] - 1
-    widest = 0
+    columns = x_edges[cells]
+    widest = np.int64(0)
     for c in range(cells):
         widest = max(widest, x_edges[c + 1] - x_edges[c])
-    value = np.zeros((rows, columns), np.float32)
-    spread = np.zeros((rows, columns), np.float32)
-    column_sum = np.zeros(columns, np.float32)
-    column_var = np.zeros(columns, np.float32)
-    column_count = np.zeros(columns, np.float32)
-    keep_row, keep_column = np.ones(rows, np.bool_), np.ones(widest, np.bool_)
-    line, line_count = np.zeros(max(rows, widest), np.float32), np.zeros(max(rows, widest), np.float32)
-    for band in range(bands):
-        column_sum[:] = 0.0
-        column_var[:] = 0.0
-        column_count[:] = 0.0
-        for r in range(rows):
-            vr = r if variance.shape[1] > 1 else 0
-            br = r if bad.shape[1] > 1 else 0
-            vb = band if variance.shape[0] > 1 else 0
-            bb = band if bad.shape[0] > 1 else 0
-            load_row(image[band, r], variance[vb, vr], bad[bb, br], scale[band], value[r], spread[r])
-            for x in range(columns):
-                column_sum[x] += value[r, x]
-                column_var[x] += spread[r, x]
-                column_count[x] += np.float32(1.0) if spread[r, x] > 0.0 else np.float32(0.0)
-        for c in range(cells):
-            low, high = x_edges[c], x_edges[c + 1]
-            width = high - low
-            total, count, var = 0.0, 0.0, 0.0
+    sums = np.zeros((3, columns), np.float32)
+    column_sum, column_var, column_count = sums[0], sums[1], sums[2]
+    keep_row, keep_column = np.empty(rows, np.bool_), np.empty(widest, np.bool_)
+    line, line_count = np.empty(max(rows, widest), np.float32), np.empty(max(rows, widest), np.float32)
+    for r in range(rows):
+        for x in range(columns):
+            seen = inverse[r, x] > np.float32(0.0)
+            column_sum[x] += value[r, x]
+            column_var[x] += np.float32(1.0) / inverse[r, x] if seen else np.float32(0.0)
+            column_count[x] += np.float32(1.0) if seen else np.float32(0.0)
+    for c in range(cells):
+        low, high = x_edges[c], x_edges[c + 1]
+        width = high - low
+        total, count, var = 0.0, 0.0, 0.0
+        for x in range(low, high):
+            total += column_sum[x]
+            count += column_count[x]
+            var += column_var[x]
+        if count < _LEAST_FILLED * rows * width:
+            continue
+        noise = np.sqrt(var / count)
+        for r in range(rows):  # the cell is still in cache
+            row_sum = np.float32(0.0)
             for x in range(low, high):
-                total += column_sum[x]
-                count += column_count[x]
-                var += column_var[x]
+                row_sum += value[r, x]
+            line[r] = row_sum
+        if count == rows * width:
+            across, along = column_sum[low:high], line[:rows]
+            tolerance_x = _tolerance(noise, rows, correlated, curvature)
+            tolerance_y = _tolerance(noise, width, correlated, curvature)
+            if _bend(across) <= rows * tolerance_x and _bend(along) <= width * tolerance_y:
+                rise_x[c, band] = _half_slope(across) / rows
+                rise_y[c, band] = _half_slope(along) / width
+                out[c, band] = total / count
+                out_weight[c, band] = count * count / (var * inflation)
+                continue
+        for r in range(rows):
+            row_count = np.float32(0.0)
+            for x in range(low, high):
+                row_count += np.float32(1.0) if inverse[r, x] > 0.0 else np.float32(0.0)
+            line_count[r] = row_count
+        rejected = _reject(line, line_count, rows, noise, correlated, curvature, keep_row)
+        rise_y[c, band] = _slope(line, line_count, rows, keep_row)
+        for x in range(width):
+            line[x], line_count[x] = column_sum[low + x], column_count[low + x]
+        rejected += _reject(line, line_count, width, noise, correlated, curvature, keep_column)
+        rise_x[c, band] = _slope(line, line_count, width, keep_column)
+        if rejected > 0:
+            total, count, var = 0.0, 0.0, 0.0
+            for r in range(rows):
+                if keep_row[r]:
+                    for x in range(width):
+                        if keep_column[x] and inverse[r, low + x] > 0.0:
+                            total += value[r, low + x]
+                            var += 1.0 / inverse[r, low + x]
+                            count += 1.0
             if count < _LEAST_FILLED * rows * width:
                 continue
-            noise = np.sqrt(var / count)
-            for r in range(rows):  # the cell is still in cache
-                row_sum = np.float32(0.0)
-                for x in range(low, high):
-                    row_sum += value[r, x]
-                line[r] = row_sum
-            if count == rows * width:
-                across, along = column_sum[low:high], line[:rows]
-                tolerance_x = _tolerance(noise, rows, correlated, curvature[band])
-                tolerance_y = _tolerance(noise, width, correlated, curvature[band])
-                if _bend(across) <= rows * tolerance_x and _bend(along) <= width * tolerance_y:
-                    rise_x[c, band] = _half_slope(across) / rows
-                    rise_y[c, band] = _half_slope(along) / width
-                    out[c, band] = total / count
-                    out_weight[c, band] = count * count / (var * inflation)
-                    continue
-            for r in range(rows):
-                row_count = np.float32(0.0)
-                for x in range(low, high):
-                    row_count += np.float32(1.0) if spread[r, x] > 0.0 else np.float32(0.0)
-                line_count[r] = row_count
-            rejected = _reject(line, line_count, rows, noise, correlated, curvature[band], keep_row)
-            rise_y[c, band] = _slope(line, line_count, rows, keep_row)
-            for x in range(width):
-                line[x], line_count[x] = column_sum[low + x], column_count[low + x]
-            rejected += _reject(line, line_count, width, noise, correlated, curvature[band], keep_column)
-            rise_x[c, band] = _slope(line, line_count, width, keep_column)
-            if rejected > 0:
-                total, count, var = 0.0, 0.0, 0.0
-                for r in range(rows):
-                    if keep_row[r]:
-                        for x in range(width):
-                            if keep_column[x] and spread[r, low + x] > 0.0:
-                                total += value[r, low + x]
-                                var += spread[r, low + x]
-                                count += 1.0
-                if count < _LEAST_FILLED * rows * width:
-                    continue
-            out[c, band] = total / count
-            out_weight[c, band] = count * count / (var * inflation)
+        out[c, band] = total / count
+        out_weight[c, band] = count * count / (var * inflation)
 
 
 @subkernel(expand=True)
@@ -506,7 +458,7 @@ def _slope(total, count, size, keep):  # type: ignore[no-untyped-def]
 @subkernel
 def _median(total, count, size, keep):  # type: ignore[no-untyped-def]
     means = np.empty(size, np.float32)
-    number = 0
+    number = np.int64(0)
     for k in range(size):
         if keep[k]:
             means[number] = total[k] / count[k]

@@ -228,7 +228,7 @@ def _minima(place, chi2, marks, where, depth):  # type: ignore[no-untyped-def]
         marks[k] = (chi2[k] <= chi2[k - 1]) & (chi2[k] < chi2[k + 1])
     marks[0] = chi2[0] < chi2[1]
     marks[count - 1] = chi2[count - 1] <= chi2[count - 2]
-    number = 0
+    number = np.int64(0)
     words = marks[:full].view(np.uint64)
     for word in range(words.shape[0]):
         if words[word] != 0:  # most groups of eight hold no minimum
@@ -252,7 +252,9 @@ def _polish(table, start, step, value, weight, item, slack, where, depth, number
         if best >= 0 and depth[at] > depth[best] + slack:
             break
         done[at] = True
-        place, _, chi2 = gauss_newton(table, (where[at] - start) / step, value, weight, item, 3, 0.03 / step)
+        place, _, chi2 = gauss_newton(
+            table, (where[at] - start) / step, value, weight, item, np.int64(3), 0.03 / step
+        )
         where[at] = start + step * place
         depth[at] = max(chi2, 0.0)
         if best < 0 or depth[at] < depth[best]:
@@ -309,11 +311,11 @@ def _evidence_row(  # type: ignore[no-untyped-def]
     for c in range(0, value.shape[0], stride):
         if np.isfinite(best[c]):
             continue
-        low, high = 0, count
+        low, high = np.int64(0), np.int64(count)
         if np.isfinite(centre[c]):
             low = np.searchsorted(place, centre[c] - (reach + 0.5) * order)
             high = max(np.searchsorted(place, centre[c] + (reach + 0.5) * order), low + 2)
-            low = max(min(low, count - 2), 0)
+            low = max(min(low, count - 2), 0)  # type: ignore[arg-type]
             high = min(high, count)
         used, number, at = _search(
             value, weight, c, nodes, place, table, start, step, low, high, chi2, marks, where, depth
@@ -324,7 +326,20 @@ def _evidence_row(  # type: ignore[no-untyped-def]
             near_end = min(where[at] - place[low], place[high - 1] - where[at]) < order
             if near_end or depth[at] > limit:
                 used, number, at = _search(
-                    value, weight, c, nodes, place, table, start, step, 0, count, chi2, marks, where, depth
+                    value,
+                    weight,
+                    c,
+                    nodes,
+                    place,
+                    table,
+                    start,
+                    step,
+                    np.int64(0),
+                    np.int64(count),
+                    chi2,
+                    marks,
+                    where,
+                    depth,
                 )
         thickness, least = where[at], depth[at]
         first = thickness - np.floor((thickness - place[0]) / order) * order
@@ -369,11 +384,12 @@ def refine_cells(
     """
     table = templates.table()
     out = np.full(cells.shape, np.nan, np.float32)
+    start = np.ascontiguousarray(thickness_um, np.float32)
 
     def work(row: int) -> None:
         refine_row(
             cells.value[row], cells.weight[row], table, templates.start_um, templates.step_um,
-            thickness_um[row], out[row],
+            start[row], out[row],
         )  # fmt: skip
 
     run_threaded(work, cells.shape[0], threads)
@@ -386,5 +402,5 @@ def refine_row(value, weight, table, start, step, thickness, out):  # type: igno
     for c in range(value.shape[0]):
         if np.isfinite(thickness[c]):
             place = min(max((thickness[c] - start) / step, 0.0), table.shape[0] - 1.0)
-            place, _, _ = gauss_newton(table, place, value, weight, c, 4, 0.03 / step)
+            place, _, _ = gauss_newton(table, place, value, weight, c, np.int64(4), 0.03 / step)
             out[c] = start + step * place

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
+from .bands import BAND_ROWS, load_band
 from .borders import gather_pixels
-from .cells import core, load_row
 from .global_fit import GlobalFit, global_fit
 from .pixels import PixelFit
 from .silicon import (
@@ -29,7 +29,6 @@ __all__ = ["JointFit", "joint_fit"]
 
 FloatArray = NDArray[np.float64]
 
-_BAND_ROWS = 16
 _STEPS = 3
 _LONGEST = 0.1
 _SURE = 0.01
@@ -134,19 +133,17 @@ def _fit_pixels(
     mean = _mean_response(data, tables, start, offset).astype(np.float32)
     padded = np.ones(tables.response.shape[2], np.float32)
     padded[: mean.size] = mean
-    scale = data.scale.astype(np.float32)
     value, spread, chi2 = start.value.copy(), start.sigma.copy(), start.chi2.copy()
 
     def work(band: int) -> None:
-        rows = slice(band * _BAND_ROWS, (band + 1) * _BAND_ROWS)
-        image, variance, bad = data.rows(rows.start, rows.stop)
+        rows = slice(band * BAND_ROWS, (band + 1) * BAND_ROWS)
         _joint_band(
-            image, core(variance), core(bad), scale, tables.response, padded, tables.silicon_start_um,
+            *load_band(data, rows.start, rows.stop), tables.response, padded, tables.silicon_start_um,
             tables.silicon_step_um, tables.start_um, tables.step_um, order_um, offset[rows], sigma[rows],
             start.n_wavelengths[rows], value[rows], spread[rows], chi2[rows],
         )  # fmt: skip
 
-    run_threaded(work, -(-shape[0] // _BAND_ROWS), threads)
+    run_threaded(work, -(-shape[0] // BAND_ROWS), threads)
     return PixelFit(value, spread, chi2, start.n_wavelengths)
 
 
@@ -169,31 +166,27 @@ def _mean_response(
 
 @kernel
 def _joint_band(  # type: ignore[no-untyped-def]
-    image, variance, bad, scale, tables, mean, silicon_start, silicon_step, start, step, order, offset, sigma,
+    amplitude, inverse, tables, mean, silicon_start, silicon_step, start, step, order, offset, sigma,
     used, thickness, spread, reduced,
 ):  # fmt: skip
     """Pixels of some rows; those that left out a wavelength in the first fit stay as they are."""
-    bands, rows, columns = image.shape
+    bands = amplitude.shape[0]
+    rows, columns = thickness.shape
     padded = tables.shape[2]
-    amplitude, noise = np.zeros((bands, columns), np.float32), np.zeros((bands, columns), np.float32)
     value, weight = np.zeros(padded), np.zeros(padded)
     cubic, slope = np.zeros(4), np.zeros(4)
     top = tables.shape[1] - 1.001
     for r in range(rows):
-        for band in range(bands):
-            vb, bb = (band if variance.shape[0] > 1 else 0), (band if bad.shape[0] > 1 else 0)
-            vr, br = (r if variance.shape[1] > 1 else 0), (r if bad.shape[1] > 1 else 0)
-            load_row(image[band, r], variance[vb, vr], bad[bb, br], scale[band], amplitude[band], noise[band])
         for x in range(columns):
             if not np.isfinite(thickness[r, x]):
                 continue
             count = 0
             for band in range(bands):
                 weight[band] = 0.0
-                if noise[band, x] > 0.0:
+                if inverse[band, r, x] > 0.0:
                     count += 1
-                    weight[band] = 1.0 / (noise[band, x] * mean[band] * mean[band])
-                value[band] = (1.0 + amplitude[band, x]) * mean[band]
+                    weight[band] = inverse[band, r, x] / (mean[band] * mean[band])
+                value[band] = (1.0 + amplitude[band, r, x]) * mean[band]
             if count != used[r, x] or count < 2:
                 continue
             place = (offset[r, x] - silicon_start) / silicon_step

@@ -15,12 +15,12 @@ from scipy.ndimage import binary_dilation
 
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
-from .cells import core, load_row
+from .bands import BAND_ROWS, load_band
 from .medians import middle_of
 from .newton import gauss_newton, newton_block
 from .templates import FringeTemplates
 
-__all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels", "subtract_row"]
+__all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels"]
 
 _STEPS = 5
 """Most Gauss-Newton steps; two are usual."""
@@ -30,9 +30,7 @@ _SAME_SURFACE = 0.25
 """Cells whose thickness agrees within this many orders, slopes allowed for, lie on one surface."""
 _LONE_CELL_PENALTY = 12.0
 """Chi-square by which a surface shown by a single cell must be better than one that several show."""
-_BAND_ROWS = 16
 _BLOCK = 32
-_KEEP_APART = 80
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +152,7 @@ def _calm_row(thickness, slope_y, slope_x, y_centre, x_centre, smooth, row, out)
     for x in range(nx):
         if not smooth[row, x]:
             continue
-        number = 0
+        number = np.int64(0)
         for b in range(max(row - 2, 0), min(row + 3, ny)):
             for a in range(max(x - 2, 0), min(x + 3, nx)):
                 if smooth[b, a]:
@@ -191,23 +189,19 @@ def fit_pixels(
     value, sigma, chi2 = (np.empty((ny, nx), np.float32) for _ in range(3))
     used = np.zeros((ny, nx), np.int32)
     table = templates.table()
-    scale = data.scale.astype(np.float32)
     below_x, share_x = bracket(surface.x_centre, nx)
     below_y, share_y = bracket(surface.y_centre, ny)
-    cell_of_row = data.cell_of_row()
 
     def work(band: int) -> None:
-        low, high = band * _BAND_ROWS, min((band + 1) * _BAND_ROWS, ny)
-        image, variance, bad = data.rows(low, high)
+        low, high = band * BAND_ROWS, min((band + 1) * BAND_ROWS, ny)
         _fit_band(
-            image, core(variance), core(bad), scale, table, templates.start_um, templates.step_um, order_um,
+            *load_band(data, low, high), table, templates.start_um, templates.step_um, order_um,
             surface.thickness_um, surface.slope_y, surface.slope_x, surface.y_centre, surface.x_centre,
             surface.smooth, surface.known, low, below_y, share_y, below_x, share_x,
-            data.offset, cell_of_row, data.x_edges,
             value[low:high], sigma[low:high], chi2[low:high], used[low:high],
         )  # fmt: skip
 
-    run_threaded(work, -(-ny // _BAND_ROWS), threads)
+    run_threaded(work, -(-ny // BAND_ROWS), threads)
     return PixelFit(value, sigma, chi2, used)
 
 
@@ -223,16 +217,14 @@ def bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64]
 
 @kernel(relaxed=True)
 def _fit_band(  # type: ignore[no-untyped-def]
-    image, variance, bad, scale, table, start, step, order,
+    amplitude, weight, table, start, step, order,
     thickness, slope_y, slope_x, y_centre, x_centre, smooth, known, first_row, below_y, share_y, below_x, share_x,
-    offset, cell_of_row, x_edges, value, sigma, chi2_out, used_out,
+    value, sigma, chi2_out, used_out,
 ):  # fmt: skip
-    bands, rows, columns = image.shape
+    bands = amplitude.shape[0]
+    rows, columns = value.shape
     padded = table.shape[1]
     longest = _LONGEST_STEP * order / step
-    # Rows of 2^n pixels would share the lines of the processor's cache; a few pixels more keep them apart.
-    amplitude = np.zeros((bands, columns + _KEEP_APART), np.float32)
-    weight = np.zeros((bands, columns + _KEEP_APART), np.float32)
     # Amplitudes lie far apart in a cube; blocks of pixels bring those of one pixel together.
     y, w = np.zeros((_BLOCK, padded), np.float32), np.zeros((_BLOCK, padded), np.float32)
     begin, flat = np.empty(columns, np.float32), np.empty(columns, np.bool_)
@@ -242,15 +234,8 @@ def _fit_band(  # type: ignore[no-untyped-def]
     upright = np.empty(thickness.shape[1], np.float32)
     for r in range(rows):
         for band in range(bands):
-            vb = band if variance.shape[0] > 1 else 0
-            bb = band if bad.shape[0] > 1 else 0
-            vr = r if variance.shape[1] > 1 else 0
-            br = r if bad.shape[1] > 1 else 0
-            line, spread = amplitude[band][:columns], weight[band][:columns]
-            load_row(image[band, r], variance[vb, vr], bad[bb, br], scale[band], line, spread)
-            _invert_row(spread, used_out[r])
-            if offset.shape[0] > 0:
-                subtract_row(line, offset[band, cell_of_row[first_row + r]], x_edges)
+            for x in range(columns):
+                used_out[r, x] += np.int32(weight[band, r, x] > np.float32(0.0))
         own_y = _start_row(
             thickness,
             smooth,
@@ -266,11 +251,11 @@ def _fit_band(  # type: ignore[no-untyped-def]
             size = min(_BLOCK, columns - first)
             for band in range(bands):
                 for b in range(size):
-                    y[b, band] = amplitude[band, first + b]
-                    w[b, band] = weight[band, first + b]
+                    y[b, band] = amplitude[band, r, first + b]
+                    w[b, band] = weight[band, r, first + b]
             for b in range(size):
                 place[b] = min(max((begin[first + b] - start) / step, 0.0), top)
-            newton_block(table, place, y, w, size, _STEPS, longest, information, misfit, move)
+            newton_block(table, place, y, w, size, np.int64(_STEPS), longest, information, misfit, move)
             for b in range(size):
                 x = first + b
                 if not flat[x] and used_out[r, x] > 0:
@@ -284,25 +269,6 @@ def _fit_band(  # type: ignore[no-untyped-def]
                 sigma[r, first + b] = information[b]
                 chi2_out[r, first + b] = misfit[b]
         _finish_row(value[r], sigma[r], chi2_out[r], used_out[r], np.float32(step))
-
-
-@subkernel
-def subtract_row(line, offset, x_edges):  # type: ignore[no-untyped-def]
-    """Divide one row of flats by the light of each cell; amplitudes are flats less one, and so is the light."""
-    for c in range(offset.shape[0]):
-        per_light = np.float32(1.0) / (np.float32(1.0) + offset[c])
-        for x in range(x_edges[c], x_edges[c + 1]):
-            line[x] = (line[x] - offset[c]) * per_light
-
-
-@subkernel(relaxed=True, expand=True)
-def _invert_row(spread, used):  # type: ignore[no-untyped-def]
-    """Variance to weight, and one wavelength more where there is one."""
-    for x in range(spread.shape[0]):
-        variance = spread[x]
-        good = variance > np.float32(0.0)
-        used[x] += np.int32(good)
-        spread[x] = np.float32(1.0) / variance if good else np.float32(0.0)
 
 
 @subkernel(relaxed=True)
@@ -364,7 +330,7 @@ def _try_surfaces(  # type: ignore[no-untyped-def]
     best, best_information, best_chi2, best_cost = 0.0, np.float32(0.0), np.float32(0.0), np.inf
     for k in range(number):
         place = min(max((guess[k] - start) / step, 0.0), table.shape[0] - 1.0)
-        place, information, chi2 = gauss_newton(table, place, y, w, item, 2 * _STEPS, longest)
+        place, information, chi2 = gauss_newton(table, place, y, w, item, np.int64(2 * _STEPS), longest)
         cost = chi2 + (_LONE_CELL_PENALTY if votes[k] == 1 else 0.0)
         if cost < best_cost:
             best, best_information, best_chi2, best_cost = place, information, chi2, cost

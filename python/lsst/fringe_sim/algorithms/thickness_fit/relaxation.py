@@ -244,7 +244,7 @@ def _top(parent, cell):  # type: ignore[no-untyped-def]
 def _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond):  # type: ignore[no-untyped-def]
     """Jumps from the cells of a surface to the cells around it; returns how many there are."""
     ny, nx = thickness.shape
-    number = 0
+    number = np.int64(0)
     for cell in members:
         y, x = cell // nx, cell % nx
         for side in range(4):
@@ -271,7 +271,7 @@ def _main_jump(jumps, beyond, number, kept):  # type: ignore[no-untyped-def]
         run = run + 1 if k > 0 and kept[k] == kept[k - 1] else 1
         if run > longest:
             most, longest = kept[k], run
-    count = 0
+    count = np.int64(0)
     for k in range(number):
         if beyond[k] == most:
             kept[count] = jumps[k]
@@ -334,7 +334,7 @@ def _move_surface(  # type: ignore[no-untyped-def]
         place = min(max((own_thickness - start) / step, 0.0), top)
         _, _, here = score(table, place, value, weight, item)
         target = min(max((own_thickness + move - start) / step, 0.0), top)
-        place, _, there = gauss_newton(table, target, value, weight, item, 5, 0.03 / step)
+        place, _, there = gauss_newton(table, target, value, weight, item, np.int64(5), 0.03 / step)
         found[k] = start + step * place
         if abs(place - target) * step > _LONE * order:
             # No minimum there: the cell would have to lie on the surface against its own data.
@@ -368,7 +368,7 @@ def _ask_row(value, weight, table, start, step, thickness, order, low, high, tem
                 cost[c, k] = np.inf
                 continue
             place = min(max((at - start) / step, 0.0), top)
-            place, _, chi2 = gauss_newton(table, place, value, weight, c, 3, 0.03 / step)
+            place, _, chi2 = gauss_newton(table, place, value, weight, c, np.int64(3), 0.03 / step)
             found = start + step * place
             # What ran away has no minimum there.
             shifted[c, k] = found if abs(found - at) < SAME_SURFACE * order else at

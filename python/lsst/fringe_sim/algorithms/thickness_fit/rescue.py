@@ -162,7 +162,7 @@ def _leave_one_out(  # type: ignore[no-untyped-def]
         y, x = rows[k], columns[k]
         if used[y, x] < _FEWEST_TO_SPARE:
             continue
-        number = 0
+        number = np.int64(0)
         for b in range(max(y - 3, 0), min(y + 4, ny)):
             for a in range(max(x - 3, 0), min(x + 4, nx)):
                 if not bad[b, a] and np.isfinite(thickness[b, a]):
@@ -182,7 +182,7 @@ def _leave_one_out(  # type: ignore[no-untyped-def]
         if worst < 0:
             continue
         weight[k, worst] = 0.0
-        at, information, chi2 = gauss_newton(table, place, value, weight, k, 5, 0.03 / step)
+        at, information, chi2 = gauss_newton(table, place, value, weight, k, np.int64(5), 0.03 / step)
         left = used[y, x] - 1
         if chi2 / (left - 1) < limit[left] and abs(at - place) * step < 0.5 * order and information > 0.0:
             thickness[y, x] = start + step * at

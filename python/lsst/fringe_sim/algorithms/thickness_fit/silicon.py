@@ -664,4 +664,4 @@ def _lagrange(place: Any) -> tuple[list[FloatArray], list[FloatArray]]:
 @kernel
 def _scan_pixels(table, places, value, weight, longest, chi2):  # type: ignore[no-untyped-def]
     for k in range(places.shape[0]):
-        _, _, chi2[k] = gauss_newton(table, places[k], value, weight, k, 4, longest)
+        _, _, chi2[k] = gauss_newton(table, places[k], value, weight, k, np.int64(4), longest)

@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel, run_threaded
 from .amplitudes import Amplitudes
-from .cells import core, load_row
+from .bands import BAND_ROWS, load_band
 from .global_fit import GlobalFit
 from .newton import gauss_newton
 from .templates import FringeTemplates
 
 __all__ = ["lone_slip_probability", "slip_probability"]
 
-_BAND_ROWS = 16
 _SHIFTS = 4
 """Orders on both sides that a lone pixel is compared with."""
 
@@ -80,47 +79,36 @@ def lone_slip_probability(
     """
     out = np.ones(thickness_um.shape, np.float32)
     table = templates.table()
-    scale = data.scale.astype(np.float32)
 
     def work(band: int) -> None:
-        rows = slice(band * _BAND_ROWS, (band + 1) * _BAND_ROWS)
-        image, variance, bad = data.rows(rows.start, rows.stop)
+        rows = slice(band * BAND_ROWS, (band + 1) * BAND_ROWS)
         _lone_band(
-            image, core(variance), core(bad), scale, table, templates.start_um, templates.step_um,
+            *load_band(data, rows.start, rows.stop), table, templates.start_um, templates.step_um,
             thickness_um[rows], order_um, out[rows],
         )  # fmt: skip
 
-    run_threaded(work, -(-len(out) // _BAND_ROWS), threads)
+    run_threaded(work, -(-len(out) // BAND_ROWS), threads)
     return out
 
 
 @kernel(relaxed=True)
-def _lone_band(image, variance, bad, scale, table, start, step, thickness, order, out):  # type: ignore[no-untyped-def]
-    bands, rows, columns = image.shape
-    amplitude, spread = np.zeros((bands, columns), np.float32), np.zeros((bands, columns), np.float32)
+def _lone_band(amplitude, weight, table, start, step, thickness, order, out):  # type: ignore[no-untyped-def]
+    bands = amplitude.shape[0]
+    rows, columns = out.shape
     y, w = np.zeros((1, table.shape[1]), np.float32), np.zeros((1, table.shape[1]), np.float32)
     top = table.shape[0] - 1.0
     for r in range(rows):
-        for band in range(bands):
-            vb = band if variance.shape[0] > 1 else 0
-            bb = band if bad.shape[0] > 1 else 0
-            vr = r if variance.shape[1] > 1 else 0
-            br = r if bad.shape[1] > 1 else 0
-            load_row(
-                image[band, r], variance[vb, vr], bad[bb, br], scale[band], amplitude[band], spread[band]
-            )
         for x in range(columns):
             middle = (thickness[r, x] - start) / step
             if not 0.0 <= middle <= top:
                 continue
             for band in range(bands):
-                y[0, band] = amplitude[band, x]
-                w[0, band] = np.float32(1.0) / spread[band, x] if spread[band, x] > 0.0 else np.float32(0.0)
-            _, _, own = gauss_newton(table, middle, y, w, 0, 5, 0.03 / step)
+                y[0, band], w[0, band] = amplitude[band, r, x], weight[band, r, x]
+            _, _, own = gauss_newton(table, middle, y, w, np.int64(0), np.int64(5), 0.03 / step)
             odds = 0.0
             for shift in range(-_SHIFTS, _SHIFTS + 1):
                 place = middle + shift * order / step
                 if shift != 0 and 0.0 <= place <= top:
-                    _, _, chi2 = gauss_newton(table, place, y, w, 0, 5, 0.03 / step)
+                    _, _, chi2 = gauss_newton(table, place, y, w, np.int64(0), np.int64(5), 0.03 / step)
                     odds += np.exp(min(max(0.5 * (own - chi2), -100.0), 100.0))
             out[r, x] = odds / (1.0 + odds)

@@ -1,0 +1,86 @@
+"""Bands of rows of a sensor, as the compiled loops of the fit want them: amplitudes and weights."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...compiled import kernel
+from .amplitudes import Amplitudes, core
+
+__all__ = ["BAND_ROWS", "load_band"]
+
+BAND_ROWS = 8
+"""Rows that are loaded at once: all wavelengths of a full sensor then stay in the cache of a processor."""
+_KEEP_APART = 80
+"""Columns more: rows of 2^n numbers would share the lines of the processor's cache."""
+_HUGE = np.float32(1e30)
+
+_EVERY = slice(None)
+
+
+def load_band(
+    data: Amplitudes, low: int, high: int, wavelengths: slice = _EVERY
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Amplitudes and inverse variances of the rows from ``low`` to ``high``, light divided out.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    low, high : `int`
+        First row, and the one after the last; rows beyond the sensor are left out.
+    wavelengths : `slice`, optional
+        Which of them; all by default.
+
+    Returns
+    -------
+    amplitude, weight : `numpy.ndarray`, float32, shape ``(n_wavelengths, rows, columns and some more)``
+        Both 0 where a pixel cannot be used; the columns beyond those of the sensor hold nothing.
+    """
+    image, variance, bad = data.rows(low, high, wavelengths)
+    variance, bad = core(variance), core(bad)
+    bands, rows, columns = image.shape
+    amplitude, weight = (np.empty((bands, rows, columns + _KEEP_APART), np.float32) for _ in range(2))
+    scale = data.scale[wavelengths].astype(np.float32)
+    light = data.offset[wavelengths] if len(data.offset) else np.zeros((bands, 0, 1), np.float32)
+    cell_of_row = data.cell_of_row()[low:high]
+    for band in range(bands):
+        _load(
+            np.ascontiguousarray(image[band]), variance[min(band, len(variance) - 1)],
+            bad[min(band, len(bad) - 1)], scale[band], light[band], cell_of_row, data.x_edges,
+            amplitude[band], weight[band],
+        )  # fmt: skip
+    return amplitude, weight
+
+
+@kernel(relaxed=True)
+def _load(image, variance, bad, factor, light, cell_of_row, x_edges, amplitude, weight):  # type: ignore[no-untyped-def]
+    """One wavelength; axes of ``variance`` and ``bad`` have one element where all along them is the same."""
+    rows, columns = image.shape
+    same_variance, same_bad = np.empty(columns, np.float32), np.empty(columns, np.int16)
+    square = factor * factor
+    for row in range(rows):
+        own = variance[min(row, variance.shape[0] - 1)]
+        if own.shape[0] < columns:
+            same_variance[:] = own[0]
+            own = same_variance
+        flag = bad[min(row, bad.shape[0] - 1)]
+        if flag.shape[0] < columns:
+            same_bad[:] = flag[0]
+            flag = same_bad
+        line, value, inverse = image[row], amplitude[row], weight[row]
+        for x in range(columns):
+            level = line[x] * factor - np.float32(1.0)
+            spread = own[x] * square
+            # NaN fails every comparison.
+            good = (abs(level) < _HUGE) & (spread > np.float32(0.0)) & (spread < _HUGE) & (flag[x] == 0)
+            value[x] = level if good else np.float32(0.0)
+            inverse[x] = np.float32(1.0) / spread if good else np.float32(0.0)
+        if light.shape[0] > 0:
+            # Amplitudes are flats less one, and so is the light.
+            own_light = light[cell_of_row[row]]
+            for cell in range(own_light.shape[0]):
+                per_light = np.float32(1.0) / (np.float32(1.0) + own_light[cell])
+                for x in range(x_edges[cell], x_edges[cell + 1]):
+                    value[x] = (value[x] - own_light[cell]) * per_light
