@@ -14,10 +14,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..compiled import contiguous, kernel, run_shares
 from ..errors import InputError, OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
@@ -405,15 +405,18 @@ class FieldTable:
             allowed = f"{self.table.start_um:.6g} to {self.table.stop_um:.6g} (range of the table)"
             raise OutOfRangeError("thickness [um]", (float(low), float(high)), allowed)
         coefficients = self.table.polynomials.astype(np.float32)
-        return _frame_kernel(
-            coefficients.reshape(len(coefficients), -1),
+        arguments = (
+            contiguous(coefficients.reshape(len(coefficients), -1)),
             self.table.start_um,
             1.0 / self.table.step_um,
             self.start_deg,
             1.0 / self.step_deg,
-            self.placement.plane((thickness.shape[0], thickness.shape[1])),
-            thickness,
+            contiguous(self.placement.plane((thickness.shape[0], thickness.shape[1])), float),
+            contiguous(thickness),
         )
+        out = np.empty(thickness.shape, dtype=np.float32)
+        run_shares(lambda first, last: _frame_kernel(*arguments, first, last, out), len(out), _LEAST_ROWS)
+        return out
 
 
 def angular_response(
@@ -656,7 +659,11 @@ def _ray_histogram(
     return np.asarray(mass / mass.sum())
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract"})
+_LEAST_ROWS = 16
+"""Rows of a frame that are worth a thread."""
+
+
+@kernel(relaxed=True)
 def _frame_kernel(
     polynomials: NDArray,
     start_um: float,
@@ -665,13 +672,15 @@ def _frame_kernel(
     per_deg: float,
     plane: NDArray,
     thickness: NDArray,
-) -> NDArray:  # pragma: no cover - compiled
+    first_row: int,
+    last_row: int,
+    out: NDArray,
+) -> None:  # pragma: no cover - compiled
     """Cubic in thickness within a cell, and through four neighbouring field radii."""
-    height, width = thickness.shape
+    width = thickness.shape[1]
     rows = polynomials.shape[0]
     last = polynomials.shape[1] // 4 - 1
-    out = np.empty((height, width), dtype=np.float32)
-    for y in numba.prange(height):
+    for y in range(first_row, last_row):
         for x in range(width):
             d = (float(thickness[y, x]) - start_um) * per_step
             if d != d:  # NaN
@@ -699,4 +708,3 @@ def _frame_kernel(
                 c = polynomials[first + k, 4 * cell : 4 * cell + 4]
                 total += weight * (c[0] + t * (c[1] + t * (c[2] + t * c[3])))
             out[y, x] = total
-    return out

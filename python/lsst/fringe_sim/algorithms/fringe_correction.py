@@ -16,11 +16,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 
+from ..compiled import kernel, run_shares
 from ..errors import InputError, OutOfRangeError
 from ..products import CORRECTED, FringeFrame, refuse_corrected
 from .sky_frame import SkyResponse
@@ -260,7 +260,7 @@ def measure_apertures(
     options : `CorrectionOptions`
         Sizes of the apertures, and clipping.
     """
-    levels = _aperture_kernel(
+    arguments = (
         np.ascontiguousarray(exposure, dtype=np.float32),
         np.stack([np.asarray(template, dtype=np.float32) for template in templates]),
         np.ascontiguousarray(good, dtype=np.bool_),
@@ -270,6 +270,9 @@ def measure_apertures(
         options.least_good,
         options.clip_sigma,
     )
+    count = len(arguments[3])
+    levels = np.full((count, 1 + len(arguments[1])), np.nan)
+    run_shares(lambda first, last: _aperture_kernel(*arguments, first, last, levels), count, 1)
     return ApertureMeasurement(levels[:, 0], levels[:, 1:])
 
 
@@ -409,7 +412,7 @@ def _clipped_solution(
     return scale, covariance, int(keep.sum()), rms
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@kernel
 def _aperture_kernel(
     exposure: NDArray,
     templates: NDArray,
@@ -419,11 +422,13 @@ def _aperture_kernel(
     large: int,
     least_good: float,
     clip: float,
-) -> NDArray:  # pragma: no cover - compiled
+    first: int,
+    last: int,
+    out: NDArray,
+) -> None:  # pragma: no cover - compiled
     height, width = exposure.shape
     number = len(templates)
-    out = np.full((len(positions), 1 + number), np.nan)
-    for place in numba.prange(len(positions)):
+    for place in range(first, last):
         y, x = positions[place, 0], positions[place, 1]
         level = np.empty((2, 1 + number))
         complete = True
@@ -455,4 +460,3 @@ def _aperture_kernel(
             level[which] = sums / kept
         if complete:
             out[place] = level[0] - level[1]
-    return out

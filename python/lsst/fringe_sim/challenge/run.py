@@ -16,10 +16,10 @@ from functools import partial
 from itertools import permutations
 from multiprocessing import get_context
 
-import numba
 import numpy as np
 
 from ..algorithms.discovery import SearchOptions, Verdict, discover
+from ..compiled import limit_threads, processors
 from ..effects import EFFECTS
 from .oracle import Oracle, visibility
 from .result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
@@ -83,8 +83,8 @@ def _results(
     if jobs == 1 or len(cases) < 2:
         yield from (work(*case) for case in cases)
         return
-    threads = max(1, numba.config.NUMBA_NUM_THREADS // jobs)
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), numba.set_num_threads, (threads,))
+    threads = max(1, processors() // jobs)
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), limit_threads, (threads,))
     try:
         for done in as_completed([pool.submit(work, *case) for case in cases]):
             yield done.result()

@@ -7,11 +7,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
+from ..compiled import contiguous, kernel, run_shares
 from ..errors import ConvergenceError, InputError, OutOfRangeError
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
@@ -28,6 +28,8 @@ DEFAULT_TOLERANCE = 1e-7
 MOST_POINTS = 4_000_000
 """Points of one row; a table that wants more is refused."""
 
+_LEAST_PIXELS = 20_000
+"""Pixels that are worth a thread."""
 _REFINEMENTS = 6
 
 
@@ -110,7 +112,7 @@ class ResponseTable:
         thickness = np.asarray(thickness_um, dtype=float)
         flat = np.ascontiguousarray(thickness).ravel()
         self._demand_inside(flat)
-        out = _lookup_kernel(self.polynomials, self.start_um, 1.0 / self.step_um, flat, 0)
+        out = self._interpolated(flat, 0)
         return out.reshape(len(out), *thickness.shape)
 
     def thickness_derivative(self, thickness_um: ArrayLike) -> FloatArray:
@@ -118,7 +120,7 @@ class ResponseTable:
         thickness = np.asarray(thickness_um, dtype=float)
         flat = np.ascontiguousarray(thickness).ravel()
         self._demand_inside(flat)
-        out = _lookup_kernel(self.polynomials, self.start_um, 1.0 / self.step_um, flat, 1)
+        out = self._interpolated(flat, 1)
         return (out / self.step_um).reshape(len(out), *thickness.shape)
 
     def frame(
@@ -158,9 +160,30 @@ class ResponseTable:
             out = np.empty(image.shape, dtype=np.float32)
         elif out.shape != image.shape or out.dtype != np.float32:
             raise InputError("output image", (out.shape, str(out.dtype)), f"{image.shape}, float32")
-        outside = _frame_kernel(self._packed[row], self.start_um, 1.0 / self.step_um, image, out)
+        # One type of array each, so that the loop is compiled once.
+        packed, image = contiguous(self._packed[row]), contiguous(image)
+        filled = out if out.flags.c_contiguous else np.empty(image.shape, dtype=np.float32)
+        outside = np.zeros(len(image), dtype=np.bool_)
+
+        def work(first: int, last: int) -> None:
+            _frame_kernel(packed, self.start_um, 1.0 / self.step_um, image, first, last, filled, outside)
+
+        run_shares(work, len(image), max(1, _LEAST_PIXELS // max(image.shape[1], 1)))
+        if filled is not out:
+            out[:] = filled
         if np.any(outside):
             self._demand_inside(np.asarray(image[int(np.argmax(outside))], dtype=float))
+        return out
+
+    def _interpolated(self, thickness: FloatArray, order: int) -> FloatArray:
+        out = np.empty((len(self.values), thickness.size))
+        polynomials = contiguous(self.polynomials)
+        thickness = contiguous(thickness)
+
+        def work(first: int, last: int) -> None:
+            _lookup_kernel(polynomials, self.start_um, 1.0 / self.step_um, thickness, order, first, last, out)
+
+        run_shares(work, thickness.size, _LEAST_PIXELS)
         return out
 
     def _demand_inside(self, thickness: FloatArray) -> None:
@@ -306,13 +329,19 @@ def _estimated_fourth_derivative(sample: Sampler, low: float, high: float) -> fl
     return 1.2 * estimate
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@kernel
 def _lookup_kernel(
-    polynomials: NDArray, start: float, per_step: float, thickness: NDArray, order: int
-) -> NDArray:  # pragma: no cover - compiled
+    polynomials: NDArray,
+    start: float,
+    per_step: float,
+    thickness: NDArray,
+    order: int,
+    first: int,
+    last: int,
+    out: NDArray,
+) -> None:  # pragma: no cover - compiled
     rows, cells, _ = polynomials.shape
-    out = np.empty((rows, thickness.size))
-    for i in numba.prange(thickness.size):
+    for i in range(first, last):
         position = (thickness[i] - start) * per_step
         if position != position:  # NaN
             for row in range(rows):
@@ -326,25 +355,30 @@ def _lookup_kernel(
                 out[row, i] = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
             else:
                 out[row, i] = c[1] + t * (2.0 * c[2] + t * 3.0 * c[3])
-    return out
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract"})
+@kernel(relaxed=True)
 def _frame_kernel(
-    polynomials: NDArray, start: float, per_step: float, thickness: NDArray, out: NDArray
-) -> NDArray:  # pragma: no cover - compiled
-    """Fill ``out`` from flat coefficients, four per cell; returns the rows in which a thickness lies outside."""
-    height, width = thickness.shape
+    polynomials: NDArray,
+    start: float,
+    per_step: float,
+    thickness: NDArray,
+    first: int,
+    last: int,
+    out: NDArray,
+    outside: NDArray,
+) -> None:  # pragma: no cover - compiled
+    """Fill rows of ``out`` from flat coefficients, four per cell; marks those in which a thickness lies outside."""
+    width = thickness.shape[1]
     # The last cell only serves its left end.
-    last = polynomials.size // 4 - 1 + 1e-9
-    outside = np.zeros(height, dtype=np.bool_)
+    end = polynomials.size // 4 - 1 + 1e-9
     # Unsigned indices spare the test for negative ones.
     one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
-    for y in numba.prange(height):
+    for y in range(first, last):
         wrong = False
         for x in range(width):
             position = (float(thickness[y, x]) - start) * per_step
-            if position >= -1e-9 and position <= last:
+            if position >= -1e-9 and position <= end:
                 cell = np.int32(position)
                 t = np.float32(position - cell)
                 k = np.uint64(np.uint32(4 * cell))
@@ -355,4 +389,3 @@ def _frame_kernel(
                 out[y, x] = np.nan
                 wrong |= position == position  # NaN is not "outside"
         outside[y] = wrong
-    return outside

@@ -23,12 +23,11 @@ import itertools
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ..compiled import subkernel
+from ..compiled import contiguous, kernel, processors, run_shares, run_threaded, subkernel
 
 __all__ = ["MOST_RATIO", "ROUNDING", "series_at", "series_on_grid"]
 
@@ -59,6 +58,9 @@ _PIECES = 4
 
 _LEAST_PIECE = 4096
 """Nodes of a share that are worth a grid of their own."""
+
+_LEAST_SUMS = 2_000
+"""Nodes times thicknesses that are worth a thread."""
 
 _POWERS = 12
 """Powers of the slow factor ``exp(-p Im kappa d)`` in one segment of an absorbing layer."""
@@ -180,11 +182,9 @@ def _segment(
     for first in range(0, len(weight), many):
         part = slice(first, first + many)
         groups = len(weight[part])
-        _gridding_kernel(
-            rule, (*(each[part] for each in coefficients), weight[part]), spread_um,
-            start_um + step_um * middle, step_um, order, grid, constant,
-        )  # fmt: skip
-        wave = scipy.fft.ifft(grid[:groups], axis=-1, workers=numba.get_num_threads())
+        nodes = (*(each[part] for each in coefficients), weight[part])
+        _fill_grids(rule, nodes, spread_um, start_um + step_um * middle, step_um, order, grid, constant)
+        wave = scipy.fft.ifft(grid[:groups], axis=-1, workers=processors())
         for group in range(groups):
             fringe[:, middle:] = wave[group, :, : count - middle].real
             fringe[:, :middle] = wave[group, :, size - middle :].real
@@ -265,8 +265,7 @@ def _harmonic(
     return largest
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
-def _gridding_kernel(
+def _fill_grids(
     rule: _Gridding,
     nodes: tuple[NDArray, ...],
     spread: float,
@@ -275,84 +274,131 @@ def _gridding_kernel(
     order: int,
     grid: NDArray,
     constant: NDArray,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Harmonics of the nodes of each group on its frequency grid, and the constant terms."""
-    a, b, e, c, g, kappa, w = nodes
-    for group in numba.prange(len(w)):
-        own = (a[group], b[group], e[group], c[group], g[group], kappa[group], w[group])
-        _grid_group(rule, own, spread, where, step, order, grid[group], constant[group])
-
-
-@subkernel
-def _grid_group(
-    rule: _Gridding,
-    nodes: tuple[NDArray, ...],
-    spread: float,
-    where: float,
-    step: float,
-    order: int,
-    grid: NDArray,
-    constant: NDArray,
-) -> None:  # pragma: no cover - compiled
-    """Harmonics of the nodes of one group on its frequency grid, and the constant terms."""
-    a, b, e, c, g, kappa, w = nodes
-    powers, size = grid.shape
     reach, width, smallest = rule
-    grid[:] = 0.0
-    constant[:] = 0.0
     shape = np.exp(-((np.arange(2 * reach) - (reach - 1.0)) ** 2) / (4.0 * width))
-    harmonic = np.empty(powers, dtype=np.complex128)
-    window = np.empty(2 * reach)
-    mean = np.abs(w).mean()
+    nodes = tuple(contiguous(each) for each in nodes)
+    transparent = not nodes[5].imag.any()
+    grid[: len(nodes[0])] = 0.0
+    constant[: len(nodes[0])] = 0.0
+
+    def work(group: int) -> None:
+        own = tuple(each[group] for each in nodes)
+        if transparent:
+            sign = complex(1j**order)
+            _grid_transparent(
+                *own,
+                shape,
+                width,
+                smallest,
+                spread,
+                where,
+                step,
+                order,
+                sign,
+                grid[group, 0],
+                constant[group],
+            )
+        else:
+            _grid_absorbing(
+                *own, shape, width, smallest, spread, where, step, order, grid[group], constant[group]
+            )
+
+    run_threaded(work, len(nodes[0]))
+
+
+@kernel
+def _grid_transparent(  # type: ignore[no-untyped-def]
+    a, b, e, c, g, kappa, w, shape, width, smallest, spread, where, step, order, sign, grid, constant
+):  # pragma: no cover - compiled
+    """One group of a transparent layer: harmonics by multiplication, as many roundings as there are harmonics."""
+    window = np.empty(shape.size, dtype=np.float64)
+    total = 0.0
+    for q in range(w.size):
+        total += abs(w[q])
     for q in range(w.size):
         if w[q] == 0.0:
             continue
         h, kr = -g[q], kappa[q].real
-        least = smallest * mean / abs(w[q])  # what has little weight needs few terms
-        transparent = kappa[q].imag == 0.0
+        least = smallest * total / (w.size * abs(w[q]))  # what has little weight needs few terms
         s = a[q] + b[q] + e[q]
-        turn = np.exp(1j * kr * where)
-        follow = (s * h + c[q] + c[q].conjugate() * h * h) * turn / (1.0 - abs(h) ** 2)
+        turn = complex(math.cos(kr * where), math.sin(kr * where))
+        norm = 1.0 / (1.0 - abs(h) ** 2)
+        if order == 0:
+            constant[0] += w[q] * norm * (s + 2.0 * (c[q].conjugate() * h).real)
+        follow = (s * h + c[q] + c[q].conjugate() * h * h) * turn * norm
+        for m in range(1, _MOST_TERMS):
+            value = follow * sign
+            if spread > 0.0:
+                value *= math.exp(-0.5 * (m * kr * spread) ** 2)
+            if order > 0:
+                value *= (m * kr) ** order
+            amount = abs(value)
+            low = _spread_harmonic(m * kr * step, 2.0 * w[q], grid.size, shape, width, window)
+            _add_harmonic(value, low, window, grid)
+            if m >= 2 and amount < least * (m * kr) ** order:
+                break
+            follow *= h * turn
+
+
+@kernel
+def _grid_absorbing(  # type: ignore[no-untyped-def]
+    a, b, e, c, g, kappa, w, shape, width, smallest, spread, where, step, order, grid, constant
+):  # pragma: no cover - compiled
+    """One group of an absorbing layer; some of its nodes may be transparent."""
+    powers, size = grid.shape
+    harmonic = np.empty(powers, dtype=np.complex128)
+    window = np.empty(shape.size, dtype=np.float64)
+    total = 0.0
+    for q in range(w.size):
+        total += abs(w[q])
+    for q in range(w.size):
+        if w[q] == 0.0:
+            continue
+        least = smallest * total / (w.size * abs(w[q]))
         for m in range(_MOST_TERMS):
-            if m > 0 and transparent:
-                # C_m z^m by multiplication: as many roundings as there are harmonics.
-                value = follow
-                if spread > 0.0:
-                    value *= math.exp(-0.5 * (m * kr * spread) ** 2)
-                if order > 0:
-                    value *= (1j * m * kr) ** order
-                amount = abs(value)
-                harmonic[0] = value
-                follow *= h * turn
-            else:
-                amount = _harmonic(
-                    m, a[q], b[q], e[q], c[q], h, kappa[q], spread, where, order, harmonic
-                )  # fmt: skip
+            amount = _harmonic(
+                m, a[q], b[q], e[q], c[q], -g[q], kappa[q], spread, where, order, harmonic
+            )  # fmt: skip
             if m == 0:
                 for power in range(powers):
                     constant[power] += w[q] * harmonic[power].real
                 continue
-            turns = m * kr * step / (2.0 * math.pi)
-            position = (turns - math.floor(turns)) * size
-            first = int(position)
-            rest = position - first
-            # exp(-(l - rest)²/4w) = exp(-rest²/4w) exp(rest/2w)^l exp(-l²/4w), from l = 1 - reach
-            ratio = math.exp(rest / (2.0 * width))
-            factor = 2.0 * w[q] * math.exp(-rest * (rest - 2.0 * (1 - reach)) / (4.0 * width))
-            for i in range(2 * reach):
-                window[i] = factor * shape[i]
-                factor *= ratio
-            low = first + 1 - reach
+            low = _spread_harmonic(m * kappa[q].real * step, 2.0 * w[q], size, shape, width, window)
             for power in range(powers):
-                value = harmonic[power]
-                if low >= 0 and low + 2 * reach <= size:
-                    for i in range(2 * reach):
-                        grid[power, low + i] += value * window[i]
-                else:
-                    for i in range(2 * reach):
-                        grid[power, (low + i) % size] += value * window[i]
+                _add_harmonic(harmonic[power], low, window, grid[power])
             if m >= 2 and amount < least * (m * abs(kappa[q])) ** order:
                 break
+
+
+@subkernel
+def _spread_harmonic(phase, weight, size, shape, width, window):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Gaussian of a harmonic over the points of the grid around it; returns the first of them."""
+    turns = phase / (2.0 * math.pi)
+    position = (turns - math.floor(turns)) * size
+    first = int(position)
+    rest = position - first
+    reach = shape.size // 2
+    # exp(-(l - rest)²/4w) = exp(-rest²/4w) exp(rest/2w)^l exp(-l²/4w), from l = 1 - reach
+    ratio = math.exp(rest / (2.0 * width))
+    factor = weight * math.exp(-rest * (rest - 2.0 * (1 - reach)) / (4.0 * width))
+    for i in range(shape.size):
+        window[i] = factor * shape[i]
+        factor *= ratio
+    return first + 1 - reach
+
+
+@subkernel
+def _add_harmonic(value, low, window, grid):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Add a harmonic to the grid, which goes on at its other end."""
+    size = grid.size
+    if low >= 0 and low + window.size <= size:
+        for i in range(window.size):
+            grid[low + i] += value * window[i]
+    else:
+        for i in range(window.size):
+            grid[(low + i) % size] += value * window[i]
 
 
 @subkernel
@@ -379,23 +425,24 @@ def _transparent_sum(
     return total
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
-def series_at(
-    a: NDArray,
-    b: NDArray,
-    e: NDArray,
-    c: NDArray,
-    g: NDArray,
-    kappa: NDArray,
-    w: NDArray,
-    spread: float,
-    thickness: NDArray,
-    order: int,
-) -> NDArray:  # pragma: no cover - compiled
+def series_at(nodes: tuple[NDArray, ...], spread: float, thickness: NDArray, order: int) -> NDArray:
     """Weighted mean, or a derivative, at any thickness; shapes ``(W, Q)``, ``(N,)`` -> ``(W, N)``."""
+    nodes = tuple(contiguous(each) for each in nodes)
+    out = np.zeros((len(nodes[-1]), thickness.size))
+
+    def work(first: int, last: int) -> None:
+        _series_kernel(*nodes, spread, thickness, order, first, last, out)
+
+    run_shares(work, thickness.size, _LEAST_SUMS // nodes[-1].size)
+    return out
+
+
+@kernel
+def _series_kernel(  # type: ignore[no-untyped-def]
+    a, b, e, c, g, kappa, w, spread, thickness, order, first, last, out
+):  # pragma: no cover - compiled
     groups, nodes = w.shape
-    out = np.zeros((groups, thickness.size))
-    for i in numba.prange(thickness.size):
+    for i in range(first, last):
         harmonic = np.empty(1, dtype=np.complex128)
         for group in range(groups):
             total = 0.0
@@ -416,4 +463,3 @@ def series_at(
                     if m >= 2 and amount < _SMALLEST * (m * scale) ** order:
                         break
             out[group, i] = total
-    return out

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import numba
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compiled import subkernel
+from ..compiled import contiguous, kernel, run_shares, subkernel
 
 __all__ = ["reduce_nodes"]
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
 def reduce_nodes(
     index: NDArray,
     thickness: NDArray,
@@ -22,7 +22,7 @@ def reduce_nodes(
     layers: NDArray,
     roughness: NDArray,
     phase: NDArray,
-) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:  # pragma: no cover - compiled
+) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:
     """Coefficients ``a, b, e, c, g, kappa`` of every node for one polarisation.
 
     Parameters
@@ -44,65 +44,93 @@ def reduce_nodes(
     phase : `numpy.ndarray`, shape ``(L,)``
         Extra round-trip phase of every layer [rad].
     """
-    count, nodes = index.shape
-    a, b, e = np.zeros(nodes), np.zeros(nodes), np.zeros(nodes)
-    c, g = np.zeros(nodes, dtype=np.complex128), np.empty(nodes, dtype=np.complex128)
-    kappa = np.empty(nodes, dtype=np.complex128)
-    threads = max(1, min(nodes, _BLOCKS))
-    for block in numba.prange(threads):
-        normal, admittance = np.empty(count, np.complex128), np.empty(count, np.complex128)
-        down, up = np.empty((2, count - 1), np.complex128), np.empty((2, count - 1), np.complex128)
-        travel = np.ones(count, dtype=np.complex128)
-        lit, back, low = (
-            np.empty((4, count), np.complex128),
-            np.empty((4, count), np.complex128),
-            np.empty((4, count), np.complex128),
+    layer_count, nodes = index.shape
+    real, mixed = np.zeros((3, nodes)), np.zeros((3, nodes), dtype=np.complex128)
+    # One type of array each, so that the loop is compiled once.
+    arrays = tuple(
+        contiguous(each, kind)
+        for each, kind in (
+            (index.T, complex), (thickness, float), (wavelength, float), (theta, float),
+            (layers, np.int64), (roughness, float), (phase, float),
         )
-        seen = np.empty((3, count), np.complex128)
-        for node in range(block * nodes // threads, (block + 1) * nodes // threads):
-            wave = wavelength[node]
-            _admittances(index[:, node], theta[node], p_polarized, normal, admittance)
-            _interfaces(normal, admittance, roughness, wave, down, up)
-            for layer in range(1, count - 1):
-                length = 0.0 if layer == varying else thickness[layer]
-                travel[layer] = _travelled((2.0 * np.pi / wave * length) * normal[layer] + 0.5 * phase[layer])
-            _sweep(down, up, travel, 0, varying, 1, seen, lit)
-            reflect_up = _sweep(up, down, travel, varying, 0, -1, seen, back)
-            reflect_low = _sweep(down, up, travel, varying, count - 1, 1, seen, low)
-            entering = lit[0, varying]
-            coupling = entering * reflect_low
-            g[node] = -reflect_up * reflect_low
-            kappa[node] = 2.0 * (2.0 * np.pi * normal[varying] / wave)
-            incident = admittance[0].real
-            for layer in layers:
-                eta = admittance[layer]
-                if layer > varying:
-                    flux = _flux(low[0, layer], low[1, layer], eta) - _flux(low[2, layer], low[3, layer], eta)
-                    e[node] += abs(entering) ** 2 * flux / incident
-                    continue
+    )  # fmt: skip
+
+    def work(first: int, last: int) -> None:
+        room = np.ones((7, 4, layer_count), dtype=np.complex128)
+        _reduce_share(first, last, *arrays, p_polarized, varying, room, real, mixed)
+
+    run_shares(work, nodes, _LEAST_NODES)
+    return real[0], real[1], real[2], mixed[0], mixed[1], mixed[2]
+
+
+_LEAST_NODES = 256
+"""Nodes that are worth a thread."""
+
+
+@kernel
+def _reduce_share(
+    first: int,
+    last: int,
+    index: NDArray,
+    thickness: NDArray,
+    wavelength: NDArray,
+    theta: NDArray,
+    layers: NDArray,
+    roughness: NDArray,
+    phase: NDArray,
+    p_polarized: bool,
+    varying: int,
+    room: NDArray,
+    real: NDArray,
+    mixed: NDArray,
+) -> None:  # pragma: no cover - compiled
+    """The nodes from ``first`` to ``last``; ``room`` holds the fields of one node, seven times four rows, ones."""
+    # A numpy integer has one type, a number in the source one of its own.
+    top, one = np.int64(0), np.int64(1)
+    count = index.shape[1]
+    a, b, e = real[0], real[1], real[2]
+    c, g, kappa = mixed[0], mixed[1], mixed[2]
+    normal, admittance, travel = room[0, 0], room[0, 1], room[0, 2]
+    down, up, seen, lit, back, low = room[1], room[2], room[3], room[4], room[5], room[6]
+    for node in range(first, last):
+        wave = wavelength[node]
+        _admittances(index[node], theta[node], p_polarized, normal, admittance)
+        _interfaces(normal, admittance, roughness, wave, down, up)
+        for layer in range(1, count - 1):
+            length = 0.0 if layer == varying else thickness[layer]
+            travel[layer] = _travelled((2.0 * np.pi / wave * length) * normal[layer] + 0.5 * phase[layer])
+        _sweep(down, up, travel, top, varying, one, seen, lit)
+        reflect_up = _sweep(up, down, travel, varying, top, -one, seen, back)
+        reflect_low = _sweep(down, up, travel, varying, count - one, one, seen, low)
+        entering = lit[0, varying]
+        coupling = entering * reflect_low
+        g[node] = -reflect_up * reflect_low
+        kappa[node] = 2.0 * (2.0 * np.pi * normal[varying] / wave)
+        incident = admittance[0].real
+        for layer in layers:
+            eta = admittance[layer]
+            if layer > varying:
+                flux = _flux(low[0, layer], low[1, layer], eta) - _flux(low[2, layer], low[3, layer], eta)
+                e[node] += abs(entering) ** 2 * flux / incident
+                continue
+            if layer == varying:
+                flux = ((1.0 + reflect_low) * (eta * (1.0 - reflect_low)).conjugate()).real
+                e[node] -= abs(entering) ** 2 * flux / incident
+            for face in range(1 if layer == varying else 2):
                 if layer == varying:
-                    flux = ((1.0 + reflect_low) * np.conj(eta * (1.0 - reflect_low))).real
-                    e[node] -= abs(entering) ** 2 * flux / incident
-                for face in range(1 if layer == varying else 2):
-                    if layer == varying:
-                        u_forward, u_backward, v_forward, v_backward = entering, 0j, 0j, coupling
-                    else:
-                        # Light from below sees the layer upside down: its lower face is the upper one.
-                        other = 2 - 2 * face
-                        u_forward, u_backward = lit[2 * face, layer], lit[2 * face + 1, layer]
-                        v_forward = g[node] * u_forward + coupling * back[other + 1, layer]
-                        v_backward = g[node] * u_backward + coupling * back[other, layer]
-                    sign = 1.0 - 2.0 * face
-                    u_sum, u_diff = u_forward + u_backward, eta * (u_forward - u_backward)
-                    v_sum, v_diff = v_forward + v_backward, eta * (v_forward - v_backward)
-                    a[node] += sign * (u_sum * np.conj(u_diff)).real / incident
-                    b[node] += sign * (v_sum * np.conj(v_diff)).real / incident
-                    c[node] += sign * 0.5 * (np.conj(u_sum) * v_diff + v_sum * np.conj(u_diff)) / incident
-    return a, b, e, c, g, kappa
-
-
-_BLOCKS = 64
-"""Shares of the nodes that threads take one after the other."""
+                    u_forward, u_backward, v_forward, v_backward = entering, 0j, 0j, coupling
+                else:
+                    # Light from below sees the layer upside down: its lower face is the upper one.
+                    other = 2 - 2 * face
+                    u_forward, u_backward = lit[2 * face, layer], lit[2 * face + 1, layer]
+                    v_forward = g[node] * u_forward + coupling * back[other + 1, layer]
+                    v_backward = g[node] * u_backward + coupling * back[other, layer]
+                sign = 1.0 - 2.0 * face
+                u_sum, u_diff = u_forward + u_backward, eta * (u_forward - u_backward)
+                v_sum, v_diff = v_forward + v_backward, eta * (v_forward - v_backward)
+                a[node] += sign * (u_sum * u_diff.conjugate()).real / incident
+                b[node] += sign * (v_sum * v_diff.conjugate()).real / incident
+                c[node] += sign * 0.5 * (u_sum.conjugate() * v_diff + v_sum * u_diff.conjugate()) / incident
 
 
 @subkernel
@@ -117,14 +145,14 @@ def _admittances(
     index: NDArray, theta: float, p_polarized: bool, normal: NDArray, admittance: NDArray
 ) -> None:  # pragma: no cover - compiled
     """As `layer_admittance`."""
-    parallel = index[0].real * np.sin(theta)
+    parallel = index[0].real * math.sin(theta)
     for layer in range(index.size):
         squared = index[layer] * index[layer]
         difference = squared - parallel * parallel
         if parallel == 0.0:
             normal[layer] = index[layer]
         elif difference.imag == 0.0 and difference.real > 0.0:
-            normal[layer] = np.sqrt(difference.real)
+            normal[layer] = math.sqrt(difference.real)
         else:
             root = np.sqrt(difference)
             normal[layer] = -root if root.imag < 0.0 else root
@@ -134,8 +162,8 @@ def _admittances(
 @subkernel
 def _travelled(phase: complex) -> complex:  # pragma: no cover - compiled
     """exp(i phase)."""
-    size = 1.0 if phase.imag == 0.0 else np.exp(-phase.imag)
-    return complex(size * np.cos(phase.real), size * np.sin(phase.real))
+    size = 1.0 if phase.imag == 0.0 else math.exp(-phase.imag)
+    return complex(size * math.cos(phase.real), size * math.sin(phase.real))
 
 
 @subkernel
@@ -209,4 +237,4 @@ def _sweep(
 @subkernel
 def _flux(forward: complex, backward: complex, admittance: complex) -> float:  # pragma: no cover - compiled
     """Energy flow along ``forward``."""
-    return ((forward + backward) * np.conj(admittance * (forward - backward))).real
+    return ((forward + backward) * (admittance * (forward - backward)).conjugate()).real

@@ -12,14 +12,13 @@ with six numbers per wavelength, angle and polarisation, however many layers the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..compiled import kernel
+from ..compiled import contiguous, kernel, run_shares
 from ..errors import ConvergenceError, InputError, OutOfRangeError
 from .coherence import phase_states
 from .harmonics import MOST_RATIO, ROUNDING, series_at, series_on_grid
@@ -39,6 +38,9 @@ _SHORT_GRID = 256
 
 _LARGEST_RATIO = 0.9
 """Ratio of two harmonics above which the series is too long to pay."""
+
+_LEAST_WORK = 20_000
+"""Nodes times thicknesses that are worth a thread."""
 
 _ANCHOR = 64
 """Steps of the phase recurrence between two exact evaluations; keeps its rounding error below 1e-14."""
@@ -142,7 +144,7 @@ class PhaseResponse:
         place = np.broadcast_to(thickness, shape).ravel()
         out = np.array(
             [
-                series_at(*(part[i : i + 1] for part in spread), self.spread_um, place[i : i + 1], order)[
+                series_at(tuple(part[i : i + 1] for part in spread), self.spread_um, place[i : i + 1], order)[
                     0, 0
                 ]
                 for i in range(place.size)
@@ -168,9 +170,9 @@ class PhaseResponse:
         arrays, weights, squeeze = self._grouped(weight)
         flat = np.ascontiguousarray(thickness).ravel()
         if self.spread_um > 0.0:
-            out = series_at(*arrays, weights, self.spread_um, flat, 0)
+            out = series_at((*arrays, weights), self.spread_um, flat, 0)
         else:
-            out = _average_kernel(*arrays, weights, flat)
+            out = _at_thicknesses(_average_kernel, arrays, weights, flat)
         return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
 
     def averaged_on_grid(
@@ -189,7 +191,7 @@ class PhaseResponse:
         if self.spread_um > 0.0 or (count > _SHORT_GRID and self._series_pays()):
             out = series_on_grid(arrays, weights, self.spread_um, *grid, tolerance=tolerance)
         else:
-            out = _grid_kernel(*arrays, weights, *grid)
+            out = _on_grid(arrays, weights, *grid)
         return out[0] if squeeze else out
 
     def averaged_derivative_on_grid(
@@ -213,9 +215,9 @@ class PhaseResponse:
         arrays, weights, squeeze = self._grouped(weight)
         flat = np.ascontiguousarray(thickness).ravel()
         if self.spread_um > 0.0:
-            out = series_at(*arrays, weights, self.spread_um, flat, 1)
+            out = series_at((*arrays, weights), self.spread_um, flat, 1)
         else:
-            out = _derivative_kernel(*arrays, weights, flat)
+            out = _at_thicknesses(_derivative_kernel, arrays, weights, flat)
         return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
 
     def derivative_bound(self, weight: ArrayLike, order: int, from_um: float = 0.0) -> FloatArray:
@@ -255,7 +257,7 @@ class PhaseResponse:
 
         def group(array: np.ndarray) -> np.ndarray:
             split = array.reshape(len(array), groups, -1)
-            return np.ascontiguousarray(np.moveaxis(split, 0, 1).reshape(groups, -1))
+            return contiguous(np.moveaxis(split, 0, 1).reshape(groups, -1))
 
         return (
             tuple(group(getattr(self, name)) for name in _COEFFICIENTS),
@@ -341,7 +343,15 @@ def reduce_to_phase(
             phase = np.zeros(count)
             phase[list(state.phases)] = list(state.phases.values())
             reduced = reduce_nodes(
-                flat, thickness, *nodes, each == "p", varying, np.array(layers, dtype=np.int64), rough, phase
+                flat,
+                thickness,
+                nodes[0],
+                nodes[1],
+                each == "p",
+                varying,
+                np.array(layers, dtype=np.int64),
+                rough,
+                phase,
             )
             parts.append([part.reshape(trailing) for part in reduced])
             shares.append(np.broadcast_to(state.share / len(polarizations), trailing))
@@ -364,14 +374,50 @@ def _checked_thickness(thickness_um: ArrayLike) -> FloatArray:
     return thickness
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+def _at_thicknesses(
+    function: Callable[..., None], arrays: tuple[np.ndarray, ...], weights: FloatArray, thickness: FloatArray
+) -> FloatArray:
+    """One of the kernels at all thicknesses, in threads; ``(W, N)``."""
+    out = np.empty((len(weights), thickness.size))
+
+    def work(first: int, last: int) -> None:
+        function(*arrays, weights, thickness, first, last, out)
+
+    run_shares(work, thickness.size, _LEAST_WORK // weights.size)
+    return out
+
+
+def _on_grid(
+    arrays: tuple[np.ndarray, ...], weights: FloatArray, start: float, step: float, count: int
+) -> FloatArray:
+    """The closed form on a uniform grid, in threads; ``(W, count)``."""
+    out = np.empty((len(weights), count))
+
+    def work(first: int, last: int) -> None:
+        _grid_kernel(*arrays, weights, start, step, first, last, out)
+
+    tasks = len(weights) * -(-count // _ANCHOR)
+    run_shares(work, tasks, _LEAST_WORK // (_ANCHOR * weights.shape[1]))
+    return out
+
+
+@kernel
 def _average_kernel(
-    a: NDArray, b: NDArray, e: NDArray, c: NDArray, g: NDArray, kappa: NDArray, w: NDArray, d: NDArray
-) -> NDArray:  # pragma: no cover - compiled
+    a: NDArray,
+    b: NDArray,
+    e: NDArray,
+    c: NDArray,
+    g: NDArray,
+    kappa: NDArray,
+    w: NDArray,
+    d: NDArray,
+    first: int,
+    last: int,
+    out: NDArray,
+) -> None:  # pragma: no cover - compiled
     groups, nodes = w.shape
-    out = np.zeros((groups, d.size))
     for m in range(groups):
-        for i in numba.prange(d.size):
+        for i in range(first, last):
             total = 0.0
             for q in range(nodes):
                 size = math.exp(-kappa[m, q].imag * d[i])
@@ -383,17 +429,25 @@ def _average_kernel(
                 v = g[m, q].real * y + g[m, q].imag * x
                 total += w[m, q] * top / (u * u + v * v)
             out[m, i] = total
-    return out
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@kernel
 def _derivative_kernel(
-    a: NDArray, b: NDArray, e: NDArray, c: NDArray, g: NDArray, kappa: NDArray, w: NDArray, d: NDArray
-) -> NDArray:  # pragma: no cover - compiled
+    a: NDArray,
+    b: NDArray,
+    e: NDArray,
+    c: NDArray,
+    g: NDArray,
+    kappa: NDArray,
+    w: NDArray,
+    d: NDArray,
+    first: int,
+    last: int,
+    out: NDArray,
+) -> None:  # pragma: no cover - compiled
     groups, nodes = w.shape
-    out = np.zeros((groups, d.size))
     for m in range(groups):
-        for i in numba.prange(d.size):
+        for i in range(first, last):
             total = 0.0
             for q in range(nodes):
                 size = math.exp(-kappa[m, q].imag * d[i])
@@ -408,7 +462,6 @@ def _derivative_kernel(
                 dbottom = 2.0 * (field.conjugate() * g[m, q] * dz).real
                 total += w[m, q] * (dtop * bottom - top * dbottom) / (bottom * bottom)
             out[m, i] = total
-    return out
 
 
 @kernel
@@ -458,7 +511,7 @@ def _bound_kernel(
     return out
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract", "arcp", "reassoc"})
+@kernel(relaxed=True)
 def _grid_kernel(
     a: NDArray,
     b: NDArray,
@@ -469,12 +522,14 @@ def _grid_kernel(
     w: NDArray,
     start: float,
     step: float,
-    count: int,
-) -> NDArray:  # pragma: no cover - compiled
-    groups, nodes = w.shape
-    out = np.zeros((groups, count))
+    first_task: int,
+    last_task: int,
+    out: NDArray,
+) -> None:  # pragma: no cover - compiled
+    """Blocks of `_ANCHOR` thicknesses of the groups, counted through."""
+    nodes, count = w.shape[1], out.shape[1]
     blocks = (count + _ANCHOR - 1) // _ANCHOR
-    for task in numba.prange(groups * blocks):
+    for task in range(first_task, last_task):
         m = task // blocks
         first = (task % blocks) * _ANCHOR
         many = min(_ANCHOR, count - first)
@@ -512,4 +567,3 @@ def _grid_kernel(
                     total[i] += wq * top / (u * u + v * v)
         for i in range(many):
             out[m, first + i] = total[i]
-    return out

@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compiled import subkernel
+from ...compiled import contiguous, kernel, run_shares, subkernel
 from ...effects import ActiveEffect, Effect, ImageGeometry, activate_effects, apply_to_image
 from ...model import FringeModel
 from ...optics.illumination import Illumination
@@ -52,6 +51,9 @@ UNIFORM = 1.8
 
 LEAST_PART = 1e-6
 """Part of a cell that is rounding."""
+
+_LEAST_LOOKUPS = 20_000
+"""Cells times wavelengths that are worth a thread."""
 
 _BLOCK = 256
 """Cells that a core interpolates at a time."""
@@ -693,7 +695,6 @@ def _along(gradient: FloatArray, moments: FloatArray) -> FloatArray:
     return np.stack([first, second])
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
 def _interpolate(
     table: FloatArray,
     start: float,
@@ -701,16 +702,28 @@ def _interpolate(
     thickness: FloatArray,
     second: FloatArray,
     fourth: FloatArray,
-) -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
+) -> tuple[FloatArray, FloatArray]:
     """Cubic interpolation of value and slope, averaged over the thickness spread.
 
     Three places have its second and fourth moment: of a uniform spread those of Gauss and Legendre.
     """
-    waves = table.shape[0]
-    column = np.ascontiguousarray(table.T)  # the wavelengths of a node side by side
-    value = np.empty((waves, thickness.size))
-    slope = np.empty((waves, thickness.size))
-    for block in numba.prange((thickness.size + _BLOCK - 1) // _BLOCK):
+    column = contiguous(table.T)  # the wavelengths of a node side by side
+    cells = tuple(contiguous(each, float) for each in (thickness, second, fourth))
+    value, slope = np.empty((len(table), thickness.size)), np.empty((len(table), thickness.size))
+
+    def work(first: int, last: int) -> None:
+        _interpolate_blocks(column, start, step, *cells, first, last, value, slope)
+
+    run_shares(work, -(-thickness.size // _BLOCK), max(1, _LEAST_LOOKUPS // (_BLOCK * len(table))))
+    return value, slope
+
+
+@kernel
+def _interpolate_blocks(  # type: ignore[no-untyped-def]
+    column, start, step, thickness, second, fourth, first_block, last_block, value, slope
+):  # pragma: no cover - compiled
+    waves = column.shape[1]
+    for block in range(first_block, last_block):
         first = block * _BLOCK
         number = min(_BLOCK, thickness.size - first)
         own_value, own_slope = np.zeros((number, waves)), np.zeros((number, waves))
@@ -731,10 +744,9 @@ def _interpolate(
             for j in range(number):
                 value[w, first + j] = own_value[j, w]
                 slope[w, first + j] = own_slope[j, w]
-    return value, slope
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _move_to_centroids(
     value: FloatArray,
     slope: FloatArray,
@@ -743,7 +755,7 @@ def _move_to_centroids(
     planes: NDArray[np.intp],
 ) -> None:  # pragma: no cover - compiled
     """Add to the cells ``(R, n)`` of some planes what their centroids ``(2, W, n)`` change, to first order."""
-    for row in numba.prange(len(planes)):
+    for row in range(len(planes)):
         plane = planes[row]
         for i in range(value.shape[1]):
             moved = gradient[0, i] * rest[0, plane, i] + gradient[1, i] * rest[1, plane, i]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from ...compiled import subkernel
+from ...compiled import kernel, run_threaded, subkernel
 from ...model import FringeModel
 from .cells import CellData
 from .start import SEARCH_STEP_UM, order_steps, robust_surface, search_template
@@ -92,11 +91,22 @@ def joined_planes(model: FringeModel, cells: CellData, thickness_um: FloatArray)
     blocks = _Blocks.of(rows, columns)
     middle = np.clip(np.rint(blocks.centre_of(surface)), 0, template.shape[1] - 1).astype(np.int64)
     slopes = np.linspace(-STEEPEST, STEEPEST, SLOPES) * order
-    found = _best_planes(
-        cross, square, columns, blocks.top, blocks.left, middle, slopes, round(ORDERS * order)
+    found = np.zeros((len(blocks.top), 4))
+    reach = round(ORDERS * order)
+    run_threaded(
+        lambda block: _best_plane(
+            cross, square, columns, blocks.top, blocks.left, middle, slopes, reach, block, found[block]
+        ),
+        len(found),
     )
     height = blocks.joined(found, order)
-    curves = _gains(cross, square, columns, blocks.top, blocks.left, found[:, 1:3])
+    curves = np.zeros((len(found), cross.shape[1]), np.float32)
+    run_threaded(
+        lambda block: _gains(
+            cross, square, columns, blocks.top[block], blocks.left[block], found[block], curves[block]
+        ),
+        len(found),
+    )
     height += _common_move(curves, height, round(ORDERS_MOVED * order))
     joined = blocks.spread(height, found, cells.shape[1:])
     return np.asarray(low + SEARCH_STEP_UM * robust_surface(joined, cells.seen, SURFACE_SPACING, order))
@@ -235,8 +245,8 @@ def _plane(
             away[row * SIDE + column] = round(down * (row - half) + along * (column - half))
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def _best_planes(
+@kernel
+def _best_plane(
     cross: NDArray[np.float32],
     square: NDArray[np.float32],
     columns: int,
@@ -245,48 +255,45 @@ def _best_planes(
     middle: NDArray[np.int64],
     slopes: FloatArray,
     reach: int,
-) -> FloatArray:  # pragma: no cover - compiled
-    """Height in the middle, slopes down and along, and gain of the best plane of every block, ``(B, 4)``."""
-    found = np.zeros((top.size, 4))
+    block: int,
+    found: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Height in the middle, slopes down and along, and gain of the best plane of a block."""
     fine = slopes[1] - slopes[0]
-    for block in numba.prange(top.size):
-        own, away = np.empty(SIDE * SIDE, np.int64), np.empty(SIDE * SIDE, np.int64)
-        found[block, 0] = middle[block]
-        for down in slopes:
-            for along in slopes:
-                _plane(top[block], left[block], columns, down, along, own, away)
-                for at in range(middle[block] - reach, middle[block] + reach + 1, STRIDE):
-                    gain = _gain(cross, square, own, away, at)
-                    if gain > found[block, 3]:
-                        found[block, 0], found[block, 1], found[block, 2] = at, down, along
-                        found[block, 3] = gain
-        first = found[block].copy()
-        for part_down in range(-2, 3):
-            for part_along in range(-2, 3):
-                down, along = first[1] + 0.25 * part_down * fine, first[2] + 0.25 * part_along * fine
-                _plane(top[block], left[block], columns, down, along, own, away)
-                for at in range(int(first[0]) - STRIDE, int(first[0]) + STRIDE + 1):
-                    gain = _gain(cross, square, own, away, at)
-                    if gain > found[block, 3]:
-                        found[block, 0], found[block, 1], found[block, 2] = at, down, along
-                        found[block, 3] = gain
-    return found
+    own, away = np.empty(SIDE * SIDE, np.int64), np.empty(SIDE * SIDE, np.int64)
+    found[0] = middle[block]
+    for down in slopes:
+        for along in slopes:
+            _plane(top[block], left[block], columns, down, along, own, away)
+            for at in range(middle[block] - reach, middle[block] + reach + 1, STRIDE):
+                gain = _gain(cross, square, own, away, at)
+                if gain > found[3]:
+                    found[0], found[1], found[2] = at, down, along
+                    found[3] = gain
+    first = found.copy()
+    for part_down in range(-2, 3):
+        for part_along in range(-2, 3):
+            down, along = first[1] + 0.25 * part_down * fine, first[2] + 0.25 * part_along * fine
+            _plane(top[block], left[block], columns, down, along, own, away)
+            for at in range(int(first[0]) - STRIDE, int(first[0]) + STRIDE + 1):
+                gain = _gain(cross, square, own, away, at)
+                if gain > found[3]:
+                    found[0], found[1], found[2] = at, down, along
+                    found[3] = gain
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _gains(
     cross: NDArray[np.float32],
     square: NDArray[np.float32],
     columns: int,
-    top: NDArray[np.int64],
-    left: NDArray[np.int64],
-    slopes: FloatArray,
-) -> NDArray[np.float32]:  # pragma: no cover - compiled
-    """Gain of planes of known slopes at every height, ``(B, D)``."""
-    curves = np.zeros((top.size, cross.shape[1]), np.float32)
-    for block in numba.prange(top.size):
-        own, away = np.empty(SIDE * SIDE, np.int64), np.empty(SIDE * SIDE, np.int64)
-        _plane(top[block], left[block], columns, slopes[block, 0], slopes[block, 1], own, away)
-        for at in range(cross.shape[1]):
-            curves[block, at] = _gain(cross, square, own, away, at)
-    return curves
+    top: int,
+    left: int,
+    plane: FloatArray,
+    curve: NDArray[np.float32],
+) -> None:  # pragma: no cover - compiled
+    """Gain of a plane of known slopes at every height."""
+    own, away = np.empty(SIDE * SIDE, np.int64), np.empty(SIDE * SIDE, np.int64)
+    _plane(top, left, columns, plane[1], plane[2], own, away)
+    for at in range(cross.shape[1]):
+        curve[at] = _gain(cross, square, own, away, at)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, median, median_filter, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ...compiled import kernel, subkernel
+from ...compiled import contiguous, kernel, run_shares, subkernel
 from ...model import FringeModel
 from .basis import SplineBasis
 from .cells import CellData
@@ -34,7 +33,7 @@ HALF_WINDOW_UM = 0.12
 """Reach of the search around a neighbour's thickness [µm]; below half a fringe order."""
 
 CELLS_AT_ONCE = 256
-"""Cells that a processor correlates one after the other."""
+"""Cells that are worth a thread."""
 
 FEWEST_ROWS = 12
 """Rows and columns of cells from which on they are looked at together."""
@@ -299,43 +298,53 @@ def _correlate(template: FloatArray, cells: CellData) -> NDArray[np.float32]:
     waves = cells.shape[0]
     amplitude = np.ascontiguousarray((cells.value - 1.0).reshape(waves, -1).T)
     weight = np.ascontiguousarray(cells.weight.reshape(waves, -1).T)
-    return np.asarray(_correlations(amplitude, weight, np.ascontiguousarray(template), template**2))
+    template = contiguous(template)
+    square = template**2
+    score = np.empty((len(amplitude), template.shape[1]), np.float32)
+    run_shares(
+        lambda first, last: _correlations(amplitude, weight, template, square, first, last, score),
+        len(score),
+        CELLS_AT_ONCE,
+    )
+    return score
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel
 def _correlations(
-    amplitude: FloatArray, weight: FloatArray, template: FloatArray, square: FloatArray
-) -> NDArray[np.float32]:  # pragma: no cover - compiled
+    amplitude: FloatArray,
+    weight: FloatArray,
+    template: FloatArray,
+    square: FloatArray,
+    first_cell: int,
+    last_cell: int,
+    score: NDArray[np.float32],
+) -> None:  # pragma: no cover - compiled
     """Of cells ``(N, W)`` with fringes ``(W, D)`` and their squares.
 
     An offset common to all wavelengths of a cell is free as well: pixel response, illumination.
     """
-    number, waves = amplitude.shape
-    steps = template.shape[1]
-    score = np.empty((number, steps), np.float32)
-    for block in numba.prange((number + CELLS_AT_ONCE - 1) // CELLS_AT_ONCE):
-        cross, first, second = np.empty(steps), np.empty(steps), np.empty(steps)
-        for i in range(block * CELLS_AT_ONCE, min(number, (block + 1) * CELLS_AT_ONCE)):
-            total, mean = 1e-30, 0.0  # a cell without data scores nothing
-            for w in range(waves):
-                total += weight[i, w]
-                mean += weight[i, w] * amplitude[i, w]
-            mean /= total
-            cross[:], first[:], second[:] = 0.0, 0.0, 0.0
-            power = 1e-300
-            for w in range(waves):
-                own = weight[i, w]
-                signal = own * (amplitude[i, w] - mean)
-                power += signal * (amplitude[i, w] - mean)
-                for d in range(steps):
-                    cross[d] += signal * template[w, d]
-                    first[d] += own * template[w, d]
-                    second[d] += own * square[w, d]
-            root = math.sqrt(power)
+    waves, steps = template.shape
+    cross, first, second = np.empty(steps), np.empty(steps), np.empty(steps)
+    for i in range(first_cell, last_cell):
+        total, mean = 1e-30, 0.0  # a cell without data scores nothing
+        for w in range(waves):
+            total += weight[i, w]
+            mean += weight[i, w] * amplitude[i, w]
+        mean /= total
+        cross[:], first[:], second[:] = 0.0, 0.0, 0.0
+        power = 1e-300
+        for w in range(waves):
+            own = weight[i, w]
+            signal = own * (amplitude[i, w] - mean)
+            power += signal * (amplitude[i, w] - mean)
             for d in range(steps):
-                spread = max(second[d] - first[d] * first[d] / total, 1e-30 * total)
-                score[i, d] = max(cross[d], 0.0) / math.sqrt(spread) / root
-    return score
+                cross[d] += signal * template[w, d]
+                first[d] += own * template[w, d]
+                second[d] += own * square[w, d]
+        root = math.sqrt(power)
+        for d in range(steps):
+            spread = max(second[d] - first[d] * first[d] / total, 1e-30 * total)
+            score[i, d] = max(cross[d], 0.0) / math.sqrt(spread) / root
 
 
 def _common_shift(score: NDArray[np.float32], best: NDArray[np.int64], order: float, count: int) -> int:
