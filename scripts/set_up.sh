@@ -28,6 +28,8 @@ extra=""
 [ "$flavour" = test ] && extra="[test,docs,postgres]"
 echo "Installing lsst-fringe-sim$extra into $venv (about 500 MB the first time)"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c "$constraints" --editable ".$extra"
+echo "Compiling for this processor, so that no command waits for it (once, less than a minute)"
+"$venv/bin/fringe-sim" compile || echo "That failed; commands compile what they need themselves." >&2
 touch "$venv/.ready-run"
 [ "$flavour" = test ] && touch "$venv/.ready-test"
 exit 0

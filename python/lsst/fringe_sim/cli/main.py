@@ -38,6 +38,7 @@ _COMMANDS = {
     "reproduce-paper": ("reproduce_paper", "Recompute the paper, number by number."),
     "export": ("export", "Write products as NetCDF, for xarray."),
     "provenance": ("provenance", "Say what a product was made with and from."),
+    "compile": ("compile", "Compile what the other commands need, once."),
     "completion": ("completion", "Print what makes a shell complete commands, options and names."),
     "challenge": ("challenge", "Hide effects in simulated sensors and count what the search finds."),
 }
