@@ -9,11 +9,18 @@ be rounded freely must therefore be a part of whatever calls it.
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import lsst.fringe_sim
 from lsst.fringe_sim.compiled import subkernel
+
+OF_TWO_TYPES = {
+    f"lsst.fringe_sim.{name}._frame_kernel" for name in ("model.response_table", "algorithms.field_response")
+}
+"""Maps are float32 in files and float64 from a simulation; converting a full sensor takes as long as its frame."""
 
 PACKAGE = Path(lsst.fringe_sim.__file__).parent
 
@@ -82,3 +89,23 @@ def test_a_relaxed_subkernel_is_put_into_what_calls_it() -> None:
         compiled_with = subkernel(lambda x: x, **options).targetoptions
         assert compiled_with["fastmath"]
         assert compiled_with.get("forceinline") or compiled_with.get("inline") == "always"
+
+
+def test_every_function_is_compiled_once() -> None:
+    """One version of each: another costs seconds of everybody's first command."""
+    script = (
+        "import gc\n"
+        "from numba.core.dispatcher import Dispatcher\n"
+        "from lsst.fringe_sim.algorithms.warm_up import FIRST\n"
+        "for work in FIRST.values():\n"
+        "    work()\n"
+        "for item in gc.get_objects():\n"
+        "    if isinstance(item, Dispatcher) and item.py_func.__module__.startswith('lsst.fringe_sim'):\n"
+        "        print(item.py_func.__module__, item.py_func.__name__, len(item.overloads))\n"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    versions = {
+        f"{module}.{name}": int(number) for module, name, number in map(str.split, shown.splitlines())
+    }
+    assert sum(number > 0 for number in versions.values()) > 10
+    assert {name for name, number in versions.items() if number > 1} <= OF_TWO_TYPES
