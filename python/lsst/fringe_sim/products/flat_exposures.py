@@ -43,9 +43,11 @@ class FlatExposures:
     dark_time_s: NDArray[np.float64] = field(default_factory=lambda: np.array(0.0))
 
     def __post_init__(self) -> None:
-        number = np.size(self.wavelength_nm)
+        number = None  # that of the wavelengths, which come first
         for column in _COLUMNS:
-            object.__setattr__(self, column.field, column.check(getattr(self, column.field), number))
+            array = column.check(getattr(self, column.field), number)
+            number = array.size
+            object.__setattr__(self, column.field, array)
 
     def __len__(self) -> int:
         return int(self.wavelength_nm.size)
@@ -67,12 +69,12 @@ class _Column:
     infinite: bool = False
     default: float | None = None
 
-    def check(self, values: ArrayLike, number: int) -> NDArray[np.float64]:
+    def check(self, values: ArrayLike, number: int | None) -> NDArray[np.float64]:
         values = without_unit(self.name, values, self.unit or "")
-        if np.ndim(values) == 0 and self.field != "wavelength_nm":
+        if number is not None and not isinstance(values, list | tuple) and np.ndim(values) == 0:
             values = np.full(number, values)
         array = check.as_float_array(self.name, values, 1, np.float64)
-        if array.size != number:
+        if number is not None and array.size != number:
             raise FrameFormatError(self.name, f"{array.size} values", f"{number}, one for each wavelength")
         good = (array >= 0 if self.zero else array > 0) & (array < np.inf if not self.infinite else True)
         if not good.all():
