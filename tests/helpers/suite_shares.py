@@ -32,9 +32,8 @@ class Share:
 
 
 def group_of(item: pytest.Item) -> str:
-    """Tests of one group stay together: those of a file that share what is prepared once for the file."""
+    """Tests of one group stay together: those of a file that use what is prepared once for the file."""
     info = getattr(item, "_fixtureinfo", None)
     definitions = info.name2fixturedefs.values() if info else ()
-    file = item.nodeid.partition("::")[0]
-    prepared = sorted(found[-1].argname for found in definitions if found[-1].scope in ("class", "module"))
-    return "::".join([file, *prepared]) if prepared else item.nodeid
+    prepared = any(found[-1].scope in ("class", "module") for found in definitions)
+    return item.nodeid.partition("::")[0] if prepared else item.nodeid
