@@ -1,4 +1,4 @@
-# `make demo` and `make test` need Python >= 3.11, make and a package index; nothing else.
+# `make demo`, `make test` and `make test-all` need Python >= 3.11, make and a package index; nothing else.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -12,8 +12,8 @@ SHARE ?= 1/1
 
 help:
 	@echo "make demo   install into .venv and run the whole chain on the built-in sensor (a few minutes)"
-	@echo "make test   install into .venv with the test tools; lint, types, wheel and the quick tests (ten minutes)"
-	@echo "make test-all  the same, then the slow tests (an hour)"
+	@echo "make test   install into .venv with the test tools; lint, types, wheel and the quick tests"
+	@echo "make test-all  the same, then the slow tests"
 	@echo "make docs   the documentation as HTML in doc/_build, every warning an error"
 	@echo "make bench  speed beside the peers, on the same work, in one run"
 	@echo "make clean  remove .venv, demo output and caches"
