@@ -5,14 +5,24 @@ from __future__ import annotations
 import argparse
 import importlib
 import pkgutil
+import sys
 from pathlib import Path
 
 from . import _table
 
+PANEL = "panel"
+"""Not among those that run by default: it takes long, has arguments of its own and says whether it failed."""
+
 
 def main() -> None:
+    if sys.argv[1:2] == [PANEL]:
+        sys.exit(importlib.import_module(f"benchmarks.{PANEL}").main(sys.argv[2:]))
     here = Path(__file__).parent
-    names = [module.name for module in pkgutil.iter_modules([str(here)]) if not module.name.startswith("_")]
+    names = [
+        module.name
+        for module in pkgutil.iter_modules([str(here)])
+        if not module.name.startswith("_") and module.name != PANEL
+    ]
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument(
         "names", nargs="*", metavar="NAME", help=f"which ones (default: all of {', '.join(names)})"

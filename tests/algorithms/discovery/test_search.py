@@ -1,12 +1,12 @@
-"""The search on sealed cases of the independent simulator."""
+"""The search on a few sealed cases and what it refuses; `python -m benchmarks panel` judges how well it does."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded_cases import recorded_case
 
 from lsst.fringe_sim.algorithms.discovery import (
     SearchOptions,
@@ -17,7 +17,6 @@ from lsst.fringe_sim.algorithms.discovery import (
 )
 from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
-from lsst.fringe_sim.algorithms.discovery.selection import IMPRECISION
 from lsst.fringe_sim.challenge.sealed_cases import draw_case, expose
 from lsst.fringe_sim.effects import ArCoating, LineTriangle
 from lsst.fringe_sim.errors import InputError
@@ -26,8 +25,6 @@ from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products.fringe_cube import FringeCube
 
 SIZE = (48, 64)
-LATER = ("dark_current", "insulation", "silicon_gradient", "void")
-"""Effects that challenges drew not yet when the hidden cases of these tests were; they would change what is drawn."""
 MODEL = FringeModel.from_setup("ts8_e2v")
 
 
@@ -75,21 +72,18 @@ def test_cells_that_are_not_seen_keep_their_thickness(rng: np.random.Generator) 
 
 @pytest.mark.slow
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
-    for seed in (11, 12):
-        case = draw_case("none", np.random.default_rng(seed), size=SIZE)
-        verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0))
-        assert verdict.verdict == "no_discrepancy"
-        assert verdict.effects == ()
-        # Flats do not see the spectrum of the night sky.
-        assert not {"sky_continuum", "oh_bands"} & {item["name"] for item in verdict.candidates}
+    case = draw_case("none", np.random.default_rng(11), size=SIZE)
+    verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0))
+    assert verdict.verdict == "no_discrepancy"
+    assert verdict.effects == ()
+    # Flats do not see the spectrum of the night sky.
+    assert not {"sky_continuum", "oh_bands"} & {item["name"] for item in verdict.candidates}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("setup", ["bnl_ts8_e2v", "ts8_itl"])
 def test_other_sensors_are_searched(setup: str) -> None:
     """Light of 1 nm shows fringes of the support; behind a black coating those of the silicon, 0.13 µm each."""
-    null = draw_case("none", np.random.default_rng(14), size=SIZE, setup=setup)
-    assert discover(null.cube, setup, rng=np.random.default_rng(0)).verdict == "no_discrepancy"
     case = draw_case("one", np.random.default_rng(14), size=SIZE, only=["ghost_pedestal"], setup=setup)
     verdict = discover(case.cube, setup, rng=np.random.default_rng(0))
     (found,) = verdict.effects
@@ -98,8 +92,8 @@ def test_other_sensors_are_searched(setup: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["illumination", "amplifier_gain", "wavelength_jitter"])
-def test_a_hidden_effect_is_named(name: str, tmp_path) -> None:
+def test_a_hidden_effect_is_named(tmp_path: Path) -> None:
+    name = "illumination"
     case = draw_case("one", np.random.default_rng(21), size=SIZE, only=[name])
     verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0))
     assert verdict.verdict == "named"
@@ -114,86 +108,14 @@ def test_a_hidden_effect_is_named(name: str, tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_what_a_strong_pedestal_leaves_is_another_effect() -> None:
-    """Electrons cannot be described wrongly; a fainter index of the adhesive beside them is no flaw of their form."""
-    # A case of a challenge that drew neither wedges of silicon nor voids yet.
-    case, rng = recorded_case(20331123, "two", 16, ("silicon_gradient", "void"))
-    assert set(case.names) == {"dark_pedestal", "epoxy_index"}
-    verdict = discover(case.cube, case.setup, rng=rng)
-    found = {effect.name: effect for effect in verdict.effects}
-    assert set(found) == set(case.names)
-    for key in ("dark_pedestal.electrons", "epoxy_index.offset"):
-        name, _, parameter = key.partition(".")
-        value = found[name].parameters[parameter]
-        assert abs(value.value - case.values[key]) < 4.0 * value.sigma
-
-
-@pytest.mark.slow
-def test_less_than_a_hundredth_is_an_effect_where_nothing_else_is_left() -> None:
-    """The form of the coating may be wrong by as much, but hardly so that it lacks dark current alone."""
-    case, rng = recorded_case(20411125, "two", 9)
-    verdict = discover(case.cube, case.setup, rng=rng)
-    found = {effect.name: effect for effect in verdict.effects}
-    assert set(found) == set(case.names) == {"dark_current", "black_coating"}
-    coating, dark = verdict.steps
-    assert dark.delta_chi2 < IMPRECISION**2 * coating.delta_chi2 + 16.0  # no more, at four sigma
-    rate = found["dark_current"].parameters["rate"]
-    assert abs(rate.value - case.values["dark_current.rate"]) < 4.0 * rate.sigma
-
-
-@pytest.mark.slow
-def test_weak_fringes_held_out_may_be_in_a_wrong_order() -> None:
-    """Coating of 1.3 µm leaves so little of the fringes that those held out hardly tell an order from the next."""
-    case, rng = recorded_case(20441125, "two", 3)
-    assert set(case.names) == {"tilt", "black_coating"}
-    verdict = discover(case.cube, case.setup, rng=rng)
-    assert {effect.name for effect in verdict.effects} == set(case.names), verdict.summary()
-
-
-@pytest.mark.slow
-def test_two_effects_are_named_where_errors_of_all_wavelengths_explain_as_much() -> None:
-    """Neither silicon that absorbs more nor a triangular line is likely by itself, and both are fewer parameters."""
-    case, rng = recorded_case(20451125, "two", 5)
-    assert set(case.names) == {"silicon_absorption", "line_triangle"}
-    told: list[str] = []
-    verdict = discover(case.cube, case.setup, rng=rng, report=told.append)
-    assert any("with wavelength_jitter:" in line for line in told)
-    assert {effect.name for effect in verdict.effects} == set(case.names), verdict.summary()
-
-
-@pytest.mark.slow
-def test_a_residual_is_judged_in_all_data() -> None:
-    """The part searched has one of chance 4e-5 in this draw of the noise, and all data have none."""
-    case, rng = recorded_case(20451125, "one", 14)
-    verdict = discover(case.cube, case.setup, rng=rng)
-    assert [effect.name for effect in verdict.effects] == list(case.names) == ["black_coating"], (
-        verdict.summary()
-    )
-    assert not verdict.steps[-1].consistent
-
-
-@pytest.mark.slow
-def test_what_a_wrong_effect_leaves_is_not_named_beside_it() -> None:
-    """Black coating of 1.4 µm takes all fringes away but a thousandth, and a spread of the thickness nearly does."""
-    case, rng = recorded_case(20431125, "one", 1)
-    assert case.names == ("black_coating",)
-    verdict = discover(case.cube, case.setup, rng=rng)
-    assert verdict.steps[0].added == ("thickness_spread",)
-    assert [effect.name for effect in verdict.effects] == ["black_coating"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("outsider", "least"), [("annealing", 0.004), ("wandering_light", 0.007)])
-def test_where_the_catalogue_explains_next_to_nothing_no_pairs_are_tried(outsider: str, least: float) -> None:
+def test_a_cause_outside_the_catalogue_is_not_named() -> None:
     rng, size = np.random.default_rng(22), 0.0
-    while size < least:
-        case = draw_case("outsider", rng.spawn(1)[0], size=SIZE, only=[outsider])
-        size = case.values[f"{outsider}.size"]
-    told: list[str] = []
-    verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0), report=told.append)
+    while size < 0.004:
+        case = draw_case("outsider", rng.spawn(1)[0], size=SIZE, only=["annealing"])
+        size = case.values["annealing.size"]
+    verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0))
     assert verdict.verdict == "unexplained"
-    assert any("next to nothing" in line for line in told)
-    assert max((len(step.added) for step in verdict.steps), default=0) <= 1
+    assert verdict.effects == ()
 
 
 class _NarrowCoating(ArCoating):
@@ -269,58 +191,6 @@ def test_no_more_effects_are_named_than_may_be() -> None:
     verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0), options=options)
     assert verdict.verdict == "unexplained"
     assert [step.added for step in verdict.steps] == [("illumination",)]
-
-
-@pytest.mark.slow
-def test_a_rival_in_a_deeper_valley_is_preferred() -> None:
-    """Behind 1.56 µm of black coating the fringes are as faint as behind a thickness that varies in every pixel."""
-    case, rng = recorded_case(20261122, "one", 8, LATER)
-    verdict = discover(case.cube, case.setup, rng=rng)
-    assert [effect.name for effect in verdict.effects] == ["black_coating"]
-    found = verdict.effects[0].parameters["thickness"]
-    assert abs(found.value - case.values["black_coating.thickness"]) < 4.0 * found.sigma
-
-
-@pytest.mark.slow
-def test_a_gradient_of_the_light_is_no_wide_ring() -> None:
-    case, rng = recorded_case(20261122, "one", 33, LATER)
-    verdict = discover(case.cube, case.setup, rng=rng)
-    assert [effect.name for effect in verdict.effects] == ["illumination"]
-
-
-@pytest.mark.slow
-def test_what_only_all_data_show_is_looked_for() -> None:
-    """Behind a pedestal, a step of 7 sigma is noise to the part of the data that is searched, and not to all."""
-    case = draw_case("one", np.random.default_rng(2), size=SIZE, only=["dark_pedestal"])
-    light = case.cube.image - np.float32(case.values["dark_pedestal.electrons"])
-    step = np.where(np.arange(SIZE[0])[:, np.newaxis] >= SIZE[0] // 2, np.float32(7.74e-4), np.float32(0.0))
-    said: list[str] = []
-    cube = replace(case.cube, image=case.cube.image + step * light)
-    verdict = discover(cube, case.setup, rng=np.random.default_rng(0), report=said.append)
-    assert any("only all data show" in line for line in said)
-    assert {effect.name for effect in verdict.effects} == {"dark_pedestal", "midline_step"}
-
-
-@pytest.mark.slow
-def test_cells_get_finer_where_a_blur_hid_how_fine_the_light_was() -> None:
-    """Behind 1.8 px of diffusion, cells of 2 px hold what is left of fringes of 5 px, and not what they were."""
-    parts = np.random.default_rng([7, 0]).spawn(2)
-    case = draw_case("one", parts[0], only=["charge_diffusion"])
-    verdict = discover(case.cube, case.setup, rng=parts[1])
-    assert [effect.name for effect in verdict.effects] == ["charge_diffusion"]
-    found = verdict.effects[0].parameters["sigma"]
-    assert abs(found.value - case.values["charge_diffusion.sigma"]) < 4.0 * found.sigma
-    assert verdict.data["cell_px"] == 1
-
-
-@pytest.mark.slow
-def test_a_scale_found_in_a_wrong_order_is_looked_for_in_others() -> None:
-    """Too few data may see only noise there; nothing else is named for what all data show then."""
-    case = draw_case("one", np.random.default_rng(102), size=(48, 48), only=["wavelength_scale"])
-    verdict = discover(case.cube, case.setup, rng=np.random.default_rng(1))
-    assert [effect.name for effect in verdict.effects] == ["wavelength_scale"]
-    stretch = verdict.effects[0].parameters["stretch"]
-    assert abs(stretch.value - case.values["wavelength_scale.stretch"]) < 5.0 * stretch.sigma
 
 
 @pytest.mark.parametrize(

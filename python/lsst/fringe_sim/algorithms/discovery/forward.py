@@ -15,6 +15,7 @@ from ...effects import ActiveEffect, Effect, ImageGeometry, activate_effects, ap
 from ...model import FringeModel
 from ...optics.illumination import Illumination
 from .cells import CellData
+from .evaluations import note_evaluation
 from .slopes import Slopes
 
 __all__ = ["Exposures", "Forward", "Prediction"]
@@ -477,6 +478,7 @@ class Forward:
         seen: _PartOfCells | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Value and slope of some rows of a table, averaged over the cells or a part; shape ``(R, ny, nx)``."""
+        note_evaluation()
         gradient = self.gradient(thickness_um)
         spread = self._spread_of_pixels(gradient)
         place, rest = self._at_centroids(thickness_um, gradient)
