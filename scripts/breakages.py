@@ -61,16 +61,23 @@ OPERATORS: dict[type[ast.AST], tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Breakage:
-    """Bytes ``begin`` to ``end`` of a file replaced by ``new``."""
+    """Bytes ``begin`` to ``end`` of a file, of which ``source`` was read when it was drawn, replaced by ``new``."""
 
     path: Path
+    source: bytes
     begin: int
     end: int
     new: bytes
 
-    def apply(self, source: bytes) -> bytes:
-        """The broken source."""
-        return source[: self.begin] + self.new + source[self.end :]
+    @property
+    def broken(self) -> bytes:
+        """The source with the breakage."""
+        return self.source[: self.begin] + self.new + self.source[self.end :]
+
+    @property
+    def line(self) -> int:
+        """Line of the file, counted from one."""
+        return self.source[: self.begin].count(b"\n") + 1
 
 
 def breakages(path: Path) -> list[Breakage]:
@@ -85,14 +92,13 @@ def breakages(path: Path) -> list[Breakage]:
         if isinstance(function, ast.FunctionDef):
             for statement in function.body:
                 for begin, end, new in _of_node(statement, source, lines):
-                    found[begin, end] = Breakage(path, begin, end, new)
+                    found[begin, end] = Breakage(path, source, begin, end, new)
     return list(found.values())
 
 
 def _is_other_code(breakage: Breakage) -> bool:
-    source = (ROOT / breakage.path).read_bytes()
     try:
-        return ast.dump(ast.parse(breakage.apply(source))) != ast.dump(ast.parse(source))
+        return ast.dump(ast.parse(breakage.broken)) != ast.dump(ast.parse(breakage.source))
     except SyntaxError:
         return False
 
@@ -217,10 +223,11 @@ class Copy:
 
     def trial(self, breakage: Breakage, room_only: bool) -> str:
         """What notices a breakage; empty if nothing does."""
-        path, original = self.root / breakage.path, (ROOT / breakage.path).read_bytes()
-        path.write_bytes(breakage.apply(original))
+        path = self.root / breakage.path
+        written = path.stat()
+        path.write_bytes(breakage.broken)
         # A compiled function in another module keeps what it took in of this one: such a cache would hide the fault.
-        compiled = re.search(rb"\b(njit|numba|kernel)\b", original) is not None
+        compiled = re.search(rb"\b(njit|numba|kernel|subkernel|compiled)\b", breakage.source) is not None
         cache = Path(tempfile.mkdtemp(dir=self.root.parent)) if compiled else self.cache
         own = tests_of(room_of(breakage.path), self.root)
         try:
@@ -228,7 +235,8 @@ class Copy:
             if not noticed and not room_only:
                 noticed = self.notices(["tests", *(f"--ignore={part}" for part in own)], cache)
         finally:
-            shutil.copy2(ROOT / breakage.path, path)  # with its time, so that the cache stays good
+            path.write_bytes(breakage.source)
+            os.utime(path, ns=(written.st_atime_ns, written.st_mtime_ns))  # the cache stays good
             if compiled:
                 shutil.rmtree(cache)
         return noticed
@@ -236,8 +244,8 @@ class Copy:
 
 def difference(breakage: Breakage) -> str:
     """The breakage as a patch."""
-    source = (ROOT / breakage.path).read_bytes()
-    before, after = (text.decode().splitlines(keepends=True) for text in (source, breakage.apply(source)))
+    texts = (breakage.source, breakage.broken)
+    before, after = (text.decode().splitlines(keepends=True) for text in texts)
     return "".join(difflib.unified_diff(before, after, str(breakage.path), str(breakage.path), n=2))
 
 
@@ -268,10 +276,9 @@ def main() -> int:
             started, noticed = time.monotonic(), copy.trial(item, options.room_only)
             if not noticed:
                 survivors.append(item)
-            line = (ROOT / item.path).read_bytes()[: item.begin].count(b"\n") + 1
             taken = time.monotonic() - started
             print(
-                f"{'caught' if noticed else 'SURVIVED'}  {item.path}:{line}  {taken:.0f} s  {noticed}",
+                f"{'caught' if noticed else 'SURVIVED'}  {item.path}:{item.line}  {taken:.0f} s  {noticed}",
                 flush=True,
             )
     for item in survivors:
