@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lsst.fringe_sim.mock.hidden_effects import HIDDEN_EFFECTS
 from lsst.fringe_sim.challenge.sealed_cases import STATED_FWHM_NM, STATED_KELVIN, draw_case, expose
+from lsst.fringe_sim.mock.hidden_effects import HIDDEN_EFFECTS
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube
