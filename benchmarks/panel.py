@@ -289,9 +289,15 @@ def mixed(cases: Sequence[PanelCase]) -> list[PanelCase]:
 
 
 def version_of(checkout: Path) -> str:
-    """Commit of a checkout."""
-    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=7"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+    """Commit that last changed the package of a checkout; ``+`` if it has changed since."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(checkout), *arguments, "--", "python"]
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+    return (git("log", "-1", "--format=%h", "--abbrev=7") or "unknown") + "+" * bool(
+        git("status", "--porcelain")
+    )
 
 
 def main(arguments: Sequence[str]) -> int:

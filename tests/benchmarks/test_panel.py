@@ -142,6 +142,11 @@ def test_a_search_is_stopped_when_its_processor_time_is_used_up(monkeypatch: pyt
 
 @pytest.mark.slow
 def test_no_case_of_the_quick_panel_is_lost() -> None:
+    recorded = panel.read_results(panel.BASELINE) if panel.BASELINE.exists() else {}
+    if not set(panel.QUICK) <= set(recorded):
+        pytest.skip(
+            "the baseline does not hold all cases of the quick panel: record it by `benchmarks panel --record`"
+        )
     command = [sys.executable, "-m", "benchmarks", "panel", "--quick", "--jobs", "2"]
     found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stdout + found.stderr
