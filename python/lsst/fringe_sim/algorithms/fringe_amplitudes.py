@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -63,7 +62,7 @@ def fringe_amplitudes(image: ArrayLike, mask: ArrayLike | None = None) -> Fringe
     mean = float(chosen.mean(dtype=np.float64)) if chosen.size else 0.0
     if not mean > 0.0:
         raise InputError("image", mean if chosen.size else "no good pixels", "a positive mean")
-    rms = float(np.sqrt(_squares(chosen, mean).sum() / chosen.size))
+    rms = float(np.sqrt(_squares(chosen, mean) / chosen.size))
     places = [percent / 100.0 * (chosen.size - 1) for percent in _PERCENTILES]
     ranks = sorted({rank for place in places for rank in _between(place, chosen.size)})
     chosen.partition([0, *ranks, chosen.size - 1])
@@ -85,15 +84,10 @@ def _at(partitioned: NDArray[Any], place: float) -> float:
     return lower + (place - int(place)) * (upper - lower)
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
-def _squares(values: NDArray[Any], mean: float) -> NDArray[np.float64]:  # pragma: no cover - compiled
-    """Sums of squared departures in blocks, whose number does not depend on that of the threads."""
-    blocks = (values.size + _BLOCK - 1) // _BLOCK
-    sums = np.empty(blocks)
-    for block in numba.prange(blocks):
-        total = 0.0
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, values.size)):
-            departure = values[i] - mean
-            total += departure * departure
-        sums[block] = total
-    return sums
+def _squares(values: NDArray[Any], mean: float) -> float:
+    """Sum of squared departures, in blocks that stay in the cache."""
+    total = 0.0
+    for start in range(0, values.size, _BLOCK):
+        departure = np.subtract(values[start : start + _BLOCK], mean, dtype=np.float64)
+        total += float(departure @ departure)
+    return total

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
 
 from ..errors import InputError, OutOfRangeError
 
@@ -19,6 +21,9 @@ SMOOTHING_REACH = 4.0
 
 MINIMUM_WEIGHT = 0.02
 """Least part of the smoothing kernel that must lie on good pixels for a value in a pixel that is not good."""
+
+_BAND_ROWS = 256
+"""Rows that one thread smooths at a time."""
 
 
 def smooth_masked(
@@ -65,58 +70,33 @@ def smooth_masked(
             np.where(usable, variance, nothing).astype(np.float32),
         )
     kernel = _gaussian_kernel(sigma_px)
+    reach = len(kernel) // 2
     value, noise = np.empty(image.shape, np.float32), np.empty(image.shape, np.float32)
-    zero = np.float32(0.0)
-    _smooth(
-        np.where(usable, image, zero).astype(np.float32, copy=False),
-        np.where(usable, variance, zero).astype(np.float32, copy=False),
-        usable.astype(np.float32),
-        kernel,
-        value,
-        noise,
-    )
+
+    def smooth(start: int) -> None:
+        """Rows of one band, from those that reach into it."""
+        stop = min(start + _BAND_ROWS, len(image))
+        first = max(start - reach, 0)
+        rows, inner = slice(first, stop + reach), slice(start - first, stop - first)
+        near = usable[rows]
+
+        def spread(values: NDArray[np.floating], factors: NDArray[np.float64]) -> NDArray[np.float32]:
+            masked = np.where(near, values, np.float32(0.0)).astype(np.float32, copy=False)
+            columns = correlate1d(masked, factors, axis=0, mode="constant")[inner]
+            return correlate1d(columns, factors, axis=1, mode="constant")
+
+        weight = spread(np.ones(near.shape, np.float32), kernel)
+        enough = (weight >= MINIMUM_WEIGHT) | near[inner]
+        weight[~enough] = np.nan
+        value[start:stop] = spread(image[rows], kernel) / weight
+        noise[start:stop] = spread(variance[rows], kernel**2) / weight**2
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(smooth, range(0, len(image), _BAND_ROWS)))
     return value, noise
 
 
-def _gaussian_kernel(sigma_px: float) -> Image:
+def _gaussian_kernel(sigma_px: float) -> NDArray[np.float64]:
     reach = max(1, math.ceil(SMOOTHING_REACH * sigma_px))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
-    return (kernel / kernel.sum()).astype(np.float32)
-
-
-@numba.njit(cache=True)
-def _accumulate(total: Image, values: Image, factor: float) -> None:  # pragma: no cover - compiled
-    for x in range(total.size):
-        total[x] += factor * values[x]
-
-
-@numba.njit(cache=True, parallel=True)
-def _smooth(
-    image: Image, variance: Image, weight: Image, kernel: Image, value: Image, noise: Image
-) -> None:  # pragma: no cover - compiled
-    ny, nx = image.shape
-    reach = kernel.size // 2
-    for line in numba.prange(ny):
-        y = int(np.int64(line))  # the parallel index is unsigned
-        # Along the columns first, into one row with room for the kernel at both ends; then along that row.
-        column = np.zeros((3, nx + 2 * reach), np.float32)
-        inner = column[:, reach : reach + nx]
-        for t in range(max(-reach, -y), min(reach, ny - 1 - y) + 1):
-            k = kernel[t + reach]
-            _accumulate(inner[0], image[y + t], k)
-            _accumulate(inner[1], weight[y + t], k)
-            _accumulate(inner[2], variance[y + t], k * k)
-        row = np.zeros((3, nx), np.float32)
-        for t in range(kernel.size):
-            k = kernel[t]
-            _accumulate(row[0], column[0, t : t + nx], k)
-            _accumulate(row[1], column[1, t : t + nx], k)
-            _accumulate(row[2], column[2, t : t + nx], k * k)
-        for x in range(nx):
-            w = row[1, x]
-            if w >= MINIMUM_WEIGHT or weight[y, x] > 0.0:
-                value[y, x] = row[0, x] / w
-                noise[y, x] = row[2, x] / (w * w)
-            else:
-                value[y, x] = np.nan
-                noise[y, x] = np.nan
+    return kernel / kernel.sum()

@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
@@ -42,8 +41,8 @@ _ROUNDING = 1e-13
 """Share of the variance below which an eigenvalue is rounding of float32 frames."""
 
 _HISTOGRAM_BINS = 32_768
-_PARTS = 8
-"""Parts of a sensor that may be counted at the same time."""
+_BLOCK = 65_536
+"""Pixels that are counted at a time."""
 
 
 def fit_pca(
@@ -497,41 +496,21 @@ def _thickness_histogram(
     OutOfRangeError
         A thickness outside the table.
     """
-    values = np.ascontiguousarray(thickness).ravel()
+    values = np.ravel(thickness)
     low, width = table.start_um, (table.stop_um - table.start_um) / bins
-    counts, outside = _count_thickness(values, low, 1.0 / width, bins, _PARTS)
-    for part in np.flatnonzero(outside):
-        # The table says what is wrong with it; rounding at its ends is not.
-        table.lookup(values[outside[part] - 1])
-    count = counts.sum(axis=0)
+    count = np.zeros(bins, dtype=np.int64)
+    for start in range(0, values.size, _BLOCK):
+        known = values[start : start + _BLOCK].astype(np.float64)
+        known = known[~np.isnan(known)]
+        if known.size:
+            # The table says what is wrong with an end outside; rounding at its own ends is not.
+            table.lookup([known.min(), known.max()])
+            place = np.clip((known - low) / width, 0, bins - 1).astype(np.int64)
+            count += np.bincount(place, minlength=bins)
     filled = np.flatnonzero(count)
     if filled.size == 0:
         raise InputError("pixels with a thickness", 0, "some pixels")
     return count[filled].astype(np.float64), np.asarray(low + (filled + 0.5) * width, dtype=np.float64)
-
-
-@numba.njit(cache=True, parallel=True)
-def _count_thickness(
-    values: NDArray, low: float, scale: float, bins: int, parts: int
-) -> tuple[NDArray, NDArray]:  # pragma: no cover - compiled
-    """Pixels per bin in each of a fixed number of parts, and one more than the place of some pixel outside.
-
-    Pixels just outside are counted in the bins at the ends; those that are no number do not count.
-    """
-    counts, outside = np.zeros((parts, bins), np.int32), np.zeros(parts, np.int64)
-    for part in numba.prange(parts):
-        count = counts[part]
-        farthest = 0.0
-        for k in range(values.size * part // parts, values.size * (part + 1) // parts):
-            place = (float(values[k]) - low) * scale
-            if 0.0 <= place < bins:
-                count[int(place)] += 1
-            elif place == place:
-                beyond = -place if place < 0.0 else place - bins
-                if beyond >= farthest:
-                    farthest, outside[part] = beyond, k + 1
-                count[0 if place < 0.0 else bins - 1] += 1
-    return counts, outside
 
 
 def _dot(one: FloatArray, two: FloatArray) -> float:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +11,9 @@ __all__ = ["bad_columns", "column_means", "isolated_defects"]
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.int32]
+
+_BAND_ROWS = 256
+"""Rows that are looked at at a time."""
 
 
 def isolated_defects(
@@ -26,72 +26,55 @@ def isolated_defects(
     across the fringe lie lower still.
     """
     defect = np.zeros(image.shape, dtype=np.bool_)
-    _find_isolated(image, variance, good, options.defect_sigma, options.defect_fraction, defect)
+    ny = len(image)
+    for start in range(1, ny - 1, _BAND_ROWS):
+        rows = slice(start, min(start + _BAND_ROWS, ny - 1))
+        y, x = _candidates(image, variance, good, options.defect_sigma, rows)
+        isolated = _is_isolated(image, variance, good, options, y, x)
+        defect[y[isolated], x[isolated]] = True
     return defect
 
 
-@numba.njit(cache=True, parallel=True)
-def _find_isolated(
-    image: Image,
-    variance: Image,
-    good: NDArray[np.bool_],
-    sigma: float,
-    fraction: float,
-    defect: NDArray[np.bool_],
-) -> None:  # pragma: no cover - compiled
-    ny, nx = image.shape
-    for line in numba.prange(ny - 2):
-        # The parallel index is unsigned; the outermost ring has too few neighbours.
-        y = int(np.int64(line)) + 1
-        for x in range(1, nx - 1):
-            # A cheap necessary condition first: beyond one of the two neighbours along x and along y.
-            value = image[y, x]
-            left, right = image[y, x - 1], image[y, x + 1]
-            above, below = image[y + 1, x], image[y - 1, x]
-            high = value - max(min(left, right), min(above, below))
-            low = min(max(left, right), max(above, below)) - value
-            beyond = max(high, low)
-            if beyond * beyond > 0.25 * sigma * sigma * variance[y, x] and good[y, x]:
-                defect[y, x] = _is_isolated(image, variance, good, sigma, fraction, y, x)
+def _candidates(
+    image: Image, variance: Image, good: NDArray[np.bool_], sigma: float, rows: slice
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Good pixels beyond one of the two neighbours along x and along y, which is cheap to see and necessary.
+
+    The outermost ring has too few neighbours.
+    """
+    value = image[rows, 1:-1]
+    left, right = image[rows, :-2], image[rows, 2:]
+    above, below = image[rows.start + 1 : rows.stop + 1, 1:-1], image[rows.start - 1 : rows.stop - 1, 1:-1]
+    high = value - np.maximum(np.minimum(left, right), np.minimum(above, below))
+    low = np.minimum(np.maximum(left, right), np.maximum(above, below)) - value
+    beyond = np.maximum(high, low)
+    y, x = np.nonzero((beyond**2 > 0.25 * sigma**2 * variance[rows, 1:-1]) & good[rows, 1:-1])
+    return y + rows.start, x + 1
 
 
-@numba.njit(cache=True)
 def _is_isolated(
     image: Image,
     variance: Image,
     good: NDArray[np.bool_],
-    sigma: float,
-    fraction: float,
-    y: int,
-    x: int,
-) -> bool:  # pragma: no cover - compiled
-    value = image[y, x]
-    high = high2 = -np.inf
-    low = low2 = np.inf
-    for yy in range(y - 1, y + 2):
-        for xx in range(x - 1, x + 2):
-            if (yy == y and xx == x) or not good[yy, xx]:
-                continue
-            near = image[yy, xx]
-            if near > high:
-                high, high2 = near, high
-            elif near > high2:
-                high2 = near
-            if near < low:
-                low, low2 = near, low
-            elif near < low2:
-                low2 = near
-    if not low2 < np.inf:
-        return False  # fewer than two neighbours to judge by
-    if high2 < value:
-        excess, reference, spread = value - high2, high2, high2 - low
-    elif low2 > value:
-        excess, reference, spread = low2 - value, low2, high - low2
-    else:
-        return False
-    # The noise that the pixel would have if it were like its neighbours.
-    noise = math.sqrt(variance[y, x] - max(value, 0.0) + max(reference, 0.0))
-    return excess > max(sigma * noise, fraction * abs(reference), spread)
+    options: FlatPrepOptions,
+    y: NDArray[np.intp],
+    x: NDArray[np.intp],
+) -> NDArray[np.bool_]:
+    dy, dx = np.delete(np.indices((3, 3)).reshape(2, -1) - 1, 4, axis=1)
+    around = y[:, None] + dy, x[:, None] + dx
+    near, known = image[around].astype(np.float64), good[around]
+    low, low2 = np.partition(np.where(known, near, np.inf), 1)[:, :2].T
+    high2, high = np.partition(np.where(known, near, -np.inf), -2)[:, -2:].T
+    value = image[y, x].astype(np.float64)
+    above, below = high2 < value, low2 > value
+    reference = np.where(above, high2, low2)
+    with np.errstate(invalid="ignore"):  # of pixels with fewer than two neighbours to judge by
+        spread = np.where(above, high2 - low, high - low2)
+        # The noise that the pixel would have if it were like its neighbours.
+        noise = np.sqrt(variance[y, x] - np.maximum(value, 0.0) + np.maximum(reference, 0.0))
+        excess = np.abs(value - reference)
+        limit = np.maximum(options.defect_sigma * noise, options.defect_fraction * np.abs(reference))
+        return (known.sum(axis=1) > 1) & (above | below) & (excess > np.maximum(limit, spread))
 
 
 def column_means(image: Image, mask: Mask) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

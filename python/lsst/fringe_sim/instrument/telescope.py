@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import batoid
-import numba
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
@@ -420,17 +419,13 @@ class BeamField:
         if not radius <= self.largest_deg:
             raise OutOfRangeError("field angle [deg]", radius, f"0 to {self.largest_deg:g}")
         weight = _lagrange_weights(self.nodes_deg, radius)
-        sine, count = _kept_rays(
-            weight,
-            self.sin_squared,
-            self.edge_ray,
-            self.edge_squared,
-            self.inner_squared,
-            self.outer_squared,
-        )
-        if count == 0:
+        crossing = weight @ self.edge_squared
+        kept = np.ones(self.sin_squared.shape[1], dtype=bool)
+        kept[self.edge_ray[(crossing > self.outer_squared) | (crossing < self.inner_squared)]] = False
+        if not kept.any():
             raise OutOfRangeError("field angle [deg]", radius, "a place that light reaches")
-        return sine[:count], count / sine.size
+        sine = (weight @ self.sin_squared)[kept]
+        return sine, sine.size / kept.size
 
     def beam(self, field_x_deg: float, field_y_deg: float = 0.0, nodes: int = BEAM_NODES) -> Beam:
         """Angles of incidence at one field position; errors as for `sin_squared_at`."""
@@ -562,30 +557,6 @@ def _edge_rays(
     # What is interpolated may be a little less than nothing.
     limits = np.full((2, ray.size), [[inner**2 - _ROUNDING_M2 if inner > 0.0 else -np.inf], [outer**2]])
     return ray.astype(np.int32), squared[:, ray], *limits
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _kept_rays(
-    weight: NDArray, sine: NDArray, edge_ray: NDArray, edge_squared: NDArray, inner: NDArray, outer: NDArray
-) -> tuple[NDArray, int]:  # pragma: no cover - compiled
-    """Weighted sums of ``sine`` over field radii for the rays that no edge cuts off, and how many these are."""
-    nodes, rays = sine.shape
-    cut = np.zeros(rays, dtype=np.bool_)
-    for edge in range(edge_ray.size):
-        crossing = 0.0
-        for node in range(nodes):
-            crossing += weight[node] * edge_squared[node, edge]
-        if crossing > outer[edge] or crossing < inner[edge]:
-            cut[edge_ray[edge]] = True
-    found, count = np.empty(rays), 0
-    for ray in range(rays):
-        total = 0.0
-        for node in range(nodes):
-            total += weight[node] * sine[node, ray]
-        # Written in any case, and over again after a ray that is cut off: there is nothing to predict.
-        found[count] = total
-        count += not cut[ray]
-    return found, count
 
 
 def _surfaces(optic: batoid.Optic) -> Iterator[batoid.Optic]:
