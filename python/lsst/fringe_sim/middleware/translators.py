@@ -6,7 +6,7 @@ them. Their registered names differ from those of Rubin's own translators, so th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import astropy.units as u
@@ -92,154 +92,66 @@ class FringeTranslator(FitsTranslator):
         return found
 
     @cache_translation
-    def to_instrument(self) -> str:
-        """Name of the instrument in data ids."""
-        return INSTRUMENTS[self.raw_metadata.camera].getName()
-
-    @cache_translation
-    def to_exposure_id(self) -> int:
-        """Number of the exposure."""
-        return self.raw_metadata.exposure_id
-
-    @cache_translation
-    def to_visit_id(self) -> int:
-        """Number of the visit: every exposure is one."""
-        return self.raw_metadata.exposure_id
-
-    @cache_translation
-    def to_exposure_group(self) -> str:
-        """Every exposure is a group of its own."""
-        return str(self.raw_metadata.exposure_id)
-
-    @cache_translation
     def to_observation_id(self) -> str:
         """Name of the exposure: the header's own, or instrument and number."""
         stated = str(self._header.get("OBSID") or "").strip()
         return stated or f"{self.to_instrument()}_{self.raw_metadata.exposure_id}"
 
-    @cache_translation
-    def to_observing_day(self) -> int:
-        """Observing day, YYYYMMDD."""
-        return self.raw_metadata.day_obs
 
-    @cache_translation
-    def to_observing_day_offset(self) -> TimeDelta:
-        """UTC hour at which the observing day begins."""
-        seconds = DAY_ROLLOVER_H[self.raw_metadata.camera] * 3600
-        return TimeDelta(seconds, format="sec", scale="tai")
+def _begin(metadata: RawMetadata) -> Time:
+    return Time(metadata.date_obs, format="datetime", scale="utc").tai
 
-    @cache_translation
-    def to_observation_counter(self) -> int:
-        """Number of the exposure within the day."""
-        return self.raw_metadata.seq_num
 
-    @cache_translation
-    def to_group_counter_start(self) -> int:
-        """First number of the group."""
-        return self.raw_metadata.seq_num
+def _physical_filter(metadata: RawMetadata) -> str:
+    """Filter of the camera, else the monochromator, else none."""
+    if metadata.filter_name and metadata.camera != "ts8":
+        return metadata.filter_name
+    return NO_FILTER if metadata.wavelength_nm is None else MONOCHROMATOR
 
-    @cache_translation
-    def to_group_counter_end(self) -> int:
-        """Last number of the group."""
-        return self.raw_metadata.seq_num
 
-    @cache_translation
-    def to_observation_type(self) -> str:
-        """Kind of the frame: bias, flat, …."""
-        return self.raw_metadata.observation_type
+_FROM_METADATA: dict[str, Callable[[RawMetadata], Any]] = {
+    "instrument": lambda m: INSTRUMENTS[m.camera].getName(),
+    "exposure_id": lambda m: m.exposure_id,
+    "visit_id": lambda m: m.exposure_id,  # every exposure is a visit, and a group of its own
+    "exposure_group": lambda m: str(m.exposure_id),
+    "observing_day": lambda m: m.day_obs,
+    "observing_day_offset": lambda m: TimeDelta(DAY_ROLLOVER_H[m.camera] * 3600, format="sec", scale="tai"),
+    "observation_counter": lambda m: m.seq_num,
+    "group_counter_start": lambda m: m.seq_num,
+    "group_counter_end": lambda m: m.seq_num,
+    "observation_type": lambda m: m.observation_type,
+    "observation_reason": lambda m: m.test_type or "unknown",
+    "object": target_name,
+    "science_program": lambda m: m.run or "unknown",
+    "physical_filter": _physical_filter,
+    "exposure_time": lambda m: m.exposure_time_s * u.s,
+    "exposure_time_requested": lambda m: m.exposure_time_s * u.s,  # the header has but one
+    "dark_time": lambda m: m.dark_time_s * u.s,
+    "datetime_begin": _begin,
+    "datetime_end": lambda m: _begin(m) + m.exposure_time_s * u.s,
+    "can_see_sky": lambda m: m.observation_type == "science",
+    "detector_num": lambda m: m.detector,
+    "detector_name": lambda m: m.slot,
+    "detector_group": lambda m: m.raft,
+    "detector_unique_name": lambda m: f"{m.raft}_{m.slot}",
+    "detector_serial": lambda m: m.serial or "unknown",
+    "detector_exposure_id": lambda m: m.exposure_id * 1000 + m.detector,
+    "ext_wavelength_nm": lambda m: m.wavelength_nm,
+    "ext_temperature_k": lambda m: m.temperature_k,
+}
+"""What the translator calls a property, and how it follows from the header."""
 
-    @cache_translation
-    def to_observation_reason(self) -> str:
-        """Kind of the test: lambda, …."""
-        return self.raw_metadata.test_type or "unknown"
 
-    @cache_translation
-    def to_object(self) -> str:
-        """Wavelength of a monochromatic flat; see `target_name`."""
-        return target_name(self.raw_metadata)
+def _translation(name: str, value: Callable[[RawMetadata], Any]) -> Callable[[FringeTranslator], Any]:
+    def translate(self: FringeTranslator) -> Any:
+        return value(self.raw_metadata)
 
-    @cache_translation
-    def to_science_program(self) -> str:
-        """Run of the test stand."""
-        return self.raw_metadata.run or "unknown"
+    translate.__name__ = f"to_{name}"
+    return cache_translation(translate)
 
-    @cache_translation
-    def to_physical_filter(self) -> str:
-        """Filter of the camera, else the monochromator, else none."""
-        metadata = self.raw_metadata
-        if metadata.filter_name and metadata.camera != "ts8":
-            return metadata.filter_name
-        return NO_FILTER if metadata.wavelength_nm is None else MONOCHROMATOR
 
-    @cache_translation
-    def to_exposure_time(self) -> u.Quantity:
-        """Time with the shutter open."""
-        return self.raw_metadata.exposure_time_s * u.s
-
-    @cache_translation
-    def to_exposure_time_requested(self) -> u.Quantity:
-        """Time asked for: the header has but one."""
-        return self.raw_metadata.exposure_time_s * u.s
-
-    @cache_translation
-    def to_dark_time(self) -> u.Quantity:
-        """Time since the CCD was cleared."""
-        return self.raw_metadata.dark_time_s * u.s
-
-    @cache_translation
-    def to_datetime_begin(self) -> Time:
-        """Start of the exposure."""
-        return Time(self.raw_metadata.date_obs, format="datetime", scale="utc").tai
-
-    @cache_translation
-    def to_datetime_end(self) -> Time:
-        """End of the exposure."""
-        return self.to_datetime_begin() + self.raw_metadata.exposure_time_s * u.s
-
-    @cache_translation
-    def to_can_see_sky(self) -> bool:
-        """Whether the frame shows the sky."""
-        return self.raw_metadata.observation_type == "science"
-
-    @cache_translation
-    def to_detector_num(self) -> int:
-        """Number of the sensor."""
-        return self.raw_metadata.detector
-
-    @cache_translation
-    def to_detector_name(self) -> str:
-        """Slot of the sensor."""
-        return self.raw_metadata.slot
-
-    @cache_translation
-    def to_detector_group(self) -> str:
-        """Raft of the sensor."""
-        return self.raw_metadata.raft
-
-    @cache_translation
-    def to_detector_unique_name(self) -> str:
-        """Name of the sensor."""
-        return f"{self.raw_metadata.raft}_{self.raw_metadata.slot}"
-
-    @cache_translation
-    def to_detector_serial(self) -> str:
-        """Serial number of the sensor."""
-        return self.raw_metadata.serial or "unknown"
-
-    @cache_translation
-    def to_detector_exposure_id(self) -> int:
-        """Number of sensor and exposure together."""
-        return self.raw_metadata.exposure_id * 1000 + self.raw_metadata.detector
-
-    @cache_translation
-    def to_ext_wavelength_nm(self) -> float | None:
-        """Wavelength of the monochromator."""
-        return self.raw_metadata.wavelength_nm
-
-    @cache_translation
-    def to_ext_temperature_k(self) -> float | None:
-        """Temperature of the CCD."""
-        return self.raw_metadata.temperature_k
+for _name, _value in _FROM_METADATA.items():
+    setattr(FringeTranslator, f"to_{_name}", _translation(_name, _value))
 
 
 class FringeTs8Translator(FringeTranslator):
