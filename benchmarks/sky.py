@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import tempfile
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import galsim
@@ -23,7 +24,7 @@ from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.instrument.telescope import TRACED_RADII, BeamField, Telescope
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import BackgroundWriter, FringeComponents
+from lsst.fringe_sim.products import FringeComponents
 
 from ._table import Row, best_of, memory_now, memory_watch, timed
 
@@ -210,9 +211,13 @@ def sensor_night() -> list[Row]:
         before = memory_now()
 
         def frames() -> None:
-            with BackgroundWriter() as writer:
+            # As the command: a frame is written while the next one is made.
+            write: Future[None] | None = None
+            with ThreadPoolExecutor(1) as thread:
                 for number, frame in enumerate(simulate_night(thickness, model, response, night)):
-                    writer.write(frame, Path(folder) / f"{number}.fits")
+                    if write is not None:
+                        write.result()
+                    write = thread.submit(frame.write_fits, Path(folder) / f"{number}.fits")
 
         _, frames_wall, frames_cpu = timed(frames)
         size = sum(path.stat().st_size for path in Path(folder).iterdir()) / 2**30

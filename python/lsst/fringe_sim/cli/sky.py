@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -189,15 +190,20 @@ def _written(
     section: SensorSection | None,
 ) -> list[SkyFringe]:
     """Frames, each written while the next one is simulated; headers tell what its bands are."""
-    from ..products import BackgroundWriter, band_cards
+    from ..products import band_cards
 
     made: list[SkyFringe] = []
-    with progress("simulating frames", len(scales)) as advance, BackgroundWriter() as writer:
+    write: Future[None] | None = None
+    with progress("simulating frames", len(scales)) as advance, ThreadPoolExecutor(1) as thread:
         for number, (frame, scale) in enumerate(zip(series, scales, strict=True)):
+            if write is not None:
+                write.result()  # an error of the disk ends the command here
             of_frame = {**cards, **band_cards(scale)}
-            writer.write(frame, f"{stem}_{number:02d}.fits", of_frame, section=section)
+            write = thread.submit(frame.write_fits, f"{stem}_{number:02d}.fits", of_frame, section=section)
             made.append(frame)
             advance()
+        if write is not None:
+            write.result()
     return made
 
 

@@ -5,7 +5,6 @@ at all, carry checksums, and two writes of one product agree to the byte.
 """
 
 from ..resources import DAMAGE
-from .background_writer import BackgroundWriter
 from .combined_bias import CombinedBias
 from .flat_exposures import FlatExposures
 from .fringe_components import FringeComponents
@@ -31,7 +30,6 @@ __all__ = [
     "DAMAGE",
     "MASK_PLANES",
     "SKY_UNITS",
-    "BackgroundWriter",
     "CombinedBias",
     "FlatExposures",
     "FringeComponents",
