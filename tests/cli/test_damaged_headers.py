@@ -136,6 +136,23 @@ def test_what_is_endless_is_seen_wherever_it_stands(
     assert harmless.tell() == 0
 
 
+@pytest.mark.parametrize("compress", [bytes, gzip.compress])
+def test_only_headers_are_looked_at(compress: Callable[[bytes], bytes]) -> None:
+    """Pixels may look like a card; behind them a header is seen again, and behind a strange header everything."""
+    card = f"{'NAXIS':8s}= {1000:>20d}".ljust(CARD).encode()
+    pixels = np.frombuffer(card * 72, dtype=np.uint8).reshape(10, -1)
+    sound = BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(pixels), fits.ImageHDU(pixels)]).writeto(sound)
+    check_axes(BytesIO(compress(sound.getvalue())), "somewhere")
+    endless = sound.getvalue() + b"XTENSION= 'IMAGE   '".ljust(CARD) + card
+    strange = sound.getvalue().replace(
+        b"NAXIS   =                    2", b"NAXIS   =                    ?", 1
+    )
+    for spoilt in (endless, strange):
+        with pytest.raises(FrameFormatError, match="NAXIS"):
+            check_axes(BytesIO(compress(spoilt)), "somewhere")
+
+
 def test_sound_files_pass(tmp_path: Path) -> None:
     path = tmp_path / "sound.fits.gz"
     fits.PrimaryHDU(np.ones((5, 7), np.float32)).writeto(path)

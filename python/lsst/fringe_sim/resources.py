@@ -7,6 +7,7 @@ import functools
 import gzip
 import hashlib
 import lzma
+import math
 import os
 import re
 import warnings
@@ -71,6 +72,10 @@ _DAMAGE = (
 )
 
 _CARD, _CHUNK = 80, 1 << 22
+_BLOCK, _LONGEST_HEADER, _MOST_BYTES = 2880, 1 << 20, 1 << 40
+_HEADER_END = re.compile(rb"END {77}(?: {80})*$")
+_SIZE_KEYWORD = re.compile(rb"BITPIX|NAXIS\d*|[PG]COUNT|GROUPS")
+_PLAIN_NUMBER = re.compile(rb"\w+ *= +([-+]?\d{1,18}) *(?:/.*)?", re.DOTALL)
 _COUNTS = (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT")
 _ENDLESS = re.compile(
     rb"(?:NAXIS  |TFIELDS) = *[-+]?0*[1-9]\d{3}|(?:NAXIS[1-9 ][\d ]{2}|TFIELDS |[PG]COUNT  )= *-"
@@ -334,17 +339,67 @@ def check_axes(stream: IO[bytes], source: str) -> None:
     opener = _COMPRESSED.get(stream.read(2))
     stream.seek(0)
     content: IO[bytes] = opener(stream) if opener else stream  # type: ignore[operator]
+    rest = _after_plain_units(content, source)
     # Cards begin at multiples of their length, and so do pieces of the file.
-    rest = b""
     while piece := content.read(_CHUNK):
         piece = rest + piece
-        for keyword in _COUNTS:
-            place = piece.find(keyword)
-            while place >= 0:
-                if place % _CARD == 0 and _ENDLESS.match(piece, place):
-                    claimed = " ".join(piece[place : place + 30].decode("ascii", "replace").split())
-                    allowed = "at most 999 axes or columns, and no negative size"
-                    raise FrameFormatError("header", claimed, allowed, source=source)
-                place = piece.find(keyword, place + 1)
+        _refuse_endless(piece, source)
         rest = piece[len(piece) // _CARD * _CARD - _CARD :] if len(piece) >= _CARD else piece
     stream.seek(0)
+
+
+def _after_plain_units(content: IO[bytes], source: str) -> bytes:
+    """Pass over headers and data of a file as long as they are what the standard asks for.
+
+    Returns
+    -------
+    header : `bytes`
+        The first header whose data may be anywhere, where astropy may look for the next one in what seems to be
+        data: from there on all has to be looked at. Nothing at the end of the file.
+    """
+    while True:
+        header = b""
+        while not _HEADER_END.search(header[-_BLOCK:]):
+            block = content.read(_BLOCK)
+            header += block
+            if len(block) < _BLOCK or len(header) > _LONGEST_HEADER:
+                _refuse_endless(header, source)
+                return header
+        _refuse_endless(header, source)
+        size = _data_size(header)
+        if size is None:
+            return header
+        content.seek(size, os.SEEK_CUR)
+
+
+def _data_size(header: bytes) -> int | None:
+    """Bytes between a header and the next one; nothing where that is open to interpretation."""
+    if not header.startswith((b"SIMPLE  =                    T", b"XTENSION= ")):
+        return None
+    values: dict[bytes, int] = {}
+    for place in range(0, len(header), _CARD):
+        card = header[place : place + _CARD]
+        keyword = card[:8].strip().upper()
+        if not _SIZE_KEYWORD.fullmatch(keyword):
+            continue
+        number = _PLAIN_NUMBER.fullmatch(card)
+        if number is None or keyword in values:
+            return None
+        values[keyword] = int(number[1])
+    axes = [values.get(b"NAXIS%d" % (axis + 1), -1) for axis in range(values.get(b"NAXIS", -1))]
+    if b"BITPIX" not in values or b"NAXIS" not in values or min(axes, default=0) < 0:
+        return None
+    bits = abs(values[b"BITPIX"]) * values.get(b"GCOUNT", 1)
+    size = bits // 8 * (values.get(b"PCOUNT", 0) + (math.prod(axes) if axes else 0))
+    return size + -size % _BLOCK if 0 <= size < _MOST_BYTES else None
+
+
+def _refuse_endless(piece: bytes, source: str) -> None:
+    for keyword in _COUNTS:
+        place = piece.find(keyword)
+        while place >= 0:
+            if place % _CARD == 0 and _ENDLESS.match(piece, place):
+                claimed = " ".join(piece[place : place + 30].decode("ascii", "replace").split())
+                allowed = "at most 999 axes or columns, and no negative size"
+                raise FrameFormatError("header", claimed, allowed, source=source)
+            place = piece.find(keyword, place + 1)
