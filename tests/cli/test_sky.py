@@ -45,6 +45,7 @@ def test_one_frame_is_written_with_its_errors(usual) -> None:
     assert "Coadds" in (usual / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_sky_of_the_command_is_that_of_the_task(thickness, tmp_path) -> None:
     """One map has one sky: the beam of every pixel in both."""
     arguments = ["--detector", "R10_S00", "--airmass", str(AIRMASS), "--out", str(tmp_path)]
@@ -61,6 +62,7 @@ def test_the_sky_of_the_command_is_that_of_the_task(thickness, tmp_path) -> None
     np.testing.assert_allclose(frame.image[known], theirs.image[known], rtol=2e-6)
 
 
+@pytest.mark.slow
 def test_level_is_that_of_the_measured_quantum_efficiency(thickness, usual, tmp_path) -> None:
     """2717 electrons in 30 s at the zenith within 10 %, unless the level of the stack is asked for."""
     assert run(["sky", "--thickness", thickness, "--level", "model", "--out", str(tmp_path)]) == 0
@@ -112,6 +114,7 @@ def test_a_map_that_is_no_map_is_refused(tmp_path, capsys) -> None:
     assert "two-dimensional" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_world_coordinates_where_the_place_is_known(thickness, usual, tmp_path) -> None:
     """A map that does not say what it shows has none; a window says so, and its frame is where it was."""
     assert "WCSNAMEF" not in fits.getheader(usual / "sky_R22_S11_00.fits", "IMAGE")
