@@ -11,6 +11,7 @@ import resource
 import signal
 import sys
 import time
+import traceback
 from types import FrameType
 from typing import Any
 
@@ -44,8 +45,11 @@ def _in_child(case: PanelCase, fresh: int | None, cap_s: float) -> str:
     pid = os.fork()
     if not pid:
         os.close(reading)
-        with os.fdopen(writing, "w") as out:
-            out.write(json.dumps(_searched(case, fresh, cap_s)))
+        try:
+            with os.fdopen(writing, "w") as out:
+                out.write(json.dumps(_searched(case, fresh, cap_s)))
+        except BaseException:  # the child must not go on as the parent
+            traceback.print_exc()
         os._exit(0)
     os.close(writing)
     with os.fdopen(reading) as source:
@@ -58,9 +62,8 @@ def _in_child(case: PanelCase, fresh: int | None, cap_s: float) -> str:
 
 def _searched(case: PanelCase, fresh: int | None, cap_s: float) -> dict[str, Any]:
     data, search, factor = case.streams(fresh)
-    cube = case.cube(data, factor)
+    cube, model = case.cube(data, factor), case.model()
     answer: dict[str, Any] = {"checksum": checksum(cube), "names": []}
-    model = case.model()
     count = count_evaluations() if count_evaluations is not None else None
     counted: EvaluationCount | None = count.__enter__() if count is not None else None
     began = time.process_time()
@@ -84,7 +87,8 @@ def _limit(cap_s: float, used_s: float) -> None:
         raise OutOfTimeError
 
     signal.signal(signal.SIGPROF, out_of_time)
-    signal.setitimer(signal.ITIMER_PROF, cap_s)
+    # Again and again: what is raised inside a callback of the garbage collector is lost.
+    signal.setitimer(signal.ITIMER_PROF, cap_s, 0.5)
     hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(resource.RLIMIT_CPU, (int(used_s + cap_s) + GRACE_S, hard))
 
