@@ -54,6 +54,7 @@ def test_a_case_is_the_same_every_time_and_another_when_fresh(name: str) -> None
     assert len({drawn(None), drawn(1), drawn(2)}) == 3
 
 
+@pytest.mark.slow
 def test_foreign_cases_hide_what_they_say() -> None:
     """Without noise that differs, a case with its sensor is not the one without."""
     for case in CASES.values():
