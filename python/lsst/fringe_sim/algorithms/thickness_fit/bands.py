@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compiled import kernel
+from ...compiled import contiguous, kernel
 from .amplitudes import Amplitudes, core
 
 __all__ = ["BAND_ROWS", "load_band"]
@@ -47,8 +47,9 @@ def load_band(
     cell_of_row = data.cell_of_row()[low:high]
     for band in range(bands):
         _load(
-            np.ascontiguousarray(image[band]), variance[min(band, len(variance) - 1)],
-            bad[min(band, len(bad) - 1)], scale[band], light[band], cell_of_row, data.x_edges,
+            contiguous(image[band]), contiguous(variance[min(band, len(variance) - 1)]),
+            contiguous(bad[min(band, len(bad) - 1)]), scale[band], contiguous(light[band]), cell_of_row,
+            data.x_edges,
             amplitude[band], weight[band],
         )  # fmt: skip
     return amplitude, weight
