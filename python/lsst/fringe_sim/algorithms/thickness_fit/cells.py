@@ -457,7 +457,7 @@ def _slope(total, count, size, keep):  # type: ignore[no-untyped-def]
 
 @subkernel
 def _median(total, count, size, keep):  # type: ignore[no-untyped-def]
-    means = np.empty(size, np.float32)
+    means = np.empty(size, np.float64)  # as everywhere that a median is taken
     number = np.int64(0)
     for k in range(size):
         if keep[k]:
