@@ -45,8 +45,13 @@ def names(pages: list[Path]) -> list[str]:
     return [str(page) for page in pages]
 
 
-LONG = ("guide/interoperability.md", "tutorials/discovering_an_effect.md", "tutorials/flats_to_thickness.md")
-"""Pages of which the examples take minutes."""
+LONG = (
+    "guide/interoperability.md",
+    "tutorials/discovering_an_effect.md",
+    "tutorials/flats_to_thickness.md",
+    "tutorials/thickness_to_sky.md",
+)
+"""Pages of which the examples take a minute or more."""
 
 WITH_EXAMPLES = [page for page in PAGES if any(True for _ in blocks(page, "pycon"))]
 

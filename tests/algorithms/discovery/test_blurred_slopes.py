@@ -57,6 +57,7 @@ def test_curvature_of_changes_is_that_of_the_written_out_basis(rng: np.random.Ge
     np.testing.assert_allclose(found, np.linalg.solve(normal, right), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_tilt_is_exact_and_a_bump_nearly(blurred) -> None:
     problem, truth, settings = blurred
     forward, rows = problem.forward, np.arange(len(truth)) - 40.0
@@ -78,6 +79,7 @@ def test_a_tilt_is_exact_and_a_bump_nearly(blurred) -> None:
     assert size(change(bump) - both) < 0.4 * size(change(bump) - alone)
 
 
+@pytest.mark.slow
 def test_effects_of_the_model_itself_count_as_those_that_are_looked_for(blurred) -> None:
     problem, truth, settings = blurred
     known = {"charge_diffusion.sigma": settings["charge_diffusion.sigma"], "crosstalk.from_left": 1e-3}

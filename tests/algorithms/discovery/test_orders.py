@@ -124,6 +124,7 @@ def test_the_deepest_of_many_minima_is_found_from_far_away(seed: int) -> None:
     assert abs(found.settings[item.key] - hidden) < 2.5 * item.neighbour
 
 
+@pytest.mark.slow
 def test_a_pair_is_found_where_the_first_by_itself_was_in_another_order() -> None:
     """Insulation makes up for the wavelengths from an order away, as the thickness does: both have to move back."""
     case, _ = recorded_case(20501129, "two", 18)

@@ -78,7 +78,7 @@ def test_the_fringes_are_averaged_over_the_area_of_a_cell(cell_px: int) -> None:
     assert errors[True] > 10.0 * errors[False]
 
 
-@pytest.mark.parametrize("points", [False, True])
+@pytest.mark.parametrize("points", first_is_quick([True, False]))
 def test_a_sensor_without_an_effect_is_taken_for_what_it_is(points: bool) -> None:
     """Steep fringes show whether pixels are areas; either way nothing is missing, and points are told."""
     rng = np.random.default_rng(41)
@@ -91,11 +91,15 @@ def test_a_sensor_without_an_effect_is_taken_for_what_it_is(points: bool) -> Non
 @pytest.mark.parametrize(
     ("places", "blur", "taken"),
     [
-        (3, {"charge_diffusion.sigma": 0.0927}, False),
-        (2, {"brighter_fatter.variance": 0.07}, False),  # 0.021 px² behind 30 000 electrons
         (3, {"charge_diffusion.sigma": 0.2}, True),
-        (2, {"charge_diffusion.sigma": 0.05}, True),
-        (0, {"charge_diffusion.sigma": 0.0927}, True),
+        *first_is_quick(
+            [
+                (3, {"charge_diffusion.sigma": 0.0927}, False),
+                (2, {"brighter_fatter.variance": 0.07}, False),  # 0.021 px² behind 30 000 electrons
+                (2, {"charge_diffusion.sigma": 0.05}, True),
+                (0, {"charge_diffusion.sigma": 0.0927}, True),
+            ]
+        ),
     ],
 )
 def test_places_beside_the_blur_that_they_lack_are_areas(places: int, blur: dict, taken: bool) -> None:
@@ -108,7 +112,7 @@ def test_places_beside_the_blur_that_they_lack_are_areas(places: int, blur: dict
     assert kept == (settings if taken else {"epoxy_index.cauchy": -0.005})
 
 
-@pytest.mark.parametrize(("points", "places"), [(False, 2), (True, 1)])
+@pytest.mark.parametrize(("points", "places"), first_is_quick([(False, 2), (True, 1)]))
 def test_a_blur_that_makes_areas_of_few_places_is_none(points: bool, places: int) -> None:
     """Areas taken as four places each need a blur, and explain as much as areas without; real points do not."""
     rng = np.random.default_rng(47)

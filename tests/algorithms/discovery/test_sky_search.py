@@ -103,6 +103,7 @@ def test_every_pixel_sees_its_own_beam() -> None:
             assert np.std(one_beam) > 0.05 * fringes  # it matters
 
 
+@pytest.mark.slow
 def test_cells_of_many_pixels_see_the_mean_of_their_beams() -> None:
     """Cells of a sensor against its pixels, averaged."""
     base, side, cell_px = FringeModel.from_setup("lsst_e2v"), 64, 8
