@@ -50,6 +50,7 @@ def fit_thickness(
     cell_px: int | None = None,
     noise_correlation_px: float | None = None,
     nuisances: Nuisances | None = None,
+    contrast: str = "wavelength",
     slip_limit: float = 0.01,
     silicon: SiliconSearch | None = None,
     threads: int | None = None,
@@ -138,7 +139,7 @@ def fit_thickness(
             templates,
             range_um=(low, high),
             cell_px=cell_px,
-            nuisances=nuisances,
+            nuisances=nuisances or Nuisances.automatic(contrast),
             threads=workers,
         )
         pixels = found.pixels
@@ -146,6 +147,7 @@ def fit_thickness(
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
         notes["CONTRAST"] = round(float(np.mean(found.nuisance.contrast)), 6)
+        notes["MARGIN"] = round(min(found.margin, 1e9), 2)
     everywhere = _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes, workers)
     return fit_islands(everywhere, cube, model if observable is None else with_observable(model, observable))
 
@@ -216,7 +218,11 @@ def make_templates(
     start = max(low - order, step)
     count = int(np.ceil((high + order - start) / step)) + 1
     response = model.response_on_grid(wavelength_nm, start, step, count)
-    return FringeTemplates(np.ascontiguousarray(response.T), start, step, wavelength_nm)
+    beside = system.stack.indices(wavelength_nm + 1.0, system.temperature_k)[
+        system.stack.position(system.varying)
+    ]
+    group = 1.0 - wavelength_nm * (beside.real - index.real) / index.real
+    return FringeTemplates(np.ascontiguousarray(response.T), start, step, wavelength_nm, group=group)
 
 
 def with_observable(model: FringeModel, observable: str) -> FringeModel:
