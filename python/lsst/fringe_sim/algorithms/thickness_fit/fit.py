@@ -14,10 +14,11 @@ from ...compiled import kernel, run_threaded
 from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ...model import FringeModel
 from ...optics.system import OBSERVABLES
-from ...products import FringeCube, ThicknessMap, mask_bits
-from ..thickness_fit_options import FIT_METHODS
+from ...products import FlatFit, FringeCube, ThicknessMap, mask_bits
+from ..thickness_fit_options import CONTRASTS, FIT_METHODS
 from .amplitudes import Amplitudes
 from .cells import sample_pixels
+from .conclusion import CERTAIN, cards, flat_fit
 from .global_fit import global_fit, normalise_to_cells, spans_orders
 from .guo2022 import walk_fit
 from .islands import fit_islands
@@ -79,8 +80,12 @@ def fit_thickness(
         Standard deviation of the Gaussian kernel with which the flats were smoothed [px]. If not given, the
         keyword ``SMOOTHPX`` of the cube's metadata, else 0.
     nuisances : `Nuisances`, optional
-        What else than thickness is free: levels, steps between zones, slow illumination, contrast. Nothing by
-        default; only with ``global``.
+        What else than thickness is free; only with ``global``. By default (`Nuisances.automatic`): the contrast, levels
+        of amplifiers as well as gains are known, a slow illumination, and wavelengths as well as they are known.
+        ``Nuisances()`` takes the model as it is.
+    contrast : {"wavelength", "common", "fixed"}, optional
+        Contrast of the fringes if no ``nuisances`` are given: a free factor at each wavelength, one for all, or that
+        of the model.
     slip_limit : `float`, optional
         Pixels whose order is wrong with a larger probability are flagged SLIP.
     silicon : `SiliconSearch`, optional
@@ -103,6 +108,8 @@ def fit_thickness(
     InputError, OutOfRangeError
         No good pixel, a range that holds less than two orders, a start pixel outside the sensor.
     """
+    if contrast not in CONTRASTS:
+        raise UnknownNameError("contrast", contrast, CONTRASTS)
     if method not in FIT_METHODS:
         raise UnknownNameError("method", method, FIT_METHODS)
     if method == "guo2022" and nuisances is not None and nuisances.any:
@@ -117,6 +124,8 @@ def fit_thickness(
     data = amplitudes_from_cube(cube, noise_correlation_px)
     low, high = range_um or model.setup.thickness_range_um
     templates = make_templates(model, cube.wavelength_nm, (low, high), observable)
+    flats: FlatFit | None = None
+    coarse: NDArray[np.float32] | None = None
     notes: dict[str, Any] = {"METHOD": method, "RANGELO": low, "RANGEHI": high}
     notes["OBSERVAB"] = observable or model.base_system.observable
     if method == "guo2022":
@@ -146,9 +155,12 @@ def fit_thickness(
         slip = slip_probability(found, out=found.border_slip)
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
-        notes["CONTRAST"] = round(float(np.mean(found.nuisance.contrast)), 6)
-        notes["MARGIN"] = round(min(found.margin, 1e9), 2)
-    everywhere = _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes, workers)
+        flats = flat_fit(found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
+        coarse = found.contrast_map
+        notes |= cards(flats, found.margin)
+    limit = slip_limit if float(notes.get("ORDMARG", CERTAIN)) >= CERTAIN else -1.0
+    everywhere = _assemble(pixels, slip, limit, cube, model.base_system.varying, notes, workers)
+    everywhere = replace(everywhere, flats=flats, contrast_map=coarse)
     return fit_islands(everywhere, cube, model if observable is None else with_observable(model, observable))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,9 @@ from .cells import (
     effective_number,
     sample_pixels,
 )
+from .conclusion import contrast_map, model_error
 from .evidence import OrderEvidence, order_evidence, refine_cells
-from .learning import LearningCells, first_nuisances, learn, rank_orders
+from .learning import LearningCells, first_nuisances, learn, rank_orders, sample_blocks
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, subtract_offset
 from .orders import SURE, solve_orders
@@ -110,6 +111,8 @@ class GlobalFit:
         Probability that the sensor as a whole has another order.
     margin : `float`
         Chi-square by which the next best order of the whole sensor is worse, where nuisances are free.
+    contrast_map : `numpy.ndarray`, float32
+        Contrast in blocks of the sensor, over that of the sensor.
     """
 
     pixels: PixelFit
@@ -122,6 +125,7 @@ class GlobalFit:
     normalisation: str
     common_slip: float = 0.0
     margin: float = np.inf
+    contrast_map: NDArray[np.float32] = field(default_factory=lambda: np.ones((1, 1), np.float32))
 
 
 def global_fit(
@@ -171,10 +175,12 @@ def global_fit(
     )  # fmt: skip
     state = solver.adjust(replace(state, thickness_um=settled.thickness_um))
     surface = _surface(state, order)
+    calmed = calm_surface(surface, threads)
+    if state.free.any:
+        state = solver.relearn(state, data, calmed)
     light = state.nuisance.light(cells, state.free)
     fringes = replace(data, offset=light, y_edges=cells.y_edges, x_edges=cells.x_edges)
-    calmed = calm_surface(surface, threads)
-    if state.normalisation == "sensor" and not state.free.patterned:
+    if state.normalisation == "sensor" and not state.free.any:
         state = replace(state, templates=_normalise_to_pixels(data, state.templates, calmed, threads))
     pixels = fit_pixels(fringes, state.templates, calmed, order, threads=threads)
     rough = spread_to_pixels(cells, ~surface.smooth)
@@ -183,6 +189,7 @@ def global_fit(
     pixels = rescue_pixels(
         fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
+    pixels = model_error(pixels, state.nuisance.scale_sigma)
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))
         pixels = replace(pixels, sigma=np.asarray(whole, np.float32))
@@ -194,7 +201,7 @@ def global_fit(
     settled = replace(settled, cell_slip=np.where(surface.smooth, settled.cell_slip, np.float32(0)))
     return GlobalFit(
         pixels, state.cells, settled, border_slip, state.templates, state.nuisance, order, state.normalisation,
-        common_slip, state.margin,
+        common_slip, state.margin, contrast_map(state.cells, state.templates, state.thickness_um),
     )  # fmt: skip
 
 
@@ -417,6 +424,21 @@ class _Solver:
             common_slip=slip,
             margin=margin,
         )
+
+
+    def relearn(self, state: _State, data: Amplitudes, surface: CellSurface) -> _State:
+        """Learn once more, on small blocks of pixels, which lose nothing where the fringes are steep."""
+        model = state.templates
+        noise = float(np.median(1.0 / np.sqrt(np.maximum(state.cells.weight[..., : model.n_wavelengths], 1e-12))))
+        pixels = np.sqrt(np.diff(state.cells.y_edges).max() * np.diff(state.cells.x_edges).max())
+        strength = float(model.amplitude().std(axis=0).mean())
+        phase_sigma = noise * float(pixels) / (strength * np.sqrt(model.n_wavelengths))
+        sample = sample_blocks(data, surface, state.free, phase_sigma)
+        if sample.thickness_um.size == 0:
+            return state
+        base = self.base or model
+        thickness, fit = learn(sample, base, state.free, state.nuisance)
+        return replace(state, templates=fit.applied_to(base).normalised_to(thickness), nuisance=fit)
 
 
 def _among(shape: NDArray[np.float32], others: list[NDArray[np.float32]], order_um: float) -> bool:

@@ -17,17 +17,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .cells import Cells
+from .amplitudes import Amplitudes
+from .borders import gather_pixels
+from .cells import Cells, effective_number
 from .evidence import refine_row
-from .nuisances import NuisanceFit, Nuisances, light_patterns
+from .nuisances import NuisanceFit, Nuisances, light_patterns, patterns_of_cells
+from .pixels import CellSurface
 from .templates import FringeTemplates
 
-__all__ = ["CommonOrder", "LearningCells", "first_nuisances", "learn", "rank_orders"]
+__all__ = [
+    "CommonOrder",
+    "LearningCells",
+    "first_nuisances",
+    "learn",
+    "rank_orders",
+    "sample_blocks",
+    "spread_of_wavelengths",
+]
 
 FloatArray = NDArray[np.float64]
 
 _MOST_CELLS = 3_000
 _FIRST_CELLS = 20_000
+_MOST_BLOCKS = 6_000
+_LARGEST_BLOCK = 6
+_PHASE_SIGMA = 0.1
+"""Uncertainty of the phase of a block [rad] at which its noise raises the contrast by half a per cent."""
 _ROUNDS = 10
 _TOLERANCE = 3e-5
 _UNSOUND = 9.0
@@ -70,7 +85,7 @@ class LearningCells:
     ) -> LearningCells:
         """Some thousand cells with a thickness, drawn at random but always the same."""
         good = _some(np.flatnonzero(np.isfinite(thickness_um)), _MOST_CELLS)
-        pattern, zones = light_patterns(cells, free, *np.unravel_index(good, cells.shape))
+        pattern, zones = patterns_of_cells(cells, free, *np.unravel_index(good, cells.shape))
         width = cells.value.shape[-1]
         return cls(
             np.ascontiguousarray(cells.value.reshape(-1, width)[good]),
@@ -80,6 +95,62 @@ class LearningCells:
             zones,
             temper,
         )
+
+
+def sample_blocks(
+    data: Amplitudes, surface: CellSurface, free: Nuisances, phase_sigma: float
+) -> LearningCells:
+    """Small blocks of pixels on the surface of the cells, drawn at random but always the same.
+
+    Cells are steep: their averages lose contrast and overtones. A block is only as large as its noise asks for, as the
+    contrast of what is mostly noise would be taken for too high.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    surface : `CellSurface`
+        Thickness of the cells.
+    free : `Nuisances`
+        What is free.
+    phase_sigma : `float`
+        Standard uncertainty of the phase of a single pixel [rad].
+    """
+    _, ny, nx = data.shape
+    side = int(np.clip(np.ceil(phase_sigma / _PHASE_SIGMA), 1, min(_LARGEST_BLOCK, ny, nx)))
+    rng = np.random.default_rng(0)
+    count = min(_MOST_BLOCKS, (ny // side) * (nx // side))
+    place = np.sort(rng.choice((ny // side) * (nx // side), count, replace=False))
+    rows, columns = side * (place // (nx // side)), side * (place % (nx // side))
+    sums: NDArray[np.float32] | None = None
+    weights: NDArray[np.float32] | None = None
+    for b in range(side):
+        for a in range(side):
+            value, weight = gather_pixels(data, rows + b, columns + a)
+            sums = value * weight if sums is None else sums + value * weight
+            weights = weight if weights is None else weights + weight
+    assert sums is not None and weights is not None
+    middle = (side - 1) // 2
+    y, x = rows + middle, columns + middle
+    thickness = _surface_at(surface, y, x)
+    good = np.isfinite(thickness) & (weights > 0).any(axis=1)
+    pattern, zones = light_patterns(free, (ny, nx), rows + 0.5 * (side - 1), columns + 0.5 * (side - 1))
+    values = np.divide(sums, weights, out=np.zeros_like(sums), where=weights > 0)
+    temper = effective_number(side, side, data.noise_correlation_px) / side**2
+    return LearningCells(
+        values[good], temper * weights[good], thickness[good], pattern[good], zones, 1.0
+    )
+
+
+def _surface_at(surface: CellSurface, y: NDArray[np.intp], x: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Bilinear surface at single places [µm]."""
+    order = np.argsort(y, kind="stable")
+    out = np.empty(y.size, np.float32)
+    for part in np.array_split(order, max(y.size // 200, 1)):
+        if part.size:
+            rows, place = np.unique(y[part], return_inverse=True)
+            out[part] = surface.at(rows, x[part])[place, np.arange(part.size)]
+    return out
 
 
 def _some(index: NDArray[np.intp], most: int) -> NDArray[np.intp]:
@@ -103,7 +174,7 @@ def first_nuisances(cells: Cells, templates: FringeTemplates, free: Nuisances) -
     """
     wavelengths, width = templates.n_wavelengths, cells.value.shape[-1]
     seen = _some(np.flatnonzero((cells.weight[..., :wavelengths] > 0).all(axis=-1)), _FIRST_CELLS)
-    pattern, zones = light_patterns(cells, free, *np.unravel_index(seen, cells.shape))
+    pattern, zones = patterns_of_cells(cells, free, *np.unravel_index(seen, cells.shape))
     known = replace(NuisanceFit.none(wavelengths, pattern.shape[-1]), contrast=templates.contrast)
     if not free.any or seen.size == 0:
         return known
@@ -443,8 +514,12 @@ def _shift_width(shift_nm: FloatArray, accuracy_nm: float) -> float:
     """Standard deviation of wavelengths about their labels, at most as stated; one far off does not widen it."""
     if accuracy_nm == 0.0:
         return 1.0
-    found = 1.4826 * float(np.median(np.abs(shift_nm))) if shift_nm.size else 0.0
-    return float(np.clip(found, min(_LEAST_SHIFT_NM, accuracy_nm), accuracy_nm))
+    return float(np.clip(spread_of_wavelengths(shift_nm), min(_LEAST_SHIFT_NM, accuracy_nm), accuracy_nm))
+
+
+def spread_of_wavelengths(shift_nm: FloatArray) -> float:
+    """Standard deviation of most wavelengths about their labels [nm]."""
+    return max(1.4826 * float(np.median(np.abs(shift_nm))), _LEAST_SHIFT_NM)
 
 
 def _shift_precision(fit: NuisanceFit, accuracy_nm: float) -> FloatArray:

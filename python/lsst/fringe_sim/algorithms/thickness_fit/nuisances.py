@@ -28,6 +28,7 @@ __all__ = [
     "Nuisances",
     "add_offset",
     "light_patterns",
+    "patterns_of_cells",
     "subtract_offset",
 ]
 
@@ -174,7 +175,7 @@ class NuisanceFit:
         out = np.empty((len(self.coefficients), *cells.shape), np.float32)
         columns = np.arange(cells.shape[1])
         for row in range(cells.shape[0]):  # patterns of all cells at once would need more memory than the cells
-            pattern, _ = light_patterns(cells, free, np.full_like(columns, row), columns)
+            pattern, _ = patterns_of_cells(cells, free, np.full_like(columns, row), columns)
             out[:, row] = np.expm1(self.coefficients @ pattern.T)
         return out
 
@@ -203,29 +204,37 @@ def _under_light(cells: Cells, light: NDArray[np.float32]) -> Cells:
     return replace(cells, value=value)
 
 
-def light_patterns(
+def patterns_of_cells(
     cells: Cells, free: Nuisances, rows: NDArray[np.intp], columns: NDArray[np.intp]
 ) -> tuple[FloatArray, int]:
-    """Known patterns at the centres of some cells, shape ``(n, n_patterns)``: level, zones, polynomials.
+    """Patterns of the light at the centres of some cells, as for `light_patterns`."""
+    shape = (int(cells.y_edges[-1]), int(cells.x_edges[-1]))
+    return light_patterns(free, shape, cells.y_centre[rows], cells.x_centre[columns])
+
+
+def light_patterns(
+    free: Nuisances, shape: tuple[int, int], y_px: FloatArray, x_px: FloatArray
+) -> tuple[FloatArray, int]:
+    """Known patterns at some places of a sensor, shape ``(n, n_patterns)``: level, zones, polynomials.
 
     Also the number of zones. The mean of a flat is that of light times fringe: where the light is free, so is the level.
     """
-    ny, nx = int(cells.y_edges[-1]), int(cells.x_edges[-1])
+    ny, nx = shape
     if not free.patterned:
-        return np.zeros((rows.size, 0)), 0
-    parts = [np.ones((rows.size, 1))]
+        return np.zeros((y_px.size, 0)), 0
+    parts = [np.ones((y_px.size, 1))]
     rows_at, columns_at = free.breaks(ny, nx)
     zones = 0
     if rows_at:
         across = len(columns_at) + 1
         zones = (len(rows_at) + 1) * across
-        zone = np.searchsorted(rows_at, cells.y_edges[rows], side="right") * across
-        zone = zone + np.searchsorted(columns_at, cells.x_edges[columns], side="right")
+        zone = np.searchsorted(rows_at, y_px, side="right") * across
+        zone = zone + np.searchsorted(columns_at, x_px, side="right")
         parts.append((zone[:, None] == np.arange(zones)).astype(float))
     if free.illumination_degree:
         degree = free.illumination_degree
-        y = 2.0 * cells.y_centre[rows] / max(ny - 1, 1) - 1.0
-        x = 2.0 * cells.x_centre[columns] / max(nx - 1, 1) - 1.0
+        y = 2.0 * y_px / max(ny - 1, 1) - 1.0
+        x = 2.0 * x_px / max(nx - 1, 1) - 1.0
         along, beside = (np.polynomial.legendre.legvander(part, degree) for part in (y, x))
         terms = [(k, total - k) for total in range(1, degree + 1) for k in range(total + 1)]
         parts.append(np.stack([along[:, a] * beside[:, b] for a, b in terms], axis=1))
