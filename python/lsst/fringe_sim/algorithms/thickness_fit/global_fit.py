@@ -433,7 +433,7 @@ class _Solver:
         pixels = np.sqrt(np.diff(state.cells.y_edges).max() * np.diff(state.cells.x_edges).max())
         strength = float(model.amplitude().std(axis=0).mean())
         phase_sigma = noise * float(pixels) / (strength * np.sqrt(model.n_wavelengths))
-        sample = sample_blocks(data, surface, state.free, phase_sigma)
+        sample = sample_blocks(data, surface, state.free, phase_sigma, self.order_um)
         if sample.thickness_um.size == 0:
             return state
         base = self.base or model

@@ -41,6 +41,8 @@ _MOST_CELLS = 3_000
 _FIRST_CELLS = 20_000
 _MOST_BLOCKS = 6_000
 _LARGEST_BLOCK = 6
+_LEAST_KEPT = 0.7
+"""Share of its contrast that a block must keep."""
 _PHASE_SIGMA = 0.1
 """Uncertainty of the phase of a block [rad] at which its noise raises the contrast by half a per cent."""
 _ROUNDS = 10
@@ -98,7 +100,7 @@ class LearningCells:
 
 
 def sample_blocks(
-    data: Amplitudes, surface: CellSurface, free: Nuisances, phase_sigma: float
+    data: Amplitudes, surface: CellSurface, free: Nuisances, phase_sigma: float, order_um: float
 ) -> LearningCells:
     """Small blocks of pixels on the surface of the cells, drawn at random but always the same.
 
@@ -115,6 +117,8 @@ def sample_blocks(
         What is free.
     phase_sigma : `float`
         Standard uncertainty of the phase of a single pixel [rad].
+    order_um : `float`
+        Thickness of one order [µm].
     """
     _, ny, nx = data.shape
     side = int(np.clip(np.ceil(phase_sigma / _PHASE_SIGMA), 1, min(_LARGEST_BLOCK, ny, nx)))
@@ -136,6 +140,17 @@ def sample_blocks(
     good = np.isfinite(thickness) & (weights > 0).any(axis=1)
     pattern, zones = light_patterns(free, (ny, nx), rows + 0.5 * (side - 1), columns + 0.5 * (side - 1))
     values = np.divide(sums, weights, out=np.zeros_like(sums), where=weights > 0)
+    # What the average over a block keeps of its fringes.
+    turns = [
+        0.5 * side / order_um * (_surface_at(surface, *ahead) - _surface_at(surface, *behind))
+        for ahead, behind in (
+            ((np.minimum(y + 1, ny - 1), x), (np.maximum(y - 1, 0), x)),
+            ((y, np.minimum(x + 1, nx - 1)), (y, np.maximum(x - 1, 0))),
+        )
+    ]
+    kept = np.sinc(turns[0]) * np.sinc(turns[1]) if side > 1 else np.ones(y.size)
+    good &= kept > _LEAST_KEPT
+    values, weights = values / kept[:, None].astype(np.float32), weights * (kept**2)[:, None].astype(np.float32)
     temper = effective_number(side, side, data.noise_correlation_px) / side**2
     return LearningCells(
         values[good], temper * weights[good], thickness[good], pattern[good], zones, 1.0
