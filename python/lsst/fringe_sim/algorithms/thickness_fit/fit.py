@@ -15,6 +15,7 @@ from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ...model import FringeModel
 from ...optics.system import OBSERVABLES
 from ...products import FlatFit, FringeCube, ThicknessMap, mask_bits
+from ..flat_conditions import model_of_flats
 from ..thickness_fit_options import CONTRASTS, FIT_METHODS
 from .amplitudes import Amplitudes
 from .cells import sample_pixels
@@ -121,6 +122,7 @@ def fit_thickness(
     workers = threads if threads is not None else len(os.sched_getaffinity(0))
     if not any((plane == 0).any() for plane in cube.mask):
         raise InputError("good pixels of the cube", 0, "one or more", source=cube.detector or None)
+    model = model_of_flats(model, cube.exposures)
     data = amplitudes_from_cube(cube, noise_correlation_px)
     low, high = range_um or model.setup.thickness_range_um
     templates = make_templates(model, cube.wavelength_nm, (low, high), observable)
@@ -148,7 +150,7 @@ def fit_thickness(
             templates,
             range_um=(low, high),
             cell_px=cell_px,
-            nuisances=nuisances or Nuisances.automatic(contrast),
+            nuisances=nuisances or Nuisances.automatic(contrast, model.setup.wavelength_accuracy_nm),
             threads=workers,
         )
         pixels = found.pixels

@@ -425,11 +425,12 @@ class _Solver:
             margin=margin,
         )
 
-
     def relearn(self, state: _State, data: Amplitudes, surface: CellSurface) -> _State:
         """Learn once more, on small blocks of pixels, which lose nothing where the fringes are steep."""
         model = state.templates
-        noise = float(np.median(1.0 / np.sqrt(np.maximum(state.cells.weight[..., : model.n_wavelengths], 1e-12))))
+        noise = float(
+            np.median(1.0 / np.sqrt(np.maximum(state.cells.weight[..., : model.n_wavelengths], 1e-12)))
+        )
         pixels = np.sqrt(np.diff(state.cells.y_edges).max() * np.diff(state.cells.x_edges).max())
         strength = float(model.amplitude().std(axis=0).mean())
         phase_sigma = noise * float(pixels) / (strength * np.sqrt(model.n_wavelengths))

@@ -150,11 +150,12 @@ def sample_blocks(
     ]
     kept = np.sinc(turns[0]) * np.sinc(turns[1]) if side > 1 else np.ones(y.size)
     good &= kept > _LEAST_KEPT
-    values, weights = values / kept[:, None].astype(np.float32), weights * (kept**2)[:, None].astype(np.float32)
-    temper = effective_number(side, side, data.noise_correlation_px) / side**2
-    return LearningCells(
-        values[good], temper * weights[good], thickness[good], pattern[good], zones, 1.0
+    values, weights = (
+        values / kept[:, None].astype(np.float32),
+        weights * (kept**2)[:, None].astype(np.float32),
     )
+    temper = effective_number(side, side, data.noise_correlation_px) / side**2
+    return LearningCells(values[good], temper * weights[good], thickness[good], pattern[good], zones, 1.0)
 
 
 def _surface_at(surface: CellSurface, y: NDArray[np.intp], x: NDArray[np.intp]) -> NDArray[np.float32]:
@@ -206,10 +207,7 @@ def first_nuisances(cells: Cells, templates: FringeTemplates, free: Nuisances) -
     rest = (1.0 + value) * np.exp(-pattern @ coefficients.T) - 1.0
     strength = templates.amplitude().std(axis=0)
     power = np.array(
-        [
-            _robust_variance(rest[:, k]) - float(np.median(1.0 / weight[:, k]))
-            for k in range(wavelengths)
-        ]
+        [_robust_variance(rest[:, k]) - float(np.median(1.0 / weight[:, k])) for k in range(wavelengths)]
     )
     contrast = np.sqrt(np.maximum(power, 0.0)) / strength
     mean = float(np.sum(contrast * strength**2) / np.sum(strength**2))
@@ -219,9 +217,7 @@ def first_nuisances(cells: Cells, templates: FringeTemplates, free: Nuisances) -
         contrast = np.full(wavelengths, mean)
     else:
         contrast = np.clip(contrast, 0.3 * mean, 3.0 * mean)
-    return replace(
-        known, coefficients=coefficients, contrast=np.maximum(contrast, 1e-3) * templates.contrast
-    )
+    return replace(known, coefficients=coefficients, contrast=np.maximum(contrast, 1e-3) * templates.contrast)
 
 
 def _robust_variance(values: FloatArray) -> float:
@@ -376,7 +372,9 @@ class _Problem:
         wavelengths, own, shared = self.base.n_wavelengths, self.own, self.shared
         weight = self.cells.temper * self.cells.weight[:, :wavelengths].astype(float)
         weight = weight * _sound(rest, weight)[:, None]
-        weight = weight / np.maximum((weight * rest**2).sum(axis=0) / np.maximum((weight > 0).sum(axis=0), 1), 1.0)
+        weight = weight / np.maximum(
+            (weight * rest**2).sum(axis=0) / np.maximum((weight > 0).sum(axis=0), 1), 1.0
+        )
         information = np.maximum((weight * slope**2).sum(axis=1), 1e-30)
         lean = weight * slope / np.sqrt(information)[:, None]
         each, common = self._design(fit, thickness, model, slope)
@@ -482,7 +480,12 @@ class _Problem:
             change = max(change, 0.01 * float(np.abs(table[:, count]).max()))
         return (
             replace(
-                fit, coefficients=coefficients, contrast=contrast, shift_nm=shift, fading=fading, overtones=overtones
+                fit,
+                coefficients=coefficients,
+                contrast=contrast,
+                shift_nm=shift,
+                fading=fading,
+                overtones=overtones,
             ),
             change,
         )
@@ -512,7 +515,9 @@ class _Problem:
         weight = self.cells.weight[:, :wavelengths].astype(float)
         sound = _sound(rest, weight)
         freedom = 1.0 - 1.0 / wavelengths
-        misfit = (weight * rest**2)[sound].sum(axis=0) / np.maximum((weight[sound] > 0).sum(axis=0), 1) / freedom
+        misfit = (
+            (weight * rest**2)[sound].sum(axis=0) / np.maximum((weight[sound] > 0).sum(axis=0), 1) / freedom
+        )
         precision, where = self._prior(fit)
         each_cell = (weight * rest**2).sum(axis=1)
         capped = np.minimum(each_cell, _UNSOUND * np.median(each_cell))

@@ -22,7 +22,6 @@ from .templates import FringeTemplates
 __all__ = [
     "CONTRASTS",
     "GAIN_ACCURACY",
-    "WAVELENGTH_ACCURACY_NM",
     "ZONES",
     "NuisanceFit",
     "Nuisances",
@@ -36,8 +35,6 @@ FloatArray = NDArray[np.float64]
 
 GAIN_ACCURACY = 0.005
 """How well gains of amplifiers are known: a few 1e-3 from iron-55, or from the variance of pairs of flats."""
-WAVELENGTH_ACCURACY_NM = 0.5
-"""Assumed accuracy of the wavelength of a monochromator, standard deviation, where the set-up states none."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +83,7 @@ class Nuisances:
             raise OutOfRangeError("accuracy of wavelengths [nm]", self.wavelength_accuracy_nm, "0 to 20")
 
     @classmethod
-    def automatic(
-        cls, contrast: str = "wavelength", wavelength_accuracy_nm: float = WAVELENGTH_ACCURACY_NM
-    ) -> Nuisances:
+    def automatic(cls, contrast: str = "wavelength", wavelength_accuracy_nm: float = 0.0) -> Nuisances:
         """What is free unless somebody asks otherwise."""
         return cls(True, "amplifiers", 2, contrast, GAIN_ACCURACY, wavelength_accuracy_nm)
 
@@ -174,7 +169,9 @@ class NuisanceFit:
             return np.zeros((0, *cells.shape), np.float32)
         out = np.empty((len(self.coefficients), *cells.shape), np.float32)
         columns = np.arange(cells.shape[1])
-        for row in range(cells.shape[0]):  # patterns of all cells at once would need more memory than the cells
+        for row in range(
+            cells.shape[0]
+        ):  # patterns of all cells at once would need more memory than the cells
             pattern, _ = patterns_of_cells(cells, free, np.full_like(columns, row), columns)
             out[:, row] = np.expm1(self.coefficients @ pattern.T)
         return out

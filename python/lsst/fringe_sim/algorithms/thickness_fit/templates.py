@@ -181,7 +181,8 @@ class FringeTemplates:
             grid = self.thickness_um
             factor = 1.0 - self.group * shift_nm / self.wavelength_nm
             response = np.stack(
-                [np.interp(grid * f, grid, column) for f, column in zip(factor, response.T, strict=True)], axis=1
+                [np.interp(grid * f, grid, column) for f, column in zip(factor, response.T, strict=True)],
+                axis=1,
             )
         found = replace(self, response=response, fading=fading, middle_um=middle_um)
         return found.with_contrast(contrast)
@@ -191,7 +192,9 @@ class FringeTemplates:
         first = int(np.clip((low_um - self.start_um) / self.step_um, 0, len(self.response) - 17))
         last = int(np.clip((high_um - self.start_um) / self.step_um + 2, first + 16, len(self.response)))
         rows = slice(first, last)
-        return replace(self, response=self.response[rows], start_um=self.start_um + first * self.step_um), rows
+        return replace(
+            self, response=self.response[rows], start_um=self.start_um + first * self.step_um
+        ), rows
 
     def even_overtones(self) -> FloatArray:
         """Part of the response that repeats after half an order, less its mean; shape of ``response``."""
