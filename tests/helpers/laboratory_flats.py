@@ -100,8 +100,8 @@ class Result:
 
     def __str__(self) -> str:
         return (
-            f"wrong {self.wrong:8.1e}  masked {self.masked:7.1e}  sigma {self.sigma_nm:6.2f} nm  pulls {self.pull:5.2f}  "
-            f"slip {self.slip:7.1e}  misfit {self.misfit:5.2f}  {self.seconds:5.1f} s"
+            f"wrong {self.wrong:8.1e}  masked {self.masked:7.1e}  sigma {self.sigma_nm:6.2f} nm  "
+            f"pulls {self.pull:5.2f}  slip {self.slip:7.1e}  misfit {self.misfit:5.2f}  {self.seconds:5.1f} s"
         )
 
 

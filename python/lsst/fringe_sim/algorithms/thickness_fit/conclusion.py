@@ -21,7 +21,8 @@ __all__ = ["CERTAIN", "MISFIT", "contrast_map", "flat_fit", "model_error", "rema
 CERTAIN = 25.0
 """Chi-square difference to the next order of the whole sensor below which the order is not decided."""
 MISFIT = 1.2
-"""Mean square of what is left of small blocks of pixels, over their variance, from which on the model is said not to fit."""
+"""Mean square of what is left of small blocks of pixels, over their variance, from which on the model is
+said not to fit."""
 _OUTLIER = 5.0
 """Standard deviations beyond which a wavelength does not belong to its label."""
 _BLOCKS = 16
@@ -179,7 +180,7 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
     if float(metadata["ORDMARG"]) < CERTAIN:
         said.append(
             f"the order of the sensor is not decided: another one is worse by a chi-square of only "
-            f"{max(metadata['ORDMARG'], 0.0):.1f}; all pixels are flagged SLIP. Flats over a wider range of wavelengths, "
-            "or better known wavelengths, would decide"
+            f"{max(metadata['ORDMARG'], 0.0):.1f}; all pixels are flagged SLIP. Flats over a wider range of "
+            "wavelengths, or better known wavelengths, would decide"
         )
     return said

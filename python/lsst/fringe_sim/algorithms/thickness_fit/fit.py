@@ -81,9 +81,9 @@ def fit_thickness(
         Standard deviation of the Gaussian kernel with which the flats were smoothed [px]. If not given, the
         keyword ``SMOOTHPX`` of the cube's metadata, else 0.
     nuisances : `Nuisances`, optional
-        What else than thickness is free; only with ``global``. By default (`Nuisances.automatic`): the contrast, levels
-        of amplifiers as well as gains are known, a slow illumination, and wavelengths as well as they are known.
-        ``Nuisances()`` takes the model as it is.
+        What else than thickness is free; only with ``global``. By default (`Nuisances.automatic`): the contrast,
+        levels of amplifiers as well as gains are known, a slow illumination, and wavelengths as well as they are
+        known. ``Nuisances()`` takes the model as it is.
     contrast : {"wavelength", "common", "fixed"}, optional
         Contrast of the fringes if no ``nuisances`` are given: a free factor at each wavelength, one for all, or that
         of the model.
@@ -140,8 +140,13 @@ def fit_thickness(
         exposures = cube.exposures
         any_silicon = SiliconModel(seen, exposures.wavelength_nm, exposures.bandwidth_fwhm_nm)
         joint = joint_fit(
-            data, templates, any_silicon, silicon, range_um=(low, high), cell_px=cell_px, threads=workers
-        )
+            data, templates, any_silicon, silicon, range_um=(low, high), cell_px=cell_px,
+            nuisances=Nuisances.automatic(contrast, model.setup.wavelength_accuracy_nm), threads=workers,
+        )  # fmt: skip
+        if joint.found.nuisance.misfit.size:
+            flats = flat_fit(joint.found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
+            coarse = joint.found.contrast_map
+            notes |= cards(flats, joint.found.margin)
         pixels, slip = joint.pixels, joint.slip
         notes |= {"ORDERUM": round(joint.found.order_um, 6), **joint.silicon.cards()}
     else:

@@ -222,7 +222,7 @@ class _State:
     common_sigma_um: float = 0.0
     searched: bool = False
     """Whether mean response and orders were found together, by a search that may have missed the true ones."""
-    free: Nuisances = Nuisances()
+    free: Nuisances = field(default_factory=Nuisances)
     margin: float = np.inf
 
     @property

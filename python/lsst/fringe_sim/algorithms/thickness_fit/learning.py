@@ -104,8 +104,8 @@ def sample_blocks(
 ) -> LearningCells:
     """Small blocks of pixels on the surface of the cells, drawn at random but always the same.
 
-    Cells are steep: their averages lose contrast and overtones. A block is only as large as its noise asks for, as the
-    contrast of what is mostly noise would be taken for too high.
+    Cells are steep: their averages lose contrast and overtones. A block is only as large as its noise asks for, as
+    the contrast of what is mostly noise would be taken for too high.
 
     Parameters
     ----------
@@ -126,14 +126,11 @@ def sample_blocks(
     count = min(_MOST_BLOCKS, (ny // side) * (nx // side))
     place = np.sort(rng.choice((ny // side) * (nx // side), count, replace=False))
     rows, columns = side * (place // (nx // side)), side * (place % (nx // side))
-    sums: NDArray[np.float32] | None = None
-    weights: NDArray[np.float32] | None = None
+    sums, weights = np.float32(0), np.float32(0)
     for b in range(side):
         for a in range(side):
             value, weight = gather_pixels(data, rows + b, columns + a)
-            sums = value * weight if sums is None else sums + value * weight
-            weights = weight if weights is None else weights + weight
-    assert sums is not None and weights is not None
+            sums, weights = sums + value * weight, weights + weight
     middle = (side - 1) // 2
     y, x = rows + middle, columns + middle
     thickness = _surface_at(surface, y, x)
@@ -227,7 +224,7 @@ def _robust_variance(values: FloatArray) -> float:
 
 
 def _widths(free: Nuisances, zones: int, count: int, shared: bool) -> FloatArray:
-    """Standard deviations of the coefficients of the light: of what wavelengths share, or of what each has besides."""
+    """Standard deviations of the coefficients of the light: what wavelengths share, or what each has besides."""
     known = np.isfinite(free.gain_accuracy)
     width = np.full(count, (_LIGHT if shared else _LIGHT_BY_WAVELENGTH) if known else 1.0)
     width[0] = 1.0

@@ -214,7 +214,8 @@ def light_patterns(
 ) -> tuple[FloatArray, int]:
     """Known patterns at some places of a sensor, shape ``(n, n_patterns)``: level, zones, polynomials.
 
-    Also the number of zones. The mean of a flat is that of light times fringe: where the light is free, so is the level.
+    Also the number of zones. The mean of a flat is that of light times fringe: where the light is free, so is the
+    level.
     """
     ny, nx = shape
     if not free.patterned:
