@@ -1,4 +1,4 @@
-"""Flats that are not as the model has them, from another simulator: by default the map is right, or says it is not."""
+"""Flats that are not as the model has them, from another simulator: right by default, or said not to be."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ def check(fitted: ThicknessMap, truth: np.ndarray, widest: float = 1.15) -> None
 
 
 @pytest.mark.parametrize("name", ["contrast 0.13", "contrast 0.13, gains 1 %"])
+@pytest.mark.rng("laboratory weak fringes are fitted by default")
 def test_weak_fringes_are_fitted_by_default(name, model, rng) -> None:
     truth, cube = case(name, rng)
     fitted = fit_thickness(cube, model)
@@ -55,6 +56,7 @@ def test_weak_fringes_are_fitted_by_default(name, model, rng) -> None:
         "gains 1 %",
     ],
 )
+@pytest.mark.rng("laboratory right by default")
 def test_right_by_default(name, model, rng) -> None:
     truth, cube = case(name, rng)
     check(fit_thickness(cube, model), truth)
@@ -62,12 +64,14 @@ def test_right_by_default(name, model, rng) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["epoxy k 0.005", "line of 6 nm"])
+@pytest.mark.rng("laboratory contrast that falls with the thickness")
 def test_contrast_that_falls_with_the_thickness(name, model, rng) -> None:
     truth, cube = case(name, rng)
     check(fit_thickness(cube, model), truth, widest=1.3)
 
 
 @pytest.mark.slow
+@pytest.mark.rng("laboratory a flat with a wrong label is named")
 def test_a_flat_with_a_wrong_label_is_named(model, rng) -> None:
     truth, cube = case("one flat 2 nm off", rng)
     fitted = fit_thickness(cube, model)
@@ -77,6 +81,7 @@ def test_a_flat_with_a_wrong_label_is_named(model, rng) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.rng("laboratory wavelengths that are off")
 def test_wavelengths_that_are_off(model, rng) -> None:
     truth, cube = case("wavelengths 0.6 nm", rng)
     result = judge(fit_thickness(cube, model), truth)
@@ -84,6 +89,7 @@ def test_wavelengths_that_are_off(model, rng) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.rng("laboratory the walk and the silicon take the default")
 def test_the_walk_and_the_silicon_take_the_default(model, rng) -> None:
     truth, cube = case("contrast 0.13", rng)
     walk = fit_thickness(cube, model, "guo2022")
@@ -94,6 +100,7 @@ def test_the_walk_and_the_silicon_take_the_default(model, rng) -> None:
     assert "contrast" in joint.metadata["SIWHY"]
 
 
+@pytest.mark.rng("laboratory a model that is held says that it does not fit")
 def test_a_model_that_is_held_says_that_it_does_not_fit(model, rng) -> None:
     """Nothing free, fringes of an eighth: wrong, but not quietly."""
     _, cube = case("contrast 0.13", rng)

@@ -185,8 +185,8 @@ def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:
     rms = PERCENT * float(frame.metadata["FRINGRMS"])
     return (
         f"the laboratory flats have {contrast:.3g} ± {sigma:.1g} of the model's contrast: fringes of rms {rms:.4f} % "
-        f"if it is lost in the laboratory only, {contrast * rms:.4f} % if it is lost on the sky as well; the frames hold "
-        "the first. A frame of the sky of this sensor decides, or a cause that 'fringe-sim discover' names"
+        f"if it is lost in the laboratory only, {contrast * rms:.4f} % if it is lost on the sky as well; the frames "
+        "hold the first. A frame of the sky of this sensor decides, or a cause that 'fringe-sim discover' names"
     )
 
 
