@@ -50,6 +50,8 @@ _NINTH_DECILE = 1.28
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
+_MOST_PROBED = 20_000
+"""Cells of a sensor that may hold too few orders for light and contrast to be told."""
 _MISFIT = 1.5
 """Reduced chi-square of cells from which on a model is known to be wrong; what it leaves over is shared by many."""
 _MEAN_TOLERANCE = 2e-6
@@ -77,8 +79,6 @@ _SAME_SHAPE = 0.25
 """Reliefs that agree within this many orders everywhere are one."""
 _WORTHWHILE = 0.01
 """Relative gain of chi-square for which another round is worth its time."""
-_HALF_OR_TWICE = 0.7
-"""Logarithm of a contrast that may still be that of the model, as far as the scatter of the flats tells."""
 _NARROW_MARGIN = 3.0
 """Orders beyond what a narrow sensor showed in a sample that its other cells may have."""
 
@@ -248,15 +248,21 @@ class _Solver:
         """Solve the orders, and again if the model turns out to be another than was thought."""
         if not self.free.any:
             return self._solve_held(cells, templates)
+        if np.isfinite(self.free.gain_accuracy) and np.prod(cells.shape) <= _MOST_PROBED:
+            # Light and contrast of a sensor of few orders cannot be told from its fringes: is the model right as it is?
+            held = replace(self, free=Nuisances())
+            probe = held._state(
+                cells, templates, NuisanceFit.none(templates.n_wavelengths), "range", self.range_um
+            )
+            if not held._is_wide(probe):
+                state = held.solve(cells, templates)
+                if state.misfit < _MISFIT:
+                    return state
         nuisance = first_nuisances(cells, templates, self.free)
         for turn in range(_MOST_SOLUTIONS):
             fitted = nuisance.applied_to(templates)
             even = subtract_offset(cells, nuisance.light(cells, self.free))
             state = self._state(even, fitted, nuisance, "sensor", self.range_um)
-            if turn == 0 and self._may_be_held(nuisance) and not self._is_wide(state):
-                held = replace(self, free=Nuisances()).solve(cells, templates)
-                if held.misfit < _MISFIT:
-                    return held
             before, state = state, self._learn(state, ranked=turn == 0)
             if _agree(before, state):
                 break
@@ -282,11 +288,6 @@ class _Solver:
                 break
             fitted, normalisation = state.templates, state.normalisation
         return state
-
-    def _may_be_held(self, nuisance: NuisanceFit) -> bool:
-        """Whether a sensor of few orders may be as the model has it; nobody asked for anything to be free."""
-        loss = abs(float(np.log(nuisance.contrast.mean())))
-        return bool(np.isfinite(self.free.gain_accuracy)) and loss < _HALF_OR_TWICE
 
     def _is_wide(self, state: _State) -> bool:
         """Whether a sensor holds orders enough to tell light and contrast from the fringes."""

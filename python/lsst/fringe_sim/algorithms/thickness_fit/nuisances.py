@@ -99,7 +99,7 @@ class Nuisances:
 
     def fitting(self, ny: int, nx: int) -> Nuisances:
         """Levels of amplifiers only where a sensor is large enough for them."""
-        small = self.zones == "amplifiers" and np.isfinite(self.gain_accuracy) and (ny < 16 or nx < 64)
+        small = self.zones == "amplifiers" and np.isfinite(self.gain_accuracy) and (ny < 32 or nx < 128)
         return replace(self, zones="sensor") if small else self
 
     def breaks(self, ny: int, nx: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
