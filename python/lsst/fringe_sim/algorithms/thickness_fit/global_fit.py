@@ -249,11 +249,10 @@ class _Solver:
         if not self.free.any:
             return self._solve_held(cells, templates)
         if np.isfinite(self.free.gain_accuracy) and np.prod(cells.shape) <= _MOST_PROBED:
-            # Light and contrast of a sensor of few orders cannot be told from its fringes: is the model right as it is?
+            # Light and contrast of a sensor of few orders cannot be told from its fringes.
             held = replace(self, free=Nuisances())
-            probe = held._state(
-                cells, templates, NuisanceFit.none(templates.n_wavelengths), "range", self.range_um
-            )
+            nothing = NuisanceFit.none(templates.n_wavelengths)
+            probe = held._state(cells, templates, nothing, "range", self.range_um)
             if not held._is_wide(probe):
                 state = held.solve(cells, templates)
                 if state.misfit < _MISFIT:
