@@ -112,7 +112,12 @@ def sky(
         *([thickness] if thickness != BUILT_IN else []),
         *([effects_file] if effects_file else []),
     ]
-    cards = {"SETUP": setup.name, "BEAMS": "pixel", **effect_cards(model), **input_cards(given)}
+    cards: dict[str, str | float] = {
+        "SETUP": setup.name,
+        "BEAMS": "pixel",
+        **effect_cards(model),
+        **input_cards(given),
+    }
     contrast = _laboratory_contrast(thickness)
     if contrast is not None:
         cards |= {"LABCONTR": contrast[0], "LABCONSG": contrast[1]}

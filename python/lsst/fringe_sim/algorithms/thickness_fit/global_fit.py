@@ -253,7 +253,7 @@ class _Solver:
             held = replace(self, free=Nuisances())
             nothing = NuisanceFit.none(templates.n_wavelengths)
             probe = held._state(cells, templates, nothing, "range", self.range_um)
-            if not held._is_wide(probe):
+            if held._mean_is_open(probe) or not held._is_wide(probe):
                 state = held.solve(cells, templates)
                 if state.misfit < _MISFIT:
                     return state

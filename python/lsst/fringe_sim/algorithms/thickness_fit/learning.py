@@ -126,16 +126,16 @@ def sample_blocks(
     count = min(_MOST_BLOCKS, (ny // side) * (nx // side))
     place = np.sort(rng.choice((ny // side) * (nx // side), count, replace=False))
     rows, columns = side * (place // (nx // side)), side * (place % (nx // side))
-    sums, weights = np.float32(0), np.float32(0)
-    for b in range(side):
-        for a in range(side):
-            value, weight = gather_pixels(data, rows + b, columns + a)
-            sums, weights = sums + value * weight, weights + weight
+    parts = [gather_pixels(data, rows + b, columns + a) for b in range(side) for a in range(side)]
+    weights = np.asarray(sum(weight for _, weight in parts), np.float32)
+    sums = np.asarray(sum(value * weight for value, weight in parts), np.float32)
     middle = (side - 1) // 2
     y, x = rows + middle, columns + middle
     thickness = _surface_at(surface, y, x)
     good = np.isfinite(thickness) & (weights > 0).any(axis=1)
-    pattern, zones = light_patterns(free, (ny, nx), rows + 0.5 * (side - 1), columns + 0.5 * (side - 1))
+    pattern, zones = light_patterns(
+        free, (ny, nx), *(np.asarray(part + 0.5 * (side - 1), dtype=float) for part in (rows, columns))
+    )
     values = np.divide(sums, weights, out=np.zeros_like(sums), where=weights > 0)
     # What the average over a block keeps of its fringes.
     turns = [
@@ -354,7 +354,7 @@ class _Problem:
         """One Gauss-Newton step of all nuisances."""
         thickness, model, slope, rest = self.residual(fit, thickness)
         normal, right = self._system(fit, thickness, model, slope, rest)
-        moved = np.linalg.solve(normal, right)
+        moved = np.asarray(np.linalg.solve(normal, right), dtype=float)
         return thickness, *self._moved(fit, moved)
 
     def _system(
@@ -508,7 +508,7 @@ class _Problem:
             each = np.arange(wavelengths) * own + count
             block = variance[np.ix_(each, each)]
             along = np.full(wavelengths, 1.0 / wavelengths) / self.base.wavelength_nm
-            scale = float(np.sqrt(max(along @ block @ along, 0.0)))
+            scale = float(np.sqrt(max(float(along @ block @ along), 0.0)))
         weight = self.cells.weight[:, :wavelengths].astype(float)
         sound = _sound(rest, weight)
         freedom = 1.0 - 1.0 / wavelengths
