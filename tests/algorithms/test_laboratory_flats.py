@@ -63,7 +63,7 @@ def test_right_by_default(name, model, rng) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["epoxy k 0.005", "line of 6 nm"])
+@pytest.mark.parametrize("name", ["epoxy k 0.005"])
 @pytest.mark.rng("laboratory contrast that falls with the thickness")
 def test_contrast_that_falls_with_the_thickness(name, model, rng) -> None:
     truth, cube = case(name, rng)

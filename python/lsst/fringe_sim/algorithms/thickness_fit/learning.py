@@ -152,7 +152,14 @@ def sample_blocks(
         weights * (kept**2)[:, None].astype(np.float32),
     )
     temper = effective_number(side, side, data.noise_correlation_px) / side**2
-    return LearningCells(values[good], temper * weights[good], thickness[good], pattern[good], zones, 1.0)
+    return LearningCells(
+        np.asarray(values[good], np.float32),
+        np.asarray(temper * weights[good], np.float32),
+        thickness[good],
+        pattern[good],
+        zones,
+        1.0,
+    )
 
 
 def _surface_at(surface: CellSurface, y: NDArray[np.intp], x: NDArray[np.intp]) -> NDArray[np.float32]:
@@ -637,27 +644,29 @@ def rank_orders(
 
 def _doubt(fit: NuisanceFit) -> float:
     """What a chi-square difference is to be divided by: model error does not average out over cells."""
-    excess = max(float(fit.misfit.mean()) - _FITS, 0.0)
-    return 1.0 + excess * (1.0 + fit.cells / _INDEPENDENT)
+    scatter = _SIGNIFICANT * np.sqrt(2.0 / (fit.misfit.size * max(fit.cells, 1)))
+    excess = max(float(fit.misfit.mean()) - 1.0 - scatter, 0.0)
+    return 1.0 + excess * (1.0 + fit.cells / _ALIKE)
 
 
-_FITS = 1.2
-"""Reduced chi-square of cells up to which noise alone may be at work, slopes and bad pixels inside them included."""
+_SIGNIFICANT = 3.0
+_ALIKE = 50
+"""Parts of a sensor in which model error differs: it repeats with the phase and changes slowly with the thickness."""
 
 
 def _guess_at_order(
     cells: LearningCells, base: FringeTemplates, free: Nuisances, start: NuisanceFit, move_um: float
 ) -> tuple[LearningCells, NuisanceFit]:
-    """Cells moved by some orders, and wavelengths half way to those at which their fringes look the same there."""
+    """Cells moved by some orders, and the wavelengths at which their fringes look the same there."""
     moved = replace(cells, thickness_um=cells.thickness_um + np.float32(move_um))
     if free.wavelength_accuracy_nm == 0.0:
         return moved, start
     wavelength = base.wavelength_nm
     away = move_um * (1.0 - wavelength / wavelength.mean()) * wavelength
-    shift = start.shift_nm + 0.5 * away / (float(np.median(moved.thickness_um)) * base.group)
+    shift = start.shift_nm + away / (float(np.median(moved.thickness_um)) * base.group)
     return moved, replace(start, shift_nm=shift)
 
 
-_ROUNDS_ELSEWHERE = 4
+_ROUNDS_ELSEWHERE = 6
 _INSIDE = 0.99
 """Share of a sensor that must lie in the range of thicknesses."""
