@@ -11,7 +11,7 @@ from ..effects import ImageGeometry, apply_to_image
 from ..errors import InputError
 from ..model import FringeModel
 from ..products import FringeCube, ThicknessMap
-from .thickness_fit import fit_thickness
+from .thickness_fit import Nuisances, fit_thickness
 
 __all__ = ["FlatResidual", "fit_and_compare", "flat_residual", "relative_flats"]
 
@@ -60,7 +60,10 @@ def relative_flats(cube: FringeCube) -> FloatArray:
 
 
 def flat_residual(
-    cube: FringeCube, model: FringeModel, thickness_um: NDArray[np.floating]
+    cube: FringeCube,
+    model: FringeModel,
+    thickness_um: NDArray[np.floating],
+    contrast: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float32]:
     """Flats minus model at a given thickness, each plane over its mean.
 
@@ -72,6 +75,8 @@ def flat_residual(
         Its effects on light, response and image are all applied.
     thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
         Thickness of the varying layer [µm]; NaN where it is not known.
+    contrast : `numpy.ndarray`, shape ``(W,)``, optional
+        Factor on the fringes of the model at each wavelength; 1 if not given.
 
     Returns
     -------
@@ -108,7 +113,9 @@ def flat_residual(
         good = known & (cube.mask[plane] == 0)
         if good.any():
             data = np.asarray(cube.image[plane], dtype=float)[good]
-            residual[plane][good] = data / data.mean() - modelled[good] / modelled[good].mean(dtype=float)
+            fringe = modelled[good] / modelled[good].mean(dtype=float) - 1.0
+            factor = 1.0 if contrast is None else float(contrast[plane])
+            residual[plane][good] = data / data.mean() - 1.0 - factor * fringe
     return residual
 
 
@@ -130,7 +137,7 @@ def fit_and_compare(cube: FringeCube, model: FringeModel) -> FlatResidual:
     InputError
         No good pixel.
     """
-    fitted = fit_thickness(cube, model)
+    fitted = fit_thickness(cube, model, nuisances=Nuisances())  # what is missing is to be seen, not learned
     residual = flat_residual(cube, model, fitted.value)
     return FlatResidual(np.asarray(cube.wavelength_nm, dtype=float), residual, fitted)
 

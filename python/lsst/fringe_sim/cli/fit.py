@@ -13,6 +13,7 @@ from .parameters import EFFECT, LABORATORY, effect_settings
 from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
+    from ..algorithms.thickness_fit import Nuisances
     from ..instrument.setup import Setup
     from ..products import FringeCube, SensorSection, ThicknessMap
 
@@ -55,25 +56,27 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
     "--zones",
     type=click.Choice(ZONES),
     default=None,
-    help="Parts of the sensor with a level of their own at each wavelength; by default levels are as they are.",
+    help="Parts of the sensor with a level of their own at each wavelength, however large; by default those of "
+    "amplifiers, as well as gains are known.",
 )
 @click.option(
     "--illumination-degree",
     type=click.IntRange(0, 8),
-    default=0,
-    show_default=True,
-    help="Degree of a slow illumination, free at each wavelength.",
+    default=None,
+    show_default="2",
+    help="Degree of a slow illumination, free at each wavelength; 0 for even light.",
 )
 @click.option(
     "--contrast",
     type=click.Choice(CONTRASTS),
-    default="fixed",
-    show_default=True,
-    help="Contrast of the fringes: that of the model, or one free factor, or one at each wavelength.",
+    default=None,
+    show_default="wavelength",
+    help="Contrast of the fringes: a free factor at each wavelength, or one for all, or that of the model.",
 )
 @click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
+@click.option("--strict", is_flag=True, help="Exit with 1 where model and flats do not go together.")
 @click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
 def fit(
     paths: tuple[str, ...],
@@ -83,11 +86,12 @@ def fit(
     smoothing: float | None,
     silicon: str,
     zones: str | None,
-    illumination_degree: int,
-    contrast: str,
+    illumination_degree: int | None,
+    contrast: str | None,
     effects: tuple[tuple[str, float], ...],
     effects_file: Path | None,
     skip_bad: bool,
+    strict: bool,
     dry_run: bool,
 ) -> None:
     """Fit the layer thickness of one sensor to raw flats (files, folders, patterns) or to a fringe cube.
@@ -100,7 +104,8 @@ def fit(
     """
     import numpy as np
 
-    from ..algorithms.thickness_fit import Nuisances, SiliconSearch, fit_thickness
+    from ..algorithms.flat_conditions import model_of_flats
+    from ..algorithms.thickness_fit import SiliconSearch, fit_thickness, remarks, says_misfit
     from ..model import FringeModel
     from ..model.provenance import input_cards
     from ..report.thickness_page import write_thickness_report
@@ -113,11 +118,12 @@ def fit(
     search = None if silicon == "fixed" else SiliconSearch(SILICON_FIELDS[silicon])
     if search is not None and method != "global":
         raise InputError("--silicon", silicon, "fixed with method guo2022")
-    free = Nuisances(zones is not None, zones or "sensor", illumination_degree, contrast)
-    if free.any and (search is not None or method != "global"):
+    asked = (zones, illumination_degree, contrast)
+    if any(choice is not None for choice in asked) and (search is not None or method != "global"):
         raise InputError(
             "--zones, --illumination-degree, --contrast", "given", "nothing with method guo2022 or --silicon"
         )
+    free = None if asked == (None, None, None) else _free(*asked, setup.wavelength_accuracy_nm)
     used = paths
     cube = read_cube(paths[0]) if len(paths) == 1 else None
     if cube is None:
@@ -129,23 +135,45 @@ def fit(
         found = 0 if cube is None else len(np.unique(cube.wavelength_nm))
         raise InputError("number of wavelengths", found, f"{LEAST_WAVELENGTHS} or more")
     section = section_of_cube(cube, setup)
+    model = model_of_flats(model, cube.exposures)
     folder = prepare_folder(out)
     cards = {**effect_cards(model), **input_cards([*used, *([effects_file] if effects_file else [])])}
     click.echo("fitting the thickness", err=True)
     fitted = fit_thickness(cube, model, method, nuisances=free, silicon=search)
+    good = fitted.mask == 0
+    said = remarks(fitted.metadata, fitted.flats)
+    if not good.any():
+        raise InputError("good pixels of the thickness map", 0, f"one or more. {'; '.join(said)}".strip())
     fitted.write_fits(folder / "thickness.fits", {"SETUP": setup.name, **cards}, section=section)
     write_thickness_report(folder, cube, fitted, model, method)
-    good = fitted.mask == 0
-    if good.any():
-        low, high = np.percentile(fitted.value[good], [1.0, 99.0])
-        click.echo(
-            f"{fitted.layer}: {low:.3f} to {high:.3f} µm (1–99 %), median σ "
-            f"{1e3 * np.median(fitted.sigma[good]):.2f} nm, {100 * (1 - good.mean()):.2f} % of the pixels masked"
-        )
+    low, high = np.percentile(fitted.value[good], [1.0, 99.0])
+    click.echo(
+        f"{fitted.layer}: {low:.3f} to {high:.3f} µm (1–99 %), median σ "
+        f"{1e3 * np.median(fitted.sigma[good]):.2f} nm, {100 * (1 - good.mean()):.2f} % of the pixels masked"
+    )
+    for sentence in said:
+        click.echo(sentence)
     if search is not None:
         click.echo(_silicon_line(fitted))
     for name in ("thickness.fits", "report.html"):
         click.echo(str(folder / name))
+    if strict and says_misfit(fitted.metadata):
+        raise InputError("--strict", "a misfit", f"flats that the model describes. {'; '.join(said)}")
+
+
+def _free(
+    zones: str | None, illumination_degree: int | None, contrast: str | None, wavelength_accuracy_nm: float
+) -> Nuisances:
+    """What is free: as by default, but for what was asked for."""
+    from dataclasses import replace
+    from math import inf
+
+    from ..algorithms.thickness_fit import Nuisances
+
+    free = Nuisances.automatic(contrast or "wavelength", wavelength_accuracy_nm)
+    if zones is not None:
+        free = replace(free, zones=zones, gain_accuracy=inf)
+    return free if illumination_degree is None else replace(free, illumination_degree=illumination_degree)
 
 
 def _silicon_line(fitted: ThicknessMap) -> str:

@@ -112,7 +112,15 @@ def sky(
         *([thickness] if thickness != BUILT_IN else []),
         *([effects_file] if effects_file else []),
     ]
-    cards = {"SETUP": setup.name, "BEAMS": "pixel", **effect_cards(model), **input_cards(given)}
+    cards: dict[str, str | float] = {
+        "SETUP": setup.name,
+        "BEAMS": "pixel",
+        **effect_cards(model),
+        **input_cards(given),
+    }
+    contrast = _laboratory_contrast(thickness)
+    if contrast is not None:
+        cards |= {"LABCONTR": contrast[0], "LABCONSG": contrast[1]}
     if section is not None:
         cards["DETSEC"] = section.keyword
     folder = prepare_folder(out)
@@ -149,6 +157,8 @@ def sky(
     page = write_sky_report(folder / "report.html", made, setup.name, seed)
     for frame in made:
         click.echo(_describe(frame))
+    if contrast is not None:
+        click.echo(_both_forecasts(made[0], *contrast))
     click.echo(str(folder))
     click.echo(str(page))
 
@@ -160,6 +170,29 @@ def _check_exposure(exptime: float | None, night: bool) -> None:
         )
     if exptime is not None and not exptime > 0.0:
         raise OutOfRangeError("exposure time [s]", exptime, "positive")
+
+
+def _laboratory_contrast(thickness: str) -> tuple[float, float] | None:
+    """Contrast of the laboratory flats over that of the model, and its uncertainty, if the map states them."""
+    from ..resources import open_user_fits
+
+    if thickness == BUILT_IN:
+        return None
+    with open_user_fits(thickness) as hdus:
+        header = hdus[0].header
+        if "CONTRAST" not in header or "CONTRSIG" not in header:
+            return None
+        return float(header["CONTRAST"]), float(header["CONTRSIG"])
+
+
+def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:
+    """The fringes of a sky frame, the contrast that the laboratory misses being lost there only, or here as well."""
+    rms = PERCENT * float(frame.metadata["FRINGRMS"])
+    return (
+        f"the laboratory flats have {contrast:.3g} ± {sigma:.1g} of the model's contrast: fringes of rms {rms:.4f} % "
+        f"if it is lost in the laboratory only, {contrast * rms:.4f} % if it is lost on the sky as well; the frames "
+        "hold the first. A frame of the sky of this sensor decides, or a cause that 'fringe-sim discover' names"
+    )
 
 
 def _layer(thickness: str, sensor: Detector, name: str) -> tuple[FloatArray, SensorSection | None]:

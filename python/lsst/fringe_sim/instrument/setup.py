@@ -32,6 +32,10 @@ _BEAM_KEYS = {
 }
 
 
+WAVELENGTH_ACCURACY_NM = 0.5
+"""Accuracy of a monochromator where the set-up states none [nm]; an assumption, of the order of what makers state."""
+
+
 @dataclass(frozen=True)
 class Setup:
     """Sensor, temperature and light of one instrument or test stand.
@@ -64,6 +68,8 @@ class Setup:
         Bandpass of the sky ("" in the laboratory).
     effective_area_m2, pixel_scale_arcsec, exposure_s, airmass : `float`
         Of a sky exposure; zero in the laboratory.
+    wavelength_accuracy_nm : `float`
+        Standard deviation of the wavelengths of the monochromator about what headers state [nm].
     """
 
     name: str
@@ -88,6 +94,7 @@ class Setup:
     pixel_scale_arcsec: float
     exposure_s: float
     airmass: float
+    wavelength_accuracy_nm: float = WAVELENGTH_ACCURACY_NM
 
     @classmethod
     def from_name(cls, name: str) -> Setup:
@@ -155,6 +162,11 @@ class Setup:
             pixel_scale_arcsec=0.0 if laboratory else light.number("pixel_scale_arcsec", low=1e-6, high=1e4),
             exposure_s=0.0 if laboratory else light.number("exposure_s", low=0.0, high=1e6),
             airmass=0.0 if laboratory else light.number("airmass", low=1.0, high=10.0),
+            wavelength_accuracy_nm=(
+                light.number("wavelength_accuracy_nm", low=0.0, high=20.0, default=WAVELENGTH_ACCURACY_NM)
+                if laboratory
+                else 0.0
+            ),
         )
         setup.stack.position(setup.varying)
         return setup

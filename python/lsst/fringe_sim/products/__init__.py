@@ -7,6 +7,7 @@ at all, carry checksums, and two writes of one product agree to the byte.
 from ..resources import DAMAGE
 from .combined_bias import CombinedBias
 from .flat_exposures import FlatExposures
+from .flat_fit import FlatFit
 from .fringe_components import FringeComponents
 from .fringe_cube import CUBE_UNITS, FringeCube
 from .fringe_flat import FringeFlat
@@ -32,6 +33,7 @@ __all__ = [
     "SKY_UNITS",
     "CombinedBias",
     "FlatExposures",
+    "FlatFit",
     "FringeComponents",
     "FringeCube",
     "FringeFlat",

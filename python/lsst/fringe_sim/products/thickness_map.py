@@ -17,6 +17,7 @@ from ..resources import open_user_fits, refuse_damage
 from . import _check as check
 from . import _fits as io
 from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
+from .flat_fit import FlatFit, FlatTable
 from .mask import mask_bits
 
 __all__ = ["THICKNESS_LIMITS_UM", "UNKNOWN_SIGMA_UM", "ThicknessMap"]
@@ -68,6 +69,10 @@ class ThicknessMap(SensorProduct):
         Number of wavelengths that each pixel was fitted with.
     detector : `str`
         Name of the sensor; empty if not known.
+    flats : `FlatFit`, optional
+        What the fit learned about each flat: contrast, wavelength, misfit.
+    contrast_map : `numpy.ndarray`, float32, optional
+        Contrast in blocks of the sensor over that of the whole; NaN where it is not known.
 
     Raises
     ------
@@ -88,6 +93,8 @@ class ThicknessMap(SensorProduct):
     metadata: Mapping[str, Any] = field(default_factory=dict)
     n_wavelengths: NDArray[np.int32] | None = None
     detector: str = ""
+    flats: FlatFit | None = None
+    contrast_map: NDArray[np.float32] | None = None
 
     CARDS = (DETECTOR, Card("layer", "LAYER", "layer", kind=str, empty=False))
     EXTENSIONS = (
@@ -97,7 +104,19 @@ class ThicknessMap(SensorProduct):
         Image("slip_probability", "SLIP_PROBABILITY", nonnegative=True),
         MASK,
         _Counts("n_wavelengths", "N_WAVELENGTHS", optional=True),
+        FlatTable("flats", "FLATS"),
+        Image("contrast_map", "CONTRAST_MAP", gaps=True, optional=True, on_sensor=False),
     )
+
+    @property
+    def contrast(self) -> NDArray[np.float64] | None:
+        """Fringe amplitude over that of the model at each wavelength; `None` if the fit did not learn it."""
+        return None if self.flats is None else self.flats.contrast
+
+    @property
+    def contrast_sigma(self) -> NDArray[np.float64] | None:
+        """Standard uncertainty of `contrast`."""
+        return None if self.flats is None else self.flats.contrast_sigma
 
     @classmethod
     def read_any(cls, path: str | os.PathLike[str], layer: str | None = None) -> Self:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "components_figure",
+    "contrast_figure",
     "correlation_figure",
     "flats_figure",
     "focal_plane_figure",
@@ -52,6 +53,13 @@ GALLERY_PIXELS = 250
 
 RESIDUAL_CELLS = 100
 """Residuals are averaged down to about this many cells a side."""
+
+
+def contrast_figure(contrast_map: NDArray[np.float32]) -> Figure:
+    """Contrast in blocks of a sensor, over that of the whole."""
+    with figure(4.6, 3.9) as made:
+        show_image(made.subplots(), contrast_map, label="contrast / mean", title="contrast over the sensor")
+    return made
 
 
 def thickness_figure(thickness: ThicknessMap, order_um: float) -> Figure:

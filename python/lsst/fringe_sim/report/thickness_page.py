@@ -10,9 +10,10 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from ..algorithms.flat_residual import flat_residual, relative_flats
+from ..algorithms.thickness_fit import remarks
 from ..model import FringeModel
-from ..products import FringeCube, ThicknessMap
-from .figures import flats_figure, phase_figure, residuals_figure, thickness_figure
+from ..products import FlatFit, FringeCube, ThicknessMap
+from .figures import contrast_figure, flats_figure, phase_figure, residuals_figure, thickness_figure
 from .page import Report
 
 __all__ = ["phase_folded", "residual_of_fit", "residual_table", "write_thickness_report"]
@@ -30,6 +31,15 @@ def write_thickness_report(
         f"Thickness of {fitted.layer}, {fitted.detector or 'one sensor'}",
         f"Set-up {model.setup.name}, method {method}, {len(wavelength)} flats.",
     )
+    said = remarks(fitted.metadata, fitted.flats)
+    if fitted.flats is not None:
+        report.section("What the fit says of itself", ". ".join(said) + ".")
+        report.table(flat_table(fitted.flats), "flats")
+        if fitted.contrast_map is not None and fitted.contrast_map.size > 1:
+            report.figure(
+                contrast_figure(fitted.contrast_map),
+                "Contrast in blocks of the sensor, over that of the whole.",
+            )
     order_um = float(model.fringe_order_um(960.0))
     report.section("Thickness", "One contour is one fringe order at 960 nm.")
     report.figure(
@@ -58,7 +68,26 @@ def residual_of_fit(cube: FringeCube, model: FringeModel, fitted: ThicknessMap) 
     """Flats minus model, shape ``(W, ny, nx)``; NaN where flat or thickness are masked."""
     if not (fitted.mask == 0).any():
         return np.full(cube.shape, np.nan, np.float32)
-    return flat_residual(cube, model, np.where(fitted.mask == 0, fitted.value, np.nan))
+    return flat_residual(cube, model, np.where(fitted.mask == 0, fitted.value, np.nan), fitted.contrast)
+
+
+def flat_table(flats: FlatFit) -> Table:
+    """What the fit learned of each flat."""
+    table = Table(
+        {
+            "wavelength": flats.wavelength_nm,
+            "contrast": flats.contrast,
+            "σ of contrast": flats.contrast_sigma,
+            "offset": flats.offset_nm,
+            "σ of offset": flats.offset_sigma_nm,
+            "misfit": flats.misfit,
+        }
+    )
+    for name in ("wavelength", "offset", "σ of offset"):
+        table[name].unit = units.nm
+    for name in table.colnames[1:]:
+        table[name].info.format = ".3f"
+    return table
 
 
 def residual_table(residual: NDArray[np.float32], cube: FringeCube) -> Table:
@@ -106,7 +135,9 @@ def phase_folded(
         bins = np.minimum(((thickness / order_um) % 1.0 * PHASE_BINS).astype(int), PHASE_BINS - 1)
         weight = np.maximum(np.bincount(bins, minlength=PHASE_BINS), 1)
         predicted = values[index] * (1.0 - fraction) + values[index + 1] * fraction
-        predicted = predicted / predicted.mean() - 1.0
+        predicted = (predicted / predicted.mean() - 1.0) * (
+            1.0 if fitted.contrast is None else fitted.contrast[row]
+        )
         measured[row] = np.bincount(bins, data[row][good], PHASE_BINS) / weight
         modelled[row] = np.bincount(bins, predicted, PHASE_BINS) / weight
     return (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS, measured, modelled

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from typing import Any, ClassVar
 
@@ -25,7 +26,7 @@ from lsst.utils.logging import getLogger
 
 from ..algorithms import fit_thickness
 from ..algorithms.template_errors import template_errors
-from ..algorithms.thickness_fit import SILICON_FIELDS, Nuisances, SiliconSearch
+from ..algorithms.thickness_fit import SILICON_FIELDS, Nuisances, SiliconSearch, remarks
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import Setup
@@ -124,10 +125,11 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
     )
     level_zones: ChoiceField[str] = ChoiceField(
         dtype=str,
-        default="none",
+        default="known",
         doc="Parts of the sensor whose level is free at each wavelength.",
         allowed={
-            "none": "levels are as they are",
+            "known": "amplifiers, as well as their gains are known",
+            "none": "levels and wavelengths are as they are",
             "sensor": "one level for the sensor",
             "halves": "one for the upper and one for the lower half",
             "amplifiers": "one for each amplifier",
@@ -135,7 +137,7 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
     )
     illumination_degree: Any = RangeField(
         dtype=int,
-        default=0,
+        default=2,
         min=0,
         max=8,
         inclusiveMax=True,
@@ -143,12 +145,12 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
     )
     contrast: ChoiceField[str] = ChoiceField(
         dtype=str,
-        default="fixed",
+        default="wavelength",
         doc="Contrast of the fringes.",
         allowed={
-            "fixed": "that of the model",
-            "common": "times one free factor",
             "wavelength": "times a free factor at each wavelength",
+            "common": "times one free factor",
+            "fixed": "that of the model",
         },
     )
     slip_limit: Field[float] = Field(
@@ -209,7 +211,7 @@ class EpoxyFitTask(PipelineTask):
         cube = FringeCube.from_flats(flats, number=number)
         setup = Setup.from_name(choice.setup)
         missing = self._check_wavelengths(cube.wavelength_nm, setup, detector)
-        model, options = choice.model(), self._options()
+        model, options = choice.model(), self._options(setup)
         fitted = fit_thickness(cube, model, self.config.method, **options)
         errors = template_errors(model, cube.wavelength_nm, options["range_um"], self.config.observable)
         metadata = {
@@ -224,22 +226,29 @@ class EpoxyFitTask(PipelineTask):
         self._report(fitted, detector)
         return Struct(thickness=dataclasses.replace(fitted, detector=detector.name, metadata=metadata))
 
-    def _options(self) -> dict[str, Any]:
+    def _options(self, setup: Setup) -> dict[str, Any]:
         config = self.config
         return {
             "observable": config.observable,
             "range_um": None if config.range_um is None else tuple(config.range_um),
             "start_pixel": None if config.start_pixel is None else tuple(config.start_pixel),
             "slip_limit": config.slip_limit,
-            "nuisances": Nuisances(
-                level=config.level_zones != "none",
-                zones="sensor" if config.level_zones == "none" else config.level_zones,
-                illumination_degree=config.illumination_degree,
-                contrast=config.contrast,
-            ),
+            "nuisances": self._nuisances(setup),
             "silicon": None if config.silicon == "fixed" else SiliconSearch(SILICON_FIELDS[config.silicon]),
             "threads": config.threads,
         }
+
+    def _nuisances(self, setup: Setup) -> Nuisances | None:
+        """What is free; `None`, which is the choice of the fit, for the walk and for two layers."""
+        config = self.config
+        if config.method != "global" or config.silicon != "fixed":
+            return None
+        if config.level_zones == "none":
+            return Nuisances(contrast=config.contrast, illumination_degree=config.illumination_degree)
+        free = Nuisances.automatic(config.contrast, setup.wavelength_accuracy_nm)
+        if config.level_zones != "known":
+            free = dataclasses.replace(free, zones=config.level_zones, gain_accuracy=math.inf)
+        return dataclasses.replace(free, illumination_degree=config.illumination_degree)
 
     def _check_wavelengths(self, found_nm: NDArray[np.float64], setup: Setup, detector: Detector) -> str:
         """Refuse too few wavelengths; return, and report, the usual ones that are missing."""
@@ -266,8 +275,12 @@ class EpoxyFitTask(PipelineTask):
 
     def _report(self, fitted: ThicknessMap, detector: Detector) -> None:
         good = fitted.mask == 0
+        said = "; ".join(remarks(fitted.metadata, fitted.flats))
         if not good.any():
-            raise InputError("good pixels of the thickness map", 0, "at least one", source=detector.name)
+            wanted = f"at least one. {said}".strip()
+            raise InputError("good pixels of the thickness map", 0, wanted, source=detector.name)
+        if said:
+            self.log.info("%s: %s", detector.name, said)
         self.log.info(
             "%s: %s %.3f to %.3f um (1 to 99 %%), median sigma %.1f nm, %.4f %% of the pixels masked: %s",
             detector.name,

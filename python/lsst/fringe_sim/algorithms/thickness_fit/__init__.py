@@ -1,6 +1,7 @@
 """Thickness maps from flats at many wavelengths: a global fit, and the walk of the paper as its peer."""
 
 from .amplitudes import Amplitudes
+from .conclusion import remarks, says_misfit
 from .fit import FIT_METHODS, fit_thickness, make_templates
 from .global_fit import GlobalFit, global_fit
 from .guo2022 import walk_fit
@@ -33,5 +34,7 @@ __all__ = [
     "fit_thickness",
     "global_fit",
     "make_templates",
+    "remarks",
+    "says_misfit",
     "walk_fit",
 ]

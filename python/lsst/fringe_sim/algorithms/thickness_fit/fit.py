@@ -14,10 +14,12 @@ from ...compiled import kernel, run_threaded
 from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ...model import FringeModel
 from ...optics.system import OBSERVABLES
-from ...products import FringeCube, ThicknessMap, mask_bits
-from ..thickness_fit_options import FIT_METHODS
+from ...products import FlatFit, FringeCube, ThicknessMap, mask_bits
+from ..flat_conditions import model_of_flats
+from ..thickness_fit_options import CONTRASTS, FIT_METHODS
 from .amplitudes import Amplitudes
 from .cells import sample_pixels
+from .conclusion import CERTAIN, cards, flat_fit
 from .global_fit import global_fit, normalise_to_cells, spans_orders
 from .guo2022 import walk_fit
 from .islands import fit_islands
@@ -50,6 +52,7 @@ def fit_thickness(
     cell_px: int | None = None,
     noise_correlation_px: float | None = None,
     nuisances: Nuisances | None = None,
+    contrast: str = "wavelength",
     slip_limit: float = 0.01,
     silicon: SiliconSearch | None = None,
     threads: int | None = None,
@@ -78,8 +81,12 @@ def fit_thickness(
         Standard deviation of the Gaussian kernel with which the flats were smoothed [px]. If not given, the
         keyword ``SMOOTHPX`` of the cube's metadata, else 0.
     nuisances : `Nuisances`, optional
-        What else than thickness is free: levels, steps between zones, slow illumination, contrast. Nothing by
-        default; only with ``global``.
+        What else than thickness is free; only with ``global``. By default (`Nuisances.automatic`): the contrast,
+        levels of amplifiers as well as gains are known, a slow illumination, and wavelengths as well as they are
+        known. ``Nuisances()`` takes the model as it is.
+    contrast : {"wavelength", "common", "fixed"}, optional
+        Contrast of the fringes if no ``nuisances`` are given: a free factor at each wavelength, one for all, or that
+        of the model.
     slip_limit : `float`, optional
         Pixels whose order is wrong with a larger probability are flagged SLIP.
     silicon : `SiliconSearch`, optional
@@ -102,6 +109,8 @@ def fit_thickness(
     InputError, OutOfRangeError
         No good pixel, a range that holds less than two orders, a start pixel outside the sensor.
     """
+    if contrast not in CONTRASTS:
+        raise UnknownNameError("contrast", contrast, CONTRASTS)
     if method not in FIT_METHODS:
         raise UnknownNameError("method", method, FIT_METHODS)
     if method == "guo2022" and nuisances is not None and nuisances.any:
@@ -113,9 +122,12 @@ def fit_thickness(
     workers = threads if threads is not None else len(os.sched_getaffinity(0))
     if not any((plane == 0).any() for plane in cube.mask):
         raise InputError("good pixels of the cube", 0, "one or more", source=cube.detector or None)
+    model = model_of_flats(model, cube.exposures)
     data = amplitudes_from_cube(cube, noise_correlation_px)
     low, high = range_um or model.setup.thickness_range_um
     templates = make_templates(model, cube.wavelength_nm, (low, high), observable)
+    flats: FlatFit | None = None
+    coarse: NDArray[np.float32] | None = None
     notes: dict[str, Any] = {"METHOD": method, "RANGELO": low, "RANGEHI": high}
     notes["OBSERVAB"] = observable or model.base_system.observable
     if method == "guo2022":
@@ -128,8 +140,13 @@ def fit_thickness(
         exposures = cube.exposures
         any_silicon = SiliconModel(seen, exposures.wavelength_nm, exposures.bandwidth_fwhm_nm)
         joint = joint_fit(
-            data, templates, any_silicon, silicon, range_um=(low, high), cell_px=cell_px, threads=workers
-        )
+            data, templates, any_silicon, silicon, range_um=(low, high), cell_px=cell_px,
+            nuisances=Nuisances.automatic(contrast, model.setup.wavelength_accuracy_nm), threads=workers,
+        )  # fmt: skip
+        if joint.found.nuisance.misfit.size:
+            flats = flat_fit(joint.found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
+            coarse = joint.found.contrast_map
+            notes |= cards(flats, joint.found.margin)
         pixels, slip = joint.pixels, joint.slip
         notes |= {"ORDERUM": round(joint.found.order_um, 6), **joint.silicon.cards()}
     else:
@@ -138,15 +155,19 @@ def fit_thickness(
             templates,
             range_um=(low, high),
             cell_px=cell_px,
-            nuisances=nuisances,
+            nuisances=nuisances or Nuisances.automatic(contrast, model.setup.wavelength_accuracy_nm),
             threads=workers,
         )
         pixels = found.pixels
         slip = slip_probability(found, out=found.border_slip)
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
-        notes["CONTRAST"] = round(float(np.mean(found.nuisance.contrast)), 6)
-    everywhere = _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes, workers)
+        flats = flat_fit(found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
+        coarse = found.contrast_map
+        notes |= cards(flats, found.margin)
+    limit = slip_limit if float(notes.get("ORDMARG", CERTAIN)) >= CERTAIN else -1.0
+    everywhere = _assemble(pixels, slip, limit, cube, model.base_system.varying, notes, workers)
+    everywhere = replace(everywhere, flats=flats, contrast_map=coarse)
     return fit_islands(everywhere, cube, model if observable is None else with_observable(model, observable))
 
 
@@ -216,7 +237,11 @@ def make_templates(
     start = max(low - order, step)
     count = int(np.ceil((high + order - start) / step)) + 1
     response = model.response_on_grid(wavelength_nm, start, step, count)
-    return FringeTemplates(np.ascontiguousarray(response.T), start, step, wavelength_nm)
+    beside = system.stack.indices(wavelength_nm + 1.0, system.temperature_k)[
+        system.stack.position(system.varying)
+    ]
+    group = 1.0 - wavelength_nm * (beside.real - index.real) / index.real
+    return FringeTemplates(np.ascontiguousarray(response.T), start, step, wavelength_nm, group=group)
 
 
 def with_observable(model: FringeModel, observable: str) -> FringeModel:

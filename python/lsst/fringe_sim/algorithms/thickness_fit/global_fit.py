@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,12 @@ from .cells import (
     effective_number,
     sample_pixels,
 )
+from .conclusion import contrast_map, model_error
 from .evidence import OrderEvidence, order_evidence, refine_cells
+from .learning import LearningCells, first_nuisances, learn, rank_orders, sample_blocks
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
-from .nuisances import NuisanceFit, Nuisances, add_offset, first_nuisances, fit_nuisances, subtract_offset
-from .orders import solve_orders
+from .nuisances import NuisanceFit, Nuisances, add_offset, subtract_offset
+from .orders import SURE, solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
 from .relaxation import SettledCells, settle_orders
 from .rescue import rescue_pixels
@@ -48,6 +50,10 @@ _NINTH_DECILE = 1.28
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
+_MOST_PROBED = 20_000
+"""Cells of a sensor that may hold too few orders for light and contrast to be told."""
+_MISFIT = 1.5
+"""Reduced chi-square of cells from which on a model is known to be wrong; what it leaves over is shared by many."""
 _MEAN_TOLERANCE = 2e-6
 """Relative change of the mean response that is left alone: far below the noise of a smoothed flat."""
 _MOST_ROUNDS = 20
@@ -102,7 +108,11 @@ class GlobalFit:
         ``sensor``, ``narrow`` or ``range``: over which thicknesses the mean response was taken. ``narrow`` is a
         sensor of few orders, whose mean response was found together with its order.
     common_slip : `float`
-        Probability that a narrow sensor has another common order; 0 for others.
+        Probability that the sensor as a whole has another order.
+    margin : `float`
+        Chi-square by which the next best order of the whole sensor is worse, where nuisances are free.
+    contrast_map : `numpy.ndarray`, float32
+        Contrast in blocks of the sensor, over that of the sensor.
     """
 
     pixels: PixelFit
@@ -114,6 +124,8 @@ class GlobalFit:
     order_um: float
     normalisation: str
     common_slip: float = 0.0
+    margin: float = np.inf
+    contrast_map: NDArray[np.float32] = field(default_factory=lambda: np.ones((1, 1), np.float32))
 
 
 def global_fit(
@@ -143,7 +155,7 @@ def global_fit(
         Number of threads; has no influence on the result.
     """
     _, ny, nx = data.shape
-    nuisances = nuisances or Nuisances()
+    nuisances = (nuisances or Nuisances()).fitting(ny, nx)
     order = templates.order_um()
     size = choose_cell_size(data) if cell_px is None else cell_px
     y_breaks, x_breaks = nuisances.breaks(ny, nx)
@@ -154,7 +166,8 @@ def global_fit(
         largest_amplitude=np.abs(templates.amplitude()).max(axis=0),
         threads=threads,
     )
-    solver = _Solver(order, range_um, cell_independence(size, data.noise_correlation_px), nuisances, threads)
+    independence = cell_independence(size, data.noise_correlation_px)
+    solver = _Solver(order, range_um, independence, nuisances, threads, templates)
     state = solver.solve(cells, templates)
     settled = settle_orders(
         state.cells, state.templates, state.thickness_um, state.slope_y, state.slope_x, order, state.found,
@@ -162,9 +175,12 @@ def global_fit(
     )  # fmt: skip
     state = solver.adjust(replace(state, thickness_um=settled.thickness_um))
     surface = _surface(state, order)
-    fringes = replace(data, offset=state.nuisance.offset, y_edges=cells.y_edges, x_edges=cells.x_edges)
     calmed = calm_surface(surface, threads)
-    if state.normalisation == "sensor" and not nuisances.patterned:
+    if state.free.any:
+        state = solver.relearn(state, data, calmed)
+    light = state.nuisance.light(cells, state.free)
+    fringes = replace(data, offset=light, y_edges=cells.y_edges, x_edges=cells.x_edges)
+    if state.normalisation == "sensor" and not state.free.any:
         state = replace(state, templates=_normalise_to_pixels(data, state.templates, calmed, threads))
     pixels = fit_pixels(fringes, state.templates, calmed, order, threads=threads)
     rough = spread_to_pixels(cells, ~surface.smooth)
@@ -173,18 +189,19 @@ def global_fit(
     pixels = rescue_pixels(
         fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
+    pixels = model_error(pixels, state.nuisance.scale_sigma)
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))
         pixels = replace(pixels, sigma=np.asarray(whole, np.float32))
     common_slip = state.common_slip
-    if state.searched:
+    if state.searched and not state.free.any:
         doubt = doubt_from_shared_misfit(fringes, state.templates, pixels.value, order)
         common_slip = 1.0 - (1.0 - common_slip) * (1.0 - doubt)
     # Near a step the pixels have been asked one by one, which is worth more than the answer of their cell.
     settled = replace(settled, cell_slip=np.where(surface.smooth, settled.cell_slip, np.float32(0)))
     return GlobalFit(
         pixels, state.cells, settled, border_slip, state.templates, state.nuisance, order, state.normalisation,
-        common_slip,
+        common_slip, state.margin, contrast_map(state.cells, state.templates, state.thickness_um),
     )  # fmt: skip
 
 
@@ -205,6 +222,15 @@ class _State:
     common_sigma_um: float = 0.0
     searched: bool = False
     """Whether mean response and orders were found together, by a search that may have missed the true ones."""
+    free: Nuisances = field(default_factory=Nuisances)
+    margin: float = np.inf
+
+    @property
+    def misfit(self) -> float:
+        """Median reduced chi-square of the cells, each by itself."""
+        freedom = np.maximum(self.cells.n_wavelengths - 1, 1)
+        reduced = (self.found.chi2 / freedom)[np.isfinite(self.found.chi2)]
+        return float(np.median(reduced)) if reduced.size else 1.0
 
 
 @dataclass(frozen=True)
@@ -216,11 +242,37 @@ class _Solver:
     temper: float
     free: Nuisances
     threads: int
+    base: FringeTemplates | None = None
 
     def solve(self, cells: Cells, templates: FringeTemplates) -> _State:
         """Solve the orders, and again if the model turns out to be another than was thought."""
+        if not self.free.any:
+            return self._solve_held(cells, templates)
+        if np.isfinite(self.free.gain_accuracy) and np.prod(cells.shape) <= _MOST_PROBED:
+            # Light and contrast of a sensor of few orders cannot be told from its fringes.
+            held = replace(self, free=Nuisances())
+            nothing = NuisanceFit.none(templates.n_wavelengths)
+            probe = held._state(cells, templates, nothing, "range", self.range_um)
+            if held._mean_is_open(probe) or not held._is_wide(probe):
+                state = held.solve(cells, templates)
+                if state.misfit < _MISFIT:
+                    return state
         nuisance = first_nuisances(cells, templates, self.free)
-        fitted, normalisation = templates.with_contrast(nuisance.contrast), "range"
+        for turn in range(_MOST_SOLUTIONS):
+            fitted = nuisance.applied_to(templates)
+            even = subtract_offset(cells, nuisance.light(cells, self.free))
+            state = self._state(even, fitted, nuisance, "sensor", self.range_um)
+            before, state = state, self._learn(state, ranked=turn == 0)
+            if _agree(before, state):
+                break
+            nuisance = state.nuisance
+        return state
+
+    def _solve_held(self, cells: Cells, templates: FringeTemplates) -> _State:
+        """Solve the orders where nothing is free but the mean response."""
+        nuisance = NuisanceFit.none(templates.n_wavelengths)
+        nuisance = replace(nuisance, contrast=templates.contrast)
+        fitted, normalisation = templates, "range"
         searched, slip = False, 0.0
         for _ in range(_MOST_SOLUTIONS):
             state = self._state(cells, fitted, nuisance, normalisation, self.range_um)
@@ -233,18 +285,30 @@ class _Solver:
             before, state = state, self.adjust(replace(state, normalisation="sensor"))
             if _agree(before, state):
                 break
-            fitted, nuisance, normalisation = state.templates, state.nuisance, state.normalisation
+            fitted, normalisation = state.templates, state.normalisation
         return state
+
+    def _is_wide(self, state: _State) -> bool:
+        """Whether a sensor holds orders enough to tell light and contrast from the fringes."""
+        if not np.isfinite(state.thickness_um).any():
+            return False
+        joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
+        return spans_orders(joined, self.order_um, self._open_orders(state.templates))
+
+    @staticmethod
+    def _open_orders(templates: FringeTemplates) -> float:
+        """Orders of thickness up to which the mean response is open."""
+        wavelength = templates.wavelength_nm
+        bandwidth = max(float(np.ptp(wavelength)) / float(wavelength.mean()), 1e-6)
+        return max(_OPEN_ORDERS / bandwidth, _SENSOR_ORDERS)
 
     def _mean_is_open(self, state: _State) -> bool:
         """Whether mean response and orders must be found together."""
-        if state.templates.n_wavelengths < _FEWEST_TO_SETTLE or self.free.any:
+        if state.templates.n_wavelengths < _FEWEST_TO_SETTLE:
             return False  # of fewer wavelengths nothing is believed, so there is nothing to settle
         if not np.isfinite(state.thickness_um).any() or not is_own_mean(state.cells, state.templates):
             return False
-        wavelength = state.templates.wavelength_nm
-        bandwidth = max(float(np.ptp(wavelength)) / float(wavelength.mean()), 1e-6)
-        orders = max(_OPEN_ORDERS / bandwidth, _SENSOR_ORDERS)
+        orders = self._open_orders(state.templates)
         if spans_orders(state.thickness_um, self.order_um, _SURELY_MORE * orders):
             return False
         # Wrong orders make a sensor look thicker and thinner than it is; joined by phases alone it cannot jump.
@@ -262,15 +326,17 @@ class _Solver:
         range_um: tuple[float, float],
     ) -> _State:
         """Orders of all cells, the model being as it is."""
-        fringes = subtract_offset(cells, nuisance)
         found = order_evidence(
-            fringes, templates, self.order_um, range_um=range_um, temper=self.temper, threads=self.threads
+            cells, templates, self.order_um, range_um=range_um, temper=self.temper, threads=self.threads
         )
-        solution = solve_orders(fringes, found)
-        return _State(
-            *compensate_slopes(fringes, found.slope_y, found.slope_x, self.order_um),
-            solution.thickness_um, templates, nuisance, normalisation, found, range_um,
+        compensated, slope_y, slope_x = compensate_slopes(cells, found.slope_y, found.slope_x, self.order_um)
+        state = _State(
+            compensated, slope_y, slope_x, found.best_um, templates, nuisance, normalisation, found, range_um,
+            free=self.free,
         )  # fmt: skip
+        # Evidence of a model that does not fit is not believed, however many cells agree: they err alike.
+        sure = np.inf if self.free.any and state.misfit > _MISFIT else SURE
+        return replace(state, thickness_um=solve_orders(cells, found, sure).thickness_um)
 
     def _narrow(self, cells: Cells, first: _State) -> _State:
         """Orders of a sensor of few orders, whose mean response depends on them, and they on it.
@@ -322,29 +388,58 @@ class _Solver:
         return self._state(cells, narrow.templates, first.nuisance, "narrow", range_um)
 
     def adjust(self, state: _State) -> _State:
-        """Fit mean response and nuisances to the cells, the orders being as they are."""
+        """Fit mean response and nuisances to the cells, the orders being as they are, but for a common one."""
+        if state.free.any:
+            return self._learn(state, ranked=True)
         if state.normalisation == "range":
             return state
         if state.normalisation == "narrow":  # refitting and renormalising in turn would crawl
             thickness = refine_cells(state.cells, state.templates, state.thickness_um, self.threads)
             return replace(state, thickness_um=thickness)
-        if self.free.patterned:  # a free level takes what is left of the mean
-            thickness, fitted = state.thickness_um, state.templates.normalised_to(state.thickness_um)
+        thickness, fitted = normalise_to_cells(state.cells, state.templates, state.thickness_um, self.threads)
+        return replace(state, thickness_um=thickness, templates=fitted)
+
+    def _learn(self, state: _State, ranked: bool) -> _State:
+        """Learn light, contrast and wavelengths; if ``ranked``, the order of the whole sensor with them."""
+        whole = add_offset(state.cells, state.nuisance.light(state.cells, state.free))
+        sample = LearningCells.of(whole, state.thickness_um, state.free, self.temper)
+        if sample.thickness_um.size == 0:
+            return state
+        base = self.base or state.templates
+        if ranked:
+            found = rank_orders(sample, base, state.free, state.nuisance, self.order_um, state.range_um)
+            fit, shift, slip, margin = found.fit, found.shift, found.slip, found.margin
         else:
-            thickness, fitted = normalise_to_cells(
-                state.cells, state.templates, state.thickness_um, self.threads
-            )
-        if not self.free.any:
-            return replace(state, thickness_um=thickness, templates=fitted)
-        whole = add_offset(state.cells, state.nuisance)
-        thickness, nuisance = fit_nuisances(whole, fitted, thickness, self.free, state.nuisance, self.threads)
+            fit, shift = learn(sample, base, state.free, state.nuisance)[1], 0.0
+            slip, margin = state.common_slip, state.margin
+        thickness = state.thickness_um + np.float32(shift * self.order_um)
+        cells = subtract_offset(whole, fit.light(state.cells, state.free))
+        fitted = fit.applied_to(base).normalised_to(thickness)
         return replace(
             state,
-            cells=subtract_offset(whole, nuisance),
-            thickness_um=thickness,
-            templates=fitted.with_contrast(nuisance.contrast),
-            nuisance=nuisance,
+            cells=cells,
+            thickness_um=refine_cells(cells, fitted, thickness, self.threads),
+            templates=fitted,
+            nuisance=fit,
+            common_slip=slip,
+            margin=margin,
         )
+
+    def relearn(self, state: _State, data: Amplitudes, surface: CellSurface) -> _State:
+        """Learn once more, on small blocks of pixels, which lose nothing where the fringes are steep."""
+        model = state.templates
+        noise = float(
+            np.median(1.0 / np.sqrt(np.maximum(state.cells.weight[..., : model.n_wavelengths], 1e-12)))
+        )
+        pixels = np.sqrt(np.diff(state.cells.y_edges).max() * np.diff(state.cells.x_edges).max())
+        strength = float(model.amplitude().std(axis=0).mean())
+        phase_sigma = noise * float(pixels) / (strength * np.sqrt(model.n_wavelengths))
+        sample = sample_blocks(data, surface, state.free, phase_sigma, self.order_um)
+        if sample.thickness_um.size == 0:
+            return state
+        base = self.base or model
+        thickness, fit = learn(sample, base, state.free, state.nuisance)
+        return replace(state, templates=fit.applied_to(base).normalised_to(thickness), nuisance=fit)
 
 
 def _among(shape: NDArray[np.float32], others: list[NDArray[np.float32]], order_um: float) -> bool:
@@ -358,12 +453,12 @@ def _among(shape: NDArray[np.float32], others: list[NDArray[np.float32]], order_
 
 def _agree(before: _State, after: _State) -> bool:
     """Whether two models differ too little to matter for the orders."""
-    strength = after.templates.amplitude().std(axis=0)
-    change = np.abs(after.templates.mean_response / before.templates.mean_response - 1.0)
-    change += np.abs(after.templates.contrast / before.templates.contrast - 1.0) * strength
-    if after.nuisance.offset.size:
-        change += np.abs(after.nuisance.offset - before.nuisance.offset).max(axis=(1, 2))
-    return bool(np.all(change < _MODEL_CHANGE * strength))
+    new = after.templates.amplitude()
+    change = np.abs(new - before.templates.amplitude()).mean(axis=0)
+    same_light = before.nuisance.coefficients.shape == after.nuisance.coefficients.shape
+    if same_light and after.nuisance.coefficients.size:
+        change += np.abs(after.nuisance.coefficients - before.nuisance.coefficients).max(axis=1)
+    return bool(np.all(change < _MODEL_CHANGE * new.std(axis=0)))
 
 
 def spread_to_pixels(cells: Cells, values: NDArray[Any]) -> NDArray[Any]:

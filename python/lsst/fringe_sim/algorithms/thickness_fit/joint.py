@@ -11,11 +11,15 @@ from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, load_band
 from .borders import gather_pixels
+from .conclusion import MISFIT
 from .global_fit import GlobalFit, global_fit
+from .nuisances import Nuisances
 from .pixels import PixelFit
+from .rescue import typical_misfit
 from .silicon import (
     STEPS_PER_SILICON_ORDER,
     SiliconFit,
+    SiliconForecast,
     SiliconModel,
     SiliconSearch,
     SiliconTables,
@@ -68,6 +72,7 @@ def joint_fit(
     *,
     range_um: tuple[float, float],
     cell_px: int | None = None,
+    nuisances: Nuisances | None = None,
     threads: int = 2,
 ) -> JointFit:
     """Fit adhesive and silicon.
@@ -86,11 +91,20 @@ def joint_fit(
         Thicknesses of the adhesive that are possible [µm].
     cell_px : `int`, optional
         Size of the cells on which orders are solved [px].
+    nuisances : `Nuisances`, optional
+        What is learned where the model does not fit; the silicon is then left as it is, as the fringes that would
+        tell it lose contrast too.
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
     free, blurred = silicon_free(data, templates, model)
     found = global_fit(free, blurred, range_um=range_um, cell_px=cell_px, threads=threads)
+    if nuisances is not None and typical_misfit(found.pixels) > MISFIT:
+        found = global_fit(
+            free, blurred, range_um=range_um, cell_px=cell_px, nuisances=nuisances, threads=threads
+        )
+        slip = slip_probability(found, out=found.border_slip)
+        return JointFit(found.pixels, slip, _unknown(search, templates.n_wavelengths), found)
     del free
     slip = slip_probability(found, out=found.border_slip)
     order = found.order_um
@@ -104,6 +118,14 @@ def joint_fit(
         slip = slip_probability(found, out=found.border_slip)
     pixels = _fit_pixels(data, model, silicon, found.pixels, order, threads)
     return JointFit(pixels, slip, silicon, found)
+
+
+def _unknown(search: SiliconSearch, wavelengths: int) -> SiliconFit:
+    """Silicon as the model has it, because the flats are not as the model has them."""
+    reason = "contrast or light of the flats is not that of the model"
+    forecast = SiliconForecast(np.inf, 1.0, 0.0, np.zeros(wavelengths), False, reason)
+    terms = search.terms(np.zeros(1), np.zeros(1)).shape[1]
+    return SiliconFit(search, np.zeros(terms), np.zeros((terms, terms)), 0.0, 1.0, forecast)
 
 
 def _believed(pixels: PixelFit, slip: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,17 +1,15 @@
-"""What flats hold besides fringes: free levels, steps between zones, slow illumination, another contrast.
+"""What flats hold besides fringes, and what of the model they do not share: which of it a fit leaves free.
 
-The flats over their mean are modelled as ``(1 + c f(d)) (1 + g(x, y))`` for each wavelength, with the fringe
-amplitude ``f`` of the templates, a contrast ``c`` and a light ``g`` of known patterns: ones over each zone of the
-sensor, and low polynomials over the whole of it. Light and gain multiply the fringes; at a light of 4 % and fringes
-of 13 % their product is larger than the noise of a flat. With the orders known this is a linear problem, step by
-step, once the thickness of every cell is eliminated: a small change of it moves the amplitudes along their slope, so
-that direction is projected out (variable projection, Golub & Pereyra 1973, Inverse Problems 19, R1 (2003) for a
-review).
+The flats over their mean are modelled as ``light(x, y) (1 + c f(d))`` for each wavelength. The light is the
+exponential of known patterns: levels of zones and low polynomials. The contrast ``c`` has a factor for each
+wavelength, and may fade with the thickness. The wavelength of each flat may be another than its label says.
+
+How they are found stands in `learning`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,25 +17,24 @@ from numpy.typing import NDArray
 from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ..thickness_fit_options import CONTRASTS, ZONES
 from .cells import Cells
-from .evidence import refine_cells
 from .templates import FringeTemplates
 
 __all__ = [
     "CONTRASTS",
+    "GAIN_ACCURACY",
     "ZONES",
     "NuisanceFit",
     "Nuisances",
     "add_offset",
-    "first_nuisances",
-    "fit_nuisances",
+    "light_patterns",
+    "patterns_of_cells",
     "subtract_offset",
 ]
 
 FloatArray = NDArray[np.float64]
 
-_MOST_CELLS = 8_000
-_ROUNDS = 8
-_TOLERANCE = 1e-5
+GAIN_ACCURACY = 0.005
+"""How well gains of amplifiers are known: a few 1e-3 from iron-55, or from the variance of pairs of flats."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +51,24 @@ class Nuisances:
         Degree of a polynomial in x and y, free at each wavelength, and the level with it; 0 for none.
     contrast : {"fixed", "common", "wavelength"}, optional
         Factor on the fringe amplitude of the model.
+    gain_accuracy : `float`, optional
+        Standard deviation of the levels of zones relative to that of the sensor, if they are known to some accuracy;
+        infinite by default.
+    wavelength_accuracy_nm : `float`, optional
+        Standard deviation of the wavelengths about their labels [nm]; 0 if they are taken as they are.
 
     Raises
     ------
     UnknownNameError, OutOfRangeError
-        A choice that does not exist, or a degree outside 0 to 8.
+        A choice that does not exist, a degree outside 0 to 8, or an accuracy that is negative.
     """
 
     level: bool = False
     zones: str = "sensor"
     illumination_degree: int = 0
     contrast: str = "fixed"
+    gain_accuracy: float = np.inf
+    wavelength_accuracy_nm: float = 0.0
 
     def __post_init__(self) -> None:
         if self.zones not in ZONES:
@@ -73,16 +77,30 @@ class Nuisances:
             raise UnknownNameError("contrast", self.contrast, CONTRASTS)
         if not 0 <= self.illumination_degree <= 8:
             raise OutOfRangeError("illumination degree", self.illumination_degree, "0 to 8")
+        if not self.gain_accuracy > 0.0:
+            raise OutOfRangeError("accuracy of gains", self.gain_accuracy, "above 0")
+        if not 0.0 <= self.wavelength_accuracy_nm <= 20.0:
+            raise OutOfRangeError("accuracy of wavelengths [nm]", self.wavelength_accuracy_nm, "0 to 20")
+
+    @classmethod
+    def automatic(cls, contrast: str = "wavelength", wavelength_accuracy_nm: float = 0.0) -> Nuisances:
+        """What is free unless somebody asks otherwise."""
+        return cls(True, "amplifiers", 2, contrast, GAIN_ACCURACY, wavelength_accuracy_nm)
 
     @property
     def any(self) -> bool:
         """Whether anything is left free."""
-        return self.patterned or self.contrast != "fixed"
+        return self.patterned or self.contrast != "fixed" or self.wavelength_accuracy_nm > 0.0
 
     @property
     def patterned(self) -> bool:
         """Whether light or level are free."""
         return self.level or self.zones != "sensor" or self.illumination_degree > 0
+
+    def fitting(self, ny: int, nx: int) -> Nuisances:
+        """Levels of amplifiers only where a sensor is large enough for them."""
+        small = self.zones == "amplifiers" and np.isfinite(self.gain_accuracy) and (ny < 32 or nx < 128)
+        return replace(self, zones="sensor") if small else self
 
     def breaks(self, ny: int, nx: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Rows and columns at which a zone begins.
@@ -102,124 +120,75 @@ class Nuisances:
 
 @dataclass(frozen=True, eq=False)
 class NuisanceFit:
-    """Patterns and contrast that a fit found.
+    """Light, contrast and wavelengths that a fit found.
 
     Attributes
     ----------
-    offset : `numpy.ndarray`, float32, shape ``(n_wavelengths, ncy, ncx)``
-        Light of each cell, less one; no wavelengths if it is even.
-    contrast : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Factor on the fringe amplitude.
+    coefficients : `numpy.ndarray`, shape ``(n_wavelengths, n_patterns)``
+        Logarithm of the light on the patterns of `light_patterns`.
+    contrast, contrast_sigma : `numpy.ndarray`, shape ``(n_wavelengths,)``
+        Factor on the fringe amplitude at the middle thickness of the sensor, and its standard uncertainty.
+    shift_nm, shift_sigma_nm : `numpy.ndarray`, shape ``(n_wavelengths,)``
+        Wavelength of each flat minus that of its label [nm].
+    fading : `float`
+        Logarithmic loss of contrast per thickness [1/µm].
+    overtones : `float`
+        Factor on the overtones of the fringe beside its fundamental.
+    middle_um : `float`
+        Thickness at which ``contrast`` holds [µm].
+    scale_sigma : `float`
+        Standard uncertainty of the scale of the thickness, which all pixels share.
+    misfit : `numpy.ndarray`, shape ``(n_wavelengths,)``
+        Mean squared residual of the cells over their variance, at each wavelength.
+    penalty : `float`
+        Chi-square of the cells looked at, and of what the prior says of the nuisances.
     """
 
-    offset: NDArray[np.float32]
+    coefficients: FloatArray
     contrast: FloatArray
+    contrast_sigma: FloatArray
+    shift_nm: FloatArray
+    shift_sigma_nm: FloatArray
+    fading: float = 0.0
+    overtones: float = 1.0
+    middle_um: float = 0.0
+    scale_sigma: float = 0.0
+    misfit: FloatArray = field(default_factory=lambda: np.ones(0))
+    penalty: float = np.inf
+    cells: int = 0
+
+    @classmethod
+    def none(cls, wavelengths: int, patterns: int = 0) -> NuisanceFit:
+        """Even light, the contrast of the model, wavelengths as labelled."""
+        zero = np.zeros(wavelengths)
+        return cls(np.zeros((wavelengths, patterns)), np.ones(wavelengths), zero, zero, zero)
+
+    def light(self, cells: Cells, free: Nuisances) -> NDArray[np.float32]:
+        """Light on all cells, less one, shape ``(n_wavelengths, ncy, ncx)``; no wavelengths if it is even."""
+        if not np.any(self.coefficients):
+            return np.zeros((0, *cells.shape), np.float32)
+        out = np.empty((len(self.coefficients), *cells.shape), np.float32)
+        columns = np.arange(cells.shape[1])
+        for row in range(
+            cells.shape[0]
+        ):  # patterns of all cells at once would need more memory than the cells
+            pattern, _ = patterns_of_cells(cells, free, np.full_like(columns, row), columns)
+            out[:, row] = np.expm1(self.coefficients @ pattern.T)
+        return out
+
+    def applied_to(self, base: FringeTemplates) -> FringeTemplates:
+        """Templates of a sensor with this contrast and these wavelengths."""
+        return base.as_found(self.contrast, self.shift_nm, self.fading, self.overtones, self.middle_um)
 
 
-def first_nuisances(cells: Cells, templates: FringeTemplates, free: Nuisances) -> NuisanceFit:
-    """Patterns and contrast before any thickness is known: fringes average out over a sensor.
-
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    templates : `FringeTemplates`
-        The model.
-    free : `Nuisances`
-        What is free.
-    """
-    wavelengths = templates.n_wavelengths
-    pattern = _patterns(cells, free)
-    offset = np.zeros((wavelengths, *cells.shape)) if pattern.shape[-1] else np.zeros((0, *cells.shape))
-    contrast = np.ones(wavelengths)
-    for band in range(wavelengths if free.any else 0):
-        weight, value = cells.weight[..., band].astype(float), cells.value[..., band].astype(float)
-        seen = weight > 0
-        if not seen.any():
-            continue
-        rest = value[seen]
-        if pattern.shape[-1]:
-            coefficients = np.linalg.lstsq(pattern[seen], rest, rcond=1e-10)[0]
-            offset[band] = pattern @ coefficients
-            rest = rest - pattern[seen] @ coefficients
-        power = _robust_variance(rest) - np.median(1.0 / weight[seen])
-        contrast[band] = np.sqrt(max(power, 0.0)) / templates.amplitude()[:, band].std()
-    if free.contrast == "fixed":
-        contrast[:] = 1.0
-    elif free.contrast == "common":
-        strength = templates.amplitude().std(axis=0)
-        contrast[:] = np.sum(contrast * strength**2) / np.sum(strength**2)
-    return NuisanceFit(offset.astype(np.float32), np.maximum(contrast, 1e-3) * templates.contrast)
+def subtract_offset(cells: Cells, light: NDArray[np.float32]) -> Cells:
+    """Cells under even light; ``light`` is that of `NuisanceFit.light`."""
+    return _under_light(cells, 1.0 / (1.0 + light))
 
 
-def _robust_variance(values: FloatArray) -> float:
-    """Variance of a fringe and its noise without its outliers: values beyond four times the median are cut."""
-    size = np.abs(values - np.median(values))
-    return float(np.mean(np.minimum(size, 4.0 * np.median(size)) ** 2))
-
-
-def fit_nuisances(
-    cells: Cells,
-    templates: FringeTemplates,
-    thickness_um: NDArray[np.float32],
-    free: Nuisances,
-    start: NuisanceFit,
-    threads: int = 2,
-) -> tuple[NDArray[np.float32], NuisanceFit]:
-    """Fit patterns, contrast and the thickness of the cells together, the orders being known.
-
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes, with nothing subtracted.
-    templates : `FringeTemplates`
-        The model.
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Thickness of the cells to within a fraction of an order [µm]; NaN where there is none.
-    free : `Nuisances`
-        What is free.
-    start : `NuisanceFit`
-        Where to begin.
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-    fit : `NuisanceFit`
-    """
-    pattern = _patterns(cells, free)
-    offset, contrast = start.offset.astype(float), start.contrast.copy()
-    thickness = thickness_um
-    for _ in range(_ROUNDS):
-        now = NuisanceFit(offset.astype(np.float32), contrast)
-        fitted = templates.with_contrast(contrast)
-        rest = subtract_offset(cells, now)
-        thickness = refine_cells(rest, fitted, thickness, threads)
-        added, factor = _one_round(rest, fitted, thickness, pattern, free)
-        change = np.abs(factor - 1.0).max()
-        contrast = contrast * factor
-        if pattern.shape[-1]:
-            step = np.moveaxis(pattern @ added.T, -1, 0)
-            offset = offset + step * (1.0 + offset)
-            change = max(change, float(np.abs(step).max()))
-        if change < _TOLERANCE:
-            break
-    final = NuisanceFit(offset.astype(np.float32), contrast)
-    thickness = refine_cells(
-        subtract_offset(cells, final), templates.with_contrast(contrast), thickness, threads
-    )
-    return thickness, final
-
-
-def subtract_offset(cells: Cells, fit: NuisanceFit) -> Cells:
-    """Cells under even light."""
-    return _under_light(cells, 1.0 / (1.0 + fit.offset))
-
-
-def add_offset(cells: Cells, fit: NuisanceFit) -> Cells:
+def add_offset(cells: Cells, light: NDArray[np.float32]) -> Cells:
     """Cells under the light that was taken from them."""
-    return _under_light(cells, 1.0 + fit.offset)
+    return _under_light(cells, 1.0 + light)
 
 
 def _under_light(cells: Cells, light: NDArray[np.float32]) -> Cells:
@@ -232,82 +201,39 @@ def _under_light(cells: Cells, light: NDArray[np.float32]) -> Cells:
     return replace(cells, value=value)
 
 
-def _patterns(cells: Cells, free: Nuisances) -> FloatArray:
-    """Known patterns at the centres of the cells, shape ``(ncy, ncx, n_patterns)``."""
-    ny, nx = int(cells.y_edges[-1]), int(cells.x_edges[-1])
-    columns = []
-    if free.patterned:
-        # The mean of a flat is that of light times fringe: where the light is free, so is the level.
-        rows_at, columns_at = free.breaks(ny, nx)
-        zone_y = np.searchsorted(rows_at, cells.y_edges[:-1], side="right")
-        zone_x = np.searchsorted(columns_at, cells.x_edges[:-1], side="right")
-        for a in range(len(rows_at) + 1):
-            for b in range(len(columns_at) + 1):
-                columns.append(np.outer(zone_y == a, zone_x == b).astype(float))
+def patterns_of_cells(
+    cells: Cells, free: Nuisances, rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> tuple[FloatArray, int]:
+    """Patterns of the light at the centres of some cells, as for `light_patterns`."""
+    shape = (int(cells.y_edges[-1]), int(cells.x_edges[-1]))
+    return light_patterns(free, shape, cells.y_centre[rows], cells.x_centre[columns])
+
+
+def light_patterns(
+    free: Nuisances, shape: tuple[int, int], y_px: FloatArray, x_px: FloatArray
+) -> tuple[FloatArray, int]:
+    """Known patterns at some places of a sensor, shape ``(n, n_patterns)``: level, zones, polynomials.
+
+    Also the number of zones. The mean of a flat is that of light times fringe: where the light is free, so is the
+    level.
+    """
+    ny, nx = shape
+    if not free.patterned:
+        return np.zeros((y_px.size, 0)), 0
+    parts = [np.ones((y_px.size, 1))]
+    rows_at, columns_at = free.breaks(ny, nx)
+    zones = 0
+    if rows_at:
+        across = len(columns_at) + 1
+        zones = (len(rows_at) + 1) * across
+        zone = np.searchsorted(rows_at, y_px, side="right") * across
+        zone = zone + np.searchsorted(columns_at, x_px, side="right")
+        parts.append((zone[:, None] == np.arange(zones)).astype(float))
     if free.illumination_degree:
-        y = 2.0 * cells.y_centre / max(ny - 1, 1) - 1.0
-        x = 2.0 * cells.x_centre / max(nx - 1, 1) - 1.0
-        along = np.polynomial.legendre.legvander(y, free.illumination_degree)
-        across = np.polynomial.legendre.legvander(x, free.illumination_degree)
-        for total in range(1, free.illumination_degree + 1):
-            for k in range(total + 1):
-                columns.append(np.outer(along[:, k], across[:, total - k]))
-    return np.stack(columns, axis=-1) if columns else np.zeros((*cells.shape, 0))
-
-
-def _one_round(
-    cells: Cells,
-    templates: FringeTemplates,
-    thickness_um: NDArray[np.float32],
-    pattern: FloatArray,
-    free: Nuisances,
-) -> tuple[FloatArray, FloatArray]:
-    """Change of the coefficients ``(n_wavelengths, n_patterns)`` and factor on the contrast."""
-    wavelengths, count = templates.n_wavelengths, pattern.shape[-1]
-    good = np.flatnonzero(np.isfinite(thickness_um))
-    good = good[:: max(1, good.size // _MOST_CELLS)]
-    weight = cells.weight.reshape(-1, cells.weight.shape[-1])[good, :wavelengths].astype(float)
-    value = cells.value.reshape(-1, cells.value.shape[-1])[good, :wavelengths].astype(float)
-    thickness = thickness_um.ravel()[good].astype(float)
-    model = templates.amplitude_at(thickness).T
-    margin = 2.0 * templates.step_um
-    inside = np.clip(thickness, templates.start_um + margin, templates.stop_um - margin)
-    slope = (
-        (templates.amplitude_at(inside + margin) - templates.amplitude_at(inside - margin)) / (2 * margin)
-    ).T
-    rest = value - model
-    sound = _sound(rest, weight)
-    weight, slope, rest, model = weight[sound], slope[sound], rest[sound], model[sound]
-    known = pattern.reshape(thickness_um.size, count)[good][sound]
-    information = np.maximum((weight * slope**2).sum(axis=1), 1e-30)
-    lean = weight * slope / np.sqrt(information)[:, None]
-    weighted = weight * rest - lean * (lean * rest).sum(axis=1)[:, None]
-    extra = 0 if free.contrast == "fixed" else 1
-    size = count + extra
-    design = [
-        np.concatenate([known, model[:, [band]]], axis=1) if extra else known for band in range(wavelengths)
-    ]
-    normal = np.zeros((wavelengths, size, wavelengths, size))
-    right = np.zeros((wavelengths, size))
-    for a in range(wavelengths):
-        right[a] = design[a].T @ weighted[:, a]
-        for b in range(a, wavelengths):
-            share = -lean[:, a] * lean[:, b] + (weight[:, a] if a == b else 0.0)
-            normal[a, :, b] = design[a].T @ (share[:, None] * design[b])
-            normal[b, :, a] = normal[a, :, b].T
-    matrix, vector = normal.reshape(wavelengths * size, -1), right.ravel()
-    spread = np.eye(wavelengths * size)
-    if free.contrast == "common":
-        keep = [k for k in range(wavelengths * size) if k % size != count]
-        shared = (np.arange(wavelengths * size) % size == count).astype(float)
-        spread = np.concatenate([spread[:, keep], shared[:, None]], axis=1)
-    solved = spread @ np.linalg.lstsq(spread.T @ matrix @ spread, spread.T @ vector, rcond=1e-12)[0]
-    table = solved.reshape(wavelengths, size)
-    factor = np.clip(1.0 + table[:, count], 0.3, 3.0) if extra else np.ones(wavelengths)
-    return table[:, :count], factor
-
-
-def _sound(rest: FloatArray, weight: FloatArray) -> NDArray[np.bool_]:
-    """Cells that fit no worse than most."""
-    misfit = (weight * rest**2).sum(axis=1)
-    return misfit <= 9.0 * np.median(misfit)
+        degree = free.illumination_degree
+        y = 2.0 * y_px / max(ny - 1, 1) - 1.0
+        x = 2.0 * x_px / max(nx - 1, 1) - 1.0
+        along, beside = (np.polynomial.legendre.legvander(part, degree) for part in (y, x))
+        terms = [(k, total - k) for total in range(1, degree + 1) for k in range(total + 1)]
+        parts.append(np.stack([along[:, a] * beside[:, b] for a, b in terms], axis=1))
+    return np.concatenate(parts, axis=1), zones

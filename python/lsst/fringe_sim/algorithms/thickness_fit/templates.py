@@ -38,6 +38,10 @@ class FringeTemplates:
         Mean over the sensor; by default the mean over the grid.
     contrast : `numpy.ndarray`, shape ``(n_wavelengths,)``, optional
         Factor on the amplitude of each wavelength; 1 by default.
+    group : `numpy.ndarray`, shape ``(n_wavelengths,)``, optional
+        Group index of the layer over its index; 1 by default.
+    fading, middle_um : `float`, optional
+        Logarithmic loss of contrast per thickness [1/µm], and the thickness [µm] at which there is none.
 
     Raises
     ------
@@ -51,6 +55,9 @@ class FringeTemplates:
     wavelength_nm: FloatArray
     mean_response: FloatArray = field(default_factory=lambda: np.empty(0))
     contrast: FloatArray = field(default_factory=lambda: np.empty(0))
+    group: FloatArray = field(default_factory=lambda: np.empty(0))
+    fading: float = 0.0
+    middle_um: float = 0.0
 
     def __post_init__(self) -> None:
         response = np.ascontiguousarray(self.response, dtype=float)
@@ -71,7 +78,9 @@ class FringeTemplates:
         contrast = np.asarray(self.contrast, dtype=float)
         mean = response.mean(axis=0) if mean.size == 0 else mean
         contrast = np.ones(wavelength.size) if contrast.size == 0 else contrast
-        for name, value in (("mean response", mean), ("contrast", contrast)):
+        group = np.asarray(self.group, dtype=float)
+        group = np.ones(wavelength.size) if group.size == 0 else group
+        for name, value in (("mean response", mean), ("contrast", contrast), ("group index", group)):
             if value.shape != wavelength.shape or not np.all(value > 0):
                 raise InputError(f"template {name}", value.tolist(), f"{wavelength.size} positive numbers")
         for name, array in (
@@ -79,6 +88,7 @@ class FringeTemplates:
             ("wavelength_nm", wavelength),
             ("mean_response", mean),
             ("contrast", contrast),
+            ("group", group),
         ):
             object.__setattr__(self, name, array)
 
@@ -99,7 +109,10 @@ class FringeTemplates:
 
     def amplitude(self) -> FloatArray:
         """Fringe amplitude ``contrast * (response / mean - 1)``, shape ``(n_thickness, n_wavelengths)``."""
-        return self.contrast * (self.response / self.mean_response - 1.0)
+        factor = self.contrast
+        if self.fading:
+            factor = factor * np.exp(-self.fading * (self.thickness_um - self.middle_um))[:, None]
+        return np.asarray(factor * (self.response / self.mean_response - 1.0))
 
     def table(self) -> NDArray[np.float32]:
         """`amplitude` as float32 with the wavelength axis padded by zeros to a multiple of `LANES`."""
@@ -136,6 +149,62 @@ class FringeTemplates:
         """Copy with other contrast factors, one for each wavelength (or one for all)."""
         values = np.broadcast_to(np.asarray(contrast, dtype=float), self.wavelength_nm.shape)
         return replace(self, contrast=np.array(values))
+
+    def as_found(
+        self,
+        contrast: ArrayLike,
+        shift_nm: FloatArray,
+        fading: float,
+        overtones: float,
+        middle_um: float,
+        even: FloatArray | None = None,
+    ) -> Self:
+        """Copy for flats whose contrast, wavelengths and waveform are a little different.
+
+        Parameters
+        ----------
+        contrast : array_like
+            Factor on the amplitude of each wavelength.
+        shift_nm : `numpy.ndarray`, shape ``(n_wavelengths,)``
+            What is added to each wavelength [nm]. The phase of a fringe is that of the thickness over the wavelength.
+        fading, middle_um : `float`
+            See the class.
+        overtones : `float`
+            Factor on the even overtones of the fringe.
+        even : `numpy.ndarray`, optional
+            These overtones, if they are known; shape of ``response``.
+        """
+        response = self.response
+        if overtones != 1.0:
+            response = response - (1.0 - overtones) * (self.even_overtones() if even is None else even)
+        if np.any(shift_nm):
+            grid = self.thickness_um
+            factor = 1.0 - self.group * shift_nm / self.wavelength_nm
+            response = np.stack(
+                [np.interp(grid * f, grid, column) for f, column in zip(factor, response.T, strict=True)],
+                axis=1,
+            )
+        found = replace(self, response=response, fading=fading, middle_um=middle_um)
+        return found.with_contrast(contrast)
+
+    def part(self, low_um: float, high_um: float) -> tuple[Self, slice]:
+        """Copy that holds a part of the range, and the rows of it; the mean response stays."""
+        first = int(np.clip((low_um - self.start_um) / self.step_um, 0, len(self.response) - 17))
+        last = int(np.clip((high_um - self.start_um) / self.step_um + 2, first + 16, len(self.response)))
+        rows = slice(first, last)
+        return replace(
+            self, response=self.response[rows], start_um=self.start_um + first * self.step_um
+        ), rows
+
+    def even_overtones(self) -> FloatArray:
+        """Part of the response that repeats after half an order, less its mean; shape of ``response``."""
+        half = 0.5 * self.order_um() * self.wavelength_nm / self.wavelength_nm.mean()
+        grid = self.thickness_um
+        even = [
+            0.5 * column + 0.25 * (np.interp(grid + h, grid, column) + np.interp(grid - h, grid, column))
+            for h, column in zip(half, self.response.T, strict=True)
+        ]
+        return np.stack(even, axis=1) - self.response.mean(axis=0)
 
     def order_um(self, weight: ArrayLike | None = None) -> float:
         """Thickness of one fringe order [µm]: the shift at which all wavelengths together repeat best.

@@ -1,0 +1,186 @@
+"""What a fit says of itself: model error in the uncertainty, numbers of each flat, and words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_distribution
+
+from ...products import FlatFit
+from .cells import Cells
+from .learning import spread_of_wavelengths
+from .nuisances import NuisanceFit
+from .pixels import PixelFit
+from .templates import FringeTemplates
+
+__all__ = ["CERTAIN", "MISFIT", "contrast_map", "flat_fit", "model_error", "remarks", "says_misfit"]
+
+CERTAIN = 25.0
+"""Chi-square difference to the next order of the whole sensor below which the order is not decided."""
+MISFIT = 1.2
+"""Mean square of what is left of small blocks of pixels, over their variance, from which on the model is
+said not to fit."""
+_OUTLIER = 5.0
+"""Standard deviations beyond which a wavelength does not belong to its label."""
+_BLOCKS = 16
+"""Blocks along a side of the sensor at most in the map of the contrast."""
+_BLOCK_PX = 32
+"""Side of the blocks over which model error is judged [px]."""
+_SIGNIFICANT = 3.0
+
+
+def model_error(pixels: PixelFit, scale_sigma: float) -> PixelFit:
+    """Uncertainties with the error of the model in them, which chi-square shows, and of the wavelengths.
+
+    What a wrong model leaves over is the same in neighbouring pixels; in the direction of the thickness, where it
+    cannot be seen, it is taken to be as large as in the others.
+
+    Parameters
+    ----------
+    pixels : `PixelFit`
+        The fit; its uncertainties are changed in place.
+    scale_sigma : `float`
+        Standard uncertainty of the scale of the thickness.
+    """
+    most = int(pixels.n_wavelengths.max(initial=0))
+    if most < 3:
+        return pixels
+    expected = float(chi2_distribution.median(most - 1)) / (most - 1)
+    # A median has the scatter of a mean of about half as many numbers.
+    scatter = _SIGNIFICANT * 1.5 * np.sqrt(2.0 / (most - 1))
+    ny, nx = pixels.chi2.shape
+    for top in range(0, ny, _BLOCK_PX):
+        for left in range(0, nx, _BLOCK_PX):
+            part = (slice(top, top + _BLOCK_PX), slice(left, left + _BLOCK_PX))
+            chi2 = pixels.chi2[part]
+            chi2 = chi2[np.isfinite(chi2)]
+            if chi2.size == 0:
+                continue
+            excess = float(np.median(chi2)) / expected
+            if excess > 1.0 + scatter / np.sqrt(chi2.size):
+                pixels.sigma[part] *= np.float32(np.sqrt(excess))
+    if scale_sigma > 0.0:
+        np.hypot(pixels.sigma, np.float32(scale_sigma) * pixels.value, out=pixels.sigma)
+    return pixels
+
+
+def contrast_map(
+    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Contrast in blocks of cells over that of the templates, the thickness of each cell being free.
+
+    Parameters
+    ----------
+    cells : `Cells`
+        Mean amplitudes under even light.
+    templates : `FringeTemplates`
+        The model with its contrast.
+    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Thickness of the cells [µm].
+    """
+    wavelengths = templates.n_wavelengths
+    rows, columns = (np.array_split(np.arange(n), min(_BLOCKS, n)) for n in cells.shape)
+    out = np.full((len(rows), len(columns)), np.nan, np.float32)
+    table, step = templates.table(), templates.step_um
+    for a, strip in enumerate(rows):
+        place = (thickness_um[strip].astype(float) - templates.start_um) / step
+        known = np.isfinite(place)
+        at = np.clip(np.rint(np.where(known, place, 2.0)).astype(int), 1, len(table) - 2)
+        model = table[at][..., :wavelengths]
+        slope = (table[at + 1] - table[at - 1])[..., :wavelengths]
+        weight = np.where(known[..., None], cells.weight[strip][..., :wavelengths], 0.0)
+        value = cells.value[strip][..., :wavelengths]
+        information = np.maximum((weight * slope**2).sum(axis=-1), 1e-30)
+        along = (weight * slope * model).sum(axis=-1) / information
+        across = model - along[..., None] * slope
+        gain, norm = (weight * across * value).sum(axis=-1), (weight * across * model).sum(axis=-1)
+        for b, part in enumerate(columns):
+            if norm[:, part].sum() > 0.0:
+                out[a, b] = gain[:, part].sum() / norm[:, part].sum()
+    return out
+
+
+def flat_fit(nuisance: NuisanceFit, wavelength_nm: NDArray[np.float64]) -> FlatFit:
+    """Numbers of each flat for a product."""
+    misfit = nuisance.misfit if nuisance.misfit.size else np.ones(wavelength_nm.size)
+    return FlatFit(
+        wavelength_nm, nuisance.contrast, nuisance.contrast_sigma, nuisance.shift_nm, nuisance.shift_sigma_nm,
+        misfit,
+    )  # fmt: skip
+
+
+def worst_flat(flats: FlatFit) -> tuple[int, float] | None:
+    """The flat whose wavelength is farthest off its label, and by how many standard deviations; `None` if all fit."""
+    if not np.any(flats.offset_sigma_nm > 0.0):
+        return None
+    others = spread_of_wavelengths(flats.offset_nm)
+    away = np.abs(flats.offset_nm) / np.hypot(flats.offset_sigma_nm, others)
+    worst = int(np.argmax(away))
+    return (worst, float(away[worst])) if away[worst] > _OUTLIER else None
+
+
+def cards(flats: FlatFit, margin: float) -> dict[str, Any]:
+    """Header keywords: contrast, misfit of cells, certainty of the order, the flat that does not fit."""
+    weight = 1.0 / np.maximum(flats.contrast_sigma, 1e-9) ** 2
+    found: dict[str, Any] = {
+        "CONTRAST": round(float(flats.contrast.mean()), 6),
+        "CONTRSIG": round(float(1.0 / np.sqrt(weight.sum())) if np.any(flats.contrast_sigma) else 0.0, 6),
+        "CELLMISF": round(float(flats.misfit.mean()), 3),
+        "ORDMARG": round(min(margin, 1e6), 1),
+    }
+    worst = worst_flat(flats)
+    if worst is not None:
+        found["WORSTFLT"] = float(flats.wavelength_nm[worst[0]])
+        found["WORSTOFF"] = round(float(flats.offset_nm[worst[0]]), 3)
+        found["WORSTSIG"] = round(worst[1], 1)
+    return found
+
+
+def says_misfit(metadata: Mapping[str, Any]) -> bool:
+    """Whether a map says that model and flats do not go together, or that its order is not decided."""
+    return (
+        float(metadata.get("CELLMISF", 1.0)) > MISFIT
+        or float(metadata.get("ORDMARG", CERTAIN)) < CERTAIN
+        or "WORSTFLT" in metadata
+    )
+
+
+def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
+    """What a person should know of a fit first, in sentences.
+
+    Parameters
+    ----------
+    metadata : mapping
+        Header of a thickness map.
+    flats : `FlatFit` or `None`
+        What was learned of each flat.
+    """
+    if flats is None:
+        return []
+    said = [
+        f"contrast {metadata['CONTRAST']:.3g} ± {metadata['CONTRSIG']:.1g} of the model's "
+        f"({flats.contrast.min():.3g} to {flats.contrast.max():.3g} over the wavelengths)"
+    ]
+    misfit = float(metadata["CELLMISF"])
+    if misfit > MISFIT:
+        worst = int(np.argmax(flats.misfit))
+        said.append(
+            f"the model does not fit: small blocks of pixels are off by {np.sqrt(misfit):.2f} times their noise, "
+            f"most at {flats.wavelength_nm[worst]:g} nm; run 'fringe-sim discover' to find out why"
+        )
+    if "WORSTFLT" in metadata:
+        label, offset = metadata["WORSTFLT"], metadata["WORSTOFF"]
+        said.append(
+            f"{label:g} nm does not fit: {metadata['WORSTSIG']:.0f} sigma; its wavelength would have to be "
+            f"{label + offset:.1f} nm"
+        )
+    if float(metadata["ORDMARG"]) < CERTAIN:
+        said.append(
+            f"the order of the sensor is not decided: another one is worse by a chi-square of only "
+            f"{max(metadata['ORDMARG'], 0.0):.1f}; all pixels are flagged SLIP. Flats over a wider range of "
+            "wavelengths, or better known wavelengths, would decide"
+        )
+    return said

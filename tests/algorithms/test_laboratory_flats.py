@@ -1,0 +1,107 @@
+"""Flats that are not as the model has them, from another simulator: right by default, or said not to be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from laboratory_flats import ROWS, judge, make_flats
+
+from lsst.fringe_sim.algorithms import fit_thickness
+from lsst.fringe_sim.algorithms.thickness_fit import Nuisances, SiliconSearch
+from lsst.fringe_sim.mock.thickness import random_field
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FringeCube, ThicknessMap
+
+SHAPE = (160, 192)
+"""Amplifiers of 80 by 24 pixels."""
+
+
+@pytest.fixture(scope="module")
+def model() -> FringeModel:
+    return FringeModel.from_setup("ts8_e2v")
+
+
+def case(name: str, rng: np.random.Generator, span: float = 2.0) -> tuple[np.ndarray, FringeCube]:
+    """A map and its flats."""
+    truth = random_field(SHAPE, rng, mean=rng.uniform(11.0, 17.0), span=span)
+    return truth, make_flats(ROWS[name], truth, rng)
+
+
+def check(fitted: ThicknessMap, truth: np.ndarray, widest: float = 1.15) -> None:
+    """Next to nothing is wrong, next to nothing masked, and the uncertainties are what they say."""
+    result = judge(fitted, truth)
+    assert result.wrong < 1e-3, str(result)
+    assert result.masked < 0.05, str(result)
+    assert 0.85 < result.pull < widest, str(result)
+
+
+@pytest.mark.parametrize("name", ["contrast 0.13", "contrast 0.13, gains 1 %"])
+@pytest.mark.rng("laboratory weak fringes are fitted by default")
+def test_weak_fringes_are_fitted_by_default(name, model, rng) -> None:
+    truth, cube = case(name, rng)
+    fitted = fit_thickness(cube, model)
+    check(fitted, truth)
+    np.testing.assert_allclose(fitted.contrast, 0.13, rtol=0.1)
+    assert np.all(np.abs(fitted.contrast - 0.13) < 6.0 * fitted.contrast_sigma)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "as the model",
+        "contrast 0.25",
+        "roughness 80 nm, gradient 3 %",
+        "contrast 0.3, gradient 2 %",
+        "gains 1 %",
+    ],
+)
+@pytest.mark.rng("laboratory right by default")
+def test_right_by_default(name, model, rng) -> None:
+    truth, cube = case(name, rng)
+    check(fit_thickness(cube, model), truth)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["epoxy k 0.005"])
+@pytest.mark.rng("laboratory contrast that falls with the thickness")
+def test_contrast_that_falls_with_the_thickness(name, model, rng) -> None:
+    truth, cube = case(name, rng)
+    check(fit_thickness(cube, model), truth, widest=1.3)
+
+
+@pytest.mark.slow
+@pytest.mark.rng("laboratory a flat with a wrong label is named")
+def test_a_flat_with_a_wrong_label_is_named(model, rng) -> None:
+    truth, cube = case("one flat 2 nm off", rng)
+    fitted = fit_thickness(cube, model)
+    check(fitted, truth, widest=1.3)
+    assert fitted.metadata["WORSTFLT"] == cube.wavelength_nm[6]
+    assert fitted.metadata["WORSTOFF"] == pytest.approx(2.0, abs=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.rng("laboratory wavelengths that are off")
+def test_wavelengths_that_are_off(model, rng) -> None:
+    truth, cube = case("wavelengths 0.6 nm", rng)
+    result = judge(fit_thickness(cube, model), truth)
+    assert result.wrong < 1e-3, str(result)
+
+
+@pytest.mark.slow
+@pytest.mark.rng("laboratory the walk and the silicon take the default")
+def test_the_walk_and_the_silicon_take_the_default(model, rng) -> None:
+    truth, cube = case("contrast 0.13", rng)
+    walk = fit_thickness(cube, model, "guo2022")
+    assert walk.contrast is None
+    joint = fit_thickness(cube, model, silicon=SiliconSearch())
+    check(joint, truth)
+    assert not joint.metadata["SIFIT"]
+    assert "contrast" in joint.metadata["SIWHY"]
+
+
+@pytest.mark.rng("laboratory a model that is held says that it does not fit")
+def test_a_model_that_is_held_says_that_it_does_not_fit(model, rng) -> None:
+    """Nothing free, fringes of an eighth: wrong, but not quietly."""
+    _, cube = case("contrast 0.13", rng)
+    assert fit_thickness(cube, model, nuisances=Nuisances()).metadata["MISFIT"] > 1.2

@@ -1,0 +1,209 @@
+"""Flats of sensors that are not as the model has them, and how a thickness map stands up to them.
+
+The optics are those of `field_matrices`, which share nothing with the package but the tables of the media. Run as
+a script, this prints a table: ``python tests/helpers/laboratory_flats.py [--maps N] [--size N] [ROW ...]``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import field_matrices
+import numpy as np
+from field_matrices import ForeignSensor
+from scipy.ndimage import gaussian_filter1d
+
+from lsst.fringe_sim.algorithms import fit_thickness
+from lsst.fringe_sim.mock.thickness import random_field
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube, ThicknessMap
+
+__all__ = ["ROWS", "Laboratory", "Result", "judge", "make_flats"]
+
+TEN_NM = np.arange(880.0, 991.0, 10.0)
+ORDER_UM = 0.3
+GRID_UM = 0.002
+READ_NOISE_E = 7.0
+
+
+@dataclass(frozen=True)
+class Laboratory:
+    """What differs from the model.
+
+    Attributes
+    ----------
+    contrast : `float`
+        Factor on the fringes.
+    roughness_nm : `float`
+        Rms of the layer inside a pixel.
+    line, epoxy_k : `float`
+        As of `ForeignSensor`.
+    gradient, bowl : `float`
+        Illumination from edge to edge along a random direction, and from middle to edge.
+    gains : `float`
+        Rms of the gains of 8 by 2 amplifiers.
+    offsets_nm : `float`
+        Rms of what the wavelengths miss their labels by.
+    mislabelled_nm : `float`
+        What one flat misses its label by.
+    electrons : `float`
+        Level of the flats.
+    """
+
+    contrast: float = 1.0
+    roughness_nm: float = 0.0
+    line: float = 1.0
+    epoxy_k: float = 0.0
+    gradient: float = 0.0
+    bowl: float = 0.0
+    gains: float = 0.0
+    offsets_nm: float = 0.0
+    mislabelled_nm: float = 0.0
+    electrons: float = 20_000.0
+
+
+ROWS: dict[str, Laboratory] = {
+    "as the model": Laboratory(),
+    "contrast 0.5": Laboratory(contrast=0.5),
+    "contrast 0.25": Laboratory(contrast=0.25),
+    "contrast 0.13": Laboratory(contrast=0.13),
+    "contrast 0.05": Laboratory(contrast=0.05),
+    "contrast 0.05, 5000 e-": Laboratory(contrast=0.05, electrons=5_000.0),
+    "epoxy k 0.005": Laboratory(epoxy_k=0.005),
+    "roughness 80 nm": Laboratory(roughness_nm=80.0),
+    "line of 6 nm": Laboratory(line=3.0),
+    "roughness 80 nm, gradient 3 %": Laboratory(roughness_nm=80.0, gradient=0.03),
+    "contrast 0.3, gradient 2 %": Laboratory(contrast=0.3, gradient=0.02),
+    "gains 1 %": Laboratory(gains=0.01),
+    "contrast 0.13, gains 1 %": Laboratory(contrast=0.13, gains=0.01),
+    "wavelengths 0.6 nm": Laboratory(offsets_nm=0.6),
+    "contrast 0.13, wavelengths 1 nm": Laboratory(contrast=0.13, offsets_nm=1.0),
+    "one flat 2 nm off": Laboratory(mislabelled_nm=2.0),
+    "contrast 0.13, one flat 2 nm off": Laboratory(contrast=0.13, mislabelled_nm=2.0),
+}
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a map compares with the truth: shares of pixels, σ in nm, width of the pulls of right orders."""
+
+    wrong: float
+    masked: float
+    sigma_nm: float
+    pull: float
+    slip: float
+    seconds: float
+    misfit: float
+
+    def __str__(self) -> str:
+        return (
+            f"wrong {self.wrong:8.1e}  masked {self.masked:7.1e}  sigma {self.sigma_nm:6.2f} nm  "
+            f"pulls {self.pull:5.2f}  slip {self.slip:7.1e}  misfit {self.misfit:5.2f}  {self.seconds:5.1f} s"
+        )
+
+
+def make_flats(
+    laboratory: Laboratory, thickness_um: np.ndarray, rng: np.random.Generator, bands: np.ndarray = TEN_NM
+) -> FringeCube:
+    """Flats of a map in electrons over their mean."""
+    sensor = ForeignSensor(line=laboratory.line, epoxy_k=laboratory.epoxy_k)
+    true_nm = bands + laboratory.offsets_nm * rng.standard_normal(bands.size)
+    true_nm[bands.size // 2] += laboratory.mislabelled_nm
+    grid = np.arange(thickness_um.min() - 0.5, thickness_um.max() + 0.5, GRID_UM)
+    away = np.linspace(-3.5, 3.5, 81)
+    share = np.exp(-0.5 * away**2)
+    share /= share.sum()
+    width = laboratory.line * field_matrices.LINE_NM / np.sqrt(8.0 * np.log(2.0))
+    light = illumination(laboratory, thickness_um.shape, rng)
+    images = []
+    for middle in true_nm:
+        response = share @ sensor.absorbed(middle + width * away, grid)
+        if laboratory.roughness_nm:
+            response = gaussian_filter1d(response, 1e-3 * laboratory.roughness_nm / GRID_UM)
+        response = response.mean() + laboratory.contrast * (response - response.mean())
+        image = np.interp(thickness_um, grid, response) * light
+        images.append(laboratory.electrons * image / image.mean())
+    counts = np.array(images)
+    variance = counts + READ_NOISE_E**2
+    counts = counts + np.sqrt(variance) * rng.standard_normal(counts.shape)
+    return FringeCube(
+        (counts / laboratory.electrons).astype(np.float32),
+        (variance / laboratory.electrons**2).astype(np.float32),
+        np.zeros(counts.shape, np.int16),
+        FlatExposures(bands, np.array(2.0), np.array(field_matrices.KELVIN)),
+        "relative",
+    )
+
+
+def illumination(laboratory: Laboratory, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    """Light times gain, the same at all wavelengths."""
+    y, x = (2.0 * index / (length - 1) - 1.0 for index, length in zip(np.indices(shape), shape, strict=True))
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    light = 1.0 + 0.5 * laboratory.gradient * (np.cos(angle) * x + np.sin(angle) * y)
+    light = light - laboratory.bowl * 0.5 * (x * x + y * y)
+    gains = 1.0 + laboratory.gains * rng.standard_normal((2, 8))
+    rows = (np.arange(shape[0]) >= shape[0] // 2).astype(int)
+    columns = np.searchsorted([shape[1] * k // 8 for k in range(1, 8)], np.arange(shape[1]), side="right")
+    return np.asarray(light * gains[rows][:, columns])
+
+
+def judge(fitted: ThicknessMap, truth: np.ndarray, seconds: float = 0.0) -> Result:
+    """Compare a map with the truth."""
+    good = fitted.mask == 0
+    error = (fitted.value - truth)[good]
+    right = np.abs(error) < 0.5 * ORDER_UM
+    pull = (error / fitted.sigma[good])[right]
+    return Result(
+        float(1.0 - right.mean()) if right.size else 0.0,
+        float(1.0 - good.mean()),
+        1e3 * float(np.median(fitted.sigma[good])) if good.any() else float("nan"),
+        float(np.sqrt(np.mean(pull.astype(float) ** 2))) if pull.size else float("nan"),
+        float(np.median(fitted.slip_probability)),
+        seconds,
+        float(fitted.metadata.get("MISFIT", 0.0)),
+    )
+
+
+def one(
+    laboratory: Laboratory, seed: int, model: FringeModel, size: int, **options: Any
+) -> tuple[ThicknessMap, Result]:
+    """Fit one map that a seed draws."""
+    rng = np.random.default_rng(seed)
+    shape = (size, size)
+    truth = random_field(shape, rng, mean=rng.uniform(10.0, 18.0), span=rng.uniform(1.0, 2.5) * size / 256.0)
+    cube = make_flats(laboratory, truth, rng)
+    start = time.process_time()
+    fitted = fit_thickness(cube, model, **options)
+    return fitted, judge(fitted, truth, time.process_time() - start)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("rows", nargs="*", help="parts of the names of rows; all if none is given")
+    parser.add_argument("--maps", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--contrast", default=None)
+    parser.add_argument("--method", default="global")
+    arguments = parser.parse_args()
+    model = FringeModel.from_setup("ts8_e2v")
+    options: dict[str, Any] = {"method": arguments.method}
+    if arguments.contrast:
+        options["contrast"] = arguments.contrast
+    for name, laboratory in ROWS.items():
+        if arguments.rows and not any(part in name for part in arguments.rows):
+            continue
+        for seed in range(arguments.first, arguments.first + arguments.maps):
+            try:
+                result = str(one(laboratory, seed, model, arguments.size, **options)[1])
+            except Exception as error:
+                result = f"{type(error).__name__}: {error}"
+            print(f"{name:32s} map {seed}  {result}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
