@@ -65,4 +65,4 @@ def _command(cache: Path, *command: str) -> dict[str, Any]:
 
 def _run(cache: Path, command: list[str]) -> str:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-    return subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
