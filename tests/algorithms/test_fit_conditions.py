@@ -57,7 +57,8 @@ def test_a_step_between_the_halves(model, rng, tmp_path) -> None:
     by_default = fit_thickness(cube, model)
     assert pulls_of(by_default, truth).std() == pytest.approx(1.0, abs=0.1)
     held = fit_thickness(cube, model, nuisances=Nuisances())
-    assert (held.value - truth).std() > 1.3 * (by_default.value - truth).std()
+    # Of 28 800 pixels the error is known to half a per cent.
+    assert (held.value - truth).std() > 1.05 * (by_default.value - truth).std()
     cube.write_fits(tmp_path / "cube.fits")
     arguments = ["fit", str(tmp_path / "cube.fits"), "--out", str(tmp_path / "fit")]
     assert run(arguments) == 0

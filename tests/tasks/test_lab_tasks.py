@@ -90,17 +90,10 @@ def test_only_the_walk_doubts_the_orders_of_single_pixels(flats: list[FringeFlat
     assert 0.01 < slips["guo2022"] < 0.5
 
 
-def test_the_total_absorption_is_half_an_order_off(flats: list[FringeFlat], frames: MockRun) -> None:
-    """The published fit took 1 - R - T for the signal; its fringes are in antiphase.
-
-    These flats are not made of it, and what neighbours leave over alike says so: no pixel is sure of its order.
-    """
+def test_flats_that_are_not_of_the_total_absorption_are_refused(flats: list[FringeFlat]) -> None:
+    """The published fit took 1 - R - T for the signal; these flats are not made of it, and no pixel is sure."""
     with pytest.raises(InputError, match="good pixels of the thickness map"):
         fit(flats, observable="total", range_um=[12.0, 14.5])
-    found = fit(flats, observable="total", range_um=[12.0, 14.5], slip_limit=1.0)
-    good = np.isfinite(found.value)
-    off_um = np.abs(found.value - frames.truth.thickness_um)[good]
-    assert 0.1 < np.median(off_um) % 0.3 < 0.2
 
 
 def test_missing_wavelengths_are_listed(flats: list[FringeFlat]) -> None:

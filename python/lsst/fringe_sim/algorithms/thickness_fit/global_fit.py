@@ -24,7 +24,7 @@ from .conclusion import contrast_map, model_error
 from .evidence import OrderEvidence, order_evidence, refine_cells
 from .learning import LearningCells, first_nuisances, learn, rank_orders, sample_blocks
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
-from .nuisances import NuisanceFit, Nuisances, add_offset, subtract_offset
+from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, subtract_offset
 from .orders import SURE, solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
 from .relaxation import SettledCells, settle_orders
@@ -50,8 +50,9 @@ _NINTH_DECILE = 1.28
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
-_MOST_PROBED = 20_000
-"""Cells of a sensor that may hold too few orders for light and contrast to be told."""
+_HOPELESS = 25.0
+"""Reduced chi-square of cells beyond which the model as it is need not be solved: the mean over the range of
+thicknesses in the place of that of the sensor costs a few."""
 _MISFIT = 1.5
 """Reduced chi-square of cells from which on a model is known to be wrong; what it leaves over is shared by many."""
 _MEAN_TOLERANCE = 2e-6
@@ -167,7 +168,7 @@ def global_fit(
         threads=threads,
     )
     independence = cell_independence(size, data.noise_correlation_px)
-    solver = _Solver(order, range_um, independence, nuisances, threads, templates)
+    solver = _Solver(order, range_um, independence, nuisances, threads, data, templates)
     state = solver.solve(cells, templates)
     settled = settle_orders(
         state.cells, state.templates, state.thickness_um, state.slope_y, state.slope_x, order, state.found,
@@ -224,6 +225,8 @@ class _State:
     """Whether mean response and orders were found together, by a search that may have missed the true ones."""
     free: Nuisances = field(default_factory=Nuisances)
     margin: float = np.inf
+    described: bool = False
+    """Whether the model as it is describes the flats, so that the orders are those that it gives."""
 
     @property
     def misfit(self) -> float:
@@ -242,21 +245,17 @@ class _Solver:
     temper: float
     free: Nuisances
     threads: int
+    data: Amplitudes
     base: FringeTemplates | None = None
 
     def solve(self, cells: Cells, templates: FringeTemplates) -> _State:
         """Solve the orders, and again if the model turns out to be another than was thought."""
         if not self.free.any:
             return self._solve_held(cells, templates)
-        if np.isfinite(self.free.gain_accuracy) and np.prod(cells.shape) <= _MOST_PROBED:
-            # Light and contrast of a sensor of few orders cannot be told from its fringes.
-            held = replace(self, free=Nuisances())
-            nothing = NuisanceFit.none(templates.n_wavelengths)
-            probe = held._state(cells, templates, nothing, "range", self.range_um)
-            if held._mean_is_open(probe) or not held._is_wide(probe):
-                state = held.solve(cells, templates)
-                if state.misfit < _MISFIT:
-                    return state
+        if np.isfinite(self.free.gain_accuracy):
+            described = self._described(cells, templates)
+            if described is not None:
+                return described
         nuisance = first_nuisances(cells, templates, self.free)
         for turn in range(_MOST_SOLUTIONS):
             fitted = nuisance.applied_to(templates)
@@ -267,6 +266,42 @@ class _Solver:
                 break
             nuisance = state.nuisance
         return state
+
+    def _described(self, cells: Cells, templates: FringeTemplates) -> _State | None:
+        """Solution with the model as it is, if that describes the flats; what is free then moves no order.
+
+        Light and contrast of a sensor of few orders cannot be told from its fringes: there they stay as they are.
+        """
+        held = replace(self, free=Nuisances())
+        nothing = NuisanceFit.none(templates.n_wavelengths)
+        probe = held._state(cells, templates, nothing, "range", self.range_um)
+        narrow = held._mean_is_open(probe) or not held._is_wide(probe)
+        if not narrow and probe.misfit > _HOPELESS:
+            return None
+        state = held.solve(cells, templates)
+        misfit, scatter = self._misfit_of_pixels(state)
+        if misfit > 1.0 + scatter:
+            return None
+        if narrow:
+            return state
+        count = patterns_of_cells(cells, self.free, *np.zeros((2, 1), np.intp))[0].shape[-1]
+        start = NuisanceFit.none(templates.n_wavelengths, count)
+        return self._learn(replace(state, free=self.free, nuisance=start, described=True), ranked=False)
+
+    def _misfit_of_pixels(self, state: _State) -> tuple[float, float]:
+        """Median reduced chi-square of single pixels, and three of its standard deviations under noise."""
+        if not np.isfinite(state.thickness_um).any():
+            return np.inf, 0.0
+        surface = calm_surface(_surface(state, self.order_um), self.threads)
+        sample, *begun = _sample_on(self.data, surface, state.templates, self.threads)
+        _, fitted = normalise_to_cells(sample, *begun)
+        found = order_evidence(
+            sample, fitted, self.order_um, range_um=state.range_um, temper=1.0, threads=self.threads
+        )
+        known = np.isfinite(found.chi2)
+        freedom = np.maximum(sample.n_wavelengths - 1, 1)[known]
+        misfit = float(np.median(found.chi2[known] / freedom)) if known.any() else np.inf
+        return misfit, 3.0 * float(np.sqrt(np.pi / max(freedom.sum(), 1)))
 
     def _solve_held(self, cells: Cells, templates: FringeTemplates) -> _State:
         """Solve the orders where nothing is free but the mean response."""
@@ -390,7 +425,7 @@ class _Solver:
     def adjust(self, state: _State) -> _State:
         """Fit mean response and nuisances to the cells, the orders being as they are, but for a common one."""
         if state.free.any:
-            return self._learn(state, ranked=True)
+            return self._learn(state, ranked=not state.described)
         if state.normalisation == "range":
             return state
         if state.normalisation == "narrow":  # refitting and renormalising in turn would crawl
@@ -522,10 +557,17 @@ def _normalise_to_pixels(
     data: Amplitudes, templates: FringeTemplates, surface: CellSurface, threads: int
 ) -> FringeTemplates:
     """Renormalise to single pixels: a steep cell spreads over a part of a fringe that its mean does not show."""
+    return normalise_to_cells(*_sample_on(data, surface, templates, threads))[1]
+
+
+def _sample_on(
+    data: Amplitudes, surface: CellSurface, templates: FringeTemplates, threads: int
+) -> tuple[Cells, FringeTemplates, NDArray[np.float32], int]:
+    """Some single pixels, and where they begin, as `normalise_to_cells` takes them."""
     sample = sample_pixels(data)
     start = surface.at(sample.y_edges[:-1], sample.x_edges[:-1])
     start[sample.n_wavelengths == 0] = np.nan
-    return normalise_to_cells(sample, templates, start, threads)[1]
+    return sample, templates, start, threads
 
 
 def choose_cell_size(data: Amplitudes) -> int:
