@@ -9,6 +9,7 @@ from astropy.table import Table
 
 from ..algorithms.amplitude_table import CASES, SkyCase, compare_amplitudes
 from ..errors import FrameFormatError
+from ..files import table_text, write_whole
 from ..mock.thickness import e2v_321
 from .inputs import prepare_folder, read_settings, read_thickness
 from .parameters import BUILT_IN, EFFECT, effect_settings
@@ -76,7 +77,7 @@ def amplitudes(
     for sentence in table.meta["contradiction"]:
         click.echo(sentence)
     if folder is not None:
-        table.write(folder / "amplitudes.ecsv", format="ascii.ecsv", overwrite=True)
+        write_whole(folder / "amplitudes.ecsv", table_text(table))
         click.echo(str(folder / "amplitudes.ecsv"))
 
 

@@ -82,15 +82,15 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises
     ------
     InputError
-        The file is not YAML, not a mapping, or an override with anything in it but effects and their numbers.
+        The file is empty, not YAML, not a mapping, or an override that is not whole or has anything in it but effects
+        and their numbers.
     """
     if Path(path).suffix == ".py":
         return dict(read_effects_override(_text_of(path), str(path)))
     content = read_user_yaml(path, "settings file")
-    if content is None:
-        return {}
     if not isinstance(content, dict):
-        raise InputError("settings file", type(content).__name__, "a mapping", source=str(path))
+        found = "empty" if content is None else type(content).__name__
+        raise InputError("settings file", found, "a mapping, {} for no effects", source=str(path))
     return content
 
 
