@@ -96,7 +96,8 @@ def discover(
     Raises
     ------
     InputError
-        The flats are simulated without noise; the set-up contradicts them (temperature, bandpass), or is not one of a laboratory.
+        The flats are simulated without noise; the set-up contradicts them (temperature, bandpass), or is not one of
+        a laboratory.
     """
     model = setup if isinstance(setup, FringeModel) else FringeModel.from_setup(setup)
     refuse_noiseless(cube.metadata, cube.detector or None)

@@ -402,8 +402,8 @@ def discover_sky(
     Raises
     ------
     InputError
-        No frames, frames of different shapes, sensors or airmass, already corrected or without noise, a map of another shape, a
-        set-up of a laboratory; bands that nobody states.
+        No frames, frames of different shapes, sensors or airmass, already corrected or without noise, a map of
+        another shape, a set-up of a laboratory; bands that nobody states.
     UnknownNameError
         A factor on a component that the sky does not have.
     """

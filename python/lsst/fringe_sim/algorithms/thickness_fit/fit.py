@@ -100,7 +100,8 @@ def fit_thickness(
     UnknownNameError
         An unknown method or observable.
     InputError, OutOfRangeError
-        No good pixel, simulated flats without noise, a range that holds less than two orders, a start pixel outside the sensor.
+        No good pixel, simulated flats without noise, a range that holds less than two orders, a start pixel
+        outside the sensor.
     """
     if method not in FIT_METHODS:
         raise UnknownNameError("method", method, FIT_METHODS)
