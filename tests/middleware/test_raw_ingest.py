@@ -219,6 +219,27 @@ def test_bad_files_stay_out_and_the_others_go_in(butler: Butler, tmp_path: Path)
         assert part in found
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"DATE-OBS": "2118-07-24T10:00:00"},
+        {"DATE-OBS": "1918-07-24T10:00:00"},
+        {"DATE-OBS": None, "MJD-OBS": 2458324.0},
+        {"DATE-OBS": None, "MJD-OBS": -2458324.0},
+    ],
+)
+def test_a_time_that_no_repository_holds_stops_one_file(
+    header: dict[str, Any], butler: Butler, tmp_path: Path
+) -> None:
+    series(tmp_path / "raw")
+    write_raw(tmp_path / "raw" / "wrong.fits", header)
+    report = ingest_raws(butler, [str(tmp_path / "raw")])
+    assert len(report.ingested) == 5
+    (message,) = report.refused
+    assert "wrong.fits" in message
+    assert "\n" not in message
+
+
 def test_instrument_that_is_not_registered_is_named(tmp_path: Path) -> None:
     from lsst.daf.butler import Config
 
