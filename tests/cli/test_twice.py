@@ -158,12 +158,17 @@ def recover(repo: Path, folder: Path) -> list[list[str]]:
     return [["recover-fringe-repo", str(repo)]]
 
 
+def prepare(repo: Path, folder: Path) -> list[list[str]]:
+    return [["prepare-fringe-repo", str(repo)]]
+
+
 SUBCOMMANDS: dict[str, Callable[[Path, Path], list[list[str]]]] = {
     "ingest-fringe-raws": ingest,
     "define-fringe-night": night,
     "adopt-sensor-datasets": adopt,
     "write-fringe-handoff": hand_off,
     "recover-fringe-repo": recover,
+    "prepare-fringe-repo": prepare,
 }
 
 

@@ -21,7 +21,7 @@ from toy_repository import Invoke
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.raw_files import find_raw_files
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_header
-from lsst.fringe_sim.middleware import get_cli_subcommands, raw_ingest
+from lsst.fringe_sim.middleware import Ts8Fringe, get_cli_subcommands, raw_ingest
 from lsst.fringe_sim.middleware.raw_ingest import IngestReport, ingest_raws
 from lsst.fringe_sim.middleware.translators import TRANSLATORS
 
@@ -357,6 +357,25 @@ def test_command_reports_and_sets_its_exit_status(repo: Path, tmp_path: Path, in
     nothing = invoke("ingest-fringe-raws", repo, tmp_path / "empty")
     assert nothing.exit_code == 1
     assert "path is" in nothing.output
+
+
+def test_a_repository_of_others_is_prepared_first(tmp_path: Path, invoke: Invoke) -> None:
+    repo = tmp_path / "repo"
+    Butler.makeRepo(str(repo))
+    with Butler.from_config(str(repo), writeable=True) as butler:
+        Ts8Fringe().register(butler.registry)
+    series(tmp_path / "raw")
+    refused = invoke("ingest-fringe-raws", repo, tmp_path / "raw", "--transfer", "copy")
+    assert refused.exit_code == 1
+    assert "prepare-fringe-repo" in refused.output
+    before = yaml.safe_load((repo / "butler.yaml").read_text())
+    assert invoke("prepare-fringe-repo", repo).exit_code == 0
+    after = yaml.safe_load((repo / "butler.yaml").read_text())
+    assert after["registry"] == before["registry"]
+    assert "nothing is missing" in invoke("prepare-fringe-repo", repo).output
+    assert invoke("ingest-fringe-raws", repo, tmp_path / "raw", "--transfer", "copy").exit_code == 0
+    with Butler.from_config(str(repo)) as butler:
+        assert isinstance(butler.get(raws(butler)[0]), RawFrame)
 
 
 def test_commands_say_when_there_is_no_repository(tmp_path: Path, invoke: Invoke) -> None:

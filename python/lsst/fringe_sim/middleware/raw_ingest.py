@@ -223,9 +223,9 @@ def _check_time(info: ObservationInfo) -> None:
     """Refuse an exposure at a time that no repository can hold."""
     first, last = TimeConverter().epoch, TimeConverter().max_time
     for time in (info.datetime_begin, info.datetime_end):
-        if not first <= time <= last:
+        if time is None or not first <= time <= last:
             allowed = f"a time from {first.isot[:10]} to {last.isot[:10]}, which a repository can hold"
-            raise FrameFormatError("DATE-OBS or MJD-OBS", time.isot, allowed)
+            raise FrameFormatError("DATE-OBS or MJD-OBS", str(time), allowed)
 
 
 def _agreeing(exposures: Sequence[RawExposure]) -> tuple[list[RawExposure], list[str]]:
