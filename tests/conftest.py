@@ -44,6 +44,14 @@ def shared_dir() -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def trials(shared_dir: Path) -> Path:
+    """Folder of small inputs that broke something once, beside a development checkout; skips where it is absent."""
+    if not (shared_dir / "trials").is_dir():
+        pytest.skip(f"no trials in {shared_dir}")
+    return shared_dir / "trials"
+
+
 @pytest.fixture
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """Generator seeded by the name in the test's ``@pytest.mark.rng("name")`` and by the values it is run with."""

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import errno
+import itertools
 import os
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from lsst.fringe_sim.files import all_or_nothing, write_whole
+from lsst.fringe_sim.files import all_or_nothing, write_together, write_whole
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -61,6 +67,45 @@ def test_two_writers_at_once_do_not_mix(tmp_path: Path) -> None:
         second.write_text("second")
     assert path.read_text() == "first"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_writer_left_is_cleared_by_the_next(tmp_path: Path) -> None:
+    path = tmp_path / "one.txt"
+    other = tmp_path / ".two.txt.0123456789ab.part"  # of another file
+    other.write_text("of two.txt")
+    program = (
+        "import os, signal, sys, pathlib; from lsst.fringe_sim.files import all_or_nothing\n"
+        "with all_or_nothing(pathlib.Path(sys.argv[1])) as part:\n"
+        "    part.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    subprocess.run([sys.executable, "-c", program, str(path)], check=False)
+    assert len(list(tmp_path.glob(".one.txt.*"))) == 1
+    write_whole(path, "whole")
+    assert sorted(tmp_path.iterdir()) == sorted([path, other])
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace", "unlink"])
+@pytest.mark.parametrize("number", range(7))
+def test_files_of_two_writes_never_stand_beside_the_index(
+    call: str, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("a", "b", "index")
+    write_together(tmp_path, dict.fromkeys(names, "old"))
+    left = itertools.count()
+
+    def stopping(*arguments: Any, **options: Any) -> Any:
+        if next(left) == number:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return original(*arguments, **options)
+
+    original = getattr(os, call)
+    with monkeypatch.context() as patched, suppress(OSError):
+        patched.setattr(os, call, stopping)
+        write_together(tmp_path, dict.fromkeys(names, "new"))
+    found = {path.name: path.read_text() for path in tmp_path.iterdir() if path.name in names}
+    assert "index" not in found or len(set(found.values())) == 1
+    write_together(tmp_path, dict.fromkeys(names, "newest"))
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(names, "newest")
 
 
 def test_a_folder_that_is_missing_is_said(tmp_path: Path) -> None:

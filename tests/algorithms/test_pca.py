@@ -353,3 +353,20 @@ def test_bad_input_is_named(frames, response, thickness):
         project(frames[0], np.stack([frames[1], frames[1]]), 1.0)
     with pytest.raises(InputError, match="good pixels"):
         project(frames[0], frames[1:3], 1.0, np.ones((60, 47)))
+
+
+@pytest.mark.rng("rank")
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_no_more_components_than_the_rank(rng, kind) -> None:
+    a, b, c = rng.standard_normal((3, 40, 50)).astype(kind)
+    frames = [a, b, c, a]
+    for number in (3, 4):
+        with pytest.raises(OutOfRangeError, match="1 to 2, the rank"):
+            fit_pca(frames, n_components=number)
+    found = fit_pca(frames, n_components=2)
+    for component in found.components:
+        assert np.linalg.norm(component) == pytest.approx(1.0, rel=1e-5)
+    small = list(rng.standard_normal((20, 3, 3)).astype(kind))
+    with pytest.raises(OutOfRangeError, match="1 to 9, the rank"):
+        fit_pca(small, n_components=12)
+    assert fit_pca(small, n_components=9).n_components == 9

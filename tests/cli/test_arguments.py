@@ -21,6 +21,7 @@ from lsst.fringe_sim.cli.main import cli, run
 from lsst.fringe_sim.cli.parameters import EFFECT, LABORATORY, SKY
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.instrument.raw_frame import read_raw_metadata
+from lsst.fringe_sim.model.effects_override import effects_override
 
 SETUPS = Path(lsst.fringe_sim.__file__).parent / "data" / "setups"
 COMMANDS = cli.list_commands(click.Context(cli))
@@ -183,6 +184,37 @@ def test_overrides_may_be_written_by_hand(tmp_path: Path) -> None:
     path = tmp_path / "effects.py"
     path.write_text("\n# mine\nconfig.effects['bandwidth.fwhm']=2.6  # nm\n", encoding="utf-8")
     assert read_settings(path) == {"bandwidth.fwhm": 2.6}
+
+
+def test_an_override_of_a_search_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "effects.py"
+    effects = {"bandwidth.fwhm": 2.3125, "roughness.sigma": 12.5, "ar_coating.scale": 1.01}
+    for found in (effects, {}):
+        text = effects_override(found, "ts8_e2v", "named", known={"bandwidth.fwhm": 2.0} if found else None)
+        path.write_text(text)
+        assert read_settings(path) == found
+        for end in range(len(text) - 1):  # the last character is a line break
+            path.write_text(text[:end])
+            with pytest.raises(InputError, match=re.escape(str(path))):
+                read_settings(path)
+
+
+@pytest.mark.parametrize("name", ["effects_disk_full.py", "effects_quota.py"])
+def test_what_a_full_disk_has_left_is_no_override(name: str, trials: Path, tmp_path: Path, capsys) -> None:
+    path = trials / name
+    assert run(["fit", "none.fits", "--effects-file", str(path), "--out", str(tmp_path / "fit")]) == 1
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert name in message
+
+
+def test_an_empty_settings_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "effects.yaml"
+    path.write_text("")
+    with pytest.raises(InputError, match="empty"):
+        read_settings(path)
+    path.write_text("{}")
+    assert read_settings(path) == {}
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -29,7 +29,6 @@ def sky(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
         "--thickness",
         str(thickness),
         "--night",
-        "--noise",
         "--out",
         str(out),
     ]

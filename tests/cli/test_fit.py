@@ -5,15 +5,21 @@ from __future__ import annotations
 import base64
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from raw_frame_maker import write_raw
 
+from lsst.fringe_sim.algorithms.flat_prep_options import FlatPrepOptions
+from lsst.fringe_sim.cli.lab_frames import find_series
 from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.mock.thickness import e2v_321
+from lsst.fringe_sim.model import Setup
 from lsst.fringe_sim.products import FringeCube, ThicknessMap
 
 SIZE = (500, 512)
@@ -152,6 +158,14 @@ def test_a_saturated_flat_is_refused(copy, tmp_path, capsys) -> None:
             hdu.data[:] = 250_000
     assert run(["fit", str(copy), "--out", str(tmp_path / "fit")]) == 1
     assert victim.name in capsys.readouterr().err
+
+
+def test_an_error_in_a_flat_names_its_file(tmp_path) -> None:
+    raw = write_raw(tmp_path / "one.fits", {})
+    series = find_series([str(raw)])
+    with pytest.raises(InputError) as caught:
+        series.read(replace(Setup.from_name("ts8_e2v"), f_number=-1.0), FlatPrepOptions(), lambda: None)
+    assert caught.value.source == str(raw)
 
 
 def test_two_sensors_are_refused(copy, tmp_path, capsys) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 
 import click
 import pytest
@@ -99,3 +102,30 @@ def test_sizes_and_effects() -> None:
         SIZE.convert("512", None, None)
     with pytest.raises(click.BadParameter):
         EFFECT.convert("bandwidth=2.4", None, None)
+
+
+def in_a_process(program: str, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    """Run a command that does something else in place of ``setups``."""
+    start = (
+        "import click, os, signal\n"
+        "from lsst.fringe_sim.cli import catalogue\nfrom lsst.fringe_sim.cli.main import main\n"
+        f"@click.command()\ndef setups():\n    {program}\n"
+        "catalogue.setups = setups\nmain(['setups'])"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", start], capture_output=True, check=False, env={**os.environ, **environment}
+    )
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii", "utf-8"])
+def test_a_terminal_that_lacks_a_letter_ends_no_command(encoding: str) -> None:
+    done = in_a_process("click.echo('σ = 1 µm'); click.echo('σ', err=True)", PYTHONIOENCODING=encoding)
+    assert done.returncode == 0, done.stderr
+    assert b"= 1" in done.stdout
+    assert b"Traceback" not in done.stderr
+
+
+def test_ctrl_c_is_one_line_and_status_130() -> None:
+    done = in_a_process("os.kill(os.getpid(), signal.SIGINT)")
+    assert done.returncode == 130
+    assert done.stderr.split() == [b"Stopped."]

@@ -32,7 +32,8 @@ def thickness(tmp_path_factory) -> str:
 def usual(thickness, tmp_path_factory) -> Path:
     """What the command writes for the middle of the field."""
     out = tmp_path_factory.mktemp("sky")
-    assert run(["sky", "--thickness", thickness, "--detector", "R22_S11", "--out", str(out)]) == 0
+    given = ["--thickness", thickness, "--detector", "R22_S11", "--noiseless"]
+    assert run(["sky", *given, "--out", str(out)]) == 0
     return out
 
 
@@ -48,7 +49,7 @@ def test_one_frame_is_written_with_its_errors(usual) -> None:
 @pytest.mark.slow
 def test_the_sky_of_the_command_is_that_of_the_task(thickness, tmp_path) -> None:
     """One map has one sky: the beam of every pixel in both."""
-    arguments = ["--detector", "R10_S00", "--airmass", str(AIRMASS), "--out", str(tmp_path)]
+    arguments = ["--detector", "R10_S00", "--airmass", str(AIRMASS), "--noiseless", "--out", str(tmp_path)]
     assert run(["sky", "--thickness", thickness, *arguments]) == 0
     frame = SkyFringe.read_fits(tmp_path / "sky_R10_S00_00.fits")
     layer = np.asarray(fits.getdata(thickness), np.float32)
@@ -80,12 +81,26 @@ def test_fringes_fade_towards_the_edge_of_the_field(thickness, usual, tmp_path) 
     assert edge < 0.5 * middle
 
 
+def test_frames_have_noise_unless_they_say_otherwise(thickness, usual, tmp_path, capsys) -> None:
+    assert run(["sky", "--thickness", thickness, "--detector", "R22_S11", "--out", str(tmp_path / "a")]) == 0
+    noisy, clean = (SkyFringe.read_fits(out / "sky_R22_S11_00.fits") for out in (tmp_path / "a", usual))
+    left = (noisy.image - clean.image)[noisy.mask == 0]
+    variance = clean.mean_electrons + float(noisy.metadata["RDNOISE"]) ** 2
+    assert np.var(left, dtype=float) == pytest.approx(variance, rel=5 * np.sqrt(2.0 / left.size))
+    capsys.readouterr()
+    search = ["discover", str(usual), "--setup", "lsst_e2v", "--thickness", thickness]
+    assert run([*search, "--out", str(tmp_path / "b")]) == 1
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "noise" in message
+
+
 @pytest.mark.slow
 def test_noise_is_seeded(thickness, tmp_path) -> None:
     images = []
     for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
         out = tmp_path / name
-        assert run(["sky", "--thickness", thickness, "--noise", "--seed", seed, "--out", str(out)]) == 0
+        assert run(["sky", "--thickness", thickness, "--seed", seed, "--out", str(out)]) == 0
         images.append(SkyFringe.read_fits(out / "sky_R22_S11_00.fits").image)
     np.testing.assert_array_equal(images[0], images[1])
     assert not np.array_equal(images[0], images[2])

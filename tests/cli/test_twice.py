@@ -43,7 +43,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     ),
     "plan-flats": ("--ecsv", "OUT/plan.ecsv", "--wavelengths", "880:990:20", "--candidates", "900,910"),
     "fit": ("CUBE", "--out", "OUT"),
-    "sky": ("--thickness", "MAP", "--noise", "--out", "OUT"),
+    "sky": ("--thickness", "MAP", "--out", "OUT"),
     "focal-plane": ("--sensor", "R22_S11", "--nights", "1", "--out", "OUT"),
     "export": ("CUBE", "--out", "OUT"),
     "amplitudes": ("--thickness", "MAP", "--lines", "LINES", "--case", "MonoCam", "--out", "OUT"),
@@ -158,12 +158,17 @@ def recover(repo: Path, folder: Path) -> list[list[str]]:
     return [["recover-fringe-repo", str(repo)]]
 
 
+def prepare(repo: Path, folder: Path) -> list[list[str]]:
+    return [["prepare-fringe-repo", str(repo)]]
+
+
 SUBCOMMANDS: dict[str, Callable[[Path, Path], list[list[str]]]] = {
     "ingest-fringe-raws": ingest,
     "define-fringe-night": night,
     "adopt-sensor-datasets": adopt,
     "write-fringe-handoff": hand_off,
     "recover-fringe-repo": recover,
+    "prepare-fringe-repo": prepare,
 }
 
 

@@ -289,3 +289,13 @@ def test_bad_input_is_named():
         EmissionLines(np.array([2.0, 1.0]), np.ones(2), np.ones(2), np.array(["8-4", "8-4"]))
     with pytest.raises(InputError, match="one common shape"):
         EmissionLines(np.ones(3), np.ones(2), np.ones(2), np.array(["8-4", "8-4"]))
+
+
+@pytest.mark.parametrize(
+    ("wavelength", "transmission", "words"),
+    [(9400.0, 0.9, "wavelength of a line"), (0.94, 0.9, "wavelength of a line"), (940.0, -1.0, "transmission"),
+     (940.0, 1.1, "transmission")],
+)  # fmt: skip
+def test_lines_of_another_unit_are_refused(wavelength: float, transmission: float, words: str) -> None:
+    with pytest.raises(OutOfRangeError, match=words):
+        EmissionLines(np.array([wavelength]), np.ones(1), np.array([transmission]), np.array(["8-4"]))

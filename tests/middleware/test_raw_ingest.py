@@ -21,7 +21,7 @@ from toy_repository import Invoke
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.raw_files import find_raw_files
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_header
-from lsst.fringe_sim.middleware import get_cli_subcommands, raw_ingest
+from lsst.fringe_sim.middleware import Ts8Fringe, get_cli_subcommands, raw_ingest
 from lsst.fringe_sim.middleware.raw_ingest import IngestReport, ingest_raws
 from lsst.fringe_sim.middleware.translators import TRANSLATORS
 
@@ -219,6 +219,27 @@ def test_bad_files_stay_out_and_the_others_go_in(butler: Butler, tmp_path: Path)
         assert part in found
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"DATE-OBS": "2118-07-24T10:00:00"},
+        {"DATE-OBS": "1918-07-24T10:00:00"},
+        {"DATE-OBS": None, "MJD-OBS": 2458324.0},
+        {"DATE-OBS": None, "MJD-OBS": -2458324.0},
+    ],
+)
+def test_a_time_that_no_repository_holds_stops_one_file(
+    header: dict[str, Any], butler: Butler, tmp_path: Path
+) -> None:
+    series(tmp_path / "raw")
+    write_raw(tmp_path / "raw" / "wrong.fits", header)
+    report = ingest_raws(butler, [str(tmp_path / "raw")])
+    assert len(report.ingested) == 5
+    (message,) = report.refused
+    assert "wrong.fits" in message
+    assert "\n" not in message
+
+
 def test_instrument_that_is_not_registered_is_named(tmp_path: Path) -> None:
     from lsst.daf.butler import Config
 
@@ -336,6 +357,25 @@ def test_command_reports_and_sets_its_exit_status(repo: Path, tmp_path: Path, in
     nothing = invoke("ingest-fringe-raws", repo, tmp_path / "empty")
     assert nothing.exit_code == 1
     assert "path is" in nothing.output
+
+
+def test_a_repository_of_others_is_prepared_first(tmp_path: Path, invoke: Invoke) -> None:
+    repo = tmp_path / "repo"
+    Butler.makeRepo(str(repo))
+    with Butler.from_config(str(repo), writeable=True) as butler:
+        Ts8Fringe().register(butler.registry)
+    series(tmp_path / "raw")
+    refused = invoke("ingest-fringe-raws", repo, tmp_path / "raw", "--transfer", "copy")
+    assert refused.exit_code == 1
+    assert "prepare-fringe-repo" in refused.output
+    before = yaml.safe_load((repo / "butler.yaml").read_text())
+    assert invoke("prepare-fringe-repo", repo).exit_code == 0
+    after = yaml.safe_load((repo / "butler.yaml").read_text())
+    assert after["registry"] == before["registry"]
+    assert "nothing is missing" in invoke("prepare-fringe-repo", repo).output
+    assert invoke("ingest-fringe-raws", repo, tmp_path / "raw", "--transfer", "copy").exit_code == 0
+    with Butler.from_config(str(repo)) as butler:
+        assert isinstance(butler.get(raws(butler)[0]), RawFrame)
 
 
 def test_commands_say_when_there_is_no_repository(tmp_path: Path, invoke: Invoke) -> None:

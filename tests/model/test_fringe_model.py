@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from astropy import units
 
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.model import FringeModel
@@ -107,3 +108,22 @@ def test_wavelengths_outside_the_tables_are_refused(model) -> None:
 def test_impossible_thicknesses_are_refused(model, thickness) -> None:
     with pytest.raises(OutOfRangeError, match="thickness"):
         model.response([14.0, thickness], [960.0])
+
+
+def test_quantities_are_converted_or_refused(model) -> None:
+    plain = model.response([16.0, 16.1], [960.0])
+    given = model.response([16000.0, 16100.0] * units.nm, [0.96] * units.um)
+    np.testing.assert_allclose(given, plain, rtol=1e-12)
+    slope = model.thickness_derivative(0.016 * units.mm, 9600 * units.AA)
+    np.testing.assert_allclose(slope, model.thickness_derivative(16.0, 960.0), rtol=1e-9)
+    for thickness, wavelength in ((16.0 * units.s, 960.0), (16.0, 960.0 * units.K)):
+        with pytest.raises(InputError, match="quantity"):
+            model.response(thickness, wavelength)
+
+
+def test_lengths_in_another_unit_are_named(model) -> None:
+    with pytest.raises(OutOfRangeError, match=r"wavelength \[nm\] is 0\.96;"):
+        model.response([16], [0.96])
+    for thickness in (16000.0, 0.016):
+        with pytest.raises(OutOfRangeError, match=r"thickness of adhesive \[um\]"):
+            model.response([thickness], [960.0])

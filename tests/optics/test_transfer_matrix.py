@@ -212,3 +212,29 @@ def test_trailing_axes_broadcast() -> None:
 def test_bad_input_is_named(arguments: tuple, error: type[Exception], field: str) -> None:
     with pytest.raises(error, match=field):
         layer_absorption(*arguments)
+
+
+@pytest.mark.parametrize("polarization", ["s", "p"])
+def test_grazing_light_is_reflected_by_anything_but_its_own_medium(polarization: str) -> None:
+    angles = np.array([0.5 * np.pi - 1e-6, 0.5 * np.pi - 1e-9, np.nextafter(0.5 * np.pi, 0.0)])
+    for index in ([1.0, 1.5], [1.5, 1.0], [1.0, 3.6 + 0.01j]):
+        fraction = layer_absorption(index, [np.inf, np.inf], 950.0, angles, polarization)
+        np.testing.assert_allclose(fraction, [[1.0] * 3, [0.0] * 3], atol=2e-5)
+        np.testing.assert_allclose(fraction[:, 1:], [[1.0] * 2, [0.0] * 2], atol=2e-8)
+    same = layer_absorption([1.5, 1.5], [np.inf, np.inf], 950.0, angles, polarization)
+    np.testing.assert_allclose(same, [[0.0] * 3, [1.0] * 3], atol=1e-12)
+
+
+@pytest.mark.parametrize("polarization", ["s", "p"])
+@pytest.mark.parametrize("ambient", [1.45, 1.5, 2.0, 3.6])
+def test_a_layer_at_its_critical_angle_is_the_limit_of_its_neighbours(
+    ambient: float, polarization: str
+) -> None:
+    critical = np.arcsin(1.0 / ambient)
+    angles = critical + np.array([-1e-9, 0.0, 1e-9])
+    fraction = layer_absorption([ambient, 1.0, ambient], [np.inf, 200.0, np.inf], 950.0, angles, polarization)
+    np.testing.assert_allclose(fraction[:, [0, 2]], fraction[:, [1, 1]], atol=2e-7)
+    np.testing.assert_allclose(fraction.sum(axis=0), 1.0, atol=1e-7)
+    bare = layer_absorption([ambient, 1.0], [np.inf, np.inf], 950.0, critical, polarization)
+    # What is transmitted rises with the root of the distance from the angle, which is known to rounding only.
+    np.testing.assert_allclose(bare, [1.0, 0.0], atol=8.0 * ambient**2 * np.sqrt(np.finfo(float).eps))

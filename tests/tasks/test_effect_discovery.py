@@ -179,6 +179,7 @@ def test_the_fit_is_better_with_what_was_found(
 
 
 def sky_of(thickness: ThicknessMap, config: SkyFringeSimConfig) -> SkyFringe:
+    config.noise = False
     config.validate()
     exposure = SkyExposure(7026112100660, 20261121, 20.0, 30.0, 1.2, "y_10")
     detector = Camera.from_name("lsstCam").detector("R22_S11")

@@ -5,6 +5,7 @@ import pytest
 from lsst.pex.config import FieldValidationError
 
 from lsst.fringe_sim.effects import EFFECTS, Effect
+from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.tasks import (
@@ -177,3 +178,12 @@ def test_choices_of_the_preparation_are_checked_with_the_field_named() -> None:
     made = IsrFlatPrepConfig(clip_sigma=0.5)
     with pytest.raises(FieldValidationError, match=r"clip_sigma is 0\.5"):
         made.validate()
+
+
+@pytest.mark.parametrize(("field", "name"), [("rafts", "RTM-020"), ("sensors", "R11_S01")])
+def test_an_entry_that_is_not_there_is_said(field: str, name: str) -> None:
+    made = config()
+    with pytest.raises(InputError, match=f"{name}.*none yet.*Config"):
+        getattr(made, field)[name]
+    assert name not in getattr(made, field)
+    assert getattr(made, field).get(name) is None

@@ -154,6 +154,16 @@ def test_contracts_refuse_tasks_that_do_not_fit_together(
         configs(pipeline)
 
 
+@pytest.mark.parametrize(
+    "name", [name for name in FILES if not name.endswith(("Flats.yaml", "iscovery.yaml"))]
+)
+def test_templates_are_made_of_frames_without_noise(name: str) -> None:
+    tasks = configs(load(name))
+    if {"skyFringeSim", "fringePca"} <= set(tasks):
+        assert not tasks["skyFringeSim"].noise
+    assert SkyFringeSimConfig().noise
+
+
 def test_one_override_file_reaches_fit_and_sky(tmp_path: Path) -> None:
     path = tmp_path / "effects.py"
     path.write_text("config.effects['roughness.sigma'] = 25.0\nconfig.effects['bandwidth.fwhm'] = 2.4\n")

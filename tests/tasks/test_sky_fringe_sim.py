@@ -45,7 +45,7 @@ def thickness(**changes: Any) -> ThicknessMap:
 def run(
     thickness_map: ThicknessMap | None = None, exposure: SkyExposure = EXPOSURE, **config: Any
 ) -> SkyFringe:
-    made = SkyFringeSimConfig(**({"beams": "centre", "level": "model"} | config))
+    made = SkyFringeSimConfig(**({"beams": "centre", "level": "model", "noise": False} | config))
     made.validate()
     given = thickness() if thickness_map is None else thickness_map
     sky: SkyFringe = SkyFringeSimTask(config=made).run(given, exposure, DETECTOR).sky

@@ -22,9 +22,15 @@ __all__ = [
     "ResourceError",
     "StackError",
     "UnknownNameError",
+    "printable_name",
+    "shown",
     "to_number",
     "without_unit",
 ]
+
+
+LONGEST_NAME, LONGEST_VALUE, LONGEST_MESSAGE = 200, 300, 2000
+"""Characters of a name from outside, and of what a message repeats of a value and says in all."""
 
 
 class FringeSimError(Exception):
@@ -55,7 +61,7 @@ class InputError(FringeSimError, ValueError):
 
     def __str__(self) -> str:
         where = f"{self.source}: " if self.source else ""
-        return f"{where}{self.field} is {_shown(self.value)}; allowed: {self.allowed}"
+        return shown(f"{where}{self.field} is {_repr(self.value)}; allowed: {self.allowed}", LONGEST_MESSAGE)
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword arguments survive the trip between processes.
@@ -74,12 +80,43 @@ def _rebuild_input_error(
     return error
 
 
-def _shown(value: object) -> str:
+def _repr(value: object) -> str:
     try:
-        return repr(value)
+        return shown(repr(value), LONGEST_VALUE)
     except ValueError:
         # Python writes no integer of more than a few thousand digits.
         return f"{type(value).__name__} too long to be shown"
+
+
+def shown(text: str, most: int) -> str:
+    """A text as a terminal can show it: nothing in it moves the cursor or ends a line.
+
+    The middle of a long one is left out.
+
+    Parameters
+    ----------
+    text : `str`
+        Anything.
+    most : `int`
+        Characters beyond which it is shortened.
+    """
+    if len(text) > most:
+        text = f"{text[: most // 2]} … {text[-most // 4 :]} ({len(text)} characters)"
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+
+
+def printable_name(field: str, name: str, *, source: str | None = None) -> str:
+    """A name from outside, which goes into headers, tables and programs.
+
+    Raises
+    ------
+    InputError
+        A name that is empty, longer than a header holds, or has control characters or half a character in it.
+    """
+    if not name.strip() or len(name) > LONGEST_NAME or not name.isprintable():
+        allowed = f"1 to {LONGEST_NAME} printable characters"
+        raise InputError(field, name, allowed, source=source)
+    return name
 
 
 class OutOfRangeError(InputError):

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import fcntl
+import io
 import os
+import re
 import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-__all__ = ["all_or_nothing", "write_whole"]
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+__all__ = ["all_or_nothing", "table_text", "write_together", "write_whole"]
 
 
 @contextmanager
@@ -22,23 +30,19 @@ def all_or_nothing(target: Path) -> Iterator[Path]:
     ----------
     target : `pathlib.Path`
         The file; an existing one is replaced. Where it is a link, the link is replaced and not what it points to.
+        What a writer of this file has left that was killed is cleared.
 
     Raises
     ------
     OSError
         The folder does not exist or cannot be written, or the disk is full.
     """
-    # A new name that nobody else has, never opened through a link that somebody has put there.
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.part")
-    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o666))
-    try:
+    with _temporary(target) as temporary:
         yield temporary
         _to_disk(temporary)
         os.replace(temporary, target)
         with suppress(OSError):  # some file systems of networks know no such thing for folders
             _to_disk(target.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_whole(path: str | os.PathLike[str], content: str | bytes) -> Path:
@@ -47,6 +51,93 @@ def write_whole(path: str | os.PathLike[str], content: str | bytes) -> Path:
     with all_or_nothing(target) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
     return target
+
+
+def write_together(folder: Path, contents: Mapping[str, str]) -> Path:
+    """Write files that belong together; the last of them is there only if all the others are those of this call.
+
+    All of them are complete under temporary names before the first gets its own.
+
+    Parameters
+    ----------
+    folder : `pathlib.Path`
+        An existing folder.
+    contents : mapping of `str` to `str`
+        Text of each file by its name. The last one is the index, by which readers find the others.
+
+    Returns
+    -------
+    index : `pathlib.Path`
+
+    Raises
+    ------
+    OSError
+        The folder does not exist or cannot be written, or the disk is full: the files of before are then untouched.
+    """
+    *_, index = contents
+    with ExitStack() as stack:
+        written = {name: stack.enter_context(_temporary(folder / name)) for name in contents}
+        for name, text in contents.items():
+            written[name].write_bytes(text.encode())
+            _to_disk(written[name])
+        # An index of before must not stand beside any file of now.
+        (folder / index).unlink(missing_ok=True)
+        for name, temporary in written.items():
+            os.replace(temporary, folder / name)
+        with suppress(OSError):
+            _to_disk(folder)
+    return folder / index
+
+
+def table_text(table: Table) -> str:
+    """A table as ECSV, for `write_whole` and `write_together`."""
+    text = io.StringIO()
+    table.write(text, format="ascii.ecsv")
+    return text.getvalue()
+
+
+@contextmanager
+def _temporary(target: Path) -> Iterator[Path]:
+    """A new empty file beside one to be written; it is gone in the end, if it has not been renamed.
+
+    It is locked as long as its writer lives: an unlocked one is what a killed writer has left.
+    """
+    _clear(target)
+    while True:
+        # A new name that nobody else has, never opened through a link that somebody has put there.
+        temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.part")
+        descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o666)
+        with suppress(OSError):  # some file systems have no locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if temporary.exists():  # else another writer cleared it before it was locked
+            break
+        os.close(descriptor)
+    try:
+        yield temporary
+    finally:
+        temporary.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _clear(target: Path) -> None:
+    """Remove temporary files of a target whose writers are dead."""
+    left: list[str] = []
+    name = re.compile(re.escape(f".{target.name}.") + r"[0-9a-f]{12}\.part")
+    with suppress(FileNotFoundError), os.scandir(target.parent) as entries:
+        left = [entry.path for entry in entries if name.fullmatch(entry.name)]
+    for path in left:
+        with suppress(OSError):  # locked, or of somebody else
+            _remove_unlocked(path)
+
+
+def _remove_unlocked(path: str) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.unlink(path)
+    finally:
+        os.close(descriptor)
 
 
 def _to_disk(path: Path) -> None:

@@ -6,14 +6,16 @@ import bz2
 import functools
 import gzip
 import hashlib
+import itertools
 import lzma
 import math
 import os
 import re
 import warnings
+import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -31,6 +33,8 @@ __all__ = [
     "open_user_fits",
     "parse_user_yaml",
     "read_table",
+    "read_user_table",
+    "read_user_text",
     "read_user_yaml",
     "read_yaml",
     "refuse_damage",
@@ -67,9 +71,21 @@ _DAMAGE = (
         MemoryError,
         AssertionError,
         zlib.error,
+        zipfile.BadZipFile,
+        yaml.YAMLError,
+        NotImplementedError,
     ),
     Warning,
 )
+
+_SHIPPED = re.compile(r"\w[\w.+-]*")
+
+LARGEST_USER_TABLE = 1 << 26
+"""Bytes of a table or document that a user gives; a line list of a whole night sky has a million."""
+
+_EXPANSION, _SMALL = 100, 1 << 30
+"""A file may stand for so many bytes, and beyond them for so many times what it takes on the disk. No frame of
+a detector is compressed more than tenfold."""
 
 _CARD, _CHUNK = 80, 1 << 22
 _BLOCK, _LONGEST_HEADER, _MOST_BYTES = 2880, 1 << 20, 1 << 40
@@ -80,7 +96,15 @@ _COUNTS = (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT")
 _ENDLESS = re.compile(
     rb"(?:NAXIS  |TFIELDS) = *[-+]?0*[1-9]\d{3}|(?:NAXIS[1-9 ][\d ]{2}|TFIELDS |[PG]COUNT  )= *-"
 )
-_COMPRESSED = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
+
+
+def _zipped(stream: IO[bytes]) -> IO[bytes]:
+    archive = zipfile.ZipFile(stream)
+    return archive.open(archive.namelist()[0])
+
+
+_COMPRESSED = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open, b"PK": _zipped}
+_LZW = b"\x1f\x9d"
 
 
 def __getattr__(name: str) -> Any:
@@ -97,6 +121,10 @@ def _damage() -> tuple[type[Exception], ...]:
     return (*_DAMAGE, VerifyError)
 
 
+def _data() -> Traversable:
+    return resources.files("lsst.fringe_sim") / "data"
+
+
 def resource_path(folder: str, name: str) -> Traversable:
     """Path of ``data/<folder>/<name>`` inside the installed package.
 
@@ -105,11 +133,16 @@ def resource_path(folder: str, name: str) -> Traversable:
     UnknownNameError
         There is no such file; the ones that exist are named.
     """
-    base = resources.files("lsst.fringe_sim") / "data"
+    base = _data()
+    # A header from outside names them: nothing but a name of the package itself is looked up.
+    if not all(map(_SHIPPED.fullmatch, [*folder.split("/"), name])):
+        raise UnknownNameError("resource", f"{folder}/{name}", ())
     for part in folder.split("/"):
         base = base / part
+    if not base.is_dir():
+        raise UnknownNameError("folder of resources", folder, (item.name for item in _data().iterdir()))
     path = base / name
-    if "/" in name or not path.is_file():
+    if not path.is_file():
         suffix = name.rpartition(".")[2]
         raise UnknownNameError(f"resource in data/{folder}", name, list_resources(folder, f".{suffix}"))
     return path
@@ -117,7 +150,7 @@ def resource_path(folder: str, name: str) -> Traversable:
 
 def list_resources(folder: str, suffix: str = ".yaml") -> tuple[str, ...]:
     """Names of the files in ``data/<folder>`` that end in ``suffix``, sorted."""
-    base = resources.files("lsst.fringe_sim") / "data"
+    base = _data()
     for part in folder.split("/"):
         base = base / part
     return tuple(sorted(entry.name for entry in base.iterdir() if entry.name.endswith(suffix)))
@@ -207,16 +240,56 @@ def read_user_yaml(path: str | os.PathLike[str], what: str) -> Any:
     InputError
         There is no such file, or `parse_user_yaml` refuses it.
     """
+    return parse_user_yaml(read_user_text(path, what, 4 * LONGEST_USER_FILE), what, source=str(path))
+
+
+def read_user_text(path: str | os.PathLike[str], what: str, most: int = LARGEST_USER_TABLE) -> str:
+    """Text of a file from outside, which may be anything.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    what : `str`
+        What it should be, for the message.
+    most : `int`, optional
+        Bytes that it may have.
+
+    Raises
+    ------
+    InputError
+        There is no such file, or it is no regular one, too large, or not in UTF-8.
+    """
     file = Path(path)
     if not file.is_file():
-        raise InputError(what, str(path), "an existing YAML file")
-    if file.stat().st_size > 4 * LONGEST_USER_FILE:
-        raise InputError(what, f"{file.stat().st_size} bytes", f"up to {LONGEST_USER_FILE}", source=str(path))
+        raise InputError(what, str(path), "an existing file")
+    if file.stat().st_size > most:
+        raise InputError(what, f"{file.stat().st_size} bytes", f"up to {most}", source=str(path))
     try:
-        text = file.read_text(encoding="utf-8")
+        return file.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise InputError(what, str(error), "text in UTF-8", source=str(path)) from None
-    return parse_user_yaml(text, what, source=str(path))
+
+
+def read_user_table(path: str | os.PathLike[str], what: str) -> Table:
+    """Read an ECSV table that a user gives, and which may be anything.
+
+    Its header is YAML, and may be no more than `parse_user_yaml` allows.
+
+    Raises
+    ------
+    InputError
+        No such file, or not such a table.
+    """
+    from astropy.table import Table
+
+    text = read_user_text(path, what)
+    lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+    header = "\n".join(line[2:] for line in lines if not line.startswith("# %"))
+    with refuse_damage(what, "an undamaged ECSV table", str(path)):
+        _check_length(header, what, str(path))
+        _check_events(header, what, str(path))
+        return Table.read(text, format="ascii.ecsv")
 
 
 def parse_user_yaml(text: str, what: str, *, source: str | None = None) -> Any:
@@ -229,16 +302,20 @@ def parse_user_yaml(text: str, what: str, *, source: str | None = None) -> Any:
     InputError
         Not YAML, a reference, too long, or too deep.
     """
-    if len(text) > LONGEST_USER_FILE:
-        raise InputError(what, f"{len(text)} characters", f"up to {LONGEST_USER_FILE}", source=source)
+    _check_length(text, what, source)
     try:
         _check_events(text, what, source)
         return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError, KeyError) as error:
+    except (yaml.YAMLError, ValueError, ArithmeticError, TypeError, AttributeError, LookupError) as error:
         if isinstance(error, InputError):
             raise
         reason = first_line(error)
         raise InputError(what, reason, "YAML", source=source) from None
+
+
+def _check_length(text: str, what: str, source: str | None) -> None:
+    if len(text) > LONGEST_USER_FILE:
+        raise InputError(what, f"{len(text)} characters", f"up to {LONGEST_USER_FILE}", source=source)
 
 
 def _check_events(text: str, what: str, source: str | None) -> None:
@@ -286,6 +363,8 @@ def open_user_fits(
     """
     from astropy.io import fits
 
+    if not Path(path).is_file():
+        raise FrameFormatError("file", str(path), "an existing regular file")
     # The stream is opened here because astropy leaves its own open when it stumbles.
     with warnings.catch_warnings(), open(path, "rb") as stream:
         warnings.simplefilter("error" if warning == "error" else "ignore")
@@ -316,10 +395,11 @@ def refuse_damage(field: str, allowed: str, source: str) -> Iterator[None]:
 
 
 def check_axes(stream: IO[bytes], source: str) -> None:
-    """Refuse a FITS file over which astropy would be busy for hours, or for ever.
+    """Refuse a FITS file over which astropy would be busy for hours, or for ever, or need more memory than there is.
 
     It asks a header for each of the axes and columns that it claims; the format has at most 999. And behind data of a
-    negative size it looks for the next header further in front, again and again.
+    negative size it looks for the next header further in front, again and again. A file of a few megabytes,
+    compressed or with holes, may stand for any number of bytes.
 
     Parameters
     ----------
@@ -331,24 +411,31 @@ def check_axes(stream: IO[bytes], source: str) -> None:
     Raises
     ------
     FrameFormatError
-        There is such a header.
+        There is such a header, or the file stands for far more than it is.
     OSError, EOFError
         The file cannot be read, or cannot be decompressed.
     """
+    most = _most_bytes(stream, source)
     stream.seek(0)
-    opener = _COMPRESSED.get(stream.read(2))
+    beginning = stream.read(2)
+    if beginning == _LZW:
+        raise FrameFormatError(
+            "compression", "that of compress (.Z)", "gzip, bzip2, xz or zip", source=source
+        )
+    opener = _COMPRESSED.get(beginning)
     stream.seek(0)
     content: IO[bytes] = opener(stream) if opener else stream  # type: ignore[operator]
-    rest = _after_plain_units(content, source)
+    rest = _after_plain_units(content, most, source)
     # Cards begin at multiples of their length, and so do pieces of the file.
     while piece := content.read(_CHUNK):
+        _refuse_expansion(content.tell(), most, source)
         piece = rest + piece
         _refuse_endless(piece, source)
         rest = piece[len(piece) // _CARD * _CARD - _CARD :] if len(piece) >= _CARD else piece
     stream.seek(0)
 
 
-def _after_plain_units(content: IO[bytes], source: str) -> bytes:
+def _after_plain_units(content: IO[bytes], most: int, source: str) -> bytes:
     """Pass over headers and data of a file as long as they are what the standard asks for.
 
     Returns
@@ -369,6 +456,7 @@ def _after_plain_units(content: IO[bytes], source: str) -> bytes:
         size = _data_size(header)
         if size is None:
             return header
+        _refuse_expansion(content.tell() + size, most, source)
         content.seek(size, os.SEEK_CUR)
 
 
@@ -403,3 +491,20 @@ def _refuse_endless(piece: bytes, source: str) -> None:
                 allowed = "at most 999 axes or columns, and no negative size"
                 raise FrameFormatError("header", claimed, allowed, source=source)
             place = piece.find(keyword, place + 1)
+
+
+def _most_bytes(stream: IO[bytes], source: str) -> int:
+    """Bytes for which a file may stand by what it takes on the disk; one with holes is refused at once."""
+    size = stored = stream.seek(0, os.SEEK_END)
+    with suppress(OSError):  # it may be in memory
+        # Some file systems do not tell their blocks.
+        stored = 512 * os.fstat(stream.fileno()).st_blocks or size
+    most = max(_SMALL, _EXPANSION * stored)
+    _refuse_expansion(size, most, source)
+    return most
+
+
+def _refuse_expansion(size: int, most: int, source: str) -> None:
+    if size > most:
+        allowed = f"up to {most}, by what the file takes on the disk"
+        raise FrameFormatError("bytes in the file", f"{size} or more", allowed, source=source)

@@ -87,7 +87,7 @@ def fit_pca(
         Fewer than two frames, shapes that differ, no good pixel, frames that are all alike, or one from which the
         fringes were subtracted.
     OutOfRangeError
-        A number of components that N frames do not have.
+        More components than the rank of the frames: the others would be rounding.
 
     Notes
     -----
@@ -109,9 +109,8 @@ def fit_pca(
         n_components = significant_components(
             eigenvalues, stack.pixels, noise_variance, rounding=stack.rounding
         )
-    if not 1 <= n_components <= len(frames):
-        raise OutOfRangeError("number of components", n_components, f"1 to {len(frames)}")
-    kept = np.maximum(eigenvalues[:n_components], np.finfo(float).tiny)
+    _check_number(n_components, eigenvalues, stack.rounding)
+    kept = eigenvalues[:n_components]
     mask = np.zeros(stack.good.shape, np.int32)
     if not stack.good.all():
         mask[~stack.good] = mask_bits("NO_DATA")
@@ -132,6 +131,14 @@ def fit_pca(
         detector=detector,
         physical_filter=physical_filter,
     )
+
+
+def _check_number(wanted: int, eigenvalues: FloatArray, rounding: float) -> None:
+    """Refuse components whose eigenvalue is rounding of the Gram matrix."""
+    rank = int(np.count_nonzero(eigenvalues > rounding * eigenvalues.sum()))
+    if not 1 <= wanted <= rank:
+        allowed = f"1 to {rank}, the rank of these {len(eigenvalues)} frames about their mean"
+        raise OutOfRangeError("number of components", wanted, allowed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +237,7 @@ def decompose_thickness(
     InputError
         Fewer than two frames, no thickness, or frames that are all alike.
     OutOfRangeError
-        A thickness outside the response, or a number of components that N frames do not have.
+        A thickness outside the response, or more components than the rank of the frames.
     """
     thickness = np.asarray(thickness_um)
     if len(scales) < 2:
@@ -247,9 +254,8 @@ def decompose_thickness(
         raise InputError("scales of the frames", "no differences between frames", "frames that vary")
     if n_components is None:
         n_components = significant_components(eigenvalues, int(count.sum()), 0.0)
-    if not 1 <= n_components <= len(scales):
-        raise OutOfRangeError("number of components", n_components, f"1 to {len(scales)}")
-    root = np.sqrt(np.maximum(eigenvalues[:n_components], np.finfo(float).tiny))
+    _check_number(n_components, eigenvalues, _ROUNDING)
+    root = np.sqrt(eigenvalues[:n_components])
     combination = vectors[:, :n_components].T / root[:, None]
     sign = _signs(combination @ centred)
     combination *= sign[:, None]

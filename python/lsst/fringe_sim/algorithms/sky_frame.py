@@ -23,7 +23,7 @@ from ..instrument.telescope import reduce_beam
 from ..model import FringeModel, ResponseTable, tabulate
 from ..optics import Beam, Illumination
 from ..optics.phase_response import PhaseResponse
-from ..products import SkyFringe, mask_bits
+from ..products import NOISE, SkyFringe, mask_bits
 from .fringe_amplitudes import fringe_amplitudes
 from .image_noise import add_exposure_noise
 from .island_response import response_with_islands
@@ -395,6 +395,7 @@ def simulate_sky_frame(
             "FRINGRMS": amplitudes.rms,
             "FRINGPTP": amplitudes.half_peak_to_peak,
             "FRING198": amplitudes.half_range_1_99,
+            NOISE: seed is not None,
             "RDNOISE": read_noise_e if seed is not None else 0.0,
         },
         detector=detector,

@@ -15,6 +15,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..files import table_text, write_together
 
 __all__ = ["CASE_KINDS", "VISIBLE", "CaseResult", "ChallengeResult"]
 
@@ -239,21 +240,19 @@ class ChallengeResult:
         return Table(rows=rows or None, names=names, dtype=(int, str, str, float, float))
 
     def write(self, out_dir: str | Path) -> Path:
-        """Write the tables of the challenge; returns the path of the table of cases."""
+        """Write the tables of the challenge, that of the cases last; returns its path."""
         folder = Path(out_dir)
         folder.mkdir(parents=True, exist_ok=True)
         cases = self.table()
         cases.meta.update({"seed": self.seed, **self.summary()})
         tables = {
-            "challenge": cases,
             "confusion": self.confusion(),
             "accuracy": self.accuracy(),
             "calibration": self.calibration(),
             "pulls": self.pull_table(),
+            "challenge": cases,
         }
-        for name, table in tables.items():
-            table.write(folder / f"{name}.ecsv", format="ascii.ecsv", overwrite=True)
-        return folder / "challenge.ecsv"
+        return write_together(folder, {f"{name}.ecsv": table_text(table) for name, table in tables.items()})
 
 
 def _moments(values: FloatArray, weights: FloatArray) -> tuple[float, float]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-from astropy.table import Table
 
 from ..algorithms.amplitude_table import CASES, SkyCase, compare_amplitudes
-from ..errors import FrameFormatError
+from ..errors import printable_name
+from ..files import table_text, write_whole
 from ..mock.thickness import e2v_321
+from ..resources import read_user_table
 from .inputs import prepare_folder, read_settings, read_thickness
 from .parameters import BUILT_IN, EFFECT, effect_settings
 
@@ -76,7 +77,7 @@ def amplitudes(
     for sentence in table.meta["contradiction"]:
         click.echo(sentence)
     if folder is not None:
-        table.write(folder / "amplitudes.ecsv", format="ascii.ecsv", overwrite=True)
+        write_whole(folder / "amplitudes.ecsv", table_text(table))
         click.echo(str(folder / "amplitudes.ecsv"))
 
 
@@ -85,15 +86,9 @@ def read_line_list(path: Path) -> SkyCase:
 
     Raises
     ------
-    FrameFormatError
-        The file is no ECSV table.
     InputError
-        The table is no line list.
+        The file is no ECSV table, or the table no line list.
     """
-    try:
-        table = Table.read(path, format="ascii.ecsv")
-    except Exception as error:
-        raise FrameFormatError(
-            "line list", str(error).split("\n")[0], "an ECSV table", source=str(path)
-        ) from None
-    return SkyCase.of_table(path.stem, table)
+    return SkyCase.of_table(
+        printable_name("name of the line list", path.stem), read_user_table(path, "line list")
+    )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import InputError
+from ..files import write_whole
 from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def _earlier_cases(record: Path, identity: dict[str, int | str]) -> list[CaseRes
 
     lines = record.read_text().splitlines() if record.exists() else []
     if not lines:
-        record.write_text(json.dumps(identity) + "\n")
+        write_whole(record, json.dumps(identity) + "\n")
         return []
     if lines[0] != json.dumps(identity):
         raise InputError(
@@ -120,5 +121,5 @@ def _earlier_cases(record: Path, identity: dict[str, int | str]) -> list[CaseRes
     # A line that a killed run left unfinished is not a case.
     complete = [line for line in lines[1:] if line.endswith("}")]
     if len(complete) < len(lines) - 1:
-        record.write_text("\n".join([lines[0], *complete]) + "\n")
+        write_whole(record, "\n".join([lines[0], *complete]) + "\n")
     return [CaseResult.from_json(line) for line in complete]

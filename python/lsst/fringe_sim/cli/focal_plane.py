@@ -24,6 +24,7 @@ from ..algorithms.field_response import (
 from ..algorithms.focal_plane import DES_CRITERION, SkyLevel, forecast_sensor, summary_table
 from ..algorithms.thickness_stand_in import ThicknessField, stand_in_thickness
 from ..errors import InputError
+from ..files import table_text, write_together
 from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 from ..instrument.night import NightHistory, StochasticNight, join_nights
@@ -142,8 +143,7 @@ def focal_plane(
                 )
                 advance()
     cells, summary = _gather(tables)
-    cells.write(folder / "cells.ecsv", format="ascii.ecsv", overwrite=True)
-    summary.write(folder / "focal_plane.ecsv", format="ascii.ecsv", overwrite=True)
+    write_together(folder, {"cells.ecsv": table_text(cells), "focal_plane.ecsv": table_text(summary)})
     drawn = focal_plane_figure(cells, summary)
     save_figure(drawn, folder / "focal_plane.png")
     lines = list(_describe(summary))

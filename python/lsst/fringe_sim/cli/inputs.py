@@ -21,7 +21,7 @@ from ..model.effects_override import read_effects_override
 from ..model.provenance import model_cards, software_cards
 from ..products import SensorSection, ThicknessMap
 from ..products.sensor_section import SECTION_KEYWORDS
-from ..resources import open_user_fits, read_user_yaml, refuse_damage
+from ..resources import LONGEST_USER_FILE, open_user_fits, read_user_text, read_user_yaml, refuse_damage
 
 __all__ = [
     "complete_fits",
@@ -82,23 +82,17 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises
     ------
     InputError
-        The file is not YAML, not a mapping, or an override with anything in it but effects and their numbers.
+        The file is empty, not YAML, not a mapping, or an override that is not whole or has anything in it but effects
+        and their numbers.
     """
     if Path(path).suffix == ".py":
-        return dict(read_effects_override(_text_of(path), str(path)))
+        text = read_user_text(path, "override file", LONGEST_USER_FILE)
+        return dict(read_effects_override(text, str(path)))
     content = read_user_yaml(path, "settings file")
-    if content is None:
-        return {}
     if not isinstance(content, dict):
-        raise InputError("settings file", type(content).__name__, "a mapping", source=str(path))
+        found = "empty" if content is None else type(content).__name__
+        raise InputError("settings file", found, "a mapping, {} for no effects", source=str(path))
     return content
-
-
-def _text_of(path: str | os.PathLike[str]) -> str:
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError("override file", str(error), "text in UTF-8", source=str(path)) from None
 
 
 def sky_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ..instrument.camera import Camera, Detector
 from ..instrument.raw_files import find_raw_files
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..model import Setup
-from ..products import FringeCube
+from ..products import FringeCube, FringeFlat
 from .inputs import complete_fits
 
 __all__ = ["LabSeries", "find_series", "read_cube"]
@@ -82,18 +82,21 @@ class LabSeries:
 
         bias = combine_biases(frames(self.biases), options) if self.biases else None
         sensor = self._sensor(setup)
-        flats = (
-            prepare_flat(
-                frame,
-                bias,
-                sensor.cut_down(frame.detector_shape),
-                bandwidth_fwhm_nm=setup.bandwidth_fwhm_nm,
-                f_number=setup.f_number,
-                options=options,
-            )
-            for frame in frames(self.flats)
-        )
-        return FringeCube.from_flats(flats, number=len(self.flats))
+
+        def prepared(frame: RawFrame) -> FringeFlat:
+            try:
+                return prepare_flat(
+                    frame,
+                    bias,
+                    sensor.cut_down(frame.detector_shape),
+                    bandwidth_fwhm_nm=setup.bandwidth_fwhm_nm,
+                    f_number=setup.f_number,
+                    options=options,
+                )
+            except InputError as error:
+                raise error.in_source(frame.metadata.source) from None
+
+        return FringeCube.from_flats(map(prepared, frames(self.flats)), number=len(self.flats))
 
     def _sensor(self, setup: Setup) -> Detector:
         camera = Camera.from_name(setup.camera)

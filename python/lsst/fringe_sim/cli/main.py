@@ -1,11 +1,12 @@
 """``fringe-sim``: the group of commands, and what an exception becomes.
 
-Exit status: 0 done, 1 bad input, 2 usage, 3 internal failure.
+Exit status: 0 done, 1 bad input, 2 usage, 3 internal failure, 130 stopped by Ctrl-C.
 """
 
 from __future__ import annotations
 
 import importlib
+import io
 import logging
 import os
 import sys
@@ -15,13 +16,14 @@ from collections.abc import Sequence
 import click
 
 from .. import __version__
-from ..errors import FringeSimError
+from ..errors import LONGEST_MESSAGE, FringeSimError, shown
 
 __all__ = ["cli", "main"]
 
 EXIT_BAD_INPUT = 1
 EXIT_USAGE = 2
 EXIT_INTERNAL = 3
+EXIT_STOPPED = 130
 
 # Name of the command, module in which it is written, and its line in the overview.
 _COMMANDS = {
@@ -103,7 +105,7 @@ def _complain(message: str) -> None:
     """One message on standard error; in colour on a terminal, unless NO_COLOR is set (no-color.org)."""
     color = False if os.environ.get("NO_COLOR") else None
     click.secho("fringe-sim:", fg="red", bold=True, nl=False, err=True, color=color)
-    click.echo(f" {message}", err=True)
+    click.echo(f" {shown(message, LONGEST_MESSAGE)}", err=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -117,6 +119,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Threads that wait for work by spinning keep a second command on the same machine from its processors. OpenMP
     # reads this when it is loaded, with the first compiled loop.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # A terminal that knows no σ gets an escape for it: no command that has done its work ends in an error over that.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     sys.exit(run(arguments))
 
 
@@ -126,9 +132,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
         result = cli.main(args=arguments, prog_name="fringe-sim", standalone_mode=False)
     except click.exceptions.Exit as stop:
         return int(stop.exit_code)
-    except click.Abort:
+    except (click.Abort, KeyboardInterrupt):
         click.echo("Stopped.", err=True)
-        return EXIT_BAD_INPUT
+        return EXIT_STOPPED
     except click.UsageError as error:
         error.show()
         return EXIT_USAGE

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..files import table_text, write_whole
 from .parameters import EFFECT, LABORATORY, THICKNESS_RANGE, WAVELENGTHS, Quantity, effect_settings
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -125,7 +126,7 @@ def plan_flats(
     goal = math.inf if sigma is None else 1e-3 * sigma
     short = recommend_flats(model, pool, range_um, slip_limit=slip_limit, sigma_um=goal, **limits)
     if ecsv is not None:
-        forecast_table(now).write(ecsv, format="ascii.ecsv", overwrite=True)
+        write_whole(ecsv, table_text(forecast_table(now)))
     if as_json:
         found = _as_mapping(now, ranked, short, slip_limit)
         found["nyquist_um"] = nyquist_thickness_um(model, nominal).tolist()

@@ -12,7 +12,7 @@ from uuid import UUID
 
 import click
 
-from ..errors import FrameFormatError, InputError, UnknownNameError
+from ..errors import FrameFormatError, InputError, UnknownNameError, printable_name
 
 __all__ = ["describe", "provenance", "read_header"]
 
@@ -24,7 +24,7 @@ _DIGESTS = {"CFGHASH": "this task", "SKYCFG": "the sky frames"}
 _FORMAT = re.compile(
     r"SIMPLE|BITPIX|NAXIS\d*|EXTEND|CHECKSUM|DATASUM|NEXTEND|COMMENT|HISTORY|INHERIT|EXPINFO_V|__.*"
 )
-_INPUT = re.compile(BUTLER + r"INPUT (\d+) (\w+)")
+_INPUT = re.compile(BUTLER + r"INPUT (\d{1,9}) (\w+)")
 
 
 @click.command()
@@ -55,7 +55,7 @@ def provenance(
         else:
             records.append({"file": target, **describe(read_header(target))})
     if as_json:
-        click.echo(json.dumps(records, indent=2, ensure_ascii=False))
+        click.echo(json.dumps(records, indent=2))
         return
     click.echo("\n\n".join(_as_text(record) for record in records))
 
@@ -83,13 +83,27 @@ def read_header(path: str) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return readers.get(suffix, _fits_header)(path)
+            header = readers.get(suffix, _fits_header)(path)
+            _check_text(header, path)
+            return header
     except InputError:
         raise
     except damage as error:
         raise FrameFormatError(
             "file", first_line(error), "an undamaged FITS, ECSV or JSON product", source=path
         ) from None
+
+
+def _check_text(value: Any, path: str) -> None:
+    """Refuse keywords and texts that would do something to a terminal, or that no header holds."""
+    if isinstance(value, Mapping):
+        for key in value:
+            printable_name("keyword", str(key), source=path)
+    items = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
+    for item in items:
+        _check_text(item, path)
+    if isinstance(value, str) and not value.replace("\n", "").replace("\t", "").isprintable():
+        raise FrameFormatError("text", value, "printable characters", source=path)
 
 
 def _fits_header(path: str) -> dict[str, Any]:
@@ -103,13 +117,15 @@ def _fits_header(path: str) -> dict[str, Any]:
 
 
 def _table_header(path: str) -> dict[str, Any]:
-    from astropy.table import Table
+    from ..resources import read_user_table
 
-    return {str(key): value for key, value in Table.read(path, format="ascii.ecsv").meta.items()}
+    return {str(key): value for key, value in read_user_table(path, "table").meta.items()}
 
 
 def _document_header(path: str) -> dict[str, Any]:
-    content = json.loads(Path(path).read_text(encoding="utf-8"))
+    from ..resources import read_user_text
+
+    content = json.loads(read_user_text(path, "document"))
     if not isinstance(content, dict) or not isinstance(content.get("provenance"), dict):
         raise FrameFormatError(
             "JSON document", "no provenance", "one with an entry 'provenance'", source=path

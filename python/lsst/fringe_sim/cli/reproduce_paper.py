@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from ..errors import InputError
+from ..files import table_text, write_whole
 from .parameters import SIZE
 from .progress import progress
 
@@ -92,7 +93,7 @@ def reproduce_paper(
         )
     with progress("recomputing", len(SECTIONS)) as advance:
         made = reproduce(context, advance=advance)
-    made.table().write(target / "paper.ecsv", format="ascii.ecsv", overwrite=True)
+    write_whole(target / "paper.ecsv", table_text(made.table()))
     write_paper_page(made, target / "paper.html", notices)
     for finding in made.all_findings:
         if finding.status == "differs":

@@ -45,7 +45,7 @@ MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
     show_default=True,
     help="Mean level: that of the measured quantum efficiency, or what the stack itself detects.",
 )
-@click.option("--noise/--no-noise", default=False, help="Photon and read noise.")
+@click.option("--noiseless/--noise", default=False, help="Without photon and read noise, as for templates.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the noise.")
 @click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
@@ -61,7 +61,7 @@ def sky(
     airmass: float | None,
     night: bool,
     level: str,
-    noise: bool,
+    noiseless: bool,
     seed: int,
     effects: tuple[tuple[str, float], ...],
     effects_file: Path | None,
@@ -75,7 +75,7 @@ def sky(
     \b
     Examples:
       fringe-sim sky --thickness fit/thickness.fits --detector R22_S11 --out sky
-      fringe-sim sky --setup monocam --thickness e2v_321 --noise --exptime 60s --out sky
+      fringe-sim sky --setup monocam --thickness e2v_321 --noiseless --exptime 60s --out sky
       fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky
     """
     from ..algorithms.field_response import SensorPlacement, sensor_response
@@ -137,8 +137,8 @@ def sky(
         band = Bandpass.from_name(setup.bandpass)
         levels = [throughput_electrons(dark.with_band_scale(scale), band, model, exptime) for scale in scales]
     common: dict[str, Any] = {
-        "read_noise_e": sensor.read_noise if noise else 0.0,
-        "seed": seed if noise else None,
+        "read_noise_e": 0.0 if noiseless else sensor.read_noise,
+        "seed": None if noiseless else seed,
         "detector": sensor.name,
         "physical_filter": setup.bandpass,
     }

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..errors import InputError, OutOfRangeError, UnknownNameError, printable_name
 from ..resources import first_line, list_resources, read_table, read_user_yaml, read_yaml
 from .detector import Amplifier, Detector, RawSegment
 
@@ -73,7 +73,7 @@ class Camera:
         try:
             if not isinstance(content, dict):
                 raise InputError("content", type(content).__name__, "a mapping")
-            return _from_mapping(file.stem, content)
+            return _from_mapping(printable_name("name of the camera", file.stem), content)
         except InputError as error:
             raise error.in_source(str(path)) from None
         except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:

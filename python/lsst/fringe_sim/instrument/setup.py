@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, UnknownNameError, to_number
+from ..errors import InputError, UnknownNameError, printable_name, to_number
 from ..optics.illumination import (
     Beam,
     GaussianProfile,
@@ -126,6 +126,7 @@ class Setup:
     def from_mapping(cls, name: str, content: Any, *, source_file: str | None = None) -> Setup:
         """Set-up from the parsed content of a YAML file; errors as for `from_file`."""
         reader = _Reader(content, source_file or name)
+        printable_name("name of the set-up", name, source=source_file)
         light = reader.section("illumination")
         kind = light.choice("kind", ("monochromator", "sky"))
         beam = light.section("beam")
@@ -236,6 +237,9 @@ class _Reader:
         value = self._get(key)
         if not isinstance(value, str) or not value.strip():
             raise InputError(f"{self._prefix}{key}", value, "text", source=self.source)
+        if not value.isprintable():
+            allowed = "text in one line, without control characters"
+            raise InputError(f"{self._prefix}{key}", value, allowed, source=self.source)
         return value
 
     def choice(self, key: str, allowed: tuple[str, ...]) -> str:

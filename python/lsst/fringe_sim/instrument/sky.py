@@ -44,6 +44,9 @@ SECOND_RADIATION_CM_K = 1.4387769
 AIRGLOW_HEIGHT_KM = 90.0
 EARTH_RADIUS_KM = 6371.0
 
+LINES_NM = (300.0, 3000.0)
+"""Where the air glows in lines; the same lines in Å or µm lie outside."""
+
 CONTINUUM_STEP_NM = 0.1
 """Spacing of continuum nodes [nm]: the fringe of 365 µm of silicon (HSC and its support) has 0.35 nm."""
 
@@ -64,7 +67,7 @@ class EmissionLines:
     Attributes
     ----------
     wavelength_nm : `numpy.ndarray`, shape ``(N,)``
-        Wavelength in vacuum [nm], ascending.
+        Wavelength in vacuum [nm], ascending, 300 to 3000.
     photon_radiance : `numpy.ndarray`, shape ``(N,)``
         Zenith radiance above the lower atmosphere [ph s⁻¹ m⁻² arcsec⁻²].
     transmission : `numpy.ndarray`, shape ``(N,)``
@@ -99,10 +102,17 @@ class EmissionLines:
                 raise InputError(f"{name} of the line list", "not finite", "finite numbers")
         if not np.all(self.photon_radiance >= 0.0):
             raise InputError("photon radiance", float(np.min(self.photon_radiance)), "not negative")
-        if not np.all(self.wavelength_nm > 0.0):
-            raise InputError("wavelengths of the lines", float(np.min(self.wavelength_nm)), "positive")
         if not np.all(np.diff(self.wavelength_nm) >= 0.0):
             raise InputError("wavelengths of the lines", "unordered", "ascending")
+        low, high = LINES_NM
+        outside = (self.wavelength_nm < low) | (self.wavelength_nm > high)
+        if outside.any():
+            worst = float(np.asarray(self.wavelength_nm)[outside][0])
+            raise OutOfRangeError("wavelength of a line [nm]", worst, f"{low:g} to {high:g}")
+        absorbed = (self.transmission < 0.0) | (self.transmission > 1.0)
+        if absorbed.any():
+            worst = float(np.asarray(self.transmission)[absorbed][0])
+            raise OutOfRangeError("transmission of the air", worst, "0 to 1")
 
     @classmethod
     def oh(

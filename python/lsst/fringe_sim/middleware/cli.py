@@ -24,6 +24,7 @@ __all__ = [
     "define_fringe_night",
     "get_cli_subcommands",
     "ingest_fringe_raws",
+    "prepare_fringe_repo",
     "recover_fringe_repo",
     "write_fringe_handoff",
 ]
@@ -36,6 +37,7 @@ def get_cli_subcommands() -> list[click.Command]:
         define_fringe_night,
         adopt_sensor_datasets,
         write_fringe_handoff,
+        prepare_fringe_repo,
         recover_fringe_repo,
     ]
 
@@ -78,7 +80,9 @@ def ingest_fringe_raws(
     and the exit status is 1.
     """
     from .raw_ingest import ingest_raws
+    from .repository import require_prepared
 
+    require_prepared(repo)
     with _butler(repo, writeable=not dry_run) as butler:
         report = ingest_raws(butler, paths, transfer=transfer, run=output_run, dry_run=dry_run)
     for message in report.refused:
@@ -142,7 +146,9 @@ def define_fringe_night(
     same night again changes nothing.
     """
     from .night import NightPlan, define_night, parse_hours
+    from .repository import require_prepared
 
+    require_prepared(repo)
     plans = [
         NightPlan(
             date=date.date(),
@@ -231,6 +237,22 @@ def adopt_sensor_datasets(
         click.echo(f"not in {instrument}: {', '.join(report.homeless)}", err=True)
     verb = "would be adopted" if dry_run else "adopted"
     click.echo(f"{len(report.adopted)} datasets {verb} into {run}; {len(report.present)} were there already")
+
+
+@click.command(short_help="Let a repository hold datasets of this package.", cls=ButlerCommand)
+@repo_argument(required=True)
+@options_file_option()
+@_one_clear_message
+def prepare_fringe_repo(repo: str) -> None:
+    """Add the storage classes and formatters of this package to the configuration of an existing repository.
+
+    A repository that was created with the seed configuration has them. What is there stays as it is; doing it twice
+    changes nothing.
+    """
+    from .repository import prepare_repository
+
+    added = prepare_repository(repo)
+    click.echo(f"{repo}: added {', '.join(dict.fromkeys(added))}" if added else f"{repo}: nothing is missing")
 
 
 @click.command(short_help="Undo what a killed process left half done.", cls=ButlerCommand)

@@ -19,6 +19,7 @@ from lsst.daf.butler import (
 from lsst.daf.butler.registry import RegistryError
 
 from ..errors import InputError
+from ..files import write_whole
 
 __all__ = ["EXPORT_FILE", "FRINGE", "write_handoff"]
 
@@ -96,9 +97,7 @@ def _export(butler: Butler, collection: str, refs: list[DatasetRef], target: Pat
     # The storage class can be changed in the file only: Python's type behind it need not be installed here.
     file = target / EXPORT_FILE
     text = file.read_text(encoding="utf-8")
-    file.write_text(
-        text.replace(f"storage_class: {storage_class}\n", "storage_class: ExposureF\n"), encoding="utf-8"
-    )
+    write_whole(file, text.replace(f"storage_class: {storage_class}\n", "storage_class: ExposureF\n"))
 
 
 def _for_other_readers(dataset: FileDataset) -> FileDataset:

@@ -26,11 +26,13 @@ from lsst.daf.butler import (
     Timespan,
 )
 from lsst.daf.butler.registry import ConflictingDefinitionError
+from lsst.daf.butler.time_utils import TimeConverter
 from lsst.resources import ResourcePath
 
 from ..errors import FrameFormatError, InputError
 from ..instrument.raw_files import find_raw_files
 from ..instrument.raw_frame import RawMetadata, read_raw_header
+from ..resources import first_line
 from .formatters import RawFrameFormatter
 from .instruments import INSTRUMENTS, FringeInstrument
 from .translators import TRANSLATORS
@@ -204,12 +206,26 @@ def _examine(path: str, registered: Mapping[str, type[FringeInstrument]]) -> Raw
             f"butler register-instrument REPO lsst.fringe_sim.{instrument.__name__} adds it",
             source=path,
         )
-    info = ObservationInfo(header, filename=path, translator_class=TRANSLATORS[camera], pedantic=True)
     try:
+        info = ObservationInfo(header, filename=path, translator_class=TRANSLATORS[camera], pedantic=True)
         instrument.band_of(str(info.physical_filter))
+        _check_time(info)
     except InputError as error:
-        raise error.in_source(path) from None
+        raise (error if error.source else error.in_source(path)) from None
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        # Whatever the translation stumbles over, the other files go in.
+        allowed = "one that the middleware can translate"
+        raise FrameFormatError("header", first_line(error), allowed, source=path) from error
     return RawExposure(path, info, instrument.getName())
+
+
+def _check_time(info: ObservationInfo) -> None:
+    """Refuse an exposure at a time that no repository can hold."""
+    first, last = TimeConverter().epoch, TimeConverter().max_time
+    for time in (info.datetime_begin, info.datetime_end):
+        if time is None or not first <= time <= last:
+            allowed = f"a time from {first.isot[:10]} to {last.isot[:10]}, which a repository can hold"
+            raise FrameFormatError("DATE-OBS or MJD-OBS", str(time), allowed)
 
 
 def _agreeing(exposures: Sequence[RawExposure]) -> tuple[list[RawExposure], list[str]]:

@@ -12,11 +12,17 @@ from collections.abc import Iterator
 
 from sqlalchemy.exc import DBAPIError
 
-from lsst.daf.butler import Butler
+from lsst.daf.butler import Butler, ButlerConfig, Config
 
 from ..errors import InputError
+from ..files import write_whole
 
-__all__ = ["open_repository", "recover_repository"]
+__all__ = ["open_repository", "prepare_repository", "recover_repository", "require_prepared"]
+
+SEED = "resource://lsst.fringe_sim/configs/butler.yaml"
+"""Storage classes and formatters that a repository needs for the datasets of this package."""
+
+SECTIONS = (("storageClasses",), ("datastore", "formatters"))
 
 
 @contextlib.contextmanager
@@ -56,6 +62,66 @@ def recover_repository(repo: str) -> None:
         raise _refusal(repo, error) from error
     except DBAPIError as error:
         raise InputError("registry", repo, f"one that can be read and written ({error.orig})") from error
+
+
+def require_prepared(repo: str) -> None:
+    """Refuse a repository in which datasets of this package cannot be stored.
+
+    Raises
+    ------
+    InputError
+        There is no such repository, or it lacks storage classes or formatters.
+    """
+    missing = _missing(_config(repo))
+    if missing:
+        names = ", ".join(dict.fromkeys(key[-1] for key in missing))
+        allowed = f"one that knows them; butler prepare-fringe-repo {repo} adds what is missing"
+        raise InputError("storage classes and formatters", f"without {names}", allowed, source=repo)
+
+
+def prepare_repository(repo: str) -> list[str]:
+    """Add to the configuration of a repository what it lacks for the datasets of this package.
+
+    What it has of the same names stays as it is. Doing it twice changes nothing.
+
+    Returns
+    -------
+    added : `list` [`str`]
+        Names of storage classes and formatters.
+
+    Raises
+    ------
+    InputError
+        There is no such repository, or its datastore or configuration has to be changed by hand.
+    """
+    config = _config(repo)
+    missing, file = _missing(config), config.configFile
+    if not missing:
+        return []
+    if file is None or not file.isLocal or "formatters" not in config["datastore"]:
+        raise InputError(
+            "repository", repo, f"one with a file datastore and a local configuration, or {SEED} by hand"
+        )
+    own, seed = Config(file), Config(SEED)
+    for key in missing:
+        own[key] = seed[key]
+    write_whole(file.ospath, str(own.dump(format="yaml")))
+    return [key[-1] for key in missing]
+
+
+def _config(repo: str) -> ButlerConfig:
+    try:
+        return ButlerConfig(repo)
+    except (FileNotFoundError, ValueError, RuntimeError) as error:
+        raise _refusal(repo, error) from error
+
+
+def _missing(config: ButlerConfig) -> list[tuple[str, ...]]:
+    """Keys of the seed that a configuration has not."""
+    seed = Config(SEED)
+    return [
+        (*section, name) for section in SECTIONS for name in seed[section] if (*section, name) not in config
+    ]
 
 
 def _open(repo: str, writeable: bool) -> Butler:

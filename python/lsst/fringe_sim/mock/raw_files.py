@@ -132,8 +132,8 @@ def write_frame(
     hdus = fits.HDUList([fits.PrimaryHDU(header=header)])
     for amp, image in zip(sensor.amplifiers, images, strict=True):
         hdus.append(fits.ImageHDU(image, header=_amplifier_header(amp, sensor.shape)))
-    with all_or_nothing(path) as part:
-        hdus.writeto(part, overwrite=True)
+    with all_or_nothing(path) as part, open(part, "wb") as stream:
+        hdus.writeto(stream)
 
 
 def _amplifier_header(amp: Amplifier, shape: tuple[int, int]) -> fits.Header:

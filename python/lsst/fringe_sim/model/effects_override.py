@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Mapping
 
@@ -11,24 +12,58 @@ __all__ = ["effects_override", "read_effects_override"]
 
 _STATEMENT = re.compile(r"""config\.effects\[(["'])([\w.]+)\1\]\s*=\s*([^#]+?)\s*(?:#.*)?""")
 
+_BEGINNING = "# Effects found in data of set-up "
+_END = "# End; SHA-256 of the lines above: "
 
-def effects_override(settings: Mapping[str, float], origin: str) -> str:
+
+def effects_override(
+    settings: Mapping[str, float],
+    setup: str,
+    verdict: str,
+    *,
+    known: Mapping[str, float] | None = None,
+    detector: str | None = None,
+) -> str:
     """Text of an override that puts effects into fit, sky simulation and templates.
+
+    Its last line states the hash of the others, so that a file that was cut short is not taken for a shorter one.
 
     Parameters
     ----------
     settings : mapping
         Values by ``effect.parameter``.
-    origin : `str`
-        Where they are from, in one line.
+    setup, verdict : `str`
+        Set-up of the data in which they were found, and the verdict on them.
+    known : mapping, optional
+        Effects that were in the model before the search.
+    detector : `str`, optional
+        Name of the sensor.
     """
-    lines = [f"# {origin}", "# Use with -C label:effects.py on any task that reads effects."]
-    lines += [f'config.effects["{key}"] = {value!r}' for key, value in settings.items()]
-    return "\n".join(lines) + "\n"
+    lines = [f"{_BEGINNING}{_quoted(setup)}; verdict: {_quoted(verdict)}."]
+    if detector is not None:
+        lines.append(f"# Sensor {_quoted(detector)}.")
+    lines.append("# Use with -C label:effects.py on any task that reads effects.")
+    if known:
+        lines += ["# Known before the search:", *_statements(known), "# Found by it:"]
+    text = "\n".join([*lines, *_statements(settings)]) + "\n"
+    return f"{text}{_END}{_hash(text)}\n"
+
+
+def _statements(settings: Mapping[str, float]) -> list[str]:
+    return [f"config.effects[{str(key)!r}] = {float(value)!r}" for key, value in settings.items()]
+
+
+def _quoted(name: str) -> str:
+    """A name as it can stand in a comment: nothing in it ends the line."""
+    return name if name.isprintable() else repr(name)
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_effects_override(text: str, source: str | None = None) -> dict[str, float]:
-    """Effects in the text of an override file that a search has left; nothing is executed.
+    """Effects in the text of an override file; nothing is executed.
 
     Parameters
     ----------
@@ -45,8 +80,10 @@ def read_effects_override(text: str, source: str | None = None) -> dict[str, flo
     Raises
     ------
     InputError
-        A line that is anything else.
+        A line that is anything else; a file that a search has begun and not ended; one written by hand that sets
+        nothing.
     """
+    complete = _is_complete(text, source)
     found: dict[str, float] = {}
     for line in map(str.rstrip, text.splitlines()):
         if not line or line.lstrip().startswith("#"):
@@ -59,4 +96,21 @@ def read_effects_override(text: str, source: str | None = None) -> dict[str, flo
         except ValueError:
             allowed = 'lines of config.effects["effect.parameter"] = number'
             raise InputError("statement", line, allowed, source=source) from None
+    if not found and not complete:
+        raise InputError("override file", "without any effect", "one that sets at least one", source=source)
     return found
+
+
+def _is_complete(text: str, source: str | None) -> bool:
+    """Whether a search wrote a text to its end; `False` for one written by hand, which says nothing of it."""
+    if not text.startswith(_BEGINNING):
+        return False
+    content, mark, stated = text.rpartition(_END)
+    if not mark or stated.strip() != _hash(content):
+        raise InputError(
+            "override file",
+            "not what a search has written: cut short, or changed",
+            "the whole file (run the search again), or one without its first line, if it was changed by hand",
+            source=source,
+        )
+    return True

@@ -20,10 +20,11 @@ from ..effects import (
     apply_to_response,
     apply_to_system,
 )
-from ..errors import InputError
+from ..errors import InputError, without_unit
 from ..instrument.setup import Setup
 from ..optics.harmonics import ROUNDING
 from ..optics.illumination import DEFAULT_STEP_NM, Illumination
+from ..optics.media import check_range
 from ..optics.phase_response import PhaseResponse
 from ..optics.system import OpticalSystem
 from .response_table import DEFAULT_TOLERANCE, ResponseTable, response_table, tabulate
@@ -31,6 +32,9 @@ from .response_table import DEFAULT_TOLERANCE, ResponseTable, response_table, ta
 __all__ = ["FringeModel"]
 
 FloatArray = NDArray[np.float64]
+
+BEYOND_THE_RANGE = 10.0
+"""Factor by which a thickness may leave the range of its set-up; any wrong unit is wrong by a thousand or more."""
 
 PHASE_MEAN_SAMPLES = 256
 """Thicknesses over which the phase average is taken; the fringe harmonics are below 1e-12 beyond the 20th."""
@@ -156,7 +160,7 @@ class FringeModel:
         Parameters
         ----------
         thickness_um : array_like
-            Thickness of the varying layer [µm], any shape.
+            Thickness of the varying layer [µm], any shape; a quantity of astropy is converted, here as elsewhere.
         wavelength_nm : array_like, shape ``(W,)``
             Nominal wavelengths [nm].
 
@@ -168,11 +172,14 @@ class FringeModel:
         Raises
         ------
         OutOfRangeError
-            A wavelength outside the range of a medium, or a thickness that is negative or not finite.
+            A wavelength outside the range of a medium, or a thickness that cannot be one of the set-up's: it is not
+            finite, or beyond its range by a factor of ten, as one in another unit is.
+        InputError
+            A quantity that is no length.
         """
-        wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
-        illumination = self.system.flat_fields(wavelength)
-        return self.respond(illumination, thickness_um, wavelength)
+        wavelength = self._wavelength(wavelength_nm)
+        thickness = self._thickness(thickness_um)
+        return self.respond(self.system.flat_fields(wavelength), thickness, wavelength)
 
     def flat_image(self, thickness_um: ArrayLike, geometry: ImageGeometry) -> FloatArray:
         """Images of monochromator flats, each over its mean, with the effects of light, sensor and read-out.
@@ -193,7 +200,7 @@ class FringeModel:
         InputError
             The map does not fit the geometry, or an effect in electrons meets a level that is not known.
         """
-        thickness = np.asarray(thickness_um, dtype=float)
+        thickness = self._thickness(thickness_um)
         if thickness.shape != geometry.sample_shape:
             raise InputError("shape of the thickness map", thickness.shape, f"{geometry.sample_shape}")
         image = self.with_islands(lambda model: model.response(thickness, geometry.wavelength_nm), geometry)
@@ -232,7 +239,7 @@ class FringeModel:
         self, wavelength_nm: ArrayLike, start_um: float, step_um: float, count: int
     ) -> FloatArray:
         """Like `response` on a uniform grid of thickness; shape ``(W, count)``."""
-        wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
+        wavelength = self._wavelength(wavelength_nm)
         illumination = self.system.flat_fields(wavelength)
         return self.respond_on_grid(illumination, start_um, step_um, count, wavelength)
 
@@ -254,9 +261,10 @@ class FringeModel:
         tolerance : `float`, optional
             Largest interpolation error.
         """
-        wavelength = np.atleast_1d(np.asarray(wavelength_nm, dtype=float))
+        wavelength = self._wavelength(wavelength_nm)
+        low, high = self._thickness(thickness_range_um).tolist()
         illumination = self.system.flat_fields(wavelength)
-        return self.table_of(illumination, thickness_range_um, wavelength_nm=wavelength, tolerance=tolerance)
+        return self.table_of(illumination, (low, high), wavelength_nm=wavelength, tolerance=tolerance)
 
     def table_of(
         self,
@@ -295,23 +303,25 @@ class FringeModel:
         late = [item.effect.name for item in self.effects if item.effect.acts_on == "response"]
         if late:
             raise InputError("effects", late, "effects of the stack or of the illumination")
-        illumination = self.system.flat_fields(wavelength_nm)
-        return self.system.reduce(illumination).averaged_derivative(illumination.weight, thickness_um)
+        illumination = self.system.flat_fields(self._wavelength(wavelength_nm))
+        thickness = self._thickness(thickness_um)
+        return self.system.reduce(illumination).averaged_derivative(illumination.weight, thickness)
 
     def fringe_order_um(self, wavelength_nm: ArrayLike) -> FloatArray:
         """Thickness of one fringe order at normal incidence, λ / 2n of the varying layer [µm].
 
         Eq. 3 of the paper with cos θ in the denominator and θ = 0.
         """
-        wavelength = np.asarray(wavelength_nm, dtype=float)
+        wavelength = np.asarray(without_unit("wavelength", wavelength_nm, "nm"), dtype=float)
         medium = self.system.stack.layers[self.system.stack.position(self.system.varying)].medium
         return 0.5e-3 * wavelength / medium.index(wavelength, self.system.temperature_k).real
 
     def quadrature_error(self, wavelength_nm: ArrayLike, thickness_um: ArrayLike) -> float:
         """Largest change of the response when the wavelength nodes are twice as dense."""
-        coarse = self.system.flat_fields(wavelength_nm)
-        fine = self.system.flat_fields(wavelength_nm, DEFAULT_STEP_NM / 2.0)
-        difference = self.respond(coarse, thickness_um) - self.respond(fine, thickness_um)
+        wavelength, thickness = self._wavelength(wavelength_nm), self._thickness(thickness_um)
+        coarse = self.system.flat_fields(wavelength)
+        fine = self.system.flat_fields(wavelength, DEFAULT_STEP_NM / 2.0)
+        difference = self.respond(coarse, thickness) - self.respond(fine, thickness)
         return float(np.abs(difference).max())
 
     def finish(
@@ -331,6 +341,27 @@ class FringeModel:
         )
         context = ResponseContext(nominal, self._phase_mean(reduced, illumination))
         return apply_to_response(self.effects, self.base_system, response, context)
+
+    def _wavelength(self, wavelength_nm: ArrayLike) -> FloatArray:
+        """Nominal wavelengths ``(W,)`` at which every layer is known."""
+        wavelength = np.atleast_1d(np.asarray(without_unit("wavelength", wavelength_nm, "nm"), dtype=float))
+        known = [layer.medium.wavelength_range_nm for layer in self.system.stack.layers]
+        check_range(
+            "wavelength [nm]", wavelength, max(low for low, _ in known), min(high for _, high in known)
+        )
+        return wavelength
+
+    def _thickness(self, thickness_um: ArrayLike) -> FloatArray:
+        """Thicknesses that the varying layer can have; those in nm or mm are a thousandfold."""
+        thickness = np.asarray(without_unit("thickness", thickness_um, "um"), dtype=float)
+        low, high = self.setup.thickness_range_um
+        check_range(
+            f"thickness of {self.setup.varying} [um]",
+            thickness,
+            low / BEYOND_THE_RANGE,
+            high * BEYOND_THE_RANGE,
+        )
+        return thickness
 
     def _phase_mean(self, reduced: PhaseResponse, illumination: Illumination) -> FloatArray:
         low, high = self.setup.thickness_range_um

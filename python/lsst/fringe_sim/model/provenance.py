@@ -208,7 +208,11 @@ def model_cards(setup: str | Setup, effects: Mapping[str, float]) -> dict[str, s
     """
     chosen = Setup.from_name(setup) if isinstance(setup, str) else setup
     stack = apply_to_system(activate_effects(effects, EFFECTS), _plain_light(chosen)).stack
-    return {"SETUP": chosen.name, **effect_cards(effects), **table_cards(tables_of(chosen, stack))}
+    return {
+        "SETUP": _printable(chosen.name),
+        **effect_cards(effects),
+        **table_cards(tables_of(chosen, stack)),
+    }
 
 
 def _plain_light(setup: Setup) -> OpticalSystem:

@@ -18,7 +18,7 @@ from ..resources import read_table, read_yaml
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline, PchipInterpolator
 
-__all__ = ["Medium", "constant_medium", "get_medium", "medium_names"]
+__all__ = ["Medium", "check_range", "constant_medium", "get_medium", "medium_names"]
 
 REFERENCE_TEMPERATURE_K = 300.0
 """Temperature at which Green (2008) tabulates silicon [K]."""
@@ -75,8 +75,8 @@ class Medium:
         wavelength = np.asarray(wavelength_nm, dtype=float)
         temperature = np.asarray(temperature_k, dtype=float)
         low, high = self.wavelength_range_nm
-        _check_range(f"wavelength [nm] in medium {self.name}", wavelength, low, high)
-        _check_range("temperature [K]", temperature, *TEMPERATURE_RANGE_K)
+        check_range(f"wavelength [nm] in medium {self.name}", wavelength, low, high)
+        check_range("temperature [K]", temperature, *TEMPERATURE_RANGE_K)
         wavelength, temperature = np.broadcast_arrays(wavelength, temperature)
         n, k = self._index(wavelength, temperature)
         # A Cauchy term relative to 960 nm, the middle of the y band: it tilts without shifting there.
@@ -214,7 +214,8 @@ def _read_tabulated(name: str, entry: dict[str, Any]) -> Medium:
     return Medium(name, (float(wavelength[0]), float(wavelength[-1])), source, index)
 
 
-def _check_range(what: str, value: NDArray[np.float64], low: float, high: float) -> None:
+def check_range(what: str, value: NDArray[np.float64], low: float, high: float) -> None:
+    """Refuse numbers outside an interval, and such as are none; the first of them is named."""
     # Written so that NaN fails too.
     good = (value >= low) & (value <= high)
     if not np.all(good):

@@ -154,13 +154,17 @@ def layer_admittance(
         ``n cos(theta)`` in units of the vacuum wave number, of the wave that decays (or travels) downwards, and
         the ratio of the tangential magnetic to electric field of that wave.
     """
-    parallel = index[0] * np.sin(theta)
     squared = index * index
-    normal = np.sqrt(squared - parallel * parallel)
+    # n² - n0² sin² θ, in a form that keeps its digits where the incidence is grazing.
+    contrast, along = (index - index[0]) * (index + index[0]), (index[0] * np.cos(theta)) ** 2
+    difference = contrast + along
+    # At a critical angle the sum vanishes; what it is called there lies within its rounding, and any limit exists.
+    rounding = np.finfo(float).eps * (np.abs(contrast) + np.abs(along))
+    normal = np.sqrt(np.where(np.abs(difference) < rounding, rounding, difference))
     # The principal root travels upwards when it would grow downwards.
     normal = np.where(normal.imag < 0.0, -normal, normal)
     # At normal incidence the two polarisations are one; the exact index avoids the rounding of the root.
-    normal = np.where(np.broadcast_to(parallel == 0.0, normal.shape), index, normal)
+    normal = np.where(np.broadcast_to(theta == 0.0, normal.shape), index, normal)
     return normal, normal if polarization == "s" else squared / normal
 
 

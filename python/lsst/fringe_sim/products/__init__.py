@@ -16,11 +16,13 @@ from .mask import MASK_PLANES, describe_mask, mask_bits
 from .sensor_section import SensorSection
 from .sky_frame import (
     CORRECTED,
+    NOISE,
     SKY_UNITS,
     SkyFringe,
     band_cards,
     bands_of_header,
     refuse_corrected,
+    refuse_noiseless,
 )
 from .sky_frames import SkyFrames
 from .thickness_map import ThicknessMap
@@ -30,6 +32,7 @@ __all__ = [
     "CUBE_UNITS",
     "DAMAGE",
     "MASK_PLANES",
+    "NOISE",
     "SKY_UNITS",
     "CombinedBias",
     "FlatExposures",
@@ -47,4 +50,5 @@ __all__ = [
     "describe_mask",
     "mask_bits",
     "refuse_corrected",
+    "refuse_noiseless",
 ]

@@ -14,10 +14,13 @@ from ..errors import InputError, UnknownNameError
 from . import _fits as io
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
 
-__all__ = ["CORRECTED", "SKY_UNITS", "SkyFringe", "refuse_corrected"]
+__all__ = ["CORRECTED", "NOISE", "SKY_UNITS", "SkyFringe", "refuse_corrected", "refuse_noiseless"]
 
 CORRECTED = "FRINGCOR"
 """Keyword of an exposure from which fringes were subtracted; its value is the number of templates."""
+
+NOISE = "NOISE"
+"""Keyword of a simulated exposure: whether photon and read noise were added."""
 
 SKY_UNITS = ("electron", "fraction")
 """Units of a sky frame: electrons in the exposure, or (sky - mean) / mean."""
@@ -139,3 +142,16 @@ def refuse_corrected(header: Mapping[str, Any], source: str | None = None) -> No
     """
     if header.get(CORRECTED):
         raise InputError(CORRECTED, header[CORRECTED], "an exposure with its fringes", source=source)
+
+
+def refuse_noiseless(header: Mapping[str, Any], source: str | None = None) -> None:
+    """Refuse a simulated exposure without noise where its pixels are weighed by the noise that they should have.
+
+    Raises
+    ------
+    InputError
+        The header says that there is none.
+    """
+    if header.get(NOISE) is False:
+        allowed = "an exposure with photon and read noise: one without is good for templates only"
+        raise InputError(NOISE, False, allowed, source=source)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from dataclasses import dataclass
 from typing import Any
 
@@ -372,7 +373,7 @@ def _use(report: Report, verdict: Verdict) -> None:
         "effects.py beside this page puts the effects into any task (-C label:effects.py); on the command line:",
     )
     report.code(
-        f"fringe-sim fit RAWS --setup {verdict.setup} --effects-file effects.py --out fit\n"
+        f"fringe-sim fit RAWS --setup {shlex.quote(verdict.setup)} --effects-file effects.py --out fit\n"
         "fringe-sim sky --thickness fit/thickness.fits --effects-file effects.py --out sky"
     )
     report.paragraph("Effects of the laboratory, as the width of its line, are not taken to the sky.")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ from pathlib import Path
 from astropy.table import Table
 from matplotlib.figure import Figure
 
-from ..files import write_whole
+from ..files import table_text, write_whole
 from .style import to_png
 
 __all__ = ["Report"]
@@ -130,11 +129,9 @@ class Report:
             + "</tr>"
             for row, mark in zip(cells, marks or [""] * len(table), strict=True)
         )
-        text = io.StringIO()
         plain = (table if download is None else download).copy(copy_data=False)
         plain.meta.clear()  # the page says it; some readers stumble over it
-        plain.write(text, format="ascii.ecsv")
-        data = base64.b64encode(text.getvalue().encode()).decode("ascii")
+        data = base64.b64encode(table_text(plain).encode()).decode("ascii")
         self._body.append(
             f'<div class="tables"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
             f'<p><a download="{html.escape(name, quote=True)}.ecsv" '

@@ -24,6 +24,7 @@ from lsst.pipe.base.connectionTypes import Input, Output
 from ..algorithms import discover
 from ..algorithms.discovery import SKY_SEARCH, SearchOptions, Verdict, discover_sky, placement_in_frames
 from ..instrument.detector import Detector
+from ..model.effects_override import effects_override
 from ..products import FringeCube, FringeFlat, SkyFringe, ThicknessMap
 from .model_config import FringeModelConfig, ModelChoice
 from .quantum import common_header, data_id_of, sensor_of, unusable
@@ -285,8 +286,10 @@ def _stored(
 
 def _override(choice: ModelChoice, verdict: Verdict, detector: Detector) -> str:
     """Override with the effects that were known before, and behind them those that were found."""
-    known = "".join(f'config.effects["{key}"] = {value!r}\n' for key, value in sorted(choice.effects.items()))
-    head = f"# Sensor {detector.name}.\n"
-    if known:
-        head += f"# Known before the search:\n{known}"
-    return head + verdict.override()
+    return effects_override(
+        verdict.settings,
+        verdict.setup,
+        verdict.verdict,
+        known=dict(sorted(choice.effects.items())),
+        detector=detector.name,
+    )

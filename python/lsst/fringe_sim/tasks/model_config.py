@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeVar
 
 from lsst.pex.config import Config, ConfigDictField, DictField, Field, FieldValidationError
+from lsst.pex.config.configDictField import ConfigDict
 
 from ..effects import EFFECTS, activate_effects
 from ..errors import InputError
@@ -92,6 +93,27 @@ class SensorConfig(Config):
     )
 
 
+class _MissingEntryError(InputError, KeyError):
+    """There is no entry of this name; a `KeyError`, which mappings rely on."""
+
+
+class _Entries(ConfigDict):
+    """Entries by name; one that is not there is said, and how to make it."""
+
+    def __getitem__(self, key: str) -> Any:
+        try:
+            return super().__getitem__(key)
+        except KeyError:
+            field, kind = self._field.name, self._field.itemtype.__name__
+            there = ", ".join(map(str, self)) or "none yet"
+            allowed = f"one with an entry ({there}); config.{field}[{key!r}] = {kind}() makes one"
+            raise _MissingEntryError(f"name in {field}", key, allowed) from None
+
+
+class _EntriesField(ConfigDictField):
+    DictClass = _Entries
+
+
 class FringeModelConfig(CameraConfig):
     """Set-up and effects, with overrides for single rafts and sensors."""
 
@@ -108,10 +130,10 @@ class FringeModelConfig(CameraConfig):
         doc="Physical effects that the set-up lacks: value by 'name.parameter', as 'bandwidth.fwhm'. "
         "Those of the laboratory's light and bench are left out on the sky.",
     )
-    rafts: ConfigDictField = ConfigDictField(
+    rafts: ConfigDictField = _EntriesField(
         keytype=str, itemtype=RaftConfig, default={}, doc="What single rafts have of their own, by raft."
     )
-    sensors: ConfigDictField = ConfigDictField(
+    sensors: ConfigDictField = _EntriesField(
         keytype=str,
         itemtype=SensorConfig,
         default={},

@@ -137,7 +137,12 @@ class SkyFringeSimConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnections
             "throughput": "what the measured quantum efficiency in the throughput tables detects",
         },
     )
-    noise: Field[bool] = Field(dtype=bool, default=False, doc="Whether photon and read noise are added.")
+    noise: Field[bool] = Field(
+        dtype=bool,
+        default=True,
+        doc="Whether photon and read noise are added. Pipelines that make templates go without; nothing can be "
+        "searched for in frames without.",
+    )
     seed: Field[int] = Field(
         dtype=int,
         default=0,

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from ...effects import EFFECTS, Effect
 from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
+from ...products.sky_frame import refuse_noiseless
 from .channels import Channel, in_looks
 from .classes import EffectClass, classes_in_all_data, outsider_probability
 from .describe import describe_residual, disagreement
@@ -95,9 +96,11 @@ def discover(
     Raises
     ------
     InputError
-        The set-up contradicts the data (temperature, bandpass), or is not one of a laboratory.
+        The flats are simulated without noise; the set-up contradicts them (temperature, bandpass), or is not one of
+        a laboratory.
     """
     model = setup if isinstance(setup, FringeModel) else FringeModel.from_setup(setup)
+    refuse_noiseless(cube.metadata, cube.detector or None)
     check_setup(cube, model)
     known = {item.effect.name for item in model.effects}
     # Flats do not see the spectrum of the night sky.

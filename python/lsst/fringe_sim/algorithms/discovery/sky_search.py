@@ -29,6 +29,7 @@ from ...products import (
     bands_of_header,
     mask_bits,
     refuse_corrected,
+    refuse_noiseless,
 )
 from ..field_response import SensorPlacement, beam_field
 from ..sky_frame import (
@@ -401,8 +402,8 @@ def discover_sky(
     Raises
     ------
     InputError
-        No frames, frames of different shapes, sensors or airmass or already corrected, a map of another shape, a
-        set-up of a laboratory; bands that nobody states.
+        No frames, frames of different shapes, sensors or airmass, already corrected or without noise, a map of
+        another shape, a set-up of a laboratory; bands that nobody states.
     UnknownNameError
         A factor on a component that the sky does not have.
     """
@@ -472,6 +473,7 @@ def _check_frames(frames: Sequence[SkyFringe]) -> None:
         raise InputError("airmass of the sky frames", airmass, f"one sky: within {AIRMASS_RANGE:g}")
     for frame in frames:
         refuse_corrected(frame.metadata, frame.detector or None)
+        refuse_noiseless(frame.metadata, frame.detector or None)
 
 
 def _check_components(sky: SkySpectrum, scales: Sequence[Mapping[str, float]]) -> None:

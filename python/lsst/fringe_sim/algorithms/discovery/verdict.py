@@ -11,6 +11,7 @@ from typing import Any
 
 from astropy.table import Table
 
+from ...files import table_text, write_together
 from ...model.effects_override import effects_override
 
 __all__ = [
@@ -272,19 +273,21 @@ class Verdict:
 
     def override(self) -> str:
         """Text of a config override that puts the effects into fit, sky simulation and templates."""
-        origin = f"Effects found in data of set-up {self.setup}; verdict: {self.verdict}."
-        return effects_override(self.settings, origin)
+        return effects_override(self.settings, self.setup, self.verdict)
 
     def write(self, out_dir: str | Path) -> Path:
-        """Write ``discovery.json``, ``discovery.ecsv`` and ``effects.py``; returns the path of the first."""
+        """Write ``effects.py``, ``discovery.ecsv`` and ``discovery.json``; returns the path of the last.
+
+        While there is a ``discovery.json``, all three are of one verdict.
+        """
         folder = Path(out_dir)
         folder.mkdir(parents=True, exist_ok=True)
-        override = folder / "effects.py"
-        override.write_text(self.override(), encoding="utf-8")
-        self.table().write(folder / "discovery.ecsv", format="ascii.ecsv", overwrite=True)
-        path = folder / "discovery.json"
-        path.write_text(self.to_json(str(override)), encoding="utf-8")
-        return path
+        contents = {
+            "effects.py": self.override(),
+            "discovery.ecsv": table_text(self.table()),
+            "discovery.json": self.to_json(str(folder / "effects.py")),
+        }
+        return write_together(folder, contents)
 
     def summary(self) -> str:
         """A few lines for people."""

@@ -14,7 +14,7 @@ from ...compiled import kernel, run_threaded
 from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ...model import FringeModel
 from ...optics.system import OBSERVABLES
-from ...products import FlatFit, FringeCube, ThicknessMap, mask_bits
+from ...products import FlatFit, FringeCube, ThicknessMap, mask_bits, refuse_noiseless
 from ..flat_conditions import model_of_flats
 from ..thickness_fit_options import CONTRASTS, FIT_METHODS
 from .amplitudes import Amplitudes
@@ -107,7 +107,8 @@ def fit_thickness(
     UnknownNameError
         An unknown method or observable.
     InputError, OutOfRangeError
-        No good pixel, a range that holds less than two orders, a start pixel outside the sensor.
+        No good pixel, simulated flats without noise, a range that holds less than two orders, a start pixel
+        outside the sensor.
     """
     if contrast not in CONTRASTS:
         raise UnknownNameError("contrast", contrast, CONTRASTS)
@@ -119,6 +120,7 @@ def fit_thickness(
         raise InputError("silicon", silicon, "fixed with method guo2022, and beside nuisances")
     if not 0.0 < slip_limit <= 1.0:
         raise OutOfRangeError("slip limit", slip_limit, "above 0, at most 1")
+    refuse_noiseless(cube.metadata, cube.detector or None)
     workers = threads if threads is not None else len(os.sched_getaffinity(0))
     if not any((plane == 0).any() for plane in cube.mask):
         raise InputError("good pixels of the cube", 0, "one or more", source=cube.detector or None)
