@@ -108,7 +108,7 @@ class LabSeries:
             except InputError as error:
                 raise error.in_source(frame.metadata.source) from None
 
-        return FringeCube.from_flats(map(prepared, frames(self.flats)), number=len(self.flats))
+        return FringeCube.from_flats((_say_masked(prepared(frame)) for frame in frames(self.flats)), number=len(self.flats))
 
     def _sensor(self, setup: Setup) -> Detector:
         camera = Camera.from_name(setup.camera)
@@ -171,6 +171,15 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
         frame for frame in frames if frame.observation_type == "bias" and frame.serial == flats[0].serial
     ]
     return LabSeries(flats[0].serial, tuple(biases), tuple(flats))
+
+
+def _say_masked(flat: FringeFlat) -> FringeFlat:
+    if flat.metadata["BADAMPS"] != "none":
+        found = flat.metadata["BADAMPS"]
+        click.echo(
+            f"{flat.wavelength_nm:g} nm: amplifiers masked whole (dead, hot or saturated): {found}", err=True
+        )
+    return flat
 
 
 def _each_once(frames: Sequence[RawMetadata]) -> list[RawMetadata]:
