@@ -159,6 +159,8 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
             "raw frames", f"{len(bad) + len(refused)} unusable", "complete raw frames, or --skip-bad to go on"
         )
     frames = _each_once(frames)
+    for note in dict.fromkeys(note for frame in frames for note in frame.notes):
+        click.echo(note, err=True)
     flats = [frame for frame in frames if frame.observation_type == "flat"]
     if not flats:
         kinds = ", ".join(sorted({frame.observation_type for frame in frames})) or "no frame"
