@@ -105,7 +105,7 @@ class FringeCube(FitsProduct):
         for wavelength in np.unique(self.wavelength_nm):
             (planes,) = np.nonzero(self.wavelength_nm == wavelength)
             if len(planes) > 1:
-                refuse_equal_pixels(f"flats at {wavelength:g} nm", self.image[planes])
+                refuse_equal_pixels(f"flats at {wavelength:g} nm", list(self.image[planes]))
         if self.unit == "relative":
             _refuse_amplitudes(self.image, self.mask)
         if self.thickness is not None:
