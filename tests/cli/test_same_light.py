@@ -74,6 +74,7 @@ def test_one_exposure_with_two_contents_is_refused(twice: Path) -> None:
 def test_equal_pixels_under_another_header_are_refused(twice: Path, card: tuple[str, object]) -> None:
     rename(twice)
     with fits.open(twice / "renamed.fits", mode="update") as hdus:
+        del hdus[0].header["DAYOBS"]
         hdus[0].header["DATE-OBS"] = "2026-01-02T00:00:00.000"
         hdus[0].header[card[0]] = card[1]
     series = find_series([str(twice)])
