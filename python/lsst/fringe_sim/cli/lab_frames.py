@@ -108,7 +108,8 @@ class LabSeries:
             except InputError as error:
                 raise error.in_source(frame.metadata.source) from None
 
-        return FringeCube.from_flats((_say_masked(prepared(frame)) for frame in frames(self.flats)), number=len(self.flats))
+        flats = (_say_masked(prepared(frame)) for frame in frames(self.flats))
+        return FringeCube.from_flats(flats, number=len(self.flats))
 
     def _sensor(self, setup: Setup) -> Detector:
         camera = Camera.from_name(setup.camera)
