@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation
 
 from lsst.fringe_sim.algorithms.flat_prep import (
     CombinedBias,
@@ -317,6 +318,8 @@ def test_saturated_pixels_are_masked_by_amplifier(run: MockRun, bias: CombinedBi
     section[20, 5] = True
     expected = np.zeros(SHAPE, bool)
     expected[amp.destination] = amp.oriented(section)
+    # Two pixels around a saturated one are masked with it.
+    expected = binary_dilation(expected, np.ones((5, 5), bool))
     np.testing.assert_array_equal(charge.mask & mask_bits("SAT") != 0, expected)
 
 

@@ -84,7 +84,7 @@ def test_record_of_a_flat(butler: Butler, tmp_path: Path) -> None:
     assert (record.exposure_time, record.dark_time) == (21.9, 21.9)
     assert record.science_program == "6006D"
     assert record.can_see_sky is False
-    assert record.timespan.begin.utc.isot.startswith("2018-07-24T10:28:45.342")
+    assert record.timespan.begin.tai.isot.startswith("2018-07-24T10:28:45.342")
     (ref,) = raws(butler)
     assert dict(ref.dataId.required) == {
         "instrument": "LSST-TS8",

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_propagation
 
 from ..errors import FrameFormatError, InputError
 from ..instrument.camera import Detector
@@ -47,8 +48,18 @@ ADC_MAXIMUM = 2**18 - 1
 MINIMUM_SIGNAL = 5.0
 """Least median signal of a flat, in units of its read noise."""
 
-DEAD_AMPLIFIER = 0.1
-"""An amplifier with less than this part of the median signal of its sensor is taken as dead."""
+AMPLIFIER_LEVELS = (0.1, 2.0)
+"""Signal of an amplifier relative to the median of its sensor outside which it is not used: dead, or hot. Gains and
+illumination of amplifiers differ by tens of per cent."""
+
+SATURATED_AMPLIFIER = 0.5
+"""An amplifier with more than this part of its pixels saturated is not used."""
+
+SHOULDER = 2.0
+"""Pixels above so many times the median of their amplifier belong to the saturated ones that they touch."""
+
+BESIDE_SATURATED_PX = 2
+"""Pixels around a saturated one that are masked with it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +74,15 @@ class PreparedCharge:
         BAD, SAT, EDGE and NO_DATA; 0 is good.
     read_noise_e : `Mapping` [`str`, `float`]
         Read noise by amplifier [electrons], measured in the overscan.
+    unused : `tuple` [`str`, ...]
+        Amplifiers that read out but are masked whole: dead, hot or saturated.
     """
 
     image: Image
     variance: Image
     mask: Mask
     read_noise_e: Mapping[str, float]
+    unused: tuple[str, ...] = ()
 
 
 # Bias -----------------------------------------------------------------------------------------------------
@@ -239,28 +253,55 @@ def assemble_charge(
     missing = (mask & mask_bits("NO_DATA")) != 0
     image[missing] = 0.0
     variance[missing] = 0.0
-    _mask_dead_amplifiers(frame, image, mask, max(read_noise.values(), default=0.0))
+    unused = _mask_odd_amplifiers(frame, image, mask, float(np.median([*read_noise.values()] or [0.0])))
     mask[isolated_defects(image, variance, mask == 0, options)] |= mask_bits("BAD")
     mask |= _border(image.shape, options)
     _mask_bad_columns(frame, image, mask, options)
-    return PreparedCharge(image, variance, mask, read_noise)
+    return PreparedCharge(image, variance, mask, read_noise, unused)
 
 
-def _mask_dead_amplifiers(frame: RawFrame, image: Image, mask: Mask, read_noise_e: float) -> None:
-    """Set BAD where an amplifier reads out but sees next to nothing of the light that its neighbours see."""
+def _mask_odd_amplifiers(frame: RawFrame, image: Image, mask: Mask, read_noise_e: float) -> tuple[str, ...]:
+    """Set BAD in amplifiers that do not see the light that most others see, and grow SAT; names of those amplifiers.
+
+    The reference is the median of the amplifiers that see light, so that no single one can move it.
+    """
     medians: dict[str, float] = {}
+    odd = []
     for amp in frame.amplifiers:
-        usable = mask[amp.destination][::4, ::4] & mask_bits("NO_DATA", "BAD") == 0
-        if usable.any():
-            medians[amp.name] = float(np.median(image[amp.destination][::4, ::4][usable]))
-    level = max(medians.values(), default=0.0)
-    if not level > MINIMUM_SIGNAL * read_noise_e:
-        least = f"a flat with light, above {MINIMUM_SIGNAL * read_noise_e:.0f}"
-        raise InputError("signal [electrons]", round(level, 1), least, source=frame.metadata.source)
-    typical = float(np.median([value for value in medians.values() if value > DEAD_AMPLIFIER * level]))
+        section = mask[amp.destination][::4, ::4]
+        usable = section & mask_bits("NO_DATA", "BAD") == 0
+        below = usable & (section & mask_bits("SAT") == 0)
+        if np.count_nonzero(below) < (1.0 - SATURATED_AMPLIFIER) * np.count_nonzero(usable):
+            odd.append(amp.name)
+        elif below.any():
+            medians[amp.name] = float(np.median(image[amp.destination][::4, ::4][below]))
+    least = MINIMUM_SIGNAL * read_noise_e
+    lit = [value for value in medians.values() if value > least]
+    if not lit and not odd:
+        brightest = round(max(medians.values(), default=0.0), 1)
+        allowed = f"a flat with light, above {least:.0f}"
+        raise InputError("signal [electrons]", brightest, allowed, source=frame.metadata.source)
+    low, high = (limit * float(np.median(lit or [0.0])) for limit in AMPLIFIER_LEVELS)
+    odd += [name for name, value in medians.items() if not low <= value <= high]
+    _grow_saturated(frame, image, mask, medians)
     for amp in frame.amplifiers:
-        if amp.name in medians and medians[amp.name] < DEAD_AMPLIFIER * typical:
+        if amp.name in odd:
             mask[amp.destination] |= mask_bits("BAD")
+    return tuple(sorted(odd))
+
+
+def _grow_saturated(frame: RawFrame, image: Image, mask: Mask, medians: Mapping[str, float]) -> None:
+    """Set SAT in the shoulders of blooming: bright pixels that touch saturated ones, and a rim around all."""
+    full = mask & mask_bits("SAT") != 0
+    if not full.any():
+        return
+    bright = full.copy()
+    for amp in frame.amplifiers:
+        level = medians.get(amp.name, np.inf)
+        bright[amp.destination] |= image[amp.destination] > SHOULDER * level
+    square = np.ones((3, 3), dtype=bool)
+    grown = binary_propagation(full, square, bright)
+    mask[binary_dilation(grown, square, BESIDE_SATURATED_PX)] |= mask_bits("SAT")
 
 
 def _border(shape: tuple[int, int], options: FlatPrepOptions) -> Mask:
@@ -386,7 +427,8 @@ def _flat_metadata(
         "RUNNUM": frame.metadata.run,
         "SERIAL": frame.metadata.serial,
         "NBIAS": 0 if bias is None else bias.n_frames,
-        "RDNOISE": float(np.mean(list(charge.read_noise_e.values()))),
+        "RDNOISE": float(np.median(list(charge.read_noise_e.values()))),
+        "BADAMPS": " ".join(charge.unused) or "none",
         "OVERSCAN": options.overscan_method,
         "SMOOTHPX": sigma,
         "CORRPX": math.sqrt(2.0) * sigma,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_lsq_spline
+from scipy.ndimage import median_filter
 
 from ..errors import FrameFormatError
 from ..instrument.raw_frame import RawAmplifier
@@ -16,6 +17,9 @@ from .flat_prep_options import DEFAULT_OPTIONS, GAUSSIAN_MAD, FlatPrepOptions
 __all__ = ["OverscanCorrected", "correct_overscan"]
 
 Image = NDArray[np.float32]
+
+NEARBY_ROWS = 25
+"""Rows on either side among which the overscan of a row is judged; fewer may hold charge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +47,8 @@ def correct_overscan(
     """Take the electronic level off one amplifier.
 
     Row by row with the serial overscan, which follows the drift of the electronics; then what columns differ from
-    each other in the parallel overscan. Outliers (cosmic rays, bleeding, deferred charge) are rejected.
+    each other in the parallel overscan. Outliers (cosmic rays, bleeding, deferred charge) are rejected, and rows
+    whose whole overscan holds charge get the level of the rows around.
 
     Parameters
     ----------
@@ -72,7 +77,7 @@ def correct_overscan(
         )
     rows, columns = amp.imaging
     serial = amp.data[:, first_column:].astype(np.float32)
-    level, noise = _row_level(serial, rows, options)
+    level, noise = _row_level(serial, amp.data[:, : columns.start].astype(np.float32), options)
     image = amp.data[rows, columns].astype(np.float32)
     image -= level[rows, np.newaxis]
     first_row = amp.parallel_overscan[0].start + options.overscan_skip
@@ -83,7 +88,7 @@ def correct_overscan(
     return OverscanCorrected(image, float(np.median(level)), noise)
 
 
-def _row_level(serial: Image, imaging_rows: slice, options: FlatPrepOptions) -> tuple[Image, float]:
+def _row_level(serial: Image, prescan: Image, options: FlatPrepOptions) -> tuple[Image, float]:
     """Level of every row, and the noise of one pixel about it [ADU]."""
     median = np.median(serial, axis=1)
     departure = serial - median[:, np.newaxis]
@@ -92,11 +97,45 @@ def _row_level(serial: Image, imaging_rows: slice, options: FlatPrepOptions) -> 
     inside = np.abs(departure) <= options.clip_sigma * rough
     noise = math.sqrt(float(np.mean(departure * departure, where=inside, dtype=np.float64)))
     noise = max(noise, 1.0 / math.sqrt(12.0))  # an integer is never known better than this
+    median = _without_charge(median, prescan, noise, options.clip_sigma)
     if options.overscan_method == "median":
         return median, noise
     clipped = np.clip(departure, -options.clip_sigma * noise, options.clip_sigma * noise)
     mean = median + clipped.mean(axis=1)
     return _robust_spline(mean.astype(float), options).astype(np.float32), noise
+
+
+def _without_charge(level: Image, prescan: Image, noise: float, clip_sigma: float) -> Image:
+    """Levels of rows, those that charge in the overscan has raised replaced by that of the rows around.
+
+    A level that the electronics have moved has moved the prescan alike, which is read before any charge.
+    """
+    around = _running_median(level)
+    departure = np.abs(level - around)
+    # Steps of integers have a spread of their own, which the deviation of most rows may not show.
+    scatter = max(GAUSSIAN_MAD * float(np.median(departure)), noise / math.sqrt(NEARBY_ROWS))
+    clean = departure <= clip_sigma * scatter
+    if clean.all() or prescan.shape[1] < 3:
+        return np.where(clean, level, around).astype(np.float32)
+    row = np.arange(len(level))
+    before = np.median(prescan, axis=1)
+    moved = before - np.interp(row, row[clean], before[clean])
+    expected = np.interp(row, row[clean], level[clean])
+    raised = level - expected
+    charged = (np.abs(raised) > clip_sigma * scatter) & (np.abs(moved - raised) > np.abs(moved)) & ~clean
+    return np.where(charged, expected, level).astype(np.float32)
+
+
+def _running_median(level: Image) -> Image:
+    """Median of the rows around each; at the ends the drift is taken to go on as it was."""
+    reach = min(NEARBY_ROWS, len(level) // 4)
+    if reach < 3:
+        return np.full_like(level, np.median(level))
+    # Point reflection about the median of the outermost five rows.
+    below = 2.0 * np.median(level[:5]) - level[5 : 5 + reach][::-1]
+    above = 2.0 * np.median(level[-5:]) - level[-5 - reach : -5][::-1]
+    padded = np.concatenate([below, level, above])
+    return median_filter(padded, 2 * reach + 1)[reach : reach + len(level)]
 
 
 def _robust_spline(values: NDArray[np.float64], options: FlatPrepOptions) -> NDArray[np.float64]:

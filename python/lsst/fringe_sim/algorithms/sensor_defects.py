@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import percentile_filter
 
 from .flat_prep_options import GAUSSIAN_MAD, FlatPrepOptions
 
@@ -14,6 +15,21 @@ Mask = NDArray[np.int32]
 
 _BAND_ROWS = 256
 """Rows that are looked at at a time."""
+
+
+WIDEST_GROUP = 10
+"""Most columns side by side that are looked for as one defect."""
+
+BESIDE = 2
+"""Columns on either side to which a group is compared."""
+
+NEARBY = 40
+"""Columns on either side, at least, that tell how much the fringes rise and fall."""
+
+USUAL_PERCENT = 80.0
+EXCEPTIONAL = 6.0
+"""A defect rises by this times what so many per cent of the groups nearby rise by at most: eight standard deviations
+of a random pattern, six times the amplitude of a sine."""
 
 
 def isolated_defects(
@@ -88,17 +104,22 @@ def column_means(image: Image, mask: Mask) -> tuple[NDArray[np.float64], NDArray
 def bad_columns(
     mean: NDArray[np.float64], known: NDArray[np.bool_], options: FlatPrepOptions
 ) -> NDArray[np.intp]:
-    """Greedy search: the worst column is replaced by what its neighbours predict, until none stands out."""
+    """Greedy search: the worst columns are replaced by what their neighbours predict, until none stands out."""
     index = np.flatnonzero(known)
     profile = mean[index].copy()
     if len(profile) < 12:
         return np.zeros(0, dtype=np.intp)
-    found: list[int] = []
     residual = profile - _predicted(profile)[0]
     limit = max(
         options.column_sigma * GAUSSIAN_MAD * float(np.median(np.abs(residual))),
         options.column_fraction * float(np.median(profile)),
     )
+    found: list[int] = []
+    # Where an amplifier is left out, the fringes go on elsewhere.
+    for run in np.split(np.arange(len(index)), np.flatnonzero(np.diff(index) > 1 + WIDEST_GROUP) + 1):
+        part = profile[run]
+        found.extend(index[run[_adjacent_bad_columns(part, limit)]].tolist())
+        profile[run] = part
     for _ in range(len(profile) // 4):
         prediction, spread = _predicted(profile)
         residual = profile - prediction
@@ -111,6 +132,58 @@ def bad_columns(
         found.append(int(index[worst]))
         profile[worst] = prediction[worst]
     return np.unique(np.array(found, dtype=np.intp))
+
+
+def _adjacent_bad_columns(profile: NDArray[np.float64], limit: float) -> NDArray[np.intp]:
+    """Columns, alone or side by side, that rise from those beside them as little else does nearby.
+
+    How much any so many columns rise from their neighbours is known from those nearby: fringes, however strong, do it
+    everywhere. What is found is replaced in ``profile`` by what lies on either side, and no longer hides others.
+    """
+    widths = range(1, min(WIDEST_GROUP, len(profile) // 6) + 1)
+    found: list[int] = []
+    before = -1
+    while widths and before < len(found) <= len(profile) // 4:
+        before = len(found)
+        least = [np.maximum(_usual_rise(_rise(profile, width)[0], width), limit) for width in widths]
+        while (group := _worst_group(profile, widths, least)) is not None:
+            first, last = group
+            found.extend(range(first, last))
+            left, right = profile[first - BESIDE : first].mean(), profile[last : last + BESIDE].mean()
+            profile[first:last] = np.linspace(left, right, last - first + 2)[1:-1]
+    return np.array(found, dtype=np.intp)
+
+
+def _worst_group(
+    profile: NDArray[np.float64], widths: range, least: list[NDArray[np.float64]]
+) -> tuple[int, int] | None:
+    """First column of the group that stands out most, and the one behind it."""
+    worst, group = 1.0, None
+    for width, low in zip(widths, least, strict=True):
+        rise, step = _rise(profile, width)
+        # At a step of the gain between amplifiers the two sides differ by more.
+        score = np.where(np.abs(rise) > np.abs(step), np.abs(rise) / low, 0.0)
+        at = int(np.argmax(score))
+        if score[at] > worst:
+            worst, group = float(score[at]), (at + BESIDE, at + BESIDE + width)
+    return group
+
+
+def _rise(profile: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean of every ``width`` columns over that of the `BESIDE` ones on either side, and by how much these differ."""
+    total = np.concatenate([[0.0], np.cumsum(profile)])
+    first = np.arange(BESIDE, len(profile) - width - BESIDE + 1)
+    inner = (total[first + width] - total[first]) / width
+    left = (total[first] - total[first - BESIDE]) / BESIDE
+    right = (total[first + width + BESIDE] - total[first + width]) / BESIDE
+    return inner - 0.5 * (left + right), right - left
+
+
+def _usual_rise(rise: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+    """What a group must exceed by the fringes around it, of which a few defects are a small part."""
+    size = min(2 * (NEARBY + 8 * width) + 1, len(rise))
+    usual: NDArray[np.float64] = percentile_filter(np.abs(rise), USUAL_PERCENT, size, mode="reflect")
+    return EXCEPTIONAL * usual
 
 
 def _predicted(profile: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -11,7 +11,8 @@ from ..errors import printable_name
 from ..files import table_text, write_whole
 from ..mock.thickness import e2v_321
 from ..resources import read_user_table
-from .inputs import prepare_folder, read_settings, read_thickness
+from .inputs import read_settings, read_thickness
+from .output import OutputFolder, output_folder
 from .parameters import BUILT_IN, EFFECT, effect_settings
 
 __all__ = ["amplitudes", "read_line_list"]
@@ -38,7 +39,7 @@ STEP_PX = 16
 )
 @click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="Folder for the table as ECSV.")
+@output_folder("Folder for the table as ECSV.", "amplitudes.ecsv", required=False)
 @click.option("--dry-run", is_flag=True, help="Check everything, compute nothing.")
 def amplitudes(
     thickness: str,
@@ -46,7 +47,7 @@ def amplitudes(
     cases: tuple[str, ...],
     effects: tuple[tuple[str, float], ...],
     effects_file: Path | None,
-    out: Path | None,
+    out: OutputFolder | None,
     dry_run: bool,
 ) -> None:
     """Fringe amplitudes of every set-up of the paper: its Table 2.
@@ -68,7 +69,7 @@ def amplitudes(
     if dry_run:
         click.echo(f"would compute every set-up with {', '.join(sky.name for sky in skies)}")
         return
-    folder = prepare_folder(out) if out is not None else None
+    folder = out.prepare() if out is not None else None
     rows = [case for case in CASES if not cases or case.name in cases]
     table = compare_amplitudes(adhesive, skies, settings, rows)
     shown = table.copy(copy_data=False)

@@ -10,6 +10,7 @@ import click
 
 from ..errors import InputError
 from ..files import write_whole
+from .output import OutputFolder, output_folder
 from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
 
 if TYPE_CHECKING:
@@ -18,12 +19,11 @@ if TYPE_CHECKING:
 __all__ = ["challenge"]
 
 RECORD = "cases.jsonl"
+TABLES = ("challenge.ecsv", "confusion.ecsv", "accuracy.ecsv", "calibration.ecsv", "pulls.ecsv")
 
 
 @click.command()
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder for results, tables and page."
-)
+@output_folder("Folder for results, tables and page.", RECORD, *TABLES, "challenge.html", resumes=True)
 @click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all cases.")
 @click.option(
     "--none", "none", type=click.IntRange(0), default=200, show_default=True, help="Cases without effect."
@@ -46,7 +46,7 @@ RECORD = "cases.jsonl"
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Cases at the same time.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done, write nothing.")
 def challenge(
-    out: Path,
+    out: OutputFolder,
     seed: int,
     none: int,
     one: int,
@@ -69,7 +69,6 @@ def challenge(
     from ..challenge.page import write_challenge_report
     from ..challenge.result import CASE_KINDS
     from ..challenge.run import run_challenge
-    from .inputs import prepare_folder
 
     LABORATORY.convert(setup, None, None)
     counts = dict(zip(CASE_KINDS, (none, one, two, outsider), strict=True))
@@ -77,7 +76,7 @@ def challenge(
     if dry_run:
         click.echo(f"would run {total} cases of {size[0]} x {size[1]} pixels of {setup}: {counts}")
         return
-    record = prepare_folder(out) / RECORD
+    record = out.prepare() / RECORD
     known = _earlier_cases(record, {"seed": seed, "setup": setup, "columns": size[0], "rows": size[1]})
     done = sum(case.number < counts[case.kind] for case in known)
     if done:
@@ -94,8 +93,8 @@ def challenge(
     result = run_challenge(
         counts, seed, size=(size[1], size[0]), setup=setup, known=known, jobs=jobs, progress=keep
     )
-    path = result.write(out)
-    write_challenge_report(out / "challenge.html", result)
+    path = result.write(out.path)
+    write_challenge_report(out.path / "challenge.html", result)
     click.echo(json.dumps(result.summary(), indent=2))
     click.echo(str(path))
 

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import click
 from .. import __version__
 from ..errors import FringeSimError, InputError
 from ..files import write_whole
+from .output import LOCK, OutputFolder, output_folder
 from .parameters import SIZE
 
 __all__ = ["demo"]
@@ -32,6 +33,7 @@ LAB_RUN, THICKNESS_RUN, SKY_RUN, CALIBRATIONS = "demo/lab", "demo/thickness", "d
 PIPELINES = "resource://lsst.fringe_sim/pipelines"
 SEED_CONFIG = "resource://lsst.fringe_sim/configs/butler.yaml"
 STATE = "demo.json"
+PRODUCTS = (STATE, "repo", "raws", "logs", "discovery", "report.html")
 
 
 class DemoError(FringeSimError):
@@ -74,7 +76,7 @@ class DemoRun:
                     f"an empty folder, or one made with the same settings ({former['settings']})",
                 )
             self._done = list(former["done"])
-        elif any(self.folder.iterdir()):
+        elif any(entry.name != LOCK for entry in self.folder.iterdir()):
             raise InputError("demo folder", str(self.folder), "an empty folder, or one that a demo has made")
         (self.folder / "logs").mkdir(exist_ok=True)
 
@@ -130,14 +132,12 @@ class DemoRun:
 
 
 @click.command()
-@click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder."
-)
+@output_folder("Folder.", *PRODUCTS, default=Path("demo"), resumes=True)
 @click.option("--size", type=SIZE, default="1024x1000", show_default=True, help="Pixels of the sensor.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the raw frames.")
-@click.option("--fresh", is_flag=True, help="Throw away what a former demo left in the folder.")
+@click.option("--fresh", is_flag=True, help="The same as --overwrite.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done.")
-def demo(out: Path, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool) -> None:
+def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool) -> None:
     """Run the whole chain on the built-in sensor: raw flats, thickness, sky, templates, report.
 
     The sensor is E2V-CCD250-321, sampled at fewer pixels. Everything is done by butler and pipetask in a SQLite
@@ -156,11 +156,8 @@ def demo(out: Path, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool
         click.echo(f"would simulate {SENSOR} with {text} pixels and process it in {out}/repo")
         return
     from .demo_report import DemoDatasets, write_demo_report
-    from .inputs import prepare_folder
 
-    if fresh and (out / STATE).is_file():
-        shutil.rmtree(out)
-    folder = prepare_folder(out)
+    folder = _folder(replace(out, overwrite=True) if fresh else out).prepare()
     run = DemoRun(folder, DemoSettings(__version__, text, seed))
     click.echo(f"Demo in {folder}: {SENSOR}, {text} pixels")
     _laboratory(run, shape, text, seed)
@@ -170,6 +167,17 @@ def demo(out: Path, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool
         run.step("discovery", "search for a missing effect", lambda: _discover(run, seed))
     run.step("report", "figures and report", lambda: write_demo_report(folder, datasets))
     _closing_words(folder, datasets)
+
+
+def _folder(out: OutputFolder) -> OutputFolder:
+    """The same folder; cleared only if a demo made it, and nothing else lies there."""
+    if not out.overwrite or not out.path.is_dir():
+        return out
+    others = sorted({entry.name for entry in out.path.iterdir()} - {*PRODUCTS, LOCK})
+    if others:
+        allowed = f"an empty folder, or one that a demo alone has made (there is {others[0]})"
+        raise InputError("demo folder", str(out), allowed)
+    return replace(out, overwrite=(out.path / STATE).is_file())
 
 
 def _laboratory(run: DemoRun, shape: tuple[int, int], size: str, seed: int) -> None:
@@ -269,7 +277,7 @@ def _discover(run: DemoRun, seed: int) -> None:
     run.program(
         "discover",
         *("fringe-sim", "discover", str(run.folder / "raws"), "--setup", SETUP),
-        *("--out", str(run.folder / "discovery"), "--seed", str(seed)),
+        *("--out", str(run.folder / "discovery"), "--overwrite", "--seed", str(seed)),
     )
 
 

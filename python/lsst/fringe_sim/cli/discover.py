@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import InputError
+from .output import OutputFolder, output_folder
 from .parameters import ANY_LIGHT, EFFECT, effect_settings
 from .progress import progress
 
@@ -26,7 +27,7 @@ __all__ = ["discover"]
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
 @ANY_LIGHT.option("ts8_e2v", "Set-up of flats, or of frames of the sky: name or file.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the verdict.")
+@output_folder("Folder for the verdict.", "discovery.json", "discovery.ecsv", "effects.py", "report.html")
 @click.option(
     "--seed", type=int, default=1, show_default=True, help="Which parts of the sensor are held out."
 )
@@ -49,7 +50,7 @@ __all__ = ["discover"]
 def discover(
     paths: tuple[str, ...],
     setup: Setup,
-    out: Path,
+    out: OutputFolder,
     seed: int,
     effects: tuple[tuple[str, float], ...],
     effects_file: Path | None,
@@ -70,7 +71,7 @@ def discover(
       fringe-sim discover raws --setup ts8_e2v --out verdict
       fringe-sim discover cube.fits --setup ts8_e2v --effect bandwidth.fwhm=2.3 --out verdict
       fringe-sim discover REPO --collections u/me/flats --detector 37 --out verdict
-      fringe-sim discover sky --setup lsst_e2v --thickness fit/thickness.fits --out verdict
+      fringe-sim discover sky --setup lsst_e2v --thickness fit/thickness.fits --out verdict_sky
     """
     import numpy as np
 
@@ -78,7 +79,7 @@ def discover(
     from ..algorithms.discovery import discover as search
     from ..model import FringeModel
     from ..report.discovery_page import residual_pair
-    from .inputs import prepare_folder, read_settings, sky_settings
+    from .inputs import read_settings, sky_settings
     from .sky_frames import read_sky_frames
 
     settings = dict(read_settings(effects_file)) if effects_file else {}
@@ -98,7 +99,7 @@ def discover(
     cube = _read(paths, setup, collections, detector, skip_bad, dry_run)
     if cube is None:
         return
-    folder = prepare_folder(out)
+    folder = out.prepare()
     verdict = search(
         cube,
         model,
@@ -109,13 +110,12 @@ def discover(
     _write(verdict, folder, residual_pair(cube, model, verdict))
 
 
-def _search_sky(data: SkyData, model: FringeModel, out: Path, seed: int, cells: int) -> None:
+def _search_sky(data: SkyData, model: FringeModel, out: OutputFolder, seed: int, cells: int) -> None:
     import numpy as np
 
     from ..algorithms.discovery import SKY_SEARCH, discover_sky, placement_in_frames
-    from .inputs import prepare_folder
 
-    folder = prepare_folder(out)
+    folder = out.prepare()
     verdict = discover_sky(
         data.sky.frames,
         data.sky.thickness_um,

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from ..errors import InputError
+from .output import OutputFolder, output_folder
 from .progress import progress
 
 __all__ = ["export"]
@@ -14,9 +15,9 @@ __all__ = ["export"]
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the NetCDF files.")
+@output_folder("Folder for the NetCDF files.")
 @click.option("--dry-run", is_flag=True, help="Read everything, write nothing.")
-def export(files: tuple[Path, ...], out: Path, dry_run: bool) -> None:
+def export(files: tuple[Path, ...], out: OutputFolder, dry_run: bool) -> None:
     """Write thickness maps, fringe cubes and sky frames as NetCDF, for xarray.
 
     Axes are named, coordinates and images have units, header keywords become attributes. Needs the extra:
@@ -29,15 +30,16 @@ def export(files: tuple[Path, ...], out: Path, dry_run: bool) -> None:
       python -c 'import xarray; print(xarray.open_dataset("nc/thickness.nc"))'
     """
     from ..products.xarray_export import read_exported, to_xarray, write_netcdf
-    from .inputs import prepare_folder
 
-    targets = [out / f"{file.stem}.nc" for file in files]
+    targets = [out.path / f"{file.stem}.nc" for file in files]
     for number, target in enumerate(targets):
         if target in targets[:number]:
             other = files[targets.index(target)]
             raise InputError("files", f"{other} and {files[number]}", "files of different names")
+    out = out.holding(*(target.name for target in targets))
+    out.refuse_used()
     if not dry_run:
-        prepare_folder(out)
+        out.prepare()
     with progress("exporting", len(files)) as advance:
         for file, target in zip(files, targets, strict=True):
             dataset = to_xarray(read_exported(file))

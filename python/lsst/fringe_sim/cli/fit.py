@@ -9,6 +9,7 @@ import click
 
 from ..algorithms.thickness_fit_options import CONTRASTS, FIT_METHODS, SILICON_FIELDS, ZONES
 from ..errors import InputError, UnknownNameError
+from .output import OutputFolder, output_folder
 from .parameters import EFFECT, LABORATORY, effect_settings
 from .progress import progress
 
@@ -29,9 +30,7 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
 @LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder for map, figures, report."
-)
+@output_folder("Folder for map, figures, report.", "thickness.fits", "report.html")
 @click.option(
     "--method",
     type=click.Choice(FIT_METHODS),
@@ -81,7 +80,7 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 def fit(
     paths: tuple[str, ...],
     setup: Setup,
-    out: Path,
+    out: OutputFolder,
     method: str,
     smoothing: float | None,
     silicon: str,
@@ -109,7 +108,7 @@ def fit(
     from ..model import FringeModel
     from ..model.provenance import input_cards
     from ..report.thickness_page import write_thickness_report
-    from .inputs import effect_cards, prepare_folder, read_settings
+    from .inputs import effect_cards, read_settings
     from .lab_frames import read_cube
 
     settings = dict(read_settings(effects_file)) if effects_file else {}
@@ -136,7 +135,7 @@ def fit(
         raise InputError("number of wavelengths", found, f"{LEAST_WAVELENGTHS} or more")
     section = section_of_cube(cube, setup)
     model = model_of_flats(model, cube.exposures)
-    folder = prepare_folder(out)
+    folder = out.prepare()
     cards = {**effect_cards(model), **input_cards([*used, *([effects_file] if effects_file else [])])}
     click.echo("fitting the thickness", err=True)
     fitted = fit_thickness(cube, model, method, nuisances=free, silicon=search)

@@ -33,7 +33,8 @@ from ..model import FringeModel, Setup
 from ..report.figures import focal_plane_figure
 from ..report.page import Report
 from ..report.style import save_figure
-from .inputs import prepare_folder, read_settings, read_thickness, sky_settings
+from .inputs import read_settings, read_thickness, sky_settings
+from .output import OutputFolder, output_folder
 from .progress import progress
 
 __all__ = ["focal_plane"]
@@ -82,8 +83,12 @@ class _SensorMapType(click.ParamType):
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of stand-ins and nights.")
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder for tables, figure and report."
+@output_folder(
+    "Folder for tables, figure and report.",
+    "cells.ecsv",
+    "focal_plane.ecsv",
+    "focal_plane.png",
+    "report.html",
 )
 @click.option("--dry-run", is_flag=True, help="Check everything, state the cost, write nothing.")
 def focal_plane(
@@ -93,7 +98,7 @@ def focal_plane(
     nights: int,
     seed: int,
     effects_file: Path | None,
-    out: Path,
+    out: OutputFolder,
     dry_run: bool,
 ) -> None:
     """Forecast the fringes of every sensor of the LSST Camera.
@@ -116,7 +121,7 @@ def focal_plane(
     if dry_run:
         click.echo(FocalPlaneCost(len(chosen), len(NightHistory.guo2022())).describe())
         return
-    folder = prepare_folder(out)
+    folder = out.prepare()
     vendors = {item.name: item.vendor for item in Camera.from_name("lsstCam").science}
     thickness = {
         name: read_thickness(path, Setup.from_name(SETUPS[vendors[name]]).varying)

@@ -1,4 +1,4 @@
-"""Reading what a command is pointed at: thickness maps, settings, output folders."""
+"""Reading what a command is pointed at: thickness maps, settings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from ..resources import LONGEST_USER_FILE, open_user_fits, read_user_text, read_
 __all__ = [
     "complete_fits",
     "effect_cards",
-    "prepare_folder",
     "read_section",
     "read_settings",
     "read_thickness",
@@ -114,28 +113,6 @@ def sky_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     if left:
         click.echo(f"effects of the laboratory, not taken to the sky: {', '.join(left)}", err=True)
     return applied
-
-
-def prepare_folder(path: str | os.PathLike[str]) -> Path:
-    """Make an output folder, or find out early that it cannot be written.
-
-    Raises
-    ------
-    InputError
-        The path is a file, or the folder cannot be written.
-    """
-    folder = Path(path)
-    if folder.exists() and not folder.is_dir():
-        raise InputError("output folder", str(folder), "a folder, not a file")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            "output folder", str(folder), f"a folder that can be made ({error.strerror})"
-        ) from None
-    if not os.access(folder, os.W_OK):
-        raise InputError("output folder", str(folder), "a folder that can be written")
-    return folder
 
 
 def effect_cards(model: FringeModel) -> dict[str, str | float]:

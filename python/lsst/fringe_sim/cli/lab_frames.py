@@ -14,7 +14,7 @@ from ..algorithms.flat_prep import combine_biases, prepare_flat
 from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..errors import FrameFormatError, FringeSimError, InputError
 from ..instrument.camera import Camera, Detector
-from ..instrument.raw_files import find_raw_files
+from ..instrument.raw_files import find_raw_files, pixel_digest
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..model import Setup
 from ..products import FringeCube, FringeFlat
@@ -73,11 +73,23 @@ class LabSeries:
             Choices of the preparation.
         advance : callable
             Called after each frame.
+
+        Raises
+        ------
+        FrameFormatError
+            A frame that cannot be used, or one whose pixels are those of another exposure.
         """
+        seen: dict[str, str] = {}
 
         def frames(several: Sequence[RawMetadata]) -> Any:
             for one in several:
-                yield RawFrame.read(one.source)
+                frame = RawFrame.read(one.source)
+                other = seen.setdefault(pixel_digest(frame), one.source)
+                if other != one.source:
+                    raise FrameFormatError(
+                        "pixels", f"those of {other}", "light of its own", source=one.source
+                    )
+                yield frame
                 advance()
 
         bias = combine_biases(frames(self.biases), options) if self.biases else None
@@ -96,7 +108,8 @@ class LabSeries:
             except InputError as error:
                 raise error.in_source(frame.metadata.source) from None
 
-        return FringeCube.from_flats(map(prepared, frames(self.flats)), number=len(self.flats))
+        flats = (_say_masked(prepared(frame)) for frame in frames(self.flats))
+        return FringeCube.from_flats(flats, number=len(self.flats))
 
     def _sensor(self, setup: Setup) -> Detector:
         camera = Camera.from_name(setup.camera)
@@ -127,6 +140,8 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
         A file that is not a raw frame (all such files are reported first).
     InputError
         Nothing there, no flats, or frames of more than one sensor.
+
+    Copies of a frame count once, and are named.
     """
     files, refused = find_raw_files(paths)
     frames: list[RawMetadata] = []
@@ -144,6 +159,9 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
         raise FrameFormatError(
             "raw frames", f"{len(bad) + len(refused)} unusable", "complete raw frames, or --skip-bad to go on"
         )
+    frames = _each_once(frames)
+    for note in dict.fromkeys(note for frame in frames for note in frame.notes):
+        click.echo(note, err=True)
     flats = [frame for frame in frames if frame.observation_type == "flat"]
     if not flats:
         kinds = ", ".join(sorted({frame.observation_type for frame in frames})) or "no frame"
@@ -156,6 +174,39 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
         frame for frame in frames if frame.observation_type == "bias" and frame.serial == flats[0].serial
     ]
     return LabSeries(flats[0].serial, tuple(biases), tuple(flats))
+
+
+def _say_masked(flat: FringeFlat) -> FringeFlat:
+    if flat.metadata["BADAMPS"] != "none":
+        found = flat.metadata["BADAMPS"]
+        click.echo(
+            f"{flat.wavelength_nm:g} nm: amplifiers masked whole (dead, hot or saturated): {found}", err=True
+        )
+    return flat
+
+
+def _each_once(frames: Sequence[RawMetadata]) -> list[RawMetadata]:
+    """Frames without the copies of an exposure.
+
+    Raises
+    ------
+    FrameFormatError
+        Two files say that they are one exposure, with different pixels.
+    """
+    kept: dict[tuple[object, ...], RawMetadata] = {}
+    copies = []
+    for frame in frames:
+        place = frame.serial or f"{frame.raft}_{frame.slot}"
+        first = kept.setdefault((frame.camera, place, frame.exposure_id), frame)
+        if first is frame:
+            continue
+        if pixel_digest(RawFrame.read(first.source)) != pixel_digest(RawFrame.read(frame.source)):
+            allowed = f"an exposure of its own: {first.source} has the same with other pixels"
+            raise FrameFormatError("exposure", frame.exposure_id, allowed, source=frame.source)
+        copies.append(frame.source)
+    if copies:
+        click.echo(f"copies of other frames, not counted again: {', '.join(copies)}", err=True)
+    return list(kept.values())
 
 
 def read_cube(path: str) -> FringeCube | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import InputError
+from .output import OutputFolder, output_folder
 from .parameters import (
     BUILT_IN,
     EFFECT,
@@ -36,7 +37,7 @@ BLEMISHES: dict[str, Any] = {"bad_columns": 6, "hot_pixels": 200, "prnu_rms": 0.
 
 
 @click.command("mock-flats")
-@click.argument("outdir", type=click.Path(path_type=Path))
+@output_folder("Folder for the frames.", "*_bias_bias_*.fits", "*_lambda_flat_*.fits", argument=True)
 @laboratory_of_the_mock
 @click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
 @click.option(
@@ -68,7 +69,7 @@ BLEMISHES: dict[str, Any] = {"bad_columns": 6, "hot_pixels": 200, "prnu_rms": 0.
 @click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all randomness.")
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def mock_flats(
-    outdir: Path,
+    out: OutputFolder,
     setup: str,
     detector: str | None,
     thickness: str,
@@ -97,7 +98,7 @@ def mock_flats(
     from ..instrument.camera import Camera
     from ..mock.hidden_effects import validate_effects
     from ..mock.raw_frames import Defects, write_mock_flats
-    from .inputs import prepare_folder, read_settings
+    from .inputs import read_settings
 
     chosen = LABORATORY.convert(setup, None, None)
     camera = Camera.from_name(chosen.camera)
@@ -113,11 +114,9 @@ def mock_flats(
     layer = thickness_map(thickness, chosen, shape, rng)
     frames = bias_frames + len(nominal)
     if dry_run:
-        click.echo(
-            f"would write {frames} frames of {sensor.name}, {shape[1]} x {shape[0]} pixels, to {outdir}"
-        )
+        click.echo(f"would write {frames} frames of {sensor.name}, {shape[1]} x {shape[0]} pixels, to {out}")
         return
-    folder = prepare_folder(outdir)
+    folder = out.prepare()
     with progress("writing raw frames", frames) as advance:
         run = write_mock_flats(
             folder,

@@ -9,6 +9,7 @@ import click
 
 from ..errors import InputError
 from ..files import table_text, write_whole
+from .output import OutputFolder, output_folder
 from .parameters import SIZE
 from .progress import progress
 
@@ -23,9 +24,7 @@ LEAST_SIDE = 64
 
 
 @click.command()
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder for the page and the table."
-)
+@output_folder("Folder for the page and the table.", "paper.html", "paper.ecsv")
 @click.option(
     "--size", type=SIZE, default="1024x1001", show_default=True, help="Pixels for the whole sensor."
 )
@@ -44,7 +43,7 @@ LEAST_SIDE = 64
 )
 @click.option("--dry-run", is_flag=True, help="Say what would be computed, write nothing.")
 def reproduce_paper(
-    out: Path, size: tuple[int, int], coadds: int, published: Path | None, seed: int, dry_run: bool
+    out: OutputFolder, size: tuple[int, int], coadds: int, published: Path | None, seed: int, dry_run: bool
 ) -> None:
     """Recompute every figure and number of the paper, beside what it states.
 
@@ -60,7 +59,6 @@ def reproduce_paper(
     from ..paper import SECTIONS, reproduce
     from ..paper.section import Context
     from ..report.paper_page import write_paper_page
-    from .inputs import prepare_folder
 
     columns, rows = size
     if min(size) < LEAST_SIDE or rows > E2V_SHAPE[0] or columns > E2V_SHAPE[1]:
@@ -79,7 +77,7 @@ def reproduce_paper(
         seed,
         folder,
     )
-    target = prepare_folder(out)
+    target = out.prepare()
     notices = []
     if folder is not None:
         click.echo(f"published curves: {folder}", err=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import InputError, OutOfRangeError
+from .output import OutputFolder, output_folder
 from .parameters import BUILT_IN, EFFECT, SKY, Quantity, effect_settings
 from .progress import progress
 
@@ -49,9 +50,7 @@ MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the noise.")
 @click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder for frames, figure and report."
-)
+@output_folder("Folder for frames, figure and report.", "sky_*_[0-9][0-9].fits", "sky.png", "report.html")
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def sky(
     setup: Setup,
@@ -65,7 +64,7 @@ def sky(
     seed: int,
     effects: tuple[tuple[str, float], ...],
     effects_file: Path | None,
-    out: Path,
+    out: OutputFolder,
     dry_run: bool,
 ) -> None:
     """Simulate the fringes of the night sky for one sensor behind a telescope.
@@ -76,7 +75,7 @@ def sky(
     Examples:
       fringe-sim sky --thickness fit/thickness.fits --detector R22_S11 --out sky
       fringe-sim sky --setup monocam --thickness e2v_321 --noiseless --exptime 60s --out sky
-      fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky
+      fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky_with_effects
     """
     from ..algorithms.field_response import SensorPlacement, sensor_response
     from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, throughput_electrons
@@ -89,7 +88,7 @@ def sky(
     from ..report.figures import sky_figure
     from ..report.sky_page import write_sky_report
     from ..report.style import save_figure
-    from .inputs import effect_cards, prepare_folder, read_settings, sky_settings
+    from .inputs import effect_cards, read_settings, sky_settings
 
     _check_exposure(exptime, night)
     sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
@@ -123,7 +122,7 @@ def sky(
         cards |= {"LABCONTR": contrast[0], "LABCONSG": contrast[1]}
     if section is not None:
         cards["DETSEC"] = section.keyword
-    folder = prepare_folder(out)
+    folder = out.prepare()
     dark = SkySpectrum.dark(airmass=airmass or setup.airmass)
     click.echo("tabulating the response to the sky", err=True)
     place = SensorPlacement.of(sensor, setup.pixel_scale_arcsec, section)

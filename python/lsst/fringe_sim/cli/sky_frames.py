@@ -6,12 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
+
 from ..algorithms.field_response import SensorPlacement
 from ..errors import InputError
 from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
 from ..products import SkyFrames, SkyFringe, ThicknessMap
+from ..products.same_light import pixels_digest
 
 __all__ = ["SkyData", "read_sky_frames"]
 
@@ -52,10 +55,23 @@ def read_sky_frames(paths: Sequence[str], setup: Setup, thickness: str | None) -
     if thickness is None:
         raise InputError("--thickness", None, "a thickness map: frames of the sky alone do not tell it")
     files = _files(paths)
-    frames = [SkyFringe.read_fits(file) for file in files]
+    frames = _each_once(files)
     sky = SkyFrames(frames, ThicknessMap.read_any(thickness, setup.varying))
     sensor = Camera.from_name(setup.camera).detector(sky.detector or setup.detector)
     return SkyData(sky, setup, sensor)
+
+
+def _each_once(files: Sequence[Path]) -> list[SkyFringe]:
+    """Frames without copies, which are named."""
+    frames: dict[str, SkyFringe] = {}
+    copies = []
+    for file in files:
+        frame = SkyFringe.read_fits(file)
+        if frames.setdefault(pixels_digest(frame.image), frame) is not frame:
+            copies.append(str(file))
+    if copies:
+        click.echo(f"copies of other frames, not counted again: {', '.join(copies)}", err=True)
+    return list(frames.values())
 
 
 def _files(paths: Sequence[str]) -> list[Path]:

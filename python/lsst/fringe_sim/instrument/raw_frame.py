@@ -25,6 +25,8 @@ from astropy.io import fits
 
 from ..errors import FrameFormatError, InputError, UnknownNameError
 from ..resources import DAMAGE, first_line, open_user_fits
+from .camera import Camera
+from .raw_checks import refuse_other_vendor
 from .raw_metadata import OBSERVATION_TYPES, RawMetadata, header_value
 
 __all__ = [
@@ -37,6 +39,9 @@ __all__ = [
     "read_raw_header",
     "read_raw_metadata",
 ]
+
+SETTING_NM = 1.0
+"""What two readings of one setting of the monochromator may differ by; steps between flats are 5 nm or more."""
 
 N_AMPLIFIERS = 16
 """Outputs of an LSST science sensor."""
@@ -195,6 +200,7 @@ class RawFrame:
             header = _merged_header(hdus)
             metadata = RawMetadata.from_header(header, source=source)
             layouts, shape = _amplifier_layouts(hdus, source)
+            _refuse_other_vendor(header, metadata, shape)
             amplifiers = tuple(
                 RawAmplifier(data=_integer_pixels(hdus[layout.hdu], source), **vars(layout))
                 for layout in layouts
@@ -249,7 +255,18 @@ def read_raw_metadata(path: str | Path) -> RawMetadata:
     UnknownNameError
         The sensor that the header names is not in the camera.
     """
-    return RawMetadata.from_header(read_raw_header(path), source=str(path))
+    source = str(path)
+    with _open_fits(source) as hdus:
+        _, shape = _amplifier_layouts(hdus, source)
+        header = _merged_header(hdus)
+    metadata = RawMetadata.from_header(header, source=source)
+    _refuse_other_vendor(header, metadata, shape)
+    return metadata
+
+
+def _refuse_other_vendor(header: fits.Header, metadata: RawMetadata, shape: tuple[int, int]) -> None:
+    sensor = Camera.from_name(metadata.camera).detector(metadata.detector)
+    refuse_other_vendor(header_value(header, "CCD_MANU"), sensor, shape, metadata.source)
 
 
 # Reading the file -----------------------------------------------------------------------------------------
@@ -281,9 +298,20 @@ def _merged_header(hdus: Sequence[Any]) -> fits.Header:
     for hdu in hdus[1:]:
         if hdu.name in _CONDITION_HDUS:
             for keyword in _CONDITIONS:
-                if header_value(header, keyword) is None and header_value(hdu.header, keyword) is not None:
-                    header[keyword] = (hdu.header[keyword], f"from {hdu.name}")
+                value = header_value(hdu.header, keyword)
+                if value is not None and header_value(header, keyword) is None:
+                    header[keyword] = (value, f"from {hdu.name}")
+                elif keyword == "MONOWL" and value is not None:
+                    _refuse_other_wavelength(header, hdu)
     return header
+
+
+def _refuse_other_wavelength(header: fits.Header, hdu: Any) -> None:
+    """The monochromator is set once: what two HDUs say of it may differ by its reading, not by another setting."""
+    here, there = header_value(header, "MONOWL"), header_value(hdu.header, "MONOWL")
+    numbers = all(isinstance(value, int | float) and value > 0 for value in (here, there))
+    if numbers and abs(here - there) > SETTING_NM:
+        raise FrameFormatError("MONOWL", f"{here} and {there} in {hdu.name}", "one wavelength")
 
 
 def _integer_pixels(hdu: Any, source: str) -> npt.NDArray[np.integer[Any]]:
@@ -374,11 +402,25 @@ def _read_sections(number: int, hdu: Any, order: int, source: str) -> _Sections:
         raise FrameFormatError(
             f"{name} DETSEC", str(detsec), f"a section of the size of DATASEC {datasec}", source=source
         )
+    _refuse_changed_pixels(hdu.header, name, source)
     if hdu.header.get("BITPIX", 0) < 0:
         raise FrameFormatError(
             f"{name} BITPIX", hdu.header["BITPIX"], "8, 16, 32 or 64: integer ADU", source=source
         )
     return _Sections(name, channel, number, raw_shape, datasec, detsec)
+
+
+def _refuse_changed_pixels(header: Mapping[str, Any], name: str, source: str) -> None:
+    """Pixels must be those of the sensor, and numbers those of the converter."""
+    binning = header_value(header, "CCDSUM")
+    if binning is not None and str(binning).split() != ["1", "1"]:
+        raise FrameFormatError(f"{name} CCDSUM", binning, "1 1: pixels that are not binned", source=source)
+    scale = header_value(header, "BSCALE")
+    if scale not in (None, 1):
+        raise FrameFormatError(f"{name} BSCALE", scale, "1: ADU as they were read", source=source)
+    blank = header_value(header, "BLANK")
+    if blank is not None and header.get("BITPIX", 0) > 0:
+        raise FrameFormatError(f"{name} BLANK", blank, "no such card: every pixel has its ADU", source=source)
 
 
 def _channel(header: Mapping[str, Any], order: int, source: str) -> int:

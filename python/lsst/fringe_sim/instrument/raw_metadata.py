@@ -19,6 +19,7 @@ from astropy.time import Time
 
 from ..errors import FrameFormatError, InputError, UnknownNameError, to_number
 from .camera import Camera, Detector
+from .raw_checks import refuse_other_day, refuse_other_instrument
 
 __all__ = ["DAY_ROLLOVER_H", "OBSERVATION_TYPES", "RawMetadata", "header_value"]
 
@@ -62,6 +63,15 @@ ZERO_CELSIUS_K = 273.15
 CONTROLLERS = "OCHPQS"
 """Data-acquisition controllers of the LSST Camera; the place adds thousands of years to the exposure number."""
 
+LAST_DAY_OF_OWN_COUNT = {"C": 20231004, "P": 20250417, "Q": 20250417, "S": 20250417}
+"""Last observing day on which a controller counted for itself; since then it shares the count of O (obs_lsst)."""
+
+TS8_NUMBERED_SINCE = datetime.datetime(2023, 5, 24, 23)
+"""Since then exposures of TS8 are numbered like those of the camera (obs_lsst)."""
+
+OF_RUBIN = ("ts8", "lsstCam")
+"""Cameras whose headers state times in TAI unless they say otherwise (obs_lsst)."""
+
 DAY_ROLLOVER_H = {"ts8": 8.0, "lsstCam": 12.0, "monocam": 12.0}
 """UTC hour at which the observing day begins, as obs_lsst has it."""
 
@@ -102,12 +112,16 @@ class RawMetadata:
         ``RUNNUM``; empty if absent.
     date_obs : `datetime.datetime`
         Start of the exposure as the header has it, without time zone.
+    time_scale : `str`
+        What that is in: ``tai`` or ``utc``. As in obs_lsst, TAI where ``TIMESYS`` does not state it.
     day_obs : `int`
         Observing day, ``YYYYMMDD``.
     seq_num : `int`
         Number of the exposure within the day; seconds since the day began where the header states none.
     exposure_id : `int`
         Number of the exposure, the same for all sensors read together.
+    notes : `tuple` [`str`, ...]
+        What was taken for granted because the header does not state it.
     """
 
     source: str
@@ -127,9 +141,11 @@ class RawMetadata:
     filter_name: str
     run: str
     date_obs: datetime.datetime
+    time_scale: str
     day_obs: int
     seq_num: int
     exposure_id: int
+    notes: tuple[str, ...] = ()
 
     def require_wavelength_nm(self) -> float:
         """Return the wavelength of a monochromatic flat.
@@ -187,15 +203,23 @@ def header_value(header: Mapping[str, Any], keyword: str) -> Any:
     Raises
     ------
     FrameFormatError
-        The card is not FITS; other cards of the header may be.
+        The card is not FITS (other cards of the header may be), or there are several with different values.
     """
     try:
         value = header.get(keyword)
+        if isinstance(header, fits.Header) and keyword in header and header.count(keyword) > 1:
+            _refuse_different(header, keyword)
     except fits.VerifyError:
         raise FrameFormatError(keyword, "a card that cannot be parsed", "a value as FITS has it") from None
     if isinstance(value, fits.card.Undefined) or (isinstance(value, str) and not value.strip()):
         return None
     return value.strip() if isinstance(value, str) else value
+
+
+def _refuse_different(header: fits.Header, keyword: str) -> None:
+    values = [header[keyword, number] for number in range(header.count(keyword))]
+    if any(value != values[0] for value in values):
+        raise FrameFormatError(keyword, " and ".join(map(str, values)), "one value, not several that differ")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,11 +255,14 @@ class _Header:
 
 def _interpret(header: _Header) -> RawMetadata:
     camera = _camera(header)
+    refuse_other_instrument(
+        {key: header.text(key) for key in ("OBSID", "TESTTYPE", "CREATOR", "CONTRLLR")}, camera, header.source
+    )
     observation_type = _observation_type(header)
     exposure_time, dark_time = _times(header, observation_type)
     temperature, temperature_source = _temperature(header)
     detector = _detector(header, camera)
-    start = _date_obs(header)
+    start, scale = _date_obs(header), _time_scale(header, camera)
     day_obs, seq_num = _day_and_sequence(header, camera, start)
     return RawMetadata(
         source=header.source,
@@ -255,9 +282,11 @@ def _interpret(header: _Header) -> RawMetadata:
         filter_name=_filter_name(header),
         run=header.text("RUNNUM"),
         date_obs=start,
+        time_scale=scale,
         day_obs=day_obs,
         seq_num=seq_num,
         exposure_id=_exposure_id(header, camera, start, day_obs, seq_num),
+        notes=_notes(header, camera),
     )
 
 
@@ -288,6 +317,14 @@ def _camera(header: _Header) -> str:
         None,
         "lsstCam or MonoCam; or TSTAND = TS8; or RAFTBAY, RAFTNAME or LSST_NUM, which tell it",
     )
+
+
+def _notes(header: _Header, camera: str) -> tuple[str, ...]:
+    """The instrument decides about sensor and exposure number: say so where the header does not name it."""
+    if header.value("INSTRUME") is not None or "TS8" in header.text("TSTAND").upper():
+        return ()
+    told = "RAFTBAY or RAFTNAME" if camera == "lsstCam" else "RAFTNAME or LSST_NUM"
+    return (f"neither INSTRUME nor TSTAND = TS8 in the header: taken as a frame of {camera}, for its {told}",)
 
 
 def _bay(header: _Header) -> str | None:
@@ -359,11 +396,15 @@ def _bandpass(header: _Header) -> float | None:
 
 
 def _times(header: _Header, observation_type: str) -> tuple[float, float]:
-    """Exposure time and dark time, seconds; a bias without ``EXPTIME`` has none."""
+    """Exposure time (that of the shutter where it was measured) and dark time, seconds; 0 for a bias without them."""
     value = header.value("EXPTIME")
     if value is None and observation_type == "bias":
         value = 0.0
     exposure = header.number("EXPTIME", value, "seconds, 0 or more", lambda s: s >= 0)
+    shutter = header.value("SHUTTIME")
+    if shutter is not None:
+        # 0 where the shutter stayed closed.
+        exposure = header.number("SHUTTIME", shutter, "seconds, 0 or more", lambda s: s >= 0) or exposure
     dark = header.value("DARKTIME")
     if dark is None:
         return exposure, exposure
@@ -389,8 +430,25 @@ def _filter_name(header: _Header) -> str:
     return "~".join(dict.fromkeys(named))
 
 
+_DATES = (
+    ("DATE-BEG", "isot"),
+    ("MJD-BEG", "mjd"),
+    ("DATE-OBS", "isot"),
+    ("MJD-OBS", "mjd"),
+    ("MJD", "mjd"),
+)
+"""Keywords of the start of the exposure, and their formats. ``DATE-OBS`` was once its end (obs_lsst)."""
+
+
+def _time_scale(header: _Header, camera: str) -> str:
+    scale = header.text("TIMESYS").lower()
+    if scale not in ("", "utc", "tai"):
+        raise header.refuse("TIMESYS", header.value("TIMESYS"), "UTC or TAI")
+    return scale or ("tai" if camera in OF_RUBIN else "utc")
+
+
 def _date_obs(header: _Header) -> datetime.datetime:
-    for keyword, scale in (("DATE-OBS", "isot"), ("MJD-OBS", "mjd"), ("MJD", "mjd")):
+    for keyword, scale in _DATES:
         value = header.value(keyword)
         if value is None:
             continue
@@ -409,7 +467,9 @@ def _day_and_sequence(header: _Header, camera: str, start: datetime.datetime) ->
     """``DAYOBS`` and ``SEQNUM``; where absent, the day on which the night began and the seconds since then."""
     day_start = start - datetime.timedelta(hours=DAY_ROLLOVER_H[camera])
     stated = header.value("DAYOBS")
-    day = int(day_start.strftime("%Y%m%d")) if stated is None else _day(header, stated)
+    derived = int(day_start.strftime("%Y%m%d"))
+    day = derived if stated is None else _day(header, stated)
+    refuse_other_day(day, start, derived, header.source)
     value = header.value("SEQNUM")
     if value is None:
         midnight = day_start.replace(hour=0, minute=0, second=0, microsecond=0)
@@ -432,12 +492,19 @@ def _day(header: _Header, value: Any) -> int:
 def _exposure_id(header: _Header, camera: str, start: datetime.datetime, day_obs: int, seq_num: int) -> int:
     """Number of the exposure, as obs_lsst has it.
 
-    On TS8 the digits of ``DATE-OBS`` down to tenths of a second: ``SEQNUM`` repeats within a day there. In the
-    cameras the day and the sequence number, moved by 1000 years for each controller.
+    In the cameras the day and the sequence number, moved by 1000 years for each controller that counts for itself. On
+    TS8 the same since ``OBSID`` begins with TS_C; before, ``SEQNUM`` repeated within a day, and the digits of
+    ``DATE-OBS`` down to tenths of a second are the number.
     """
-    if camera == "ts8":
+    numbered = start > TS8_NUMBERED_SINCE and header.text("OBSID").startswith("TS_C_")
+    if camera == "ts8" and not numbered:
+        digits = re.sub(r"\D", "", header.text("DATE-OBS")[:21])
+        if len(digits) == 15:
+            return int(digits)
         return int(start.strftime("%Y%m%d%H%M%S")) * 10 + start.microsecond // 100_000
     controller = header.text("CONTRLLR").upper() or "O"
     if controller not in CONTROLLERS:
         raise header.refuse("CONTRLLR", controller, f"one of {', '.join(CONTROLLERS)}")
+    if day_obs > LAST_DAY_OF_OWN_COUNT.get(controller, day_obs):
+        controller = "O"
     return (day_obs + CONTROLLERS.index(controller) * 10_000_000) * 100_000 + seq_num

@@ -99,7 +99,7 @@ class FringeTranslator(FitsTranslator):
 
 
 def _begin(metadata: RawMetadata) -> Time:
-    return Time(metadata.date_obs, format="datetime", scale="utc").tai
+    return Time(metadata.date_obs, format="datetime", scale=metadata.time_scale).tai
 
 
 def _physical_filter(metadata: RawMetadata) -> str:

@@ -18,6 +18,7 @@ from .fits_product import DETECTOR, NARROW_MASK, Card, FitsProduct, Image
 from .flat_exposures import ExposureTable, FlatExposures
 from .fringe_flat import FringeFlat
 from .mask import mask_bits
+from .same_light import refuse_equal_pixels
 
 __all__ = ["CUBE_UNITS", "FlatExposures", "FringeCube"]
 
@@ -101,6 +102,10 @@ class FringeCube(FitsProduct):
         super().__post_init__()
 
     def _check(self) -> None:
+        for wavelength in np.unique(self.wavelength_nm):
+            (planes,) = np.nonzero(self.wavelength_nm == wavelength)
+            if len(planes) > 1:
+                refuse_equal_pixels(f"flats at {wavelength:g} nm", list(self.image[planes]))
         if self.unit == "relative":
             _refuse_amplitudes(self.image, self.mask)
         if self.thickness is not None:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import FrameFormatError, InputError, without_unit
 from . import _check as check
 from .mask import mask_bits
+from .same_light import refuse_equal_pixels, refuse_mixed_models
 from .sky_frame import SkyFringe
 from .thickness_map import UNKNOWN_SIGMA_UM, ThicknessMap
 
@@ -32,7 +33,7 @@ class SkyFrames:
     Raises
     ------
     InputError
-        No frames, or frames of several sensors.
+        No frames, frames of several sensors or of several models, or one frame twice.
     FrameFormatError
         Sizes that differ.
     """
@@ -47,6 +48,8 @@ class SkyFrames:
         names = sorted({frame.detector for frame in self.frames if frame.detector})
         if len(names) > 1:
             raise InputError("detectors of the sky frames", names, "one sensor")
+        refuse_mixed_models([frame.metadata for frame in self.frames])
+        refuse_equal_pixels("sky frames", [frame.image for frame in self.frames])
         for frame in self.frames:
             if frame.shape != self.thickness.shape:
                 allowed = f"shape {self.thickness.shape}, that of the thickness map"

@@ -24,6 +24,7 @@ from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.pca import fit_pca, fringe_templates
 from ..products import FringeComponents, SkyFringe
+from ..products.same_light import refuse_equal_pixels, refuse_mixed_models
 from .quantum import common_header, data_id_of, run_datetime, sensor_of, unusable
 
 __all__ = ["FringePcaConfig", "FringePcaConnections", "FringePcaTask"]
@@ -133,9 +134,12 @@ class FringePcaTask(PipelineTask):
         Raises
         ------
         InputError
-            Too few frames, frames of different sensors or sizes, or all alike.
+            Too few frames, frames of different sensors, sizes or models, one frame twice, or all alike.
         """
         first = frames[0]
+        refuse_mixed_models([frame.metadata for frame in frames])
+        # Without noise, equal hours of two nights are equal.
+        refuse_equal_pixels("sky frames", [frame.image for frame in frames if frame.seed is not None])
         shared = _shared_metadata(frames)
         metadata = {**shared, **common_header(self.config), **_numerical_errors(frames)}
         if "CFGHASH" in shared:

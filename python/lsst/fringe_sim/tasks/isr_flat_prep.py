@@ -178,6 +178,10 @@ class IsrFlatPrepTask(PipelineTask):
             f_number=setup.f_number,
             options=self.config.options(),
         )
+        if flat.metadata["BADAMPS"] != "none":
+            self.log.warning(
+                "%s: masked whole, dead, hot or saturated: %s", detector.name, flat.metadata["BADAMPS"]
+            )
         self.log.info(
             "%s at %g nm: level %.0f e, masked %s",
             detector.name,

@@ -1,0 +1,210 @@
+"""Folders that commands write into: one run in each, and one writer at a time."""
+
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..errors import InputError
+
+__all__ = ["OutputFolder", "output_folder"]
+
+LOCK = ".fringe-sim.lock"
+OURS = b"ORIGIN  = 'lsst.fringe_sim'"
+HEADER_BYTES = 57_600  # of a FITS file, in which its ORIGIN is looked for
+
+
+@dataclass(frozen=True)
+class OutputFolder(os.PathLike[str]):
+    """Where a command writes.
+
+    Parameters
+    ----------
+    path : `pathlib.Path`
+        The folder; it need not exist.
+    products : `tuple` [`str`, ...]
+        Names of what the command writes there; ``*`` and ``[0-9]`` as in the shell.
+    overwrite : `bool`
+        Whether products of an earlier run are cleared. Nothing else ever is.
+    resumes : `bool`
+        Whether the command goes on with what an earlier run has left.
+    """
+
+    path: Path
+    products: tuple[str, ...]
+    overwrite: bool = False
+    resumes: bool = False
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def holding(self, *products: str) -> OutputFolder:
+        """The same folder for products that are known only now."""
+        return replace(self, products=products)
+
+    def refuse_used(self) -> None:
+        """Refuse a folder with products of an earlier run, before long work.
+
+        Raises
+        ------
+        InputError
+            There are some, and neither are they to be cleared nor to be gone on with; or the path is a file.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError("output folder", str(self), "a folder, not a file")
+        left = [file.name for file in self._left()]
+        if left and not self.overwrite and not self.resumes:
+            more = f" and {len(left) - 1} more" if len(left) > 1 else ""
+            raise InputError(
+                "output folder",
+                str(self),
+                f"one without products of an earlier run (there is {left[0]}{more}); --overwrite replaces them",
+            )
+
+    def prepare(self) -> Path:
+        """Make the folder, keep other writers out until the command ends, clear what is to be replaced.
+
+        Raises
+        ------
+        InputError
+            It cannot be made or written, another run writes into it, or it is used (`refuse_used`).
+        """
+        self.refuse_used()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            allowed = f"a folder that can be made ({error.strerror})"
+            raise InputError("output folder", str(self), allowed) from None
+        if not os.access(self.path, os.W_OK):
+            raise InputError("output folder", str(self), "a folder that can be written")
+        self._lock()
+        self.refuse_used()
+        for part in self._matching(f".{name}.*.part" for name in self.products):
+            part.unlink(missing_ok=True)
+        if self.overwrite:
+            self._clear()
+        return self.path
+
+    def _left(self) -> list[Path]:
+        return self._matching(self.products)
+
+    def _matching(self, patterns: Any) -> list[Path]:
+        return sorted({file for pattern in patterns for file in self.path.glob(pattern)})
+
+    def _clear(self) -> None:
+        left = self._left()
+        foreign = [file.name for file in left if file.suffix == ".fits" and not _is_ours(file)]
+        if foreign:
+            raise InputError(
+                "output folder",
+                str(self),
+                f"one in which {foreign[0]} was written by this program; nothing is cleared",
+            )
+        for file in left:
+            if file.is_dir() and not file.is_symlink():
+                shutil.rmtree(file)
+            else:
+                file.unlink(missing_ok=True)
+
+    def _lock(self) -> None:
+        """Lock that the system releases when the process ends, however it does."""
+        for descriptor in _locks(self.path / LOCK):
+            if descriptor is None:
+                raise InputError(
+                    "output folder", str(self), "one into which no other run is writing just now"
+                )
+            context = click.get_current_context(silent=True)
+            if context is not None:
+                context.call_on_close(functools.partial(_release, self.path / LOCK, descriptor))
+            return
+
+
+def _locks(path: Path) -> Iterator[int | None]:
+    """One lock, `None` where another process has it, nothing where the file system knows no locks."""
+    import fcntl
+
+    while True:
+        descriptor = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            current = path.stat().st_ino if path.exists() else None
+        except BlockingIOError:
+            os.close(descriptor)
+            yield None
+            return
+        except OSError:  # some network file systems
+            os.close(descriptor)
+            return
+        if current == os.fstat(descriptor).st_ino:
+            yield descriptor
+            return
+        os.close(descriptor)  # the former holder has just removed it
+
+
+def _release(path: Path, descriptor: int) -> None:
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+    os.close(descriptor)
+
+
+def _is_ours(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return OURS in stream.read(HEADER_BYTES)
+
+
+def output_folder(
+    help_text: str,
+    *products: str,
+    argument: bool = False,
+    default: Path | None = None,
+    required: bool = True,
+    resumes: bool = False,
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """``--out`` and ``--overwrite`` of a command, which gets them as one `OutputFolder` named ``out``.
+
+    Parameters
+    ----------
+    help_text : `str`
+        What ``--out`` says under ``--help``.
+    *products : `str`
+        What the command writes there; see `OutputFolder`.
+    argument : `bool`, optional
+        The folder is the argument OUTDIR, not an option.
+    default, required : `pathlib.Path`, `bool`, optional
+        Folder without the option, and whether there must be one.
+    resumes : `bool`, optional
+        The command goes on with what an earlier run has left.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def with_folder(*, out: Path | None, overwrite: bool, **others: Any) -> None:
+            folder = None if out is None else OutputFolder(out, products, overwrite, resumes)
+            if folder is not None:
+                folder.refuse_used()
+            command(out=folder, **others)
+
+        kind = click.Path(path_type=Path)
+        if argument:
+            named = click.argument("out", metavar="OUTDIR", type=kind)
+        elif default is None:
+            named = click.option("--out", type=kind, required=required, help=help_text)
+        else:
+            named = click.option("--out", type=kind, default=default, show_default=True, help=help_text)
+        clear = click.option(
+            "--overwrite", is_flag=True, help="Clear what an earlier run of this command left in the folder."
+        )
+        return named(clear(with_folder))
+
+    return decorate

@@ -1,0 +1,54 @@
+"""The same light twice would count twice: images of equal pixels, and frames of different models."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+__all__ = ["pixels_digest", "refuse_equal_pixels", "refuse_mixed_models"]
+
+_MODEL = re.compile(r"SETUP|BEAMS|(EFFECT|EFFVAL|TABLE)\d+")
+
+
+def pixels_digest(image: NDArray[Any]) -> str:
+    """Digest of the pixels of an image."""
+    return hashlib.blake2b(np.ascontiguousarray(image, "<f4").tobytes(), digest_size=16).hexdigest()
+
+
+def refuse_equal_pixels(field: str, images: Sequence[NDArray[Any]]) -> None:
+    """Refuse images of which two have equal pixels; images of one value have no light to tell.
+
+    Raises
+    ------
+    InputError
+        Two are equal; they are named by their numbers, from 0.
+    """
+    seen: dict[str, int] = {}
+    for number, image in enumerate(images):
+        first = seen.setdefault(pixels_digest(image), number)
+        if first != number and image.min() != image.max():
+            raise InputError(field, f"equal pixels in {first} and {number}", "each exposure once")
+
+
+def refuse_mixed_models(metadata: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse simulated frames of different set-ups, effects or tables.
+
+    Raises
+    ------
+    InputError
+        Cards of the model differ; the first of them is named.
+    """
+    cards = [{key: value for key, value in one.items() if _MODEL.fullmatch(key)} for one in metadata]
+    for number, other in enumerate(cards):
+        differ = sorted(key for key in {*cards[0], *other} if cards[0].get(key) != other.get(key))
+        if differ:
+            key = differ[0]
+            found = f"{cards[0].get(key)} in frame 0, {other.get(key)} in frame {number}"
+            raise InputError(f"{key} of the frames", found, "frames of one model")

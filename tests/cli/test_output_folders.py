@@ -1,0 +1,97 @@
+"""One run in a folder, one writer at a time, and nothing cleared but what a run of this program left."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from lsst.fringe_sim.cli.main import cli, run
+from lsst.fringe_sim.cli.output import OutputFolder
+
+FRAMES = ("--size", "64x64", "--wavelengths", "900", "--bias-frames", "1", "--seed", "1")
+
+
+def test_every_command_with_a_folder_can_replace_what_is_there() -> None:
+    context = click.Context(cli)
+    for name in cli.list_commands(context):
+        command = cli.get_command(context, name)
+        options = {option for item in command.params for option in item.opts}
+        assert ("--overwrite" in options) == bool({"--out", "out"} & options), name
+
+
+@pytest.fixture
+def used(tmp_path: Path) -> Path:
+    assert run(["mock-flats", str(tmp_path / "raws"), *FRAMES]) == 0
+    (tmp_path / "raws" / "notes.txt").write_text("mine")
+    return tmp_path / "raws"
+
+
+def test_frames_of_two_runs_do_not_mix(used: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path.name: path.read_bytes() for path in used.iterdir()}
+    other = ("mock-flats", str(used), "--detector", "R11_S02", *FRAMES)
+    assert run(other) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in used.iterdir()} == before
+    assert run([*other, "--overwrite"]) == 0
+    left = {path.name for path in used.iterdir()}
+    assert "notes.txt" in left
+    assert left & set(before) == {"notes.txt"}
+
+
+def test_frames_of_a_camera_are_never_cleared(used: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (real,) = used.glob("*_lambda_flat_*.fits")
+    real.write_bytes(real.read_bytes().replace(b"'lsst.fringe_sim'", b"'SLAC           '"))
+    before = sorted(used.iterdir())
+    assert run(["mock-flats", str(used), *FRAMES, "--overwrite"]) == 1
+    assert real.name in capsys.readouterr().err
+    assert sorted(used.iterdir()) == before
+
+
+def folder(path: Path, **options: bool) -> OutputFolder:
+    return OutputFolder(path, ("report.html", "sky_*.fits"), **options)
+
+
+def test_two_writers_at_once(tmp_path: Path) -> None:
+    """The second is refused while the first is at work, and a killed one keeps nobody out."""
+    code = (
+        "import sys, pathlib, time; from lsst.fringe_sim.cli.output import OutputFolder;"
+        f"OutputFolder(pathlib.Path({str(tmp_path)!r}), ('report.html',)).prepare();"
+        "print('ready', flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as first:
+        assert first.stdout.readline() == b"ready\n"
+        with pytest.raises(ValueError, match="no other run is writing"):
+            folder(tmp_path).prepare()
+        first.kill()
+    assert folder(tmp_path).prepare() == tmp_path
+
+
+def test_nothing_of_the_lock_is_left(tmp_path: Path) -> None:
+    @click.command()
+    def command() -> None:
+        folder(tmp_path / "out").prepare()
+
+    assert CliRunner().invoke(command).exit_code == 0
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_what_a_killed_writer_left_is_cleared(tmp_path: Path) -> None:
+    (tmp_path / ".report.html.0123456789ab.part").write_text("half")
+    (tmp_path / ".thesis.tex.0123456789ab.part").write_text("mine")
+    folder(tmp_path).prepare()
+    assert not list(tmp_path.glob(".report*"))
+    assert list(tmp_path.glob(".thesis*"))
+
+
+def test_links_are_cleared_and_not_what_they_lead_to(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere.html").write_text("mine")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "report.html").symlink_to(tmp_path / "elsewhere.html")
+    folder(tmp_path / "out", overwrite=True).prepare()
+    assert not (tmp_path / "out" / "report.html").is_symlink()
+    assert (tmp_path / "elsewhere.html").read_text() == "mine"

@@ -1,0 +1,165 @@
+"""Headers that contradict themselves or the instrument are refused; times and numbers are those of obs_lsst."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+from raw_frame_maker import LSSTCAM_HEADER, TS8_HEADER, header_with, write_raw
+
+from lsst.fringe_sim.errors import FrameFormatError
+from lsst.fringe_sim.instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
+from lsst.fringe_sim.middleware.translators import FringeLsstCamTranslator
+
+
+def interpret(base: dict[str, Any], **changes: Any) -> RawMetadata:
+    cards = {key.replace("_", "-") if key == "DATE_OBS" else key: value for key, value in changes.items()}
+    return RawMetadata.from_header(header_with(cards, base), source="raw.fits")
+
+
+def camera(day: str, controller: str | None, sequence: int, prefix: str = "MC") -> dict[str, Any]:
+    date = f"{day[:4]}-{day[4:6]}-{day[6:]}T20:00:00.000"
+    about = {"DAYOBS": day, "SEQNUM": sequence, "CONTRLLR": controller, "DATE-OBS": date}
+    return {**about, "OBSID": f"{prefix}_{controller or 'C'}_{day}_{sequence:06d}"}
+
+
+@pytest.mark.parametrize(
+    ("base", "changes", "number"),
+    [
+        (LSSTCAM_HEADER, camera("20211212", "C", 310), 3021121200310),
+        (LSSTCAM_HEADER, camera("20231004", "C", 7), 3023100400007),
+        (LSSTCAM_HEADER, camera("20231005", "C", 7), 2023100500007),
+        (LSSTCAM_HEADER, camera("20231107", "C", 78), 2023110700078),
+        (LSSTCAM_HEADER, camera("20231107", "O", 78), 2023110700078),
+        (LSSTCAM_HEADER, camera("20231107", None, 78), 2023110700078),
+        (LSSTCAM_HEADER, camera("20250417", "P", 5), 5025041700005),
+        (LSSTCAM_HEADER, camera("20250418", "P", 5), 2025041800005),
+        (LSSTCAM_HEADER, camera("20250417", "Q", 5), 6025041700005),
+        (LSSTCAM_HEADER, camera("20250417", "S", 5), 7025041700005),
+        (LSSTCAM_HEADER, camera("20260101", "S", 5), 2026010100005),
+        (TS8_HEADER, {}, 201807241028453),
+        (
+            TS8_HEADER,
+            {**camera("20230524", "C", 906, "TS"), "DATE-OBS": "2023-05-24T22:59:59.000"},
+            202305242259590,
+        ),
+        (
+            TS8_HEADER,
+            {**camera("20230524", "C", 906, "TS"), "DATE-OBS": "2023-05-24T23:30:00.000"},
+            3023052400906,
+        ),
+        (TS8_HEADER, camera("20231107", "C", 78, "TS"), 2023110700078),
+        (TS8_HEADER, {**camera("20231107", "C", 78, "TS"), "OBSID": None}, 202311072000000),
+    ],
+)
+def test_exposures_are_numbered_as_by_obs_lsst(
+    base: dict[str, Any], changes: dict[str, Any], number: int
+) -> None:
+    assert RawMetadata.from_header(header_with(changes, base), source="raw.fits").exposure_id == number
+
+
+@pytest.mark.parametrize(("stated", "scale"), [(None, "tai"), ("TAI", "tai"), ("tai", "tai"), ("UTC", "utc")])
+def test_exposures_begin_when_obs_lsst_says(stated: str | None, scale: str) -> None:
+    """A header of Rubin states TAI unless it says otherwise: 37 s apart."""
+    header = header_with({"TIMESYS": stated}, LSSTCAM_HEADER)
+    begin = FringeLsstCamTranslator(header, filename="raw.fits").to_datetime_begin()
+    assert abs((begin - Time("2021-12-13T04:58:56.398", scale=scale)).to_value("s")) < 1e-3
+
+
+def test_the_begin_is_preferred_and_the_shutter_measures() -> None:
+    about = RawMetadata.from_header(
+        header_with({"DATE-BEG": "2021-12-13T04:58:40.000", "SHUTTIME": 14.98}, LSSTCAM_HEADER),
+        source="raw.fits",
+    )
+    assert about.date_obs.second == 40
+    assert about.exposure_time_s == 14.98
+    assert interpret(LSSTCAM_HEADER, SHUTTIME=0.0).exposure_time_s == 15.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "keyword"),
+    [
+        ({"DAYOBS": "20201212"}, "DAYOBS"),
+        ({"DAYOBS": "20211215"}, "DAYOBS"),
+        ({"TIMESYS": "GPS"}, "TIMESYS"),
+        ({"INSTRUME": "LSST_CAMERA", "OBSID": "CC_C_20211212_000310"}, "OBSID"),
+        ({"OBSID": "TS_C_20211212_000310"}, "OBSID"),
+        ({"TESTTYPE": "PHOSIM"}, "TESTTYPE"),
+        ({"CREATOR": "PHOSIM"}, "CREATOR"),
+        ({"CONTRLLR": "H"}, "CONTRLLR"),
+        ({"SHUTTIME": -1.0}, "SHUTTIME"),
+    ],
+)
+def test_contradictions_are_refused(changes: dict[str, Any], keyword: str) -> None:
+    with pytest.raises(FrameFormatError, match=f"^raw.fits: {keyword} is"):
+        interpret(LSSTCAM_HEADER, **changes)
+
+
+def test_what_is_taken_for_granted_is_said() -> None:
+    assert interpret(TS8_HEADER).notes == ()
+    assert interpret(LSSTCAM_HEADER).notes == ()
+    (note,) = interpret(TS8_HEADER, TSTAND=None, RAFTBAY="R11", SLOTNAME="S01").notes
+    assert "lsstCam" in note
+    assert "TSTAND" in note
+
+
+# Files ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    write_raw(tmp_path / "raw.fits", {})
+    return tmp_path / "raw.fits"
+
+
+def both_refuse(path: Path, words: str) -> None:
+    for reader in (read_raw_metadata, RawFrame.read):
+        with pytest.raises(FrameFormatError, match=words):
+            reader(path)
+
+
+def test_two_wavelengths_are_refused(raw: Path) -> None:
+    with fits.open(raw, mode="update") as hdus:
+        hdus[0].header.append(("MONOWL", 967.0), end=True)
+    both_refuse(raw, "MONOWL is '960.03 and 967.0'")
+
+
+@pytest.mark.parametrize(("second", "refused"), [(967.0, True), (959.8, False), (-1.0, False)])
+def test_another_wavelength_in_the_test_conditions(raw: Path, second: float, refused: bool) -> None:
+    with fits.open(raw, mode="append") as hdus:
+        hdus.append(fits.BinTableHDU.from_columns([fits.Column("A", "J", array=[1])], name="TEST_COND"))
+        hdus[-1].header["MONOWL"] = second
+    if refused:
+        both_refuse(raw, "TEST_COND")
+    else:
+        assert RawFrame.read(raw).metadata.wavelength_nm == 960.03
+
+
+@pytest.mark.parametrize(
+    ("keyword", "value"), [("CCDSUM", "2 2"), ("CCDSUM", "1 2"), ("BSCALE", 2.0), ("BLANK", -32768)]
+)
+def test_pixels_that_are_not_those_of_the_sensor(raw: Path, keyword: str, value: Any) -> None:
+    content = raw.read_bytes()
+    card = fits.Card(keyword, value).image.encode()
+    extname = content.index(b"EXTNAME")
+    raw.write_bytes(content[:extname] + card + content[extname + 80 :])
+    both_refuse(raw, keyword)
+
+
+def test_a_sensor_of_the_other_vendor_is_refused(tmp_path: Path) -> None:
+    write_raw(tmp_path / "maker.fits", {"CCD_MANU": "ITL"})
+    both_refuse(tmp_path / "maker.fits", "CCD_MANU is 'ITL'")
+
+
+def test_the_size_of_the_other_vendor_is_refused() -> None:
+    from lsst.fringe_sim.instrument.camera import Camera
+    from lsst.fringe_sim.instrument.raw_checks import refuse_other_vendor
+
+    sensor = Camera.from_name("lsstCam").detector("R22_S21")
+    with pytest.raises(FrameFormatError, match="DETSIZE"):
+        refuse_other_vendor(None, sensor, (4000, 4072), "raw.fits")
+    for shape in ((4004, 4096), (160, 192)):
+        refuse_other_vendor("E2V", sensor, shape, "raw.fits")
