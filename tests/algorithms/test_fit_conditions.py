@@ -99,6 +99,7 @@ def test_thin_and_thick_adhesive(mean: float, model, rng) -> None:
     assert pull.std() == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.rng("a sensor cut in two")
 def test_a_sensor_cut_in_two(model, rng) -> None:
     """Masked rows that no path crosses: both parts find their order, by themselves or together."""

@@ -20,6 +20,7 @@ def sealed(seed: int = 3, **values: float) -> SealedCase:
     return SealedCase(cube, "ts8_e2v", "two", names, sizes, thickness, 1.0)
 
 
+@pytest.mark.slow
 def test_signal_to_noise_grows_with_the_effect() -> None:
     """A loss of contrast of a fifth is seen twice as clearly as one of a tenth."""
     small, large = (

@@ -74,6 +74,7 @@ def test_level_is_that_of_the_measured_quantum_efficiency(thickness, usual, tmp_
     assert rms[0] == pytest.approx(rms[1], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_fringes_fade_towards_the_edge_of_the_field(thickness, usual, tmp_path) -> None:
     assert run(["sky", "--thickness", thickness, "--detector", "R11_S01", "--out", str(tmp_path)]) == 0
     files = (tmp_path / "sky_R11_S01_00.fits", usual / "sky_R22_S11_00.fits")

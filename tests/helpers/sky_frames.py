@@ -37,7 +37,7 @@ def sky_frames_of(
         # Pixels average the light over their area.
         light = frame.image.reshape(SHAPE[0], FINER, SHAPE[1], FINER).mean(axis=(1, 3), dtype=np.float64)
         image = add_exposure_noise(light.astype(np.float32), np.random.default_rng(seed + 10 * time), 0.0)
-        cards = {**frame.metadata, **band_cards(scale)}
+        cards = {**frame.metadata, "NOISE": True, **band_cards(scale)}
         mask = np.zeros(SHAPE, dtype=frame.mask.dtype)
         frames.append(replace(frame, image=image, mask=mask, seed=seed + 10 * time, metadata=cards))
     return frames, truth + 0.002 * rng.standard_normal(SHAPE)

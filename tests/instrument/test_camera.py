@@ -182,7 +182,7 @@ def test_camera_that_is_not_described_well_is_refused(
 
 
 def test_camera_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="an existing YAML file"):
+    with pytest.raises(InputError, match="an existing file"):
         Camera.from_file(tmp_path / "nothing.yaml")
 
 

@@ -79,6 +79,7 @@ def test_doubts_about_the_map_reach_the_frame() -> None:
     assert np.isfinite(frame.image).all()
 
 
+@pytest.mark.slow
 def test_every_pixel_has_the_beam_of_its_place() -> None:
     """At the centre of the field the corners of the sensor differ most from its middle."""
     one, pixel = usual(), run(beams="pixel")

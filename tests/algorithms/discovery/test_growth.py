@@ -88,6 +88,7 @@ def test_cells_without_data_do_not_stop_it(blurred) -> None:
     assert grown.settings[f"{BLUR}.sigma"] == pytest.approx(sigma, rel=0.02)
 
 
+@pytest.mark.slow
 def test_where_the_model_fits_nothing_grows(blurred) -> None:
     problem, truth, sigma = blurred
     assert grown_thickness(problem, _fit_at(problem, sigma, truth), truth) is None

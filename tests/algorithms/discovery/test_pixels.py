@@ -88,6 +88,7 @@ def test_a_sensor_without_an_effect_is_taken_for_what_it_is(points: bool) -> Non
     assert any("taken as a point" in note for note in verdict.notes) == points
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("places", "blur", "taken"),
     [
@@ -112,6 +113,7 @@ def test_places_beside_the_blur_that_they_lack_are_areas(places: int, blur: dict
     assert kept == (settings if taken else {"epoxy_index.cauchy": -0.005})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("points", "places"), first_is_quick([(False, 2), (True, 1)]))
 def test_a_blur_that_makes_areas_of_few_places_is_none(points: bool, places: int) -> None:
     """Areas taken as four places each need a blur, and explain as much as areas without; real points do not."""

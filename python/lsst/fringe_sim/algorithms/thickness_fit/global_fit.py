@@ -293,8 +293,8 @@ class _Solver:
         if not np.isfinite(state.thickness_um).any():
             return np.inf, 0.0
         surface = calm_surface(_surface(state, self.order_um), self.threads)
-        sample, *begun = _sample_on(self.data, surface, state.templates, self.threads)
-        _, fitted = normalise_to_cells(sample, *begun)
+        begun = _sample_on(self.data, surface, state.templates, self.threads)
+        sample, (_, fitted) = begun[0], normalise_to_cells(*begun)
         found = order_evidence(
             sample, fitted, self.order_um, range_um=state.range_um, temper=1.0, threads=self.threads
         )
