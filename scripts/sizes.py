@@ -1,0 +1,179 @@
+"""Size of every room: what a reader must read, beside another revision if one is named.
+
+python scripts/sizes.py [--of REV] [--against REV] [--long]
+"""
+
+import argparse
+import ast
+import io
+import subprocess
+import tarfile
+from collections import defaultdict
+from dataclasses import dataclass, fields
+from pathlib import Path, PurePosixPath
+
+TOP = Path(__file__).parents[1]
+PACKAGE = PurePosixPath("python/lsst/fringe_sim")
+LONG_BODY, MANY_ARGUMENTS, LONG_MODULE = 40, 8, 450
+# Our two decorators, and those of numba.
+COMPILED = {"kernel", "subkernel", "njit", "jit", "vectorize", "guvectorize"}
+FunctionNode = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+@dataclass
+class Size:
+    """Counts of one room; two add up."""
+
+    lines: int = 0
+    statements: int = 0
+    docstrings: int = 0
+    compiled: int = 0
+    long: int = 0
+    wide: int = 0
+    modules: int = 0
+
+    def __add__(self, other: "Size") -> "Size":
+        return Size(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
+
+
+TITLES = {
+    "lines": "lines",
+    "statements": "statements",
+    "docstrings": "lines of docstrings",
+    "compiled": "compiled",
+    "long": f"bodies > {LONG_BODY}",
+    "wide": f"arguments > {MANY_ARGUMENTS}",
+    "modules": f"modules > {LONG_MODULE}",
+}
+
+
+def sources(revision: str | None) -> dict[PurePosixPath, str]:
+    """Python files of package and tests, by path, of a revision or of the work tree."""
+    command = ["git", "-C", str(TOP)]
+    if revision is None:
+        listed = subprocess.run(
+            [*command, "ls-files", "python", "tests"], check=True, capture_output=True, text=True
+        )
+        paths = [path for path in listed.stdout.split("\n") if path.endswith(".py") and (TOP / path).exists()]
+        return {PurePosixPath(path): (TOP / path).read_text() for path in paths}
+    packed = subprocess.run(
+        [*command, "archive", revision, "python", "tests"], check=True, capture_output=True
+    )
+    found = {}
+    with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
+        for member in archive:
+            if member.isfile() and member.name.endswith(".py"):
+                found[PurePosixPath(member.name)] = archive.extractfile(member).read().decode()
+    return found
+
+
+def room_of(path: PurePosixPath) -> str:
+    """Name of the room of a file, as the table has it."""
+    if path.parts[0] == "tests":
+        return "tests"
+    inside = path.relative_to(PACKAGE).parts if path.is_relative_to(PACKAGE) else ("",)
+    if len(inside) < 2:
+        return "root"
+    return "/".join(inside[:-1]) if inside[0] == "algorithms" else inside[0]
+
+
+def docstring_lines(tree: ast.AST) -> int:
+    """Lines of the docstrings of a module, its classes and functions."""
+    total = 0
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | FunctionNode) and ast.get_docstring(node) is not None:
+            total += node.body[0].end_lineno - node.body[0].lineno + 1
+    return total
+
+
+def body_lines(function: FunctionNode) -> int:
+    """Lines of the body of a function without its docstring."""
+    body = function.body[1:] if ast.get_docstring(function) is not None else function.body
+    return body[-1].end_lineno - body[0].lineno + 1 if body else 0
+
+
+def arguments(function: FunctionNode) -> int:
+    """Arguments of a function without self and cls."""
+    names = function.args.posonlyargs + function.args.args + function.args.kwonlyargs
+    return sum(one.arg not in ("self", "cls") for one in names)
+
+
+def decorator_names(function: FunctionNode) -> set[str]:
+    """Last parts of the names of the decorators of a function."""
+    called = [one.func if isinstance(one, ast.Call) else one for one in function.decorator_list]
+    return {one.attr if isinstance(one, ast.Attribute) else getattr(one, "id", "") for one in called}
+
+
+def measure(text: str) -> tuple[Size, list[tuple[int, int, str]]]:
+    """Size of one file, and (lines of the body, arguments, name) of its functions that are long or wide."""
+    tree = ast.parse(text)
+    size = Size(
+        lines=text.count("\n"),
+        statements=sum(isinstance(node, ast.stmt) for node in ast.walk(tree)),
+        docstrings=docstring_lines(tree),
+        modules=int(text.count("\n") > LONG_MODULE),
+    )
+    notable = []
+    for node in ast.walk(tree):
+        if not isinstance(node, FunctionNode):
+            continue
+        names = decorator_names(node)
+        long, count = body_lines(node), arguments(node)
+        # The arguments of a command are its options.
+        wide = count > MANY_ARGUMENTS and not names & {"command", "option", "argument"}
+        size += Size(compiled=int(bool(names & COMPILED)), long=int(long > LONG_BODY), wide=int(wide))
+        if long > LONG_BODY or wide:
+            notable.append((long, count, node.name))
+    return size, notable
+
+
+def per_room(revision: str | None, long: bool = False) -> dict[str, Size]:
+    """Size of every room of a revision (default: the work tree); ``long`` prints what is long or wide."""
+    rooms: dict[str, Size] = defaultdict(Size)
+    for path, text in sources(revision).items():
+        size, notable = measure(text)
+        rooms[room_of(path)] += size
+        if long and path.parts[0] == "python":
+            if size.modules:
+                print(f"{path}: {size.lines} lines")
+            for body, count, name in sorted(notable, reverse=True):
+                print(f"{path}: {name}: body of {body} lines, {count} arguments")
+    return rooms
+
+
+def table(now: dict[str, Size], before: dict[str, Size] | None) -> str:
+    """Markdown table, one row a room, each number as "before → now" where it changed."""
+
+    def row(name: str, of: list[str]) -> str:
+        new = sum((now.get(room, Size()) for room in of), Size())
+        old = sum((before.get(room, Size()) for room in of), Size()) if before is not None else new
+        cells = []
+        for one in TITLES:
+            then, today = getattr(old, one), getattr(new, one)
+            cells.append(f"{today:,}" if then == today else f"{then:,} → {today:,}")
+        return f"| {name} | " + " | ".join(cells) + " |"
+
+    rooms = sorted(set(now) | set(before or {}))
+    package = [room for room in rooms if room != "tests"]
+    search = [room for room in package if room.startswith("algorithms/discovery")]
+    lines = ["| room | " + " | ".join(TITLES.values()) + " |", "|---|" + "--:|" * len(TITLES)]
+    lines += [row(room, [room]) for room in package]
+    lines.append(row("**package without the search**", [room for room in package if room not in search]))
+    lines.append(row("**package**", package))
+    lines.append(row("**tests**", ["tests"]))
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--of", metavar="REV", help="revision to measure (default: the work tree)")
+    parser.add_argument("--against", metavar="REV", help="revision to compare with")
+    parser.add_argument("--long", action="store_true", help="name what is too long or too wide")
+    options = parser.parse_args()
+    now = per_room(options.of, options.long)
+    print(table(now, per_room(options.against) if options.against else None))
+
+
+if __name__ == "__main__":
+    main()
