@@ -54,31 +54,18 @@ _MARGIN_UM = 1e-3
 
 @dataclass(frozen=True)
 class AmplitudeCase:
-    """One row of the table: a set-up, and what the paper says of it.
+    """One row of the table: a set-up, and what the paper says of it."""
 
-    Attributes
-    ----------
-    name, setup : `str`
-        Name of the row and of the set-up.
-    field_deg : `float`
-        Field radius [deg].
-    wavelength_nm : `float`
-        Wavelength of a laboratory flat [nm]; NaN on the sky.
-    observed, simulated : `str`
-        Amplitudes in Table 2 of the paper; empty where it has none.
-    recomputed : `str`
-        What the data of the paper's figures give, with the definition of amplitude.
-    own_map : `bool`
-        Whether the adhesive of E2V-CCD250-321 is the layer that varies; a random field if not.
-    """
-
+    # name, setup: of the row, and of the set-up
     name: str
     setup: str
     field_deg: float
-    wavelength_nm: float
+    wavelength_nm: float  # wavelength of a laboratory flat; NaN on the sky
+    # observed, simulated: amplitudes in Table 2 of the paper; empty where it has none
     observed: str
     simulated: str
-    recomputed: str
+    recomputed: str  # what the data of the paper's figures give, with the definition of amplitude
+    # Whether the adhesive of E2V-CCD250-321 is the layer that varies; a random field if not
     own_map: bool = True
 
     @property
@@ -106,21 +93,11 @@ CASES: tuple[AmplitudeCase, ...] = (
 
 @dataclass(frozen=True)
 class SkyCase:
-    """A spectrum of the night sky.
+    """A spectrum of the night sky."""
 
-    Attributes
-    ----------
-    name : `str`
-        Name for the column ``sky``.
-    lines : `EmissionLines`
-        Line list.
-    continuum : `bool`
-        Whether the airglow continuum and zodiacal light are added.
-    """
-
-    name: str
+    name: str  # name for the column ``sky``
     lines: EmissionLines
-    continuum: bool
+    continuum: bool  # whether the airglow continuum and zodiacal light are added
 
     @classmethod
     def palace(cls) -> tuple[SkyCase, SkyCase]:
@@ -170,31 +147,12 @@ def amplitude_table(
 ) -> Table:
     """Amplitudes of the fringes of every set-up.
 
-    Parameters
-    ----------
-    adhesive_um : array_like, shape ``(ny, nx)``
-        Thickness of the adhesive of E2V-CCD250-321 [µm]; every 16th pixel will do.
-    skies : sequence of `SkyCase`, optional
-        Spectra of the night sky; PALACE with and without continua by default.
-    effects : mapping, optional
-        Effects that the set-ups lack, by ``name.parameter``; those of the laboratory are left out on the sky. Without
-        any, this is the undamped model of the paper.
-    cases : sequence of `AmplitudeCase`, optional
-        Rows.
-
-    Returns
-    -------
-    table : `astropy.table.Table`
-        One row per case and sky. Amplitudes in per cent of the mean: of the frame itself (``rms``,
-        ``half_peak_to_peak``, ``half_range_1_99``), and ``rms_flat_fielded`` after division by a flat field of white
-        light, which takes out how absorption changes with the thickness of silicon.
-
-    Raises
-    ------
-    InputError
-        A map without two axes.
-    UnknownNameError, OutOfRangeError
-        An effect that does not exist, or out of its bounds.
+    ``adhesive_um`` (ny, nx): thickness of the adhesive of E2V-CCD250-321; every 16th pixel will do. ``skies``:
+    spectra of the night sky; PALACE with and without continua by default. ``effects``: effects that the set-ups
+    lack, by ``name.parameter``; those of the laboratory are left out on the sky. Without any, this is the
+    undamped model of the paper. Returns one row per case and sky. Amplitudes in per cent of the mean: of the
+    frame itself (``rms``, ``half_peak_to_peak``, ``half_range_1_99``), and ``rms_flat_fielded`` after division
+    by a flat field of white light, which takes out how absorption changes with the thickness of silicon.
     """
     adhesive = np.asarray(adhesive_um, dtype=float)
     if adhesive.ndim != 2:
@@ -228,16 +186,8 @@ def compare_amplitudes(
 ) -> Table:
     """`amplitude_table` without effects and, if there are any, with them, in one table.
 
-    Returns
-    -------
-    table : `astropy.table.Table`
-        As of `amplitude_table`, with a column ``model`` of `UNDAMPED` and `WITH_EFFECTS`; ``meta["contradiction"]``
-        has a sentence for each model where the rows that it needs are there.
-
-    Raises
-    ------
-    InputError, UnknownNameError, OutOfRangeError
-        As of `amplitude_table`.
+    Returns the table of `amplitude_table`, with a column ``model`` of `UNDAMPED` and `WITH_EFFECTS`;
+    ``meta["contradiction"]`` has a sentence for each model where the rows that it needs are there.
     """
     settings = dict(effects or {})
     parts = [amplitude_table(adhesive_um, skies, {}, cases)]

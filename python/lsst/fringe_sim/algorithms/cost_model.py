@@ -31,18 +31,12 @@ MIB = 2.0**20
 
 @dataclass(frozen=True)
 class QuantumCost:
-    """What one quantum of a full e2v sensor costs.
+    """What one quantum of a full e2v sensor costs."""
 
-    Attributes
-    ----------
-    processor_s : `float`
-        Processor time of all threads [s], that of the most expensive quantum; the start of the process is not in it.
-    peak_bytes : `float`
-        Most memory of the process.
-    """
-
+    # Processor time of all threads, that of the most expensive quantum; the start of the process is not
+    # in it
     processor_s: float
-    peak_bytes: float
+    peak_bytes: float  # most memory of the process
 
 
 QUANTUM_COSTS: Mapping[str, QuantumCost] = MappingProxyType(
@@ -67,14 +61,9 @@ sensor: its time is that of a small one with an effect, its memory that of eleve
 
 @dataclass(frozen=True)
 class FocalPlaneCost:
-    """Cost of a forecast; the times were measured on the machine of doc/performance.md.
+    """Cost of a forecast; the times were measured on the machine of doc/performance.md."""
 
-    Attributes
-    ----------
-    sensors, exposures : `int`
-        Sensors, and exposures of the night.
-    """
-
+    # exposures: those of the night
     sensors: int
     exposures: int
 

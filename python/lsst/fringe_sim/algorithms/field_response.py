@@ -77,23 +77,16 @@ _CELLS = 16_384
 
 @dataclass(frozen=True)
 class SensorPlacement:
-    """Where the pixels of a sensor lie in the field.
+    """Where the pixels of a sensor lie in the field."""
 
-    Attributes
-    ----------
-    field_x_deg, field_y_deg : `float`
-        Field angle of the centre [deg].
-    width_deg, height_deg : `float`
-        Extent along columns and along rows [deg]; negative where the pixels are counted the other way round.
-    yaw_deg : `float`
-        Rotation of the sensor in the focal plane [deg].
-    """
-
+    # field_x_deg, field_y_deg: field angle of the centre
     field_x_deg: float
     field_y_deg: float
+    # width_deg, height_deg: extent along columns and along rows; negative where the pixels are counted
+    # the other way round
     width_deg: float
     height_deg: float
-    yaw_deg: float = 0.0
+    yaw_deg: float = 0.0  # rotation of the sensor in the focal plane
 
     @classmethod
     def of(
@@ -123,10 +116,7 @@ class SensorPlacement:
     def plane(self, shape: tuple[int, int]) -> FloatArray:
         """Field angles as a linear function of pixel indices, for a map of any shape that covers the sensor.
 
-        Returns
-        -------
-        plane : `numpy.ndarray`, shape ``(2, 3)``
-            Rows for x and y; ``angle = plane @ (1, column, row)`` [deg].
+        Returns (2, 3): rows for x and y; ``angle = plane @ (1, column, row)`` [deg].
         """
         turn = math.radians(self.yaw_deg)
         along = np.array([math.cos(turn), math.sin(turn)]) * self.width_deg / shape[1]
@@ -157,55 +147,30 @@ class SensorPlacement:
 
 @dataclass(frozen=True, eq=False)
 class AngularResponse:
-    """Electrons from the components of a sky at fixed angles of incidence, over thickness.
+    """Electrons from the components of a sky at fixed angles of incidence, over thickness."""
 
-    Attributes
-    ----------
-    component : `tuple` [`str`, ...]
-        Names of the components, C of them.
-    photons : `numpy.ndarray`, shape ``(C,)``
-        Photons behind air and optics [s⁻¹ m⁻² arcsec⁻²].
-    wavelength_nm : `numpy.ndarray`, shape ``(C,)``
-        Mean wavelength of every component [nm].
-    limits : `tuple` [`float`, `float`]
-        Smallest and largest sin²θ.
-    start_um, step_um : `float`
-        Grid of thickness [µm].
-    values : `numpy.ndarray`, shape ``(C, A, N)``
-        Electrons s⁻¹ m⁻² arcsec⁻² at the A nodes of a Gauss-Legendre rule in sin²θ and N thicknesses.
-    flat : `numpy.ndarray`, shape ``(A, N)``
-        The same from the light of a flat field, in arbitrary units.
-    interpolation_error, quadrature_error : `float`
-        Estimated errors of the interpolation in thickness and of the sums over wavelength and angle, relative to the
-        mean sky.
-    airmass : `float`
-        Airmass of the sky.
-    """
-
-    component: tuple[str, ...]
-    photons: FloatArray
-    wavelength_nm: FloatArray
-    limits: tuple[float, float]
+    component: tuple[str, ...]  # names of the components, C of them
+    photons: FloatArray  # (C,): photons behind air and optics [s⁻¹ m⁻² arcsec⁻²]
+    wavelength_nm: FloatArray  # (C,): mean wavelength of every component
+    limits: tuple[float, float]  # smallest and largest sin²θ
+    # start_um, step_um: grid of thickness
     start_um: float
     step_um: float
+    # (C, A, N): electrons s⁻¹ m⁻² arcsec⁻² at the A nodes of a Gauss-Legendre rule in sin²θ and N
+    # thicknesses
     values: FloatArray
-    flat: FloatArray
+    flat: FloatArray  # (A, N): the same from the light of a flat field, in arbitrary units
+    # interpolation_error, quadrature_error: estimated errors of the interpolation in thickness and of the
+    # sums over wavelength and angle, relative to the mean sky
     interpolation_error: float
     quadrature_error: float
-    airmass: float
+    airmass: float  # airmass of the sky
 
     def weights(self, sin_squared: ArrayLike) -> FloatArray:
         """Weights of the nodes that stand for a beam.
 
-        Parameters
-        ----------
-        sin_squared : array_like, shape ``(R,)``
-            sin²θ of rays that carry the same light.
-
-        Returns
-        -------
-        weights : `numpy.ndarray`, shape ``(A,)``
-            They sum to 1; some may be negative.
+        ``sin_squared`` (R,): sin²θ of rays that carry the same light. Returns weights (A,) that sum to 1; some may be
+        negative.
         """
         return _moment_weights(self.values.shape[1]) @ _ray_histogram(sin_squared, self.limits)
 
@@ -221,25 +186,14 @@ class AngularResponse:
 
 @dataclass(frozen=True, eq=False)
 class FieldResponse:
-    """Response to a sky over field radius.
+    """Response to a sky over field radius."""
 
-    Attributes
-    ----------
-    angular : `AngularResponse`
-        Response by angle.
-    start_deg, step_deg : `float`
-        Grid of field radii [deg].
-    weights : `numpy.ndarray`, shape ``(K, A)``
-        Beam at every field radius.
-    kept : `numpy.ndarray`, shape ``(K,)``
-        Unvignetted share of the pupil relative to the axis.
-    """
-
-    angular: AngularResponse
+    angular: AngularResponse  # response by angle
+    # start_deg, step_deg: grid of field radii
     start_deg: float
     step_deg: float
-    weights: FloatArray
-    kept: FloatArray
+    weights: FloatArray  # (K, A): beam at every field radius
+    kept: FloatArray  # (K,): unvignetted share of the pupil relative to the axis
 
     @property
     def radius_deg(self) -> FloatArray:
@@ -251,13 +205,7 @@ class FieldResponse:
         return np.asarray(np.interp(np.asarray(radius_deg, dtype=float), self.radius_deg, self.kept))
 
     def on(self, placement: SensorPlacement) -> SensorResponse:
-        """Response of a sensor at its place.
-
-        Raises
-        ------
-        OutOfRangeError
-            The sensor begins outside the tabulated radii.
-        """
+        """Response of a sensor at its place."""
         low, high = placement.radius_range_deg
         radii = self.radius_deg
         if low < radii[0] - 1e-9 or low > radii[-1]:
@@ -274,23 +222,14 @@ class FieldResponse:
 class SensorResponse:
     """Response of one sensor with the beam of every pixel; stands for a `SkyResponse` in `simulate_sky_frame`.
 
-    Attributes
-    ----------
-    field : `FieldResponse`
-        Tabulated at the radii of the sensor.
-    placement : `SensorPlacement`
-        Where its pixels lie.
-
-    Notes
-    -----
     Frames are those of flat-fielded exposures. A flat field of white light sees the same beams and the same silicon
     without fringes of lines; divided by it, frames lose the vignetting (`FieldResponse.relative_illumination`), the
     change of absorption with the angle (0.1 % over a sensor at the edge of the field), and its change with the
     thickness of silicon (0.3 % per micrometre, ten times the fringes of a sensor with black coating).
     """
 
-    field: FieldResponse
-    placement: SensorPlacement
+    field: FieldResponse  # tabulated at the radii of the sensor
+    placement: SensorPlacement  # where its pixels lie
 
     @property
     def component(self) -> tuple[str, ...]:
@@ -347,22 +286,13 @@ class SensorResponse:
 
 @dataclass(frozen=True, eq=False)
 class FieldTable:
-    """Electrons over field radius and thickness.
+    """Electrons over field radius and thickness."""
 
-    Attributes
-    ----------
-    table : `ResponseTable`
-        One row per field radius.
-    start_deg, step_deg : `float`
-        Field radii of the rows [deg].
-    placement : `SensorPlacement`
-        Where the pixels of the frames lie.
-    """
-
-    table: ResponseTable
+    table: ResponseTable  # one row per field radius
+    # start_deg, step_deg: field radii of the rows
     start_deg: float
     step_deg: float
-    placement: SensorPlacement
+    placement: SensorPlacement  # where the pixels of the frames lie
 
     @property
     def wavelength_nm(self) -> FloatArray:
@@ -377,22 +307,8 @@ class FieldTable:
     def frame(self, thickness_um: ArrayLike) -> NDArray[np.float32]:
         """Image of the sensor.
 
-        Parameters
-        ----------
-        thickness_um : array_like, shape ``(ny, nx)``
-            Thickness [µm] on pixels of any size that cover the sensor; NaN gives NaN.
-
-        Returns
-        -------
-        image : `numpy.ndarray`, float32, shape ``(ny, nx)``
-            The same bits whatever the number of threads.
-
-        Raises
-        ------
-        InputError
-            A map that is not two-dimensional.
-        OutOfRangeError
-            A thickness outside the table.
+        ``thickness_um`` (ny, nx): thickness on pixels of any size that cover the sensor; NaN gives NaN.
+        Returns (ny, nx), the same bits whatever the number of threads.
         """
         thickness = np.asarray(thickness_um)
         if thickness.dtype not in (np.float32, np.float64):
@@ -430,27 +346,8 @@ def angular_response(
 ) -> AngularResponse:
     """Tabulate the response of a sensor to a sky under single angles.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        The sensor, with effects; its own beam only decides how fine the table is in thickness.
-    sky, bandpass, thickness_range_um, quadrature
-        See `sky_response`.
-    limits : `tuple` [`float`, `float`]
-        Range of sin²θ that the beams may have.
-    angles : `int`, optional
-        Nodes in that range.
-
-    Returns
-    -------
-    response : `AngularResponse`
-
-    Raises
-    ------
-    InputError
-        An effect changes the beam, so that the beams of the telescope are not those on the sensor.
-    OutOfRangeError
-        Limits that do not ascend within 0 to 1.
+    ``model``: the sensor, with effects; its own beam only decides how fine the table is in thickness.
+    ``limits``: range of sin²θ that the beams may have.
     """
     if not 0.0 <= limits[0] < limits[1] < 1.0:
         raise OutOfRangeError("limits of sin² of the angle", limits, "two increasing numbers within 0 to 1")
@@ -494,21 +391,8 @@ def field_response(
 ) -> FieldResponse:
     """Give an angular response the beams of a range of field radii.
 
-    Parameters
-    ----------
-    angular : `AngularResponse`
-        Response by angle.
-    beams : `BeamField`
-        Beams of the telescope.
-    radius_range_deg : `tuple` [`float`, `float`]
-        Field radii to cover [deg]; what lies beyond the field of the telescope gets the beam of its edge.
-    step_deg : `float`, optional
-        Largest spacing of the radii.
-
-    Raises
-    ------
-    OutOfRangeError
-        A range that is empty or outside the field.
+    ``radius_range_deg``: field radii to cover; what lies beyond the field of the telescope gets the beam of its
+    edge.
     """
     low, high = radius_range_deg
     edge = beams.largest_deg
@@ -538,18 +422,8 @@ def sensor_response(
 
     Commands and Tasks make their frames with it, so that one map has one sky.
 
-    Parameters
-    ----------
-    model, sky, thickness_range_um, quadrature
-        See `sky_response`.
-    placement : `SensorPlacement`
-        Where the pixels of the sensor lie.
-
-    Returns
-    -------
-    response : `Response`
-        With the one beam of the model behind a cone, and behind a telescope whose beams do not depend on the
-        distance from the axis alone.
+    It has the one beam of the model behind a cone, and behind a telescope whose beams do not depend on
+    the distance from the axis alone.
     """
 
     def respond(own: FringeModel) -> Response:

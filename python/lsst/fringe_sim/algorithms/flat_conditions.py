@@ -23,23 +23,7 @@ def model_of_flats(model: FringeModel, exposures: FlatExposures) -> FringeModel:
 
     An effect on either of them wins over the headers.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        The model of the set-up.
-    exposures : `FlatExposures`
-        What the flats state.
-
-    Returns
-    -------
-    model : `FringeModel`
-        The same one where the flats state what the set-up does.
-
-    Raises
-    ------
-    InputError, OutOfRangeError
-        Flats of different temperatures, a temperature that the tables of the sensor do not cover, a width of the line
-        that must be in another unit, a converging beam where the set-up has a parallel one.
+    Returns the same model where the flats state what the set-up does.
     """
     known = {item.effect.name for item in model.effects}
     if "converging_beam" not in known:

@@ -61,21 +61,11 @@ _REFINEMENTS = 4
 
 @dataclass(frozen=True)
 class PlannedFlat:
-    """A flat that has been or could be taken.
-
-    Attributes
-    ----------
-    wavelength_nm : `float`
-        Nominal wavelength [nm].
-    electrons : `float`
-        Mean level [electrons per pixel].
-    bandwidth_fwhm_nm : `float` or `None`
-        Width of the line [nm]; as in the model if `None`.
-    """
+    """A flat that has been or could be taken."""
 
     wavelength_nm: float
-    electrons: float = 20_000.0
-    bandwidth_fwhm_nm: float | None = None
+    electrons: float = 20_000.0  # mean level [electrons per pixel]
+    bandwidth_fwhm_nm: float | None = None  # width of the line; as in the model if `None`
 
     def __post_init__(self) -> None:
         if not 0.0 < self.wavelength_nm < math.inf:
@@ -88,37 +78,21 @@ class PlannedFlat:
 
 @dataclass(frozen=True, eq=False)
 class FlatForecast:
-    """What a set of flats will tell.
-
-    Attributes
-    ----------
-    flats : `tuple` [`PlannedFlat`, ...]
-        The flats.
-    thickness_um : `numpy.ndarray`, shape ``(n,)``
-        True thickness [µm].
-    sigma_um : `numpy.ndarray`, shape ``(n,)``
-        Uncertainty of the thickness of a single pixel [µm]; infinite where the flats do not depend on it.
-    rival_um : `numpy.ndarray`, shape ``(n,)``
-        Thickness that competes most [µm]; NaN where none does.
-    separation : `numpy.ndarray`, shape ``(n,)``
-        Expected Δχ² between the two for a single pixel; infinite where there is no rival.
-    pixel_slip, region_slip : `numpy.ndarray`, shape ``(n,)``
-        Probability that the order is wrong, for a single pixel and for a region.
-    region_px : `int`
-        Number of independent pixels of a region, whose evidence is added.
-    order_um : `float`
-        Thickness of one fringe order, mean over the flats [µm].
-    """
+    """What a set of flats will tell."""
 
     flats: tuple[PlannedFlat, ...]
-    thickness_um: FloatArray
+    thickness_um: FloatArray  # (n,): true thickness
+    # (n,): uncertainty of the thickness of a single pixel; infinite where the flats do not depend on it
     sigma_um: FloatArray
-    rival_um: FloatArray
+    rival_um: FloatArray  # (n,): thickness that competes most; NaN where none does
+    # (n,): expected Δχ² between the two for a single pixel; infinite where there is no rival
     separation: FloatArray
+    # pixel_slip, region_slip (n,): probability that the order is wrong, for a single pixel and for a
+    # region
     pixel_slip: FloatArray
     region_slip: FloatArray
-    region_px: int
-    order_um: float
+    region_px: int  # number of independent pixels of a region, whose evidence is added
+    order_um: float  # thickness of one fringe order, mean over the flats
 
     @property
     def worst(self) -> int:
@@ -132,25 +106,15 @@ class FlatForecast:
 
 @dataclass(frozen=True)
 class RankedFlat:
-    """A further flat, and what a forecast becomes with it.
-
-    Attributes
-    ----------
-    flat : `PlannedFlat`
-        The flat.
-    separation : `float`
-        Least Δχ² of a single pixel over all thicknesses.
-    pixel_slip, region_slip : `float`
-        Mean over all thicknesses of the slip probability of a pixel; largest slip probability of a region.
-    sigma_um : `float`
-        Root of the mean square uncertainty of a pixel [µm].
-    """
+    """A further flat, and what a forecast becomes with it."""
 
     flat: PlannedFlat
-    separation: float
+    separation: float  # least Δχ² of a single pixel over all thicknesses
+    # pixel_slip, region_slip: mean over all thicknesses of the slip probability of a pixel; largest slip
+    # probability of a region
     pixel_slip: float
     region_slip: float
-    sigma_um: float
+    sigma_um: float  # root of the mean square uncertainty of a pixel
 
 
 def forecast_flats(
@@ -201,17 +165,8 @@ def nyquist_thickness_um(model: FringeModel, wavelength_nm: Sequence[float]) -> 
     A thicker layer is sampled below the Nyquist rate there: only the chirp of the fringe over all flats tells it from
     its mirror image.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        The model.
-    wavelength_nm : `~collections.abc.Sequence` [`float`]
-        Wavelengths [nm], in any order; equal ones count once.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, shape ``(n_different - 1,)``
-        ``1 / (4 |n / lambda - n' / lambda'|)`` for each pair of neighbours, from short to long wavelengths [µm].
+    ``wavelength_nm``: wavelengths, in any order; equal ones count once. Returns (n_different - 1,): ``1 / (4 |n
+    / lambda - n' / lambda'|)`` for each pair of neighbours, from short to long wavelengths.
     """
     wavelength = np.unique(np.asarray(wavelength_nm, dtype=float))
     # One order is half a wavelength in the layer.

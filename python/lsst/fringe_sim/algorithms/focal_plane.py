@@ -51,21 +51,12 @@ _HIGH_PERCENTILE = 90.0
 
 @dataclass(frozen=True)
 class ForecastOptions:
-    """How a sensor is summed up.
+    """How a sensor is summed up."""
 
-    Attributes
-    ----------
-    cells : `int`
-        Cells along each side of the sensor, for the map of the focal plane.
-    apertures_arcsec : `tuple` [`float`, ...]
-        Sides of the square apertures over which fringe and noise are compared [arcsec], whole numbers.
-    templates : `int`
-        Largest number of templates of a correction.
-    """
-
-    cells: int = 8
+    cells: int = 8  # cells along each side of the sensor, for the map of the focal plane
+    # Sides of the square apertures over which fringe and noise are compared [arcsec], whole numbers
     apertures_arcsec: tuple[float, ...] = (1.0, 2.0, 5.0, 10.0, 20.0)
-    templates: int = 3
+    templates: int = 3  # largest number of templates of a correction
 
     def __post_init__(self) -> None:
         if self.cells < 1 or self.templates < 1:
@@ -78,24 +69,13 @@ class ForecastOptions:
 
 @dataclass(frozen=True, eq=False)
 class SkyLevel:
-    """Electrons of the sky in one pixel, component by component, with every band at its reference level.
+    """Electrons of the sky in one pixel, component by component, with every band at its reference level."""
 
-    Attributes
-    ----------
-    electrons : `numpy.ndarray`, shape ``(C,)``
-        Through the measured quantum efficiency of the throughput tables [e⁻ per pixel and exposure].
-    read_noise_e : `float`
-        Read noise [e⁻ rms].
-    pixel_scale_arcsec : `float`
-        Side of a pixel [arcsec].
-    microjansky : `float`
-        Surface brightness of the whole sky [µJy arcsec⁻²].
-    """
-
+    # (C,): through the measured quantum efficiency of the throughput tables [e⁻ per pixel and exposure]
     electrons: FloatArray
-    read_noise_e: float
-    pixel_scale_arcsec: float
-    microjansky: float
+    read_noise_e: float  # read noise [e⁻ rms]
+    pixel_scale_arcsec: float  # side of a pixel [arcsec]
+    microjansky: float  # surface brightness of the whole sky [µJy arcsec⁻²]
 
     @classmethod
     def of(
@@ -108,18 +88,9 @@ class SkyLevel:
     ) -> SkyLevel:
         """Level of a sky on the sensor of a set-up.
 
-        Parameters
-        ----------
-        sky : `SkySpectrum`
-            Lines and continua.
-        model : `FringeModel`
-            Where area, pixel scale, bandpass and exposure time come from.
-        read_noise_e : `float`
-            Read noise [e⁻ rms].
-        relative_illumination : `float`, optional
-            Light at the place of the sensor relative to the axis (vignetting).
-        exposure_s : `float`, optional
-            Exposure time [s]; by default that of the set-up.
+        ``model``: where area, pixel scale, bandpass and exposure time come from. ``read_noise_e``: read noise
+        [e⁻ rms]. ``relative_illumination``: light at the place of the sensor relative to the axis (vignetting).
+        ``exposure_s``: exposure time; by default that of the set-up.
         """
         setup = model.setup
         band = Bandpass.from_name(setup.bandpass)
@@ -140,25 +111,16 @@ class SkyLevel:
 
 @dataclass(frozen=True, eq=False)
 class PatternMoments:
-    """Mean products of the fringe patterns of the components of the sky.
+    """Mean products of the fringe patterns of the components of the sky."""
 
-    Attributes
-    ----------
-    apertures_arcsec : `tuple` [`float`, ...]
-        Sides of the apertures over which patterns were averaged, A of them [arcsec].
-    product : `numpy.ndarray`, shape ``(A, n, n, C, C)``
-        Mean over the apertures in each of n × n cells of the product of two patterns, each in units of the mean sky
-        at its reference level, less its mean over the sensor; NaN in a cell without thickness.
-    share : `numpy.ndarray`, shape ``(C,)``
-        Share of each component in the mean sky that the sensor detects.
-    amplitudes : `FringeAmplitudes`
-        Of the frame at the reference level.
-    """
-
+    # Sides of the apertures over which patterns were averaged, A of them [arcsec]
     apertures_arcsec: tuple[float, ...]
+    # (A, n, n, C, C): mean over the apertures in each of n × n cells of the product of two patterns, each
+    # in units of the mean sky at its reference level, less its mean over the sensor; NaN in a cell
+    # without thickness
     product: FloatArray
-    share: FloatArray
-    amplitudes: FringeAmplitudes
+    share: FloatArray  # (C,): share of each component in the mean sky that the sensor detects
+    amplitudes: FringeAmplitudes  # of the frame at the reference level
 
     @property
     def whole(self) -> FloatArray:
@@ -168,16 +130,7 @@ class PatternMoments:
     def rms(self, vectors: ArrayLike, factors: ArrayLike) -> FloatArray:
         """Rms of sums of patterns as fractions of the sky of their time.
 
-        Parameters
-        ----------
-        vectors : array_like, shape ``(T, C)``
-            Coefficients of the patterns.
-        factors : array_like, shape ``(T, C)``
-            Factors on the components of the sky.
-
-        Returns
-        -------
-        rms : `numpy.ndarray`, shape ``(A, T)``
+        ``vectors`` (T, C). ``factors`` (T, C). Returns (A, T).
         """
         wanted = np.asarray(vectors, dtype=float)
         square = np.einsum("tc,acd,td->at", wanted, self.whole, wanted)
@@ -186,47 +139,29 @@ class PatternMoments:
 
 @dataclass(frozen=True, eq=False)
 class SensorForecast:
-    """Fringes of one sensor.
-
-    Attributes
-    ----------
-    detector, vendor : `str`
-        The sensor.
-    stand_in : `bool`
-        Whether its thickness is a random field in place of a measured map.
-    field_radius_deg, relative_illumination : `float`
-        Distance of its centre from the axis [deg], and the light there relative to the axis.
-    amplitudes : `FringeAmplitudes`
-        Of the frame with every band at its reference level.
-    mean_electrons, microjansky : `float`
-        Sky per pixel [e⁻] and per square arcsecond [µJy].
-    apertures_arcsec : `tuple` [`float`, ...]
-        Sides of the apertures, A of them [arcsec].
-    over_noise : `numpy.ndarray`, shape ``(A,)``
-        Rms fringe over the noise of the sky, both averaged over the aperture.
-    residual_over_noise : `numpy.ndarray`, shape ``(K, A)``
-        The same after correction with 1 to K templates; the level that 90 % of the exposures of other nights stay
-        below.
-    cell_x_mm, cell_y_mm : `numpy.ndarray`, shape ``(n, n)``
-        Centres of the cells in the focal plane [mm].
-    cell_rms, cell_over_noise, cell_residual : `numpy.ndarray`, shape ``(n, n)``
-        Rms fringe (fraction of the sky), largest ratio to the noise over the apertures, and that ratio after
-        correction with K templates.
-    """
+    """Fringes of one sensor."""
 
     detector: str
     vendor: str
-    stand_in: bool
+    stand_in: bool  # whether its thickness is a random field in place of a measured map
+    # field_radius_deg, relative_illumination: distance of its centre from the axis [deg], and the light
+    # there relative to the axis
     field_radius_deg: float
     relative_illumination: float
-    amplitudes: FringeAmplitudes
+    amplitudes: FringeAmplitudes  # of the frame with every band at its reference level
+    # mean_electrons, microjansky: sky per pixel [e⁻] and per square arcsecond [µJy]
     mean_electrons: float
     microjansky: float
-    apertures_arcsec: tuple[float, ...]
-    over_noise: FloatArray
+    apertures_arcsec: tuple[float, ...]  # sides of the apertures, A of them [arcsec]
+    over_noise: FloatArray  # (A,): rms fringe over the noise of the sky, both averaged over the aperture
+    # (K, A): the same after correction with 1 to K templates; the level that 90 % of the exposures of
+    # other nights stay below
     residual_over_noise: FloatArray
+    # cell_x_mm, cell_y_mm (n, n): centres of the cells in the focal plane
     cell_x_mm: FloatArray
     cell_y_mm: FloatArray
+    # cell_rms, cell_over_noise, cell_residual (n, n): rms fringe (fraction of the sky), largest ratio to
+    # the noise over the apertures, and that ratio after correction with K templates
     cell_rms: FloatArray
     cell_over_noise: FloatArray
     cell_residual: FloatArray
@@ -314,19 +249,8 @@ def pattern_moments(
 ) -> PatternMoments:
     """Mean products of the fringe patterns of a sensor.
 
-    Parameters
-    ----------
-    thickness_um : array_like, shape ``(ny, nx)``
-        Thickness [µm], on pixels of any size that cover the sensor; NaN where it is not known.
-    response : `SensorResponse`
-        Response of the sensor to the sky.
-    options : `ForecastOptions`, optional
-        Cells and apertures.
-
-    Raises
-    ------
-    InputError
-        A map without thickness, or too coarse for its cells.
+    ``thickness_um`` (ny, nx): thickness, on pixels of any size that cover the sensor; NaN where it is not
+    known.
     """
     chosen = ForecastOptions() if options is None else options
     thickness = np.asarray(thickness_um)
@@ -356,21 +280,11 @@ def correction_residuals(
 ) -> list[FloatArray]:
     """What corrections with templates from one night leave of the fringes of others.
 
-    Parameters
-    ----------
-    moments : `PatternMoments`
-        The sensor.
-    training, observed : array_like, shape ``(T, C)`` and ``(S, C)``
-        Factors on the components of the sky, of the exposures that make the templates and of those to be corrected.
-    templates : `int`
-        Largest number of templates: the mean fringe of the training exposures, then their principal components
-        beside it.
-
-    Returns
-    -------
-    residuals : `list` of `numpy.ndarray`, shape ``(S, C)``
-        For 1, 2, ... templates the coefficients of the patterns that are left, with the scales of the templates
-        fitted to noiseless exposures.
+    ``training``, ``observed`` (T, C) and (S, C): factors on the components of the sky, of the exposures
+    that make the templates and of those to be corrected. ``templates``: largest number of templates: the
+    mean fringe of the training exposures, then their principal components beside it. Returns (S, C) for 1,
+    2, ... templates: the coefficients of the patterns that are left, with the scales of the templates
+    fitted to noiseless exposures.
     """
     basis_of = np.asarray(training, dtype=float)
     wanted = np.asarray(observed, dtype=float)
@@ -399,25 +313,8 @@ def forecast_sensor(
 ) -> SensorForecast:
     """Forecast the fringes of one sensor.
 
-    Parameters
-    ----------
-    thickness_um, response
-        See `pattern_moments`.
-    detector : `Detector`
-        The sensor.
-    level : `SkyLevel`
-        Electrons of the sky at its place.
-    training, observed : `NightHistory`
-        The night from which the templates come, and other times that are corrected with them.
-    stand_in : `bool`, optional
-        Whether the thickness stands for a map that is not measured.
-    options : `ForecastOptions`, optional
-        Cells, apertures, templates.
-
-    Raises
-    ------
-    InputError
-        A map without thickness, or a level of another sky.
+    ``training``, ``observed``: the night from which the templates come, and other times that are corrected with
+    them. ``stand_in``: whether the thickness stands for a map that is not measured.
     """
     chosen = ForecastOptions() if options is None else options
     if level.electrons.shape != (len(response.component),):

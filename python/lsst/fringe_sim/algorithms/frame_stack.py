@@ -31,40 +31,21 @@ tiles are always in double precision."""
 
 @dataclass(frozen=True, eq=False)
 class FrameStack:
-    """Frames as ``(frame - offset) / unit``.
+    """Frames as ``(frame - offset) / unit``."""
 
-    Attributes
-    ----------
-    frames : `tuple`
-        Images of one shape, N of them, that can be sliced by rows.
-    good : `numpy.ndarray`, bool, shape ``(ny, nx)``
-        Pixels that are used. Those without a value in some frame are taken out as the frames are read.
-    offset : `numpy.ndarray`, shape ``(N,)``
-        What is subtracted from every frame.
-    unit : `float`
-        What they are divided by.
-    noise_variance : `float`
-        Variance of the noise of a pixel of a frame, in that unit; 0 where it is not known.
-    rows : `int`
-        Rows of a tile.
-    """
-
-    frames: tuple[Any, ...]
+    frames: tuple[Any, ...]  # images of one shape, N of them, that can be sliced by rows
+    # (ny, nx): pixels that are used. Those without a value in some frame are taken out as the frames are
+    # read.
     good: NDArray[np.bool_]
-    offset: FloatArray
-    unit: float
+    offset: FloatArray  # (N,): what is subtracted from every frame
+    unit: float  # what they are divided by
+    # Variance of the noise of a pixel of a frame, in that unit; 0 where it is not known
     noise_variance: float
-    rows: int
+    rows: int  # rows of a tile
 
     @classmethod
     def of(cls, frames: Sequence[Any], mask: ArrayLike | None, tile_bytes: int = TILE_BYTES) -> FrameStack:
-        """Frames of one sensor: arrays as they are, exposures in electrons in units of their common mean sky.
-
-        Raises
-        ------
-        InputError
-            Fewer than two frames, shapes that differ, or no good pixel.
-        """
+        """Frames of one sensor: arrays as they are, exposures in electrons in units of their common mean sky."""
         if len(frames) < 2:
             raise InputError("number of frames", len(frames), "two or more")
         images = tuple(each.image if isinstance(each, SkyFringe) else each for each in frames)
@@ -101,13 +82,7 @@ class FrameStack:
         return int(np.count_nonzero(self.good))
 
     def gram_and_mean(self) -> tuple[FloatArray, NDArray[np.float32]]:
-        """Gram matrix of the frames less their mean over frames, and that mean frame; 0 where there is none.
-
-        Raises
-        ------
-        InputError
-            No pixel has a value in all frames.
-        """
+        """Gram matrix of the frames less their mean over frames, and that mean frame; 0 where there is none."""
         count = len(self.frames)
         whole = np.zeros((count, count))
         mean = np.zeros(self.good.shape, dtype=np.float32)

@@ -23,17 +23,8 @@ FloatArray = NDArray[np.float64]
 def response_with_islands(model: FringeModel, respond: Callable[[FringeModel], Response]) -> Response:
     """Response of a sensor with its local effects where they are.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        The sensor.
-    respond : callable
-        ``(model) -> response``: what it would be if all of the sensor were like ``model``.
-
-    Returns
-    -------
-    response : `Response`
-        That of ``respond`` itself where no effect is local.
+    ``respond``: ``(model) -> response``: what it would be if all of the sensor were like ``model``. Returns
+    that of ``respond`` itself where no effect is local.
     """
     outside = respond(model)
     islands = tuple((item, respond(inside)) for item, inside in model.islands)
@@ -42,21 +33,11 @@ def response_with_islands(model: FringeModel, respond: Callable[[FringeModel], R
 
 @dataclass(frozen=True, eq=False)
 class IslandResponse:
-    """Stands for a `SkyResponse` in `simulate_sky_frame`.
-
-    Attributes
-    ----------
-    model : `FringeModel`
-        The sensor.
-    outside : `Response`
-        Response outside local effects.
-    islands : `tuple`
-        Local effects, each with the response where it is.
-    """
+    """Stands for a `SkyResponse` in `simulate_sky_frame`."""
 
     model: FringeModel
-    outside: Response
-    islands: tuple[tuple[ActiveEffect, Response], ...]
+    outside: Response  # response outside local effects
+    islands: tuple[tuple[ActiveEffect, Response], ...]  # local effects, each with the response where it is
 
     @property
     def component(self) -> tuple[str, ...]:

@@ -490,17 +490,11 @@ class _Tested:
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """Pixels that stand for a sensor: every fringe phase of both layers, scattered over the sensor.
+    """Pixels that stand for a sensor: every fringe phase of both layers, scattered over the sensor."""
 
-    Attributes
-    ----------
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness of the varying layer [µm].
-    silicon_um : `numpy.ndarray`, shape ``(ny,)``
-        Thickness of the detection layer minus that of the stack [µm]; zero if that is the layer that varies.
-    """
-
-    thickness_um: FloatArray
+    thickness_um: FloatArray  # (ny, nx): thickness of the varying layer
+    # (ny,): thickness of the detection layer minus that of the stack; zero if that is the layer that
+    # varies
     silicon_um: FloatArray
 
     @classmethod
@@ -536,28 +530,18 @@ class _Sample:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """One series of flats at the sample, shapes ``(W, P)`` and ``(K, W, P)``.
+    """One series of flats at the sample, shapes ``(W, P)`` and ``(K, W, P)``."""
 
-    Attributes
-    ----------
-    image : `numpy.ndarray`
-        Signal relative to its mean.
-    weight : `numpy.ndarray`
-        Inverse standard deviation of the noise of a pixel.
-    thickness, silicon : `numpy.ndarray`
-        Derivatives with respect to the two thicknesses [1/µm].
-    tested, further : `numpy.ndarray`
-        Derivatives with respect to the parameters of the effects, in units of their prior scales.
-    difference : `numpy.ndarray`
-        What the effect that was found does, and what it does that each of the others does not.
-    """
-
-    image: FloatArray
-    weight: FloatArray
+    image: FloatArray  # signal relative to its mean
+    weight: FloatArray  # inverse standard deviation of the noise of a pixel
+    # thickness, silicon: derivatives with respect to the two thicknesses [1/µm]
     thickness: FloatArray
     silicon: FloatArray
+    # tested, further: derivatives with respect to the parameters of the effects, in units of their prior
+    # scales
     tested: FloatArray
     further: FloatArray
+    # What the effect that was found does, and what it does that each of the others does not
     difference: FloatArray
 
 
@@ -605,11 +589,8 @@ class _Forecast:
     def signatures(self, blocks: Sequence[_Block]) -> FloatArray:
         """What the effects do to the flats of a sensor and nothing else does, in units of the noise.
 
-        Returns
-        -------
-        signature : `numpy.ndarray`, shape ``(rows, K)``
-            One column for each parameter, and one for each difference; the products of columns are the Fisher
-            information.
+        Returns (rows, K): one column for each parameter, and one for each difference; the products of columns
+        are the Fisher information.
         """
         joined = [np.concatenate([getattr(block, name) for block in blocks], axis=-2) for name in _FIELDS]
         image, weight, thickness, silicon, tested, further, difference = joined

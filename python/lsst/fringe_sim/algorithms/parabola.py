@@ -14,30 +14,17 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Minima of several curves.
+    """Minima of several curves."""
 
-    Attributes
-    ----------
-    place : `numpy.ndarray`, shape ``(n,)``
-        Where they are [samples].
-    value : `numpy.ndarray`, shape ``(n,)``
-        Values there.
-    bend : `numpy.ndarray`, shape ``(n,)``
-        Second differences there.
-    """
-
-    place: FloatArray
-    value: FloatArray
-    bend: FloatArray
+    place: FloatArray  # (n,): where they are [samples]
+    value: FloatArray  # (n,): values there
+    bend: FloatArray  # (n,): second differences there
 
 
 def parabolic_minimum(curves: FloatArray) -> Minimum:
     """Minimum of each column by a parabola through the least sample and its neighbours; at an end, the sample itself.
 
-    Parameters
-    ----------
-    curves : `numpy.ndarray`, shape ``(samples, n)``
-        The curves, of three samples or more.
+    ``curves`` (samples, n).
     """
     best, each = np.argmin(curves, axis=0), np.arange(curves.shape[1])
     middle = np.clip(best, 1, len(curves) - 2)

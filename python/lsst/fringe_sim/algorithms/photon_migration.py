@@ -36,28 +36,15 @@ _DEPTH_STEP_UM = 0.02
 
 @dataclass(frozen=True, eq=False)
 class PhotonMigration:
-    """Depths of absorption and refracted slopes, independent of each other.
+    """Depths of absorption and refracted slopes, independent of each other."""
 
-    Attributes
-    ----------
-    depth_um : `numpy.ndarray`, shape ``(D,)``
-        Equally probable depths of absorption [µm], ascending.
-    slope_x, slope_y : `numpy.ndarray`, shape ``(R,)``
-        Slopes dx/dz and dy/dz inside the silicon of equally probable rays.
-    """
-
-    depth_um: FloatArray
+    depth_um: FloatArray  # (D,): equally probable depths of absorption, ascending
+    # slope_x, slope_y (R,): slopes dx/dz and dy/dz inside the silicon of equally probable rays
     slope_x: FloatArray
     slope_y: FloatArray
 
     def fraction_inside(self, half_width_um: float) -> float:
-        """Share of the absorbed photons that end within a square around their point of entry.
-
-        Parameters
-        ----------
-        half_width_um : `float`
-            Half of the side of the square [µm].
-        """
+        """Share of the absorbed photons that end within a square around their point of entry."""
         if not half_width_um > 0.0:
             raise OutOfRangeError("half width [um]", half_width_um, "positive")
         steepest = np.maximum(np.abs(self.slope_x), np.abs(self.slope_y))
@@ -68,17 +55,7 @@ class PhotonMigration:
     def sample(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Random photons that entered at the origin.
 
-        Parameters
-        ----------
-        count : `int`
-            Photons.
-        rng : `numpy.random.Generator`
-            Source of randomness.
-
-        Returns
-        -------
-        position_um : `numpy.ndarray`, shape ``(count, 3)``
-            Where they are absorbed: x, y, depth [µm].
+        Returns (count, 3).
         """
         depth = self.depth_um[rng.integers(self.depth_um.size, size=count)]
         ray = rng.integers(self.slope_x.size, size=count)
@@ -87,22 +64,7 @@ class PhotonMigration:
     def pixel_kernel(self, pixel_um: float, reach_px: int = 3) -> FloatArray:
         """Where the photons of a uniformly lit pixel are absorbed.
 
-        Parameters
-        ----------
-        pixel_um : `float`
-            Pixel pitch [µm].
-        reach_px : `int`, optional
-            Pixels on either side.
-
-        Returns
-        -------
-        kernel : `numpy.ndarray`, shape ``(2 reach + 1, 2 reach + 1)``
-            Shares by pixel ``[y, x]``; they sum to 1.
-
-        Raises
-        ------
-        OutOfRangeError
-            A pitch that is not positive, or a reach that leaves out more than 1e-3 of the photons.
+        Returns (2 reach + 1, 2 reach + 1): shares by pixel ``[y, x]``; they sum to 1.
         """
         if not pixel_um > 0.0 or reach_px < 1:
             raise OutOfRangeError("pixel pitch [um] and reach [px]", (pixel_um, reach_px), "positive")
@@ -127,27 +89,7 @@ def photon_migration(
 ) -> PhotonMigration:
     """Walk of the photons of a sky in the detection layer.
 
-    Parameters
-    ----------
-    rays : `RayBundle`
-        Directions at a place of the focal plane.
-    light : sequence of `SpectralComponent`
-        Photons behind air and optics.
-    stack : `LayerStack`
-        The sensor.
-    temperature_k : `float`
-        Its temperature [K].
-    layer : `str`, optional
-        Name of the layer that absorbs.
-
-    Returns
-    -------
-    migration : `PhotonMigration`
-
-    Raises
-    ------
-    InputError
-        No light.
+    ``rays``: directions at a place of the focal plane.
     """
     if not light or not sum(float(item.photons.sum()) for item in light) > 0.0:
         raise InputError("light", "none", "components with photons")
@@ -178,12 +120,7 @@ def photon_migration(
 def spread_charge(image: ArrayLike, kernel: ArrayLike) -> NDArray[np.float32]:
     """Frame after photons have walked to neighbouring pixels; edges repeat the outermost pixels.
 
-    Parameters
-    ----------
-    image : array_like, shape ``(ny, nx)``
-        Expected electrons.
-    kernel : array_like
-        From `PhotonMigration.pixel_kernel`.
+    ``image`` (ny, nx).
     """
     values = np.asarray(image, dtype=np.float32)
     if values.ndim != 2:

@@ -24,22 +24,10 @@ def template_errors(
 ) -> tuple[float, float]:
     """Largest errors of the templates, as fractions of their mean.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        The model that is fitted.
-    wavelength_nm : array_like, shape ``(W,)``
-        Wavelengths of the flats [nm].
-    range_um : `tuple` [`float`, `float`], optional
-        Thicknesses that are searched [µm]; by default those of the set-up.
-    observable : {"detection", "total"}, optional
-        What a pixel responds to; by default that of the model.
-
-    Returns
-    -------
-    quadrature_error, interpolation_error : `float`
-        Change when the wavelength nodes are twice as dense; difference between the model and the straight line
-        between two neighbouring thicknesses of the templates, half way between them.
+    ``wavelength_nm`` (W,). ``range_um``: thicknesses that are searched; by default those of the set-up.
+    ``observable`` {"detection", "total"}: what a pixel responds to; by default that of the model. Returns
+    the change when the wavelength nodes are twice as dense, and the difference between the model and the
+    straight line between two neighbouring thicknesses of the templates, half way between them.
     """
     wavelength = np.unique(np.asarray(wavelength_nm, dtype=float))
     if observable is not None:

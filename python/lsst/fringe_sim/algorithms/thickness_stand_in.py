@@ -33,22 +33,11 @@ _RANGE_SAMPLES = 96
 
 @dataclass(frozen=True)
 class ThicknessField:
-    """Statistics of the thickness of a layer.
+    """Statistics of the thickness of a layer."""
 
-    Attributes
-    ----------
-    layer : `str`
-        Name of the layer.
-    mean_um : `float`
-        Middle of the range of thickness on a sensor [µm].
-    span_um : `tuple` [`float`, `float`]
-        Smallest and largest difference between the thickest and the thinnest place of a sensor [µm].
-    scale_mm : `float`
-        Correlation length [mm].
-    """
-
-    layer: str
-    mean_um: float
+    layer: str  # name of the layer
+    mean_um: float  # middle of the range of thickness on a sensor
+    # Smallest and largest difference between the thickest and the thinnest place of a sensor
     span_um: tuple[float, float]
     scale_mm: float
 
@@ -63,13 +52,7 @@ class ThicknessField:
 
     @classmethod
     def of(cls, setup: Setup) -> ThicknessField:
-        """Statistics of the varying layer of a set-up.
-
-        Raises
-        ------
-        UnknownNameError
-            None are known for its stack.
-        """
+        """Statistics of the varying layer of a set-up."""
         fields = read_yaml("laboratory", "thickness_fields.yaml")["fields"]
         stack, layer = setup.stack.name, setup.varying
         if layer not in fields.get(stack, {}):
@@ -84,18 +67,7 @@ class ThicknessField:
     ) -> NDArray[np.float32]:
         """Thickness of one sensor.
 
-        Parameters
-        ----------
-        shape : `tuple` [`int`, `int`]
-            Rows and columns of the map. The field does not depend on them, only where it is sampled.
-        size_mm : `tuple` [`float`, `float`]
-            Height and width of the sensor [mm].
-        rng : `numpy.random.Generator`
-            Source of randomness.
-
-        Returns
-        -------
-        thickness_um : `numpy.ndarray`, float32, ``shape``
+        ``shape``: rows and columns of the map. The field does not depend on them, only where it is sampled.
         """
         if min(shape) < 1:
             raise InputError("shape of the thickness map", shape, "positive")
@@ -122,26 +94,10 @@ def stand_in_thickness(
 ) -> ThicknessMap:
     """Map that stands for the unknown thickness of a sensor.
 
-    Parameters
-    ----------
-    setup : `Setup`
-        The sensor's stack and varying layer.
-    detector : `Detector`
-        The sensor; its number is part of the seed.
-    seed : `int`, optional
-        Another seed gives other stand-ins for all sensors.
-    shape : `tuple` [`int`, `int`], optional
-        Rows and columns of the map, which covers the whole sensor; those of the sensor by default.
-
-    Returns
-    -------
-    thickness : `ThicknessMap`
-        Its header states ``STANDIN``; its uncertainty is that of not knowing: the standard deviation of the field.
-
-    Raises
-    ------
-    UnknownNameError
-        No statistics are known for the stack of the set-up.
+    ``detector``: the sensor; its number is part of the seed. ``seed``: another seed gives other stand-ins for
+    all sensors. ``shape``: rows and columns of the map, which covers the whole sensor; those of the sensor by
+    default. The header of the map states ``STANDIN``; its uncertainty is that of not knowing: the standard
+    deviation of the field.
     """
     field = ThicknessField.of(setup)
     rows, columns = detector.shape
