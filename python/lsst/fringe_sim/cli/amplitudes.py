@@ -83,13 +83,7 @@ def amplitudes(
 
 
 def read_line_list(path: Path) -> SkyCase:
-    """Line list of the user, named like its file.
-
-    Raises
-    ------
-    InputError
-        The file is no ECSV table, or the table no line list.
-    """
+    """Line list of the user, named like its file."""
     return SkyCase.of_table(
         printable_name("name of the line list", path.stem), read_user_table(path, "line list")
     )

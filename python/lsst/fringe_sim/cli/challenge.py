@@ -100,13 +100,7 @@ def challenge(
 
 
 def _earlier_cases(record: Path, identity: dict[str, int | str]) -> list[CaseResult]:
-    """Cases that ran before; a new record starts with what they have in common.
-
-    Raises
-    ------
-    InputError
-        The record is one of another challenge.
-    """
+    """Cases that ran before; a new record starts with what they have in common."""
     from ..challenge.result import CaseResult
 
     lines = record.read_text().splitlines() if record.exists() else []

@@ -51,18 +51,10 @@ class DemoSettings:
 
 @dataclass
 class DemoRun:
-    """Steps of the demo; those that a former run has finished are not done again.
+    """Steps of the demo; those that a former run has finished are not done again."""
 
-    Parameters
-    ----------
-    folder : `pathlib.Path`
-        Where everything goes.
-    settings : `DemoSettings`
-        Written beside the results; a folder made with other settings is refused.
-    """
-
-    folder: Path
-    settings: DemoSettings
+    folder: Path  # where everything goes
+    settings: DemoSettings  # written beside the results; a folder made with other settings is refused
 
     def __post_init__(self) -> None:
         self._state = self.folder / STATE
@@ -102,13 +94,7 @@ class DemoRun:
         self._remember()
 
     def program(self, log: str, *command: str) -> None:
-        """Run a program of this environment; its output goes to ``logs/<log>.log``.
-
-        Raises
-        ------
-        DemoError
-            The program failed; the message has the end of its output.
-        """
+        """Run a program of this environment; its output goes to ``logs/<log>.log``."""
         path = self.folder / "logs" / f"{log}.log"
         binary = Path(sys.executable).parent / command[0]
         environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "2")}

@@ -28,17 +28,10 @@ LEAST_SIZE = (16, 64)
 
 @dataclass(frozen=True)
 class LabSeries:
-    """Bias frames and flats of one sensor.
+    """Bias frames and flats of one sensor."""
 
-    Attributes
-    ----------
-    serial : `str`
-        Serial number of the sensor.
-    biases, flats : `tuple` [`RawMetadata`, ...]
-        What the headers say; ``source`` of each is the file.
-    """
-
-    serial: str
+    serial: str  # serial number of the sensor
+    # biases, flats: what the headers say; ``source`` of each is the file
     biases: tuple[RawMetadata, ...]
     flats: tuple[RawMetadata, ...]
 
@@ -65,19 +58,7 @@ class LabSeries:
     def read(self, setup: Setup, options: FlatPrepOptions, advance: Callable[[], None]) -> FringeCube:
         """Prepare all frames, one at a time.
 
-        Parameters
-        ----------
-        setup : `Setup`
-            Decides the bandpass and the focal ratio where the headers do not.
-        options : `FlatPrepOptions`
-            Choices of the preparation.
-        advance : callable
-            Called after each frame.
-
-        Raises
-        ------
-        FrameFormatError
-            A frame that cannot be used, or one whose pixels are those of another exposure.
+        ``setup``: decides the bandpass and the focal ratio where the headers do not.
         """
         seen: dict[str, str] = {}
 
@@ -123,25 +104,7 @@ class LabSeries:
 def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
     """Bias frames and flats among files, folders and patterns.
 
-    Parameters
-    ----------
-    paths : sequence of `str`
-        What the user names.
-    skip_bad : `bool`, optional
-        Report files that cannot be read and go on without them.
-
-    Returns
-    -------
-    series : `LabSeries`
-
-    Raises
-    ------
-    FrameFormatError
-        A file that is not a raw frame (all such files are reported first).
-    InputError
-        Nothing there, no flats, or frames of more than one sensor.
-
-    Copies of a frame count once, and are named.
+    ``skip_bad``: report files that cannot be read and go on without them.
     """
     files, refused = find_raw_files(paths)
     frames: list[RawMetadata] = []
@@ -186,13 +149,7 @@ def _say_masked(flat: FringeFlat) -> FringeFlat:
 
 
 def _each_once(frames: Sequence[RawMetadata]) -> list[RawMetadata]:
-    """Frames without the copies of an exposure.
-
-    Raises
-    ------
-    FrameFormatError
-        Two files say that they are one exposure, with different pixels.
-    """
+    """Frames without the copies of an exposure."""
     kept: dict[tuple[object, ...], RawMetadata] = {}
     copies = []
     for frame in frames:
@@ -210,13 +167,7 @@ def _each_once(frames: Sequence[RawMetadata]) -> list[RawMetadata]:
 
 
 def read_cube(path: str) -> FringeCube | None:
-    """The fringe cube in a file, or `None` if the path is something else.
-
-    Raises
-    ------
-    FrameFormatError
-        The file is not FITS, or damaged.
-    """
+    """The fringe cube in a file, or `None` if the path is something else."""
     if not Path(path).is_file():
         return None
     with complete_fits(path) as hdus:

@@ -145,15 +145,7 @@ class SetupType(click.ParamType):
         self.wanted = wanted
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Setup:
-        """The set-up.
-
-        Raises
-        ------
-        UnknownNameError
-            There is no such set-up; near misses are offered.
-        InputError
-            A file that is not a set-up, or a set-up with light of the other kind.
-        """
+        """The set-up."""
         from ..instrument.setup import Setup
 
         if isinstance(value, Setup):
@@ -168,10 +160,7 @@ class SetupType(click.ParamType):
     def option(self, default: str, help_text: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
         """``--setup``, read when all else on the command line is known to be well formed.
 
-        Parameters
-        ----------
-        default, help_text : `str`
-            Set-up without the option, and what it says under ``--help``.
+        ``default``, ``help_text``: set-up without the option, and what it says under ``--help``.
         """
 
         def decorate(command: Callable[..., None]) -> Callable[..., None]:

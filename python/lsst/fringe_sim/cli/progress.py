@@ -13,15 +13,7 @@ __all__ = ["progress"]
 
 @contextmanager
 def progress(label: str, steps: int) -> Iterator[Callable[[], None]]:
-    """Show progress while the body calls the yielded function once per step.
-
-    Parameters
-    ----------
-    label : `str`
-        What is going on.
-    steps : `int`
-        Number of steps.
-    """
+    """Show progress while the body calls the yielded function once per step."""
     if sys.stderr.isatty():
         with click.progressbar(length=steps, label=label, file=sys.stderr) as bar:
             yield lambda: bar.update(1)

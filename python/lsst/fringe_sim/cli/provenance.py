@@ -63,15 +63,7 @@ def provenance(
 def read_header(path: str) -> dict[str, Any]:
     """Keywords of a product and their values.
 
-    Parameters
-    ----------
-    path : `str`
-        FITS file, ECSV table, or JSON document with an entry ``provenance``.
-
-    Raises
-    ------
-    InputError
-        There is no such file, or it is damaged or of another kind; it is named.
+    ``path``: FITS file, ECSV table, or JSON document with an entry ``provenance``.
     """
     from ..resources import DAMAGE, first_line
 

@@ -38,19 +38,8 @@ class SkyData:
 def read_sky_frames(paths: Sequence[str], setup: Setup, thickness: str | None) -> SkyData:
     """Read frames and map.
 
-    Parameters
-    ----------
-    paths : sequence of `str`
-        FITS files written as `SkyFringe`, or folders with them.
-    setup : `Setup`
-        A telescope.
-    thickness : `str` or `None`
-        File with the map; it is needed.
-
-    Raises
-    ------
-    InputError
-        No map, no frames, frames of several sensors, files of another kind or damaged.
+    ``paths``: FITS files written as `SkyFringe`, or folders with them. ``thickness``: file with the map; it is
+    needed.
     """
     if thickness is None:
         raise InputError("--thickness", None, "a thickness map: frames of the sky alone do not tell it")
