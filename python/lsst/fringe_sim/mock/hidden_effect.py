@@ -23,34 +23,16 @@ RIM_SQUARES, RIM_POINTS = 8, 8
 
 @dataclass(frozen=True)
 class AmplifierState:
-    """What one amplifier really does, as opposed to what the tables say of it.
+    """What one amplifier really does, as opposed to what the tables say of it."""
 
-    Attributes
-    ----------
-    name : `str`
-        ``C00`` … ``C17``.
-    gain : `float`
-        Gain [electrons per ADU].
-    read_noise_e : `float`
-        Read noise [electrons rms].
-    saturation_e : `float`
-        Full well [electrons].
-    dark_e : `float`
-        Charge that gathers in every imaging pixel of a flat without being light [electrons].
-    dark_rate_e : `float`
-        The same, in each second of the exposure [electrons / s].
-    offset_e : `float`
-        Level that the imaging pixels of a flat have and its overscan has not, without noise of its own
-        [electrons].
-    """
-
-    name: str
-    gain: float
-    read_noise_e: float
+    name: str  # ``C00`` … ``C17``
+    gain: float  # gain [electrons per ADU]
+    read_noise_e: float  # read noise [electrons rms]
     saturation_e: float
-    dark_e: float = 0.0
+    dark_e: float = 0.0  # charge that gathers in every imaging pixel of a flat without being light
+    # Level that the imaging pixels of a flat have and its overscan has not, without noise of its own
     offset_e: float = 0.0
-    dark_rate_e: float = 0.0
+    dark_rate_e: float = 0.0  # the same, in each second of the exposure [electrons / s]
 
     def dark_signal_e(self, seconds: float) -> float:
         """Charge without light of an exposure of so many seconds [electrons]."""
@@ -59,21 +41,14 @@ class AmplifierState:
 
 @dataclass(frozen=True, eq=False)
 class Island:
-    """Where on a sensor something is.
+    """Where on a sensor something is."""
 
-    Attributes
-    ----------
-    part : `numpy.ndarray` [y, x]
-        Part of every pixel that lies on it.
-    rows, columns : `numpy.ndarray`, shape ``(N,)``
-        Pixels that its rim may cross.
-    squares : `numpy.ndarray`, shape ``(N, RIM_SQUARES, RIM_SQUARES)``
-        Part of each of the equal squares in these pixels, along y and x, that lies on it.
-    """
-
-    part: FloatArray
+    part: FloatArray  # [y, x]: part of every pixel that lies on it
+    # rows, columns (N,): pixels that its rim may cross
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
+    # (N, RIM_SQUARES, RIM_SQUARES): part of each of the equal squares in these pixels, along y and x,
+    # that lies on it
     squares: FloatArray
 
 

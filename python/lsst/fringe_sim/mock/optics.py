@@ -633,12 +633,7 @@ def _rough_face(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
     what it lets through by (q1 - q2) h, with q the normal wave number on either side. The mean of exp(i a h) is
     exp(-a² σ² / 2).
 
-    Parameters
-    ----------
-    admittance : `numpy.ndarray`, shape ``(2, Q)``
-        Admittance above and below.
-    phase : `numpy.ndarray`, shape ``(2, Q)``
-        Normal wave number above and below times the rms height.
+    ``admittance`` (2, Q). ``phase`` (2, Q): normal wave number above and below times the rms height.
     """
     above, below = admittance
     reflected = (above - below) / (above + below)

@@ -59,22 +59,8 @@ def primary_header(
 ) -> fits.Header:
     """Primary header of one frame, as the test stands and the camera write them.
 
-    Parameters
-    ----------
-    camera : `str`
-        ``ts8`` or ``lsstCam``.
-    sensor : `Detector`
-        The sensor.
-    celsius : `float`
-        Temperature that the set-up states [°C].
-    wavelength_nm : `float` or `None`
-        Setting of the monochromator [nm]; `None` for a bias.
-    number : `int`
-        Number of the frame, from 0.
-    start : `datetime.datetime`
-        Start of the exposure.
-    exposure_s : `float`
-        Exposure time [s].
+    ``celsius``: temperature that the set-up states [°C]. ``wavelength_nm``: setting of the monochromator;
+    `None` for a bias.
     """
     header = fits.Header()
     day = (start - datetime.timedelta(hours=DAY_ROLLOVER_H)).strftime("%Y%m%d")

@@ -25,26 +25,13 @@ SILICON_STEP_UM = 0.03
 
 @dataclass(frozen=True, eq=False)
 class SensorSignal:
-    """Signal of flats at every pixel.
+    """Signal of flats at every pixel."""
 
-    Attributes
-    ----------
-    area : `PixelArea`
-        Thickness of the varying layer.
-    thicker_um : `numpy.ndarray` [y, x]
-        What is added to the detection layer [µm].
-    added_um : `numpy.ndarray`, shape ``(N,)``
-        The same for the N tables, increasing [µm].
-    tables : `tuple` [`SignalTable`, ...]
-        Signal against the thickness of the varying layer.
-    islands : `tuple`
-        What sees other optics, and the signal of a sensor that has them everywhere.
-    """
-
-    area: PixelArea
-    thicker_um: FloatArray
-    added_um: FloatArray
-    tables: tuple[SignalTable, ...]
+    area: PixelArea  # thickness of the varying layer
+    thicker_um: FloatArray  # [y, x]: what is added to the detection layer
+    added_um: FloatArray  # (N,): the same for the N tables, increasing
+    tables: tuple[SignalTable, ...]  # signal against the thickness of the varying layer
+    # What of the sensor has other optics, and the signal of a sensor that has them everywhere
     islands: tuple[tuple[Island, SensorSignal], ...] = ()
 
     @classmethod

@@ -168,17 +168,10 @@ def random_field(
 
 @dataclass(frozen=True, eq=False)
 class PixelArea:
-    """A thickness map over the area of its pixels: each is a plane through its own thickness.
+    """A thickness map over the area of its pixels: each is a plane through its own thickness."""
 
-    Attributes
-    ----------
-    thickness_um : `numpy.ndarray` [y, x]
-        Thickness at the centres of the pixels [µm].
-    slope_y, slope_x : `numpy.ndarray` [y, x]
-        How the thickness rises within a pixel [µm per px].
-    """
-
-    thickness_um: NDArray[np.float64]
+    thickness_um: NDArray[np.float64]  # [y, x]: thickness at the centres of the pixels
+    # slope_y, slope_x [y, x]: how the thickness rises within a pixel [µm per px]
     slope_y: NDArray[np.float64]
     slope_x: NDArray[np.float64]
 
