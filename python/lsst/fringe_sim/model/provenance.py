@@ -91,13 +91,7 @@ def effect_cards(effects: Mapping[str, float]) -> dict[str, str | float]:
 
 
 def effects_of_header(header: Mapping[str, Any]) -> dict[str, float]:
-    """Effects by ``name.parameter`` that a header states; the inverse of `effect_cards`.
-
-    Raises
-    ------
-    FrameFormatError
-        An effect without a value that is a number.
-    """
+    """Effects by ``name.parameter`` that a header states; the inverse of `effect_cards`."""
     found: dict[str, float] = {}
     number = 0
     while f"EFFECT{number}" in header:
@@ -113,15 +107,7 @@ def effects_of_header(header: Mapping[str, Any]) -> dict[str, float]:
 def input_cards(paths: Iterable[str | os.PathLike[str]]) -> dict[str, str]:
     """Keywords ``INPUTn`` of files that a product is made from: name, without its folders, and content.
 
-    Parameters
-    ----------
-    paths : iterable of path-like
-        The files. One that is named twice is stated once.
-
-    Raises
-    ------
-    OSError
-        A file cannot be read.
+    A file that is named twice is stated once.
     """
     stated = dict.fromkeys(f"{_printable(Path(path).name)} {_content(path)}" for path in paths)
     return {f"INPUT{number}": text for number, text in enumerate(stated)}
@@ -149,12 +135,8 @@ def _printable(name: str) -> str:
 def tables_of(setup: Setup, stack: LayerStack | None = None) -> tuple[tuple[str, str], ...]:
     """Shipped files, as (folder, name), that a set-up takes its numbers from.
 
-    Parameters
-    ----------
-    setup : `Setup`
-        The set-up.
-    stack : `LayerStack`, optional
-        Layers with the effects in them, which may bring media of their own; by default those of the set-up.
+    ``stack``: layers with the effects in them, which may bring media of their own; by default those of the
+    set-up.
     """
     shipped = [("setups", f"{setup.name}.yaml")] if setup.name in setup_names() else []
     shipped += [("stacks", f"{setup.stack.name}.yaml"), ("media", "media.yaml")]
@@ -197,15 +179,7 @@ def table_cards(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
 
 
 def model_cards(setup: str | Setup, effects: Mapping[str, float]) -> dict[str, str | float]:
-    """Keywords of a fringe model: set-up, effects, tables.
-
-    Parameters
-    ----------
-    setup : `str` or `Setup`
-        The set-up.
-    effects : mapping of `str` to `float`
-        Values by ``name.parameter``.
-    """
+    """Keywords of a fringe model: set-up, effects, tables."""
     chosen = Setup.from_name(setup) if isinstance(setup, str) else setup
     stack = apply_to_system(activate_effects(effects, EFFECTS), _plain_light(chosen)).stack
     return {
