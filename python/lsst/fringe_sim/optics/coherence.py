@@ -32,18 +32,10 @@ _FEWEST, _MOST = 8, 512
 
 @dataclass(frozen=True)
 class PhaseState:
-    """One combination of extra round-trip phases.
+    """One combination of extra round-trip phases."""
 
-    Attributes
-    ----------
-    phases : `dict` [`int`, `float`]
-        Extra round-trip phase [rad] by position of the layer.
-    share : `numpy.ndarray` or `float`
-        Weight of the state, for every node.
-    """
-
-    phases: dict[int, float]
-    share: NDArray[np.float64] | float
+    phases: dict[int, float]  # extra round-trip phase [rad] by position of the layer
+    share: NDArray[np.float64] | float  # weight of the state, for every node
 
 
 def phase_states(
@@ -57,25 +49,9 @@ def phase_states(
 ) -> list[PhaseState]:
     """Phases over which the response of a stack is to be averaged.
 
-    Parameters
-    ----------
-    index : `numpy.ndarray`, shape ``(L, ...)``
-        Complex indices.
-    thickness : `numpy.ndarray`, shape ``(L,)`` or ``(L, ...)``
-        Mean thickness of every layer, in the unit of ``wavelength``.
-    spread : `numpy.ndarray`, shape ``(L,)``
-        Its rms spread.
-    wavelength, theta : `numpy.ndarray`
-        Of the nodes.
-    polarization : {"s", "p"}
-        Polarisation.
-    shifted : sequence of `int`
-        Positions of the layers that are not fully coherent.
-
-    Returns
-    -------
-    states : `list` [`PhaseState`]
-        One state without extra phases if ``shifted`` is empty; the shares sum to 1.
+    ``index`` (L, ...). ``thickness`` (L,) or (L, ...): mean thickness of every layer, in the unit of
+    ``wavelength``. ``spread`` (L,). ``polarization`` {"s", "p"}. ``shifted``: positions of the layers that are
+    not fully coherent. Returns one state without extra phases if ``shifted`` is empty; the shares sum to 1.
     """
     if not shifted:
         return [PhaseState({}, 1.0)]

@@ -84,24 +84,10 @@ def series_on_grid(
 ) -> FloatArray:
     """Weighted mean of the closed form, or a thickness derivative of it, on a uniform grid.
 
-    Parameters
-    ----------
-    coefficients : `tuple` of `numpy.ndarray`, shape ``(W, Q)``
-        ``a, b, e, c, g, kappa`` of the nodes of W groups.
-    weight : `numpy.ndarray`, shape ``(W, Q)``
-        Weights.
-    spread_um : `float`
-        Rms spread of the thickness inside a pixel [µm].
-    start_um, step_um, count
-        The grid [µm].
-    order : `int`, optional
-        Order of the derivative.
-    tolerance : `float`, optional
-        Error allowed, relative to the fringes; the sum takes half the time at 1e-9.
-
-    Returns
-    -------
-    response : `numpy.ndarray`, shape ``(W, count)``
+    ``coefficients`` (W, Q): ``a, b, e, c, g, kappa`` of the nodes of W groups. ``weight`` (W, Q).
+    ``spread_um``: rms spread of the thickness inside a pixel. ``start_um``, ``step_um``, ``count``: the grid
+    [µm]. ``tolerance``: error allowed, relative to the fringes; the sum takes half the time at 1e-9. Returns
+    (W, count).
     """
     if len(weight) == 1 and weight.size >= _PIECES * _LEAST_PIECE:
         # Shares of the nodes for all cores; as many on any machine, so that rounding is the same.

@@ -25,24 +25,9 @@ def reduce_nodes(
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:
     """Coefficients ``a, b, e, c, g, kappa`` of every node for one polarisation.
 
-    Parameters
-    ----------
-    index : `numpy.ndarray`, shape ``(L, N)``
-        Complex indices.
-    thickness : `numpy.ndarray`, shape ``(L,)``
-        Thickness, in the unit of ``wavelength``; not used of the ends and of the varying layer.
-    wavelength, theta : `numpy.ndarray`, shape ``(N,)``
-        Of the nodes.
-    p_polarized : `bool`
-        Polarisation p, or s.
-    varying : `int`
-        Position of the varying layer.
-    layers : `numpy.ndarray` of `int`
-        Positions of the layers whose absorption is wanted.
-    roughness : `numpy.ndarray`, shape ``(L-1,)``
-        Rms height of the interfaces.
-    phase : `numpy.ndarray`, shape ``(L,)``
-        Extra round-trip phase of every layer [rad].
+    ``index`` (L, N). ``thickness`` (L,): thickness, in the unit of ``wavelength``; not used of the ends and of
+    the varying layer. ``wavelength``, ``theta`` (N,). ``layers``: positions of the layers whose absorption is
+    wanted. ``roughness`` (L-1,). ``phase`` (L,): extra round-trip phase of every layer [rad].
     """
     layer_count, nodes = index.shape
     real, mixed = np.zeros((3, nodes)), np.zeros((3, nodes), dtype=np.complex128)
