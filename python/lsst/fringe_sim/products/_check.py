@@ -39,15 +39,7 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
 def as_float_array(
     field: str, values: ArrayLike, ndim: int, dtype: type[np.floating] = np.float32, unit: str = ""
 ) -> NDArray[Any]:
-    """Read-only real array of ``ndim`` axes; one that has the type already, in any byte order, is shared.
-
-    Raises
-    ------
-    FrameFormatError
-        Not real numbers, or the wrong number of axes, or no pixels.
-    InputError
-        A quantity that has no such unit.
-    """
+    """Read-only real array of ``ndim`` axes; one that has the type already, in any byte order, is shared."""
     try:
         array = np.asarray(without_unit(field, values, unit))
     except InputError:
@@ -67,13 +59,7 @@ def as_float_array(
 def as_mask(
     field: str, values: ArrayLike, shape: tuple[int, ...], dtype: type[np.signedinteger] = np.int32
 ) -> NDArray[Any]:
-    """Read-only mask of the given shape; one that has the type already, in any byte order, is shared.
-
-    Raises
-    ------
-    FrameFormatError
-        Not integers, another shape, or a bit that names no plane.
-    """
+    """Read-only mask of the given shape; one that has the type already, in any byte order, is shared."""
     array = np.asarray(without_unit(field, values))
     if array.dtype.kind not in "iub":
         raise FrameFormatError(field, f"dtype {array.dtype}", "integers, one bit for each mask plane")
@@ -128,15 +114,7 @@ def check_number(
     allow_inf: bool = False,
     unit: str = "",
 ) -> float:
-    """Return ``value``, or a quantity in ``unit``, as a float inside ``[low, high]`` (or ``(low, high]``).
-
-    Raises
-    ------
-    InputError
-        Not a number.
-    OutOfRangeError
-        Outside the interval.
-    """
+    """Return ``value``, or a quantity in ``unit``, as a float inside ``[low, high]`` (or ``(low, high]``)."""
     value = without_unit(field, value, unit)
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
         raise InputError(field, value, "a number")
@@ -149,15 +127,7 @@ def check_number(
 
 
 def check_whole_number(field: str, value: object, *, low: int, high: int) -> int:
-    """Return ``value`` as an integer inside ``[low, high]``.
-
-    Raises
-    ------
-    InputError
-        Not a whole number.
-    OutOfRangeError
-        Outside the interval.
-    """
+    """Return ``value`` as an integer inside ``[low, high]``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise InputError(field, value, "a whole number")
     if not low <= value <= high:

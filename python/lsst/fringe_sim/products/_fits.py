@@ -66,24 +66,6 @@ def normalise_metadata(metadata: Mapping[str, Any] | None, own: Sequence[str] = 
 
     Keywords are upper-cased; numpy scalars become Python ones; blanks at the end of a text are dropped, as
     FITS does.
-
-    Parameters
-    ----------
-    metadata : `Mapping` or `None`
-        Keywords and their values.
-    own : `~collections.abc.Sequence` [`str`], optional
-        Keywords that the product writes itself.
-
-    Returns
-    -------
-    metadata : `Mapping` [`str`, `bool` | `int` | `float` | `str` | `None`]
-        Read-only copy.
-
-    Raises
-    ------
-    InputError
-        A keyword or a value that a FITS header cannot give back, or a keyword that the file or the product
-        writes itself.
     """
     result: dict[str, Scalar] = {}
     for key, value in check_mapping("metadata", {} if metadata is None else metadata).items():
@@ -227,20 +209,9 @@ def write_hdus(
 ) -> None:
     """Write HDUs to ``path``: checksummed, repeatable to the byte, and all or nothing.
 
-    Parameters
-    ----------
-    path : path-like
-        File to write; an existing one is replaced when the new one is complete.
-    hdus : `~collections.abc.Sequence`
-        The primary HDU and its extensions.
-    section : `SensorSection`, optional
-        Pixels of the sensor that the first image shows, and every other of its size: their world coordinates are
-        added, and the section itself to the primary header.
-
-    Raises
-    ------
-    InputError
-        The folder does not exist.
+    ``path``: file to write; an existing one is replaced when the new one is complete. ``section``: pixels of
+    the sensor that the first image shows, and every other of its size: their world coordinates are added, and
+    the section itself to the primary header.
     """
     target = existing_folder(path)
     hdus[0].header[EXTENSIONS_KEY] = (len(hdus) - 1, "number of extensions")
@@ -254,13 +225,7 @@ def write_hdus(
 
 
 def existing_folder(path: str | os.PathLike[str]) -> Path:
-    """Path of a file to be written.
-
-    Raises
-    ------
-    InputError
-        Its folder does not exist.
-    """
+    """Path of a file to be written."""
     target = Path(path)
     if not target.parent.is_dir():
         raise InputError("folder", str(target.parent), "an existing folder", source=str(target))
@@ -281,23 +246,8 @@ def open_fits(
 ) -> Iterator[fits.HDUList]:
     """Open a product for reading.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    product : `str`
-        Class the file must hold; a file that does not say what it is is accepted.
-    memmap : `bool`, optional
-        Leave the data on disk until touched.
-    verify : `bool`, optional
-        Compare the checksums, which reads the whole file.
-
-    Raises
-    ------
-    InputError
-        There is no such file.
-    FrameFormatError
-        Not FITS, truncated, damaged, or another product.
+    ``product``: class the file must hold; a file that does not say what it is is accepted. ``verify``: compare
+    the checksums, which reads the whole file.
     """
     source = str(path)
     if not Path(path).is_file():
@@ -345,13 +295,7 @@ def read_metadata(header: fits.Header, own: Sequence[str]) -> dict[str, Scalar]:
 
 
 def read_keyword(header: fits.Header, keyword: str, *, source: str) -> Any:
-    """Value of a keyword that must be there.
-
-    Raises
-    ------
-    FrameFormatError
-        It is not.
-    """
+    """Value of a keyword that must be there."""
     if keyword not in header:
         raise FrameFormatError(keyword, "missing", "a value in the header", source=source)
     return header[keyword]
@@ -360,15 +304,7 @@ def read_keyword(header: fits.Header, keyword: str, *, source: str) -> Any:
 def read_image(hdus: fits.HDUList, name: str, *, source: str, native: bool = True) -> NDArray[Any]:
     """Data of an image extension.
 
-    Parameters
-    ----------
-    native : `bool`, optional
-        Copy into memory in the byte order of the machine; otherwise leave it as it lies in the file.
-
-    Raises
-    ------
-    FrameFormatError
-        There is no such extension, or it holds no image.
+    ``native``: copy into memory in the byte order of the machine; otherwise leave it as it lies in the file.
     """
     if name not in hdus:
         raise FrameFormatError("extension", f"no {name}", f"an image extension named {name}", source=source)
@@ -381,13 +317,7 @@ def read_image(hdus: fits.HDUList, name: str, *, source: str, native: bool = Tru
 def in_unit(
     field: str, values: NDArray[Any], found: object, unit: str | None, *, source: str
 ) -> NDArray[Any]:
-    """Numbers of a file in the unit that is wanted; a file that states none has it.
-
-    Raises
-    ------
-    FrameFormatError
-        A unit that is none, or one of another kind.
-    """
+    """Numbers of a file in the unit that is wanted; a file that states none has it."""
     if not unit or found is None or str(found).strip() in ("", unit):
         return values
     from astropy import units  # rarely needed
@@ -402,15 +332,7 @@ def in_unit(
 
 
 def read_mask(hdus: fits.HDUList, name: str = "MASK", *, source: str, native: bool = True) -> NDArray[Any]:
-    """Mask of an extension, its bits moved to the numbering of `MASK_PLANES`.
-
-    Raises
-    ------
-    FrameFormatError
-        No such extension, not integers, or bits without a name.
-    UnknownNameError
-        A plane that is not known here.
-    """
+    """Mask of an extension, its bits moved to the numbering of `MASK_PLANES`."""
     data = read_image(hdus, name, source=source, native=native)
     if data.dtype.kind not in "iu":
         raise FrameFormatError(name, f"dtype {data.dtype}", "integers", source=source)

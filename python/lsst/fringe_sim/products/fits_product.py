@@ -177,21 +177,12 @@ NARROW_MASK = _Mask("mask", "MASK", np.int16)
 
 
 class FitsProduct(ABC):
-    """A product that a FITS file can hold: a frozen dataclass with ``metadata``, which says what is where.
+    """A product that a FITS file can hold: a frozen dataclass with ``metadata``, which says what is where."""
 
-    Attributes
-    ----------
-    CARDS : `tuple` [`Card`, ...]
-        Its numbers and names, in the order of the header.
-    EXTENSIONS : `tuple` [`Extension`, ...]
-        The rest, in the order of the file. The first is an image whose shape the mask has.
-    RESERVED : `tuple` [`str`, ...]
-        Further keywords that metadata may not use.
-    """
-
-    CARDS: ClassVar[tuple[Card, ...]]
+    CARDS: ClassVar[tuple[Card, ...]]  # its numbers and names, in the order of the header
+    # The rest, in the order of the file. The first is an image whose shape the mask has.
     EXTENSIONS: ClassVar[tuple[Extension, ...]]
-    RESERVED: ClassVar[tuple[str, ...]] = ()
+    RESERVED: ClassVar[tuple[str, ...]] = ()  # further keywords that metadata may not use
 
     def __post_init__(self) -> None:
         first = self.EXTENSIONS[0]
@@ -233,19 +224,9 @@ class FitsProduct(ABC):
     ) -> None:
         """Write the product with checksums, repeatable to the byte.
 
-        Parameters
-        ----------
-        path : path-like
-            File to write; an existing one is replaced when the new one is complete.
-        metadata : `Mapping`, optional
-            Further header keywords, which win over those of the product.
-        section : `SensorSection`, optional
-            Pixels of the sensor that the images show; their world coordinates are written with them.
-
-        Raises
-        ------
-        InputError
-            The folder does not exist, or a keyword that no header can hold.
+        ``path``: file to write; an existing one is replaced when the new one is complete. ``metadata``: further
+        header keywords, which win over those of the product. ``section``: pixels of the sensor that the images
+        show; their world coordinates are written with them.
         """
         merged = io.merge_metadata(getattr(self, "metadata"), metadata, self._keywords())  # noqa: B009
         hdus = [io.primary_hdu(type(self).__name__, self._primary_cards(merged), merged)]
@@ -262,13 +243,7 @@ class FitsProduct(ABC):
 
     @classmethod
     def read_fits(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file that `write_fits` wrote.
-
-        Raises
-        ------
-        InputError
-            No such file, another product, or a damaged file; the message names the file.
-        """
+        """Read a file that `write_fits` wrote."""
         with io.open_fits(path, cls.__name__) as hdus:
             return cls(**cls._values(hdus, str(path)))
 

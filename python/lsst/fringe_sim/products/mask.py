@@ -90,17 +90,7 @@ def mask_plane_cards() -> list[tuple[str, int, str]]:
 def planes_from_header(header: Mapping[str, object], *, source: str | None = None) -> dict[str, int]:
     """Read the ``MP_<plane>`` keywords of a mask HDU.
 
-    Returns
-    -------
-    planes : `dict` [`str`, `int`]
-        Bit number in the file of each plane; empty if the header names none.
-
-    Raises
-    ------
-    UnknownNameError
-        A plane that this package does not know.
-    FrameFormatError
-        A bit number that no int32 has, or one bit for two planes.
+    Returns the bit number in the file of each plane; empty if the header names none.
     """
     planes: dict[str, int] = {}
     for keyword in header:
@@ -120,22 +110,8 @@ def planes_from_header(header: Mapping[str, object], *, source: str | None = Non
 def remap_mask(mask: NDArray[Any], planes: Mapping[str, int], *, source: str | None = None) -> NDArray[Any]:
     """Move bits from a file's numbering to that of `MASK_PLANES`.
 
-    Parameters
-    ----------
-    mask : `numpy.ndarray`, integer
-        Mask as it stands in the file.
-    planes : `Mapping` [`str`, `int`]
-        Bit of each plane in that file (`planes_from_header`). Empty: the numbering is the one used here.
-
-    Returns
-    -------
-    mask : `numpy.ndarray`, integer
-        The mask itself if no set bit has to move, else an int32 one.
-
-    Raises
-    ------
-    FrameFormatError
-        A bit is set that stands for no plane.
+    ``planes``: bit of each plane in that file (`planes_from_header`). Empty: the numbering is the one used
+    here. Returns the mask itself if no set bit has to move, else an int32 one.
     """
     bits_in_file = dict(planes) or dict(MASK_PLANES)
     used = int(np.bitwise_or.reduce(mask, axis=None)) if mask.size else 0

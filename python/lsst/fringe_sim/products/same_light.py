@@ -23,13 +23,7 @@ def pixels_digest(image: NDArray[Any]) -> str:
 
 
 def refuse_equal_pixels(field: str, images: Sequence[NDArray[Any]]) -> None:
-    """Refuse images of which two have equal pixels; images of one value have no light to tell.
-
-    Raises
-    ------
-    InputError
-        Two are equal; they are named by their numbers, from 0.
-    """
+    """Refuse images of which two have equal pixels; images of one value have no light to tell."""
     seen: dict[str, int] = {}
     for number, image in enumerate(images):
         first = seen.setdefault(pixels_digest(image), number)
@@ -38,13 +32,7 @@ def refuse_equal_pixels(field: str, images: Sequence[NDArray[Any]]) -> None:
 
 
 def refuse_mixed_models(metadata: Sequence[Mapping[str, Any]]) -> None:
-    """Refuse simulated frames of different set-ups, effects or tables.
-
-    Raises
-    ------
-    InputError
-        Cards of the model differ; the first of them is named.
-    """
+    """Refuse simulated frames of different set-ups, effects or tables."""
     cards = [{key: value for key, value in one.items() if _MODEL.fullmatch(key)} for one in metadata]
     for number, other in enumerate(cards):
         differ = sorted(key for key in {*cards[0], *other} if cards[0].get(key) != other.get(key))

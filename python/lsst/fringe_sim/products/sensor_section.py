@@ -165,22 +165,8 @@ def section_pixels(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rows and columns of the sensor at which the pixels of an image are centred.
 
-    Parameters
-    ----------
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of the image.
-    header : `Mapping`
-        Its keywords; without one of `SECTION_KEYWORDS` the image begins at pixel 0.
-
-    Returns
-    -------
-    y, x : `numpy.ndarray`, shapes ``(ny,)`` and ``(nx,)``
-        From 0 [px].
-
-    Raises
-    ------
-    FrameFormatError
-        The keyword is no section.
+    ``header``: its keywords; without one of `SECTION_KEYWORDS` the image begins at pixel 0. Returns (ny,) and
+    (nx,): from 0 [px].
     """
     ends = ((0, shape[1] - 1), (0, shape[0] - 1))
     for keyword in SECTION_KEYWORDS:
