@@ -63,15 +63,7 @@ def contrast_figure(contrast_map: NDArray[np.float32]) -> Figure:
 
 
 def thickness_figure(thickness: ThicknessMap, order_um: float) -> Figure:
-    """Thickness with a contour per fringe order, its uncertainty, and the probability of a slipped order.
-
-    Parameters
-    ----------
-    thickness : `ThicknessMap`
-        The map.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    """
+    """Thickness with a contour per fringe order, its uncertainty, and the probability of a slipped order."""
     with figure(13.0, 3.9) as made:
         left, middle, right = made.subplots(1, 3)
         show_image(
@@ -121,20 +113,9 @@ def flats_figure(
 ) -> Figure:
     """Gallery of frames ``[wavelength, y, x]`` on one colour scale.
 
-    Parameters
-    ----------
-    amplitude, mask : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Frames as fractions, and where they are not to be shown.
-    wavelength_nm : sequence of `float`
-        Wavelengths [nm].
-    title, unit : `str`
-        Title, and label of the colour scale.
-    limits : `tuple` [`float`, `float`], optional
-        Ends of the colour scale [%]; from the frames if not given.
-    most_px : `int`, optional
-        Frames are averaged down to about this many pixels a side.
-    step_px : `float`, optional
-        Pixels of the sensor between samples of the frames.
+    ``amplitude``, ``mask`` (W, ny, nx): frames as fractions, and where they are not to be shown. ``limits``:
+    ends of the colour scale [%]; from the frames if not given. ``most_px``: frames are averaged down to about
+    this many pixels a side. ``step_px``: pixels of the sensor between samples of the frames.
     """
     count = len(wavelength_nm)
     columns = min(6, count)
@@ -170,12 +151,7 @@ def flats_figure(
 def residuals_figure(residual: NDArray[np.floating], wavelength_nm: Sequence[float]) -> Figure:
     """Gallery of what a model leaves of the flats, averaged until noise does not hide it.
 
-    Parameters
-    ----------
-    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Flats minus model, as fractions; NaN where a pixel is not to be shown.
-    wavelength_nm : sequence of `float`
-        Wavelengths [nm].
+    ``residual`` (W, ny, nx): flats minus model, as fractions; NaN where a pixel is not to be shown.
     """
     block = max(1, min(residual.shape[1:]) // RESIDUAL_CELLS)
     coarse = np.stack([block_mean(np.asarray(plane, dtype=float), block) for plane in residual])
@@ -198,14 +174,7 @@ def phase_figure(
 ) -> Figure:
     """Data and model folded on fringe phase, one panel per wavelength.
 
-    Parameters
-    ----------
-    phase : `numpy.ndarray`, shape ``(B,)``
-        Centres of the phase bins, in fringe orders.
-    data, model : `numpy.ndarray`, shape ``(W, B)``
-        Mean amplitude in each bin.
-    wavelength_nm : sequence of `float`
-        Wavelengths [nm].
+    ``phase`` (B,): centres of the phase bins, in fringe orders. ``data``, ``model`` (W, B).
     """
     count = len(wavelength_nm)
     columns = min(4, count)
@@ -365,12 +334,7 @@ def single_pixel_figure(
 def focal_plane_figure(cells: Table, sensors: Table) -> Figure:
     """Fringes over a focal plane: strength, ratio to the shot noise, what a correction leaves, and field radius.
 
-    Parameters
-    ----------
-    cells : `astropy.table.Table`
-        Cells of all sensors (`SensorForecast.to_table`), with the sensor in a column ``detector``.
-    sensors : `astropy.table.Table`
-        One row per sensor (`summary_table`).
+    ``cells``: cells of all sensors (`SensorForecast.to_table`), with the sensor in a column ``detector``.
     """
     from ..algorithms.focal_plane import DES_CRITERION
 

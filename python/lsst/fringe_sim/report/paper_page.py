@@ -35,14 +35,7 @@ STATUS_WORDS = {
 def write_paper_page(made: Reproduction, path: str | os.PathLike[str], notices: Sequence[str] = ()) -> Path:
     """Write the page.
 
-    Parameters
-    ----------
-    made : `Reproduction`
-        Sections and findings.
-    path : path-like
-        HTML file.
-    notices : sequence of `str`, optional
-        What the reader must know first, as that published curves were not at hand.
+    ``notices``: what the reader must know first, as that published curves were not at hand.
     """
     report = Report(
         "The paper, recomputed",

@@ -50,17 +50,8 @@ def sky_amplitudes(frames: Sequence[SkyFringe]) -> Table:
 def coadds_of_frames(frames: Sequence[SkyFringe], rng: np.random.Generator) -> CoaddCorrelation | None:
     """Correlation left in coadds of randomly placed and rotated pieces of the frames.
 
-    Parameters
-    ----------
-    frames : `~collections.abc.Sequence` [`SkyFringe`]
-        Frames without noise, of one sensor.
-    rng : `numpy.random.Generator`
-        Places, angles, and the photon noise of each exposure.
-
-    Returns
-    -------
-    result : `CoaddCorrelation` or `None`
-        `None` for frames too small to be rotated.
+    ``rng``: places, angles, and the photon noise of each exposure. Returns `None` for frames too small to be
+    rotated.
     """
     # A region that is rotated by any angle needs its diagonal, and the spline a few pixels more.
     region = min(LARGEST_REGION_PX, int((min(frames[0].shape) - 8) / np.sqrt(2.0)) - 1)
@@ -74,16 +65,7 @@ def coadds_of_frames(frames: Sequence[SkyFringe], rng: np.random.Generator) -> C
 def write_sky_report(path: Path, frames: Sequence[SkyFringe], setup: str, seed: int) -> Path:
     """Write the page.
 
-    Parameters
-    ----------
-    path : `pathlib.Path`
-        The page.
-    frames : `~collections.abc.Sequence` [`SkyFringe`]
-        Frames of one sensor.
-    setup : `str`
-        Name of the set-up.
-    seed : `int`
-        Of places, angles and noise of the coadds.
+    ``seed``: of places, angles and noise of the coadds.
     """
     first = frames[0]
     report = Report(
