@@ -29,33 +29,14 @@ class CameraConfig(Config):
     )
 
     def validate(self) -> None:
-        """Refuse a camera that does not exist.
-
-        Raises
-        ------
-        lsst.pex.config.FieldValidationError
-            The nearest names are offered.
-        """
+        """Refuse a camera that does not exist."""
         super().validate()
         if self.camera and self.camera not in INSTRUMENTS:
             error = UnknownNameError("camera", self.camera, INSTRUMENTS)
             raise FieldValidationError(CameraConfig.camera, self, str(error))
 
     def check_rafts(self, field: Field, names: Iterable[str]) -> None:
-        """Refuse the name of a raft that the camera does not have.
-
-        Parameters
-        ----------
-        field : `lsst.pex.config.Field`
-            The field in which the names stand.
-        names : iterable of `str`
-            The names.
-
-        Raises
-        ------
-        lsst.pex.config.FieldValidationError
-            The nearest names are offered.
-        """
+        """Refuse the name of a raft that the camera does not have."""
         self._check("raft", field, names, {detector.raft for detector in self._detectors()})
 
     def check_sensors(self, field: Field, names: Iterable[str]) -> None:

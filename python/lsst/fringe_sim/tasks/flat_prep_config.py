@@ -89,13 +89,7 @@ class FlatPrepConfig(Config):
         return FlatPrepOptions(**{name: getattr(self, name) for name in names})
 
     def validate(self) -> None:
-        """Refuse what the algorithms would refuse.
-
-        Raises
-        ------
-        lsst.pex.config.FieldValidationError
-            The field and what would be allowed are named.
-        """
+        """Refuse what the algorithms would refuse."""
         super().validate()
         try:
             self.options()

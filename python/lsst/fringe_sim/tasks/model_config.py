@@ -27,18 +27,10 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """Set-up and effects of one sensor.
+    """Set-up and effects of one sensor."""
 
-    Parameters
-    ----------
-    setup : `str`
-        Name of the set-up.
-    effects : `Mapping` [`str`, `float`]
-        Values by ``name.parameter``.
-    """
-
-    setup: str
-    effects: Mapping[str, float] = field(default_factory=dict)
+    setup: str  # name of the set-up
+    effects: Mapping[str, float] = field(default_factory=dict)  # values by ``name.parameter``
 
     @property
     def applied_effects(self) -> dict[str, float]:

@@ -84,10 +84,8 @@ def data_id_of(butlerQC: QuantumContext) -> DataCoordinate:
 def common_header(config: Config) -> dict[str, Any]:
     """Header keywords that every product of the tasks has.
 
-    Parameters
-    ----------
-    config : `lsst.pex.config.Config`
-        Configuration of the task; its digest goes into the header, itself is the dataset ``<label>_config``.
+    ``config``: configuration of the task; its digest goes into the header, itself is the dataset
+    ``<label>_config``.
     """
     return {**software_cards(), "CFGHASH": config_digest(config)}
 
@@ -101,16 +99,10 @@ def config_digest(config: Config) -> str:
 def run_datetime(run: str, otherwise: datetime.datetime) -> str:
     """Date of a run, ``YYYY-MM-DDThh:mm:ss``, from the timestamp at the end of its name.
 
-    Parameters
-    ----------
-    run : `str`
-        Name of the run; ``pipetask`` ends it in ``20261121T031500Z`` unless told otherwise.
-    otherwise : `datetime.datetime`
-        Date of a run whose name tells none.
-
-    Notes
-    -----
     The clock is not asked: repeating a quantum in its run gives the same bytes.
+
+    ``run``: name of the run; ``pipetask`` ends it in ``20261121T031500Z`` unless told otherwise. ``otherwise``:
+    date of a run whose name tells none.
     """
     match = _TIMESTAMP.search(run)
     found = datetime.datetime.strptime(match[1], "%Y%m%dT%H%M%S") if match else otherwise

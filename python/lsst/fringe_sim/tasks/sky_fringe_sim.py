@@ -61,26 +61,16 @@ RANDOM_NIGHT_H = (12.0, 36.0, 0.25)
 
 @dataclasses.dataclass(frozen=True)
 class SkyExposure:
-    """One exposure of the sky.
+    """One exposure of the sky."""
 
-    Parameters
-    ----------
-    exposure_id, day_obs : `int`
-        Number of the exposure and of its night; they decide the noise and a random night.
-    hour : `float`
-        Local time, in hours; after midnight on beyond 24.
-    exposure_s, airmass : `float`
-        Exposure time [s] and airmass.
-    physical_filter : `str`
-        Filter, as the instrument names it.
-    """
-
+    # exposure_id, day_obs: number of the exposure and of its night; they decide the noise and a random
+    # night
     exposure_id: int
     day_obs: int
-    hour: float
+    hour: float  # local time, in hours; after midnight on beyond 24
     exposure_s: float
     airmass: float
-    physical_filter: str
+    physical_filter: str  # filter, as the instrument names it
 
 
 class SkyFringeSimConnections(PipelineTaskConnections, dimensions=("instrument", "exposure", "detector")):
@@ -297,13 +287,7 @@ def _charge_kernel(sky_model: SkyModel) -> NDArray[np.float64]:
 
 
 def _at_hour(night: NightHistory, hour: float) -> NightHistory:
-    """The night at one time, interpolated linearly.
-
-    Raises
-    ------
-    OutOfRangeError
-        The night does not reach so far.
-    """
+    """The night at one time, interpolated linearly."""
     first, last = float(night.hours[0]), float(night.hours[-1])
     # The middle of an exposure is known to rounding only.
     if not first - 1e-6 <= hour <= last + 1e-6:

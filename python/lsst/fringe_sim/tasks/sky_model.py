@@ -42,32 +42,18 @@ LINE_LIST = "PALACE OH (Noll et al. 2025)"
 
 @dataclasses.dataclass(frozen=True)
 class SkyModel:
-    """All that the response of a sensor to the sky depends on; the hour is not among it.
+    """All that the response of a sensor to the sky depends on; the hour is not among it."""
 
-    Parameters
-    ----------
-    choice : `tuple`
-        Set-up, and sorted pairs of effects and values.
-    placement : `SensorPlacement`
-        Place of the sensor in the field.
-    beams : `str`
-        ``pixel`` or ``centre``.
-    airmass, solar_flux_sfu : `float`
-        Airmass, and solar radio flux [sfu].
-    rotational_temperature_k, vibrational_temperature_k : `float` or `None`
-        Temperatures of OH [K].
-    thickness_range_um : `tuple` [`float`, `float`]
-        Thicknesses of the map [µm].
-    """
-
-    choice: tuple[str, tuple[tuple[str, float], ...]]
-    placement: SensorPlacement
-    beams: str
+    choice: tuple[str, tuple[tuple[str, float], ...]]  # set-up, and sorted pairs of effects and values
+    placement: SensorPlacement  # place of the sensor in the field
+    beams: str  # ``pixel`` or ``centre``
+    # airmass, solar_flux_sfu: airmass, and solar radio flux [sfu]
     airmass: float
     solar_flux_sfu: float
+    # rotational_temperature_k, vibrational_temperature_k: temperatures of OH
     rotational_temperature_k: float | None
     vibrational_temperature_k: float | None
-    thickness_range_um: tuple[float, float]
+    thickness_range_um: tuple[float, float]  # thicknesses of the map
 
     def fringe_model(self) -> FringeModel:
         """Sensor behind the telescope."""
@@ -163,14 +149,7 @@ class SkyModelConfig(FringeModelConfig):
         return _band(Setup.from_name(self.setup))
 
     def map_of(self, thickness: ThicknessMap | None, detector: Detector) -> ThicknessMap:
-        """The map of a sensor, or its stand-in.
-
-        Raises
-        ------
-        InputError
-            There is none and stand-ins are not wanted; or the map is of another layer, or was fitted with other
-            effects than those configured here.
-        """
+        """The map of a sensor, or its stand-in."""
         choice = self.choice_of(detector)
         if thickness is not None:
             _check_map(thickness, choice)
