@@ -438,11 +438,8 @@ def check_axes(stream: IO[bytes], source: str) -> None:
 def _after_plain_units(content: IO[bytes], most: int, source: str) -> bytes:
     """Pass over headers and data of a file as long as they are what the standard asks for.
 
-    Returns
-    -------
-    header : `bytes`
-        The first header whose data may be anywhere, where astropy may look for the next one in what seems to be
-        data: from there on all has to be looked at. Nothing at the end of the file.
+    Returns the first header whose data may be anywhere, where astropy may look for the next one in what seems
+    to be data: from there on all has to be looked at. Nothing at the end of the file.
     """
     while True:
         header = b""
