@@ -78,14 +78,9 @@ class FieldBasis(ABC):
 
 @dataclass(frozen=True, eq=False)
 class SplineBasis(FieldBasis):
-    """Tensor product of uniform cubic B-splines.
+    """Tensor product of uniform cubic B-splines."""
 
-    Attributes
-    ----------
-    along_y, along_x : `numpy.ndarray`, shapes ``(ny, my)`` and ``(nx, mx)``
-        Basis functions at the rows and columns of cells.
-    """
-
+    # along_y, along_x (ny, my) and (nx, mx): basis functions at the rows and columns of cells
     along_y: FloatArray
     along_x: FloatArray
 
@@ -176,15 +171,9 @@ class SplineBasis(FieldBasis):
 
 @dataclass(frozen=True, eq=False)
 class CellBasis(FieldBasis):
-    """One coefficient per cell.
+    """One coefficient per cell."""
 
-    Attributes
-    ----------
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of cells.
-    """
-
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # rows and columns of cells
 
     @property
     def size(self) -> int:

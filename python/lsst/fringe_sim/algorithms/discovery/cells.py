@@ -28,34 +28,21 @@ BAD_PLANES = mask_bits("BAD", "SAT", "INTRP", "CR", "EDGE", "SUSPECT", "NO_DATA"
 
 @dataclass(frozen=True, eq=False)
 class CellData:
-    """Fringe amplitudes on a grid of cells.
+    """Fringe amplitudes on a grid of cells."""
 
-    Attributes
-    ----------
-    value : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Mean counts of a cell over the mean of its plane, or the relative counts of a relative cube; 1 where there are
-        no data.
-    weight : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Inverse variance; 0 where there are no data.
-    geometry : `ImageGeometry`
-        Centres of the cells, wavelengths, levels.
-    cell_px : `int`
-        Side of a cell [px].
-    response_scatter : `float`
-        Rms of the response of the cells, common to all wavelengths (pixel response non-uniformity).
-    thickness_um, thickness_sigma_um : `numpy.ndarray`, shape ``(ny, nx)``, optional
-        Known thickness and its uncertainty [µm].
-    centroid : `numpy.ndarray`, shape ``(2, W, ny, nx)``, optional
-        Where the good pixels of a cell have their mean, along rows and columns, from its centre [cells].
-    """
-
+    # (W, ny, nx): mean counts of a cell over the mean of its plane, or the relative counts of a relative
+    # cube; 1 where there are no data
     value: FloatArray
-    weight: FloatArray
-    geometry: ImageGeometry
-    cell_px: int
+    weight: FloatArray  # (W, ny, nx): inverse variance; 0 where there are no data
+    geometry: ImageGeometry  # centres of the cells, wavelengths, levels
+    cell_px: int  # side of a cell [px]
+    # Rms of the response of the cells, common to all wavelengths (pixel response non-uniformity)
     response_scatter: float = 0.0
+    # thickness_um, thickness_sigma_um (ny, nx): known thickness and its uncertainty
     thickness_um: FloatArray | None = None
     thickness_sigma_um: FloatArray | None = None
+    # (2, W, ny, nx): where the good pixels of a cell have their mean, along rows and columns, from its
+    # centre [cells]
     centroid: FloatArray | None = None
 
     @property
@@ -107,10 +94,7 @@ class CellData:
         fit towards them. How far the variance follows the counts is measured, wavelength by wavelength; whatever
         else it depends on stays.
 
-        Parameters
-        ----------
-        expected : `numpy.ndarray`, shape ``(W, ny, nx)``
-            Values of the cells by a fit.
+        ``expected`` (W, ny, nx).
         """
         used = self.weight > 0.0
         variance = np.divide(1.0, self.weight, out=np.zeros(self.shape), where=used)
@@ -148,21 +132,8 @@ def bin_cube(
 ) -> CellData:
     """Average a cube over cells.
 
-    Parameters
-    ----------
-    cube : `FringeCube`
-        The flats.
-    cell_px : `int`
-        Side of a cell [px]; rows and columns that fill no cell are left out.
-    level_e : mapping, optional
-        Mean level of single planes [electrons], where the cube does not know it.
-    y_edges, x_edges : `tuple` [`int`, ...], optional
-        Borders of the amplifiers [px].
-
-    Raises
-    ------
-    InputError
-        A plane without a good pixel, or with a mean that is not positive.
+    ``cell_px``: side of a cell [px]; rows and columns that fill no cell are left out. ``level_e``: mean level
+    of single planes, where the cube does not know it. ``y_edges``, ``x_edges``: borders of the amplifiers [px].
     """
     rows, columns = cube.shape[1] // cell_px, cube.shape[2] // cell_px
     if rows == 0 or columns == 0:
@@ -230,14 +201,8 @@ def finest_useful_cell(cube: FringeCube, *, most_cells: int, largest: int = 64) 
     The variance of an image falls with the cell size by its noise; what it falls beyond that is pattern. A size
     is taken while the part `KEPT_PATTERN` of the pattern's variance is left at every wavelength.
 
-    Parameters
-    ----------
-    cube : `FringeCube`
-        The flats.
-    most_cells : `int`
-        Number of cells wanted at most; pattern is not sacrificed for it.
-    largest : `int`, optional
-        Largest side [px].
+    ``most_cells``: number of cells wanted at most; pattern is not sacrificed for it. ``largest``: largest side
+    [px].
     """
     sizes = [1]
     while not _is_coarse(
@@ -306,13 +271,7 @@ class _Sums(NamedTuple):
 
 
 def _pixels_of(cube: FringeCube, source: int) -> tuple[_Sums, NDArray[np.bool_], float]:
-    """Pixels of one plane as cells, which of them are good, and their mean.
-
-    Raises
-    ------
-    InputError
-        No good pixel, or a mean that is not positive.
-    """
+    """Pixels of one plane as cells, which of them are good, and their mean."""
     image = np.array(cube.image[source], dtype=np.float64)
     variance = np.array(cube.variance[source], dtype=np.float64)
     good = (np.asarray(cube.mask[source]) & BAD_PLANES) == 0

@@ -47,49 +47,25 @@ LEAST_OVERLAP = 0.1
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """A fit with all that the tests need.
+    """A fit with all that the tests need."""
 
-    Attributes
-    ----------
-    design : `Design`
-        Linearised model at the fit, all nuisances and free effects in it.
-    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Whitened residual.
-    raw_residual : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Data minus model, relative; 0 where there are no data.
-    value : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Model.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Fitted field.
-    whiten : `Whitener`
-        The noise.
-    """
-
-    design: Design
-    residual: FloatArray
-    raw_residual: FloatArray
-    value: FloatArray
-    thickness_um: FloatArray
+    design: Design  # linearised model at the fit, all nuisances and free effects in it
+    residual: FloatArray  # (W, ny, nx): whitened residual
+    raw_residual: FloatArray  # (W, ny, nx): data minus model, relative; 0 where there are no data
+    value: FloatArray  # (W, ny, nx)
+    thickness_um: FloatArray  # (ny, nx): fitted field
     whiten: Whitener
 
 
 @dataclass(frozen=True)
 class Channel:
-    """Result of one test.
+    """Result of one test."""
 
-    Attributes
-    ----------
-    name : `str`
-        What was looked at.
-    statistic, degrees : `float`
-        χ² and its degrees of freedom under the null hypothesis.
-    probability : `float`
-        Chance of so large a statistic from noise alone, corrected for the looks within the channel.
-    """
-
-    name: str
+    name: str  # what was looked at
+    # statistic, degrees: χ² and its degrees of freedom under the null hypothesis
     statistic: float
     degrees: float
+    # Chance of so large a statistic from noise alone, corrected for the looks within the channel
     probability: float
 
 
@@ -117,18 +93,9 @@ def measure_channels(
 ) -> tuple[Channel, ...]:
     """All tests that need no catalogue.
 
-    Parameters
-    ----------
-    state : `State`
-        Fit to be criticised.
-    geometry : `ImageGeometry`
-        Cells.
-    index : `numpy.ndarray`, shape ``(W,)``
-        Refractive index of the varying layer.
-    imprecision : `float`, optional
-        χ² by which the shape of the fringes may be off because effects that were found are described only so well.
-    correlation : `float`, optional
-        Correlation of the noise of neighbouring cells that the effects of the fit account for.
+    ``index`` (W,). ``imprecision``: χ² by which the shape of the fringes may be off because effects that were
+    found are described only so well. ``correlation``: correlation of the noise of neighbouring cells that the
+    effects of the fit account for.
     """
     channels = [
         _feature_channel("thickness phase", phase_features(state, geometry, index), state, imprecision)

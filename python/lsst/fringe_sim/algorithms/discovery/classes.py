@@ -44,47 +44,21 @@ CHI2_PER_PARAMETER = 6.0
 
 @dataclass(frozen=True)
 class EffectClass:
-    """Effects any of which may be the one that was found.
+    """Effects any of which may be the one that was found."""
 
-    Attributes
-    ----------
-    members : `dict`
-        Share of each effect among all replacements, by name.
-    probability : `float`
-        Sum of the shares.
-    values : `dict`
-        Fitted parameters of each member.
-    significance : `float`
-        Signal to noise of what the effect explains.
-    best : `Hypothesis`
-        The likeliest set of all, with this effect or with another in its place.
-    rivals : `dict` [`str`, `Hypothesis`]
-        Every set that was compared with the first, by the effect in this one's place.
-    """
-
-    members: dict[str, float]
-    probability: float
-    values: dict[str, dict[str, float]]
-    significance: float
-    best: Hypothesis
+    members: dict[str, float]  # share of each effect among all replacements, by name
+    probability: float  # sum of the shares
+    values: dict[str, dict[str, float]]  # fitted parameters of each member
+    significance: float  # signal to noise of what the effect explains
+    best: Hypothesis  # the likeliest set of all, with this effect or with another in its place
+    # Every set that was compared with the first, by the effect in this one's place
     rivals: dict[str, Hypothesis]
 
 
 def classes_of(selector: Selector, chosen: Hypothesis, width: float) -> dict[str, EffectClass]:
     """Class of each effect of a set.
 
-    Parameters
-    ----------
-    selector : `Selector`
-        Fits replacements.
-    chosen : `Hypothesis`
-        The set.
-    width : `float`
-        Difference in log evidence within which effects are one class.
-
-    Returns
-    -------
-    classes : `dict` [`str`, `EffectClass`]
+    ``width``: difference in log evidence within which effects are one class.
     """
     return {name: _class_of(selector, chosen, name, width) for name in chosen.names}
 
@@ -123,20 +97,9 @@ def classes_in_all_data(
 ) -> dict[str, EffectClass]:
     """Classes as all data see them: a rival that the part searched all but excludes may be the likelier one in all.
 
-    Parameters
-    ----------
-    classes : mapping [`str`, `EffectClass`]
-        Classes of the effects in the part that was searched.
-    chosen, final : `Hypothesis`
-        The set fitted to that part, and to all data.
-    fitted_to_all : callable
-        Fits a set to all data, from its fit to the part.
-    width : `float`
-        Difference in log evidence within which effects are one class.
-
-    Returns
-    -------
-    classes : `dict` [`str`, `EffectClass`]
+    ``classes``: classes of the effects in the part that was searched. ``chosen``, ``final``: the set fitted to
+    that part, and to all data. ``fitted_to_all``: fits a set to all data, from its fit to the part. ``width``:
+    difference in log evidence within which effects are one class.
     """
     least = chosen.log_evidence - WIDTHS_BEHIND * width
     found = {}
@@ -220,16 +183,9 @@ def outsider_probability(
     effects cannot mimic may be anything, and is seen if it is not too weak: nearly nothing is known of the cause of a
     signal to noise of 5, and one effect more mimics as much more.
 
-    Parameters
-    ----------
-    hypothesis : `Hypothesis`
-        The set that was found.
-    prior : `float`
-        Probability of such a cause before the data are seen.
-    explained : `float`
-        χ² that the set takes off the unchanged model.
-    spots : `float`, optional
-        Log evidence of spots, which no effect is, in the place of an effect, over that of the effect.
+    ``prior``: probability of such a cause before the data are seen. ``explained``: χ² that the set takes off
+    the unchanged model. ``spots``: log evidence of spots, which no effect is, in the place of an effect, over
+    that of the effect.
     """
     hidden = HIDDEN_CHI2 * max(len(hypothesis.names), 1) / max(explained, 1e-300)
     mimicked = min(max(MIMICKED, hidden), 1.0)

@@ -49,16 +49,7 @@ def chi2_with_free_levels(model: FloatArray, value: FloatArray, weight: FloatArr
 def chi2_with_free_fringes(models: FloatArray, value: FloatArray, weight: FloatArray) -> FloatArray:
     """χ² of several models, with the best level and the best contrast, not a negative one, at each wavelength.
 
-    Parameters
-    ----------
-    models : `numpy.ndarray`, shape ``(W, S, ny, nx)``
-        The models.
-    value, weight : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Data and their inverse variance.
-
-    Returns
-    -------
-    chi2 : `numpy.ndarray`, shape ``(S,)``
+    ``models`` (W, S, ny, nx). ``value``, ``weight`` (W, ny, nx). Returns (S,).
     """
     waves = len(value)
     weights = weight.reshape(waves, -1, 1)

@@ -20,17 +20,7 @@ STIFFNESS, NO_WEIGHT = 1e-3, 1e-12
 def continued(field: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     """Continue a field from where it is known with the least sum of squares of its second derivatives.
 
-    Parameters
-    ----------
-    field : `numpy.ndarray`, shape ``(ny, nx)``
-        The field; its values elsewhere do not matter.
-    known : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
-        Where it is known.
-
-    Returns
-    -------
-    field : `numpy.ndarray`, shape ``(ny, nx)``
-        Slightly smoothed where it is known.
+    ``field`` (ny, nx): the field; its values elsewhere do not matter. ``known`` (ny, nx). Returns (ny, nx).
     """
     weight = np.where(known, 1.0, NO_WEIGHT).ravel()
     matrix = sparse.diags(weight) + STIFFNESS * _curvature(*field.shape)

@@ -92,18 +92,9 @@ def describe_residual(
 def places_apart(residual: FloatArray, geometry: ImageGeometry) -> list[dict[str, float]]:
     """Places of the sensor that fit worse than the rest of it, the worst first.
 
-    Parameters
-    ----------
-    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Whitened residual; 0 where there are no data.
-    geometry : `ImageGeometry`
-        Where the cells lie.
-
-    Returns
-    -------
-    places : `list` [`dict`]
-        Row and column of the middle and diameter of a disk of the same area [px], part of the excess of all places
-        that lies here, and standard deviations of its worst cell. Empty where the misfit is everywhere.
+    ``residual`` (W, ny, nx): whitened residual; 0 where there are no data. Returns row and column of the middle
+    and diameter of a disk of the same area [px], part of the excess of all places that lies here, and standard
+    deviations of its worst cell. Empty where the misfit is everywhere.
     """
     number = (residual != 0.0).sum(axis=0)
     seen = number > 0

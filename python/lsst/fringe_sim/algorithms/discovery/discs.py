@@ -26,27 +26,13 @@ Disc = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Discs:
-    """Discs of all radii about every cell.
+    """Discs of all radii about every cell."""
 
-    Attributes
-    ----------
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of cells.
-    padded : `tuple` [`int`, `int`]
-        The same with room for the largest disc.
-    radii : `list` [`float`]
-        Radii [cells].
-    transforms : `list` [`numpy.ndarray`]
-        Fourier transform of a disc of each radius.
-    usable : `list` [`numpy.ndarray`]
-        Cells about which enough of a disc of each radius has data.
-    """
-
-    shape: tuple[int, int]
-    padded: tuple[int, int]
-    radii: list[float]
-    transforms: list[NDArray[np.complex128]]
-    usable: list[NDArray[np.bool_]]
+    shape: tuple[int, int]  # rows and columns of cells
+    padded: tuple[int, int]  # the same with room for the largest disc
+    radii: list[float]  # radii [cells]
+    transforms: list[NDArray[np.complex128]]  # Fourier transform of a disc of each radius
+    usable: list[NDArray[np.bool_]]  # cells about which enough of a disc of each radius has data
 
     @classmethod
     def of(cls, seen: NDArray[np.bool_]) -> Discs:

@@ -28,16 +28,7 @@ def log_evidence(fit: Fit, null_chi2: float) -> float:
     Exchangeable parameters are draws from a Gaussian about null, the width of which has the half-Cauchy prior: what
     sixteen gains are thought to be before the data are seen is one number, not sixteen.
 
-    Parameters
-    ----------
-    fit : `Fit`
-        The set, fitted with all parameters.
-    null_chi2 : `float`
-        χ² of the unchanged model, fitted to the same data.
-
-    Returns
-    -------
-    log_evidence : `float`
+    ``null_chi2``: χ² of the unchanged model, fitted to the same data.
     """
     total = 0.5 * (null_chi2 - fit.chi2)
     if not fit.coordinates:

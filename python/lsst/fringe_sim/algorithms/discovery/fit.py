@@ -62,45 +62,25 @@ class Coordinate:
 
     The coordinate is 0 at null. An effect that starts with the square of its parameter (roughness, aperture) is
     followed in the square, so that data and coordinate are in proportion near the null.
-
-    Attributes
-    ----------
-    effect, parameter : `str`
-        Whose coordinate it is.
-    null, low, high, scale : `float`
-        Null value, bounds and prior scale of the parameter.
-    quadratic : `bool`
-        Whether the coordinate is the square of the departure from null.
-    unit : `str`
-        Unit of the parameter.
-    neighbour : `float`
-        Distance of neighbouring minima of the misfit in the coordinate; 0 if there is only one.
-    of_one_exposure : `bool`
-        Whether it concerns the exposures at one wavelength only.
-    place : `bool`
-        Whether it says where an effect is; see `SearchHints`.
-    step : `float`
-        Largest step of a derivative; 0 for a thousandth of the scale.
-    refinement : `int`
-        0 for what the effect surely has; see `SearchHints`.
-    exchangeable : `bool`
-        Whether it is one of many draws about null; see `SearchHints`.
     """
 
+    # effect, parameter: whose coordinate it is
     effect: str
     parameter: str
+    # null, low, high, scale: null value, bounds and prior scale of the parameter
     null: float
     low: float
     high: float
     scale: float
-    quadratic: bool
-    unit: str = ""
+    quadratic: bool  # whether the coordinate is the square of the departure from null
+    unit: str = ""  # unit of the parameter
+    # Distance of neighbouring minima of the misfit in the coordinate; 0 if there is only one
     neighbour: float = 0.0
-    of_one_exposure: bool = False
-    place: bool = False
-    step: float = 0.0
-    refinement: int = 0
-    exchangeable: bool = False
+    of_one_exposure: bool = False  # whether it concerns the exposures at one wavelength only
+    place: bool = False  # whether it says where an effect is; see `SearchHints`
+    step: float = 0.0  # largest step of a derivative; 0 for a thousandth of the scale
+    refinement: int = 0  # 0 for what the effect surely has; see `SearchHints`
+    exchangeable: bool = False  # whether it is one of many draws about null; see `SearchHints`
 
     @property
     def key(self) -> str:
@@ -273,22 +253,11 @@ class PlaneColumns:
     """Whitened derivatives each of which concerns one wavelength, as those with respect to the levels.
 
     Written out, such columns would be zeros but for one plane in ``W``, and what the common response makes of it.
-
-    Attributes
-    ----------
-    amplitude : `numpy.ndarray`, shape ``(C, ny, nx)``
-        Derivatives in units of the noise.
-    plane : `numpy.ndarray`, shape ``(C,)``
-        The wavelength that each belongs to.
-    basis : `numpy.ndarray`, shape ``(C, L)``
-        Free parameters of which they are made.
-    whiten : `Whitener`
-        The noise.
     """
 
-    amplitude: FloatArray
-    plane: NDArray[np.int64]
-    basis: FloatArray
+    amplitude: FloatArray  # (C, ny, nx): derivatives in units of the noise
+    plane: NDArray[np.int64]  # (C,): the wavelength that each belongs to
+    basis: FloatArray  # (C, L): free parameters of which they are made
     whiten: Whitener
 
     def dot(self, values: FloatArray) -> FloatArray:
@@ -332,37 +301,20 @@ Columns = FullColumns | PlaneColumns
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Data, model and nuisances of one search.
-
-    Attributes
-    ----------
-    cells : `CellData`
-        The data.
-    forward : `Forward`
-        The model.
-    basis : `FieldBasis`
-        The thickness field.
-    level_basis : `numpy.ndarray`, shape ``(W, L)``
-        Free levels: the unit matrix, or a few smooth functions of wavelength.
-    field_prior : `float`
-        Precision of the coefficients of the field about `field_centre` [1/µm²]; 0 for a free field.
-    field_centre : `numpy.ndarray`, shape ``(M,)``, optional
-        Coefficients of a map that is known; needed with a prior.
-    free_contrast : `bool`
-        Whether the fringes of each wavelength have an amplitude of their own: the ``W`` contrasts, relative to
-        the model's, follow the levels.
-    reference : `numpy.ndarray`, shape ``(W, ny, nx)``, optional
-        Light of the cells that the scatter of their response multiplies; that of the first guess by default. With
-        it, χ² means the same in all fits.
-    """
+    """Data, model and nuisances of one search."""
 
     cells: CellData
     forward: Forward
-    basis: FieldBasis
-    level_basis: FloatArray
+    basis: FieldBasis  # the thickness field
+    level_basis: FloatArray  # (W, L): free levels: the unit matrix, or a few smooth functions of wavelength
+    # Precision of the coefficients of the field about `field_centre` [1/µm²]; 0 for a free field
     field_prior: float = 0.0
-    field_centre: FloatArray | None = None
+    field_centre: FloatArray | None = None  # (M,): coefficients of a map that is known; needed with a prior
+    # Whether the fringes of each wavelength have an amplitude of their own: the ``W`` contrasts, relative
+    # to the model's, follow the levels
     free_contrast: bool = False
+    # (W, ny, nx): light of the cells that the scatter of their response multiplies; that of the first
+    # guess by default. With it, χ² means the same in all fits.
     reference: FloatArray | None = None
 
     @property
@@ -441,31 +393,17 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Linearised model at one point, nuisances included.
-
-    Attributes
-    ----------
-    slope : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Whitened derivative with respect to thickness.
-    levels : `PlaneColumns`
-        Derivatives with respect to the levels.
-    effects : `FullColumns`
-        Derivatives with respect to the effects.
-    pull : `numpy.ndarray`, shape ``(M,)``
-        What draws the coefficients of the field besides the residual: half a gradient of χ².
-    normal : `NormalMatrix`
-        Curvature in the coefficients of the thickness field.
-    slope_changes : `numpy.ndarray`, shape ``(2, W, ny, nx)``, optional
-        Whitened derivatives with respect to the change of the thickness per cell along rows and columns, where a
-        blur lets cells see that.
-    """
+    """Linearised model at one point, nuisances included."""
 
     basis: FieldBasis
-    slope: FloatArray
-    levels: PlaneColumns
-    effects: FullColumns
+    slope: FloatArray  # (W, ny, nx): whitened derivative with respect to thickness
+    levels: PlaneColumns  # derivatives with respect to the levels
+    effects: FullColumns  # derivatives with respect to the effects
+    # (M,): what draws the coefficients of the field besides the residual: half a gradient of χ²
     pull: FloatArray
-    normal: NormalMatrix
+    normal: NormalMatrix  # curvature in the coefficients of the thickness field
+    # (2, W, ny, nx): whitened derivatives with respect to the change of the thickness per cell along rows
+    # and columns, where a blur lets cells see that
     slope_changes: FloatArray | None
     _coupling: FloatArray
     _curvature: FloatArray
@@ -539,17 +477,7 @@ class Design:
     def project(self, columns: Columns, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Score and information of further columns with all nuisances of this design projected out.
 
-        Parameters
-        ----------
-        columns : `FullColumns` or `PlaneColumns`
-            ``F`` derivatives.
-        residual : `numpy.ndarray`, shape ``(W, ny, nx)``
-            Whitened residual at the minimum of this design.
-
-        Returns
-        -------
-        score : `numpy.ndarray`, shape ``(F,)``
-        information : `numpy.ndarray`, shape ``(F, F)``
+        ``residual`` (W, ny, nx): whitened residual at the minimum of this design. Returns (F,) and (F, F).
         """
         coupling = _against_field(self.basis, (columns,), self.slope, self.slope_changes)
         solved = self.normal.solve(coupling)
@@ -711,28 +639,8 @@ def fit_model(
 ) -> Fit:
     """Minimise χ² in effects, levels and thickness field together (Gauss–Newton with damping).
 
-    Parameters
-    ----------
-    problem : `Problem`
-        Data, model, nuisances.
-    coordinates : sequence of `Coordinate`
-        Free effects.
-    start : `numpy.ndarray`
-        First guess of the coordinates.
-    field_start : `numpy.ndarray`, shape ``(M,)``
-        First coefficients of the thickness.
-    levels_start : `numpy.ndarray`, optional
-        First levels; all 1 by default.
-    fixed : mapping, optional
-        Effects held at a value.
-    iterations : `int`, optional
-        Largest number of iterations.
-    rival : `float`, optional
-        χ² of another fit to the same data: one that will not come near it need not converge.
-
-    Returns
-    -------
-    fit : `Fit`
+    ``field_start`` (M,). ``levels_start``: first levels; all 1 by default. ``rival``: χ² of another fit to the
+    same data: one that will not come near it need not converge.
     """
     solver = _Solver(problem, tuple(coordinates), dict(fixed or {}))
     return solver.run(np.asarray(start, dtype=float), field_start, levels_start, iterations, rival)

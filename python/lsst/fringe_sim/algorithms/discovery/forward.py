@@ -65,18 +65,10 @@ FARTHEST_UM = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Model values of the cells.
+    """Model values of the cells."""
 
-    Attributes
-    ----------
-    value : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Signal relative to its mean over the thicknesses of the tables.
-    slope : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Its derivative with respect to thickness [1/µm].
-    """
-
-    value: FloatArray
-    slope: FloatArray
+    value: FloatArray  # (W, ny, nx): signal relative to its mean over the thicknesses of the tables
+    slope: FloatArray  # (W, ny, nx): its derivative with respect to thickness [1/µm]
 
 
 class Exposures(Protocol):
@@ -97,17 +89,10 @@ class Exposures(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _PartOfCells:
-    """Thickness in a part of every cell, relative to that of the cell.
+    """Thickness in a part of every cell, relative to that of the cell."""
 
-    Attributes
-    ----------
-    away_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Its mean [µm].
-    second, fourth : `numpy.ndarray`, shape ``(ny, nx)``
-        Its moments about that [µm², µm⁴].
-    """
-
-    away_um: FloatArray
+    away_um: FloatArray  # (ny, nx): its mean
+    # second, fourth (ny, nx): its moments about that [µm², µm⁴]
     second: FloatArray
     fourth: FloatArray
 
@@ -136,42 +121,24 @@ class _Light:
 
 @dataclass(eq=False)
 class Forward:
-    """Model of one sensor on cells.
+    """Model of one sensor on cells."""
 
-    Attributes
-    ----------
-    model : `FringeModel`
-        The model as it is known before the search.
-    catalogue : sequence of `Effect`
-        Effects that may be set.
-    geometry : `ImageGeometry`
-        The cells.
-    cell_px : `int`
-        Side of a cell [px].
-    range_um : `tuple` [`float`, `float`]
-        Thicknesses that the tables cover [µm]; grows on demand, by `FARTHEST_UM` at most.
-    centroid : `numpy.ndarray`, shape ``(2, W, ny, nx)``, optional
-        See `CellData`.
-    seen : `numpy.ndarray` of `bool`, shape ``(ny, nx)``, optional
-        Cells with data; by default all. The thickness of others is not known, and slopes do not lean on it.
-    exposures : `Exposures`, optional
-        The light; monochromator flats by default.
-    scatter_um2 : `numpy.ndarray`, shape ``(ny, nx)``, optional
-        Variance of the thickness at which a cell is looked up about the true one [µm²]; by default none.
-    places : `int`, optional
-        Places along the side of a pixel at which it sees the thickness; 0, the default, for all of its area, as real
-        pixels do.
-    """
-
-    model: FringeModel
-    catalogue: Sequence[Effect]
+    model: FringeModel  # the model as it is known before the search
+    catalogue: Sequence[Effect]  # effects that may be set
     geometry: ImageGeometry
-    cell_px: int
+    cell_px: int  # side of a cell [px]
+    # Thicknesses that the tables cover; grows on demand, by `FARTHEST_UM` at most
     range_um: tuple[float, float]
-    centroid: FloatArray | None = None
+    centroid: FloatArray | None = None  # (2, W, ny, nx): see `CellData`
+    # (ny, nx): cells with data; by default all. The thickness of others is not known, and slopes do not
+    # lean on it.
     seen: NDArray[np.bool_] | None = None
-    exposures: Exposures | None = None
+    exposures: Exposures | None = None  # the light; monochromator flats by default
+    # (ny, nx): variance of the thickness at which a cell is looked up about the true one [µm²]; by
+    # default none
     scatter_um2: FloatArray | None = None
+    # Places along the side of a pixel at which it sees the thickness; 0, the default, for all of its
+    # area, as real pixels do
     places: int = 0
     _tables: dict[tuple[tuple[str, float], ...], tuple[FloatArray, FloatArray]] = field(
         default_factory=dict, repr=False
@@ -351,12 +318,7 @@ class Forward:
     def predict(self, settings: Settings, thickness_um: FloatArray) -> Prediction:
         """Model of the cells.
 
-        Parameters
-        ----------
-        settings : mapping
-            Effects by ``name.parameter``.
-        thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-            Thickness at the centres of the cells [µm], within the tables.
+        ``thickness_um`` (ny, nx): thickness at the centres of the cells, within the tables.
         """
         value, slope = self._light(settings, thickness_um)
         image_settings = self._image(settings)
@@ -537,22 +499,8 @@ class Forward:
 
         Effects on the image are left out.
 
-        Parameters
-        ----------
-        name : `str`
-            The local effect.
-        settings : mapping
-            All effects.
-        field_um : `numpy.ndarray`, shape ``(ny, nx)``
-            Thickness [µm].
-        cells : `numpy.ndarray`, shape ``(n,)``, optional
-            Numbers of the cells; all by default.
-        places_um : `numpy.ndarray`, shape ``(S, n)``, optional
-            Thicknesses of the cells [µm]; those of the field by default.
-
-        Returns
-        -------
-        on, off : `numpy.ndarray`, shape ``(W, S, n)``
+        ``field_um`` (ny, nx). ``cells`` (n,): numbers of the cells; all by default. ``places_um`` (S, n):
+        thicknesses of the cells; those of the field by default. Returns (W, S, n).
         """
         own = np.arange(field_um.size) if cells is None else cells
         places = field_um.ravel()[own][np.newaxis] if places_um is None else places_um

@@ -55,18 +55,10 @@ VISIBLE, WIDE_SIDE = 2.0, 5
 
 @dataclass(frozen=True, eq=False)
 class Grown:
-    """What has grown.
+    """What has grown."""
 
-    Attributes
-    ----------
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness of all cells.
-    settings : `dict`
-        Effects that were fitted with it.
-    """
-
-    thickness_um: FloatArray
-    settings: dict[str, float]
+    thickness_um: FloatArray  # (ny, nx): thickness of all cells
+    settings: dict[str, float]  # effects that were fitted with it
 
 
 def grown_thickness(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Grown | None:
@@ -76,19 +68,7 @@ def grown_thickness(problem: Problem, fit: Fit, thickness_um: FloatArray) -> Gro
     in which the model with its effects fits is taken for right; it grows into its surroundings, which continue it
     with little curvature and are fitted together with it, effects included, as far as the model then fits there.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        All data, without a map.
-    fit : `Fit`
-        Fit with the effects.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness from which to begin.
-
-    Returns
-    -------
-    grown : `Grown` or `None`
-        `None` if nothing fits better, or the model fits everywhere.
+    ``thickness_um`` (ny, nx). Returns `None` if nothing fits better, or the model fits everywhere.
     """
     first = best = fitted_smooth(problem, fit, thickness_um, KNOTS[-1])
     bridged = _bridged(first, thickness_um)

@@ -29,20 +29,11 @@ ten thousand places."""
 
 @dataclass(frozen=True, eq=False)
 class HiddenIsland:
-    """A local effect beside which the thickness is as smooth on an island as around it.
-
-    Attributes
-    ----------
-    effect : `Effect`
-        The effect.
-    fit : `Fit`
-        Fit with it.
-    prepared : `Prepared` or `None`
-        The data with a thickness that is smooth beside it, if no step of the thickness is as good.
-    """
+    """A local effect beside which the thickness is as smooth on an island as around it."""
 
     effect: Effect
-    fit: Fit
+    fit: Fit  # fit with it
+    # The data with a thickness that is smooth beside it, if no step of the thickness is as good
     prepared: Prepared | None
 
     @property
@@ -66,14 +57,8 @@ def hidden_island(prepared: Prepared, catalogue: Sequence[Effect], found: Hypoth
     well, and nothing disagrees; that layers do not step is knowledge that no flat holds. Only what no thickness of
     the cells would explain tells them apart.
 
-    Parameters
-    ----------
-    prepared : `Prepared`
-        The data; a map of the thickness tells where it steps.
-    catalogue : sequence of `Effect`
-        Effects that may be named.
-    found : `Hypothesis`
-        Fit of all data with what was found so far.
+    ``prepared``: the data; a map of the thickness tells where it steps. ``found``: fit of all data with what
+    was found so far.
     """
     local = [effect for effect in catalogue if effect.local and effect.name not in found.names]
     if not local or not prepared.rich or prepared.problem.field_prior:

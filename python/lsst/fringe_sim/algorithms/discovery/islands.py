@@ -58,18 +58,10 @@ ANOTHER_ORDER = 0.5
 
 @dataclass(frozen=True, eq=False)
 class IslandStart:
-    """Values from which to fit a local effect.
-
-    Attributes
-    ----------
-    position : `numpy.ndarray`
-        Its coordinates.
-    promise : `float`
-        Expected fall of χ².
-    """
+    """Values from which to fit a local effect."""
 
     position: FloatArray
-    promise: float
+    promise: float  # expected fall of χ²
 
 
 def island_starts(
@@ -87,18 +79,8 @@ def island_starts(
     apart. In the best discs, all sizes are compared with the data themselves: what anything else has done there may
     promise much along the effect, and the data are farther from all of it than from nothing.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        Data and model.
-    state : `State`
-        Fit without the effect.
-    settings : mapping
-        Effects of the fit.
-    coordinates : sequence of `Coordinate`
-        Those of the effect: its size, and the places called ``centre_x``, ``centre_y`` and ``radius``.
-    level : `numpy.ndarray`
-        Level of every wavelength in the fit; broadcasts to the cells.
+    ``coordinates``: those of the effect: its size, and the places called ``centre_x``, ``centre_y`` and
+    ``radius``. ``level``: level of every wavelength in the fit; broadcasts to the cells.
     """
     (size,) = (item for item in coordinates if not item.place)
     sizes = _sizes(size)
@@ -162,18 +144,7 @@ def followed_on_island(
 ) -> FloatArray:
     """Thickness moved on the island of a local effect to where the fringes there lie on the data [µm].
 
-    Parameters
-    ----------
-    problem : `Problem`
-        Data and model.
-    name : `str`
-        The effect.
-    settings : mapping
-        All effects, this one among them.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness of a fit without it [µm].
-    level : `numpy.ndarray`
-        Level of every wavelength; broadcasts to the cells.
+    ``thickness_um`` (ny, nx). ``level``: level of every wavelength; broadcasts to the cells.
     """
     if not problem.forward.has_island(name, settings):
         return thickness_um
@@ -193,25 +164,9 @@ def placed_on_island(
     A rim that moves over a cell changes its phase, and steps of all parameters at once leave its thickness where it
     was. Here every place is judged with the thickness that each cell then wants.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        Data and model.
-    coordinates : sequence of `Coordinate`
-        Effects of a fit, the local one last.
-    position : `numpy.ndarray`
-        Coordinates from which to start.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness that lies well on the data in the middle of the island [µm].
-    level : `numpy.ndarray`
-        Level of every wavelength; broadcasts to the cells.
-
-    Returns
-    -------
-    position : `numpy.ndarray`
-        Coordinates.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness [µm].
+    ``coordinates``: effects of a fit, the local one last. ``thickness_um`` (ny, nx): thickness that lies well
+    on the data in the middle of the island. ``level``: level of every wavelength; broadcasts to the cells.
+    Returns (ny, nx).
     """
     name = coordinates[-1].effect
     settings = {item.key: item.value(x) for item, x in zip(coordinates, position, strict=True)}
@@ -242,16 +197,7 @@ def thickness_on_islands(
 ) -> FloatArray:
     """Thickness of cells on islands that took no part in a fit, from those within half an order [µm].
 
-    Parameters
-    ----------
-    problem : `Problem`
-        All data.
-    fit : `Fit`
-        Fit to a part of the data.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness so far, returned for all other cells.
-    held_out : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
-        Cells that took no part.
+    ``thickness_um`` (ny, nx): thickness so far, returned for all other cells. ``held_out`` (ny, nx).
     """
     level, _ = problem.amplitudes(fit.levels)
     found = thickness_um
@@ -275,14 +221,8 @@ def mended_on_islands(
     Without the local effect the fringes there belong to another thickness, and where they are narrow a fit leaves
     part of an island in another order than the rest.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        Data and model.
-    fit : `Fit`
-        Fit with the local effects.
-    thickness_um, around_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness of the fit, for cells on islands, and one for all others [µm].
+    ``thickness_um``, ``around_um`` (ny, nx): thickness of the fit, for cells on islands, and one for all
+    others.
     """
     on = problem.forward.on_islands(fit.settings)
     torn = np.where(on, thickness_um, around_um)
@@ -306,23 +246,14 @@ def _moved(
 
 @dataclass(frozen=True, eq=False)
 class _Surroundings:
-    """Cells on an island and about it, with what they would be on and off it at many thicknesses.
-
-    Attributes
-    ----------
-    own : `numpy.ndarray`
-        The cells.
-    places : `numpy.ndarray`, shape ``(S, n)``
-        Thicknesses [µm].
-    outside, inside : `numpy.ndarray`, shape ``(W, S, n)``
-        Signal at its level.
-    """
+    """Cells on an island and about it, with what they would be on and off it at many thicknesses."""
 
     problem: Problem
     name: str
     thickness_um: FloatArray
     own: NDArray[np.intp]
-    places: FloatArray
+    places: FloatArray  # (S, n): thicknesses [µm]
+    # outside, inside (W, S, n): signal at its level
     outside: FloatArray
     inside: FloatArray
     value: FloatArray
@@ -373,18 +304,10 @@ def _of_cells(cells: CellData, level: FloatArray, own: NDArray[np.intp]) -> tupl
 
 @dataclass(frozen=True)
 class _Compared:
-    """A local effect on its island, compared with the data there.
+    """A local effect on its island, compared with the data there."""
 
-    Attributes
-    ----------
-    shift_um : `float`
-        Shift of the thickness with which it lies best.
-    gain : `float`
-        Fall of χ² from none, with the thickness that suits each cell.
-    """
-
-    shift_um: float
-    gain: float
+    shift_um: float  # shift of the thickness with which it lies best
+    gain: float  # fall of χ² from none, with the thickness that suits each cell
 
 
 def _on_island(

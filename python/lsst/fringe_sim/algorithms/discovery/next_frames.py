@@ -59,15 +59,7 @@ class FrameForecast:
         self.problem, self.fit, self.coordinates = problem, fit, coordinates
 
     def ranked(self, name: str, rivals: Values) -> tuple[RankedMeasurement, ...]:
-        """Measurements by how well they would tell an effect from others, best first.
-
-        Parameters
-        ----------
-        name : `str`
-            The effect, one of the fit.
-        rivals : mapping
-            Fitted values of the others.
-        """
+        """Measurements by how well they would tell an effect from others, best first."""
         present = self._information(self.problem, name, rivals)
         ranked = []
         for measurement, after in self._candidates(name, rivals, present):

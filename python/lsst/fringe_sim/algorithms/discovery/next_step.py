@@ -35,16 +35,8 @@ def with_next_measurements(
 ) -> tuple[tuple[NamedEffect, ...], tuple[dict[str, Any], ...]]:
     """Effects with the data that would decide between the members of their class, and all that was compared.
 
-    Parameters
-    ----------
-    named : sequence of `NamedEffect`
-        Effects with their classes.
-    rivals : mapping
-        For each effect, the fitted values of the other members of its class.
-    rank : callable
-        See `Ranking`.
-    report : callable
-        Called with a line of text at every stage.
+    ``rivals``: for each effect, the fitted values of the other members of its class. ``report``: called with a
+    line of text at every stage.
     """
     result, table = [], []
     for effect in named:
@@ -78,24 +70,7 @@ def flats_ranked(
 ) -> tuple[RankedMeasurement, ...]:
     """Further flats by how well they tell an effect from others; see `rank_measurements`.
 
-    Parameters
-    ----------
-    effect : `NamedEffect`
-        The effect.
-    rivals : mapping
-        Fitted values of the others.
-    named : sequence of `NamedEffect`
-        All effects that were found.
-    model : `FringeModel`
-        The model before the search.
-    cells : `CellData`
-        The data, for their wavelengths and levels.
-    thickness_um : `tuple` [`float`, `float`]
-        Smallest and largest thickness [µm].
-    catalogue : sequence of `Effect`
-        Where the effects are.
-    few : `bool`, optional
-        Whether the data are a few pixels only: then more of them are a measurement, too.
+    ``few``: whether the data are a few pixels only: then more of them are a measurement, too.
     """
     certain = dict(model.effect_settings)
     for other in named:

@@ -32,24 +32,12 @@ LEAST_OTHERS = 2
 
 @dataclass(frozen=True, eq=False)
 class NoiseEstimate:
-    """How the noise of the cells compares with what was stated.
+    """How the noise of the cells compares with what was stated."""
 
-    Attributes
-    ----------
-    factor : `numpy.ndarray`, shape ``(W,)``
-        Measured over stated standard deviation of the independent noise.
-    response_scatter : `float`
-        Rms of the response of the cells that all wavelengths have in common.
-    measured : `bool`
-        Whether the data allowed a measurement; otherwise the stated noise stands.
-    neighbour_correlation : `float`
-        Correlation of the noise of neighbouring cells; 0 for independent pixels.
-    """
-
-    factor: FloatArray
-    response_scatter: float
-    measured: bool
-    neighbour_correlation: float
+    factor: FloatArray  # (W,): measured over stated standard deviation of the independent noise
+    response_scatter: float  # rms of the response of the cells that all wavelengths have in common
+    measured: bool  # whether the data allowed a measurement; otherwise the stated noise stands
+    neighbour_correlation: float  # correlation of the noise of neighbouring cells; 0 for independent pixels
 
     def with_taken(self, part: FloatArray | float) -> NoiseEstimate:
         """The same of data whose fit has taken up a part of the variance of the noise."""
@@ -59,17 +47,8 @@ class NoiseEstimate:
 def noise_ratio(cells: CellData, left: Iterable[FloatArray], noise: Iterable[FloatArray]) -> FloatArray:
     """What second differences see of noise that a fit has left, over what they see of all of it.
 
-    Parameters
-    ----------
-    cells : `CellData`
-        Which cells have data.
-    left, noise : iterable of `numpy.ndarray`, shape ``(W, ny, nx)``
-        Draws of whitened noise after and before the fit.
-
-    Returns
-    -------
-    ratio : `numpy.ndarray`, shape ``(W,)``
-        Ratio of variances; 1 for wavelengths without data.
+    ``left``, ``noise`` (W, ny, nx): draws of whitened noise after and before the fit. Returns (W,): ratio of
+    variances; 1 for wavelengths without data.
     """
     good = _all_of_nine(cells.weight > 0)
 
@@ -87,12 +66,7 @@ def estimate_noise(cells: CellData, residual: FloatArray) -> NoiseEstimate:
     wavelength is that of the noise; their covariance between wavelengths is the scatter of the response of the
     cells, which no wavelength sees alone.
 
-    Parameters
-    ----------
-    cells : `CellData`
-        Data and stated weights.
-    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Data minus model, relative to the level.
+    ``residual`` (W, ny, nx).
     """
     waves = cells.shape[0]
     assumed = NoiseEstimate(np.ones(waves), cells.response_scatter, False, 0.0)
@@ -169,17 +143,9 @@ def map_variance_share(slope: FloatArray, residual: FloatArray, variance_um2: fl
 
     An error of the map shows along the derivative with respect to thickness, noise in all directions alike.
 
-    Parameters
-    ----------
-    slope, residual : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Whitened derivative with respect to thickness [1/µm], and whitened residual at the map; both 0 without data.
-    variance_um2 : `float`
-        Stated variance [µm²].
-
-    Returns
-    -------
-    share : `float`
-        Most likely part, 0 to 1; 1 where there are too few wavelengths to tell.
+    ``slope``, ``residual`` (W, ny, nx): whitened derivative with respect to thickness [1/µm], and whitened
+    residual at the map; both 0 without data. ``variance_um2``: stated variance [µm²]. Returns the most likely part,
+    0 to 1; 1 where there are too few wavelengths to tell.
     """
     curvature = (slope**2).sum(axis=0)
     others = (slope != 0.0).sum(axis=0) - 1

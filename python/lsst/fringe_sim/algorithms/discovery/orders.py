@@ -57,18 +57,8 @@ def starts_in_other_orders(
     its size with the others held: a second coordinate that is nearly thickness itself would lead a fit from a rough
     size astray.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        Data and model.
-    fit : `Fit`
-        What is known of the effects so far.
-    moved : sequence of `int`
-        Coordinates of one effect that shift the phase.
-    first_field : `numpy.ndarray`, shape ``(M,)``
-        Field that is moved.
-    index : `float`
-        Refractive index of the layer.
+    ``fit``: what is known of the effects so far. ``moved``: coordinates of one effect that shift the phase.
+    ``first_field`` (M,).
     """
     found, least = [], np.inf
     for place, field in _fields(problem, _places(problem, fit, moved, first_field, index), first_field):
@@ -90,14 +80,7 @@ def fields_in_other_orders(problem: Problem, field: FloatArray, index: float) ->
     For an effect with a shift of its own at each wavelength: it follows such a move by itself, as what an order more
     lacks at the ends of the spectrum is a small part of a fringe.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        Data and model.
-    field : `numpy.ndarray`, shape ``(M,)``
-        Field that is moved.
-    index : `float`
-        Refractive index of the layer.
+    ``field`` (M,).
     """
     whole, used = problem.basis.expand(field), problem.cells.seen.astype(float)
     shifts = np.array(NEIGHBOURING_ORDERS, dtype=float) * fringe_order_um(problem.cells.wavelength_nm, index)

@@ -41,16 +41,7 @@ def spoiled_cells(residual: FloatArray, used: BoolArray) -> BoolArray:
     What all exposures have in common (the response of the cells) is taken off. The spread is that of the residual
     itself, in tiles: where the model does not fit, only what is far worse than its misfit stands out.
 
-    Parameters
-    ----------
-    residual : `numpy.ndarray`, shape ``(W, ny, nx)``
-        Data minus a fit.
-    used : `numpy.ndarray` of `bool`, shape ``(W, ny, nx)``
-        Where there are data.
-
-    Returns
-    -------
-    spoiled : `numpy.ndarray` of `bool`, shape ``(W, ny, nx)``
+    ``residual`` (W, ny, nx). ``used`` (W, ny, nx). Returns (W, ny, nx).
     """
     waves = len(residual)
     if waves < 3:

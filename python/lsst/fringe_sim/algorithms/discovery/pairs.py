@@ -20,21 +20,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PairCandidate:
-    """Score test of two effects together against a fit that lacks both.
-
-    Attributes
-    ----------
-    names : `tuple` [`str`, `str`]
-        The effects.
-    starts : `tuple` [`numpy.ndarray`, `numpy.ndarray`]
-        Coordinates of each from which a fit should start.
-    gain : `float`
-        Expected fall of χ² if both are added.
-    """
+    """Score test of two effects together against a fit that lacks both."""
 
     names: tuple[str, str]
-    starts: tuple[FloatArray, FloatArray]
-    gain: float
+    starts: tuple[FloatArray, FloatArray]  # coordinates of each from which a fit should start
+    gain: float  # expected fall of χ² if both are added
 
 
 def likely_pairs(selector: Selector, fit: Fit, names: Sequence[str]) -> list[PairCandidate]:
@@ -43,14 +33,8 @@ def likely_pairs(selector: Selector, fit: Fit, names: Sequence[str]) -> list[Pai
     Neither of two effects that share what one of many parameters explains need be likely by itself. Derivatives at
     the fit are all that is used: what is far from linear, an effect of many parameters does not explain either.
 
-    Parameters
-    ----------
-    selector : `Selector`
-        Data and catalogue.
-    fit : `Fit`
-        Fit without them.
-    names : sequence of `str`
-        Effects of which pairs are made; what has many parameters, or a place that is not known, is left out.
+    ``names``: effects of which pairs are made; what has many parameters, or a place that is not known, is left
+    out.
     """
     state = selector.state(fit)
     columns: dict[str, FloatArray] = {}

@@ -43,14 +43,7 @@ SURFACE_SPACING = 8.0
 def is_torn(thickness_um: FloatArray, seen: NDArray[np.bool_], order_um: float) -> bool:
     """Whether there are cliffs of about a fringe order between many neighbouring cells.
 
-    Parameters
-    ----------
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness [µm].
-    seen : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
-        Cells with data.
-    order_um : `float`
-        Thickness from one fringe to the next [µm].
+    ``thickness_um`` (ny, nx). ``seen`` (ny, nx).
     """
     cliffs = pairs = 0
     for axis in (0, 1):
@@ -67,19 +60,8 @@ def joined_planes(model: FringeModel, cells: CellData, thickness_um: FloatArray)
     Planes of neighbouring blocks differ by whole fringe orders where they go on into one another; they are joined
     over a tree of those that do so best, and moved together to where the fringes of all lie on the data.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        The model with the effects that are known by now.
-    cells : `CellData`
-        The data.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness so far, some orders off in places [µm].
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``, or `None`
-        `None` if there are too few cells for blocks.
+    ``model``: the model with the effects that are known by now. ``thickness_um`` (ny, nx): thickness so far,
+    some orders off in places. Returns (ny, nx): `None` if there are too few cells for blocks.
     """
     rows, columns = cells.shape[1:]
     if min(rows, columns) < 2 * SIDE:
@@ -125,17 +107,10 @@ def _projections(template: FloatArray, cells: CellData) -> tuple[NDArray[np.floa
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Blocks of cells in rows and columns.
+    """Blocks of cells in rows and columns."""
 
-    Attributes
-    ----------
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of blocks.
-    top, left : `numpy.ndarray`
-        Their first rows and columns of cells.
-    """
-
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # rows and columns of blocks
+    # top, left: their first rows and columns of cells
     top: NDArray[np.int64]
     left: NDArray[np.int64]
 

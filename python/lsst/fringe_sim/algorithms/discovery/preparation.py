@@ -112,41 +112,20 @@ SCATTER_CHANGE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Data and model, ready for the search.
+    """Data and model, ready for the search."""
 
-    Attributes
-    ----------
-    problem : `Problem`
-        Data with their measured noise, model and nuisances.
-    null : `Fit`
-        Fit of the unchanged model.
-    noise : `NoiseEstimate`
-        What was measured of the noise.
-    index : `numpy.ndarray`, shape ``(W,)``
-        Refractive index of the varying layer.
-    rich : `bool`
-        Whether there are enough cells to measure noise and levels, and for the tests without a catalogue.
-    stated : `CellData`
-        The data with their stated noise.
-    notes : `tuple` [`str`, ...]
-        For the verdict.
-    undistorted_field : `numpy.ndarray`, optional
-        Field that was fitted with free contrasts.
-    shifts_um : `tuple` [`float`, ...]
-        Moves of the whole field [µm] among which the order of a few pixels is looked for.
-    guess : `dict`
-        Settings with which ``undistorted_field`` was fitted.
-    """
-
-    problem: Problem
-    null: Fit
-    noise: NoiseEstimate
-    index: FloatArray
+    problem: Problem  # data with their measured noise, model and nuisances
+    null: Fit  # fit of the unchanged model
+    noise: NoiseEstimate  # what was measured of the noise
+    index: FloatArray  # (W,): refractive index of the varying layer
+    # Whether there are enough cells to measure noise and levels, and for the tests without a catalogue
     rich: bool
-    stated: CellData
-    notes: tuple[str, ...] = field(default=())
-    undistorted_field: FloatArray | None = None
+    stated: CellData  # the data with their stated noise
+    notes: tuple[str, ...] = field(default=())  # for the verdict
+    undistorted_field: FloatArray | None = None  # field that was fitted with free contrasts
+    # Moves of the whole field among which the order of a few pixels is looked for
     shifts_um: tuple[float, ...] = ()
+    # Settings with which ``undistorted_field`` was fitted
     guess: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -162,13 +141,7 @@ def _places_told(places: int) -> str:
 
 
 def check_setup(cube: FringeCube, model: FringeModel) -> None:
-    """Refuse data that contradict the set-up.
-
-    Raises
-    ------
-    InputError
-        Not a set-up of a laboratory; temperature, bandpass or focal ratio are not those of the flats.
-    """
+    """Refuse data that contradict the set-up."""
     if model.setup.kind != "monochromator":
         raise InputError("set-up", model.setup.name, "a laboratory set-up with a monochromator")
     rows = cube.exposures
@@ -298,18 +271,8 @@ def prepare_finer(
 
     Cells are chosen by what is seen of the pattern. An effect that blurs it hides how fine the light was.
 
-    Parameters
-    ----------
-    cube : `FringeCube`
-        The data.
-    prepared : `Prepared`
-        Their larger cells, without a map of the thickness.
-    fit : `Fit`
-        Fit with the effect.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness of all larger cells in that fit.
-    most_cells : `int`
-        As of `prepare`.
+    ``prepared``: their larger cells, without a map of the thickness. ``thickness_um`` (ny, nx): thickness of
+    all larger cells in that fit.
     """
     larger, old = prepared.problem.cells, prepared.problem.forward
     cells = _cells_of(cube, larger.cell_px // 2, most_cells)
@@ -362,21 +325,8 @@ def _part_told(cells: CellData) -> list[str]:
 def prepare_again(prepared: Prepared, fit: Fit, thickness_um: FloatArray) -> tuple[Prepared | None, int]:
     """Field and noise as judged with an effect in the model.
 
-    Parameters
-    ----------
-    prepared : `Prepared`
-        What they were judged to be without.
-    fit : `Fit`
-        Fit with the effect.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness of all cells in that fit.
-
-    Returns
-    -------
-    prepared : `Prepared` or `None`
-        `None` if the judgement is about the same.
-    mended : `int`
-        Cells that are in another fringe order now.
+    ``thickness_um`` (ny, nx). Returns `None` if the judgement is about the same, and the cells that are in
+    another fringe order now.
     """
     problem = prepared.problem
     if not prepared.rich:

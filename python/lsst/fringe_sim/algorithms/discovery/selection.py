@@ -84,47 +84,24 @@ HOPELESS = 25.0
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Score test of one effect against a fit that lacks it.
-
-    Attributes
-    ----------
-    name : `str`
-        The effect.
-    gain : `float`
-        Expected fall of χ² if it is added, from its derivative.
-    degrees : `int`
-        Its free parameters that the data see.
-    start : `numpy.ndarray`
-        Coordinates from which a fit should start.
-    promise : `float`
-        Expected fall of χ² from its finite signatures, if that is more: effects whose onset is absorbed by the
-        thickness show only at a finite size.
-    """
+    """Score test of one effect against a fit that lacks it."""
 
     name: str
-    gain: float
-    degrees: int
-    start: FloatArray
+    gain: float  # expected fall of χ² if it is added, from its derivative
+    degrees: int  # its free parameters that the data see
+    start: FloatArray  # coordinates from which a fit should start
+    # Expected fall of χ² from its finite signatures, if that is more: effects whose onset is absorbed by
+    # the thickness show only at a finite size
     promise: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A set of effects, fitted.
+    """A set of effects, fitted."""
 
-    Attributes
-    ----------
-    names : `tuple` [`str`, ...]
-        The effects; empty for the unchanged model.
-    fit : `Fit`
-        The fit.
-    log_evidence : `float`
-        Laplace approximation, relative to the unchanged model fitted to the same data.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # the effects; empty for the unchanged model
     fit: Fit
-    log_evidence: float
+    log_evidence: float  # Laplace approximation, relative to the unchanged model fitted to the same data
     channels: tuple[Channel, ...] = field(default=())
 
     @property
@@ -454,13 +431,7 @@ class Selector:
         return ThicknessFollower(self.problem, thickness_um, float(self.index.mean()))
 
     def features(self, state: State, fit: Fit, name: str) -> FloatArray:
-        """Whitened signature of an effect: derivatives with respect to its coordinates at a fit.
-
-        Raises
-        ------
-        InputError
-            The effect cannot be combined with those of the fit.
-        """
+        """Whitened signature of an effect: derivatives with respect to its coordinates at a fit."""
         return np.stack([self._slope(state, fit, item) for item in self.coordinates[name]])
 
     def _slope(self, state: State, fit: Fit, item: Coordinate) -> FloatArray:
@@ -476,14 +447,8 @@ class Selector:
     ) -> Hypothesis:
         """Fit a set of effects; remembered.
 
-        Parameters
-        ----------
-        names : sequence of `str`
-            Effects.
-        start : `numpy.ndarray`, optional
-            First guess of the coordinates of the last effect.
-        base : `Fit`, optional
-            Fit of the others, from which the search starts.
+        ``start``: first guess of the coordinates of the last effect. ``base``: fit of the others, from which
+        the search starts.
         """
         key = frozenset(names)
         if key in self.fitted:
@@ -553,15 +518,9 @@ class Selector:
     def improved(self, names: Sequence[str], base: Fit, *, scan: bool = False) -> Hypothesis:
         """Fit a set again from what a fit of more effects found, or from a scan; the better fit is remembered.
 
-        Parameters
-        ----------
-        names : sequence of `str`
-            Effects, all of them in ``base`` or fitted before.
-        base : `Fit`
-            Where to start.
-        scan : `bool`, optional
-            Try sizes from the smallest to the largest of the last effect as well, and of all that shift the phase: a
-            strong effect may have several minima, and one of a pair takes that which suits it alone.
+        ``names``: effects, all of them in ``base`` or fitted before. ``scan``: try sizes from the smallest to
+        the largest of the last effect as well, and of all that shift the phase: a strong effect may have
+        several minima, and one of a pair takes that which suits it alone.
         """
         known = self.hypothesis(names, None, base)
         coordinates = known.fit.coordinates

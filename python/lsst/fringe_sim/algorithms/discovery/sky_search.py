@@ -90,25 +90,14 @@ class SkyExposures:
     Few angles and few wavelengths tell well enough what an effect changes; the unchanged model is summed in full
     once, and what the short sums lack of it is added to all. Lines keep the places at which the unchanged sky is
     merged, so that what the sensor makes of every place and angle is worked out once for all skies.
-
-    Attributes
-    ----------
-    base : `FringeModel`
-        The model before the search.
-    sky : `SkySpectrum`
-        Lines and continua before any effect.
-    band : `Bandpass`
-        Optics and air.
-    scales : `tuple` of mapping
-        Factors on components of the sky, by name, for each frame.
-    field : `BeamsOverSensor`, optional
-        How the beam changes over the sensor, in flat-fielded frames; by default it is that of the model everywhere.
     """
 
-    base: FringeModel
-    sky: SkySpectrum
-    band: Bandpass
-    scales: tuple[Mapping[str, float], ...]
+    base: FringeModel  # the model before the search
+    sky: SkySpectrum  # lines and continua before any effect
+    band: Bandpass  # optics and air
+    scales: tuple[Mapping[str, float], ...]  # factors on components of the sky, by name, for each frame
+    # How the beam changes over the sensor, in flat-fielded frames; by default it is that of the model
+    # everywhere
     field: BeamsOverSensor | None = None
     _places: dict[str, FloatArray] = dataclass_field(init=False, repr=False)
     _reduced: dict[tuple[Any, ...], dict[str, _Reduced]] = dataclass_field(default_factory=dict, repr=False)
@@ -266,27 +255,13 @@ class SkyExposures:
 
 @dataclass(frozen=True, eq=False)
 class BeamsOverSensor:
-    """Beams of a telescope at some field radii of one sensor, and which of them a pixel sees.
+    """Beams of a telescope at some field radii of one sensor, and which of them a pixel sees."""
 
-    Attributes
-    ----------
-    placement : `SensorPlacement`
-        Where the pixels lie.
-    radius_deg : `numpy.ndarray`, shape ``(K,)``
-        Field radii [deg].
-    beams : `tuple` of `Beam`
-        The beams there.
-    few_radius_deg : `numpy.ndarray`
-        Radii enough for what an effect changes [deg].
-    few_beams : `tuple` of `Beam`
-        The beams there.
-    """
-
-    placement: SensorPlacement
-    radius_deg: FloatArray
-    beams: tuple[Beam, ...]
-    few_radius_deg: FloatArray
-    few_beams: tuple[Beam, ...]
+    placement: SensorPlacement  # where the pixels lie
+    radius_deg: FloatArray  # (K,): field radii
+    beams: tuple[Beam, ...]  # the beams there
+    few_radius_deg: FloatArray  # radii enough for what an effect changes
+    few_beams: tuple[Beam, ...]  # the beams there
 
     @classmethod
     def of(cls, telescope: str, placement: SensorPlacement) -> BeamsOverSensor | None:

@@ -39,15 +39,6 @@ def spot_channel(state: State, correlation: float = 0.0) -> Channel:
     What is in one place is diluted among the patterns of the whole sensor. The chance that noise has a maximum as
     high is the mean Euler characteristic of a smooth Gaussian field [1]_, added up over the sizes.
 
-    Parameters
-    ----------
-    state : `State`
-        Fit to be criticised.
-    correlation : `float`, optional
-        Correlation of the noise of neighbouring cells.
-
-    References
-    ----------
     .. [1] Worsley et al. 1996, Human Brain Mapping 4, 58
     """
     scores = _Scores.of(state, correlation)
@@ -64,18 +55,6 @@ def log_evidence_of_spots(state: State, correlation: float = 0.0) -> float:
 
     They are added one by one where they bring most, fitted together, and place, size and depth of each integrated by
     the Laplace approximation: equal chances for every place, for the logarithm of the size and for that of the depth.
-
-    Parameters
-    ----------
-    state : `State`
-        Fit without the spots.
-    correlation : `float`, optional
-        Correlation of the noise of neighbouring cells.
-
-    Returns
-    -------
-    log_evidence : `float`
-        Not below 0.
     """
     scores = _Scores.of(state, correlation)
     spots: FloatArray = np.zeros((0, 4))

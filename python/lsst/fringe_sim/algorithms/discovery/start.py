@@ -78,16 +78,7 @@ def starting_thickness(model: FringeModel, cells: CellData) -> FloatArray:
     Flats are relative to their mean. On a sensor of few fringes that is not the mean of a fringe: levels are guessed
     for every mean thickness there, and those with which the fringes lie best on the data are kept.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        The model as it is known.
-    cells : `CellData`
-        The data.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+    Returns (ny, nx).
     """
     low, template = search_template(model, cells)
     order = order_steps(model, cells)
@@ -204,18 +195,8 @@ def _at(template: FloatArray, steps: NDArray[np.int64]) -> FloatArray:
 def mended_thickness(model: FringeModel, cells: CellData, thickness_um: FloatArray) -> FloatArray:
     """Thickness with patches in a wrong fringe order taken back, as a better model than the first one shows them.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        The model with the effects that are known by now.
-    cells : `CellData`
-        The data.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness so far; returned where no order changes.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
+    ``model``: the model with the effects that are known by now. ``thickness_um`` (ny, nx): thickness so far;
+    returned where no order changes. Returns (ny, nx).
     """
     low, template = search_template(model, cells)
     order, count = order_steps(model, cells), template.shape[1]

@@ -30,17 +30,7 @@ def best_thickness_step(state: State) -> tuple[Disc, float]:
     What is left of a step is seen about the rim, which must be right to a cell: every place is tried. What a smooth
     thickness takes up changes slowly from place to place.
 
-    Parameters
-    ----------
-    state : `State`
-        Fit with a smooth field.
-
-    Returns
-    -------
-    disc : `tuple` [`float`, `float`, `float`, `float`]
-        Fall of χ², row, column and radius [cells].
-    step_um : `float`
-        By how much the layer is thicker there [µm].
+    Returns the fall of χ², row, column and radius [cells], and by how much the layer is thicker there.
     """
     design = state.design
     score, curvature = (design.slope * state.residual).sum(axis=0), (design.slope**2).sum(axis=0)

@@ -27,22 +27,9 @@ def trend_channel(name: str, wavelength_nm: FloatArray, error: FloatArray, covar
     What moves fringes smoothly with wavelength is in all exposures alike. It is no accident of each, though free
     errors of all exposures explain it. An error that all have in common is left to the draws.
 
-    Parameters
-    ----------
-    name : `str`
-        Name of the channel.
-    wavelength_nm : `numpy.ndarray`, shape ``(N,)``
-        Where the errors are; `FEWEST_DRAWS` at least.
-    error : `numpy.ndarray`, shape ``(N,)``
-        Fitted errors.
-    covariance : `numpy.ndarray`, shape ``(N, N)``
-        How well they are known, all else free.
-
-    Returns
-    -------
-    channel : `Channel`
-        F test in units in which errors scatter alike; the width of the distribution is the likeliest beside the
-        polynomial (REML).
+    ``wavelength_nm`` (N,): where the errors are; `FEWEST_DRAWS` at least. ``error`` (N,). ``covariance`` (N,
+    N): how well they are known, all else free. Returns the F test in units in which errors scatter alike; the width
+    of the distribution is the likeliest beside the polynomial (REML).
     """
     place = wavelength_nm - wavelength_nm.mean()
     shapes = np.vander(place / max(float(np.abs(place).max()), 1e-300), ORDER + 1, increasing=True)

@@ -42,18 +42,13 @@ FEWEST_WAVELENGTHS = 8
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Unchanged model against effects, on data that took no part in fitting them.
+    """Unchanged model against effects, on data that took no part in fitting them."""
 
-    Attributes
-    ----------
-    blocks, wavelengths : `float`
-        Fall of χ² on parts of the sensor, and on wavelengths; 0 where there are too few.
-    before_rms, after_rms : `float`
-        Rms of data minus model without and with the effects.
-    """
-
+    # blocks, wavelengths: fall of χ² on parts of the sensor, and on wavelengths; 0 where there are too
+    # few
     blocks: float
     wavelengths: float
+    # before_rms, after_rms: rms of data minus model without and with the effects
     before_rms: float
     after_rms: float
 
@@ -66,18 +61,7 @@ class HeldOut:
 def held_out_blocks(shape: tuple[int, int], fraction: float, rng: np.random.Generator) -> BoolArray:
     """Blocks of cells that no selection sees, scattered over the sensor; none where there are few cells.
 
-    Parameters
-    ----------
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of cells.
-    fraction : `float`
-        Part of the sensor that is held out.
-    rng : `numpy.random.Generator`
-        Decides which.
-
-    Returns
-    -------
-    held_out : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
+    ``fraction``: part of the sensor that is held out. Returns (ny, nx).
     """
     if min(shape) < FEWEST_ROWS:
         return np.zeros(shape, dtype=bool)
@@ -154,20 +138,8 @@ def _moved_everywhere(
 def validate(problem: Problem, null: Fit, final: Fit, held_out: BoolArray, *, rich: bool) -> HeldOut:
     """Fit the effects without a part of the data, and compare what is predicted for that part.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        All data.
-    null, final : `Fit`
-        Fits of the unchanged model and of the effects to all data.
-    held_out : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
-        Cells that are left out.
-    rich : `bool`
-        Whether there are enough cells for levels to be free; if not, wavelengths are left out one by one.
-
-    Returns
-    -------
-    result : `HeldOut`
+    ``null``, ``final``: fits of the unchanged model and of the effects to all data. ``held_out`` (ny, nx).
+    ``rich``: whether there are enough cells for levels to be free; if not, wavelengths are left out one by one.
     """
     if not rich:
         return _without_single_wavelengths(problem, null, final)
