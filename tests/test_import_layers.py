@@ -13,6 +13,7 @@ PACKAGE = Path(lsst.fringe_sim.__file__).parent
 ROOT = "lsst.fringe_sim"
 ORDER = (
     "errors",
+    "lazy",
     "files",
     "compiled",
     "resources",

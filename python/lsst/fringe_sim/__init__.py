@@ -6,8 +6,7 @@ effects that a model still lacks. The heavy parts are imported on first use.
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from .lazy import on_first_use
 
 __version__ = "0.2.0"
 
@@ -19,9 +18,4 @@ _LAZY = {
 }
 
 __all__ = ["__version__", *sorted(_LAZY)]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name], __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = on_first_use(__name__, _LAZY)

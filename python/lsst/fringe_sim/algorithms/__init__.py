@@ -5,8 +5,7 @@ The public functions are imported on first use, because some of them bring heavy
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from ..lazy import on_first_use
 
 _LAZY = {
     "coadd_correlation": ".image_correlation",
@@ -23,9 +22,4 @@ _LAZY = {
 }
 
 __all__ = sorted(_LAZY)  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name], __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = on_first_use(__name__, _LAZY)

@@ -12,7 +12,7 @@ with six numbers per wavelength, angle and polarisation, however many layers the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -166,14 +166,7 @@ class PhaseResponse:
         -------
         response : `numpy.ndarray`, shape ``(W, *thickness.shape)`` (or ``thickness.shape``)
         """
-        thickness = _checked_thickness(thickness_um)
-        arrays, weights, squeeze = self._grouped(weight)
-        flat = np.ascontiguousarray(thickness).ravel()
-        if self.spread_um > 0.0:
-            out = series_at((*arrays, weights), self.spread_um, flat, 0)
-        else:
-            out = _at_thicknesses(_average_kernel, arrays, weights, flat)
-        return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
+        return self._averaged(weight, thickness_um, 0)
 
     def averaged_on_grid(
         self, weight: ArrayLike, start_um: float, step_um: float, count: int, *, tolerance: float = ROUNDING
@@ -211,13 +204,16 @@ class PhaseResponse:
 
     def averaged_derivative(self, weight: ArrayLike, thickness_um: ArrayLike) -> FloatArray:
         """Thickness derivative of `averaged` [1/µm]; same shape."""
+        return self._averaged(weight, thickness_um, 1)
+
+    def _averaged(self, weight: ArrayLike, thickness_um: ArrayLike, order: int) -> FloatArray:
         thickness = _checked_thickness(thickness_um)
         arrays, weights, squeeze = self._grouped(weight)
         flat = np.ascontiguousarray(thickness).ravel()
         if self.spread_um > 0.0:
-            out = series_at((*arrays, weights), self.spread_um, flat, 1)
+            out = series_at((*arrays, weights), self.spread_um, flat, order)
         else:
-            out = _at_thicknesses(_derivative_kernel, arrays, weights, flat)
+            out = _at_thicknesses(arrays, weights, flat, order)
         return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
 
     def derivative_bound(self, weight: ArrayLike, order: int, from_um: float = 0.0) -> FloatArray:
@@ -375,13 +371,13 @@ def _checked_thickness(thickness_um: ArrayLike) -> FloatArray:
 
 
 def _at_thicknesses(
-    function: Callable[..., None], arrays: tuple[np.ndarray, ...], weights: FloatArray, thickness: FloatArray
+    arrays: tuple[np.ndarray, ...], weights: FloatArray, thickness: FloatArray, order: int
 ) -> FloatArray:
-    """One of the kernels at all thicknesses, in threads; ``(W, N)``."""
+    """The closed form or its derivative at all thicknesses, in threads; ``(W, N)``."""
     out = np.empty((len(weights), thickness.size))
 
     def work(first: int, last: int) -> None:
-        function(*arrays, weights, thickness, first, last, out)
+        _point_kernel(*arrays, weights, thickness, np.int64(order), first, last, out)
 
     run_shares(work, thickness.size, _LEAST_WORK // weights.size)
     return out
@@ -402,7 +398,7 @@ def _on_grid(
 
 
 @kernel
-def _average_kernel(
+def _point_kernel(
     a: NDArray,
     b: NDArray,
     e: NDArray,
@@ -411,36 +407,7 @@ def _average_kernel(
     kappa: NDArray,
     w: NDArray,
     d: NDArray,
-    first: int,
-    last: int,
-    out: NDArray,
-) -> None:  # pragma: no cover - compiled
-    groups, nodes = w.shape
-    for m in range(groups):
-        for i in range(first, last):
-            total = 0.0
-            for q in range(nodes):
-                size = math.exp(-kappa[m, q].imag * d[i])
-                angle = kappa[m, q].real * d[i]
-                x, y = size * math.cos(angle), size * math.sin(angle)
-                top = a[m, q] + (b[m, q] * size + e[m, q]) * size
-                top += 2.0 * (c[m, q].real * x - c[m, q].imag * y)
-                u = 1.0 + g[m, q].real * x - g[m, q].imag * y
-                v = g[m, q].real * y + g[m, q].imag * x
-                total += w[m, q] * top / (u * u + v * v)
-            out[m, i] = total
-
-
-@kernel
-def _derivative_kernel(
-    a: NDArray,
-    b: NDArray,
-    e: NDArray,
-    c: NDArray,
-    g: NDArray,
-    kappa: NDArray,
-    w: NDArray,
-    d: NDArray,
+    order: int,
     first: int,
     last: int,
     out: NDArray,
@@ -453,12 +420,16 @@ def _derivative_kernel(
                 size = math.exp(-kappa[m, q].imag * d[i])
                 angle = kappa[m, q].real * d[i]
                 z = complex(size * math.cos(angle), size * math.sin(angle))
-                dz = 1j * kappa[m, q] * z
-                dsize = -kappa[m, q].imag * size
                 top = a[m, q] + (b[m, q] * size + e[m, q]) * size + 2.0 * (c[m, q] * z).real
-                dtop = (2.0 * b[m, q] * size + e[m, q]) * dsize + 2.0 * (c[m, q] * dz).real
+                if order == 0:
+                    u = 1.0 + g[m, q].real * z.real - g[m, q].imag * z.imag
+                    v = g[m, q].real * z.imag + g[m, q].imag * z.real
+                    total += w[m, q] * top / (u * u + v * v)
+                    continue
                 field = 1.0 + g[m, q] * z
                 bottom = field.real * field.real + field.imag * field.imag
+                dz, dsize = 1j * kappa[m, q] * z, -kappa[m, q].imag * size
+                dtop = (2.0 * b[m, q] * size + e[m, q]) * dsize + 2.0 * (c[m, q] * dz).real
                 dbottom = 2.0 * (field.conjugate() * g[m, q] * dz).real
                 total += w[m, q] * (dtop * bottom - top * dbottom) / (bottom * bottom)
             out[m, i] = total

@@ -5,9 +5,7 @@ Each is imported on first use. Importing this package makes the storage classes 
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
-
+from ..lazy import on_first_use
 from ..middleware import register_storage_classes
 
 register_storage_classes()
@@ -38,9 +36,4 @@ _LAZY = {
 }
 
 __all__ = sorted(_LAZY)  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name], __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = on_first_use(__name__, _LAZY)

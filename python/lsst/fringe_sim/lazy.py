@@ -1,0 +1,20 @@
+"""Names of a package that are imported on first use: some bring a compiler or a Butler along."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+__all__ = ["on_first_use"]
+
+
+def on_first_use(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+    """``__getattr__`` of a package whose names are in the modules ``homes``, relative to it."""
+
+    def getattribute(name: str) -> Any:
+        if name in homes:
+            return getattr(importlib.import_module(homes[name], package), name)
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    return getattribute
