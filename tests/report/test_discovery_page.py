@@ -13,11 +13,12 @@ from astropy.table import Table
 
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Step, Where
+from lsst.fringe_sim.algorithms.flat_residual import residual_pair
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FlatExposures
 from lsst.fringe_sim.report.discovery_figures import candidates_figure, gap_figure, where_figure
-from lsst.fringe_sim.report.discovery_page import discovery_page, residual_pair
+from lsst.fringe_sim.report.discovery_page import discovery_page
 
 WAVELENGTHS = [880.0 + 10.0 * k for k in range(12)]
 

@@ -7,9 +7,10 @@ import pytest
 from browser import check_page
 
 from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
+from lsst.fringe_sim.algorithms.image_correlation import coadds_of_frames
 from lsst.fringe_sim.products import SkyFringe
 from lsst.fringe_sim.report.figures import residuals_figure
-from lsst.fringe_sim.report.sky_page import coadds_of_frames, sky_amplitudes, write_sky_report
+from lsst.fringe_sim.report.sky_page import sky_amplitudes, write_sky_report
 from lsst.fringe_sim.report.style import block_mean
 
 

@@ -17,6 +17,7 @@ from astropy.table import Column, Table, vstack
 from numpy.typing import ArrayLike, NDArray
 
 from ..effects import EFFECTS, activate_effects
+from ..effects.active import settings_of
 from ..errors import InputError
 from ..instrument.bandpass import Bandpass
 from ..instrument.camera import Camera
@@ -24,6 +25,7 @@ from ..instrument.sky import EmissionLines, SkySpectrum
 from ..instrument.telescope import reduce_beam
 from ..model import FringeModel, ResponseTable
 from ..optics import Illumination
+from ..products.thickness_map import thickness_span_um
 from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
 from .sky_frame import SkyQuadrature, tabulate_components, white_light
 from .thickness_stand_in import stand_in_thickness
@@ -48,8 +50,6 @@ _FLAT_ANGLES = 32
 
 _QUADRATURE = SkyQuadrature(table_tolerance=3e-6)
 """Amplitudes are given to 1e-6 of the sky."""
-
-_MARGIN_UM = 1e-3
 
 
 @dataclass(frozen=True)
@@ -238,12 +238,8 @@ _MEASURED_MONOCAM = 2.0
 def _model(case: AmplitudeCase, settings: Mapping[str, Any]) -> FringeModel:
     """Model with those effects that the stack and the light of a case can have."""
     bare = FringeModel.from_setup(case.setup, field_x_deg=case.field_deg)
-    kept = {
-        key: value
-        for key, value in settings.items()
-        if _applies(bare, {key: value}) and not (case.on_sky and _of_laboratory(key))
-    }
-    return bare.with_effects(kept)
+    given = settings_of(activate_effects(settings, EFFECTS), on_sky=case.on_sky)
+    return bare.with_effects({key: value for key, value in given.items() if _applies(bare, {key: value})})
 
 
 def _applies(model: FringeModel, setting: Mapping[str, Any]) -> bool:
@@ -252,11 +248,6 @@ def _applies(model: FringeModel, setting: Mapping[str, Any]) -> bool:
     except InputError:
         return False
     return True
-
-
-def _of_laboratory(key: str) -> bool:
-    name = key.partition(".")[0]
-    return any(effect.name == name and effect.laboratory_only for effect in EFFECTS)
 
 
 @functools.lru_cache(maxsize=4)
@@ -271,7 +262,7 @@ def _amplitudes(
     case: AmplitudeCase, model: FringeModel, thickness: FloatArray, sky: SkyCase | None
 ) -> tuple[FringeAmplitudes, FringeAmplitudes]:
     """Amplitudes of the frame, and of the frame over a flat field of white light."""
-    span = float(thickness.min()) - _MARGIN_UM, float(thickness.max()) + _MARGIN_UM
+    span = thickness_span_um(thickness)
     if sky is None:
         found = fringe_amplitudes(model.table(span, [case.wavelength_nm]).lookup(thickness)[0])
         return found, found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,17 @@ from ..model import FringeModel
 from ..products import FringeCube, ThicknessMap
 from .thickness_fit import Nuisances, fit_thickness
 
-__all__ = ["FlatResidual", "fit_and_compare", "flat_residual", "relative_flats"]
+if TYPE_CHECKING:  # the search is not needed to compare
+    from .discovery import Verdict
+
+__all__ = [
+    "FlatResidual",
+    "ResidualPair",
+    "fit_and_compare",
+    "flat_residual",
+    "relative_flats",
+    "residual_pair",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -41,6 +52,25 @@ class FlatResidual:
         """Root mean square of each plane, shape ``(W,)``; NaN for a plane without a good pixel."""
         squares = [np.square(plane[np.isfinite(plane)], dtype=float) for plane in self.residual]
         return np.array([np.sqrt(values.mean()) if values.size else np.nan for values in squares])
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualPair:
+    """Flats minus model, with the unchanged model and with what was found.
+
+    Attributes
+    ----------
+    before : `FlatResidual`
+        Of the model without the effects found.
+    after : `FlatResidual` or `None`
+        Of the model with them; none where nothing was named.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    """
+
+    before: FlatResidual
+    after: FlatResidual | None
+    order_um: float
 
 
 def relative_flats(cube: FringeCube) -> FloatArray:
@@ -140,6 +170,35 @@ def fit_and_compare(cube: FringeCube, model: FringeModel) -> FlatResidual:
     fitted = fit_thickness(cube, model, nuisances=Nuisances())  # what is missing is to be seen, not learned
     residual = flat_residual(cube, model, fitted.value)
     return FlatResidual(np.asarray(cube.wavelength_nm, dtype=float), residual, fitted)
+
+
+def residual_pair(cube: FringeCube, model: FringeModel, verdict: Verdict) -> ResidualPair | None:
+    """Images of data minus model for the page.
+
+    Parameters
+    ----------
+    cube : `FringeCube`
+        The flats that were searched.
+    model : `FringeModel`
+        The model before the search.
+    verdict : `Verdict`
+        What was found.
+
+    Returns
+    -------
+    residuals : `ResidualPair` or `None`
+        None where the thickness cannot be fitted pixel by pixel, as with a single wavelength.
+    """
+    if "cell_px" not in verdict.data:
+        return None  # too poor to be averaged and fitted
+    try:
+        before = fit_and_compare(cube, model)
+        after = None
+        if verdict.effects:
+            after = fit_and_compare(cube, model.with_effects({**model.effect_settings, **verdict.settings}))
+    except InputError:
+        return None
+    return ResidualPair(before, after, float(model.fringe_order_um(float(np.median(cube.wavelength_nm)))))
 
 
 def _plane_mean(image: FloatArray) -> FloatArray:

@@ -22,6 +22,7 @@ from ..instrument.camera import Camera
 from ..instrument.night import AirglowField
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel, Setup
+from ..products.thickness_map import thickness_span_um
 from .island_response import response_with_islands
 from .sky_frame import sky_response
 from .thickness_stand_in import ThicknessField
@@ -174,8 +175,7 @@ class CCDFringing:
 
     @functools.cached_property
     def _pattern(self) -> FloatArray:
-        low, high = float(self.thickness_um.min()), float(self.thickness_um.max())
-        dark, span = SkySpectrum.dark(airmass=self.airmass), (low - 1e-6, high + 1e-6)
+        dark, span = SkySpectrum.dark(airmass=self.airmass), thickness_span_um(self.thickness_um, 1e-6)
         response = response_with_islands(
             self._model, lambda own: sky_response(own, dark, thickness_range_um=span)
         )

@@ -24,6 +24,7 @@ from ..model import FringeModel, ResponseTable, tabulate
 from ..optics import Beam, Illumination
 from ..optics.phase_response import PhaseResponse
 from ..products import NOISE, SkyFringe, mask_bits
+from ..products.thickness_map import thickness_span_um
 from .fringe_amplitudes import fringe_amplitudes
 from .image_noise import add_exposure_noise
 from .island_response import response_with_islands
@@ -360,7 +361,7 @@ def simulate_sky_frame(
         raise OutOfRangeError("exposure time [s]", exposure, "positive")
     if response is None:
         dark = SkySpectrum.dark(airmass=model.setup.airmass) if sky is None else sky
-        span = _range_of(thickness[known])
+        span = thickness_span_um(thickness[known])
         response = response_with_islands(model, lambda own: sky_response(own, dark, thickness_range_um=span))
 
     level = response.sky(scale)
@@ -668,9 +669,3 @@ def bandpass_of(model: FringeModel) -> Bandpass:
     if not model.setup.bandpass:
         raise InputError("set-up", model.setup.name, "one of the sky, or a bandpass")
     return Bandpass.from_name(model.setup.bandpass)
-
-
-def _range_of(thickness: NDArray[np.floating]) -> tuple[float, float]:
-    """Range of a map, widened so that rounding cannot leave it; never empty."""
-    low, high = float(thickness.min()), float(thickness.max())
-    return max(low - 1e-3, 0.0), high + 1e-3

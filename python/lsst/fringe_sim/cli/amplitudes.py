@@ -9,7 +9,7 @@ import click
 from ..algorithms.amplitude_table import CASES, SkyCase, compare_amplitudes
 from ..errors import printable_name
 from ..files import table_text, write_whole
-from ..mock.thickness import e2v_321
+from ..instrument.measured_thickness import e2v_321
 from ..resources import read_user_table
 from .inputs import read_settings, read_thickness
 from .output import OutputFolder, output_folder

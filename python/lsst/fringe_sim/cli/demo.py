@@ -170,10 +170,10 @@ def _laboratory(run: DemoRun, shape: tuple[int, int], size: str, seed: int) -> N
     import numpy as np
 
     from ..instrument.camera import Camera
+    from ..instrument.measured_thickness import e2v_321
     from ..instrument.setup import Setup
     from ..middleware.instruments import Ts8Fringe
     from ..mock.raw_frames import write_mock_flats
-    from ..mock.thickness import e2v_321
 
     raws = run.folder / "raws"
     repo = str(run.repo)

@@ -13,6 +13,7 @@ from lsst.daf.butler import Butler
 
 from ..algorithms.discovery import Verdict
 from ..algorithms.flat_residual import relative_flats
+from ..algorithms.image_correlation import coadds_of_frames
 from ..algorithms.single_pixel import fit_single_pixel, published_pixel
 from ..model import FringeModel
 from ..products import FringeComponents, FringeCube, FringeFrame, SkyFringe, ThicknessMap
@@ -30,7 +31,7 @@ from ..report.figures import (
     thickness_figure,
 )
 from ..report.page import Report
-from ..report.sky_page import coadds_of_frames, sky_amplitudes
+from ..report.sky_page import sky_amplitudes
 from ..report.style import save_figure
 from ..report.thickness_page import phase_folded, residual_of_fit, residual_table
 

@@ -15,10 +15,10 @@ from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..algorithms.discovery import Verdict
+    from ..algorithms.flat_residual import ResidualPair
     from ..instrument.setup import Setup
     from ..model import FringeModel
     from ..products import FringeCube
-    from ..report.discovery_page import ResidualPair
     from .sky_frames import SkyData
 
 __all__ = ["discover"]
@@ -77,8 +77,8 @@ def discover(
 
     from ..algorithms.discovery import SearchOptions
     from ..algorithms.discovery import discover as search
+    from ..algorithms.flat_residual import residual_pair
     from ..model import FringeModel
-    from ..report.discovery_page import residual_pair
     from .inputs import read_settings, sky_settings
     from .sky_frames import read_sky_frames
 

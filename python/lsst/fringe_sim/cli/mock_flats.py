@@ -139,7 +139,8 @@ def thickness_map(
     text: str, setup: Setup, shape: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Thickness map of a sensor from the argument of ``--thickness``."""
-    from ..mock.thickness import e2v_321, fit_to_sensor, random_field
+    from ..instrument.measured_thickness import e2v_321, fit_to_sensor
+    from ..mock.thickness import random_field
     from .inputs import read_thickness
 
     if text == "random":

@@ -55,7 +55,7 @@ def reproduce_paper(
       fringe-sim reproduce-paper --out paper
       fringe-sim reproduce-paper --out paper --published ../shared
     """
-    from ..mock.thickness import E2V_SHAPE, e2v_321
+    from ..instrument.measured_thickness import E2V_SHAPE, e2v_321
     from ..paper import SECTIONS, reproduce
     from ..paper.section import Context
     from ..report.paper_page import write_paper_page

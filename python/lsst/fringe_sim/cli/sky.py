@@ -85,6 +85,7 @@ def sky(
     from ..instrument.sky import SkySpectrum
     from ..model import FringeModel
     from ..model.provenance import input_cards
+    from ..products.thickness_map import thickness_span_um
     from ..report.figures import sky_figure
     from ..report.sky_page import write_sky_report
     from ..report.style import save_figure
@@ -126,7 +127,7 @@ def sky(
     dark = SkySpectrum.dark(airmass=airmass or setup.airmass)
     click.echo("tabulating the response to the sky", err=True)
     place = SensorPlacement.of(sensor, setup.pixel_scale_arcsec, section)
-    response = sensor_response(model, dark, place, _span_um(layer))
+    response = sensor_response(model, dark, place, thickness_span_um(layer, MARGIN_UM))
     # Bands of each frame, relative to the dark sky.
     scales = [dict.fromkeys(response.bands, 1.0)]
     if night:
@@ -196,7 +197,7 @@ def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:
 
 def _layer(thickness: str, sensor: Detector, name: str) -> tuple[FloatArray, SensorSection | None]:
     """Thickness of the varying layer [µm], and the part of the sensor that it is of."""
-    from ..mock.thickness import e2v_321
+    from ..instrument.measured_thickness import e2v_321
     from ..products import SensorSection
     from .inputs import read_section, read_thickness
 
@@ -205,13 +206,6 @@ def _layer(thickness: str, sensor: Detector, name: str) -> tuple[FloatArray, Sen
         return layer, SensorSection.of_image(sensor, (layer.shape[0], layer.shape[1]), {})
     layer = read_thickness(thickness, name)
     return layer, read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
-
-
-def _span_um(layer: FloatArray) -> tuple[float, float]:
-    """Thicknesses that the layer has [µm], widened so that rounding cannot leave them."""
-    import numpy as np
-
-    return float(np.nanmin(layer)) - MARGIN_UM, float(np.nanmax(layer)) + MARGIN_UM
 
 
 def _written(

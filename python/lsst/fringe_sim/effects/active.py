@@ -20,6 +20,7 @@ __all__ = [
     "apply_to_sky",
     "apply_to_system",
     "check_settings",
+    "settings_of",
 ]
 
 AnyEffect = TypeVar("AnyEffect", bound=Described)
@@ -84,6 +85,20 @@ def activate_effects(settings: Mapping[str, Any], effects: Sequence[Effect]) -> 
         A value that is not a number, or a setting without a parameter.
     """
     return tuple(ActiveEffect(effect, values) for effect, values in check_settings(settings, effects))
+
+
+def settings_of(active: Iterable[ActiveEffect], *, on_sky: bool = False) -> dict[str, float]:
+    """Values by ``name.parameter``; on the sky without the effects of the laboratory.
+
+    A sensor takes its layers and its electronics to the telescope, but not the temperature of the cryostat nor the
+    lamp and the reflections of the bench.
+    """
+    return {
+        f"{item.effect.name}.{parameter}": value
+        for item in active
+        if not (on_sky and item.effect.laboratory_only)
+        for parameter, value in item.values.items()
+    }
 
 
 def check_settings(

@@ -1,4 +1,4 @@
-"""Thickness of the adhesive as a function of position on the sensor: measured and random.
+"""Random thickness as a function of position on the sensor, and the area of its pixels.
 
 Every map is an array ``[y, x]`` in µm on the assembled, trimmed sensor, lower-left pixel first.
 """
@@ -8,114 +8,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
-from scipy.ndimage import map_coordinates
 
-from ..errors import InputError, OutOfRangeError
-from ..resources import read_table
+from ..errors import OutOfRangeError
+from ..instrument.measured_thickness import E2V_SHAPE, e2v_321, fit_to_sensor
 
 __all__ = [
     "E2V_SHAPE",
     "PixelArea",
-    "Sampling",
     "e2v_321",
     "fit_to_sensor",
     "random_field",
 ]
 
-E2V_SHAPE = (4004, 4096)
-"""Rows and columns of an assembled, trimmed E2V-CCD250."""
-
 GAUSS_NODES = ((-0.5 * math.sqrt(0.6), 5.0 / 18.0), (0.0, 4.0 / 9.0), (0.5 * math.sqrt(0.6), 5.0 / 18.0))
 """Places along a side of a pixel [px] and their weights: exact to the fifth power."""
-
-Sampling = Literal["resample", "window"]
-"""How a large map becomes a small one: the whole of it on fewer pixels, or a part of it pixel by pixel."""
-
-
-def e2v_321(
-    shape: tuple[int, int] = E2V_SHAPE,
-    *,
-    sampling: Sampling = "resample",
-    corner: tuple[int, int] = (0, 0),
-) -> NDArray[np.float64]:
-    """Adhesive of E2V-CCD250-321, as a smooth model of the map that Guo et al. (2022) fitted.
-
-    A bicubic spline of 24 × 24 coefficients. It differs from the published map by 9.5 nm rms, which is the
-    quantisation of that map. Range 14.03 to 22.01 µm.
-
-    Parameters
-    ----------
-    shape : `tuple` [`int`, `int`], optional
-        Rows and columns wanted.
-    sampling : `str`, optional
-        ``"resample"`` spreads the whole sensor over ``shape``; ``"window"`` takes the pixels from ``corner`` on.
-    corner : `tuple` [`int`, `int`], optional
-        First row and column of the window on the full sensor.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, ``shape``
-        Thickness [µm].
-
-    Raises
-    ------
-    InputError
-        The window reaches over the edge of the sensor, or the shape is not positive.
-    """
-    table = read_table("laboratory", "thickness_e2v_321.ecsv")
-    count, degree = int(table.meta["coefficients_per_axis"]), int(table.meta["degree"])
-    size_y, size_x = table.meta["sensor_shape"]
-    coefficients = np.zeros((count, count))
-    coefficients[table["iy"], table["ix"]] = table["coefficient"].quantity.to_value("um")
-    rows = _positions("rows", shape[0], size_y, sampling, corner[0])
-    columns = _positions("columns", shape[1], size_x, sampling, corner[1])
-    basis_y = _clamped_basis(rows, size_y, count, degree)
-    basis_x = _clamped_basis(columns, size_x, count, degree)
-    return basis_y @ coefficients @ basis_x.T
-
-
-def fit_to_sensor(
-    thickness_um: NDArray[np.float64],
-    shape: tuple[int, int],
-    *,
-    sampling: Sampling = "resample",
-    corner: tuple[int, int] = (0, 0),
-) -> NDArray[np.float64]:
-    """Bring any map to the shape of a sensor.
-
-    Parameters
-    ----------
-    thickness_um : `numpy.ndarray`, (rows, columns)
-        Thickness [µm].
-    shape : `tuple` [`int`, `int`]
-        Rows and columns wanted.
-    sampling, corner
-        As for `e2v_321`. Resampling is bicubic, from pixel centres to pixel centres.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, ``shape``
-        Thickness [µm].
-
-    Raises
-    ------
-    InputError
-        The map is not two-dimensional, or the window reaches over its edge.
-    """
-    thickness = np.asarray(thickness_um, dtype=float)
-    if thickness.ndim != 2:
-        raise InputError("thickness map dimensions", thickness.ndim, "2")
-    rows = _positions("rows", shape[0], thickness.shape[0], sampling, corner[0])
-    columns = _positions("columns", shape[1], thickness.shape[1], sampling, corner[1])
-    if sampling == "window" or thickness.shape == tuple(shape):
-        return thickness[np.ix_(rows.astype(int), columns.astype(int))]
-    grid = np.meshgrid(rows, columns, indexing="ij")
-    return map_coordinates(thickness, grid, order=3, mode="nearest")
 
 
 def random_field(
@@ -210,27 +119,6 @@ def _limited_slope(field: NDArray[np.float64], axis: int) -> NDArray[np.float64]
     np.divide(2.0 * product, below + above, out=own[1:-1], where=product > 0.0)
     own[0], own[-1] = step[0], step[-1]
     return result
-
-
-def _positions(what: str, wanted: int, available: int, sampling: Sampling, first: int) -> NDArray[np.float64]:
-    """Pixel coordinates on the large map of the ``wanted`` pixels of the small one."""
-    if wanted < 1:
-        raise InputError(f"number of {what}", wanted, "1 or more")
-    if sampling == "resample":
-        return (np.arange(wanted) + 0.5) * available / wanted - 0.5
-    if sampling != "window":
-        raise InputError("sampling", sampling, "'resample' or 'window'")
-    if first < 0 or first + wanted > available:
-        raise InputError(f"window of {what}", (first, first + wanted), f"within 0 to {available}")
-    return np.arange(first, first + wanted, dtype=float)
-
-
-def _clamped_basis(position: NDArray[np.float64], size: int, count: int, degree: int) -> NDArray[np.float64]:
-    inner = np.linspace(0.0, size - 1.0, count - degree + 1)
-    knots = np.concatenate([[0.0] * degree, inner, [size - 1.0] * degree])
-    # Resampled onto more pixels than the sensor has, the outermost centres lie up to half a pixel outside.
-    inside = np.clip(position, 0.0, size - 1.0)
-    return BSpline.design_matrix(inside, knots, degree).toarray()
 
 
 def _stretch(field: NDArray[np.float64], mean: float, span: float) -> NDArray[np.float64]:

@@ -20,6 +20,7 @@ from ..effects import (
     apply_to_response,
     apply_to_system,
 )
+from ..effects.active import settings_of
 from ..errors import InputError, without_unit
 from ..instrument.setup import Setup
 from ..optics.harmonics import ROUNDING
@@ -110,11 +111,7 @@ class FringeModel:
     @property
     def effect_settings(self) -> dict[str, float]:
         """Values of all effects by ``name.parameter``; what a header or an override file holds."""
-        return {
-            f"{item.effect.name}.{parameter}": value
-            for item in self.effects
-            for parameter, value in item.values.items()
-        }
+        return settings_of(self.effects)
 
     @property
     def islands(self) -> tuple[tuple[ActiveEffect, FringeModel], ...]:

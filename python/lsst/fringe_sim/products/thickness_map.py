@@ -20,7 +20,7 @@ from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
 from .flat_fit import FlatFit, FlatTable
 from .mask import mask_bits
 
-__all__ = ["THICKNESS_LIMITS_UM", "UNKNOWN_SIGMA_UM", "ThicknessMap"]
+__all__ = ["THICKNESS_LIMITS_UM", "UNKNOWN_SIGMA_UM", "ThicknessMap", "thickness_span_um"]
 
 UNKNOWN_SIGMA_UM = 0.003
 """Uncertainty of a map that states none."""
@@ -182,6 +182,16 @@ class ThicknessMap(SensorProduct):
         if bool(np.any((self.slip_probability > 1) & good)):
             worst = float(self.slip_probability[good].max())
             raise OutOfRangeError("SLIP_PROBABILITY", worst, "0 to 1")
+
+
+def thickness_span_um(
+    thickness_um: NDArray[np.floating], margin_um: float = 1e-3, source: str | None = None
+) -> tuple[float, float]:
+    """Smallest and largest known thickness of a map, widened so that rounding cannot leave it and it is not empty."""
+    known = thickness_um[np.isfinite(thickness_um)]
+    if not known.size:
+        raise InputError("thickness map", "no known thickness", "one in at least one pixel", source=source)
+    return max(float(known.min()) - margin_um, 0.0), float(known.max()) + margin_um
 
 
 def _unit_of(hdus: fits.HDUList, number: int) -> str:

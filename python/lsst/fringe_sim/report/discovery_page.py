@@ -4,48 +4,25 @@ from __future__ import annotations
 
 import math
 import shlex
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
 from ..algorithms.discovery import Verdict, probability_text
-from ..algorithms.flat_residual import FlatResidual, fit_and_compare
-from ..errors import InputError
-from ..model import FringeModel
-from ..products import FringeCube
+from ..algorithms.flat_residual import ResidualPair
 from .discovery_figures import candidates_figure, gap_figure, leftover_figure, where_figure
 from .figures import flats_figure, thickness_figure
 from .page import Report
 from .style import finite_range
 
-__all__ = ["ResidualPair", "discovery_page", "headline", "residual_pair"]
+__all__ = ["discovery_page", "headline"]
 
 PERCENT = 100.0
 GALLERY_PX = 128
 """Frames of a gallery are averaged to about this size, so that patterns stand out from the noise of pixels."""
 
 LEAST_CHANCE = 1e-300
-
-
-@dataclass(frozen=True, eq=False)
-class ResidualPair:
-    """Flats minus model, with the unchanged model and with what was found.
-
-    Attributes
-    ----------
-    before : `FlatResidual`
-        Of the model without the effects found.
-    after : `FlatResidual` or `None`
-        Of the model with them; none where nothing was named.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    """
-
-    before: FlatResidual
-    after: FlatResidual | None
-    order_um: float
 
 
 def discovery_page(verdict: Verdict, residuals: ResidualPair | None = None) -> Report:
@@ -75,35 +52,6 @@ def discovery_page(verdict: Verdict, residuals: ResidualPair | None = None) -> R
     _use(report, verdict)
     _data(report, verdict)
     return report
-
-
-def residual_pair(cube: FringeCube, model: FringeModel, verdict: Verdict) -> ResidualPair | None:
-    """Images of data minus model for the page.
-
-    Parameters
-    ----------
-    cube : `FringeCube`
-        The flats that were searched.
-    model : `FringeModel`
-        The model before the search.
-    verdict : `Verdict`
-        What was found.
-
-    Returns
-    -------
-    residuals : `ResidualPair` or `None`
-        None where the thickness cannot be fitted pixel by pixel, as with a single wavelength.
-    """
-    if not _was_searched(verdict):
-        return None
-    try:
-        before = fit_and_compare(cube, model)
-        after = None
-        if verdict.effects:
-            after = fit_and_compare(cube, model.with_effects({**model.effect_settings, **verdict.settings}))
-    except InputError:
-        return None
-    return ResidualPair(before, after, float(model.fringe_order_um(float(np.median(cube.wavelength_nm)))))
 
 
 def headline(verdict: Verdict) -> str:

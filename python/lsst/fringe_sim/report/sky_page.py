@@ -8,24 +8,16 @@ from pathlib import Path
 import numpy as np
 from astropy import units
 from astropy.table import Table
-from numpy.typing import NDArray
 
-from ..algorithms.image_correlation import CoaddCorrelation, coadd_correlation
+from ..algorithms.image_correlation import CoaddCorrelation, coadds_of_frames
 from ..algorithms.pca import fit_pca
 from ..products import SkyFringe
 from .figures import components_figure, correlation_figure, sky_figure
 from .page import Report
 
-__all__ = ["coadds_of_frames", "sky_amplitudes", "write_sky_report"]
+__all__ = ["sky_amplitudes", "write_sky_report"]
 
 PERCENT = 100.0
-COADDS = (1, 10, 100)
-"""Exposures in the coadds of the page."""
-
-LARGEST_REGION_PX = 240
-"""Side of the region that is coadded [px]; that of the paper's figure is 200."""
-
-SMALLEST_REGION_PX = 16
 
 
 def sky_amplitudes(frames: Sequence[SkyFringe]) -> Table:
@@ -45,21 +37,6 @@ def sky_amplitudes(frames: Sequence[SkyFringe]) -> Table:
     table["half peak to peak"] = np.round(half, 4) * units.percent
     table["half range 1-99"] = np.round(trimmed, 4) * units.percent
     return table
-
-
-def coadds_of_frames(frames: Sequence[SkyFringe], rng: np.random.Generator) -> CoaddCorrelation | None:
-    """Correlation left in coadds of randomly placed and rotated pieces of the frames.
-
-    ``rng``: places, angles, and the photon noise of each exposure. Returns `None` for frames too small to be
-    rotated.
-    """
-    # A region that is rotated by any angle needs its diagonal, and the spline a few pixels more.
-    region = min(LARGEST_REGION_PX, int((min(frames[0].shape) - 8) / np.sqrt(2.0)) - 1)
-    if region < SMALLEST_REGION_PX:
-        return None
-    patterns = [_filled(frame) for frame in frames]
-    noise = 1.0 / np.sqrt(np.mean([frame.mean_electrons for frame in frames]))
-    return coadd_correlation(patterns, COADDS, float(noise), rng, region_px=region)
 
 
 def write_sky_report(path: Path, frames: Sequence[SkyFringe], setup: str, seed: int) -> Path:
@@ -92,12 +69,6 @@ def write_sky_report(path: Path, frames: Sequence[SkyFringe], setup: str, seed: 
         report.figure(correlation_figure(found), "Correlation against separation; a line ends below zero.")
         report.table(_correlation_table(found), "coadd_correlation")
     return report.write(path)
-
-
-def _filled(frame: SkyFringe) -> NDArray[np.float64]:
-    """Pattern with the mean sky where it is not known."""
-    values = frame.fraction().astype(float)
-    return np.where((frame.mask == 0) & np.isfinite(values), values, 0.0)
 
 
 def _correlation_table(found: CoaddCorrelation) -> Table:

@@ -14,6 +14,7 @@ from lsst.pex.config import Config, ConfigDictField, DictField, Field, FieldVali
 from lsst.pex.config.configDictField import ConfigDict
 
 from ..effects import EFFECTS, activate_effects
+from ..effects.active import settings_of
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
@@ -34,19 +35,9 @@ class ModelChoice:
 
     @property
     def applied_effects(self) -> dict[str, float]:
-        """Effects that belong to this set-up: on the sky, not those of the laboratory.
-
-        A sensor takes its layers and its electronics to the telescope, but not the temperature of the cryostat nor
-        the lamp and the reflections of the bench.
-        """
-        active = activate_effects(self.effects, EFFECTS)
+        """Effects that belong to this set-up: on the sky, not those of the laboratory."""
         on_sky = Setup.from_name(self.setup).kind == "sky"
-        return {
-            f"{item.effect.name}.{parameter}": value
-            for item in active
-            for parameter, value in item.values.items()
-            if not (on_sky and item.effect.laboratory_only)
-        }
+        return settings_of(activate_effects(self.effects, EFFECTS), on_sky=on_sky)
 
     @property
     def left_out(self) -> tuple[str, ...]:

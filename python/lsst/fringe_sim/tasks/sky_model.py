@@ -24,6 +24,7 @@ from ..instrument.sky import EmissionLines, SkySpectrum
 from ..model import FringeModel, Setup
 from ..model.provenance import effects_of_header
 from ..products import SensorSection, ThicknessMap
+from ..products.thickness_map import thickness_span_um
 from .model_config import FringeModelConfig, ModelChoice
 
 __all__ = [
@@ -34,8 +35,6 @@ __all__ = [
     "thickness_input",
     "without_constraint",
 ]
-
-RANGE_MARGIN_UM = 1e-3
 
 LINE_LIST = "PALACE OH (Noll et al. 2025)"
 
@@ -179,7 +178,7 @@ class SkyModelConfig(FringeModelConfig):
             solar_flux_sfu=self.solar_flux_sfu,
             rotational_temperature_k=self.rotational_temperature_k,
             vibrational_temperature_k=self.vibrational_temperature_k,
-            thickness_range_um=_range_of(thickness_um),
+            thickness_range_um=thickness_span_um(thickness_um),
         )
 
 
@@ -206,14 +205,6 @@ def takes_images(data_id: DataCoordinate) -> bool:
 
 def _band(setup: Setup) -> str:
     return setup.bandpass.rpartition("_")[2]
-
-
-def _range_of(thickness_um: NDArray[np.float32]) -> tuple[float, float]:
-    """Range of the known thicknesses, widened so that rounding cannot leave it."""
-    finite = thickness_um[np.isfinite(thickness_um)]
-    if finite.size == 0:
-        raise InputError("thickness map", "no known thickness", "one in at least one pixel")
-    return max(float(finite.min()) - RANGE_MARGIN_UM, 0.0), float(finite.max()) + RANGE_MARGIN_UM
 
 
 def _check_map(thickness: ThicknessMap, choice: ModelChoice) -> None:
