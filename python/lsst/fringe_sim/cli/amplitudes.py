@@ -11,9 +11,9 @@ from ..errors import printable_name
 from ..files import table_text, write_whole
 from ..instrument.measured_thickness import e2v_321
 from ..resources import read_user_table
-from .inputs import read_settings, read_thickness
+from .inputs import read_thickness
 from .output import OutputFolder, output_folder
-from .parameters import BUILT_IN, EFFECT, effect_settings
+from .parameters import BUILT_IN, ChosenEffects, model_effects
 
 __all__ = ["amplitudes", "read_line_list"]
 
@@ -37,16 +37,14 @@ STEP_PX = 16
     multiple=True,
     help="Row of the table; may be repeated. All by default.",
 )
-@click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
-@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@model_effects()
 @output_folder("Folder for the table as ECSV.", "amplitudes.ecsv", required=False)
 @click.option("--dry-run", is_flag=True, help="Check everything, compute nothing.")
 def amplitudes(
     thickness: str,
     lines: tuple[Path, ...],
     cases: tuple[str, ...],
-    effects: tuple[tuple[str, float], ...],
-    effects_file: Path | None,
+    effects: ChosenEffects,
     out: OutputFolder | None,
     dry_run: bool,
 ) -> None:
@@ -60,8 +58,6 @@ def amplitudes(
       fringe-sim amplitudes
       fringe-sim amplitudes --effect contrast_loss.factor=0.13 --out table2
     """
-    settings = dict(read_settings(effects_file)) if effects_file else {}
-    settings.update(effect_settings(effects))
     skies = [read_line_list(path) for path in lines] + list(SkyCase.palace())
     adhesive = (
         e2v_321()[::STEP_PX, ::STEP_PX] if thickness == BUILT_IN else read_thickness(thickness, "adhesive")
@@ -71,7 +67,7 @@ def amplitudes(
         return
     folder = out.prepare() if out is not None else None
     rows = [case for case in CASES if not cases or case.name in cases]
-    table = compare_amplitudes(adhesive, skies, settings, rows)
+    table = compare_amplitudes(adhesive, skies, effects.settings, rows)
     shown = table.copy(copy_data=False)
     shown.remove_columns(["setup", "temperature", "layer"])
     click.echo("\n".join(shown.pformat(max_lines=-1, max_width=-1, align="<")))

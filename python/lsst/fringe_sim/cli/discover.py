@@ -10,7 +10,7 @@ import click
 
 from ..errors import InputError
 from .output import OutputFolder, output_folder
-from .parameters import ANY_LIGHT, EFFECT, effect_settings
+from .parameters import ANY_LIGHT, ChosenEffects, model_effects
 from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -31,10 +31,7 @@ __all__ = ["discover"]
 @click.option(
     "--seed", type=int, default=1, show_default=True, help="Which parts of the sensor are held out."
 )
-@click.option(
-    "--effect", "effects", type=EFFECT, multiple=True, help="Effect known already; may be repeated."
-)
-@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@model_effects("Effect known already; may be repeated.")
 @click.option(
     "--thickness", default=None, help="Map of the varying layer, for frames of the sky: a FITS file [µm]."
 )
@@ -52,8 +49,7 @@ def discover(
     setup: Setup,
     out: OutputFolder,
     seed: int,
-    effects: tuple[tuple[str, float], ...],
-    effects_file: Path | None,
+    effects: ChosenEffects,
     thickness: str | None,
     collections: str,
     detector: str | None,
@@ -79,11 +75,9 @@ def discover(
     from ..algorithms.discovery import discover as search
     from ..algorithms.flat_residual import residual_pair
     from ..model import FringeModel
-    from .inputs import read_settings, sky_settings
+    from .inputs import sky_settings
     from .sky_frames import read_sky_frames
 
-    settings = dict(read_settings(effects_file)) if effects_file else {}
-    settings.update(effect_settings(effects))
     if setup.kind == "sky":
         data = read_sky_frames(paths, setup, thickness)
         if dry_run:
@@ -91,11 +85,11 @@ def discover(
                 f"would search {len(data.sky.frames)} frames of {data.sky.shape[1]} x {data.sky.shape[0]} pixels"
             )
             return
-        _search_sky(data, data.model(sky_settings(settings)), out, seed, cells)
+        _search_sky(data, data.model(sky_settings(effects.settings)), out, seed, cells)
         return
     if thickness is not None:
         raise InputError("--thickness", thickness, "only with the set-up of a telescope, as lsst_e2v")
-    model = FringeModel.from_setup(setup, settings)
+    model = FringeModel.from_setup(setup, effects.settings)
     cube = _read(paths, setup, collections, detector, skip_bad, dry_run)
     if cube is None:
         return

@@ -35,6 +35,7 @@ from ..report.page import Report
 from ..report.style import save_figure
 from .inputs import read_settings, read_thickness, sky_settings
 from .output import OutputFolder, output_folder
+from .parameters import effects_file_option
 from .progress import progress
 
 __all__ = ["focal_plane"]
@@ -82,7 +83,7 @@ class _SensorMapType(click.ParamType):
     "--nights", type=click.IntRange(1, 1000), default=5, show_default=True, help="Random nights to correct."
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of stand-ins and nights.")
-@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@effects_file_option()
 @output_folder(
     "Folder for tables, figure and report.",
     "cells.ecsv",
@@ -113,8 +114,7 @@ def focal_plane(
     """
     chosen = _chosen(sensors)
     measured = {Camera.from_name("lsstCam").detector(item.name).name: item.path for item in maps}
-    settings = dict(read_settings(effects_file)) if effects_file else {}
-    settings = sky_settings(settings)
+    settings = sky_settings(read_settings(effects_file) if effects_file else {})
     for path in measured.values():
         if not path.is_file():
             raise InputError("--thickness", str(path), "an existing FITS file")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,13 +10,13 @@ from ..errors import InputError
 from .output import OutputFolder, output_folder
 from .parameters import (
     BUILT_IN,
-    EFFECT,
     LABORATORY,
     SIZE,
     WAVELENGTHS,
+    ChosenEffects,
     Quantity,
-    effect_settings,
     laboratory_of_the_mock,
+    model_effects,
 )
 from .progress import progress
 
@@ -47,12 +46,7 @@ BLEMISHES: dict[str, Any] = {"bad_columns": 6, "hot_pixels": 200, "prnu_rms": 0.
     help="Map of the varying layer: a FITS file [µm], 'random', or 'e2v_321' (model of a measured sensor).",
 )
 @click.option("--wavelengths", type=WAVELENGTHS, default=None, help="first:last:step or a list [nm].")
-@click.option("--effect", "effects", type=EFFECT, multiple=True, help="Hidden effect; may be repeated.")
-@click.option(
-    "--effects-file",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="YAML with hidden effects.",
-)
+@model_effects("Hidden effect; may be repeated.", "YAML with hidden effects.")
 @click.option(
     "--size", type=SIZE, default=None, help="Cut-down sensor, columns x rows; full size if not given."
 )
@@ -74,8 +68,7 @@ def mock_flats(
     detector: str | None,
     thickness: str,
     wavelengths: tuple[float, ...] | None,
-    effects: tuple[tuple[str, float], ...],
-    effects_file: Path | None,
+    effects: ChosenEffects,
     size: tuple[int, int] | None,
     bias_frames: int,
     level: float,
@@ -98,15 +91,13 @@ def mock_flats(
     from ..instrument.camera import Camera
     from ..mock.hidden_effects import validate_effects
     from ..mock.raw_frames import Defects, write_mock_flats
-    from .inputs import read_settings
 
     chosen = LABORATORY.convert(setup, None, None)
     camera = Camera.from_name(chosen.camera)
     sensor = camera.detector(detector or chosen.detector)
     shape = (size[1], size[0]) if size else sensor.shape
     rng = np.random.default_rng(seed)
-    settings = dict(read_settings(effects_file)) if effects_file else {}
-    settings.update(effect_settings(effects))
+    settings = dict(effects.settings)
     if temperature is not None:
         settings["temperature.kelvin"] = temperature
     validate_effects(settings)

@@ -9,6 +9,8 @@ import functools
 import math
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -29,10 +31,13 @@ __all__ = [
     "SKY",
     "THICKNESS_RANGE",
     "WAVELENGTHS",
+    "ChosenEffects",
     "Quantity",
     "SetupType",
     "effect_settings",
+    "effects_file_option",
     "laboratory_of_the_mock",
+    "model_effects",
 ]
 
 
@@ -253,6 +258,45 @@ SKY = SetupType("sky", "one behind a telescope, as lsst_e2v, monocam or hsc")
 
 laboratory_of_the_mock = LABORATORY.name_option("ts8_e2v", "Laboratory set-up: name or file.")
 """Set-up that the mock reads itself: the command gets it as it was written."""
+
+
+@dataclass(frozen=True)
+class ChosenEffects:
+    """Effects that a command was given."""
+
+    settings: dict[str, Any]
+    files: tuple[Path, ...]  # where they were read
+
+
+def model_effects(
+    help_text: str = "Effect in the model; may be repeated.", file_help: str = "YAML."
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """``--effect`` and ``--effects-file`` of a command, which gets them as `ChosenEffects` named ``effects``.
+
+    An option wins over the file, and the last of equal names over the others.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def with_effects(
+            *, effects: tuple[tuple[str, float], ...], effects_file: Path | None, **others: Any
+        ) -> None:
+            from .inputs import read_settings
+
+            settings = {} if effects_file is None else read_settings(effects_file)
+            files = () if effects_file is None else (effects_file,)
+            command(effects=ChosenEffects({**settings, **effect_settings(effects)}, files), **others)
+
+        one = click.option("--effect", "effects", type=EFFECT, multiple=True, help=help_text)
+        return one(effects_file_option(file_help)(with_effects))
+
+    return decorate
+
+
+def effects_file_option(help_text: str = "YAML.") -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """``--effects-file`` as it was written."""
+    kind = click.Path(exists=True, dir_okay=False, path_type=Path)
+    return click.option("--effects-file", type=kind, help=help_text)
 
 
 def effect_settings(settings: tuple[tuple[str, float], ...]) -> dict[str, float]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..files import table_text, write_whole
-from .parameters import EFFECT, LABORATORY, THICKNESS_RANGE, WAVELENGTHS, Quantity, effect_settings
+from .parameters import LABORATORY, THICKNESS_RANGE, WAVELENGTHS, ChosenEffects, Quantity, model_effects
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from astropy.table import QTable
@@ -60,8 +60,7 @@ RANKED_ROWS = 5
     multiple=True,
     help="Width of their line; may be repeated; the width of the list and half of it.",
 )
-@click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
-@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@model_effects()
 @click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
 @click.option("--ecsv", type=click.Path(path_type=Path), help="File for the forecast at every thickness.")
 @click.option("--dry-run", is_flag=True, help="Check everything, say what would be done, write nothing.")
@@ -78,8 +77,7 @@ def plan_flats(
     sigma: float | None,
     candidates: tuple[float, ...] | None,
     widths: tuple[float, ...],
-    effects: tuple[tuple[str, float], ...],
-    effects_file: Path | None,
+    effects: ChosenEffects,
     as_json: bool,
     ecsv: Path | None,
     dry_run: bool,
@@ -104,10 +102,8 @@ def plan_flats(
         recommend_flats,
     )
     from ..model import FringeModel
-    from .inputs import read_settings
 
-    settings = dict(read_settings(effects_file)) if effects_file else {}
-    model = FringeModel.from_setup(setup, {**settings, **effect_settings(effects)})
+    model = FringeModel.from_setup(setup, effects.settings)
     nominal = wavelengths or setup.wavelengths_nm
     width = setup.bandwidth_fwhm_nm if bandwidth is None else bandwidth
     flats = [PlannedFlat(value, electrons, bandwidth) for value in nominal]

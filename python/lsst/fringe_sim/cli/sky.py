@@ -11,7 +11,7 @@ import click
 
 from ..errors import InputError, OutOfRangeError
 from .output import OutputFolder, output_folder
-from .parameters import BUILT_IN, EFFECT, SKY, Quantity, effect_settings
+from .parameters import BUILT_IN, SKY, ChosenEffects, Quantity, model_effects
 from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -48,8 +48,7 @@ MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
 )
 @click.option("--noiseless/--noise", default=False, help="Without photon and read noise, as for templates.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the noise.")
-@click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
-@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@model_effects()
 @output_folder("Folder for frames, figure and report.", "sky_*_[0-9][0-9].fits", "sky.png", "report.html")
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def sky(
@@ -62,8 +61,7 @@ def sky(
     level: str,
     noiseless: bool,
     seed: int,
-    effects: tuple[tuple[str, float], ...],
-    effects_file: Path | None,
+    effects: ChosenEffects,
     out: OutputFolder,
     dry_run: bool,
 ) -> None:
@@ -89,14 +87,12 @@ def sky(
     from ..report.figures import sky_figure
     from ..report.sky_page import write_sky_report
     from ..report.style import save_figure
-    from .inputs import effect_cards, read_settings, sky_settings
+    from .inputs import effect_cards, sky_settings
 
     _check_exposure(exptime, night)
     sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
-    settings = dict(read_settings(effects_file)) if effects_file else {}
-    settings.update(effect_settings(effects))
     layer, section = _layer(thickness, sensor, setup.varying)
-    settings = sky_settings(settings)
+    settings = sky_settings(effects.settings)
     history = NightHistory.guo2022()
     frames = len(history) if night else 1
     if dry_run:
@@ -110,7 +106,7 @@ def sky(
     )
     given: list[str | Path] = [
         *([thickness] if thickness != BUILT_IN else []),
-        *([effects_file] if effects_file else []),
+        *effects.files,
     ]
     cards: dict[str, str | float] = {
         "SETUP": setup.name,
