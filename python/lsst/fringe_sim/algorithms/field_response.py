@@ -22,7 +22,7 @@ from ..errors import InputError, OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
 from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
-from ..instrument.telescope import BeamField, Telescope, TracedOptics
+from ..instrument.telescope import BeamField, Telescope, TracedOptics, reduce_beam
 from ..model import FringeModel, ResponseTable
 from ..optics import Illumination
 from ..products import SensorSection
@@ -68,6 +68,14 @@ faintest (96 give 4e-3)."""
 RADIUS_STEP_DEG = 0.005
 """Spacing of the tabulated field radii. Where the pupil is vignetted, beyond 1.75 deg, the phase of the light from
 its edge turns once in 0.085 deg."""
+
+_MORE_ANGLES = 12
+"""Nodes beyond their share for a part of the angles: a Gauss rule converges once it has a few more than the phase
+asks for, whatever the range."""
+
+_LIMIT_RADII = 9
+"""Field radii at which the angles of a sensor are looked up; between them the extreme angle bends by 1e-5 of the
+range, which the margin of `beam_limits` covers a hundred times."""
 
 _STENCIL = 4
 
@@ -356,11 +364,12 @@ def angular_response(
     fineness = SkyQuadrature() if quadrature is None else quadrature
     band = bandpass_of(model) if bandpass is None else bandpass
     sky = sky_with_effects(model, sky)
-    table, photons, level = tabulate_components(model, sky, band, thickness_range_um, fineness)
+    few_rays = reduce_beam(model.system.beam, fineness.continuum_angles)
+    table, photons, level = tabulate_components(model, sky, band, thickness_range_um, fineness, few_rays)
     grid = (table.start_um, table.step_um, table.values.shape[1])
     lines, continua = split_components(sky, band, fineness.continuum_step_nm)
     merged = blend_components(lines, fineness.line_shift_nm) if lines else []
-    few = min(CONTINUUM_ANGLES, angles)
+    few = math.ceil(angles * CONTINUUM_ANGLES / ANGLES)
     samples = error_samples((table.start_um, table.stop_um))
     of_lines = [_single_angles(model, item, limits, angles, grid, samples) for item in merged]
     of_continua = [_single_angles(model, item, limits, few, grid, samples) for item in continua]
@@ -430,8 +439,12 @@ def sensor_response(
         beams = beam_field(own.setup.telescope)
         if beams is None:
             return sky_response(own, sky, None, thickness_range_um, quadrature)
-        angular = angular_response(own, sky, beam_limits(beams), None, thickness_range_um, quadrature)
-        return field_response(angular, beams, placement.radius_range_deg).on(placement)
+        radii = placement.radius_range_deg
+        limits = beam_limits(beams, radii)
+        share = (limits[1] - limits[0]) / float(np.subtract(*beam_limits(beams)[::-1]))
+        angles = math.ceil(ANGLES * share) + _MORE_ANGLES
+        angular = angular_response(own, sky, limits, None, thickness_range_um, quadrature, angles)
+        return field_response(angular, beams, radii).on(placement)
 
     return response_with_islands(model, respond)
 
@@ -447,9 +460,15 @@ def beam_field(telescope: str) -> BeamField | None:
     return BeamField.trace(found)
 
 
-def beam_limits(beams: BeamField) -> tuple[float, float]:
-    """Range of sin²θ of all beams, with room for rays between the traced radii."""
-    low, high = float(beams.sin_squared.min()), float(beams.sin_squared.max())
+def beam_limits(beams: BeamField, radius_range_deg: tuple[float, float] | None = None) -> tuple[float, float]:
+    """Range of sin²θ of all beams, or of those at some field radii, with room for rays between the traced radii."""
+    if radius_range_deg is None:
+        low, high = float(beams.sin_squared.min()), float(beams.sin_squared.max())
+    else:
+        first, last = radius_range_deg
+        radii = np.linspace(max(0.0, first - RADIUS_STEP_DEG), last + RADIUS_STEP_DEG, _LIMIT_RADII)
+        rays = [beams.sin_squared_at(min(radius, beams.largest_deg))[0] for radius in radii.tolist()]
+        low, high = (float(of([of(sine) for sine in rays])) for of in (np.min, np.max))
     margin = 1e-3 * (high - low)
     return max(0.0, low - margin), high + margin
 

@@ -247,12 +247,16 @@ def tabulate_components(
     band: Bandpass,
     thickness_range_um: tuple[float, float] | None,
     fineness: SkyQuadrature,
+    beam: Beam | None = None,
 ) -> tuple[ResponseTable, FloatArray, float]:
-    """Table of `SkyResponse`, photons of its components, and its level; parameters as of `sky_response`."""
+    """Table of `SkyResponse`, photons of its components, and its level; parameters as of `sky_response`.
+
+    Another beam than that of the model may be given, as where only the grid of the table is wanted.
+    """
     low, high = model.setup.thickness_range_um if thickness_range_um is None else thickness_range_um
     if not 0.0 <= low < high < math.inf:
         raise OutOfRangeError("thickness range [um]", (low, high), "two increasing, not negative numbers")
-    lights = _lights(sky, band, fineness, model.system.beam)
+    lights = _lights(sky, band, fineness, model.system.beam if beam is None else beam)
     if not lights:
         raise InputError("sky", "no light behind the bandpass", "lines or a continuum inside it")
     sums = [_SpectralSum.of(model, light) for light in lights]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from .parameters import ANY_LIGHT, ChosenEffects, model_effects
 from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
-    from ..algorithms.discovery import Verdict
+    from ..algorithms.discovery import SearchOptions, Verdict
     from ..algorithms.flat_residual import ResidualPair
     from ..instrument.setup import Setup
     from ..model import FringeModel
@@ -42,6 +43,13 @@ __all__ = ["discover"]
 @click.option(
     "--cells", type=click.IntRange(100), default=20_000, show_default=True, help="Cells to average to."
 )
+@click.option(
+    "--time-budget",
+    type=click.FloatRange(0.0, min_open=True),
+    default=None,
+    metavar="SECONDS",
+    help="Stop after so long with the best answer so far, which says that it is not complete.",
+)
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
 @click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
 def discover(
@@ -54,6 +62,7 @@ def discover(
     collections: str,
     detector: str | None,
     cells: int,
+    time_budget: float | None,
     skip_bad: bool,
     dry_run: bool,
 ) -> None:
@@ -71,13 +80,17 @@ def discover(
     """
     import numpy as np
 
-    from ..algorithms.discovery import SearchOptions
+    from ..algorithms.discovery import SKY_SEARCH, SearchOptions
     from ..algorithms.discovery import discover as search
     from ..algorithms.flat_residual import residual_pair
     from ..model import FringeModel
     from .inputs import sky_settings
     from .sky_frames import read_sky_frames
 
+    limits: dict[str, Any] = {
+        "most_cells": cells,
+        "time_budget_s": math.inf if time_budget is None else time_budget,
+    }
     if setup.kind == "sky":
         data = read_sky_frames(paths, setup, thickness)
         if dry_run:
@@ -85,7 +98,9 @@ def discover(
                 f"would search {len(data.sky.frames)} frames of {data.sky.shape[1]} x {data.sky.shape[0]} pixels"
             )
             return
-        _search_sky(data, data.model(sky_settings(effects.settings)), out, seed, cells)
+        _search_sky(
+            data, data.model(sky_settings(effects.settings)), out, seed, replace(SKY_SEARCH, **limits)
+        )
         return
     if thickness is not None:
         raise InputError("--thickness", thickness, "only with the set-up of a telescope, as lsst_e2v")
@@ -98,16 +113,18 @@ def discover(
         cube,
         model,
         rng=np.random.default_rng(seed),
-        options=SearchOptions(most_cells=cells),
+        options=SearchOptions(**limits),
         report=lambda line: click.echo(line, err=True),
     )
     _write(verdict, folder, residual_pair(cube, model, verdict))
 
 
-def _search_sky(data: SkyData, model: FringeModel, out: OutputFolder, seed: int, cells: int) -> None:
+def _search_sky(
+    data: SkyData, model: FringeModel, out: OutputFolder, seed: int, options: SearchOptions
+) -> None:
     import numpy as np
 
-    from ..algorithms.discovery import SKY_SEARCH, discover_sky, placement_in_frames
+    from ..algorithms.discovery import discover_sky, placement_in_frames
 
     folder = out.prepare()
     verdict = discover_sky(
@@ -117,7 +134,7 @@ def _search_sky(data: SkyData, model: FringeModel, out: OutputFolder, seed: int,
         model,
         placement=placement_in_frames(data.sky.frames, data.detector, data.setup.pixel_scale_arcsec),
         rng=np.random.default_rng(seed),
-        options=replace(SKY_SEARCH, most_cells=cells),
+        options=options,
         report=lambda line: click.echo(line, err=True),
     )
     _write(verdict, folder, None)

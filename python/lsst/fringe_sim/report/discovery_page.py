@@ -56,6 +56,8 @@ def discovery_page(verdict: Verdict, residuals: ResidualPair | None = None) -> R
 
 def headline(verdict: Verdict) -> str:
     """The verdict in one line."""
+    if not verdict.complete and verdict.verdict == "unexplained":
+        return "The search was stopped before it had an answer"
     if verdict.verdict == "no_discrepancy":
         return "Model and data agree within the noise"
     if verdict.unexplained.get("too_poor"):
@@ -94,6 +96,11 @@ def _answer(report: Report, verdict: Verdict) -> None:
     report.section(
         "Verdict", f"The chance that noise alone disagrees as much with the unchanged model: {chance}."
     )
+    if not verdict.complete:
+        report.paragraph("The search was stopped before its end: this is the best answer that it had.")
+    if math.isfinite(verdict.size["of_counts"]):
+        text = verdict.size_text()
+        report.paragraph(f"{text[0].upper()}{text[1:]}.")
     if verdict.unexplained.get("reason"):
         report.paragraph(f"Why there is no name: {verdict.unexplained['reason']}.")
     if not verdict.effects:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -86,10 +87,19 @@ class SearchConfig(Config):
     significance: Field[float] = Field(
         dtype=float, default=1e-3, doc="Chance of noise below which the model is held to disagree."
     )
+    time_budget_s: Field[float] = Field(
+        dtype=float,
+        default=None,
+        optional=True,
+        doc="Time for one sensor [s], after which the best answer so far is given; by default as long as it takes.",
+    )
 
     def options(self, usual: SearchOptions) -> SearchOptions:
         """The same for the algorithm, which has its usual ones."""
-        return replace(usual, most_cells=self.most_cells, significance=self.significance)
+        budget = math.inf if self.time_budget_s is None else self.time_budget_s
+        return replace(
+            usual, most_cells=self.most_cells, significance=self.significance, time_budget_s=budget
+        )
 
     def rng(self, detector: Detector) -> np.random.Generator:
         """Random numbers of a sensor."""

@@ -1,13 +1,19 @@
-"""How often the forward model is asked: the cost of a search that does not depend on the machine."""
+"""How often the forward model is asked, which is the cost of a search on any machine, and until when it may be."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
-__all__ = ["EvaluationCount", "count_evaluations", "note_evaluation"]
+__all__ = ["EvaluationCount", "OutOfTimeError", "count_evaluations", "note_evaluation", "time_limit"]
+
+
+class OutOfTimeError(Exception):
+    """The time that a caller gave is over."""
 
 
 @dataclass
@@ -18,6 +24,7 @@ class EvaluationCount:
 
 
 _counting: ContextVar[EvaluationCount | None] = ContextVar("_counting", default=None)
+_deadline: ContextVar[float] = ContextVar("_deadline", default=math.inf)
 
 
 @contextmanager
@@ -31,8 +38,20 @@ def count_evaluations() -> Iterator[EvaluationCount]:
         _counting.reset(token)
 
 
+@contextmanager
+def time_limit(until: float) -> Iterator[None]:
+    """Let the evaluations inside the block raise `OutOfTimeError` from an instant of `time.monotonic` on [s]."""
+    token = _deadline.set(min(until, _deadline.get()))
+    try:
+        yield
+    finally:
+        _deadline.reset(token)
+
+
 def note_evaluation() -> None:
-    """Called by a forward model at every evaluation."""
+    """Called by a forward model at every evaluation; raises `OutOfTimeError` after the limit."""
+    if time.monotonic() > _deadline.get():
+        raise OutOfTimeError
     count = _counting.get()
     if count is not None:
         count.number += 1

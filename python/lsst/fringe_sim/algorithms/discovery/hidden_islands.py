@@ -24,7 +24,7 @@ beside the smooth one."""
 
 CLEAR = 45.0
 """Fall of χ² beside a thickness of each cell from which on an island is no step of the thickness: four parameters in
-ten thousand places."""
+ten thousand places. An island is not looked for where the fine thickness gains less than that over a smooth one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +71,9 @@ def hidden_island(prepared: Prepared, catalogue: Sequence[Effect], found: Hypoth
             field = problem.basis.fit(thickness, problem.cells.seen.astype(float))
             base = fit_model(problem, found.fit.coordinates, found.fit.position, field, found.fit.levels)
         missing = base.chi2 - found.fit.chi2 - (prepared.problem.basis.size - problem.basis.size)
+        if missing < CLEAR:
+            # What the fine thickness gains is noise, and so would be an island in it.
+            continue
         selector = Selector(problem, chosen, smooth.null, smooth.index)
         for effect in local:
             beside = selector.at_step(effect.name, base, LEAST_PROMISED * missing)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+from ...errors import OutOfRangeError
 from .selection import Hypothesis
 
 __all__ = ["SearchOptions"]
@@ -40,6 +42,9 @@ class SearchOptions:
         Part of the sensor that no selection sees.
     outsider_prior : `float`
         Prior probability of a cause that is not in the catalogue.
+    time_budget_s : `float`
+        Time on the clock [s] after which the best answer so far is given; as long as it takes by default. A fifth of
+        it is kept for the judgement of that answer on the data held out.
     """
 
     most_cells: int = 20_000
@@ -54,6 +59,11 @@ class SearchOptions:
     parents: int = 5
     heldout_fraction: float = 0.25
     outsider_prior: float = 0.15
+    time_budget_s: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not self.time_budget_s > 0.0:
+            raise OutOfRangeError("time budget [s]", self.time_budget_s, "a positive number")
 
     def is_noise(self, found: Hypothesis) -> bool:
         """Whether a set leaves what noise may be."""

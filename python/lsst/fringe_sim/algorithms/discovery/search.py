@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ...products.sky_frame import refuse_noiseless
 from .channels import Channel, in_looks
 from .classes import EffectClass, classes_in_all_data, outsider_probability
 from .describe import describe_residual, disagreement
+from .evaluations import OutOfTimeError, time_limit
 from .fit import Fit, fit_model
 from .forward import Exposures
 from .hidden_islands import hidden_island
@@ -37,10 +39,11 @@ from .preparation import (
     why_too_poor,
     without_blurs,
 )
-from .selection import IMPRECISION, Hypothesis, Selector, chance_of
+from .selection import IMPRECISION, Candidate, Hypothesis, Selector, chance_of
 from .set_search import SetSearch
 from .validation import (
     HeldOut,
+    disagreement_size,
     held_out_blocks,
     misfit_rms,
     thickness_starts,
@@ -61,6 +64,10 @@ Report = Callable[[str], None]
 PAIR = 2
 """Effects with which fringe orders are judged again before a third is looked for: what leaves a residual may be one
 effect and a thickness that is wrong in places."""
+
+
+FOR_JUDGEMENT = 0.2
+"""Part of a time budget that is kept for the judgement of the best answer on the data held out."""
 
 
 def discover(
@@ -125,17 +132,39 @@ def search_exposures(
         poor = why_too_poor(cube, model)
         if poor:
             return _no_answer(model, poor, cube)
-        say("fitting the thickness with the unchanged model")
-        prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
-        return _Search(cube, prepared, model, effects, chosen, rng, say).run()
+        begun, budget = time.monotonic(), chosen.time_budget_s
+        search = None
+        try:
+            with time_limit(begun + (1.0 - FOR_JUDGEMENT) * budget):
+                say("fitting the thickness with the unchanged model")
+                prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
+                search = _Search(cube, prepared, model, effects, chosen, rng, say)
+                return search.run()
+        except OutOfTimeError:
+            say(f"the search is stopped: {budget:g} s were given")
+            stopped = search.best_so_far(begun + budget) if search is not None else None
+            reason = f"{budget:g} s did not suffice to fit the unchanged model"
+            return stopped or replace(_no_answer(model, reason, cube, too_poor=False), complete=False)
 
 
-def _no_answer(model: FringeModel, reason: str, cube: FringeCube) -> Verdict:
+def _no_answer(model: FringeModel, reason: str, cube: FringeCube, *, too_poor: bool = True) -> Verdict:
     nan = math.nan
+    unexplained = {"reason": reason, "too_poor": too_poor}
     return Verdict(
-        "unexplained", (), Where(), Gap(_METRIC, nan, nan, nan, nan, nan), (), {"reason": reason, "too_poor": True},
+        "unexplained", (), Where(), Gap(_METRIC, nan, nan, nan, nan, nan), (), unexplained,
         model.setup.name, nan, data={"shape": list(cube.shape)},
     )  # fmt: skip
+
+
+@dataclass
+class _Reached:
+    """How far a search has come."""
+
+    prepared: Prepared
+    heldout: NDArray[np.bool_]
+    whole: Selector
+    chance: float
+    sets: SetSearch | None = None
 
 
 class _Search:
@@ -156,6 +185,8 @@ class _Search:
         self.headers = headers_apart(cube, model)
         self.next_measurements: tuple[dict[str, Any], ...] = ()
         self.unseen: HeldOut | None = None
+        self.scores: Sequence[Candidate] = ()
+        self.reached: _Reached | None = None
         self._may_judge_orders = self._may_take_areas = self._may_look_for_islands = True
         self._take_other_cells(prepared)
 
@@ -191,11 +222,13 @@ class _Search:
         self.where = self._where(whole)
         chance = self._chance(whole, whole.null)
         self.say(f"chance that noise alone disagrees as much: {chance:.3g}")
+        self.reached = _Reached(self.prepared, self.heldout, whole, chance)
         if chance > self.options.significance:
             return self._with_hidden_island(whole.null) or self._verdict(
                 "no_discrepancy", whole, whole.null, chance, (), {}
             )
         sets = self._sets(whole)
+        self.reached.sets = sets
         if known is not None and known.coordinates:
             chosen, steps = self._resumed(sets, known)
             chosen = sets.enlarged(chosen, steps, self.options.most_effects)
@@ -296,6 +329,26 @@ class _Search:
 
         return SetSearch(
             training, self.options, self.say, rescued, order_open=len(self.prepared.shifts_um) > 0
+        )
+
+    def best_so_far(self, until: float) -> Verdict | None:
+        """Verdict of a search that was stopped; the data held out are asked about it until an instant [s]."""
+        if self.reached is None:
+            return None
+        found = self.reached
+        self.heldout = found.heldout
+        self._take(found.prepared)
+        chosen, steps = (found.whole.null, []) if found.sets is None else found.sets.best_so_far()
+        if found.sets is not None and chosen.names:
+            try:
+                with time_limit(until):
+                    verdict = self._conclude(found.whole, found.sets, chosen, steps, found.chance)
+                return replace(verdict, complete=False)
+            except OutOfTimeError:
+                self.notes.append(f"best so far, not judged on data held out: {', '.join(chosen.names)}")
+        reason = f"the search was stopped after {self.options.time_budget_s:g} s"
+        return replace(
+            self._unexplained(found.whole, found.whole.null, found.chance, steps, reason), complete=False
         )
 
     def _training(self, whole: Selector) -> Selector:
@@ -563,5 +616,5 @@ class _Search:
         }
         return Verdict(
             verdict, effects, self.where, gap, tuple(steps), unexplained, self.model.setup.name, chance, candidates,
-            self.next_measurements, tuple(self.notes), data,
+            self.next_measurements, tuple(self.notes), data, size=disagreement_size(whole.problem, null),
         )  # fmt: skip

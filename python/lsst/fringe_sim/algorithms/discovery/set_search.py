@@ -71,6 +71,17 @@ class SetSearch:
     ) -> None:
         self.selector, self.options, self.say, self.rescued = selector, options, say, rescued
         self.order_open = order_open
+        self._reached: tuple[Hypothesis, list[Step]] | None = None
+
+    def best_so_far(self) -> tuple[Hypothesis, list[Step]]:
+        """The set that was reached, or the likeliest single effect of those that were fitted."""
+        if self._reached is not None:
+            return self._reached
+        singles = self.selector.known(1)
+        if not singles or singles[0].log_evidence < self.options.least_evidence:
+            return self.selector.null, []
+        best = self.selector.with_channels(singles[0])
+        return best, [self.step(self.selector.null, best)]
 
     def refits(self, base: Hypothesis, rival: Hypothesis | None = None) -> list[Hypothesis]:
         """Refits of the best-scored additions to a set, likeliest first; none that cannot come near a rival."""
@@ -97,7 +108,8 @@ class SetSearch:
                 self.selector.improved(best.names, self.selector.null.fit, scan=True)
             )
         best = self.rescued(best)
-        return best, [self.step(self.selector.null, best)]
+        self._reached = best, [self.step(self.selector.null, best)]
+        return self._reached
 
     def to_judge_with(self, singles: list[Hypothesis]) -> Hypothesis:
         """The single effect with which field and noise are judged again.
@@ -145,6 +157,7 @@ class SetSearch:
             larger = self.rescued(larger)
             steps.append(self.step(current, larger))
             current = larger
+            self._reached = current, steps
         return current
 
     def finished(self, current: Hypothesis, steps: list[Step]) -> Hypothesis:

@@ -208,6 +208,16 @@ def misfit_rms(problem: Problem, fit: Fit) -> float:
     return problem.cells.noise_rms * math.sqrt(fit.chi2 / max(problem.cells.n_values - free, 1))
 
 
+def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
+    """Size of what a fit leaves beyond noise, as `Verdict.size` states it."""
+    noise = problem.cells.noise_rms
+    counts = math.sqrt(max(misfit_rms(problem, fit) ** 2 - noise**2, 0.0))
+    level, _ = problem.amplitudes(fit.levels)
+    pattern = (problem.expected_of(fit) / level - 1.0)[:, problem.cells.seen]
+    fringes = math.sqrt(float(pattern.var(axis=1).mean())) if pattern.size else 0.0
+    return {"of_counts": counts, "of_fringes": counts / fringes if fringes > 0.0 else math.nan}
+
+
 def _field_freedom(problem: Problem) -> int:
     """Coefficients of the field that the data reach."""
     if problem.field_prior:

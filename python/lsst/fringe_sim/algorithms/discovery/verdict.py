@@ -155,6 +155,11 @@ class Verdict:
         Every effect that was tried, with score, gain in χ² and evidence.
     next_measurements : `tuple` of `dict`
         Measurements that would help, best first.
+    complete : `bool`
+        Whether the search came to its end; otherwise it was stopped, and this is the best answer so far.
+    size : `dict`
+        How large the disagreement with the unchanged model is: ``of_counts``, rms relative to the mean counts without
+        what noise adds, and ``of_fringes``, the same relative to the rms of the fringes.
     """
 
     verdict: str
@@ -169,6 +174,8 @@ class Verdict:
     next_measurements: tuple[dict[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
     data: dict[str, Any] = field(default_factory=dict)
+    complete: bool = True
+    size: dict[str, float] = field(default_factory=lambda: {"of_counts": math.nan, "of_fringes": math.nan})
 
     @property
     def settings(self) -> dict[str, float]:
@@ -188,6 +195,8 @@ class Verdict:
             effects.append(entry)
         content = {
             "verdict": self.verdict,
+            "complete": self.complete,
+            "size": self.size,
             "effects": effects,
             "where": asdict(self.where),
             "gap": asdict(self.gap),
@@ -248,6 +257,8 @@ class Verdict:
             tuple(content["next_measurements"]),
             tuple(content["notes"]),
             content["data"],
+            content.get("complete", True),
+            {key: _number(content.get("size", {}).get(key)) for key in ("of_counts", "of_fringes")},
         )
 
     def table(self) -> Table:
@@ -289,9 +300,21 @@ class Verdict:
         }
         return write_together(folder, contents)
 
+    def size_text(self) -> str:
+        """How large the disagreement is, for people."""
+        counts, fringes = self.size["of_counts"], self.size["of_fringes"]
+        if counts == 0.0:
+            return "size of the disagreement: none beyond the noise"
+        return (
+            f"size of the disagreement: {100.0 * fringes:.2g} % of the fringes ({counts:.2g} of the counts)"
+        )
+
     def summary(self) -> str:
         """A few lines for people."""
-        lines = [f"verdict: {self.verdict}"]
+        stopped = "" if self.complete else " (the search was stopped; the best answer so far)"
+        lines = [f"verdict: {self.verdict}{stopped}"]
+        if math.isfinite(self.size["of_counts"]):
+            lines.append(f"  {self.size_text()}")
         for effect in self.effects:
             values = ", ".join(
                 f"{name} = {p.value:.6g} ± {p.sigma:.2g} {p.unit}".rstrip()

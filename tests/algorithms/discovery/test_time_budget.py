@@ -1,0 +1,63 @@
+"""A search that is given a time says what it knows when the time is over, and that it did not end."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover, evaluations
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
+from lsst.fringe_sim.errors import OutOfRangeError
+
+BUDGET_S = 100.0
+CASE = draw_case("one", np.random.default_rng(31), size=(48, 64), only=["ghost_pedestal"])
+
+
+def stopped(monkeypatch: pytest.MonkeyPatch, line: str, at_s: float) -> Verdict:
+    """Verdict of a search whose clock stands still, and jumps once a line is said."""
+    clock = {"now": 0.0}
+    monkeypatch.setattr(evaluations.time, "monotonic", lambda: clock["now"])
+
+    def report(said: str) -> None:
+        if said.startswith(line):
+            clock["now"] = at_s
+
+    options = SearchOptions(time_budget_s=BUDGET_S)
+    return discover(CASE.cube, CASE.setup, rng=np.random.default_rng(0), options=options, report=report)
+
+
+def test_time_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    verdict = stopped(monkeypatch, "fitting the thickness", 2 * BUDGET_S)
+    assert (verdict.verdict, verdict.complete) == ("unexplained", False)
+    assert verdict.effects == ()
+    assert "stopped" in verdict.summary()
+
+
+@pytest.mark.slow
+def test_what_was_not_judged_on_data_held_out_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    verdict = stopped(monkeypatch, "  with ", 2 * BUDGET_S)
+    assert (verdict.verdict, verdict.complete) == ("unexplained", False)
+    assert verdict.effects == ()
+    assert any("not judged" in note for note in verdict.notes)
+    assert verdict.size["of_counts"] > 0.0
+
+
+@pytest.mark.slow
+def test_the_best_so_far_is_judged_on_data_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time kept for it suffices, as the clock stands still: the effect has its class, and the search no end."""
+    verdict = stopped(monkeypatch, "  with ghost_pedestal", 0.9 * BUDGET_S)
+    assert not verdict.complete
+    assert verdict.gap.heldout_after < verdict.gap.heldout_before
+    (found,) = verdict.effects
+    assert "ghost_pedestal" in {found.name, *found.ambiguous_with}
+    again = Verdict.from_json(verdict.to_json())
+    assert not again.complete
+    assert again.size == pytest.approx(verdict.size)
+
+
+def test_a_budget_is_positive() -> None:
+    with pytest.raises(OutOfRangeError, match="time budget"):
+        SearchOptions(time_budget_s=-1.0)
+    assert math.isinf(SearchOptions().time_budget_s)
