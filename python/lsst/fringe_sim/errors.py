@@ -141,7 +141,7 @@ class UnknownNameError(InputError):
         near = difflib.get_close_matches(str(value), names, n=3, cutoff=0.5)
         near += [name for name in names if value and str(value) in name and name not in near][: 3 - len(near)]
         if near:
-            allowed = f"did you mean {' or '.join(near)}? ({_shorten(names)})"
+            allowed = f"did you mean {' or '.join(near)}? ({len(names)} are known)"
         else:
             allowed = _shorten(names)
         super().__init__(field, value, allowed, source=source)

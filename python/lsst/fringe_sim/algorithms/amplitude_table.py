@@ -16,7 +16,7 @@ import numpy as np
 from astropy.table import Column, Table, vstack
 from numpy.typing import ArrayLike, NDArray
 
-from ..effects import EFFECTS, activate_effects
+from ..effects import activate_effects, known_effects
 from ..effects.active import settings_of
 from ..errors import InputError
 from ..instrument.bandpass import Bandpass
@@ -158,7 +158,7 @@ def amplitude_table(
     if adhesive.ndim != 2:
         raise InputError("shape of the thickness map", adhesive.shape, "two axes (y, x)")
     settings = dict(effects or {})
-    activate_effects(settings, EFFECTS)
+    activate_effects(settings, known_effects())
     chosen = SkyCase.palace() if skies is None else tuple(skies)
     rows = []
     for case in cases:
@@ -238,7 +238,7 @@ _MEASURED_MONOCAM = 2.0
 def _model(case: AmplitudeCase, settings: Mapping[str, Any]) -> FringeModel:
     """Model with those effects that the stack and the light of a case can have."""
     bare = FringeModel.from_setup(case.setup, field_x_deg=case.field_deg)
-    given = settings_of(activate_effects(settings, EFFECTS), on_sky=case.on_sky)
+    given = settings_of(activate_effects(settings, known_effects()), on_sky=case.on_sky)
     return bare.with_effects({key: value for key, value in given.items() if _applies(bare, {key: value})})
 
 

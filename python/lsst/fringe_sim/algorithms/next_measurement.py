@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from ..effects import EFFECTS, Effect, ImageGeometry, Parameter, activate_effects, apply_to_image
+from ..effects import Effect, ImageGeometry, Parameter, activate_effects, apply_to_image, known_effects
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..model import FringeModel
 from ..optics import Beam
@@ -328,7 +328,7 @@ def rank_measurements(
     significance: float | None = None,
     measurements: Sequence[FlatMeasurement] | None = None,
     nuisance_effects: Sequence[str] = (),
-    catalogue: Sequence[Effect] = EFFECTS,
+    catalogue: Sequence[Effect] | None = None,
     report: Report | None = None,
 ) -> tuple[RankedMeasurement, ...]:
     """Rank further measurements by how well they tell apart effects that the present flats cannot.
@@ -374,6 +374,7 @@ def rank_measurements(
     if model.setup.kind != "monochromator":
         raise InputError("set-up", model.setup.name, "a laboratory set-up with a monochromator")
     say = report or (lambda text: None)
+    catalogue = known_effects() if catalogue is None else catalogue
     known = {effect.name: effect for effect in catalogue}
     unknown = [name for name in (*effects, *nuisance_effects) if name not in known]
     if unknown:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
 
+from ..errors import UnknownNameError
+from .parameters import effects_from_option
+
 if TYPE_CHECKING:
-    from ..effects import Parameter
+    from ..effects import Effect, Parameter
 
 __all__ = ["effects", "setups"]
 
@@ -57,18 +61,31 @@ def setups(as_json: bool) -> None:
         )
 
 
+def _named(known: Sequence[Effect], names: Sequence[str]) -> list[Effect]:
+    """The effects of some names; all if there are none."""
+    by_name = {effect.name: effect for effect in known}
+    for name in names:
+        if name not in by_name:
+            raise UnknownNameError("effect", name, by_name)
+    return [by_name[name] for name in names] or list(known)
+
+
 @click.command()
+@click.argument("names", nargs=-1, metavar="[NAME]...")
 @click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
-def effects(as_json: bool) -> None:
-    """List the physical effects that the model knows, with parameters, units and null values.
+@effects_from_option
+def effects(names: tuple[str, ...], as_json: bool) -> None:
+    """List the physical effects that the model knows, or those of some names, with parameters, units, null values.
 
     \b
     Example, with one of them switched on:
       fringe-sim effects
+      fringe-sim effects bandwidth
       fringe-sim mock-flats raws --setup ts8_e2v --effect bandwidth.fwhm=2.6 --seed 1
     """
-    from ..effects import EFFECTS
+    from ..effects import known_effects
 
+    shown = _named(known_effects(), names)
     if as_json:
         rows = [
             {
@@ -88,11 +105,11 @@ def effects(as_json: bool) -> None:
                     for parameter in effect.parameters
                 ],
             }
-            for effect in EFFECTS
+            for effect in shown
         ]
         click.echo(json.dumps(rows, indent=2))
         return
-    for effect in EFFECTS:
+    for effect in shown:
         click.echo(f"{effect.name}  ({effect.acts_on}: {effect.title})")
         for parameter in effect.parameters:
             click.echo(f"    {_describe(parameter)}")

@@ -10,7 +10,7 @@ import click
 from ..algorithms.thickness_fit_options import CONTRASTS, FIT_METHODS, SILICON_FIELDS, ZONES
 from ..errors import InputError, UnknownNameError
 from .output import OutputFolder, output_folder
-from .parameters import EFFECT, LABORATORY, effect_settings
+from .parameters import EFFECT, LABORATORY, effect_settings, effects_from_option
 from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -73,6 +73,7 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
     help="Contrast of the fringes: a free factor at each wavelength, or one for all, or that of the model.",
 )
 @click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
+@effects_from_option
 @click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
 @click.option("--strict", is_flag=True, help="Exit with 1 where model and flats do not go together.")

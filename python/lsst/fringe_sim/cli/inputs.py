@@ -13,7 +13,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..effects import EFFECTS, activate_effects
+from ..effects import activate_effects, known_effects
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel
@@ -102,7 +102,7 @@ def sky_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     UnknownNameError, OutOfRangeError, InputError
         An effect that there is not, or a value that it cannot have.
     """
-    active = activate_effects(settings, EFFECTS)
+    active = activate_effects(settings, known_effects())
     applied = {
         f"{item.effect.name}.{name}": value
         for item in active

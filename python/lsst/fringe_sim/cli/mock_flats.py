@@ -46,7 +46,7 @@ BLEMISHES: dict[str, Any] = {"bad_columns": 6, "hot_pixels": 200, "prnu_rms": 0.
     help="Map of the varying layer: a FITS file [µm], 'random', or 'e2v_321' (model of a measured sensor).",
 )
 @click.option("--wavelengths", type=WAVELENGTHS, default=None, help="first:last:step or a list [nm].")
-@model_effects("Hidden effect; may be repeated.", "YAML with hidden effects.")
+@model_effects("Hidden effect; may be repeated.", "YAML with hidden effects.", own=False)
 @click.option(
     "--size", type=SIZE, default=None, help="Cut-down sensor, columns x rows; full size if not given."
 )

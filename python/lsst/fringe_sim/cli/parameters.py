@@ -36,6 +36,7 @@ __all__ = [
     "SetupType",
     "effect_settings",
     "effects_file_option",
+    "effects_from_option",
     "laboratory_of_the_mock",
     "model_effects",
 ]
@@ -239,11 +240,11 @@ class _EffectSetting(click.ParamType):
 
 def _parameters() -> list[tuple[str, Parameter]]:
     """All parameters of the catalogue by ``name.parameter``."""
-    from ..effects import EFFECTS
+    from ..effects import known_effects
 
     return [
         (f"{effect.name}.{parameter.name}", parameter)
-        for effect in EFFECTS
+        for effect in known_effects()
         for parameter in effect.parameters
     ]
 
@@ -269,11 +270,11 @@ class ChosenEffects:
 
 
 def model_effects(
-    help_text: str = "Effect in the model; may be repeated.", file_help: str = "YAML."
+    help_text: str = "Effect in the model; may be repeated.", file_help: str = "YAML.", *, own: bool = True
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """``--effect`` and ``--effects-file`` of a command, which gets them as `ChosenEffects` named ``effects``.
 
-    An option wins over the file, and the last of equal names over the others.
+    An option wins over the file, and the last of equal names over the others. ``own``: with ``--effects-from``.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -288,9 +289,30 @@ def model_effects(
             command(effects=ChosenEffects({**settings, **effect_settings(effects)}, files), **others)
 
         one = click.option("--effect", "effects", type=EFFECT, multiple=True, help=help_text)
-        return one(effects_file_option(file_help)(with_effects))
+        with_options = one(effects_file_option(file_help)(with_effects))
+        return effects_from_option(with_options) if own else with_options
 
     return decorate
+
+
+def effects_from_option(command: Callable[..., None]) -> Callable[..., None]:
+    """``--effects-from``, which puts effects of one's own into the catalogue until the command ends."""
+
+    def put(ctx: click.Context, param: click.Parameter, sources: tuple[str, ...]) -> None:
+        for source in sources:
+            from ..effects import effects_from
+
+            ctx.with_resource(effects_from(source))
+
+    return click.option(
+        "--effects-from",
+        multiple=True,
+        metavar="FILE.py|MODULE",
+        is_eager=True,
+        expose_value=False,
+        callback=put,
+        help="Python file or module with effects of your own, as EFFECTS; it is executed.",
+    )(command)
 
 
 def effects_file_option(help_text: str = "YAML.") -> Callable[[Callable[..., None]], Callable[..., None]]:

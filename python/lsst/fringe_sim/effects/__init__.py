@@ -9,6 +9,7 @@ from .active import (
     apply_to_system,
 )
 from .base import Effect, Parameter, Residuals, ResponseContext, SearchHints
+from .catalogue import effects_from, known_effects
 from .geometry import AMPLIFIERS, ImageGeometry
 from .illumination import ChromaticIllumination, IlluminationPattern, Vignetting
 from .light import (
@@ -72,6 +73,8 @@ __all__ = [
     "apply_to_response",
     "apply_to_sky",
     "apply_to_system",
+    "effects_from",
+    "known_effects",
 ]
 
 EFFECTS: tuple[Effect, ...] = (
@@ -127,4 +130,4 @@ EFFECTS: tuple[Effect, ...] = (
     SkyContinuum(),
     WaterVapour(),
 )
-"""Every effect that the model knows, in the order in which they are applied."""
+"""Every effect of this package, in the order in which they are applied; `known_effects` has those of others, too."""

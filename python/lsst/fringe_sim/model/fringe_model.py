@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..effects import (
-    EFFECTS,
     ActiveEffect,
     Effect,
     ImageGeometry,
@@ -19,6 +18,7 @@ from ..effects import (
     apply_to_image,
     apply_to_response,
     apply_to_system,
+    known_effects,
 )
 from ..effects.active import settings_of
 from ..errors import InputError, without_unit
@@ -74,7 +74,7 @@ class FringeModel:
         field_x_deg: float = 0.0,
         field_y_deg: float = 0.0,
         observable: str = "detection",
-        catalogue: Sequence[Effect] = EFFECTS,
+        catalogue: Sequence[Effect] | None = None,
     ) -> FringeModel:
         """Model of a set-up.
 
@@ -89,7 +89,7 @@ class FringeModel:
         observable : {"detection", "total"}, optional
             Absorption in the detection layer, or 1 - R - T of the stack as the paper's fit used.
         catalogue : sequence of `Effect`, optional
-            The effects that may be named.
+            The effects that may be named; `known_effects` by default.
 
         Raises
         ------
@@ -102,11 +102,15 @@ class FringeModel:
         system = chosen.optical_system(
             field_x_deg=field_x_deg, field_y_deg=field_y_deg, observable=observable
         )
-        return cls(chosen, system, activate_effects(effects or {}, catalogue))
+        known = known_effects() if catalogue is None else catalogue
+        return cls(chosen, system, activate_effects(effects or {}, known))
 
-    def with_effects(self, effects: Mapping[str, Any], catalogue: Sequence[Effect] = EFFECTS) -> FringeModel:
+    def with_effects(
+        self, effects: Mapping[str, Any], catalogue: Sequence[Effect] | None = None
+    ) -> FringeModel:
         """Same set-up and light with other effects in place of the present ones."""
-        return replace(self, effects=activate_effects(effects, catalogue))
+        known = known_effects() if catalogue is None else catalogue
+        return replace(self, effects=activate_effects(effects, known))
 
     @property
     def effect_settings(self) -> dict[str, float]:

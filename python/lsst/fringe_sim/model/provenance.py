@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..effects import EFFECTS, activate_effects, apply_to_system
+from ..effects import activate_effects, apply_to_system, known_effects
 from ..errors import FrameFormatError, InputError, UnknownNameError, to_number
 from ..instrument.setup import Setup, setup_names
 from ..optics.stack import LayerStack
@@ -181,7 +181,7 @@ def table_cards(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
 def model_cards(setup: str | Setup, effects: Mapping[str, float]) -> dict[str, str | float]:
     """Keywords of a fringe model: set-up, effects, tables."""
     chosen = Setup.from_name(setup) if isinstance(setup, str) else setup
-    stack = apply_to_system(activate_effects(effects, EFFECTS), _plain_light(chosen)).stack
+    stack = apply_to_system(activate_effects(effects, known_effects()), _plain_light(chosen)).stack
     return {
         "SETUP": _printable(chosen.name),
         **effect_cards(effects),

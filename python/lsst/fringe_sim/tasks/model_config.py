@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TypeVar
 from lsst.pex.config import Config, ConfigDictField, DictField, Field, FieldValidationError
 from lsst.pex.config.configDictField import ConfigDict
 
-from ..effects import EFFECTS, activate_effects
+from ..effects import activate_effects, known_effects
 from ..effects.active import settings_of
 from ..errors import InputError
 from ..instrument.detector import Detector
@@ -37,7 +37,7 @@ class ModelChoice:
     def applied_effects(self) -> dict[str, float]:
         """Effects that belong to this set-up: on the sky, not those of the laboratory."""
         on_sky = Setup.from_name(self.setup).kind == "sky"
-        return settings_of(activate_effects(self.effects, EFFECTS), on_sky=on_sky)
+        return settings_of(activate_effects(self.effects, known_effects()), on_sky=on_sky)
 
     @property
     def left_out(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from ...effects import EFFECTS, Effect
+from ...effects import Effect, known_effects
 from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
 from ...products.sky_frame import refuse_noiseless
@@ -73,7 +73,7 @@ FOR_JUDGEMENT = 0.2
 def discover(
     cube: FringeCube,
     setup: str | Setup | FringeModel,
-    effects: Sequence[Effect] = EFFECTS,
+    effects: Sequence[Effect] | None = None,
     *,
     rng: np.random.Generator,
     options: SearchOptions | None = None,
@@ -88,7 +88,7 @@ def discover(
     setup : `str`, `Setup` or `FringeModel`
         What is known of sensor and light; a model may hold effects that are known already.
     effects : sequence of `Effect`, optional
-        The catalogue.
+        The catalogue; `known_effects` by default.
     rng : `numpy.random.Generator`
         Decides which parts of the sensor are held out; nothing else is random.
     options : `SearchOptions`, optional
@@ -111,7 +111,8 @@ def discover(
     check_setup(cube, model)
     known = {item.effect.name for item in model.effects}
     # Flats do not see the spectrum of the night sky.
-    own = [effect for effect in effects if effect.acts_on != "spectrum" or effect.name in known]
+    catalogue = known_effects() if effects is None else effects
+    own = [effect for effect in catalogue if effect.acts_on != "spectrum" or effect.name in known]
     return search_exposures(cube, model, own, rng, options, report)
 
 

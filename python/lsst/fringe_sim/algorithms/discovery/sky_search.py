@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BarycentricInterpolator
 
-from ...effects import EFFECTS, Effect, ImageGeometry
+from ...effects import Effect, ImageGeometry, known_effects
 from ...errors import InputError
 from ...instrument.bandpass import Bandpass
 from ...instrument.detector import Detector
@@ -330,7 +330,7 @@ def discover_sky(
     thickness_um: ArrayLike,
     thickness_sigma_um: ArrayLike | float,
     setup: str | Setup | FringeModel,
-    effects: Sequence[Effect] = EFFECTS,
+    effects: Sequence[Effect] | None = None,
     *,
     rng: np.random.Generator,
     sky: SkySpectrum | None = None,
@@ -398,7 +398,8 @@ def discover_sky(
     light = replace(light, scales=tuple(light.scales[number] for number in order))
     cube = _as_cube(_images_of(frames).in_order(order), light, model, thickness_um, thickness_sigma_um)
     known = {item.effect.name for item in model.effects}
-    own = [effect for effect in effects if not effect.laboratory_only or effect.name in known]
+    catalogue = known_effects() if effects is None else effects
+    own = [effect for effect in catalogue if not effect.laboratory_only or effect.name in known]
     return search_exposures(cube, model, own, rng, options or SKY_SEARCH, report, light)
 
 

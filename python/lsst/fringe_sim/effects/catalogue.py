@@ -1,0 +1,130 @@
+"""The effects that may be named: those of the package, of installed ones, and of one's own files and modules."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from ..errors import InputError
+from .base import Effect
+
+__all__ = ["ENTRY_POINTS", "effects_from", "known_effects"]
+
+ENTRY_POINTS = "lsst.fringe_sim.effects"
+"""Group of the entry points by which an installed package offers effects: each names a sequence of `Effect`."""
+
+_STATED = ("name", "title", "acts_on", "parameters", "reference")
+
+_own: ContextVar[tuple[Effect, ...]] = ContextVar("_own", default=())
+
+
+def known_effects() -> tuple[Effect, ...]:
+    """All effects that may be named here, in the order in which they are applied.
+
+    Returns
+    -------
+    effects : `tuple` [`Effect`, ...]
+        `EFFECTS`, then those that installed packages offer as entry points of the group ``lsst.fringe_sim.effects``,
+        then those of `effects_from`.
+
+    Raises
+    ------
+    InputError
+        An installed package offers something else, or a name that is taken.
+    """
+    return (*_installed(), *_own.get())
+
+
+@contextmanager
+def effects_from(source: str | Path) -> Iterator[tuple[Effect, ...]]:
+    """Add effects of one's own to the catalogue for as long as the block lasts.
+
+    Parameters
+    ----------
+    source : `str` or `~pathlib.Path`
+        A Python file, or the dotted name of a module. It is executed, and its ``EFFECTS`` are taken.
+
+    Yields
+    ------
+    effects : `tuple` [`Effect`, ...]
+        What it holds.
+
+    Raises
+    ------
+    InputError
+        There is no such file; it cannot be imported, has no ``EFFECTS``, holds something else, or a name that is
+        taken.
+    """
+    module = _module(source)
+    offered = getattr(module, "EFFECTS", None)
+    if offered is None:
+        raise InputError("EFFECTS", "missing", "a sequence of effects in the module", source=str(source))
+    added = _checked(offered, known_effects(), str(source))
+    token = _own.set((*_own.get(), *added))
+    try:
+        yield added
+    finally:
+        _own.reset(token)
+
+
+@functools.cache
+def _installed() -> tuple[Effect, ...]:
+    from . import EFFECTS
+
+    found = EFFECTS
+    for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda item: item.name):
+        found += _checked(entry.load(), found, f"entry point {entry.name} = {entry.value}")
+    return found
+
+
+def _module(source: str | Path) -> ModuleType:
+    path = Path(source)
+    is_file = path.suffix == ".py" or len(path.parts) > 1
+    try:
+        if not is_file:
+            return importlib.import_module(str(source))
+        if not path.is_file():
+            raise InputError("file of effects", str(path), "a Python file that is there")
+        spec = importlib.util.spec_from_file_location(f"fringe_sim_effects_{path.stem}", path)
+        if spec is None or spec.loader is None:
+            raise InputError(
+                "file of effects", path.name, "a Python file, as my_effects.py", source=str(path)
+            )
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    except InputError:
+        raise
+    except Exception as error:  # whatever the code of a stranger raises
+        told = f"{type(error).__name__}: {error}"
+        raise InputError("effects", told, "a module that can be imported", source=str(source)) from error
+    return module
+
+
+def _checked(offered: Any, known: tuple[Effect, ...], source: str) -> tuple[Effect, ...]:
+    try:
+        effects = tuple(offered)
+    except TypeError:
+        effects = (offered,)
+    taken = {effect.name for effect in known}
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            raise InputError("EFFECTS", repr(effect), "instances of subclasses of Effect", source=source)
+        missing = [name for name in _STATED if not hasattr(effect, name)]
+        if missing:
+            allowed = f"an effect that states its {', '.join(_STATED)}"
+            raise InputError(
+                "effect", f"{type(effect).__name__} without {missing[0]}", allowed, source=source
+            )
+        if not effect.name.isidentifier() or effect.name in taken:
+            allowed = "an identifier that no other effect of the catalogue has"
+            raise InputError("name of an effect", effect.name, allowed, source=source)
+        taken.add(effect.name)
+    return effects
