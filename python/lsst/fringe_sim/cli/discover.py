@@ -166,16 +166,16 @@ def _read(
 ) -> FringeCube | None:
     """Cube of one sensor, or `None` after a dry run."""
     from ..algorithms.flat_prep_options import FlatPrepOptions
-    from .lab_frames import find_series, read_cube
+    from .lab_frames import find_series, given_cube
 
-    if len(paths) == 1:
-        cube = read_cube(paths[0])
-        if cube is None and (Path(paths[0]) / "butler.yaml").is_file():
-            cube = _from_repository(paths[0], collections, detector)
-        if cube is not None:
-            if dry_run:
-                click.echo(f"would search {cube.shape[0]} flats of {cube.shape[1]} x {cube.shape[2]} pixels")
-            return None if dry_run else cube
+    if len(paths) == 1 and (Path(paths[0]) / "butler.yaml").is_file():
+        cube: FringeCube | None = _from_repository(paths[0], collections, detector)
+    else:
+        cube, _ = given_cube(paths, setup)
+    if cube is not None:
+        if dry_run:
+            click.echo(f"would search {cube.shape[0]} flats of {cube.shape[1]} x {cube.shape[2]} pixels")
+        return None if dry_run else cube
     series = find_series(paths, skip_bad=skip_bad)
     listed = ", ".join(f"{w:g}" for w in series.wavelengths_nm)
     click.echo(

@@ -18,9 +18,10 @@ from ..instrument.raw_files import find_raw_files, pixel_digest
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..model import Setup
 from ..products import FringeCube, FringeFlat
+from ..products.plain_flats import is_plain, read_plain_flats
 from .inputs import complete_fits
 
-__all__ = ["LabSeries", "find_series", "read_cube"]
+__all__ = ["LabSeries", "find_series", "given_cube", "read_cube"]
 
 LEAST_SIZE = (16, 64)
 """Rows and columns below which a frame is no sensor."""
@@ -164,6 +165,40 @@ def _each_once(frames: Sequence[RawMetadata]) -> list[RawMetadata]:
     if copies:
         click.echo(f"copies of other frames, not counted again: {', '.join(copies)}", err=True)
     return list(kept.values())
+
+
+def given_cube(paths: Sequence[str], setup: Setup) -> tuple[FringeCube | None, tuple[str, ...]]:
+    """Cube and files of what a command was given; `None` if that is neither a cube nor flats of one image each.
+
+    What the headers of such flats do not say, the set-up does.
+    """
+    cube = read_cube(paths[0]) if len(paths) == 1 else None
+    if cube is not None:
+        return cube, (paths[0],)
+    files, refused = find_raw_files(paths)
+    if refused or not files or not all(map(_is_plain, files)):
+        return None, ()
+    cube = read_plain_flats(
+        files,
+        temperature_k=setup.temperature_k,
+        bandwidth_fwhm_nm=setup.bandwidth_fwhm_nm,
+        f_number=setup.f_number,
+    )
+    listed = ", ".join(f"{wavelength:g}" for wavelength in cube.wavelength_nm)
+    biases = cube.metadata["NBIAS"]
+    subtracted = (
+        f"{biases} bias images subtracted" if biases else "taken as bias-subtracted: there are no bias images"
+    )
+    click.echo(f"{len(cube.wavelength_nm)} plain flats at {listed} nm; {subtracted}", err=True)
+    return cube, tuple(files)
+
+
+def _is_plain(file: str) -> bool:
+    """Whether a file is one image; one that cannot be read is left to what reads raw frames, and says so."""
+    try:
+        return is_plain(file)
+    except FringeSimError:
+        return False
 
 
 def read_cube(path: str) -> FringeCube | None:

@@ -13,6 +13,7 @@ from .fringe_cube import CUBE_UNITS, FringeCube
 from .fringe_flat import FringeFlat
 from .fringe_frame import FringeFrame
 from .mask import MASK_PLANES, describe_mask, mask_bits
+from .plain_flats import read_plain_flats
 from .sensor_section import SensorSection
 from .sky_frame import (
     CORRECTED,
@@ -49,6 +50,7 @@ __all__ = [
     "bands_of_header",
     "describe_mask",
     "mask_bits",
+    "read_plain_flats",
     "refuse_corrected",
     "refuse_noiseless",
 ]

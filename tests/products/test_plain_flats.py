@@ -1,0 +1,104 @@
+"""Flats of a sensor without a layout of its own: one image in one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.mock.thickness import e2v_321
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import ThicknessMap, read_plain_flats
+
+WAVELENGTHS_NM = np.arange(880.0, 1000.0, 10.0)
+THICKNESS_UM = e2v_321((64, 96))
+LIGHT: dict[str, Any] = {"temperature_k": 183.15, "bandwidth_fwhm_nm": 2.0}
+
+
+def write(path: Path, counts: np.ndarray, **cards: Any) -> Path:
+    header = fits.Header()
+    header.update({key: value for key, value in cards.items() if value is not None})
+    fits.PrimaryHDU(counts.astype(np.float32), header).writeto(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def electrons() -> np.ndarray:
+    rng = np.random.default_rng(20261127)
+    response = FringeModel.from_setup("ts8_e2v").response(THICKNESS_UM.ravel(), WAVELENGTHS_NM)
+    mean = 20_000.0 * response / response.mean(axis=1, keepdims=True)
+    return rng.poisson(mean).reshape(-1, *THICKNESS_UM.shape).astype(float)
+
+
+@pytest.fixture
+def flats(electrons: np.ndarray, tmp_path: Path) -> Path:
+    """The flats in ADU above a bias level, with bias images, in a second HDU like that of many cameras."""
+    folder = tmp_path / "flats"
+    folder.mkdir()
+    for number, (wavelength, image) in enumerate(zip(WAVELENGTHS_NM, electrons, strict=True)):
+        cards = {"MONOWL": wavelength, "BUNIT": "ADU", "GAIN": 0.7, "IMGTYPE": "FLAT", "RDNOISE": 5.0}
+        header = fits.Header(cards)
+        counts = (image / 0.7 + 1000.0).astype(np.float32)
+        fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(counts, header)]).writeto(folder / f"{number}.fits")
+    for number in range(2):
+        level = np.full(THICKNESS_UM.shape, 1000.0)
+        write(folder / f"bias{number}.fits", level, BUNIT="adu", GAIN=0.7, IMGTYPE="BIAS")
+    return folder
+
+
+def test_counts_become_electrons_without_the_bias(flats: Path, electrons: np.ndarray) -> None:
+    cube = read_plain_flats(flats.iterdir(), **LIGHT)
+    assert cube.metadata["NBIAS"] == 2
+    np.testing.assert_array_equal(cube.wavelength_nm, WAVELENGTHS_NM)
+    np.testing.assert_allclose(cube.image, electrons, rtol=1e-5)
+    np.testing.assert_allclose(cube.variance, electrons + 1.5 * 25.0, rtol=1e-5)
+
+
+def test_pixels_without_a_number_and_full_ones_are_masked(tmp_path: Path) -> None:
+    counts = np.full((20, 30), 1000.0)
+    counts[3, 4], counts[5, 6] = np.nan, 70_000.0
+    path = write(tmp_path / "flat.fits", counts, WAVELEN=950.0, BUNIT="electron", SATURATE=65_000)
+    cube = read_plain_flats([path], **LIGHT)
+    assert set(zip(*(axis.tolist() for axis in np.nonzero(cube.mask[0])), strict=True)) == {(3, 4), (5, 6)}
+
+
+def test_the_command_fits_a_folder_of_them(flats: Path, tmp_path: Path, capsys) -> None:
+    assert run(["fit", str(flats), "--setup", "ts8_e2v", "--out", str(tmp_path / "fit")]) == 0
+    assert "12 plain flats" in capsys.readouterr().err
+    found = ThicknessMap.read_fits(tmp_path / "fit" / "thickness.fits")
+    good = found.mask == 0
+    assert good.mean() > 0.95
+    assert np.abs(found.value - THICKNESS_UM)[good].max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("cards", "words"),
+    [
+        ({"MONOWL": None}, "MONOWL is 'missing'"),
+        ({"MONOWL": 9500.0}, "200 to 1300"),
+        ({"MONOWL": "blue"}, "a number"),
+        ({"BUNIT": None}, "BUNIT is 'missing'"),
+        ({"BUNIT": "adu"}, "GAIN is 'missing'"),
+        ({"BUNIT": "adu", "GAIN": -1.0}, "positive"),
+        ({"BUNIT": "jansky"}, "electron, or adu"),
+        ({"IMGTYPE": "DARK"}, "one flat or more"),
+    ],
+)
+def test_what_is_missing_is_said(tmp_path: Path, cards: dict[str, Any], words: str) -> None:
+    path = write(tmp_path / "one.fits", np.ones((20, 30)), **{"MONOWL": 950.0, "BUNIT": "electron", **cards})
+    with pytest.raises(InputError, match=words):
+        read_plain_flats([path], **LIGHT)
+
+
+def test_images_of_other_shapes_are_refused(tmp_path: Path) -> None:
+    paths = [
+        write(tmp_path / f"{rows}.fits", np.ones((rows, 30)), MONOWL=950.0 + rows, BUNIT="electron")
+        for rows in (20, 21)
+    ]
+    with pytest.raises(InputError, match=r"shape is \(21, 30\)"):
+        read_plain_flats(paths, **LIGHT)
