@@ -1,6 +1,6 @@
 """The panel: whether the search still works, case by case against a frozen baseline.
 
-See "The panel" in doc/discovery.md for how to run and read it.
+See "The panel" in doc/discovery_details.md for how to run and read it.
 """
 
 from __future__ import annotations

@@ -479,3 +479,22 @@ def test_where_fringes_are_narrow_a_part_is_searched_and_that_is_said() -> None:
     found = prepared.problem.basis.expand(prepared.null.field)
     np.testing.assert_allclose(found, thickness[2:98, 58:141], atol=0.02)
     assert prepare(cube, model, EFFECTS[:3], 20_000).stated.shape == (12, 100, 200)
+
+
+@pytest.mark.parametrize("far_um", [(-1.3, 0.0), (0.0, 2.1), (-0.7, 0.9), (-5.0, 0.0)])
+def test_what_is_predicted_does_not_depend_on_what_was_asked_before(far_um: tuple[float, float]) -> None:
+    """Tables that grow for another fit keep levels and fringes; so do copies with pixels of another kind."""
+    model = FringeModel.from_setup("ts8_e2v")
+    geometry = ImageGeometry.of_pixels((4, 5), np.array([900.0, 960.0]), 20_000.0)
+    settings = {"bandwidth.fwhm": 2.4, "ghost_pedestal.fraction": 0.02}
+    field = np.linspace(14.2, 15.7, 20).reshape(4, 5)
+    fresh, asked = (Forward(model, EFFECTS, geometry, 1, (14.0, 16.0)) for _ in range(2))
+    asked.cover(np.array([14.0 + far_um[0], 16.0 + far_um[1]]))
+    before = fresh.predict(settings, field)
+    for forward in (asked, asked.with_places(1).with_places(0)):
+        after = forward.predict(settings, field)
+        np.testing.assert_allclose(after.value, before.value, rtol=1e-8)
+        np.testing.assert_allclose(after.slope, before.slope, rtol=1e-6, atol=1e-6)
+    tables = asked.range_um
+    asked.cover(np.array([14.0 + far_um[0], 16.0 + far_um[1]]))
+    assert asked.range_um == tables

@@ -127,7 +127,7 @@ class Forward:
     catalogue: Sequence[Effect]  # effects that may be set
     geometry: ImageGeometry
     cell_px: int  # side of a cell [px]
-    # Thicknesses that the tables cover; grows on demand, by `FARTHEST_UM` at most
+    # Thicknesses that the tables cover; grows on demand, by `FARTHEST_UM` at most, which changes no answer
     range_um: tuple[float, float]
     centroid: FloatArray | None = None  # (2, W, ny, nx): see `CellData`
     # (ny, nx): cells with data; by default all. The thickness of others is not known, and slopes do not
@@ -140,6 +140,9 @@ class Forward:
     # Places along the side of a pixel at which it sees the thickness; 0, the default, for all of its
     # area, as real pixels do
     places: int = 0
+    reference_um: tuple[float, float] | None = (
+        None  # thicknesses over which the mean light is 1: the first range
+    )
     _tables: dict[tuple[tuple[str, float], ...], tuple[FloatArray, FloatArray]] = field(
         default_factory=dict, repr=False
     )
@@ -154,7 +157,9 @@ class Forward:
 
     def __post_init__(self) -> None:
         self._by_name = {effect.name: effect for effect in self.catalogue}
-        low, high = self.range_um
+        if self.reference_um is None:
+            self.reference_um = self.range_um
+        low, high = self.reference_um
         self._limits_um = (max(low - FARTHEST_UM, 0.05), high + FARTHEST_UM)
         if self.centroid is not None:
             common = self.centroid.mean(axis=1)
@@ -219,8 +224,10 @@ class Forward:
         if key not in self._tables:
             low, count = self._grid()
             response = self._response(settings, low, count)
-            # Tapered, so that a broken fringe order at an end of the table does not count.
-            mean = np.average(response, axis=1, weights=np.hanning(count + 2)[1:-1])
+            first, last = self._grid_indices(self._reference)
+            # Tapered, so that a broken fringe order at an end of the range does not count.
+            taper = np.hanning(last - first + 3)[1:-1]
+            mean = np.average(response[:, first : last + 1], axis=1, weights=taper)
             each = mean.reshape(-1, len(self.geometry.wavelength_nm)).mean(axis=0)  # over all places
             level = np.resize(each, len(mean))[:, np.newaxis]
             self._keep(key, (response / level, level))
@@ -252,10 +259,19 @@ class Forward:
         while len(self._tables) * table[0].nbytes > MOST_TABLE_BYTES and len(self._tables) > 2:
             self._tables.pop(next(iter(self._tables)))
 
+    @property
+    def _reference(self) -> tuple[float, float]:
+        assert self.reference_um is not None
+        return self.reference_um
+
     def _grid(self) -> tuple[float, int]:
         """First thickness of the tables [µm], and their number of thicknesses."""
-        low, high = self.range_um
-        return low, int(np.ceil((high - low) / TABLE_STEP_UM)) + 1
+        return self.range_um[0], self._grid_indices(self.range_um)[1] + 1
+
+    def _grid_indices(self, range_um: tuple[float, float]) -> tuple[int, int]:
+        """First and last place of the tables for a range that begins at one of them."""
+        first = round((range_um[0] - self.range_um[0]) / TABLE_STEP_UM)
+        return first, first + math.ceil((range_um[1] - range_um[0]) / TABLE_STEP_UM)
 
     def _fresh_response(self, model: FringeModel, low_um: float, count: int) -> FloatArray:
         """Response ``(W, count)`` of a model on the grid, or of all places of the field."""
@@ -308,8 +324,11 @@ class Forward:
         wanted_low = max(float(thickness_um.min()) - MARGIN_UM, lowest)
         wanted_high = min(float(thickness_um.max()) + MARGIN_UM, highest)
         if wanted_low < low or wanted_high > high:
+            below = max(min(wanted_low - MARGIN_UM, low), lowest)
+            # Whole steps, so that what was in the tables stays where it was.
+            steps = math.ceil((self._reference[0] - below) / TABLE_STEP_UM - 1e-9)
             self.range_um = (
-                max(min(wanted_low - MARGIN_UM, low), lowest),
+                self._reference[0] - steps * TABLE_STEP_UM,
                 min(max(wanted_high + MARGIN_UM, high), highest),
             )
             self._tables.clear()
