@@ -42,6 +42,7 @@ def pulls_of(fitted, truth: np.ndarray, least: float = 0.95) -> np.ndarray:
     return np.asarray(error / fitted.sigma[good])
 
 
+@pytest.mark.slow
 @pytest.mark.rng("a step between the halves")
 def test_a_step_between_the_halves(model, rng, tmp_path) -> None:
     """As measured: -1.1 % at the midline, a little different at each wavelength."""

@@ -78,7 +78,8 @@ def test_the_fringes_are_averaged_over_the_area_of_a_cell(cell_px: int) -> None:
     assert errors[True] > 10.0 * errors[False]
 
 
-@pytest.mark.parametrize("points", first_is_quick([True, False]))
+@pytest.mark.slow
+@pytest.mark.parametrize("points", [True, False])
 def test_a_sensor_without_an_effect_is_taken_for_what_it_is(points: bool) -> None:
     """Steep fringes show whether pixels are areas; either way nothing is missing, and points are told."""
     rng = np.random.default_rng(41)

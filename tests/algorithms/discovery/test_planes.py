@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded_cases import recorded_case
-from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube
 from lsst.fringe_sim.algorithms.discovery.planes import is_torn, joined_planes
@@ -35,7 +34,8 @@ def weak(seed: int) -> tuple[FringeModel, CellData, np.ndarray]:
     return model, replace(cells, value=value, weight=cells.weight / (1.0 + sigma**2 * cells.weight)), truth
 
 
-@pytest.mark.parametrize("seed", first_is_quick([2, 4]))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 4])
 def test_planes_find_orders_that_single_cells_do_not_tell(seed: int) -> None:
     model, cells, truth = weak(seed)
     order = float(model.fringe_order_um(float(np.median(cells.wavelength_nm))))
