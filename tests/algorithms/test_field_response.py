@@ -18,13 +18,8 @@ from lsst.fringe_sim.algorithms.field_response import (
     sensor_response,
 )
 from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
-from lsst.fringe_sim.algorithms.sky_frame import (
-    SkyQuadrature,
-    SkyResponse,
-    simulate_sky_frame,
-    sky_response,
-    white_light,
-)
+from lsst.fringe_sim.algorithms.sky_frame import SkyQuadrature, SkyResponse, simulate_sky_frame, sky_response
+from lsst.fringe_sim.algorithms.sky_response import white_light
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.instrument.bandpass import Bandpass
 from lsst.fringe_sim.instrument.camera import Camera
