@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..compiled import kernel, run_shares
-from .transfer_matrix import (
-    FloatArray,
-)
+from .transfer_matrix import FloatArray
 
-__all__ = ["at_thicknesses", "derivative_bounds", "on_grid"]
+__all__ = ["Nodes", "at_thicknesses", "derivative_bounds", "on_grid"]
+
+Nodes = tuple[NDArray[Any], ...]
+"""``a, b, e, c, g, kappa`` of the Q nodes of W groups, and their weights, all ``(W, Q)``."""
 
 _LEAST_WORK = 20_000
 """Nodes times thicknesses that are worth a thread."""
@@ -28,7 +30,7 @@ def at_thicknesses(
     out = np.empty((len(weights), thickness.size))
 
     def work(first: int, last: int) -> None:
-        _point_kernel(*arrays, weights, thickness, np.int64(order), first, last, out)
+        _point_kernel((*arrays, weights), thickness, np.int64(order), first, last, out)
 
     run_shares(work, thickness.size, _LEAST_WORK // weights.size)
     return out
@@ -41,7 +43,7 @@ def on_grid(
     out = np.empty((len(weights), count))
 
     def work(first: int, last: int) -> None:
-        _grid_kernel(*arrays, weights, start, step, first, last, out)
+        _grid_kernel((*arrays, weights), start, step, first, last, out)
 
     tasks = len(weights) * -(-count // _ANCHOR)
     run_shares(work, tasks, _LEAST_WORK // (_ANCHOR * weights.shape[1]))
@@ -50,24 +52,19 @@ def on_grid(
 
 @kernel
 def _point_kernel(
-    a: NDArray,
-    b: NDArray,
-    e: NDArray,
-    c: NDArray,
-    g: NDArray,
-    kappa: NDArray,
-    w: NDArray,
+    nodes: Nodes,
     d: NDArray,
     order: int,
     first: int,
     last: int,
     out: NDArray,
 ) -> None:  # pragma: no cover - compiled
-    groups, nodes = w.shape
+    a, b, e, c, g, kappa, w = nodes
+    groups, count = w.shape
     for m in range(groups):
         for i in range(first, last):
             total = 0.0
-            for q in range(nodes):
+            for q in range(count):
                 size = math.exp(-kappa[m, q].imag * d[i])
                 angle = kappa[m, q].real * d[i]
                 z = complex(size * math.cos(angle), size * math.sin(angle))
@@ -88,21 +85,16 @@ def _point_kernel(
 
 @kernel
 def derivative_bounds(
-    a: NDArray,
-    b: NDArray,
-    e: NDArray,
-    c: NDArray,
-    g: NDArray,
-    kappa: NDArray,
-    w: NDArray,
+    nodes: Nodes,
     order: int,
     start: float,
 ) -> NDArray:  # pragma: no cover - compiled
     """Upper bounds of a thickness derivative above ``start``, ``(W,)``; see `PhaseResponse.derivative_bound`."""
-    groups, nodes = w.shape
+    a, b, e, c, g, kappa, w = nodes
+    groups, count = w.shape
     out = np.zeros(groups)
     for m in range(groups):
-        for q in range(nodes):
+        for q in range(count):
             h, kr, ki = -g[m, q], abs(kappa[m, q].real), kappa[m, q].imag
             r = math.exp(-ki * start)
             total = 0.0
@@ -136,13 +128,7 @@ def derivative_bounds(
 
 @kernel(relaxed=True)
 def _grid_kernel(
-    a: NDArray,
-    b: NDArray,
-    e: NDArray,
-    c: NDArray,
-    g: NDArray,
-    kappa: NDArray,
-    w: NDArray,
+    nodes: Nodes,
     start: float,
     step: float,
     first_task: int,
@@ -150,7 +136,8 @@ def _grid_kernel(
     out: NDArray,
 ) -> None:  # pragma: no cover - compiled
     """Blocks of `_ANCHOR` thicknesses of the groups, counted through."""
-    nodes, count = w.shape[1], out.shape[1]
+    a, b, e, c, g, kappa, w = nodes
+    count = out.shape[1]
     blocks = (count + _ANCHOR - 1) // _ANCHOR
     for task in range(first_task, last_task):
         m = task // blocks
@@ -158,7 +145,7 @@ def _grid_kernel(
         many = min(_ANCHOR, count - first)
         x, y = np.empty(_ANCHOR), np.empty(_ANCHOR)
         total = np.zeros(_ANCHOR)
-        for q in range(nodes):
+        for q in range(w.shape[1]):
             kr, ki = kappa[m, q].real, kappa[m, q].imag
             # Powers of the one-step factor by doubling: log2(64) roundings, and a loop that vectorises.
             angle, size = kr * (start + first * step), math.exp(-ki * (start + first * step))

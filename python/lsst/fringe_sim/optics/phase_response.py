@@ -236,7 +236,7 @@ class PhaseResponse:
         if order < 1:
             raise InputError("order of the derivative", order, "1 or more")
         arrays, weights, _ = self._grouped(weight)
-        return derivative_bounds(*arrays, np.abs(weights), int(order), float(from_um))
+        return derivative_bounds((*arrays, np.abs(weights)), int(order), float(from_um))
 
     def _grouped(self, weight: ArrayLike) -> tuple[tuple[np.ndarray, ...], FloatArray, bool]:
         """Coefficients as ``(W, P * Q)`` and weights to match."""
