@@ -10,8 +10,8 @@ import numpy as np
 import tmm
 
 from lsst.fringe_sim.optics import Beam, Illumination, LayerStack, ThicknessGrid, layer_absorption
+from lsst.fringe_sim.optics.closed_form import on_grid
 from lsst.fringe_sim.optics.illumination import GaussianProfile, MonochromaticProfile
-from lsst.fringe_sim.optics.phase_response import _on_grid
 from lsst.fringe_sim.optics.system import OpticalSystem
 
 from ._table import Row, median_time
@@ -50,7 +50,7 @@ def paper_table() -> list[Row]:
     ours_s = median_time(ours, 7)
     closed = system.reduce(light)
     arrays, weights, _ = closed._grouped(light.weight)
-    direct_s = median_time(lambda: _on_grid(arrays, weights, start, step, THICKNESSES), 3)
+    direct_s = median_time(lambda: on_grid(arrays, weights, start, step, THICKNESSES), 3)
 
     index = system.stack.indices(light.wavelength_nm, TEMPERATURE_K)
     wave_um = 1e-3 * light.wavelength_nm
@@ -73,7 +73,7 @@ def paper_table() -> list[Row]:
     wrong = max(
         abs(closed.evaluate(d)[i, j] - value) for (i, j, d), value in zip(cases, expected, strict=True)
     )
-    gap = np.abs(ours() - _on_grid(arrays, weights, start, step, THICKNESSES)).max()
+    gap = np.abs(ours() - on_grid(arrays, weights, start, step, THICKNESSES)).max()
     return [
         Row(work, "tmm 0.2 (400 of them)", tmm_each * evaluations, evaluations),
         Row(
@@ -156,7 +156,7 @@ def sky_table() -> list[Row]:
     arrays, weights, _ = system.reduce(light)._grouped(light.weight)
 
     def direct() -> np.ndarray:
-        return _on_grid(arrays, weights, *grid)
+        return on_grid(arrays, weights, *grid)
 
     exact = direct()
     error = np.abs(ours() - exact).max() / np.ptp(exact)

@@ -18,10 +18,11 @@ from lsst.fringe_sim.algorithms.image_noise import add_exposure_noise
 from lsst.fringe_sim.algorithms.pca import decompose_thickness, fit_pca, fit_pca_from_thickness
 from lsst.fringe_sim.algorithms.sky_frame import simulate_night, sky_response
 from lsst.fringe_sim.algorithms.thickness_stand_in import stand_in_thickness
+from lsst.fringe_sim.instrument.beam_field import TRACED_RADII, BeamField
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.instrument.sky import SkySpectrum
-from lsst.fringe_sim.instrument.telescope import TRACED_RADII, BeamField, Telescope
+from lsst.fringe_sim.instrument.telescope import Telescope
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeComponents

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sky_frames import bright_sky
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.field_response import (
@@ -18,17 +19,11 @@ from lsst.fringe_sim.algorithms.field_response import (
     sensor_response,
 )
 from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
-from lsst.fringe_sim.algorithms.sky_frame import (
-    SkyQuadrature,
-    SkyResponse,
-    simulate_sky_frame,
-    sky_response,
-    white_light,
-)
+from lsst.fringe_sim.algorithms.sky_frame import SkyQuadrature, SkyResponse, simulate_sky_frame, sky_response
+from lsst.fringe_sim.algorithms.sky_response import white_light
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.instrument.bandpass import Bandpass
 from lsst.fringe_sim.instrument.camera import Camera
-from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum, airglow_continuum
 from lsst.fringe_sim.instrument.telescope import reduce_beam, telescope_beam
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.optics import Illumination
@@ -36,19 +31,6 @@ from lsst.fringe_sim.products import SensorSection
 
 RANGE = (15.0, 17.0)
 SCALE = 0.2
-
-
-def bright_sky(count: int = 20) -> SkySpectrum:
-    """The brightest lines and a continuum."""
-    lines = EmissionLines.oh()
-    chosen = np.sort(np.argsort(lines.photon_radiance)[-count:])
-    bright = EmissionLines(
-        lines.wavelength_nm[chosen],
-        lines.photon_radiance[chosen],
-        lines.transmission[chosen],
-        lines.band[chosen],
-    )
-    return SkySpectrum(bright, (airglow_continuum(),), 1.2)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sky_frames import bright_sky
 
 from lsst.fringe_sim.algorithms.field_response import (
     SensorPlacement,
@@ -27,7 +28,6 @@ from lsst.fringe_sim.algorithms.thickness_stand_in import stand_in_thickness
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.night import NightHistory, StochasticNight
-from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum, airglow_continuum
 from lsst.fringe_sim.model import FringeModel
 
 DETECTOR = Camera.from_name("lsstCam").detector("R22_S12")
@@ -35,18 +35,6 @@ PLACE = SensorPlacement.of(DETECTOR, 0.2)
 OPTIONS = ForecastOptions(cells=4)
 SHAPE = (801, 820)
 """One pixel per arcsecond."""
-
-
-def bright_sky() -> SkySpectrum:
-    lines = EmissionLines.oh()
-    chosen = np.sort(np.argsort(lines.photon_radiance)[-40:])
-    bright = EmissionLines(
-        lines.wavelength_nm[chosen],
-        lines.photon_radiance[chosen],
-        lines.transmission[chosen],
-        lines.band[chosen],
-    )
-    return SkySpectrum(bright, (airglow_continuum(),), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +51,7 @@ def thickness(model) -> np.ndarray:
 def response(model, thickness):
     beams = beam_field("LSST")
     span = float(thickness.min()) - 0.01, float(thickness.max()) + 0.01
-    angular = angular_response(model, bright_sky(), beam_limits(beams), thickness_range_um=span)
+    angular = angular_response(model, bright_sky(40, 1.0), beam_limits(beams), thickness_range_um=span)
     return field_response(angular, beams, PLACE.radius_range_deg).on(PLACE)
 
 
@@ -74,7 +62,7 @@ def moments(thickness, response):
 
 @pytest.fixture(scope="module")
 def level(model) -> SkyLevel:
-    return SkyLevel.of(bright_sky(), model, DETECTOR.read_noise)
+    return SkyLevel.of(bright_sky(40, 1.0), model, DETECTOR.read_noise)
 
 
 @pytest.fixture(scope="module")

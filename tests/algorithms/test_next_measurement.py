@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from lsst.fringe_sim.algorithms import next_measurement as forecasts
+from lsst.fringe_sim.algorithms import measurement_forecast as forecasts
+from lsst.fringe_sim.algorithms.flat_series import LEVEL_E
 from lsst.fringe_sim.algorithms.next_measurement import (
     FlatMeasurement,
     FlatSeries,
@@ -45,10 +46,8 @@ def few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def forecast_of(model: FringeModel, **effects: dict[str, float]) -> Any:
     by_name = {effect.name: effect for effect in EFFECTS}
-    tested = tuple(forecasts._Tested.of(by_name[name], values, model) for name, values in effects.items())
-    return forecasts._Forecast(
-        model, EFFECTS, tested, (), forecasts._Sample.of(model, None), FlatSeries(FLATS)
-    )
+    tested = tuple(forecasts.Tested.of(by_name[name], values, model) for name, values in effects.items())
+    return forecasts.Forecast(model, EFFECTS, tested, (), forecasts.Sample.of(model, None), FlatSeries(FLATS))
 
 
 @pytest.mark.parametrize(
@@ -101,7 +100,7 @@ def fit_of_flats(
     """Size of another effect, and root of χ² of a sensor, of a fit of it and of every nuisance to noiseless flats."""
     truth = np.concatenate([forecast._observe(each, found) for each in series])
     flats, pixels = truth.shape
-    sigma = np.sqrt(truth / forecasts.LEVEL_E)
+    sigma = np.sqrt(truth / LEVEL_E)
     sample = forecast.sample
 
     def misfit(p: NDArray) -> NDArray:

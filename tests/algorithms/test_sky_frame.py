@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sky_frames import bright_lines
 
 from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
 from lsst.fringe_sim.algorithms.sky_frame import (
@@ -44,17 +45,6 @@ def response(monocam, sky):
 @pytest.fixture
 def thickness(rng):
     return rng.uniform(*RANGE, (40, 50))
-
-
-def bright_lines(count: int) -> EmissionLines:
-    lines = EmissionLines.oh()
-    chosen = np.sort(np.argsort(lines.photon_radiance)[-count:])
-    return EmissionLines(
-        lines.wavelength_nm[chosen],
-        lines.photon_radiance[chosen],
-        lines.transmission[chosen],
-        lines.band[chosen],
-    )
 
 
 def test_frame_is_the_direct_sum_over_lines_and_angles(monocam):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.sky_frame import sky_response, sky_with_effects, throughput_electrons
+from lsst.fringe_sim.algorithms.sky_frame import sky_response, throughput_electrons
+from lsst.fringe_sim.algorithms.sky_response import sky_with_effects
 from lsst.fringe_sim.effects import EFFECTS, apply_to_sky
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.bandpass import Bandpass

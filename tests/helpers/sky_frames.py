@@ -1,4 +1,4 @@
-"""Frames of a night sky with photon noise, for searches."""
+"""A night sky of few lines, and frames of one with photon noise, for searches."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from lsst.fringe_sim.algorithms.image_noise import add_exposure_noise
 from lsst.fringe_sim.algorithms.sky_frame import simulate_sky_frame, sky_response
 from lsst.fringe_sim.instrument.night import NightHistory
-from lsst.fringe_sim.instrument.sky import SkySpectrum
+from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum, airglow_continuum
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import SkyFringe, band_cards
@@ -18,6 +18,23 @@ from lsst.fringe_sim.products import SkyFringe, band_cards
 SHAPE = (48, 48)
 FRAMES = 3
 FINER = 3
+
+
+def bright_lines(count: int) -> EmissionLines:
+    """The brightest lines of OH."""
+    lines = EmissionLines.oh()
+    chosen = np.sort(np.argsort(lines.photon_radiance)[-count:])
+    return EmissionLines(
+        lines.wavelength_nm[chosen],
+        lines.photon_radiance[chosen],
+        lines.transmission[chosen],
+        lines.band[chosen],
+    )
+
+
+def bright_sky(count: int = 20, airmass: float = 1.2) -> SkySpectrum:
+    """The same and a continuum."""
+    return SkySpectrum(bright_lines(count), (airglow_continuum(),), airmass)
 
 
 def sky_frames_of(

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, ResourceError, UnknownNameError
+from lsst.fringe_sim.instrument.beam_field import BeamField
 from lsst.fringe_sim.instrument.telescope import (
-    BeamField,
     ConeOptics,
     Telescope,
     TracedOptics,

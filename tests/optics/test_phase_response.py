@@ -17,9 +17,9 @@ from lsst.fringe_sim.optics import (
     layer_absorption,
     reduce_to_phase,
 )
+from lsst.fringe_sim.optics.closed_form import on_grid
 from lsst.fringe_sim.optics.harmonics import series_at, series_on_grid
 from lsst.fringe_sim.optics.illumination import GaussianProfile
-from lsst.fringe_sim.optics.phase_response import _on_grid
 from lsst.fringe_sim.optics.system import OpticalSystem
 
 
@@ -79,7 +79,7 @@ def test_series_is_the_closed_form(ratio: float, loss: float, rng: np.random.Gen
     response, weight = random_response(rng, ratio, loss)
     arrays, spread, _ = response._grouped(weight)
     for start, step, count in ((0.0, 0.01, 300), (14.0, 0.0007, 1111), (5.0, 0.5, 40)):
-        closed = _on_grid(arrays, spread, start, step, count)
+        closed = on_grid(arrays, spread, start, step, count)
         scale = np.abs(closed).max()
         series = series_on_grid(arrays, spread, 0.0, start, step, count)
         assert np.abs(series - closed).max() < 2e-12 * scale

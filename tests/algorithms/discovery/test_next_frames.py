@@ -15,7 +15,7 @@ from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit, Problem, c
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.next_frames import FrameForecast, laboratory_of
 from lsst.fringe_sim.algorithms.discovery.sky_search import SKY_SEARCH, SkyExposures
-from lsst.fringe_sim.algorithms.sky_frame import bandpass_of
+from lsst.fringe_sim.algorithms.sky_response import bandpass_of
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.mock.thickness import random_field

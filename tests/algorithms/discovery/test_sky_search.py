@@ -14,7 +14,8 @@ from lsst.fringe_sim.algorithms.discovery.cells import CellData
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.sky_search import BeamsOverSensor, SkyExposures
 from lsst.fringe_sim.algorithms.field_response import SensorPlacement, sensor_response
-from lsst.fringe_sim.algorithms.sky_frame import bandpass_of, sky_response
+from lsst.fringe_sim.algorithms.sky_frame import sky_response
+from lsst.fringe_sim.algorithms.sky_response import bandpass_of
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.instrument.camera import Camera

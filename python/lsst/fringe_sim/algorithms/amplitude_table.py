@@ -27,7 +27,8 @@ from ..model import FringeModel, ResponseTable
 from ..optics import Illumination
 from ..products.thickness_map import thickness_span_um
 from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
-from .sky_frame import SkyQuadrature, tabulate_components, white_light
+from .sky_frame import SkyQuadrature
+from .sky_response import tabulate_components, white_light
 from .thickness_stand_in import stand_in_thickness
 
 __all__ = [

@@ -19,28 +19,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..compiled import contiguous, kernel, run_shares
 from ..errors import InputError, OutOfRangeError
-from ..instrument.bandpass import Bandpass
-from ..instrument.detector import Detector
-from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
-from ..instrument.telescope import BeamField, Telescope, TracedOptics, reduce_beam
+from ..instrument.beam_field import BeamField
+from ..instrument.sky import SkySpectrum
+from ..instrument.telescope import Telescope, TracedOptics
 from ..model import FringeModel, ResponseTable
-from ..optics import Illumination
-from ..products import SensorSection
+from .angular_response import ANGLES, AngularResponse, angular_response
 from .island_response import response_with_islands
-from .sky_frame import (
+from .sensor_placement import SensorPlacement
+from .sky_frame import SkyQuadrature, is_band, sky_response
+from .sky_response import (
     Response,
-    SkyQuadrature,
-    SkyResponse,
-    bandpass_of,
     component_factors,
-    error_samples,
-    is_band,
-    sky_response,
-    sky_with_effects,
-    spectral_error,
-    split_components,
-    tabulate_components,
-    white_light,
 )
 
 __all__ = [
@@ -58,13 +47,6 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
-ANGLES = 192
-"""Nodes in sin²θ for lines: 3e-5 of the peak-to-peak of an LSST sky frame at any radius (128 give 2e-3)."""
-
-CONTINUUM_ANGLES = 128
-"""The same for continua, whose fringes average out over wavelength: 2e-4 of the peak-to-peak where fringes are
-faintest (96 give 4e-3)."""
-
 RADIUS_STEP_DEG = 0.005
 """Spacing of the tabulated field radii. Where the pupil is vignetted, beyond 1.75 deg, the phase of the light from
 its edge turns once in 0.085 deg."""
@@ -78,118 +60,6 @@ _LIMIT_RADII = 9
 range, which the margin of `beam_limits` covers a hundred times."""
 
 _STENCIL = 4
-
-_CELLS = 16_384
-"""Cells of the histogram of rays; the phase between two of them differs by less than 0.01 rad."""
-
-
-@dataclass(frozen=True)
-class SensorPlacement:
-    """Where the pixels of a sensor lie in the field."""
-
-    # field_x_deg, field_y_deg: field angle of the centre
-    field_x_deg: float
-    field_y_deg: float
-    # width_deg, height_deg: extent along columns and along rows; negative where the pixels are counted
-    # the other way round
-    width_deg: float
-    height_deg: float
-    yaw_deg: float = 0.0  # rotation of the sensor in the focal plane
-
-    @classmethod
-    def of(
-        cls, detector: Detector, pixel_scale_arcsec: float, section: SensorSection | None = None
-    ) -> SensorPlacement:
-        """Placement of a sensor of a camera, or of a part of it; on the axis where the camera states no angles."""
-        seen = SensorSection.whole(detector) if section is None else section
-        scale = pixel_scale_arcsec / 3600.0
-        on_axis = math.isnan(detector.field_radius_deg)
-        rows, columns = detector.shape
-        x, y = (
-            scale * 0.5 * (first + last + 1 - size)
-            for (first, last), size in ((seen.x, columns), (seen.y, rows))
-        )
-        width, height = (
-            scale * math.copysign(abs(last - first) + 1, last - first) for first, last in (seen.x, seen.y)
-        )
-        turn = math.radians(detector.yaw_deg)
-        return cls(
-            (0.0 if on_axis else detector.field_x_deg) + math.cos(turn) * x - math.sin(turn) * y,
-            (0.0 if on_axis else detector.field_y_deg) + math.sin(turn) * x + math.cos(turn) * y,
-            width,
-            height,
-            detector.yaw_deg,
-        )
-
-    def plane(self, shape: tuple[int, int]) -> FloatArray:
-        """Field angles as a linear function of pixel indices, for a map of any shape that covers the sensor.
-
-        Returns (2, 3): rows for x and y; ``angle = plane @ (1, column, row)`` [deg].
-        """
-        turn = math.radians(self.yaw_deg)
-        along = np.array([math.cos(turn), math.sin(turn)]) * self.width_deg / shape[1]
-        across = np.array([-math.sin(turn), math.cos(turn)]) * self.height_deg / shape[0]
-        centre = np.array([self.field_x_deg, self.field_y_deg])
-        corner = centre - 0.5 * (shape[1] - 1) * along - 0.5 * (shape[0] - 1) * across
-        return np.stack([corner, along, across], axis=1)
-
-    def radius_deg(self, shape: tuple[int, int]) -> FloatArray:
-        """Field radius of every pixel of a map that covers the sensor [deg], ``shape``."""
-        return self.radius_at_deg(shape, np.arange(shape[0]), np.arange(shape[1]))
-
-    def radius_at_deg(self, shape: tuple[int, int], rows: ArrayLike, columns: ArrayLike) -> FloatArray:
-        """Field radius on a grid of rows and columns of such a map [deg], shape ``(rows, columns)``."""
-        y, x = np.asarray(rows, dtype=float)[:, None], np.asarray(columns, dtype=float)[None, :]
-        return np.asarray(np.hypot(*(line[0] + line[1] * x + line[2] * y for line in self.plane(shape))))
-
-    @property
-    def radius_range_deg(self) -> tuple[float, float]:
-        """Smallest and largest field radius on the sensor [deg]."""
-        turn = math.radians(-self.yaw_deg)
-        x = math.cos(turn) * self.field_x_deg - math.sin(turn) * self.field_y_deg
-        y = math.sin(turn) * self.field_x_deg + math.cos(turn) * self.field_y_deg
-        half = 0.5 * abs(self.width_deg), 0.5 * abs(self.height_deg)
-        near = math.hypot(max(abs(x) - half[0], 0.0), max(abs(y) - half[1], 0.0))
-        return near, math.hypot(abs(x) + half[0], abs(y) + half[1])
-
-
-@dataclass(frozen=True, eq=False)
-class AngularResponse:
-    """Electrons from the components of a sky at fixed angles of incidence, over thickness."""
-
-    component: tuple[str, ...]  # names of the components, C of them
-    photons: FloatArray  # (C,): photons behind air and optics [s⁻¹ m⁻² arcsec⁻²]
-    wavelength_nm: FloatArray  # (C,): mean wavelength of every component
-    limits: tuple[float, float]  # smallest and largest sin²θ
-    # start_um, step_um: grid of thickness
-    start_um: float
-    step_um: float
-    # (C, A, N): electrons s⁻¹ m⁻² arcsec⁻² at the A nodes of a Gauss-Legendre rule in sin²θ and N
-    # thicknesses
-    values: FloatArray
-    flat: FloatArray  # (A, N): the same from the light of a flat field, in arbitrary units
-    # interpolation_error, quadrature_error: estimated errors of the interpolation in thickness and of the
-    # sums over wavelength and angle, relative to the mean sky
-    interpolation_error: float
-    quadrature_error: float
-    airmass: float  # airmass of the sky
-
-    def weights(self, sin_squared: ArrayLike) -> FloatArray:
-        """Weights of the nodes that stand for a beam.
-
-        ``sin_squared`` (R,): sin²θ of rays that carry the same light. Returns weights (A,) that sum to 1; some may be
-        negative.
-        """
-        return _moment_weights(self.values.shape[1]) @ _ray_histogram(sin_squared, self.limits)
-
-    def response(self, sin_squared: ArrayLike) -> SkyResponse:
-        """Response of a sensor under one beam; parameter as for `weights`."""
-        rows = self.weights(sin_squared) @ self.values
-        level = float(rows.sum(axis=0).mean())
-        table = ResponseTable(
-            self.start_um, self.step_um, rows / level, self.wavelength_nm, self.interpolation_error
-        )
-        return SkyResponse(self.component, self.photons, level, table, self.quadrature_error, self.airmass)
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,55 +213,6 @@ class FieldTable:
         return out
 
 
-def angular_response(
-    model: FringeModel,
-    sky: SkySpectrum,
-    limits: tuple[float, float],
-    bandpass: Bandpass | None = None,
-    thickness_range_um: tuple[float, float] | None = None,
-    quadrature: SkyQuadrature | None = None,
-    angles: int = ANGLES,
-) -> AngularResponse:
-    """Tabulate the response of a sensor to a sky under single angles.
-
-    ``model``: the sensor, with effects; its own beam only decides how fine the table is in thickness.
-    ``limits``: range of sin²θ that the beams may have.
-    """
-    if not 0.0 <= limits[0] < limits[1] < 1.0:
-        raise OutOfRangeError("limits of sin² of the angle", limits, "two increasing numbers within 0 to 1")
-    if model.system.beam is not model.base_system.beam:
-        raise InputError("effects", sorted(model.effect_settings), "none that changes the beam")
-    fineness = SkyQuadrature() if quadrature is None else quadrature
-    band = bandpass_of(model) if bandpass is None else bandpass
-    sky = sky_with_effects(model, sky)
-    few_rays = reduce_beam(model.system.beam, fineness.continuum_angles)
-    table, photons, level = tabulate_components(model, sky, band, thickness_range_um, fineness, few_rays)
-    grid = (table.start_um, table.step_um, table.values.shape[1])
-    lines, continua = split_components(sky, band, fineness.continuum_step_nm)
-    merged = blend_components(lines, fineness.line_shift_nm) if lines else []
-    few = math.ceil(angles * CONTINUUM_ANGLES / ANGLES)
-    samples = error_samples((table.start_um, table.stop_um))
-    of_lines = [_single_angles(model, item, limits, angles, grid, samples) for item in merged]
-    of_continua = [_single_angles(model, item, limits, few, grid, samples) for item in continua]
-    refine = _legendre_interpolation(few, angles)
-    error = spectral_error(model, sky, band, fineness, samples)
-    for components, made in ((merged, of_lines), (continua, of_continua)):
-        error += _angular_error(model, components, [sampled for _, sampled in made], limits, samples)
-    return AngularResponse(
-        tuple(item.name for item in [*merged, *continua]),
-        photons,
-        table.wavelength_nm,
-        limits,
-        table.start_um,
-        table.step_um,
-        np.stack([*(values for values, _ in of_lines), *(refine @ values for values, _ in of_continua)]),
-        refine @ _single_angles(model, white_light(band, fineness.continuum_step_nm), limits, few, grid)[0],
-        table.interpolation_error,
-        error / level,
-        sky.airmass,
-    )
-
-
 def field_response(
     angular: AngularResponse,
     beams: BeamField,
@@ -471,85 +292,6 @@ def beam_limits(beams: BeamField, radius_range_deg: tuple[float, float] | None =
         low, high = (float(of([of(sine) for sine in rays])) for of in (np.min, np.max))
     margin = 1e-3 * (high - low)
     return max(0.0, low - margin), high + margin
-
-
-def _single_angles(
-    model: FringeModel,
-    component: SpectralComponent,
-    limits: tuple[float, float],
-    angles: int,
-    *grids: tuple[float, float, int],
-) -> list[FloatArray]:
-    """Electrons from one component under every angle on each grid of thickness, ``(angles, thicknesses)``."""
-    nodes, _ = np.polynomial.legendre.leggauss(angles)
-    sine = 0.5 * (limits[0] + limits[1]) + 0.5 * (limits[1] - limits[0]) * nodes
-    shape = (angles, component.photons.size)
-    light = Illumination(
-        np.broadcast_to(component.wavelength_nm, shape),
-        np.broadcast_to(np.arcsin(np.sqrt(sine))[:, None], shape),
-        np.broadcast_to(component.photons / component.photons.sum(), shape),
-    )
-    reduced = model.system.reduce(light)
-    photons = float(component.photons.sum())
-    return [
-        photons * model.finish(reduced, light, reduced.averaged_on_grid(light.weight, *grid), None)
-        for grid in grids
-    ]
-
-
-def _legendre_interpolation(few: int, many: int) -> FloatArray:
-    """Matrix from values at the nodes of one Gauss-Legendre rule to those of another, shape ``(many, few)``."""
-    nodes, rule = np.polynomial.legendre.leggauss(few)
-    targets, _ = np.polynomial.legendre.leggauss(many)
-    vander = np.polynomial.legendre.legvander
-    inner = vander(nodes, few - 1) * (np.arange(few) + 0.5) * rule[:, None]
-    return np.asarray(vander(targets, few - 1) @ inner.T)
-
-
-def _angular_error(
-    model: FringeModel,
-    components: list[SpectralComponent],
-    electrons: list[FloatArray],
-    limits: tuple[float, float],
-    samples: tuple[float, float, int],
-) -> float:
-    """Largest change of the electrons under the beam of the model when a sixth of the angles is left out.
-
-    ``electrons`` are those of the components at the samples under all angles. As for `sky_response`, the change is
-    several times the error of all angles.
-    """
-    if not components:
-        return 0.0
-    beam = model.system.beam
-    light = _ray_histogram(np.sin(beam.theta) ** 2, limits, beam.weight)
-    fewer = 5 * len(electrons[0]) // 6
-    sparse = [_single_angles(model, item, limits, fewer, samples)[0] for item in components]
-    sums = [
-        (_moment_weights(len(values[0])) @ light) @ np.asarray(sum(values)) for values in (electrons, sparse)
-    ]
-    return float(np.abs(sums[0] - sums[1]).max())
-
-
-@functools.lru_cache(maxsize=4)
-def _moment_weights(count: int) -> FloatArray:
-    """Weights of ``count`` nodes for unit light at each of the cells of the ray histogram."""
-    nodes, rule = np.polynomial.legendre.leggauss(count)
-    vander = np.polynomial.legendre.legvander
-    expansion = vander(nodes, count - 1) * (np.arange(count) + 0.5) * rule[:, None]
-    return np.asarray(expansion @ vander(np.linspace(-1.0, 1.0, _CELLS + 1), count - 1).T)
-
-
-def _ray_histogram(
-    sin_squared: ArrayLike, limits: tuple[float, float], weight: FloatArray | float = 1.0
-) -> FloatArray:
-    """Light at evenly spaced sin²θ; every ray is shared between its neighbours, which keeps the mean."""
-    rays = np.asarray(sin_squared, dtype=float)
-    place = np.clip((rays - limits[0]) * (_CELLS / (limits[1] - limits[0])), 0.0, _CELLS - 1e-9)
-    cell = place.astype(np.int64)
-    upper = place - cell
-    mass = np.bincount(cell, weight * (1.0 - upper), _CELLS + 1)
-    mass += np.bincount(cell + 1, weight * upper, _CELLS + 1)
-    return np.asarray(mass / mass.sum())
 
 
 _LEAST_ROWS = 16

@@ -13,7 +13,7 @@ from ..effects import ActiveEffect, ImageGeometry
 from ..model import FringeModel
 
 if TYPE_CHECKING:
-    from .sky_frame import FrameTable, Response
+    from .sky_response import FrameTable, Response
 
 __all__ = ["IslandResponse", "IslandTable", "response_with_islands"]
 

@@ -21,17 +21,18 @@ from ..algorithms.field_response import (
     beam_limits,
     field_response,
 )
-from ..algorithms.focal_plane import DES_CRITERION, SkyLevel, forecast_sensor, summary_table
+from ..algorithms.focal_plane import SkyLevel, forecast_sensor, summary_table
 from ..algorithms.thickness_stand_in import ThicknessField, stand_in_thickness
 from ..errors import InputError
 from ..files import table_text, write_together
 from ..instrument.camera import Camera
 from ..instrument.detector import Detector
-from ..instrument.night import NightHistory, StochasticNight, join_nights
+from ..instrument.night import NightHistory, random_nights
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel, Setup
+from ..products.thickness_map import thickness_span_um
 from ..report.figures import focal_plane_figure
-from ..report.page import Report
+from ..report.focal_plane_page import write_focal_plane_page
 from ..report.style import save_figure
 from .inputs import read_settings, read_thickness, sky_settings
 from .output import OutputFolder, output_folder
@@ -127,12 +128,7 @@ def focal_plane(
         name: read_thickness(path, Setup.from_name(SETUPS[vendors[name]]).varying)
         for name, path in measured.items()
     }
-    observed = join_nights(
-        [
-            StochasticNight().draw(np.arange(11.0), np.random.default_rng([seed, number]))
-            for number in range(nights)
-        ]
-    )
+    observed = random_nights(nights, seed)
     sky = SkySpectrum.dark(airmass=airmass)
     tables = []
     with progress("forecasting sensors", len(chosen)) as advance:
@@ -151,33 +147,12 @@ def focal_plane(
     write_together(folder, {"cells.ecsv": table_text(cells), "focal_plane.ecsv": table_text(summary)})
     drawn = focal_plane_figure(cells, summary)
     save_figure(drawn, folder / "focal_plane.png")
-    lines = list(_describe(summary))
-    page = Report(
-        "Fringes over the focal plane",
-        f"{len(summary)} sensors of the LSST Camera in the y band at airmass {airmass:g}; templates from the "
-        f"published night, {nights} random night{'s' if nights > 1 else ''} corrected. Sensors with a thickness map "
-        f"that was given: {len(measured)}; the others have a random field like the measured ones.",
-    )
-    page.section("Focal plane")
-    for line in lines:
-        page.paragraph(line)
-    page.figure(drawn, "Strength, ratio to the shot noise, what a correction leaves, and field radius.")
-    page.section("Sensors")
-    page.table(_shown(summary), "focal_plane", download=summary)
-    page.write(folder / "report.html")
+    page = folder / "report.html"
+    lines = write_focal_plane_page(page, drawn, summary, airmass, nights, len(measured))
     for line in lines:
         click.echo(line)
     click.echo(str(folder))
-    click.echo(str(folder / "report.html"))
-
-
-def _shown(summary: Table) -> Table:
-    """Columns of the summary that fit on a page."""
-    names = ("detector", "vendor", "field_radius", "rms", "over_noise")
-    table = summary[[*names, *(name for name in summary.colnames if name.startswith("residual_"))]].copy()
-    for name in table.colnames[2:]:
-        table[name].info.format = ".4f"
-    return table
+    click.echo(str(page))
 
 
 def _chosen(names: Iterable[str]) -> list[Detector]:
@@ -216,9 +191,9 @@ def _field(model: FringeModel, sky: SkySpectrum, maps: list[NDArray[np.float64]]
         )
     statistics = ThicknessField.of(model.setup)
     half = 0.53 * statistics.span_um[1]
-    low = min([statistics.mean_um - half, *(float(np.nanmin(each)) - 1e-3 for each in maps)])
-    high = max([statistics.mean_um + half, *(float(np.nanmax(each)) + 1e-3 for each in maps)])
-    angular = angular_response(model, sky, beam_limits(beams), thickness_range_um=(low, high))
+    spans = [(statistics.mean_um - half, statistics.mean_um + half), *map(thickness_span_um, maps)]
+    span = min(low for low, _ in spans), max(high for _, high in spans)
+    angular = angular_response(model, sky, beam_limits(beams), thickness_range_um=span)
     return field_response(angular, beams, (0.0, beams.largest_deg))
 
 
@@ -252,20 +227,3 @@ def _gather(tables: list[Table]) -> tuple[Table, Table]:
     for table in tables:
         table.add_column(Column([table.meta["detector"]] * len(table), name="detector"), index=0)
     return vstack(tables, metadata_conflicts="silent"), summary
-
-
-def _describe(summary: Table) -> Iterable[str]:
-    for vendor in sorted(set(summary["vendor"])):
-        rows = summary[summary["vendor"] == vendor]
-        rms, ratio = np.asarray(rows["rms"]), np.asarray(rows["over_noise"])
-        yield (
-            f"{vendor}: {len(rows)} sensors, fringe rms {rms.min():.4f} to {rms.max():.4f} %, "
-            f"{ratio.min():.2f} to {ratio.max():.2f} times the shot noise at up to 20 arcsec"
-        )
-        for number in range(1, 1 + sum(name.startswith("residual_") for name in rows.colnames)):
-            left = np.asarray(rows[f"residual_{number}"])
-            good = int(np.count_nonzero(left < DES_CRITERION))
-            yield (
-                f"{vendor} with {number} template{'s' if number > 1 else ''}: at most {left.max():.3f} times "
-                f"the noise; {good} of {len(rows)} sensors below {DES_CRITERION}"
-            )

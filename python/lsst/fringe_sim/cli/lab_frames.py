@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from ..algorithms.flat_prep import combine_biases, prepare_flat
 from ..algorithms.flat_prep_options import FlatPrepOptions
@@ -51,10 +50,9 @@ class LabSeries:
         """Files of all frames."""
         return tuple(frame.source for frame in (*self.biases, *self.flats))
 
-    def missing_nm(self, setup: Setup, tolerance_nm: float = 1.0) -> tuple[float, ...]:
+    def missing_nm(self, setup: Setup) -> tuple[float, ...]:
         """Usual wavelengths of a set-up of which there is no flat [nm]."""
-        found = np.array(self.wavelengths_nm)
-        return tuple(w for w in setup.wavelengths_nm if np.abs(found - w).min() > tolerance_nm)
+        return setup.missing_nm(self.wavelengths_nm)
 
     def read(self, setup: Setup, options: FlatPrepOptions, advance: Callable[[], None]) -> FringeCube:
         """Prepare all frames, one at a time.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,9 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from numpy.typing import NDArray
 
     from ..instrument.detector import Detector
+    from ..instrument.night import NightHistory
     from ..instrument.setup import Setup
+    from ..model import FringeModel
     from ..products import SensorSection, SkyFringe
 
     FloatArray = NDArray[np.float64]
@@ -75,79 +78,37 @@ def sky(
       fringe-sim sky --setup monocam --thickness e2v_321 --noiseless --exptime 60s --out sky
       fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky_with_effects
     """
-    from ..algorithms.field_response import SensorPlacement, sensor_response
-    from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, throughput_electrons
-    from ..instrument.bandpass import Bandpass
     from ..instrument.camera import Camera
     from ..instrument.night import NightHistory
-    from ..instrument.sky import SkySpectrum
-    from ..model import FringeModel
-    from ..model.provenance import input_cards
-    from ..products.thickness_map import thickness_span_um
     from ..report.figures import sky_figure
     from ..report.sky_page import write_sky_report
     from ..report.style import save_figure
-    from .inputs import effect_cards, sky_settings
+    from .inputs import sky_settings
 
     _check_exposure(exptime, night)
     sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
     layer, section = _layer(thickness, sensor, setup.varying)
     settings = sky_settings(effects.settings)
-    history = NightHistory.guo2022()
-    frames = len(history) if night else 1
+    history = NightHistory.guo2022() if night else None
+    count = 1 if history is None else len(history)
     if dry_run:
         click.echo(
-            f"would simulate {frames} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
+            f"would simulate {count} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
         )
         return
-    centre = SensorPlacement.of(sensor, setup.pixel_scale_arcsec)
-    model = FringeModel.from_setup(
-        setup, settings, field_x_deg=centre.field_x_deg, field_y_deg=centre.field_y_deg
-    )
-    given: list[str | Path] = [
-        *([thickness] if thickness != BUILT_IN else []),
-        *effects.files,
-    ]
-    cards: dict[str, str | float] = {
-        "SETUP": setup.name,
-        "BEAMS": "pixel",
-        **effect_cards(model),
-        **input_cards(given),
-    }
+    model = _model(setup, settings, sensor)
     contrast = _laboratory_contrast(thickness)
-    if contrast is not None:
-        cards |= {"LABCONTR": contrast[0], "LABCONSG": contrast[1]}
-    if section is not None:
-        cards["DETSEC"] = section.keyword
+    given: list[str | Path] = [*([] if thickness == BUILT_IN else [thickness]), *effects.files]
+    cards = _cards(model, given, contrast, section)
     folder = out.prepare()
-    dark = SkySpectrum.dark(airmass=airmass or setup.airmass)
-    click.echo("tabulating the response to the sky", err=True)
-    place = SensorPlacement.of(sensor, setup.pixel_scale_arcsec, section)
-    response = sensor_response(model, dark, place, thickness_span_um(layer, MARGIN_UM))
-    # Bands of each frame, relative to the dark sky.
-    scales = [dict.fromkeys(response.bands, 1.0)]
-    if night:
-        scales = [history.band_scale(time, response.bands) for time in range(frames)]
-    levels = None
-    if level == "measured":
-        band = Bandpass.from_name(setup.bandpass)
-        levels = [throughput_electrons(dark.with_band_scale(scale), band, model, exptime) for scale in scales]
     common: dict[str, Any] = {
         "read_noise_e": 0.0 if noiseless else sensor.read_noise,
         "seed": None if noiseless else seed,
         "detector": sensor.name,
         "physical_filter": setup.bandpass,
     }
-    series: Iterable[SkyFringe]
-    if night:
-        series = simulate_night(layer, model, response, history, mean_electrons=levels, **common)
-    else:
-        mean = levels[0] if levels else None
-        series = [
-            simulate_sky_frame(
-                layer, model, response=response, exposure_s=exptime, mean_electrons=mean, **common
-            )
-        ]
+    exposure = Exposure(exptime, airmass or setup.airmass, history, level == "measured")
+    series, scales = _frames(layer, model, sensor, section, exposure, common)
     made = _written(series, scales, folder / f"sky_{sensor.name}", cards, section)
     save_figure(sky_figure(made), folder / "sky.png")
     page = write_sky_report(folder / "report.html", made, setup.name, seed)
@@ -157,6 +118,85 @@ def sky(
         click.echo(_both_forecasts(made[0], *contrast))
     click.echo(str(folder))
     click.echo(str(page))
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How the sky is exposed."""
+
+    exptime_s: float | None  # by default that of the set-up
+    airmass: float
+    night: NightHistory | None  # a frame for each of its times; one frame of the dark sky without
+    measured: bool  # whether the level is that of the measured quantum efficiency
+
+
+def _model(setup: Setup, settings: Mapping[str, Any], sensor: Detector) -> FringeModel:
+    from ..algorithms.field_response import SensorPlacement
+    from ..model import FringeModel
+
+    centre = SensorPlacement.of(sensor, setup.pixel_scale_arcsec)
+    return FringeModel.from_setup(
+        setup, settings, field_x_deg=centre.field_x_deg, field_y_deg=centre.field_y_deg
+    )
+
+
+def _cards(
+    model: FringeModel,
+    given: Sequence[str | Path],
+    contrast: tuple[float, float] | None,
+    section: SensorSection | None,
+) -> dict[str, str | float]:
+    """Header keywords that all frames have."""
+    from ..model.provenance import input_cards
+    from .inputs import effect_cards
+
+    cards: dict[str, str | float] = {
+        "SETUP": model.setup.name,
+        "BEAMS": "pixel",
+        **effect_cards(model),
+        **input_cards(given),
+    }
+    if contrast is not None:
+        cards |= {"LABCONTR": contrast[0], "LABCONSG": contrast[1]}
+    if section is not None:
+        cards["DETSEC"] = section.keyword
+    return cards
+
+
+def _frames(
+    layer: FloatArray,
+    model: FringeModel,
+    sensor: Detector,
+    section: SensorSection | None,
+    exposure: Exposure,
+    common: Mapping[str, Any],
+) -> tuple[Iterable[SkyFringe], list[dict[str, float]]]:
+    """Frames, made one after the other as they are asked for, and the bands of each relative to the dark sky."""
+    from ..algorithms.field_response import SensorPlacement, sensor_response
+    from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, throughput_electrons
+    from ..instrument.bandpass import Bandpass
+    from ..instrument.sky import SkySpectrum
+    from ..products.thickness_map import thickness_span_um
+
+    dark = SkySpectrum.dark(airmass=exposure.airmass)
+    click.echo("tabulating the response to the sky", err=True)
+    place = SensorPlacement.of(sensor, model.setup.pixel_scale_arcsec, section)
+    response = sensor_response(model, dark, place, thickness_span_um(layer, MARGIN_UM))
+    night, seconds = exposure.night, exposure.exptime_s
+    scales = [dict.fromkeys(response.bands, 1.0)]
+    if night is not None:
+        scales = [night.band_scale(time, response.bands) for time in range(len(night))]
+    levels = None
+    if exposure.measured:
+        band = Bandpass.from_name(model.setup.bandpass)
+        levels = [throughput_electrons(dark.with_band_scale(scale), band, model, seconds) for scale in scales]
+    if night is not None:
+        return simulate_night(layer, model, response, night, mean_electrons=levels, **common), scales
+    mean = levels[0] if levels else None
+    frame = simulate_sky_frame(
+        layer, model, response=response, exposure_s=seconds, mean_electrons=mean, **common
+    )
+    return [frame], scales
 
 
 def _check_exposure(exptime: float | None, night: bool) -> None:

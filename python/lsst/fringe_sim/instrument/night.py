@@ -13,7 +13,7 @@ from scipy.interpolate import RegularGridInterpolator
 from ..errors import InputError, OutOfRangeError
 from ..resources import read_table
 
-__all__ = ["AirglowField", "NightHistory", "StochasticNight", "join_nights"]
+__all__ = ["AirglowField", "NightHistory", "StochasticNight", "join_nights", "random_nights"]
 
 FloatArray = NDArray[np.float64]
 
@@ -212,6 +212,14 @@ class AirglowField:
                 f"{self.x_deg[0]} to {self.x_deg[-1]} in x and y",
             )
         return np.asarray(RegularGridInterpolator((self.x_deg, self.y_deg), self.level)((x, y)))
+
+
+def random_nights(count: int, seed: int) -> NightHistory:
+    """Eleven hours of each of so many random nights, joined."""
+    hours = np.arange(0.0, 11.0)
+    return join_nights(
+        [StochasticNight().draw(hours, np.random.default_rng([seed, number])) for number in range(count)]
+    )
 
 
 def join_nights(nights: Sequence[NightHistory]) -> NightHistory:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +31,9 @@ _BEAM_KEYS = {
     "telescope": {"telescope"},
 }
 
+
+SAME_WAVELENGTH_NM = 1.0
+"""A flat within this distance of a usual wavelength counts as taken there."""
 
 WAVELENGTH_ACCURACY_NM = 0.5
 """Accuracy of a monochromator where the set-up states none [nm]; an assumption, of the order of what makers state."""
@@ -171,6 +174,15 @@ class Setup:
         )
         setup.stack.position(setup.varying)
         return setup
+
+    def missing_nm(self, found_nm: Iterable[float]) -> tuple[float, ...]:
+        """Usual wavelengths that are not among those found [nm]."""
+        found = tuple(found_nm)
+        return tuple(
+            usual
+            for usual in self.wavelengths_nm
+            if min(abs(one - usual) for one in found) > SAME_WAVELENGTH_NM
+        )
 
     @property
     def profile(self) -> SpectralProfile:

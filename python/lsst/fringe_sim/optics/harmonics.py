@@ -274,7 +274,7 @@ def _fill_grids(
         if transparent:
             sign = complex(1j**order)
             _grid_transparent(
-                *own,
+                own,
                 shape,
                 width,
                 smallest,
@@ -288,7 +288,7 @@ def _fill_grids(
             )
         else:
             _grid_absorbing(
-                *own, shape, width, smallest, spread, where, step, order, grid[group], constant[group]
+                own, shape, width, smallest, spread, where, step, order, grid[group], constant[group]
             )
 
     run_threaded(work, len(nodes[0]))
@@ -296,9 +296,10 @@ def _fill_grids(
 
 @kernel
 def _grid_transparent(  # type: ignore[no-untyped-def]
-    a, b, e, c, g, kappa, w, shape, width, smallest, spread, where, step, order, sign, grid, constant
+    nodes, shape, width, smallest, spread, where, step, order, sign, grid, constant
 ):  # pragma: no cover - compiled
     """One group of a transparent layer: harmonics by multiplication, as many roundings as there are harmonics."""
+    a, b, e, c, g, kappa, w = nodes
     window = np.empty(shape.size, dtype=np.float64)
     total = 0.0
     for q in range(w.size):
@@ -330,9 +331,10 @@ def _grid_transparent(  # type: ignore[no-untyped-def]
 
 @kernel
 def _grid_absorbing(  # type: ignore[no-untyped-def]
-    a, b, e, c, g, kappa, w, shape, width, smallest, spread, where, step, order, grid, constant
+    nodes, shape, width, smallest, spread, where, step, order, grid, constant
 ):  # pragma: no cover - compiled
     """One group of an absorbing layer; some of its nodes may be transparent."""
+    a, b, e, c, g, kappa, w = nodes
     powers, size = grid.shape
     harmonic = np.empty(powers, dtype=np.complex128)
     window = np.empty(shape.size, dtype=np.float64)
@@ -417,7 +419,7 @@ def series_at(nodes: tuple[NDArray, ...], spread: float, thickness: NDArray, ord
     out = np.zeros((len(nodes[-1]), thickness.size))
 
     def work(first: int, last: int) -> None:
-        _series_kernel(*nodes, spread, thickness, order, first, last, out)
+        _series_kernel(nodes, spread, thickness, order, first, last, out)
 
     run_shares(work, thickness.size, _LEAST_SUMS // nodes[-1].size)
     return out
@@ -425,14 +427,15 @@ def series_at(nodes: tuple[NDArray, ...], spread: float, thickness: NDArray, ord
 
 @kernel
 def _series_kernel(  # type: ignore[no-untyped-def]
-    a, b, e, c, g, kappa, w, spread, thickness, order, first, last, out
+    nodes, spread, thickness, order, first, last, out
 ):  # pragma: no cover - compiled
-    groups, nodes = w.shape
+    a, b, e, c, g, kappa, w = nodes
+    groups, many = w.shape
     for i in range(first, last):
         harmonic = np.empty(1, dtype=np.complex128)
         for group in range(groups):
             total = 0.0
-            for q in range(nodes):
+            for q in range(many):
                 scale = abs(kappa[group, q])
                 if kappa[group, q].imag == 0.0:
                     total += w[group, q] * _transparent_sum(

@@ -42,7 +42,7 @@ def reduce_nodes(
 
     def work(first: int, last: int) -> None:
         room = np.ones((7, 4, layer_count), dtype=np.complex128)
-        _reduce_share(first, last, *arrays, p_polarized, varying, room, real, mixed)
+        _reduce_share(first, last, arrays, p_polarized, varying, room, real, mixed)
 
     run_shares(work, nodes, _LEAST_NODES)
     return real[0], real[1], real[2], mixed[0], mixed[1], mixed[2]
@@ -56,13 +56,7 @@ _LEAST_NODES = 256
 def _reduce_share(
     first: int,
     last: int,
-    index: NDArray,
-    thickness: NDArray,
-    wavelength: NDArray,
-    theta: NDArray,
-    layers: NDArray,
-    roughness: NDArray,
-    phase: NDArray,
+    given: tuple[NDArray, ...],
     p_polarized: bool,
     varying: int,
     room: NDArray,
@@ -70,6 +64,7 @@ def _reduce_share(
     mixed: NDArray,
 ) -> None:  # pragma: no cover - compiled
     """The nodes from ``first`` to ``last``; ``room`` holds the fields of one node, seven times four rows, ones."""
+    index, thickness, wavelength, theta, layers, roughness, phase = given
     # A numpy integer has one type, a number in the source one of its own.
     top, one = np.int64(0), np.int64(1)
     count = index.shape[1]

@@ -38,9 +38,6 @@ __all__ = ["EpoxyFitConfig", "EpoxyFitConnections", "EpoxyFitTask"]
 
 _LOG = getLogger(__name__)
 
-SAME_WAVELENGTH_NM = 1.0
-"""A flat within this distance of a usual wavelength counts as taken there."""
-
 
 class EpoxyFitConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
     """The flats of a sensor in, its thickness map out."""
@@ -260,11 +257,7 @@ class EpoxyFitTask(PipelineTask):
                 f"{self.config.min_wavelengths} or more",
                 source=detector.name,
             )
-        missing = [
-            f"{usual:g}"
-            for usual in setup.wavelengths_nm
-            if np.abs(found_nm - usual).min() > SAME_WAVELENGTH_NM
-        ]
+        missing = [f"{usual:g}" for usual in setup.missing_nm(found_nm)]
         if missing:
             self.log.warning(
                 "%s: no flats at %s nm; the fit is less certain without them",

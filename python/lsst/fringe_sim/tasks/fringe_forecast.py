@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import numpy as np
-
 from lsst.pex.config import Field, FieldValidationError, ListField
 from lsst.pipe.base import (
     InputQuantizedConnection,
@@ -23,7 +21,7 @@ from ..algorithms.field_response import SensorResponse
 from ..algorithms.focal_plane import ForecastOptions, SkyLevel, forecast_sensor
 from ..errors import InputError
 from ..instrument.detector import Detector
-from ..instrument.night import NightHistory, StochasticNight, join_nights
+from ..instrument.night import NightHistory, random_nights
 from ..model import Setup
 from ..products import ThicknessMap
 from .quantum import common_header, data_id_of, sensor_of, unusable
@@ -114,13 +112,7 @@ class FringeForecastConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnectio
 
     def observed(self) -> NightHistory:
         """Hours of random nights, none of which makes a template."""
-        hours = np.arange(0.0, 11.0)
-        return join_nights(
-            [
-                StochasticNight().draw(hours, np.random.default_rng([self.nights_seed, number]))
-                for number in range(self.nights)
-            ]
-        )
+        return random_nights(self.nights, self.nights_seed)
 
 
 class FringeForecastTask(PipelineTask):

@@ -16,7 +16,8 @@ from lsst.pipe.base.connectionTypes import Input
 
 from ..algorithms.field_response import SensorPlacement, sensor_response
 from ..algorithms.island_response import response_with_islands
-from ..algorithms.sky_frame import Response, sky_response
+from ..algorithms.sky_frame import sky_response
+from ..algorithms.sky_response import Response
 from ..algorithms.thickness_stand_in import stand_in_thickness
 from ..errors import InputError
 from ..instrument.detector import Detector

@@ -16,14 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model import FringeModel, Setup, setup_names
-from ..next_measurement import (
-    RESPONSE_SCATTER,
-    FlatMeasurement,
-    FlatSeries,
-    Measurement,
-    PairForecast,
-    RankedMeasurement,
-)
+from ..measurement_forecast import RESPONSE_SCATTER
+from ..next_measurement import FlatMeasurement, FlatSeries, Measurement, PairForecast, RankedMeasurement
 from .cells import CellData
 from .fit import (
     Coordinate,

@@ -32,11 +32,11 @@ from ...products import (
     refuse_noiseless,
 )
 from ..field_response import SensorPlacement, beam_field
-from ..sky_frame import (
+from ..sky_frame import is_band
+from ..sky_response import (
     bandpass_of,
     component_factors,
     electrons_on_grid,
-    is_band,
     sky_with_effects,
     split_components,
     white_light,
