@@ -83,7 +83,7 @@ def test_rotational_temperature_keeps_the_vibrational_population():
     key = np.array([f"{row['v_up']} {row['N_up']} {row['F_up']} {row['parity_up']}" for row in table])[order]
     weight, upper = np.asarray(table["g_up"])[order], np.asarray(table["v_up"])[order]
     _, first = np.unique(key, return_index=True)
-    for level in range(3, 10):
+    for level in (3, 4, 5, 7, 8, 9):  # of 6 only the outskirts are in the list
         chosen = first[upper[first] == level]
         totals = [(weight * lines.photon_radiance / rate)[chosen].sum() for lines in (cold, hot)]
         assert totals[0] == pytest.approx(totals[1], rel=1e-12)
