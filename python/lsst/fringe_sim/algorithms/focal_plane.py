@@ -89,7 +89,7 @@ class SkyLevel:
     pixel_scale_arcsec : `float`
         Side of a pixel [arcsec].
     microjansky : `float`
-        Surface brightness of the whole sky [µJy arcsec⁻²].
+        Surface brightness above the air of a source as bright as the whole sky [µJy arcsec⁻²].
     """
 
     electrons: FloatArray
@@ -125,7 +125,8 @@ class SkyLevel:
         band = Bandpass.from_name(setup.bandpass)
         exposure = setup.exposure_s if exposure_s is None else exposure_s
         electrons = np.array(list(component_electrons(sky, band, model, exposure).values()))
-        zero = zero_point(band, setup.effective_area_m2)
+        # What fringes are compared with, a source above the air, has passed it.
+        zero = zero_point(band, setup.effective_area_m2, setup.airmass)
         brightness = electrons_to_microjansky(electrons.sum(), zero, exposure, setup.pixel_scale_arcsec)
         return cls(
             electrons * relative_illumination, read_noise_e, setup.pixel_scale_arcsec, float(brightness)

@@ -132,14 +132,14 @@ def sky(
     if night:
         scales = [history.band_scale(time, response.bands) for time in range(frames)]
     levels = None
+    band = Bandpass.from_name(setup.bandpass)
     if level == "measured":
-        band = Bandpass.from_name(setup.bandpass)
         levels = [throughput_electrons(dark.with_band_scale(scale), band, model, exptime) for scale in scales]
     common: dict[str, Any] = {
         "read_noise_e": 0.0 if noiseless else sensor.read_noise,
         "seed": None if noiseless else seed,
         "detector": sensor.name,
-        "physical_filter": setup.bandpass,
+        "physical_filter": band.name,
     }
     series: Iterable[SkyFringe]
     if night:

@@ -41,6 +41,7 @@ from .stack import (
     ArCoating,
     BlackCoating,
     ContrastLoss,
+    DiffuseGateSide,
     EpoxyAbsorption,
     EpoxyIndex,
     GateOxide,
@@ -93,6 +94,7 @@ EFFECTS: tuple[Effect, ...] = (
     GateThickness(),
     Insulation(),
     BlackCoating(),
+    DiffuseGateSide(),
     Void(),
     # illumination
     Bandwidth(),

@@ -167,7 +167,10 @@ def tables_of(setup: Setup, stack: LayerStack | None = None) -> tuple[tuple[str,
         shipped.append(("telescopes", f"{setup.telescope.lower()}.yaml"))
     if setup.bandpass:
         description = f"{setup.bandpass}.yaml"
-        shipped += [("bandpasses", description), ("sky", str(read_yaml("bandpasses", description)["table"]))]
+        content = read_yaml("bandpasses", description)
+        shipped += [("bandpasses", description), ("sky", str(content["table"]))]
+        if isinstance(content["detector"], Mapping):
+            shipped.append(("sky", str(content["detector"]["table"])))
         shipped += SKY_TABLES
     return tuple(item for item in shipped if _exists(*item))
 

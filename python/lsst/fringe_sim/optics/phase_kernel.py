@@ -42,7 +42,7 @@ def reduce_nodes(
     roughness : `numpy.ndarray`, shape ``(L-1,)``
         Rms height of the interfaces.
     phase : `numpy.ndarray`, shape ``(L,)``
-        Extra round-trip phase of every layer [rad].
+        Extra complex round-trip phase of every layer [rad].
     """
     layer_count, nodes = index.shape
     real, mixed = np.zeros((3, nodes)), np.zeros((3, nodes), dtype=np.complex128)
@@ -51,7 +51,7 @@ def reduce_nodes(
         contiguous(each, kind)
         for each, kind in (
             (index.T, complex), (thickness, float), (wavelength, float), (theta, float),
-            (layers, np.int64), (roughness, float), (phase, float),
+            (layers, np.int64), (roughness, float), (phase, complex),
         )
     )  # fmt: skip
 
