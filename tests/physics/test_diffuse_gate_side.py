@@ -111,7 +111,7 @@ def test_plane_wave_gives_what_is_scattered() -> None:
 
 
 def test_fringes_fade_with_every_passage() -> None:
-    """The wave that comes back from the adhesive has passed the gate side twice: its power is (1 - R)² of what was."""
+    """The wave that comes back from the adhesive has passed the gate side twice, and has (1 - R)² of its power."""
     thickness = np.linspace(14.0, 14.3, 61)
 
     def swing(reflectance: float) -> float:
@@ -139,7 +139,7 @@ def test_it_reproduces_the_measured_efficiency() -> None:
         if reflectance == 0.35:
             np.testing.assert_allclose(seen[WAVES <= 1000.0], measured[WAVES <= 1000.0], rtol=0.08)
     assert spread[0.0] > 0.38
-    assert spread[0.3] < 0.16
+    assert spread[0.3] < 0.17
     assert spread[0.4] < 0.11
 
 

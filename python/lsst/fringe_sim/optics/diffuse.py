@@ -27,8 +27,8 @@ class DiffuseReturn:
     """A gate side of which a part returns light evenly in cos θ dΩ (Lambert), and lets none pass.
 
     The plane wave loses that part whenever it passes: on the way down into diffuse light, on the way up into what
-    lies below. The two are told apart by sharing the loss between two layers without thickness: with q² = 1 − R these take
-    (1 − q)(D + q U) and (1 − q)(q D + U) of the light that comes down, D, and up, U.
+    lies below. The two are told apart by sharing the loss between two layers without thickness: with q² = 1 − R these
+    take (1 − q)(D + q U) and (1 − q)(q D + U) of the light that comes down, D, and up, U.
 
     Attributes
     ----------
