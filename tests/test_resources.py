@@ -21,6 +21,7 @@ def test_every_table_states_where_it_comes_from(folder, name) -> None:
     table = read_table(folder, name)
     assert len(table) > 0
     assert {"source", "doi", "licence"} <= set(table.meta)
+    assert not table.meta["licence"].startswith(("no ", "none", "unknown"))
 
 
 def test_tables_without_a_licence_are_not_shipped() -> None:

@@ -32,30 +32,11 @@ def band_photons(sky: SkySpectrum) -> dict[str, float]:
     return {name: float(sky.lines.of_band(name).photon_radiance.sum()) for name in sky.lines.bands}
 
 
-@pytest.mark.parametrize("settings", [{"rotational_temperature__offset": 40.0}, {"hot_rotation__ratio": 0.1}])
-def test_rotation_keeps_the_photons_of_every_band(settings, sky) -> None:
-    before, after = band_photons(sky), band_photons(changed(sky, **settings))
-    assert after == pytest.approx(before, rel=1e-12)
-
-
-def test_warmer_air_fills_higher_levels(sky) -> None:
-    """Among lines of one band, the ratio is that of two Boltzmann factors."""
-    warm = changed(sky, rotational_temperature__offset=20.0)
-    chosen = sky.lines.band == "8-4"
-    ratio = np.log(warm.lines.photon_radiance[chosen] / sky.lines.photon_radiance[chosen])
-    energy = sky.lines.rotational_energy_cm[chosen]
-    slope = np.polyfit(energy, ratio, 1)[0]
-    assert slope == pytest.approx(1.4387769 * (1.0 / 190.0 - 1.0 / 210.0), rel=1e-6)
-
-
 def test_an_equal_temperature_agrees_with_the_recomputed_list() -> None:
     """From 190 K to 230 K by the effect, and by the line list itself."""
     cold, warm = (SkySpectrum(EmissionLines.oh(kelvin)) for kelvin in (190.0, 230.0))
     by_effect = changed(cold, rotational_temperature__offset=40.0).lines.photon_radiance
-    strong = warm.lines.photon_radiance > 1e-3 * warm.lines.photon_radiance.max()
-    ratio = by_effect[strong] / warm.lines.photon_radiance[strong]
-    # The list keeps the population of a vibrational level, the effect the photons of a band.
-    np.testing.assert_allclose(ratio, 1.0, atol=0.03)
+    np.testing.assert_allclose(by_effect, warm.lines.photon_radiance, rtol=1e-9)
 
 
 def test_bands_continuum_and_water_are_factors(sky) -> None:
@@ -98,5 +79,5 @@ def test_lines_without_energies_have_no_temperature(sky) -> None:
         sky.lines.wavelength_nm, sky.lines.photon_radiance, sky.lines.transmission, sky.lines.band
     )
     model = FringeModel.from_setup("lsst_e2v", {"rotational_temperature.offset": 20.0}, catalogue=EFFECTS)
-    with pytest.raises(InputError, match="rotational energies"):
+    with pytest.raises(InputError, match="rotational levels"):
         apply_to_sky(model.effects, model.base_system, SkySpectrum(bare))

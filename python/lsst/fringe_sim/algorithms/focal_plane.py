@@ -75,7 +75,8 @@ class SkyLevel:
     electrons: FloatArray
     read_noise_e: float  # read noise [e⁻ rms]
     pixel_scale_arcsec: float  # side of a pixel [arcsec]
-    microjansky: float  # surface brightness of the whole sky [µJy arcsec⁻²]
+    # Surface brightness above the air of a source as bright as the whole sky [µJy arcsec⁻²]
+    microjansky: float
 
     @classmethod
     def of(
@@ -96,7 +97,8 @@ class SkyLevel:
         band = Bandpass.from_name(setup.bandpass)
         exposure = setup.exposure_s if exposure_s is None else exposure_s
         electrons = np.array(list(component_electrons(sky, band, model, exposure).values()))
-        zero = zero_point(band, setup.effective_area_m2)
+        # What fringes are compared with, a source above the air, has passed it.
+        zero = zero_point(band, setup.effective_area_m2, setup.airmass)
         brightness = electrons_to_microjansky(electrons.sum(), zero, exposure, setup.pixel_scale_arcsec)
         return cls(
             electrons * relative_illumination, read_noise_e, setup.pixel_scale_arcsec, float(brightness)

@@ -59,6 +59,9 @@ BLEMISHES: dict[str, Any] = {"bad_columns": 6, "hot_pixels": 200, "prnu_rms": 0.
 @click.option(
     "--temperature", type=Quantity("K"), default=None, help="Sensor temperature, as 183.15 or -90degC."
 )
+@click.option(
+    "--silicon", default=None, help="Table of silicon, as Si_franta2017; that of the set-up if not given."
+)
 @click.option("--blemishes/--no-blemishes", default=False, help="Bad columns and hot pixels.")
 @click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all randomness.")
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
@@ -73,6 +76,7 @@ def mock_flats(
     bias_frames: int,
     level: float,
     temperature: float | None,
+    silicon: str | None,
     blemishes: bool,
     seed: int,
     dry_run: bool,
@@ -121,6 +125,7 @@ def mock_flats(
             n_bias=bias_frames,
             level_e=level,
             defects=Defects(**BLEMISHES) if blemishes else None,
+            silicon=silicon,
             progress=lambda path: advance(),
         )
     click.echo(f"{len(run.paths)} raw frames in {folder}")

@@ -4,64 +4,70 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from ..instrument.sky import SECOND_RADIATION_CM_K, SkySpectrum
-from .base import FloatArray, Parameter, PlainNullEffect, SearchHints, Values
+from ..instrument.sky import SkySpectrum
+from .base import Parameter, PlainNullEffect, SearchHints, Values
 
 __all__ = ["HotRotation", "OHBands", "RotationalTemperature", "SkyContinuum", "WaterVapour"]
 
-REFERENCE_K, HOT_K = 190.0, 1000.0
-"""Rotational temperature of the low levels in the line list, from which departures count, and of the hot ones."""
+HOT_K = 1000.0
+"""Temperature of a hot population that is added to that of the line list [K]."""
+
+_TWO_POPULATIONS = "Noll et al. 2020, doi 10.5194/acp-20-5269-2020 (two populations in every v')"
 
 BANDS = ("7-3", "8-4", "3-0", "9-5", "4-1", "5-2")
 """Bands of OH that matter in the y band. A factor common to all is one of the level."""
 
 
 class RotationalTemperature(PlainNullEffect):
-    """Rotational levels are populated as in warmer or colder air; every band keeps its photons."""
+    """The cold population of the rotational levels is as in warmer or colder air; the hot one stays.
+
+    Every vibrational level keeps what it holds.
+    """
 
     name = "rotational_temperature"
     title = "rotational temperature of OH"
     acts_on = "spectrum"
-    reference = "Noll et al. 2025, Geosci. Model Dev. 18, 4353 (PALACE: 190-200 K, +-20 K through a night)"
-    parameters = (
-        Parameter("offset", "K", 0.0, (-80.0, 200.0), 15.0, "departure from the 190 K of the line list"),
-    )
-
-    def change_sky(self, sky: SkySpectrum, values: Values) -> SkySpectrum:
-        """Multiply populations by the ratio of two Boltzmann factors."""
-        colder = SECOND_RADIATION_CM_K * (1.0 / REFERENCE_K - 1.0 / (REFERENCE_K + values["offset"]))
-        return replace(sky, lines=sky.lines.with_rotation(lambda energy: np.exp(colder * energy)))
-
-
-class HotRotation(PlainNullEffect):
-    """A second rotational population of 1000 K, which fills levels that cold air leaves empty."""
-
-    name = "hot_rotation"
-    title = "hot rotational population of OH"
-    acts_on = "spectrum"
-    reference = "Oliva et al. 2015, doi 10.1051/0004-6361/201526291 (hot OH in the nightglow)"
+    reference = f"{_TWO_POPULATIONS}; Noll et al. 2025, doi 10.5194/gmd-18-4353-2025 (+-20 K in a night)"
     parameters = (
         Parameter(
-            "ratio",
-            "",
-            0.0,
-            (0.0, 1.0),
-            0.01,
-            "size over that of the cold one, at zero rotational energy, added",
+            "offset", "K", 0.0, (-80.0, 200.0), 15.0, "departure from the temperature of the line list"
         ),
     )
 
     def change_sky(self, sky: SkySpectrum, values: Values) -> SkySpectrum:
-        """Add the population in proportion to the cold one."""
-        step = SECOND_RADIATION_CM_K * (1.0 / REFERENCE_K - 1.0 / HOT_K)
+        """Warm the cold population."""
+        offset = values["offset"]
+        return replace(
+            sky, lines=sky.lines.with_rotation(lambda levels: levels.warmed(levels.cold_k + offset))
+        )
 
-        def factor(energy_cm: FloatArray) -> FloatArray:
-            # Beyond 2000 1/cm the list holds the hot population already.
-            return np.asarray(1.0 + values["ratio"] * np.exp(step * np.minimum(energy_cm, 2000.0)))
 
-        return replace(sky, lines=sky.lines.with_rotation(factor))
+class HotRotation(PlainNullEffect):
+    """The hot population of the rotational levels is larger or smaller, or one of 1000 K is added to it.
+
+    Every vibrational level keeps what it holds; the cold population keeps its temperature.
+    """
+
+    name = "hot_rotation"
+    title = "hot rotational population of OH"
+    acts_on = "spectrum"
+    reference = f"{_TWO_POPULATIONS}; Oliva et al. 2015, doi 10.1051/0004-6361/201526291 (hot OH)"
+    parameters = (
+        Parameter(
+            "ratio", "", 0.0, (0.0, 1.0), 0.01, "added population of 1000 K, over the cold one at zero energy"
+        ),
+        Parameter("scale", "", 1.0, (0.0, 20.0), 0.5, "factor on the hot population of the line list"),
+    )  # fmt: skip
+    search = SearchHints(natural_bounds=(0.0,), refinements={"ratio": 1})
+
+    def change_sky(self, sky: SkySpectrum, values: Values) -> SkySpectrum:
+        """Scale the hot population, and add to it."""
+        return replace(
+            sky,
+            lines=sky.lines.with_rotation(
+                lambda levels: levels.with_hot(values["scale"], values["ratio"], HOT_K)
+            ),
+        )
 
 
 class OHBands(PlainNullEffect):

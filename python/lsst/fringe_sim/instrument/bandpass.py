@@ -76,7 +76,7 @@ class Bandpass:
     Attributes
     ----------
     name : `str`
-        Name of the bandpass.
+        Name of the bandpass, or of its filter where several bandpasses have one.
     wavelength_nm, optics : `numpy.ndarray`, shape ``(K,)``
         Transmission of mirrors, lenses, window and filter.
     detector : `numpy.ndarray`, shape ``(K,)``
@@ -109,11 +109,11 @@ class Bandpass:
             optics = np.prod(
                 [np.asarray(table[factor], dtype=float) for factor in content["factors"]], axis=0
             )
-            detector = np.asarray(table[content["detector"]], dtype=float)
+            detector = _detector(content["detector"], table, wavelength)
             air = _atmosphere(wavelength, table, content["atmosphere"])
         except KeyError as error:
             raise ResourceError(f"data/bandpasses/{name}.yaml: wrong or missing entry {error}") from error
-        return cls(name, wavelength, optics, detector, air)
+        return cls(content.get("filter", name), wavelength, optics, detector, air)
 
     @classmethod
     def from_speclite(
@@ -183,6 +183,15 @@ class Bandpass:
 def bandpass_names() -> tuple[str, ...]:
     """Names of the shipped bandpasses."""
     return tuple(entry.removesuffix(".yaml") for entry in list_resources("bandpasses"))
+
+
+def _detector(content: Any, table: Mapping[str, Any], wavelength: FloatArray) -> FloatArray:
+    """Quantum efficiency: a column of the table of the optics, or the product of columns of a table of its own."""
+    if isinstance(content, str):
+        return np.asarray(table[content], dtype=float)
+    own = read_table("sky", content["table"])
+    factors = [np.asarray(own[name], dtype=float) for name in content["columns"]]
+    return np.interp(wavelength, np.asarray(own["wavelength"], dtype=float), np.prod(factors, axis=0))
 
 
 def _atmosphere(wavelength: FloatArray, table: Mapping[str, Any], content: Mapping[str, Any]) -> Atmosphere:

@@ -110,6 +110,11 @@ def zero_point(bandpass: Bandpass, collecting_area_m2: float, airmass: float | N
         Collecting area [m²].
     airmass : `float`, optional
         Airmass of the air in the throughput; without air if not given.
+
+    Notes
+    -----
+    The brightness of the sky is by convention that which arrives at the telescope: without air. What disturbs the
+    photometry of stars and galaxies, as fringes do, is compared with their brightness above the air.
     """
     wave = bandpass.wavelength_nm
     throughput = bandpass.transmission(wave) * bandpass.quantum_efficiency(wave)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,7 +50,7 @@ class Setup:
     camera, detector : `str`
         Camera and default detector.
     stack : `LayerStack`
-        The sensor.
+        The sensor; in a file, ``silicon: Si_green2008`` takes its silicon from another table.
     varying : `str`
         Layer whose thickness varies over the sensor.
     thickness_range_um : `tuple` [`float`, `float`]
@@ -147,7 +147,9 @@ class Setup:
             source=reader.text("source"),
             camera=reader.text("camera"),
             detector=reader.text("detector"),
-            stack=LayerStack.from_resource(reader.text("stack")),
+            stack=LayerStack.from_resource(reader.text("stack")).with_silicon(
+                reader.optional("silicon", "Si")
+            ),
             varying=reader.text("varying"),
             thickness_range_um=(low, high),
             temperature_k=reader.number("temperature_k", low=100.0, high=400.0),
@@ -183,6 +185,10 @@ class Setup:
             for usual in self.wavelengths_nm
             if min(abs(one - usual) for one in found) > SAME_WAVELENGTH_NM
         )
+
+    def with_silicon(self, name: str) -> Setup:
+        """The same set-up with silicon of another table; see `LayerStack.with_silicon`."""
+        return replace(self, stack=self.stack.with_silicon(name))
 
     @property
     def profile(self) -> SpectralProfile:
@@ -253,6 +259,9 @@ class _Reader:
             allowed = "text in one line, without control characters"
             raise InputError(f"{self._prefix}{key}", value, allowed, source=self.source)
         return value
+
+    def optional(self, key: str, default: str) -> str:
+        return self.text(key) if key in self._content else default
 
     def choice(self, key: str, allowed: tuple[str, ...]) -> str:
         value = self._get(key)

@@ -20,6 +20,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..resources import read_table
+from .oh_levels import SECOND_RADIATION_CM_K, RotationalLevels, boltzmann
 
 if TYPE_CHECKING:  # filters take time to import, and effects do without
     from .bandpass import Bandpass
@@ -37,9 +38,6 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-
-SECOND_RADIATION_CM_K = 1.4387769
-"""hc/k [cm K]."""
 
 AIRGLOW_HEIGHT_KM = 90.0
 EARTH_RADIUS_KM = 6371.0
@@ -74,15 +72,15 @@ class EmissionLines:
         Molecular transmission of the air at the wavelength of the line, zenith.
     band : `numpy.ndarray` of `str`, shape ``(N,)``
         Vibrational band, e.g. ``8-4``.
-    rotational_energy_cm : `numpy.ndarray`, shape ``(N,)``, optional
-        Energy of the upper level above the lowest of its vibrational level [1/cm], if it is known.
+    levels : `RotationalLevels`, optional
+        The upper levels with their cold and hot populations, if they are known.
     """
 
     wavelength_nm: FloatArray
     photon_radiance: FloatArray
     transmission: FloatArray
     band: NDArray[np.str_]
-    rotational_energy_cm: FloatArray | None = None
+    levels: RotationalLevels | None = None
 
     def __post_init__(self) -> None:
         shapes = {
@@ -92,7 +90,7 @@ class EmissionLines:
                 self.photon_radiance,
                 self.transmission,
                 self.band,
-                self.band if self.rotational_energy_cm is None else self.rotational_energy_cm,
+                self.band if self.levels is None else self.levels.line_level,
             )
         }
         if len(shapes) != 1 or len(next(iter(shapes))) != 1:
@@ -129,8 +127,8 @@ class EmissionLines:
         Parameters
         ----------
         rotational_temperature_k : `float`, optional
-            Rotational temperature [K] of every vibrational level; by default the PALACE populations, which are
-            close to 190-200 K in the low levels and hotter in the high ones.
+            Rotational temperature [K] of every vibrational level; by default the PALACE populations, which have
+            191 K in the low levels and a hot population in the high ones.
         vibrational_temperature_k : `float`, optional
             Vibrational temperature [K] between the lowest rotational levels; by default the PALACE populations,
             which correspond to 10 970 K.
@@ -155,13 +153,13 @@ class EmissionLines:
         temperature redistributes the levels and keeps the photon radiance of the whole list.
         """
         table = read_table("sky", "oh_lines_palace_yband.ecsv")
-        level = _LevelPopulations.of_reference()
+        levels = RotationalLevels.of_reference()
         if hot_temperature_k is not None and rotational_temperature_k is None:
             raise InputError("rotational_temperature_k", None, "a temperature of the cold population")
         if rotational_temperature_k is not None:
-            level = level.thermal(rotational_temperature_k, hot_temperature_k, hot_ratio)
+            levels = levels.thermal(rotational_temperature_k, hot_temperature_k, hot_ratio)
         rate = np.asarray(table["A"], dtype=float) * np.asarray(table["g_up"], dtype=float)
-        radiance = rate * level.of_lines() * _photons_per_rayleigh()
+        radiance = rate * levels.line_population * _photons_per_rayleigh()
         if vibrational_temperature_k is not None:
             total = radiance.sum()
             radiance *= _vibrational_factor(np.asarray(table["v_up"]), vibrational_temperature_k)
@@ -172,7 +170,7 @@ class EmissionLines:
             radiance[order],
             np.asarray(table["transmission"], dtype=float)[order],
             np.asarray(table["band"], dtype=str)[order],
-            np.asarray(table["E_rot"], dtype=float)[order],
+            levels.of_lines(order),
         )
         return lines.scaled(band_scale or {})
 
@@ -210,32 +208,29 @@ class EmissionLines:
             self.photon_radiance[chosen],
             self.transmission[chosen],
             self.band[chosen],
-            None if self.rotational_energy_cm is None else self.rotational_energy_cm[chosen],
+            None if self.levels is None else self.levels.of_lines(chosen),
         )
 
-    def with_rotation(self, factor: Callable[[FloatArray], FloatArray]) -> EmissionLines:
-        """Lines of other rotational populations; every band keeps its photons.
+    def with_rotation(self, change: Callable[[RotationalLevels], RotationalLevels]) -> EmissionLines:
+        """Lines of other rotational populations.
 
         Parameters
         ----------
-        factor : callable
-            Factor on the population at rotational energies [1/cm].
+        change : callable
+            Changes the populations of the levels.
 
         Raises
         ------
         InputError
-            The energies of the lines are not known.
+            The levels of the lines are not known.
         """
-        if self.rotational_energy_cm is None:
-            raise InputError(
-                "rotational energies of the lines", None, "known, as those of `EmissionLines.oh`"
-            )
-        changed = self.photon_radiance * factor(self.rotational_energy_cm)
-        for name in self.bands:
-            own = self.band == name
-            total = float(changed[own].sum())
-            changed[own] *= float(self.photon_radiance[own].sum()) / total if total > 0.0 else 1.0
-        return replace(self, photon_radiance=changed)
+        if self.levels is None:
+            raise InputError("rotational levels of the lines", None, "known, as those of `EmissionLines.oh`")
+        changed = change(self.levels)
+        # A level can be empty only where a Boltzmann factor is below the smallest number; it stays so.
+        before = np.maximum(self.levels.line_population, math.ulp(0.0))
+        factor = changed.line_population / before
+        return replace(self, photon_radiance=self.photon_radiance * factor, levels=changed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -521,65 +516,11 @@ def _photons_per_rayleigh() -> float:
     return 1e10 / (4.0 * math.pi) / _ARCSEC2_PER_SR
 
 
-@dataclass(frozen=True, eq=False)
-class _LevelPopulations:
-    """Populations per sublevel of the upper levels of the line list [rayleigh seconds]."""
-
-    vibration: NDArray[np.int64]
-    energy_cm: FloatArray
-    weight: FloatArray
-    population: FloatArray
-    line_level: NDArray[np.int64]
-
-    @classmethod
-    def of_reference(cls) -> _LevelPopulations:
-        table = read_table("sky", "oh_lines_palace_yband.ecsv")
-        names = ("v_up", "N_up", "F_up", "parity_up")
-        keys = list(zip(*(table[name].tolist() for name in names), strict=True))
-        levels = {key: number for number, key in enumerate(dict.fromkeys(keys))}
-        first = [keys.index(key) for key in levels]
-
-        def column(name: str) -> FloatArray:
-            return np.asarray(table[name], dtype=float)[first]
-
-        return cls(
-            np.asarray(table["v_up"], dtype=np.int64)[first],
-            column("E_rot"),
-            column("g_up"),
-            np.exp(column("ln_pop")),
-            np.array([levels[key] for key in keys]),
-        )
-
-    def thermal(self, cold_k: float, hot_k: float | None, hot_ratio: float) -> _LevelPopulations:
-        """Boltzmann populations with the same total in every vibrational level."""
-        shape = _boltzmann(self.energy_cm, cold_k)
-        if hot_k is not None:
-            if not 0.0 <= hot_ratio < math.inf:
-                raise OutOfRangeError("ratio of the hot population", hot_ratio, "finite and not negative")
-            shape = shape + hot_ratio * _boltzmann(self.energy_cm, hot_k)
-        population = np.empty_like(shape)
-        for level in np.unique(self.vibration):
-            chosen = self.vibration == level
-            held = self.weight[chosen] @ self.population[chosen] / (self.weight[chosen] @ shape[chosen])
-            population[chosen] = held * shape[chosen]
-        return replace(self, population=population)
-
-    def of_lines(self) -> FloatArray:
-        """Population of the upper level of every line of the table."""
-        return self.population[self.line_level]
-
-
-def _boltzmann(energy_cm: FloatArray, temperature_k: float) -> FloatArray:
-    if not 0.0 < temperature_k < math.inf:
-        raise OutOfRangeError("temperature [K]", temperature_k, "positive")
-    return np.exp(-SECOND_RADIATION_CM_K * energy_cm / temperature_k)
-
-
 def _vibrational_factor(upper: NDArray[np.int64], temperature_k: float) -> FloatArray:
     """Wanted over reference population of the lowest rotational level, per line."""
     table = read_table("sky", "oh_levels_palace.ecsv")
     level = np.asarray(table["v_up"], dtype=np.int64)
-    wanted = _boltzmann(np.asarray(table["E_v0"], dtype=float), temperature_k)
+    wanted = boltzmann(np.asarray(table["E_v0"], dtype=float), temperature_k)
     # Scaled to the middle of the range so that neither factor overflows.
     ratio = np.log(wanted) - np.asarray(table["ln_pop_N1"], dtype=float)
     factor = dict(zip(level.tolist(), np.exp(ratio - ratio[level == 6]), strict=True))

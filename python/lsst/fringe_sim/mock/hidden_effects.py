@@ -144,7 +144,10 @@ def _epoxy_absorption(optics: FlatFieldOptics, values: Values) -> FlatFieldOptic
 
 
 def _silicon_absorption(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return optics.with_film(optics.detection, extinction_scale=values["scale"])
+    for film in optics.films:
+        if film.medium.partition("_")[0] == "Si":
+            optics = optics.with_film(film.name, extinction_scale=values["scale"])
+    return optics
 
 
 def _ar_coating(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:

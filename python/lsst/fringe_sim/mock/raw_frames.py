@@ -187,13 +187,15 @@ def parse_size(size: str) -> tuple[int, int]:
     return int(second), int(first)
 
 
-def setup_optics(setup: str) -> tuple[FlatFieldOptics, str]:
+def setup_optics(setup: str, silicon: str | None = None) -> tuple[FlatFieldOptics, str]:
     """Sensor and light of a laboratory set-up, and the camera it belongs to.
 
     Parameters
     ----------
     setup : `str`
         Name of a file in ``data/setups``, or a YAML file laid out like those.
+    silicon : `str`, optional
+        Table of silicon in ``data/media/media.yaml``, as ``Si_franta2017``; by default that of the set-up.
 
     Raises
     ------
@@ -209,8 +211,15 @@ def setup_optics(setup: str) -> tuple[FlatFieldOptics, str]:
     beam = light["beam"]["kind"]
     if beam != "collimated":
         raise InputError("illumination.beam.kind", beam, "collimated", source=setup)
+    own = silicon or str(content.get("silicon", "Si"))
+    if own.partition("_")[0] != "Si":
+        raise InputError("silicon", own, "Si or a table that begins with Si_", source=setup)
     films = tuple(
-        Film(str(layer["name"]), str(layer["medium"]), float(layer["thickness_um"]))
+        Film(
+            str(layer["name"]),
+            own if layer["medium"] == "Si" else str(layer["medium"]),
+            float(layer["thickness_um"]),
+        )
         for layer in _read_named("stack", "stacks", content["stack"])["layers"]
     )
     optics = FlatFieldOptics(
@@ -237,6 +246,7 @@ def write_mock_flats(
     repeats: int = 1,
     level_e: float = DEFAULT_LEVEL_E,
     defects: Defects | None = None,
+    silicon: str | None = None,
     first_exposure: datetime.datetime = FIRST_EXPOSURE,
     progress: Callable[[Path], None] | None = None,
 ) -> MockRun:
@@ -268,6 +278,8 @@ def write_mock_flats(
         Mean charge of the flats [electrons].
     defects : `Defects`, optional
         Blemishes; none by default.
+    silicon : `str`, optional
+        Table of the optical constants of silicon, as ``Si_franta2017``; by default that of the set-up.
     first_exposure : `datetime.datetime`, optional
         Time of the first frame.
     progress : callable, optional
@@ -283,7 +295,7 @@ def write_mock_flats(
     InputError, OutOfRangeError, UnknownNameError
         An argument cannot be used; nothing has been written then.
     """
-    optics, camera = setup_optics(setup)
+    optics, camera = setup_optics(setup, silicon)
     sensor = _sensor(camera, detector, size)
     thickness = _check_thickness(thickness_um, sensor.shape)
     wavelengths = _check_wavelengths(wavelengths_nm)

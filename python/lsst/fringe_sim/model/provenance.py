@@ -66,6 +66,10 @@ SKY_TABLES = (
 """Line list, populations, their history and the continuum: what every simulated sky is made of."""
 
 
+SILICON_LAWS = {"franta2017": "nk_Si_franta2017_T.ecsv", "green2008": "nk_Si_green2008.ecsv"}
+"""Tables from which silicon's dependence on temperature comes, by the name of the law in ``media.yaml``."""
+
+
 @functools.cache
 def _software() -> dict[str, str]:
     cards = {"ORIGIN": "lsst.fringe_sim", "FSIMVER": __version__, "VERSION PYTHON": platform.python_version()}
@@ -145,16 +149,20 @@ def tables_of(setup: Setup, stack: LayerStack | None = None) -> tuple[tuple[str,
         shipped.append(("telescopes", f"{setup.telescope.lower()}.yaml"))
     if setup.bandpass:
         description = f"{setup.bandpass}.yaml"
-        shipped += [("bandpasses", description), ("sky", str(read_yaml("bandpasses", description)["table"]))]
+        content = read_yaml("bandpasses", description)
+        shipped += [("bandpasses", description), ("sky", str(content["table"]))]
+        if isinstance(content["detector"], Mapping):
+            shipped.append(("sky", str(content["detector"]["table"])))
         shipped += SKY_TABLES
     return tuple(item for item in shipped if _exists(*item))
 
 
 def _media(names: Iterable[str]) -> list[tuple[str, str]]:
     entries = read_yaml("media", "media.yaml")
-    return [
-        ("media", str(entries[name]["table"])) for name in sorted(set(names)) if _has_table(entries, name)
-    ]
+    known = [entries[name] for name in sorted(set(names)) if _has_table(entries, name)]
+    files = [str(entry["table"]) for entry in known]
+    files += [SILICON_LAWS[entry["temperature"]] for entry in known if "temperature" in entry]
+    return [("media", file) for file in dict.fromkeys(files)]
 
 
 def _has_table(entries: Mapping[str, Any], name: str) -> bool:

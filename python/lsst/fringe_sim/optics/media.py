@@ -16,6 +16,7 @@ from ..errors import OutOfRangeError, ResourceError, UnknownNameError
 from ..resources import read_table, read_yaml
 
 if TYPE_CHECKING:
+    from astropy.table import Table
     from scipy.interpolate import CubicSpline, PchipInterpolator
 
 __all__ = ["Medium", "check_range", "constant_medium", "get_medium", "medium_names"]
@@ -24,7 +25,13 @@ REFERENCE_TEMPERATURE_K = 300.0
 """Temperature at which Green (2008) tabulates silicon [K]."""
 
 TEMPERATURE_RANGE_K = (100.0, 400.0)
-"""Range in which the power law of Green (2008) is used; below about 250 K it is an extrapolation."""
+"""Temperatures for which silicon is known: measured up to 300 K, by the power law of Green (2008) above."""
+
+COLD_NODES_K = np.array([100.0, 150.0, 200.0, 250.0, 300.0])
+"""Temperatures at which silicon was measured (Franta et al. 2017; n of Frey et al. 2006)."""
+
+COLD_TABLE = "nk_Si_franta2017_T.ecsv"
+WARM_TABLE = "nk_Si_green2008.ecsv"
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,13 @@ class Medium:
     extinction_offset: float = 0.0
     index_offset: float = 0.0
     dispersion_um2: float = 0.0
+    toward: tuple[tuple[str, float], ...] = ()
+    """Other tables of the same material, and how far the index lies on the way to each: 0 here, 1 there."""
+
+    @property
+    def is_silicon(self) -> bool:
+        """Whether it is one of the tables of crystalline silicon."""
+        return self.name.partition("_")[0] == "Si"
 
     def index(self, wavelength_nm: ArrayLike, temperature_k: ArrayLike = 300.0) -> NDArray[np.complex128]:
         """Complex refractive index ``n + i k``.
@@ -79,20 +93,25 @@ class Medium:
         check_range("temperature [K]", temperature, *TEMPERATURE_RANGE_K)
         wavelength, temperature = np.broadcast_arrays(wavelength, temperature)
         n, k = self._index(wavelength, temperature)
+        own_n, own_k = n, k
+        for name, part in self.toward:
+            other_n, other_k = get_medium(name)._index(wavelength, temperature)
+            n, k = n + part * (other_n - own_n), k * (other_k / own_k) ** part
         # A Cauchy term relative to 960 nm, the middle of the y band: it tilts without shifting there.
         cauchy = self.dispersion_um2 * ((1000.0 / wavelength) ** 2 - (1000.0 / 960.0) ** 2)
         n = n * self.index_scale + self.index_offset + cauchy
         k = k * self.extinction_scale + self.extinction_offset
         return n + 1j * k
 
-    def modified(self, **changes: float) -> Medium:
-        """Return a copy with some of the five modifiers set.
+    def modified(self, **changes: object) -> Medium:
+        """Return a copy with some of the modifiers set.
 
         Parameters
         ----------
         **changes
-            ``index_scale``, ``index_offset``, ``extinction_scale``, ``extinction_offset``, or
-            ``dispersion_um2`` (Cauchy coefficient added to ``n``, zero at 960 nm).
+            ``index_scale``, ``index_offset``, ``extinction_scale``, ``extinction_offset``,
+            ``dispersion_um2`` (Cauchy coefficient added to ``n``, zero at 960 nm), or ``toward`` (parts of the
+            difference to other tables: ``n`` is interpolated, ``k`` in its logarithm).
         """
         return replace(self, **changes)  # type: ignore[arg-type]
 
@@ -112,25 +131,77 @@ class _ConstantIndex:
 class _TabulatedIndex:
     """Tabulated ``n`` (cubic spline) and ``k`` (monotone cubic in ``log k``), exact at the nodes."""
 
-    wavelength: NDArray[np.float64]
     n: CubicSpline
     log_k: PchipInterpolator | None
-    temperature_n: PchipInterpolator | None = None
-    temperature_k: PchipInterpolator | None = None
+    law: _PowerLaw | _MeasuredLaw | None = None
 
     def __call__(
         self, wavelength: NDArray[np.float64], temperature: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         n = self.n(wavelength)
         k = np.zeros(wavelength.shape) if self.log_k is None else np.exp(self.log_k(wavelength))
-        if self.temperature_n is None or self.temperature_k is None:
+        if self.law is None:
             return n, k
-        # Green (2008): X(T) = X(300 K) (T/300 K)^(C 300 K), with C tabulated in 1e-4/K.
+        return self.law(n, k, wavelength, temperature)
+
+
+@dataclass(frozen=True, eq=False)
+class _PowerLaw:
+    """X(T) = X(300 K) (T/300 K)^(C 300 K) of Green (2008), with C tabulated in 1e-4/K."""
+
+    coefficient_n: PchipInterpolator
+    coefficient_k: PchipInterpolator
+
+    def __call__(
+        self,
+        n: NDArray[np.float64],
+        k: NDArray[np.float64],
+        wavelength: NDArray[np.float64],
+        temperature: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         log_ratio = np.log(temperature / REFERENCE_TEMPERATURE_K) * REFERENCE_TEMPERATURE_K * 1e-4
         return (
-            n * np.exp(self.temperature_n(wavelength) * log_ratio),
-            k * np.exp(self.temperature_k(wavelength) * log_ratio),
+            n * np.exp(self.coefficient_n(wavelength) * log_ratio),
+            k * np.exp(self.coefficient_k(wavelength) * log_ratio),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _MeasuredLaw:
+    """n(T) - n(300 K) and k(T) / k(300 K) as measured; above 300 K the power law.
+
+    Between its nodes the polynomial of fourth degree in temperature is taken, of n and of the logarithm of k.
+    """
+
+    n: CubicSpline  # over wavelength, one column per node
+    log_k: PchipInterpolator
+    warm: _PowerLaw
+    measured_at_k: float
+
+    def __call__(
+        self,
+        n: NDArray[np.float64],
+        k: NDArray[np.float64],
+        wavelength: NDArray[np.float64],
+        temperature: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        part = _lagrange(np.minimum(temperature, COLD_NODES_K[-1])) - _lagrange(np.array(self.measured_at_k))
+        n = n + (self.n(wavelength) * part).sum(axis=-1)
+        k = k * np.exp((self.log_k(wavelength) * part).sum(axis=-1))
+        if np.all(temperature <= REFERENCE_TEMPERATURE_K):
+            return n, k
+        return self.warm(n, k, wavelength, np.maximum(temperature, REFERENCE_TEMPERATURE_K))
+
+
+def _lagrange(temperature: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights of the nodes in the polynomial through all of them, along a last axis."""
+    away = temperature[..., np.newaxis] - COLD_NODES_K
+    weights = [
+        np.prod(np.delete(away, node, axis=-1), axis=-1)
+        / np.prod(np.delete(COLD_NODES_K[node] - COLD_NODES_K, node))
+        for node in range(COLD_NODES_K.size)
+    ]
+    return np.stack(weights, axis=-1)
 
 
 def constant_medium(
@@ -192,26 +263,59 @@ def _read_tabulated(name: str, entry: dict[str, Any]) -> Medium:
     from scipy.interpolate import CubicSpline, PchipInterpolator
 
     table = read_table("media", entry["table"])
-    wavelength = np.asarray(table["wavelength"].quantity.to_value("nm"), dtype=float)
-    if np.any(np.diff(wavelength) <= 0):
-        raise ResourceError(f"{entry['table']}: wavelengths must increase")
-    k = np.asarray(table["k"], dtype=float)
+    wavelength = _wavelengths(table, entry["table"])
+    names = entry.get("columns", ("n", "k"))
+    n, k = (np.asarray(table[column], dtype=float) for column in names)
     if np.all(k == 0.0):
         log_k = None
     else:
         floor = 1e-12  # far below any absorption that matters over a millimetre
         log_k = PchipInterpolator(wavelength, np.log(np.maximum(k, floor)), extrapolate=False)
-    coefficients: tuple[PchipInterpolator | None, PchipInterpolator | None] = (None, None)
-    if entry.get("temperature") == "green2008":
-        coefficients = (
-            PchipInterpolator(wavelength, np.asarray(table["C_n"], dtype=float), extrapolate=False),
-            PchipInterpolator(wavelength, np.asarray(table["C_k"], dtype=float), extrapolate=False),
-        )
-    index = _TabulatedIndex(
-        wavelength, CubicSpline(wavelength, np.asarray(table["n"], dtype=float)), log_k, *coefficients
+    low, high = float(wavelength[0]), float(wavelength[-1])
+    law: _PowerLaw | _MeasuredLaw | None = None
+    match entry.get("temperature"):
+        case "green2008":
+            law = _power_law(entry["table"])
+        case "franta2017":
+            law, cold = _measured_law(float(entry.get("measured_at_k", REFERENCE_TEMPERATURE_K)))
+            low, high = max(low, float(cold[0])), min(high, float(cold[-1]))
+    index = _TabulatedIndex(CubicSpline(wavelength, n), log_k, law)
+    return Medium(name, (low, high), f"{table.meta['source']} (doi {table.meta['doi']})", index)
+
+
+def _wavelengths(table: Table, file: str) -> NDArray[np.float64]:
+    wavelength = np.asarray(table["wavelength"].quantity.to_value("nm"), dtype=float)
+    if np.any(np.diff(wavelength) <= 0):
+        raise ResourceError(f"{file}: wavelengths must increase")
+    return wavelength
+
+
+def _power_law(file: str) -> _PowerLaw:
+    from scipy.interpolate import PchipInterpolator
+
+    table = read_table("media", file)
+    wavelength = _wavelengths(table, file)
+    coefficients = (np.asarray(table[name], dtype=float) for name in ("C_n", "C_k"))
+    return _PowerLaw(*(PchipInterpolator(wavelength, each, extrapolate=False) for each in coefficients))
+
+
+def _measured_law(measured_at_k: float) -> tuple[_MeasuredLaw, NDArray[np.float64]]:
+    """Law of a table of silicon that was measured at some temperature, and the wavelengths of its measurement."""
+    from scipy.interpolate import CubicSpline, PchipInterpolator
+
+    table = read_table("media", COLD_TABLE)
+    wavelength = _wavelengths(table, COLD_TABLE)
+    n, k = (
+        np.stack([np.asarray(table[f"{part}_{node:.0f}K"], dtype=float) for node in COLD_NODES_K], axis=1)
+        for part in "nk"
     )
-    source = f"{table.meta['source']} (doi {table.meta['doi']})"
-    return Medium(name, (float(wavelength[0]), float(wavelength[-1])), source, index)
+    law = _MeasuredLaw(
+        CubicSpline(wavelength, n),
+        PchipInterpolator(wavelength, np.log(k), extrapolate=False),
+        _power_law(WARM_TABLE),
+        measured_at_k,
+    )
+    return law, wavelength
 
 
 def check_range(what: str, value: NDArray[np.float64], low: float, high: float) -> None:

@@ -27,7 +27,7 @@ def reduce_nodes(
 
     ``index`` (L, N). ``thickness`` (L,): thickness, in the unit of ``wavelength``; not used of the ends and of
     the varying layer. ``wavelength``, ``theta`` (N,). ``layers``: positions of the layers whose absorption is
-    wanted. ``roughness`` (L-1,). ``phase`` (L,): extra round-trip phase of every layer [rad].
+    wanted. ``roughness`` (L-1,). ``phase`` (L,): extra complex round-trip phase of every layer [rad].
     """
     layer_count, nodes = index.shape
     real, mixed = np.zeros((3, nodes)), np.zeros((3, nodes), dtype=np.complex128)
@@ -36,7 +36,7 @@ def reduce_nodes(
         contiguous(each, kind)
         for each, kind in (
             (index.T, complex), (thickness, float), (wavelength, float), (theta, float),
-            (layers, np.int64), (roughness, float), (phase, float),
+            (layers, np.int64), (roughness, float), (phase, complex),
         )
     )  # fmt: skip
 

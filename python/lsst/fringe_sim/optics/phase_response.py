@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -82,6 +82,14 @@ class PhaseResponse:
     def node_shape(self) -> tuple[int, ...]:
         """Shape of the nodes, without the polarisation axis."""
         return self.a.shape[1:]
+
+    def plus(self, other: PhaseResponse, factor: ArrayLike) -> PhaseResponse:
+        """Sum of the response and of another one of the same fields, times a factor at every node."""
+        sums = {
+            name: getattr(self, name) + np.asarray(factor) * getattr(other, name)
+            for name in ("a", "b", "e", "c")
+        }
+        return replace(self, **sums)
 
     def evaluate(self, thickness_um: ArrayLike) -> FloatArray:
         """Response at every node.
@@ -268,6 +276,7 @@ def reduce_to_phase(
     layers: Sequence[int],
     roughness: ArrayLike | None = None,
     spread: ArrayLike | None = None,
+    attenuation: ArrayLike | None = None,
 ) -> PhaseResponse:
     """Reduce a stack to its closed form in the phase of one layer.
 
@@ -290,6 +299,8 @@ def reduce_to_phase(
     spread : array_like, shape ``(L,)``, optional
         Rms thickness spread of every layer inside a pixel [µm]. Infinite for an incoherent layer (not the varying
         one). The spread changes the phase; the attenuation of a fixed layer is that of its mean thickness.
+    attenuation : array_like, shape ``(L,)``, optional
+        Logarithm of the power that every passage of a layer takes besides its absorption.
 
     Returns
     -------
@@ -322,6 +333,7 @@ def reduce_to_phase(
     heights = None if roughness is None else np.asarray(roughness, dtype=float)
     if heights is not None and not np.any(heights):
         heights = None
+    extra = np.zeros(count) if attenuation is None else np.asarray(attenuation, dtype=float)
     spreads = np.zeros(count) if spread is None else np.asarray(spread, dtype=float)
     polarizations = pure_polarizations(polarization, angle)
     shifted = [layer for layer in range(1, count - 1) if layer != varying and spreads[layer] > 0.0]
@@ -331,8 +343,8 @@ def reduce_to_phase(
     parts, shares = [], []
     for each in polarizations:
         for state in phase_states(index, thickness, wave, angle, each, shifted, spreads):
-            phase = np.zeros(count)
-            phase[list(state.phases)] = list(state.phases.values())
+            phase = 1j * extra
+            phase[list(state.phases)] += list(state.phases.values())
             reduced = reduce_nodes(
                 flat,
                 thickness,

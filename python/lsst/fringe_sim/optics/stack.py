@@ -180,6 +180,27 @@ class LayerStack:
         """Stack in which the layer ``name`` is made of something else."""
         return self.replace_layer(name, medium=medium)
 
+    def with_silicon(self, name: str) -> LayerStack:
+        """Stack in which all silicon has the optical constants of another table.
+
+        Parameters
+        ----------
+        name : `str`
+            ``Si``, ``Si_green2008`` (the constants of the paper), ``Si_schinke2015`` or ``Si_franta2017``.
+
+        Raises
+        ------
+        InputError
+            It is not silicon.
+        """
+        medium = get_medium(name)
+        if not medium.is_silicon:
+            raise InputError("table of silicon", name, "Si or one that begins with Si_", source=self.name)
+        layers = tuple(
+            replace(layer, medium=medium) if layer.medium.is_silicon else layer for layer in self.layers
+        )
+        return replace(self, layers=layers)
+
     def with_inserted(self, layer: Layer, *, before: str) -> LayerStack:
         """Stack with one more layer on the light's side of the layer called ``before``."""
         position = self.position(before)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
+from .diffuse import DiffuseReturn
 from .illumination import DEFAULT_STEP_NM, Beam, Illumination, LampSpectrum, SpectralProfile
 from .phase_response import PhaseResponse, reduce_to_phase
 from .stack import LayerStack
@@ -53,6 +55,8 @@ class OpticalSystem:
         constant beyond.
     lamp : `LampSpectrum`, optional
         Spectrum of the lamp behind the monochromator; white if not given.
+    diffuse : `DiffuseReturn`, optional
+        What the gate side scatters back into the silicon; nothing if not given.
     """
 
     stack: LayerStack
@@ -68,6 +72,7 @@ class OpticalSystem:
     stretch_pivot_nm: float = 935.0
     wavelength_errors_nm: tuple[tuple[tuple[float, float], ...], ...] = ()
     lamp: LampSpectrum | None = None
+    diffuse: DiffuseReturn | None = None
 
     def __post_init__(self) -> None:
         self.stack.position(self.varying)
@@ -113,17 +118,32 @@ class OpticalSystem:
             layers = [self.stack.position(self.detection)]
         else:
             layers = list(range(1, len(self.stack.layers) - 1))
-        return reduce_to_phase(
+        reduced = functools.partial(
+            reduce_to_phase,
             index,
             thickness,
             1e-3 * illumination.wavelength_nm,
             illumination.theta,
             self.polarization,
             varying=self.stack.position(self.varying),
-            layers=layers,
             roughness=1e-3 * self.stack.roughness_nm,
             spread=self.stack.thickness_spread_um,
         )
+        if self.diffuse is None:
+            return reduced(layers=layers)
+        taken = self.diffuse.attenuation(self.stack)
+        absorbed, escaped = self.diffuse.fate(
+            self.stack, self.detection, illumination.wavelength_nm, self.temperature_k
+        )
+        seen = absorbed if self.observable == "detection" else -escaped
+        response = reduced(layers=layers, attenuation=taken)
+        for name, factor in zip(
+            (self.diffuse.upper, self.diffuse.lower), self.diffuse.returned(), strict=True
+        ):
+            response = response.plus(
+                reduced(layers=[self.stack.position(name)], attenuation=taken), factor * seen
+            )
+        return response
 
     def reduce_two_layers(self, illumination: Illumination) -> TwoPhaseResponse:
         """Closed form in the thickness of the detection layer and of the varying layer below it.
@@ -136,6 +156,8 @@ class OpticalSystem:
         """
         if self.observable != "detection":
             raise InputError("observable", self.observable, "detection (with two varying layers)")
+        if self.diffuse is not None:
+            raise InputError("diffuse return", self.diffuse.reflectance, "none (with two varying layers)")
         if np.any(self.stack.thickness_spread_um):
             raise InputError(
                 "thickness spread", self.stack.thickness_spread_um.tolist(), "zero in all layers"

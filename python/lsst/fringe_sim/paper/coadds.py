@@ -24,7 +24,7 @@ FIRST_HOUR = 19.0
 
 def components(context: Context) -> Section:
     """Principal components of a night."""
-    response, night = lines_only("lsst_e2v"), NightHistory.guo2022()
+    response, night = lines_only(context.setup("lsst_e2v")), NightHistory.guo2022()
     scales = [night.band_scale(time, response.bands) for time in range(len(night))]
     found = fit_pca_from_thickness(context.thickness_um, response, scales)
     ratio = np.zeros(2)
@@ -55,7 +55,7 @@ def components(context: Context) -> Section:
 
 def coadd(context: Context) -> Section:
     """Figure 16."""
-    frame = lines_only("lsst_e2v").sky().lookup(context.detail_um)[0]
+    frame = lines_only(context.setup("lsst_e2v")).sky().lookup(context.detail_um)[0]
     relative = frame / frame.mean() - 1.0
     counts = tuple(sorted({count for count in (1, 10, 100, context.coadds) if count <= context.coadds}))
     result = coadd_correlation(

@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 from ..algorithms.single_pixel import fit_single_pixel, published_pixel
 from ..algorithms.thickness_fit import fit_thickness
 from ..mock.thickness import E2V_SHAPE
-from ..model import FringeModel, Setup
+from ..model import FringeModel
 from ..products import FlatExposures, FringeCube
 from .section import Context, Curve, Graph, Picture, Section, missing
 
@@ -48,8 +48,8 @@ RAFT = (
 def one_pixel(context: Context) -> Section:
     """Figure 4."""
     wavelength, amplitude = published_pixel()
-    detection = FringeModel.from_setup(LAB)
-    total = FringeModel.from_setup(LAB, observable="total")
+    detection = FringeModel.from_setup(context.setup(LAB))
+    total = FringeModel.from_setup(context.setup(LAB), observable="total")
     absolute, predicted, searched, misfit_total = _fit_as_published(wavelength, amplitude, total)
     damped = fit_single_pixel(wavelength, amplitude, detection, free_contrast=True, free_offset=True)
     curves = [Curve(wavelength, PERCENT * amplitude, "measured", "o")]
@@ -100,7 +100,8 @@ def flat_contrast(context: Context) -> Section:
     """Figures 2, 5 and 6 and the first row of Table 2."""
     phase = (np.arange(256) + 0.5) / 256.0
     detection, total = (
-        FringeModel.from_setup(LAB, observable=observable) for observable in ("detection", "total")
+        FringeModel.from_setup(context.setup(LAB), observable=observable)
+        for observable in ("detection", "total")
     )
     order = float(total.fringe_order_um(WAVELENGTH_NM))
     layer = 17.0 // order * order + phase * order
@@ -149,7 +150,7 @@ def flat_contrast(context: Context) -> Section:
 
 def thickness_fit(context: Context) -> Section:
     """Section 3.3, on flats whose thickness is known."""
-    model = FringeModel.from_setup(LAB, {"contrast_loss.factor": FIT_CONTRAST})
+    model = FringeModel.from_setup(context.setup(LAB), {"contrast_loss.factor": FIT_CONTRAST})
     detail = context.detail_um[: FIT_SHAPE[0], : FIT_SHAPE[1]]
     cube = _flats(model, detail, context.rng("thickness fit"))
     order = float(model.fringe_order_um(WAVELENGTH_NM))
@@ -182,7 +183,7 @@ def raft(context: Context) -> Section:
     ]
     if not all(path for _, path in paths):
         return Section("Raft: Fig. 7", f"{text} The maps are not at hand.", missing("row_jumps"))
-    model = FringeModel.from_setup(LAB, observable="total")
+    model = FringeModel.from_setup(context.setup(LAB), observable="total")
     order = float(model.fringe_order_um(WAVELENGTH_NM))
     pictures, jumping = [], 0
     for title, path in paths:
@@ -222,7 +223,7 @@ def _fundamental(profile: FloatArray) -> float:
 
 def _flats(model: FringeModel, layer: FloatArray, rng: np.random.Generator) -> FringeCube:
     """Flats of the model over their means, with white noise."""
-    setup = Setup.from_name(LAB)
+    setup = model.setup
     wavelength = np.array(setup.wavelengths_nm)
     clean = model.response(layer, wavelength)
     clean /= clean.mean(axis=(1, 2), keepdims=True)

@@ -11,7 +11,7 @@ from ..algorithms.sky_frame import is_band
 from ..instrument.bandpass import Bandpass
 from ..instrument.sky import EmissionLines, SkySpectrum
 from ..instrument.telescope import RayBundle, Telescope
-from ..model import FringeModel, Setup
+from ..model import FringeModel
 from ..optics import Beam, Illumination
 from ..resources import read_table
 from .section import Context, Curve, Graph, Section
@@ -129,7 +129,7 @@ def _histogram_beam(rays: RayBundle, bins: int) -> Beam:
 
 def _rms(context: Context, beam: Beam) -> float:
     """Rms fringe of the OH lines in a beam, in the centre of the LSST field."""
-    model = FringeModel.from_setup("lsst_e2v")
+    model = FringeModel.from_setup(context.setup("lsst_e2v"))
     components = SkySpectrum(EmissionLines.oh(), airmass=1.2).components(Bandpass.from_name("lsst_y"))
     wavelength = np.concatenate([item.wavelength_nm for item in components])
     photons = np.concatenate([item.photons for item in components])
@@ -143,7 +143,7 @@ def _rms(context: Context, beam: Beam) -> float:
 
 def photon_walk(context: Context) -> Section:
     """Section 4.2, Figure 11."""
-    setup = Setup.from_name("lsst_e2v")
+    setup = context.setup("lsst_e2v")
     light = SkySpectrum(EmissionLines.oh()).components(Bandpass.from_name("lsst_y"))
     widths = np.linspace(0.5, 20.0, 40)
     values, curves = {}, []

@@ -111,12 +111,16 @@ class Finding:
         Within the tolerance of the paper; of the corrected number, where the paper errs; of neither; not computed.
     reason : `str`
         Why it was skipped.
+    cold : `float`
+        The same recomputed with silicon as measured in the cold, NaN if it was not; `value` has the paper's
+        constants.
     """
 
     number: PublishedNumber
     value: float
     status: str
     reason: str = ""
+    cold: float = math.nan
 
 
 @functools.lru_cache(maxsize=1)

@@ -12,9 +12,14 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..instrument.setup import Setup
 from ..mock.thickness import E2V_SHAPE
+from ..optics import LayerStack
 
-__all__ = ["Context", "Curve", "Graph", "Picture", "Section"]
+__all__ = ["COLD_SILICON", "PAPER_SILICON", "Context", "Curve", "Graph", "Picture", "Section"]
+
+PAPER_SILICON, COLD_SILICON = "Si_green2008", "Si"
+"""Tables of silicon: that of the paper, a law extrapolated to the cold, and what was measured there."""
 
 FloatArray = NDArray[np.float64]
 
@@ -91,6 +96,8 @@ class Context:
         Seed of noise, random fields and rotations.
     shared : `pathlib.Path` or `None`
         Folder with ``measured/`` and ``data/``: curves and maps read off the published figures.
+    silicon : `str`
+        Table of silicon; by default the constants of the paper, whatever the set-ups have today.
     """
 
     thickness_um: FloatArray
@@ -98,6 +105,7 @@ class Context:
     coadds: int = 800
     seed: int = 1
     shared: Path | None = None
+    silicon: str = PAPER_SILICON
 
     def __post_init__(self) -> None:
         for name in ("thickness_um", "detail_um"):
@@ -107,6 +115,15 @@ class Context:
             raise InputError("exposures in a coadd", self.coadds, "2 or more")
         if self.shared is not None and not (self.shared / "measured").is_dir():
             raise InputError("published curves", str(self.shared), "a folder with a folder 'measured' in it")
+
+    def setup(self, name: str) -> Setup:
+        """A set-up with this silicon."""
+        return Setup.from_name(name).with_silicon(self.silicon)
+
+    @property
+    def stack(self) -> LayerStack:
+        """The sensor of Table 1 with this silicon."""
+        return LayerStack.from_resource("e2v_ccd250").with_silicon(self.silicon)
 
     @property
     def step_px(self) -> float:

@@ -23,7 +23,7 @@ from ..instrument.readout import (
     zero_point,
 )
 from ..instrument.sky import EmissionLines, SkySpectrum
-from ..model import FringeModel
+from ..model import FringeModel, Setup
 from ..optics import Illumination
 from .section import Context, Curve, Graph, Picture, Section, missing
 
@@ -51,7 +51,7 @@ HSC_SCALE = 60.0
 
 
 @functools.lru_cache(maxsize=8)
-def lines_only(setup: str, field_deg: float = 0.0, silicon_offset_um: float = 0.0) -> SkyResponse:
+def lines_only(setup: Setup, field_deg: float = 0.0, silicon_offset_um: float = 0.0) -> SkyResponse:
     """Response to the OH lines alone, as in the paper."""
     effects = {"silicon_thickness.offset": silicon_offset_um} if silicon_offset_um else None
     model = FringeModel.from_setup(setup, effects, field_x_deg=field_deg)
@@ -60,7 +60,7 @@ def lines_only(setup: str, field_deg: float = 0.0, silicon_offset_um: float = 0.
 
 def monocam(context: Context) -> Section:
     """Section 5.1, Figure 12."""
-    frame = lines_only("monocam").sky().lookup(context.thickness_um)[0]
+    frame = lines_only(context.setup("monocam")).sky().lookup(context.thickness_um)[0]
     values = {
         "monocam": PERCENT * fringe_amplitudes(frame).half_peak_to_peak,
         **missing("monocam_curve", "monocam_shape"),
@@ -90,7 +90,9 @@ def hsc(context: Context) -> Section:
     relief = gaussian_filter(rng.standard_normal((HSC_SIDE, HSC_SIDE)), HSC_SCALE, mode="wrap")
     layer = 200.0 + HSC_RELIEF_UM * ((relief - relief.min()) / np.ptp(relief) - 0.5)
     sky = SkySpectrum(EmissionLines.oh(), airmass=AIRMASS)
-    response = sky_response(FringeModel.from_setup("hsc"), sky, thickness_range_um=(199.0, 201.0))
+    response = sky_response(
+        FringeModel.from_setup(context.setup("hsc")), sky, thickness_range_um=(199.0, 201.0)
+    )
     frame = response.sky().lookup(layer)[0]
     half = PERCENT * fringe_amplitudes(frame).half_peak_to_peak
     curves = [Curve(_places(frame), _diagonal(frame), "this package, random relief")]
@@ -116,9 +118,10 @@ def hsc(context: Context) -> Section:
 def lsst(context: Context) -> Section:
     """Section 5.3, Figure 14."""
     centre, edge = (
-        lines_only("lsst_e2v", field).sky().lookup(context.thickness_um)[0] for field in (0.0, EDGE_DEG)
+        lines_only(context.setup("lsst_e2v"), field).sky().lookup(context.thickness_um)[0]
+        for field in (0.0, EDGE_DEG)
     )
-    thicker = lines_only("lsst_e2v", 0.0, 0.1).sky().lookup(context.thickness_um)[0]
+    thicker = lines_only(context.setup("lsst_e2v"), 0.0, 0.1).sky().lookup(context.thickness_um)[0]
     values = {
         "lsst_centre": PERCENT * fringe_amplitudes(centre).rms,
         "lsst_edge": PERCENT * fringe_amplitudes(edge).rms,
@@ -156,7 +159,7 @@ def lsst(context: Context) -> Section:
 
 def surface_brightness(context: Context) -> Section:
     """Figure 15, section 5.4."""
-    model = FringeModel.from_setup("lsst_e2v")
+    model = FringeModel.from_setup(context.setup("lsst_e2v"))
     setup, band = model.setup, Bandpass.from_name(model.setup.bandpass)
     zero = zero_point(band, setup.effective_area_m2)
 
@@ -165,7 +168,7 @@ def surface_brightness(context: Context) -> Section:
 
     sky_e = throughput_electrons(SkySpectrum.dark(), band, model)
     sky = brightness(sky_e)
-    frame = lines_only("lsst_e2v").sky().lookup(context.detail_um)[0]
+    frame = lines_only(context.setup("lsst_e2v")).sky().lookup(context.detail_um)[0]
     # Continua do not fringe; their share of the light dilutes the fringe of the lines.
     light = SkySpectrum.dark().components(band)
     photons = {item.name: float(item.photons.sum()) for item in light}
@@ -175,7 +178,7 @@ def surface_brightness(context: Context) -> Section:
     noise = np.sqrt(sky_e + READ_NOISE_E**2) * rng.standard_normal(relative.shape)
     smooth = gaussian_filter(brightness(1.0) * noise, SMOOTHING_PX, truncate=2.0)
     limit = 0.1 * float(magnitude_to_microjansky(26.0))
-    whole = lines_only("lsst_e2v").sky().lookup(context.thickness_um)[0]
+    whole = lines_only(context.setup("lsst_e2v")).sky().lookup(context.thickness_um)[0]
     fringe = sky * lines * 2.0 * fringe_amplitudes(whole).half_peak_to_peak
     smooth_fringe = gaussian_filter(sky * relative, SMOOTHING_PX, truncate=2.0)
     return Section(
@@ -237,7 +240,7 @@ class _AsPublished:
         wavelength = np.asarray(lines["wavelength"], dtype=float)
         weight = np.asarray(lines["intensity"], dtype=float) * band.transmission(wavelength)
         weight *= band.air.total(wavelength, AIRMASS)
-        model = FringeModel.from_setup(setup, field_x_deg=field_deg)
+        model = FringeModel.from_setup(context.setup(setup), field_x_deg=field_deg)
         light = Illumination.spectrum(wavelength, weight, model.system.beam)
         response = model.table_of(light, RANGE_UM, tolerance=1e-6)
         layer, diagonal = _published_map(path)

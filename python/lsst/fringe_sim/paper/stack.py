@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from ..model import FringeModel
-from ..optics import Beam, LayerStack, get_medium
+from ..optics import Beam, LayerStack, Medium, get_medium
 from ..optics.illumination import GaussianProfile
 from ..optics.system import OpticalSystem
 from .section import Context, Curve, Graph, Section, missing
@@ -25,12 +25,12 @@ NINETY_NINE = float(np.log(100.0))
 
 def layers(context: Context) -> Section:
     """Table 1, Eqs. 1 and 3."""
-    stack = LayerStack.from_resource("e2v_ccd250")
+    stack = context.stack
     adhesive = stack.position("adhesive")
     fixed = np.delete(stack.thickness_um, adhesive)
     wavelength = 960.0
     index = float(stack.layers[adhesive].medium.index(wavelength, LAB_K).real)
-    silicon = float(get_medium("Si").index(1000.0, LAB_K).real)
+    silicon = float(get_medium(context.silicon).index(1000.0, LAB_K).real)
     thickness = np.linspace(5.0, 30.0, 200)
     spacing = wavelength**2 / (2e3 * index * thickness + wavelength)
     return Section(
@@ -60,12 +60,11 @@ def layers(context: Context) -> Section:
 
 
 def _absorption(
-    wavelength_nm: ArrayLike, fwhm_nm: float, extinction_scale: float = 1.0
+    stack: LayerStack, wavelength_nm: ArrayLike, fwhm_nm: float, extinction_scale: float = 1.0
 ) -> NDArray[np.float64]:
     """1 − R − T of the stack of Table 1 with 14 µm of adhesive, as Figure 1 shows it."""
-    stack = LayerStack.from_resource("e2v_ccd250")
     if extinction_scale != 1.0:
-        silicon = get_medium("Si").modified(extinction_scale=extinction_scale)
+        silicon = stack.layers[stack.position("detection")].medium.modified(extinction_scale=extinction_scale)
         for layer in ("detection", "gates", "support"):
             stack = stack.with_medium(layer, silicon)
     system = OpticalSystem(stack, LAB_K, GaussianProfile(fwhm_nm), Beam.collimated(), observable="total")
@@ -92,22 +91,23 @@ def bandwidth(context: Context) -> Section:
     """Figure 1."""
     wide = np.arange(820.0, 1000.0, 0.5)
     close = np.arange(958.0, 970.0, 0.1)
-    narrow = _ripple(close, _absorption(close, 1.0))
+    stack = context.stack
+    narrow = _ripple(close, _absorption(stack, close, 1.0))
     values = {
         "spacing_silicon_seen": _spacing(close, narrow),
         "ripple_narrow": PERCENT * 0.5 * float(np.ptp(narrow)),
-        "ripple_wide": PERCENT * 0.5 * float(np.ptp(_ripple(close, _absorption(close, 2.0)))),
+        "ripple_wide": PERCENT * 0.5 * float(np.ptp(_ripple(close, _absorption(stack, close, 2.0)))),
         **missing("absorption_level", "absorption_level_less", "absorption_fringe"),
     }
-    curves = [Curve(wide, _absorption(wide, 2.0), "this package, 2 nm")]
-    inset = [Curve(close, _absorption(close, 1.0), "this package, 1 nm")]
+    curves = [Curve(wide, _absorption(stack, wide, 2.0), "this package, 2 nm")]
+    inset = [Curve(close, _absorption(stack, close, 1.0), "this package, 1 nm")]
     published = context.curve("bandwidth_verify_2nm")
     if published is not None:
         place, theirs = (np.asarray(published[name], dtype=float) for name in ("wavelength", "absorption"))
-        departure = _absorption(place, 2.0) - theirs
+        departure = _absorption(stack, place, 2.0) - theirs
         x = place - place.mean()
         residual = departure - np.polyval(np.polyfit(x, departure, 3), x)
-        less = _absorption(place, 2.0, 0.955) - theirs
+        less = _absorption(stack, place, 2.0, 0.955) - theirs
         values["absorption_level"] = PERCENT * float(np.abs(departure).max())
         values["absorption_level_less"] = PERCENT * float(np.abs(less).max())
         values["absorption_fringe"] = PERCENT * float(residual.std())
@@ -136,23 +136,24 @@ def bandwidth(context: Context) -> Section:
     )
 
 
-def _depth_um(wavelength_nm: ArrayLike, temperature_k: float) -> FloatArray:
+def _depth_um(silicon: Medium, wavelength_nm: ArrayLike, temperature_k: float) -> FloatArray:
     """Depth at which 99 % are absorbed [µm]."""
     wavelength = np.asarray(wavelength_nm, dtype=float)
-    extinction = get_medium("Si").index(wavelength, temperature_k).imag
+    extinction = silicon.index(wavelength, temperature_k).imag
     return NINETY_NINE * 1e-3 * wavelength / (4.0 * np.pi * extinction)
 
 
 def absorption_depth(context: Context) -> Section:
     """Figure 3."""
     wavelength = np.arange(650.0, 1051.0, 2.0)
+    silicon = get_medium(context.silicon)
     values = {
-        "depth_wavelength": float(brentq(lambda w: _depth_um(w, LAB_K) - 100.0, 700.0, 950.0)),
+        "depth_wavelength": float(brentq(lambda w: _depth_um(silicon, w, LAB_K) - 100.0, 700.0, 950.0)),
         **missing("depth_temperature", "depth_warm"),
     }
     curves = [
-        Curve(wavelength, _depth_um(wavelength, 300.0), "300 K"),
-        Curve(wavelength, _depth_um(wavelength, LAB_K), "183 K"),
+        Curve(wavelength, _depth_um(silicon, wavelength, 300.0), "300 K"),
+        Curve(wavelength, _depth_um(silicon, wavelength, LAB_K), "183 K"),
     ]
     warm, cold = (context.curve(f"Si_absorption_depth_pdf_{k}K") for k in (300, 183))
     if warm is not None and cold is not None:
@@ -163,19 +164,21 @@ def absorption_depth(context: Context) -> Section:
             return place[chosen], np.asarray(table["depth"], dtype=np.float64)[chosen]
 
         place, depth = inside(warm)
-        values["depth_warm"] = PERCENT * float(np.abs(depth / _depth_um(place, 300.0) - 1.0).max())
+        values["depth_warm"] = PERCENT * float(np.abs(depth / _depth_um(silicon, place, 300.0) - 1.0).max())
         cold_place, cold_depth = inside(cold)
         # The ratio of the two curves depends on the temperature law alone, not on the table of the extinction.
         ratio = np.log(cold_depth / np.interp(cold_place, place, depth))
-        warm_depth = _depth_um(cold_place, 300.0)
+        warm_depth = _depth_um(silicon, cold_place, 300.0)
         trial = np.arange(160.0, 200.0, 0.1)
-        misfit = [np.mean((ratio - np.log(_depth_um(cold_place, t) / warm_depth)) ** 2) for t in trial]
+        misfit = [
+            np.mean((ratio - np.log(_depth_um(silicon, cold_place, t) / warm_depth)) ** 2) for t in trial
+        ]
         values["depth_temperature"] = float(trial[int(np.argmin(misfit))])
         place, depth = cold_place, cold_depth
         curves.append(Curve(place, depth, "Fig. 3, labelled 183 K", "--"))
     return Section(
         "Absorption depth: Fig. 3",
-        "Depth of silicon that absorbs 99 % of the light, with the temperature law of Green (2008).",
+        "Depth of silicon that absorbs 99 % of the light; the paper takes the temperature law of Green (2008).",
         values,
         (Graph("99 % depth", "wavelength [nm]", "depth [µm]", tuple(curves), logarithmic=True),),
         "Where a curve exceeds 100 µm, light reaches the adhesive.",
@@ -188,7 +191,7 @@ def other_vendor(context: Context) -> Section:
 
     def fringe(aperture: float) -> FloatArray:
         effects = {"bandwidth.fwhm": 1.0, "converging_beam.numerical_aperture": aperture}
-        response = FringeModel.from_setup("ts8_itl", effects).response(thickness, [960.0])[0]
+        response = FringeModel.from_setup(context.setup("ts8_itl"), effects).response(thickness, [960.0])[0]
         # Thicker silicon absorbs more: a trend that is no fringe.
         trend = np.polyval(np.polyfit(thickness, response, 1), thickness)
         return np.asarray(response / trend - 1.0)

@@ -47,6 +47,10 @@ def write_paper_page(made: Reproduction, path: str | os.PathLike[str], notices: 
         '"Paper errs" means that the recomputed number confirms a correction of the paper, for the reason given. '
         '"Amplitude" is not defined in the paper; every line says which of its meanings is used.'
     )
+    report.paragraph(
+        '"Here" has the optical constants of silicon that the paper uses, a law extrapolated to the cold; "cold '
+        'silicon" has those that were measured there.'
+    )
     for notice in notices:
         report.paragraph(notice)
     _add_table(report, made.all_findings, "paper_summary", made.table())
@@ -128,6 +132,7 @@ def _add_table(report: Report, findings: Sequence[Finding], name: str, download:
             "quantity": [f.number.quantity for f in findings],
             "paper": _with_unit(findings, [f.number.stated for f in findings]),
             "here": _with_unit(findings, [f"{f.value:.4g}" for f in findings]),
+            "cold silicon": _with_unit(findings, [f"{f.cold:.4g}" for f in findings]),
             "tolerance": [f"±{f.number.tolerance:g}" for f in findings],
             "corrected": [
                 "" if np.isnan(f.number.corrected) else f"{f.number.corrected:g}" for f in findings
