@@ -16,9 +16,9 @@ FloatArray = NDArray[np.float64]
 WINDOW_PX = 128
 """Side of the windows in which fringes are sought as waves; within one they change little in direction and length."""
 
-THRESHOLD = 2.5
-"""Power over that of the noise, averaged over 3 x 3 waves, below which all is noise. Noise alone has it in 1 of 500; at
-2.0 and 3.0 what is left of noise and of fringes together is larger by up to a tenth."""
+THRESHOLD = 3.0
+"""Power over that of the noise, averaged over 3 x 3 waves, below which all is noise. Of pure noise 1.8 % of the standard
+deviation pass; what is left of noise and of fringes together is the same from 2.5 to 3.5."""
 
 FILLINGS = 4
 """Times that pixels without a value get the one that the others let expect."""
@@ -48,7 +48,7 @@ def shrink_noise(
     Notes
     -----
     In windows that overlap by half, a wave of power P (the mean of it and its eight neighbours) where noise has N is
-    multiplied by ``1 - 2.5 N / P``, or by 0 if that is negative: James and Stein's rule for blocks, with the threshold
+    multiplied by ``1 - 3 N / P``, or by 0 if that is negative: James and Stein's rule for blocks, with the threshold
     that Cai (1999, Annals of Statistics 27, 898) puts into it.
     """
     if not known.any():

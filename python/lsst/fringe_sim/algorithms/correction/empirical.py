@@ -1,4 +1,4 @@
-"""Templates from observed frames: weighted principal components of what is left when background and objects are gone."""
+"""Templates from observed frames: weighted principal components of frames without background and objects."""
 
 from __future__ import annotations
 
@@ -30,6 +30,9 @@ LEARNING_ROUNDS = 3
 
 STEPS = 6
 """Alternations between scores and patterns; each is a weighted least-squares solution given the other."""
+
+FOLDS = 4
+"""Groups of frames, each of which is left out in turn."""
 
 CHECK_PX = 16
 """Side of the squares of a chequerboard: scores from the white ones predict the black ones, and the other way round."""
@@ -74,8 +77,9 @@ class ObservedTemplates:
         Frames that see each pixel.
     scores : `numpy.ndarray`, shape ``(N, K)``
         Scale of every template in every frame, in the unit of the frames.
-    gain : `numpy.ndarray`, shape ``(most + 1,)``
-        What 0, 1, 2, … templates take of the squared residuals of frames that they were not made of, over the variance.
+    gain : `numpy.ndarray`
+        What 0, 1, 2, … templates take of the squared pulls of frames that they were not made of, as far as they were
+        tried; empty if their number was given.
     """
 
     patterns: NDArray[np.float32]
@@ -316,20 +320,30 @@ def _scores_of(
 
 
 def _held_out_gain(stack: _Stack, most: int, prior: Sequence[NDArray[np.float32]]) -> FloatArray:
-    """What 0, 1, 2, … patterns take of the squared pulls of frames that they were not made of."""
-    folds = min(5, stack.frames)
-    gain = np.zeros(most + 1)
-    white = np.indices(stack.shape).sum(axis=0, dtype=np.int64)
-    white = (np.add.outer(*(np.arange(side) // CHECK_PX for side in stack.shape)) % 2).astype(float)
-    for fold in range(folds):
-        left = np.arange(fold, stack.frames, folds)
-        others = np.setdiff1d(np.arange(stack.frames), left)
-        for number in range(1, most + 1):
-            patterns = _decompose(stack, number, prior, others).patterns
-            for part in (white, 1.0 - white):
-                scores = _scores_of(stack, patterns, left, 1.0 - part)
-                for score, frame in zip(scores, left, strict=True):
-                    fringes = np.tensordot(score, patterns, axes=1)
-                    both = 2.0 * stack.values[frame] * fringes - fringes**2
-                    gain[number] += float((part * stack.weight[frame] * both).sum())
+    """What 0, 1, 2, … patterns take of the squared pulls of frames that they were not made of, until it falls."""
+    rows, columns = (np.arange(side) // CHECK_PX for side in stack.shape)
+    white = (np.add.outer(rows, columns) % 2).astype(float)
+    gain = [0.0]
+    for number in range(1, most + 1):
+        gain.append(sum(_fold_gain(stack, number, prior, fold, white) for fold in range(FOLDS)))
+        if gain[-1] < gain[-2]:
+            break
+    return np.array(gain)
+
+
+def _fold_gain(
+    stack: _Stack, number: int, prior: Sequence[NDArray[np.float32]], fold: int, white: FloatArray
+) -> float:
+    left = np.arange(fold, stack.frames, FOLDS)
+    others = np.setdiff1d(np.arange(stack.frames), left)
+    if left.size == 0 or others.size <= number:
+        return 0.0
+    patterns = _decompose(stack, number, prior, others).patterns
+    gain = 0.0
+    for part in (white, 1.0 - white):
+        scores = _scores_of(stack, patterns, left, 1.0 - part)
+        for score, frame in zip(scores, left, strict=True):
+            fringes = np.tensordot(score, patterns, axes=1)
+            both = 2.0 * stack.values[frame] * fringes - fringes**2
+            gain += float((part * stack.weight[frame] * both).sum())
     return gain
