@@ -9,7 +9,7 @@ import pytest
 from foreign_sky import ForeignClutter, ForeignSky, foreign_map, foreign_night
 from observed_night import observed_night
 
-from lsst.fringe_sim.algorithms.correction import AmplifierGrid
+from lsst.fringe_sim.algorithms.correction import AmplifierGrid, BackgroundTerms, fit_scales
 from lsst.fringe_sim.algorithms.correction.denoise import shrink_noise
 from lsst.fringe_sim.algorithms.correction.empirical import TemplateOptions
 from lsst.fringe_sim.algorithms.fringe_correction import CorrectionOptions
@@ -30,13 +30,18 @@ def templates_of(images, options, **more):
     return make_templates([partial(frame_of, image) for image in images], NOW, options, **more)
 
 
-def part_left(fringes, corrected):
-    """Standard deviation of the fringes that a correction leaves, over that of the fringes."""
-    left = [
-        np.std(fringe - each.fringes - np.mean(fringe)) / np.std(fringe)
-        for fringe, each in zip(fringes, corrected, strict=True)
-    ]
-    return float(np.median(left))
+def part_left(fringes, corrected, amplifiers):
+    """Standard deviation of the fringes that a correction leaves, over that of the fringes, beside the background."""
+    background = BackgroundTerms(fringes[0].shape, amplifiers=amplifiers)
+    even = np.ones(fringes[0].shape, dtype=np.float32)
+
+    def beside(image):
+        fit = fit_scales(image, even, [], background, clip_sigma=np.inf)
+        return np.std(image - background.surface(fit.coefficient))
+
+    return float(
+        np.median([beside(f - each.fringes) / beside(f) for f, each in zip(fringes, corrected, strict=True)])
+    )
 
 
 @pytest.mark.rng("templates take the fringes out of other frames")
@@ -48,7 +53,7 @@ def test_templates_take_the_fringes_out_of_other_frames(rng):
         correct_frame(frame_of(image), made.frames(), CorrectionOptions(amplifiers=TWO))
         for image in night.images[8:]
     ]
-    assert part_left(night.fringes[8:], corrected) < 0.33
+    assert part_left(night.fringes[8:], corrected, TWO) < 0.33
     assert all(each.proof.passed for each in corrected)
     assert all(each.proof.structure_after < 0.4 * each.proof.structure_before for each in corrected)
 
@@ -97,7 +102,8 @@ def test_a_model_as_prior_mean_helps_few_frames(rng):
         )
         for given in ((), (prior,))
     )
-    assert helped > max(alone, 0.985)
+    # Of what the four frames alone miss, the model finds half.
+    assert 1.0 - helped < 0.5 * (1.0 - alone)
 
 
 @pytest.mark.rng("a template with noise or stars in it is refused")
@@ -168,14 +174,14 @@ def test_noise_is_taken_out_of_a_template_and_fringes_are_not(rng, deviation):
 @pytest.mark.slow
 @pytest.mark.rng("a night of foreign frames with stars")
 def test_a_night_of_foreign_frames_with_stars(rng):
-    """Frames of a simulator with another line list and silicon: a sixth of the fringes is left, in frames not used."""
+    """Frames of a simulator with another line list and silicon; templates are judged on frames that they have not seen."""
     sky, amplifiers = ForeignSky(f_number=2.25), AmplifierGrid(2, 8)
     clutter = ForeignClutter(stars=1.0, cosmic_rays=0.05, gradient=0.03, amplifier_steps=0.002, moon=0.2)
     night = foreign_night(sky, foreign_map(rng, (256, 256), 13.0, 14.6), rng, 16, clutter)
     made = templates_of([each.image for each in night[:12]], TemplateOptions(amplifiers=amplifiers))
     options = CorrectionOptions(amplifiers=amplifiers)
     corrected = [correct_frame(frame_of(each.image), made.frames(), options) for each in night[12:]]
-    assert part_left([each.fringes for each in night[12:]], corrected) < 0.25
+    assert part_left([each.fringes for each in night[12:]], corrected, amplifiers) < 0.25
     for each in corrected:
         assert each.proof.passed
         assert each.proof.structure_after < 0.35 * each.proof.structure_before

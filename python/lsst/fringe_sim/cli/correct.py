@@ -59,7 +59,7 @@ def correct(
     undo: bool,
     out: OutputFolder,
     dry_run: bool,
-) -> int | None:
+) -> None:
     """Subtract fringe templates from observed frames, and prove frame by frame that it helped.
 
     Files keep their layout: pixels change, and the header says by how much. A frame to which the templates add
@@ -76,18 +76,19 @@ def correct(
     _check_headers(images, undo)
     if dry_run:
         click.echo(f"would {'restore' if undo else 'correct'} {len(images)} images")
-        return None
+        return
     target = out.prepare()
     if undo:
         _restore(images, known, target)
-        return None
+        return
     options = CorrectionOptions(background_px, grid_of(amplifiers))
     done, refused = _corrected(images, known, options, background, pixel_scale, target)
     _write_report(target, done, refused)
     for line in [*map(_describe, done), *refused]:
         click.echo(line)
     click.echo(str(target / "report.html"))
-    return EXIT_REFUSED if refused or not all(each.proof.passed for each in done) else None
+    if refused or not all(each.proof.passed for each in done):
+        raise click.exceptions.Exit(EXIT_REFUSED)
 
 
 def _check_headers(images: list[ObservedImage], undo: bool) -> None:

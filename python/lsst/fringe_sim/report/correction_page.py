@@ -17,7 +17,7 @@ from .style import figure, finite_range, show_image
 __all__ = ["frame_figure", "write_correction_report", "write_templates_report"]
 
 PERCENT = 100.0
-MOST_PICTURES = 6
+MOST_PICTURES = 3
 
 
 def write_templates_report(path: Path, made: Mapping[str, FringeTemplates]) -> Path:
