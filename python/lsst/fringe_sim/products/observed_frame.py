@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
 from .sky_frame import SkyFringe
 
-__all__ = ["ObservedFrame"]
+__all__ = ["ObservedFrame", "observed_from_simulation"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -57,13 +57,17 @@ class ObservedFrame(SensorProduct):
         Image("variance", "VARIANCE", None, gaps=True, optional=True),
     )
 
-    @classmethod
-    def from_simulation(cls, frame: SkyFringe) -> ObservedFrame:
-        """A simulated frame of the sky, as if it had been observed."""
-        electrons = frame.image
-        if frame.unit == "fraction":
-            electrons = (frame.mean_electrons * (1.0 + frame.image)).astype(np.float32)
-        variance = np.maximum(electrons, np.float32(1.0)) if frame.seed is not None else None
-        return cls(
-            electrons, frame.mask, variance, "electron", frame.metadata, frame.detector, frame.physical_filter
-        )
+
+def observed_from_simulation(frame: SkyFringe) -> ObservedFrame:
+    """A simulated frame of the sky, as if it had been observed."""
+    electrons = frame.image
+    if frame.unit == "fraction":
+        electrons = (frame.mean_electrons * (1.0 + frame.image)).astype(np.float32)
+    return ObservedFrame(
+        image=electrons,
+        mask=frame.mask,
+        unit="electron",
+        metadata=frame.metadata,
+        detector=frame.detector,
+        physical_filter=frame.physical_filter,
+    )
