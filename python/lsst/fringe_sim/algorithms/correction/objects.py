@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -136,7 +137,10 @@ def _above(residual: NDArray[np.float32], good: BoolArray, width: float, thresho
     share, smooth = (_smooth(each, width, binned) for each in (good.astype(np.float32), values))
     seen = share > 0.25
     smooth /= np.maximum(share, 0.25)
-    above = seen & (smooth > threshold * _scatter(smooth[seen]) / np.sqrt(np.maximum(share, 0.25)))
+    # White noise is the least there is: few independent places do not tell less.
+    least = _scatter(values[good]) / (2.0 * math.sqrt(math.pi) * width)
+    scatter = max(_scatter(smooth[seen]), least) / np.sqrt(np.maximum(share, 0.25))
+    above = seen & (smooth > threshold * scatter)
     if binned > 1:
         above = above.repeat(binned, axis=0).repeat(binned, axis=1)
         above = above[: good.shape[0], : good.shape[1]]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve, gaussian_filter, uniform_filter
+from scipy.ndimage import convolve, uniform_filter
 from scipy.stats import norm as normal
 from scipy.stats import t as student
 
@@ -107,7 +107,7 @@ def prove(
     scatter between blocks; the probability of the largest is corrected for their number (Šidák 1967, JASA 62, 626).
     """
     # Objects without regard to the template: what it prints into the frame is not left out.
-    plain = fit_frame(image, weight, [], background)
+    plain = fit_frame(image, weight, [], background, rounds=1)
     untouched = np.where(plain.objects, 0, plain.fit.weight)
     used = fit.weight
     alone = fit_scales(image, used, [], background, clip_sigma=math.inf)
@@ -235,14 +235,14 @@ def _rises(
 ) -> dict[str, float]:
     """Probability, for each band of scales, that what is subtracted there adds so much to the squares by chance."""
     looks = {}
-    finer, width = fringes, 1.0
+    finer, width = fringes, 1
     while width <= max(largest, 2):
-        coarser = gaussian_filter(fringes, width)
+        coarser = uniform_filter(fringes, 2 * width + 1)
         band = finer - coarser
         rise = float(np.sum(weight * (band**2 - 2.0 * band * before - allowed)))
         error = 2.0 * math.sqrt(chi2 * float(np.sum(weight * band**2)))
-        looks[f"structure of {width:g} px"] = float(normal.sf(rise / error)) if error > 0.0 else 1.0
-        finer, width = coarser, 2.0 * width
+        looks[f"structure of {width} px"] = float(normal.sf(rise / error)) if error > 0.0 else 1.0
+        finer, width = coarser, 2 * width
     return looks
 
 
