@@ -1,7 +1,7 @@
 """Fringes that several ways of correction leave, on the same frames of a simulator that none of them knows.
 
-Every way gets the same training frames and corrects the same other ones. What is left is the light of the fringes less
-what was subtracted, beside a smooth background, as a fraction of the light of the fringes.
+Every way gets the same training frames and corrects the same other ones. What is left is the light of the
+fringes less what was subtracted, beside a smooth background, as a fraction of the light of the fringes.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def run() -> list[Row]:
 
 
 def left_over(fringes: Image, subtracted: Image, amplifiers: AmplifierGrid | None = None) -> float:
-    """Standard deviation of the fringes that are left over that of all, beside what a background takes away anyway."""
+    """Standard deviation of the fringes that are left over that of all, beside a smooth background."""
     grid = amplifiers or AmplifierGrid(2, 8)
     background = BackgroundTerms((fringes.shape[0], fringes.shape[1]), amplifiers=grid)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from benchmarks.fringe_peers import aperture_scale
+
 from lsst.fringe_sim.middleware.handoff import APERTURES, isr_override
 
 LEVEL, SIDE = 2700.0, 512

@@ -18,8 +18,8 @@ from scipy.ndimage import uniform_filter
 
 from ..errors import InputError, OutOfRangeError
 from ..products import CORRECTED, FringeFrame, refuse_corrected
-from .correction.background import SPACING_PX, AmplifierGrid, BackgroundTerms
-from .correction.objects import FrameFit, fit_frame
+from .correction.background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
+from .correction.objects import ROUNDS, FrameFit, fit_frame
 from .correction.scales import steady_weight
 from .sky_frame import SkyResponse
 
@@ -55,7 +55,7 @@ class CorrectionOptions:
     """
 
     spacing_px: float = SPACING_PX
-    amplifiers: AmplifierGrid = AmplifierGrid()
+    amplifiers: AmplifierGrid = ONE_AMPLIFIER
     find_objects: bool = True
 
 
@@ -145,7 +145,8 @@ def correct_fringes(
         Variance of the exposure; by default one for all pixels, from the differences of neighbours. The errors of the
         scales do not rely on it.
     mask : array_like, shape ``(ny, nx)``, optional
-        Non-zero where the exposure is not to be measured (defects, known objects). It is corrected there all the same.
+        Non-zero where the exposure is not to be measured (defects, known objects). It is corrected there all
+        the same.
     options : `CorrectionOptions`, optional
         Background, amplifiers, detection of objects.
     header : mapping, optional
@@ -176,8 +177,8 @@ def correct_fringes(
         good, None if variance is None else _of_shape("variance", variance, shape), exposure
     )
     background = BackgroundTerms(shape, chosen.spacing_px, chosen.amplifiers)
-    rounds = {} if chosen.find_objects else {"rounds": 1}
-    frame = fit_frame(exposure, weight, patterns, background, **rounds)
+    rounds = ROUNDS if chosen.find_objects else 1
+    frame = fit_frame(exposure, weight, patterns, background, rounds=rounds)
     corrected = exposure - _fringes(patterns, frame.fit.scale, unknown, exposure)
     return FringeCorrection(
         corrected, unknown, frame.fit.scale, frame.fit.covariance, template_identity(templates), frame

@@ -101,8 +101,8 @@ def make_templates(
     Parameters
     ----------
     frames : sequence of callables
-        Each returns a frame with its fringes; they are asked several times, one at a time, so that memory does not grow
-        with their number.
+        Each returns a frame with its fringes; they are asked several times, one at a time, so that memory
+        does not grow with their number.
     creation_datetime : `str`
         When the templates are made, ``YYYY-MM-DDThh:mm:ss``.
     options : `TemplateOptions`, optional

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +16,8 @@ from .output import OutputFolder, output_folder
 from .progress import progress
 
 if TYPE_CHECKING:
-    from ..products import FringeTemplates
+    from ..algorithms.correction.empirical import TemplateOptions
+    from ..products import FringeFrame, FringeTemplates
     from ..products.observed_files import ObservedImage
 
 __all__ = ["templates"]
@@ -105,11 +108,18 @@ def _by_sensor(images: list[ObservedImage]) -> dict[str, list[ObservedImage]]:
     return dict(sensors)
 
 
-def _made(images, options, prior, background, advance) -> FringeTemplates:  # type: ignore[no-untyped-def]
+def _made(
+    images: list[ObservedImage],
+    options: TemplateOptions,
+    prior: list[FringeFrame],
+    background: Path | None,
+    advance: Callable[[], None],
+) -> FringeTemplates:
+    """Templates of one sensor; each frame is read anew in every round."""
     from ..algorithms.observed_frames import make_templates
     from ..model.provenance import software_cards
 
-    loaders = [(lambda image=image: image.read(background_path(background, image))) for image in images]
+    loaders = [partial(image.read, background_path(background, image)) for image in images]
     date = latest_date([image.header() for image in images])
     return make_templates(loaders, date, options, prior, software_cards(), advance)
 

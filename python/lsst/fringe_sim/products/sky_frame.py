@@ -20,8 +20,8 @@ CORRECTED = "FRINGCOR"
 """Keyword of an exposure from which fringes were subtracted; its value is the number of templates."""
 
 CORRECTED_BY = (CORRECTED, "FRINGE", "FRGSCALE", "FRGFLAG", "SKYFSUB", "FRNGMDL")
-"""Keywords that say so, unless they say no: ours; those of the DECam Community Pipeline (template and scale) and of its
-like for Mosaic-3; that of fringez, for ZTF."""
+"""Keywords that say so, unless they say no: ours; those of the DECam Community Pipeline (template and scale)
+and of its like for Mosaic-3; that of fringez, for ZTF."""
 
 _NO = ("", "N", "NO", "F", "FALSE", "NONE", "0", "0.0")
 

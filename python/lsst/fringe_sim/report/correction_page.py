@@ -31,7 +31,7 @@ def write_templates_report(path: Path, made: Mapping[str, FringeTemplates]) -> P
         )
         report.figure(
             _templates_figure(product),
-            "Templates, in percent of the sky, and the frames that see each pixel.",
+            "Templates in percent of the sky, and how many frames see each pixel.",
         )
         table = Table({"frame": np.arange(len(product.scores))})
         for number, scores in enumerate(product.scores.T):
@@ -46,12 +46,13 @@ def write_correction_report(path: Path, records: Sequence[FrameRecord], refused:
     passed = sum(each.proof.passed for each in records)
     report = Report(
         "Fringe correction",
-        f"{passed} of {len(table) + len(refused)} images corrected; structure is a fraction of the noise of the aperture.",
+        f"{passed} of {len(table) + len(refused)} images corrected.",
     )
     report.section(
         "Frames",
-        "Structure beyond the noise in apertures up to 20 arcsec, fringes that the errors of the scales leave, the uniform "
-        "background indicator (1 and a twelfth for white noise), and the probability that a good template does so badly.",
+        "Structure beyond the noise in apertures up to 20 arcsec, as a fraction of it; fringes that the errors of "
+        "the scales leave; the uniform background indicator, 1 and a twelfth for white noise; and the probability "
+        "that a good template does so badly.",
     )
     if len(table):
         shown = table.copy()

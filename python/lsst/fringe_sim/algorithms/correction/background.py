@@ -42,11 +42,14 @@ class AmplifierGrid:
             raise OutOfRangeError("amplifiers", (self.rows, self.columns), "1 or more each")
 
 
+ONE_AMPLIFIER = AmplifierGrid()
+
+
 class BackgroundTerms:
     """Linear terms of a background, each a function of the row times a function of the column.
 
-    The surface is a tensor product of cubic B-splines; the level of an amplifier is 1 on it and 0 elsewhere. Sums over
-    the pixels of the image are therefore products of small matrices, however large the image is.
+    The surface is a tensor product of cubic B-splines; the level of an amplifier is 1 on it and 0 elsewhere.
+    Sums over the pixels of the image are therefore products of small matrices, however large the image is.
 
     Parameters
     ----------
@@ -66,7 +69,7 @@ class BackgroundTerms:
     ) -> None:
         if not spacing_px > 0.0:
             raise OutOfRangeError("spacing of the background [px]", spacing_px, "positive")
-        grid = amplifiers or AmplifierGrid()
+        grid = amplifiers or ONE_AMPLIFIER
         self.shape = shape
         self._parts = [(_splines(shape[0], spacing_px), _splines(shape[1], spacing_px))]
         if grid.rows * grid.columns > 1:

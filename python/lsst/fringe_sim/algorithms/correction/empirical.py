@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, UndeterminedError
-from .background import SPACING_PX, AmplifierGrid, BackgroundTerms
+from .background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .denoise import shrink_noise
 from .objects import fit_frame
 
@@ -35,7 +35,8 @@ FOLDS = 4
 """Groups of frames, each of which is left out in turn."""
 
 CHECK_PX = 16
-"""Side of the squares of a chequerboard: scores from the white ones predict the black ones, and the other way round."""
+"""Side of the squares of a chequerboard: scores from the white ones predict the black ones, and the other way
+round."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class TemplateOptions:
     most: int = 4
     least_frames: int = 3
     spacing_px: float = SPACING_PX
-    amplifiers: AmplifierGrid = AmplifierGrid()
+    amplifiers: AmplifierGrid = ONE_AMPLIFIER
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +173,7 @@ class _Stack:
         self._file: Any = None
         if 8 * int(np.prod(size)) > IN_MEMORY:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by __exit__
-            both = np.memmap(self._file, dtype=np.float32, shape=(2, *size), mode="w+")
+            both: NDArray[np.float32] = np.memmap(self._file, dtype=np.float32, shape=(2, *size), mode="w+")
         else:
             both = np.zeros((2, *size), dtype=np.float32)
         self.values, self.weight = both

@@ -182,8 +182,8 @@ def uniform_background_indicator(residual: NDArray[Any], good: NDArray[np.bool_]
     Notes
     -----
     ``(std(flux) + median(error) / area) / median(error)``, as the program fringez of the authors computes it
-    (doi 10.1088/1538-3873/abf77a), with apertures of radius 2 px; here they stand on every pixel that has six good ones
-    on either side, and not on random ones.
+    (doi 10.1088/1538-3873/abf77a), with apertures of radius 2 px; here they stand on every pixel that has six
+    good ones on either side, and not on random ones.
     """
     values = np.where(good, residual, 0.0).astype(np.float64)
     disc = _disc(UBI_RADIUS_PX)

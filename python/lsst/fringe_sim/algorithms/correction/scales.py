@@ -30,12 +30,12 @@ LEAST_BLOCKS = 25
 error is itself known to 14 %."""
 
 MOST_BLOCKS_A_SIDE, SMALLEST_BLOCK_PX = 16, 4
-"""Blocks are as large as correlated noise reaches, and enough of them to know a scatter to 5 %: 16 a side where the image
-is large enough, 4 pixels a side where it is not."""
+"""Blocks are as large as correlated noise reaches, and enough of them to know a scatter to 5 %: 16 a side
+where the image is large enough, 4 pixels a side where it is not."""
 
 ROUNDS, UNCHANGED = 6, 2e-4
-"""Most rounds of clipping, and the part of the pixels below which it ends: Gaussian noise has 6e-5 beyond four standard
-deviations."""
+"""Most rounds of clipping, and the part of the pixels below which it ends: Gaussian noise has 6e-5 beyond
+four standard deviations."""
 
 SAMPLE = 200_000
 """Pixels that tell a scatter to 0.2 %."""
@@ -115,8 +115,9 @@ def fit_scales(
 
     Notes
     -----
-    The covariance is ``S⁻¹ (Σ_b g_b g_bᵀ) S⁻¹`` with the normal matrix ``S`` of the templates less what the background
-    takes of them, and the score ``g_b`` of a block of pixels (Liang & Zeger 1986, Biometrika 73, 13).
+    The covariance is ``S⁻¹ (Σ_b g_b g_bᵀ) S⁻¹`` with the normal matrix ``S`` of the templates less what the
+    background takes of them, and the score ``g_b`` of a block of pixels (Liang & Zeger 1986, Biometrika 73,
+    13).
     """
     level = np.float32(np.median(image[weight > 0])) if (weight > 0).any() else np.float32(0.0)
     centred = np.where(weight > 0, image - level, 0).astype(np.float32)
