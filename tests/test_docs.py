@@ -47,6 +47,7 @@ def names(pages: list[Path]) -> list[str]:
 
 LONG = (
     "guide/interoperability.md",
+    "guide/observed_frames.md",
     "tutorials/discovering_an_effect.md",
     "tutorials/flats_to_thickness.md",
     "tutorials/thickness_to_sky.md",

@@ -28,6 +28,8 @@ def imported_by(*arguments: str) -> set[str]:
         ("--help",),
         ("fit", "--help"),
         ("sky", "--help"),
+        ("templates", "--help"),
+        ("correct", "--help"),
         ("discover", "--help"),
         ("mock-flats", "--help"),
         ("plan-flats", "--help"),

@@ -21,6 +21,7 @@ __all__ = [
     "OutOfRangeError",
     "ResourceError",
     "StackError",
+    "UndeterminedError",
     "UnknownNameError",
     "printable_name",
     "shown",
@@ -129,6 +130,10 @@ class StackError(InputError):
 
 class FrameFormatError(InputError):
     """A raw frame, a cube or a map is not laid out as it must be."""
+
+
+class UndeterminedError(InputError):
+    """The data do not decide what is asked for: too few pixels or frames, or templates that are not independent."""
 
 
 class UnknownNameError(InputError):

@@ -1,16 +1,12 @@
 """Fringe correction of exposures by templates, and how much fringe is left.
 
-The measurement follows that of the LSST Science Pipelines: at many random positions the level of a small aperture
-less that of a large one, on the exposure and on every template; the scales of the templates are the least-squares
-solution between the two, with outlying positions (sources) clipped away in several rounds. Three things are done
-differently. An exposure that offers too few positions is returned as it is, and says so. Inputs are never changed.
-And the level of an aperture is the mean of the same pixels on exposure and template, clipped on the exposure: the
-median of a noiseless template is another function of the fringe than the median of a noisy exposure, which makes the
-scales of fringes below the noise too large (by 16 % for a 30 s exposure of LSST in y).
+All templates are fitted at once by weighted least squares over the good pixels, with the background and steps between
+amplifiers beside them; objects are found where both are subtracted. Inputs are never changed.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,81 +16,47 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 
-from ..compiled import kernel, run_shares
 from ..errors import InputError, OutOfRangeError
 from ..products import CORRECTED, FringeFrame, refuse_corrected
+from .correction.background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
+from .correction.objects import ROUNDS, FrameFit, fit_frame
+from .correction.scales import steady_weight
 from .sky_frame import SkyResponse
 
 __all__ = [
-    "ApertureMeasurement",
     "CorrectionOptions",
     "FringeCorrection",
     "ResidualFringe",
     "component_patterns",
     "correct_fringes",
-    "measure_apertures",
-    "random_positions",
     "residual_fringe",
+    "template_identity",
+    "undo_correction",
 ]
 
 FloatArray = NDArray[np.float64]
 
-_MOST_SAMPLES = 36
-"""Pixels along a side of an aperture from which its median is taken."""
+TEMPLATE_ID = "FRINGTID"
+"""Keyword of a corrected exposure: which templates were subtracted."""
 
 
 @dataclass(frozen=True)
 class CorrectionOptions:
-    """How the scales of the templates are measured.
+    """What is fitted beside the templates.
 
     Attributes
     ----------
-    positions : `int`
-        Random positions.
-    small_px, large_px : `int`
-        Half sides of the two square apertures [px]; an aperture has ``2 h + 1`` pixels on a side. The small one
-        should be below a quarter of a fringe, and as large as that, for it sets the noise.
-    least_good : `float`
-        Share of good pixels that an aperture needs.
-    rounds : `int`
-        Most rounds of clipping.
-    clip_sigma : `float`
-        Positions whose residual exceeds so many standard deviations (from quartiles) are left out, and so are pixels
-        of an aperture.
+    spacing_px : `float`
+        Distance between the knots of the background [px].
+    amplifiers : `AmplifierGrid`
+        Amplifiers with levels of their own.
+    find_objects : `bool`
+        Whether objects are looked for; otherwise the mask names all of them.
     """
 
-    positions: int = 30_000
-    small_px: int = 7
-    large_px: int = 50
-    least_good: float = 0.5
-    rounds: int = 20
-    clip_sigma: float = 4.0
-
-    def __post_init__(self) -> None:
-        if self.positions < 1 or self.rounds < 1:
-            raise OutOfRangeError("positions and rounds", (self.positions, self.rounds), "1 or more each")
-        if not 0 <= self.small_px < self.large_px:
-            raise OutOfRangeError("apertures [px]", (self.small_px, self.large_px), "small below large")
-        if not 0.0 < self.least_good <= 1.0:
-            raise OutOfRangeError("share of good pixels", self.least_good, "above 0, at most 1")
-        if not self.clip_sigma > 0.0:
-            raise OutOfRangeError("clipping [sigma]", self.clip_sigma, "positive")
-
-
-@dataclass(frozen=True, eq=False)
-class ApertureMeasurement:
-    """Differences of small and large apertures; NaN where an aperture has too few good pixels.
-
-    Attributes
-    ----------
-    exposure : `numpy.ndarray`, shape ``(M,)``
-        Level of the small aperture less that of the large one.
-    template : `numpy.ndarray`, shape ``(M, K)``
-        The same of the templates, on the same pixels.
-    """
-
-    exposure: FloatArray
-    template: FloatArray
+    spacing_px: float = SPACING_PX
+    amplifiers: AmplifierGrid = ONE_AMPLIFIER
+    find_objects: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,36 +65,39 @@ class FringeCorrection:
 
     Attributes
     ----------
-    image : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Exposure less the scaled templates; the exposure itself if no solution was found.
+    image : `numpy.ndarray`, shape ``(ny, nx)``
+        Exposure less the scaled templates, in the floating type of the exposure; where a template has no value, the
+        exposure itself.
+    uncorrected : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
+        Pixels in which a template has no value.
     scale : `numpy.ndarray`, shape ``(K,)``
-        Scales of the templates, in the units of the exposure; 0 if no solution was found.
+        Scales of the templates, in the unit of the exposure over that of the templates.
     covariance : `numpy.ndarray`, shape ``(K, K)``
-        Their covariance; NaN if no solution was found.
-    positions_used : `int`
-        Positions left after clipping.
-    residual_rms : `float`
-        Standard deviation of their residuals, in the units of the exposure; NaN if no solution was found.
+        Their covariance.
+    template_id : `str`
+        Which templates they are (`template_identity`).
+    frame : `FrameFit`
+        Background, objects and residual.
     """
 
-    image: NDArray[np.float32]
+    image: NDArray[Any]
+    uncorrected: NDArray[np.bool_]
     scale: FloatArray
     covariance: FloatArray
-    positions_used: int
-    residual_rms: float
+    template_id: str
+    frame: FrameFit
 
     @property
-    def solved(self) -> bool:
-        """Whether a solution was found."""
-        return math.isfinite(self.residual_rms)
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the scales."""
+        return np.sqrt(np.diag(self.covariance))
 
     @property
-    def cards(self) -> dict[str, float]:
-        """Header keywords of the corrected exposure, by which a second correction is refused; none if unsolved."""
-        if not self.solved:
-            return {}
+    def cards(self) -> dict[str, Any]:
+        """Header keywords of the corrected exposure: by them it is refused a second time, and restored."""
         scales = {f"FRINGSC{number}": float(scale) for number, scale in enumerate(self.scale)}
-        return {CORRECTED: len(self.scale), **scales, "FRINGRES": self.residual_rms}
+        sigmas = {f"FRINGSE{number}": float(sigma) for number, sigma in enumerate(self.sigma)}
+        return {CORRECTED: len(self.scale), TEMPLATE_ID: self.template_id, **scales, **sigmas}
 
 
 @dataclass(frozen=True)
@@ -162,7 +127,8 @@ class ResidualFringe:
 def correct_fringes(
     image: ArrayLike,
     templates: Sequence[FringeFrame] | ArrayLike,
-    rng: np.random.Generator,
+    *,
+    variance: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     options: CorrectionOptions | None = None,
     header: Mapping[str, Any] | None = None,
@@ -172,16 +138,17 @@ def correct_fringes(
     Parameters
     ----------
     image : array_like, shape ``(ny, nx)``
-        Exposure, sky included.
+        Exposure; its sky may be subtracted already, as long as the fringes are not.
     templates : sequence of `FringeFrame`, or array_like of shape ``(K, ny, nx)``
-        Fringe templates.
-    rng : `numpy.random.Generator`
-        Source of the random positions.
+        Fringe templates; NaN, or masked, where they have no value.
+    variance : array_like, shape ``(ny, nx)``, optional
+        Variance of the exposure; by default one for all pixels, from the differences of neighbours. The errors of the
+        scales do not rely on it.
     mask : array_like, shape ``(ny, nx)``, optional
-        Non-zero where the exposure is not to be measured (defects, detected sources). Pixels that a template masks
-        are not measured either.
+        Non-zero where the exposure is not to be measured (defects, known objects). It is corrected there all
+        the same.
     options : `CorrectionOptions`, optional
-        Positions, apertures, clipping.
+        Background, amplifiers, detection of objects.
     header : mapping, optional
         Header of the exposure; one that was corrected before is refused (`FringeCorrection.cards`).
 
@@ -193,87 +160,69 @@ def correct_fringes(
     ------
     InputError
         An exposure that was corrected already, no template, or shapes that do not belong together.
+    UndeterminedError
+        Too few good pixels, or templates that the background or each other can stand for.
     """
     refuse_corrected(header or {})
-    chosen = CorrectionOptions() if options is None else options
-    exposure = np.asarray(image, dtype=np.float32)
+    chosen = options or CorrectionOptions()
+    exposure = np.asarray(image)
     if exposure.ndim != 2:
         raise InputError("shape of the exposure", exposure.shape, "two axes (y, x)")
-    patterns, unusable = _templates(templates, exposure.shape)
-    good = np.isfinite(exposure) & ~unusable
+    shape = (exposure.shape[0], exposure.shape[1])
+    patterns, unknown = _templates(templates, shape)
+    good = np.isfinite(exposure) & ~unknown
     if mask is not None:
-        flags = np.asarray(mask)
-        if flags.shape != exposure.shape:
-            raise InputError("shape of the mask", flags.shape, f"{exposure.shape}")
-        good &= flags == 0
-    places = random_positions(exposure.shape, chosen, rng)
-    levels = measure_apertures(exposure, patterns, good, places, chosen)
-    usable = np.isfinite(levels.exposure)
-    solution = _clipped_solution(levels.exposure[usable], levels.template[usable], chosen)
-    if solution is None:
-        number = len(patterns)
-        return FringeCorrection(
-            exposure.copy(), np.zeros(number), np.full((number, number), np.nan), 0, math.nan
-        )
-    scale, covariance, used, rms = solution
-    corrected = exposure.copy()
-    for factor, pattern in zip(scale, patterns, strict=True):
-        corrected -= np.float32(factor) * pattern
-    return FringeCorrection(corrected, scale, covariance, used, rms)
+        good &= _of_shape("mask", mask, shape) == 0
+    weight = steady_weight(
+        good, None if variance is None else _of_shape("variance", variance, shape), exposure
+    )
+    background = BackgroundTerms(shape, chosen.spacing_px, chosen.amplifiers)
+    rounds = ROUNDS if chosen.find_objects else 1
+    frame = fit_frame(exposure, weight, patterns, background, rounds=rounds)
+    corrected = exposure - _fringes(patterns, frame.fit.scale, unknown, exposure)
+    return FringeCorrection(
+        corrected, unknown, frame.fit.scale, frame.fit.covariance, template_identity(templates), frame
+    )
 
 
-def random_positions(
-    shape: tuple[int, int], options: CorrectionOptions, rng: np.random.Generator
-) -> NDArray[np.int64]:
-    """Centres of apertures that lie inside the image with their small aperture, shape ``(M, 2)`` as y, x.
+def undo_correction(
+    image: ArrayLike, templates: Sequence[FringeFrame] | ArrayLike, header: Mapping[str, Any]
+) -> NDArray[Any]:
+    """Add the fringes again that `correct_fringes` subtracted; the exposure is what it was, to rounding.
+
+    Parameters
+    ----------
+    image : array_like, shape ``(ny, nx)``
+        Corrected exposure.
+    templates : sequence of `FringeFrame`, or array_like of shape ``(K, ny, nx)``
+        The templates of the correction.
+    header : mapping
+        Header of the corrected exposure.
 
     Raises
     ------
     InputError
-        The image is smaller than the small aperture.
+        The header states no correction of ours, or other templates.
     """
-    edge = options.small_px
-    if min(shape) <= 2 * edge:
-        raise InputError("shape of the exposure", shape, f"more than {2 * edge} pixels on every side")
-    return np.stack([rng.integers(edge, side - edge, options.positions) for side in shape], axis=1)
+    number = header.get(CORRECTED)
+    if not number:
+        raise InputError(CORRECTED, number, "an exposure that was corrected by this package")
+    own = template_identity(templates)
+    if header.get(TEMPLATE_ID) != own:
+        raise InputError(TEMPLATE_ID, header.get(TEMPLATE_ID), f"{own}, which the templates given have")
+    corrected = np.asarray(image)
+    patterns, unknown = _templates(templates, (corrected.shape[0], corrected.shape[1]))
+    scale = np.array([float(header[f"FRINGSC{item}"]) for item in range(int(number))])
+    return np.asarray(corrected + _fringes(patterns, scale, unknown, corrected))
 
 
-def measure_apertures(
-    exposure: ArrayLike,
-    templates: Sequence[ArrayLike],
-    good: ArrayLike,
-    positions: ArrayLike,
-    options: CorrectionOptions,
-) -> ApertureMeasurement:
-    """Level of a small aperture less that of a large one, at many positions.
-
-    Parameters
-    ----------
-    exposure : array_like, shape ``(ny, nx)``
-        Exposure; its pixels decide which of an aperture are left out.
-    templates : sequence of array_like, K of shape ``(ny, nx)``
-        Templates.
-    good : array_like of `bool`, shape ``(ny, nx)``
-        Pixels to be used.
-    positions : array_like of `int`, shape ``(M, 2)``
-        Centres as y, x.
-    options : `CorrectionOptions`
-        Sizes of the apertures, and clipping.
-    """
-    arguments = (
-        np.ascontiguousarray(exposure, dtype=np.float32),
-        np.stack([np.asarray(template, dtype=np.float32) for template in templates]),
-        np.ascontiguousarray(good, dtype=np.bool_),
-        np.ascontiguousarray(positions, dtype=np.int64),
-        options.small_px,
-        options.large_px,
-        options.least_good,
-        options.clip_sigma,
-    )
-    count = len(arguments[3])
-    levels = np.full((count, 1 + len(arguments[1])), np.nan)
-    run_shares(lambda first, last: _aperture_kernel(*arguments, first, last, levels), count, 1)
-    return ApertureMeasurement(levels[:, 0], levels[:, 1:])
+def template_identity(templates: Sequence[FringeFrame] | ArrayLike) -> str:
+    """Beginning of the SHA-256 of all pixels of templates, where they have a value."""
+    digest = hashlib.sha256()
+    for template in templates:  # type: ignore[union-attr]
+        image, unknown = _pattern(template)
+        digest.update(np.where(unknown, np.float32(np.nan), image).astype("<f4").tobytes())
+    return digest.hexdigest()[:16]
 
 
 def residual_fringe(
@@ -364,99 +313,47 @@ def component_patterns(thickness_um: ArrayLike, response: SkyResponse) -> NDArra
 
 
 def _templates(
-    templates: Sequence[FringeFrame] | ArrayLike, shape: tuple[int, ...]
+    templates: Sequence[FringeFrame] | ArrayLike, shape: tuple[int, int]
 ) -> tuple[list[NDArray[np.float32]], NDArray[np.bool_]]:
-    unusable = np.zeros(shape, dtype=bool)
+    """Patterns of mean 0 with numbers everywhere, and the pixels in which one of them has no value."""
+    unknown = np.zeros(shape, dtype=bool)
     patterns: list[NDArray[np.float32]] = []
     for template in templates:  # type: ignore[union-attr]
-        image = (
-            template.image if isinstance(template, FringeFrame) else np.asarray(template, dtype=np.float32)
-        )
-        if image.shape != shape:
-            raise InputError("shape of a template", image.shape, f"{shape}")
-        unusable |= ~np.isfinite(image)
-        if isinstance(template, FringeFrame):
-            unusable |= template.mask != 0
-        patterns.append(image)
+        pattern, missing = _pattern(template)
+        unknown |= _of_shape("template", missing, shape)
+        # A pedestal is no fringe, and would take sky along.
+        pedestal = pattern.mean(where=~missing, dtype=np.float64) if not missing.all() else 0.0
+        patterns.append(np.where(missing, np.float32(0.0), pattern - np.float32(pedestal)))
     if not patterns:
         raise InputError("templates", 0, "one or more")
-    return patterns, unusable
+    return patterns, unknown
 
 
-def _clipped_solution(
-    wanted: FloatArray, design: FloatArray, options: CorrectionOptions
-) -> tuple[FloatArray, FloatArray, int, float] | None:
-    """Least squares with positions clipped until none leaves; None if there are too few or they do not decide."""
-    number = design.shape[1]
-    keep = np.ones(wanted.size, dtype=bool)
-    scale: FloatArray = np.zeros(number)
-    residual = wanted
-    for _ in range(options.rounds):
-        if keep.sum() <= 2 * number:
-            return None
-        solution = np.linalg.lstsq(design[keep], wanted[keep], rcond=1e-10)
-        scale, rank = np.asarray(solution[0], dtype=float), int(solution[2])
-        if rank < number:
-            return None
-        residual = wanted - design @ scale
-        low, high = np.percentile(residual[keep], [25.0, 75.0])
-        spread = 0.7413 * (high - low)
-        if spread == 0.0:
-            break
-        closer = np.abs(residual - 0.5 * (low + high)) <= options.clip_sigma * spread
-        if np.array_equal(closer, keep):
-            break
-        keep = closer
-    rms = float(residual[keep].std())
-    covariance = np.asarray(rms**2 * np.linalg.inv(design[keep].T @ design[keep]), dtype=float)
-    return scale, covariance, int(keep.sum()), rms
+def _pattern(template: FringeFrame | ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """A template, and where it has no value."""
+    if isinstance(template, FringeFrame):
+        return template.image, template.mask != 0
+    image = np.asarray(template, dtype=np.float32)
+    return image, ~np.isfinite(image)
 
 
-@kernel
-def _aperture_kernel(
-    exposure: NDArray,
-    templates: NDArray,
-    good: NDArray,
-    positions: NDArray,
-    small: int,
-    large: int,
-    least_good: float,
-    clip: float,
-    first: int,
-    last: int,
-    out: NDArray,
-) -> None:  # pragma: no cover - compiled
-    height, width = exposure.shape
-    number = len(templates)
-    for place in range(first, last):
-        y, x = positions[place, 0], positions[place, 1]
-        level = np.empty((2, 1 + number))
-        complete = True
-        for which in range(2):
-            half = small if which == 0 else large
-            # A thousand pixels of the large aperture tell its level better than the small one is known.
-            step = 1 + (2 * half) // _MOST_SAMPLES
-            values = np.empty((2 * half + 1) ** 2, dtype=np.float32)
-            count, seen = 0, 0
-            for row in range(max(y - half, 0), min(y + half + 1, height), step):
-                for column in range(max(x - half, 0), min(x + half + 1, width), step):
-                    seen += 1
-                    if good[row, column]:
-                        values[count] = exposure[row, column]
-                        count += 1
-            if count == 0 or count < least_good * seen:
-                complete = False
-                break
-            quartiles = np.percentile(values[:count], np.array([25.0, 50.0, 75.0]))
-            reach = max(clip * 0.7413 * (quartiles[2] - quartiles[0]), 1e-6 * abs(quartiles[1]))
-            sums, kept = np.zeros(1 + number), 0
-            for row in range(max(y - half, 0), min(y + half + 1, height), step):
-                for column in range(max(x - half, 0), min(x + half + 1, width), step):
-                    if good[row, column] and abs(exposure[row, column] - quartiles[1]) <= reach:
-                        kept += 1
-                        sums[0] += exposure[row, column]
-                        for item in range(number):
-                            sums[1 + item] += templates[item, row, column]
-            level[which] = sums / kept
-        if complete:
-            out[place] = level[0] - level[1]
+def _of_shape(name: str, values: ArrayLike, shape: tuple[int, int]) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.shape != shape:
+        raise InputError(f"shape of the {name}", array.shape, f"{shape}")
+    return array
+
+
+def _fringes(
+    patterns: Sequence[NDArray[np.float32]],
+    scale: FloatArray,
+    unknown: NDArray[np.bool_],
+    exposure: NDArray[Any],
+) -> NDArray[Any]:
+    """What is subtracted, in the floating type of the exposure."""
+    kind = exposure.dtype.newbyteorder("=") if exposure.dtype.kind == "f" else np.dtype(np.float32)
+    total = np.zeros(exposure.shape, dtype=kind)
+    for factor, pattern in zip(scale, patterns, strict=True):
+        total += (factor * pattern).astype(kind)
+    total[unknown] = 0.0
+    return total

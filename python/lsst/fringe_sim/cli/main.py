@@ -34,6 +34,8 @@ _COMMANDS = {
     "plan-flats": ("plan_flats", "Say which flats a thickness fit needs."),
     "fit": ("fit", "Fit the layer thickness to raw flats."),
     "sky": ("sky", "Simulate the fringes of the night sky."),
+    "templates": ("templates", "Make fringe templates from observed frames."),
+    "correct": ("correct", "Subtract fringe templates from observed frames."),
     "focal-plane": ("focal_plane", "Forecast the fringes of every sensor of the LSST Camera."),
     "amplitudes": ("amplitudes", "Tabulate the fringe amplitudes of every set-up of the paper."),
     "discover": ("discover", "Find the effect that the model lacks."),

@@ -18,7 +18,9 @@ from ..errors import InputError
 __all__ = ["OutputFolder", "output_folder"]
 
 LOCK = ".fringe-sim.lock"
-OURS = b"ORIGIN  = 'lsst.fringe_sim'"
+OURS = (b"ORIGIN  = 'lsst.fringe_sim'", b"FRINGTID=", b"FRINGUND=")
+"""What a FITS file of this program says in its first header: its origin, or that fringes were taken or put back."""
+
 HEADER_BYTES = 57_600  # of a FITS file, in which its ORIGIN is looked for
 
 
@@ -160,7 +162,8 @@ def _release(path: Path, descriptor: int) -> None:
 
 def _is_ours(path: Path) -> bool:
     with path.open("rb") as stream:
-        return OURS in stream.read(HEADER_BYTES)
+        header = stream.read(HEADER_BYTES)
+    return any(word in header for word in OURS)
 
 
 def output_folder(

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..products import MASK_PLANES, FringeFrame
+from ..products import MASK_PLANES, FringeFrame, ObservedFrame
 
-__all__ = ["frame_from_exposure", "read_exposure"]
+__all__ = ["frame_from_exposure", "observed_from_exposure", "read_exposure"]
 
 
 def read_exposure(path: str) -> Any:
@@ -59,6 +59,26 @@ def frame_from_exposure(exposure: Any) -> FringeFrame:
         creation_datetime=str(header["CALIB_CREATION_DATETIME"]),
         detector="" if detector is None else str(detector.getName()),
         xy0=(int(corner[0]), int(corner[1])),
+    )
+
+
+def observed_from_exposure(exposure: Any) -> ObservedFrame:
+    """Return the frame that an exposure of Rubin's pipelines holds.
+
+    Parameters
+    ----------
+    exposure : ``lsst.afw.image.ExposureF``
+        A science exposure after the removal of its instrument's signature.
+    """
+    detector, header = exposure.getDetector(), exposure.getMetadata()
+    label = exposure.getFilter()
+    return ObservedFrame(
+        image=np.array(exposure.image.array, dtype=np.float32),
+        mask=_known_planes(exposure.mask),
+        variance=np.array(exposure.variance.array, dtype=np.float32),
+        unit=str(header["BUNIT"]) if "BUNIT" in header else "",
+        detector="" if detector is None else str(detector.getName()),
+        physical_filter="" if label is None else str(label.physicalLabel),
     )
 
 

@@ -1,11 +1,13 @@
 """Fringe frames for a repository of real images, where this package is not installed.
 
 The hand-off is a directory that ``butler import`` reads: the FITS files, which afw reads as they are, and an
-export file in which they are ``ExposureF`` with the formatter of Rubin's own packages.
+export file in which they are ``ExposureF`` with the formatter of Rubin's own packages. A configuration with which the
+fringe correction of ip_isr works goes along.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from lsst.daf.butler import (
@@ -21,12 +23,17 @@ from lsst.daf.butler.registry import RegistryError
 from ..errors import InputError
 from ..files import write_whole
 
-__all__ = ["EXPORT_FILE", "FRINGE", "write_handoff"]
+__all__ = ["EXPORT_FILE", "FRINGE", "ISR_FILE", "isr_override", "write_handoff"]
 
 FRINGE = "fringe"
 """Dataset type that Rubin's instrument signature removal reads."""
 
 EXPORT_FILE = "export.yaml"
+
+ISR_FILE = "isr_fringe.py"
+
+APERTURES = 20_000
+"""Places at which the scale of a template is measured; the default of ip_isr is 30 000."""
 
 EXPOSURE_FORMATTER = "lsst.obs.base.formatters.fitsExposure.FitsExposureFormatter"
 
@@ -98,6 +105,32 @@ def _export(butler: Butler, collection: str, refs: list[DatasetRef], target: Pat
     file = target / EXPORT_FILE
     text = file.read_text(encoding="utf-8")
     write_whole(file, text.replace(f"storage_class: {storage_class}\n", "storage_class: ExposureF\n"))
+    filters = sorted({str(ref.dataId["physical_filter"]) for ref in refs})
+    write_whole(target / ISR_FILE, isr_override(filters))
+
+
+def isr_override(filters: Sequence[str]) -> str:
+    """Configuration with which ``IsrTask`` of ip_isr subtracts templates without noise: ``-C isr:isr_fringe.py``.
+
+    Parameters
+    ----------
+    filters : sequence of `str`
+        Physical filters to be corrected; ip_isr corrects none unless it is told.
+
+    Notes
+    -----
+    The default statistic of an aperture is the median, which is another function of the fringe for a template without
+    noise than for a noisy exposure; with it the scales of such templates were several times too large. Means agree.
+    """
+    return (
+        "# Fringe correction with templates of lsst.fringe_sim.\n"
+        "from lsst.afw.math import MEAN\n\n"
+        "config.doFringe = True\n"
+        f"config.fringe.filters = {list(filters)!r}\n"
+        f"config.fringe.num = {APERTURES}\n"
+        "# Medians of noiseless and of noisy apertures differ; means do not.\n"
+        "config.fringe.stats.stat = int(MEAN)\n"
+    )
 
 
 def _for_other_readers(dataset: FileDataset) -> FileDataset:

@@ -12,7 +12,9 @@ from .fringe_components import FringeComponents
 from .fringe_cube import CUBE_UNITS, FringeCube
 from .fringe_flat import FringeFlat
 from .fringe_frame import FringeFrame
+from .fringe_templates import FringeTemplates
 from .mask import MASK_PLANES, describe_mask, mask_bits
+from .observed_frame import ObservedFrame
 from .plain_flats import read_plain_flats
 from .sensor_section import SensorSection
 from .sky_frame import (
@@ -42,6 +44,8 @@ __all__ = [
     "FringeCube",
     "FringeFlat",
     "FringeFrame",
+    "FringeTemplates",
+    "ObservedFrame",
     "SensorSection",
     "SkyFrames",
     "SkyFringe",

@@ -19,6 +19,12 @@ __all__ = ["CORRECTED", "NOISE", "SKY_UNITS", "SkyFringe", "refuse_corrected", "
 CORRECTED = "FRINGCOR"
 """Keyword of an exposure from which fringes were subtracted; its value is the number of templates."""
 
+CORRECTED_BY = (CORRECTED, "FRINGE", "FRGSCALE", "FRGFLAG", "SKYFSUB", "FRNGMDL")
+"""Keywords that say so, unless they say no: ours; those of the DECam Community Pipeline (template and scale)
+and of its like for Mosaic-3; that of fringez, for ZTF."""
+
+_NO = ("", "N", "NO", "F", "FALSE", "NONE", "0", "0.0")
+
 NOISE = "NOISE"
 """Keyword of a simulated exposure: whether photon and read noise were added."""
 
@@ -133,15 +139,17 @@ class SkyFringe(SensorProduct):
 
 
 def refuse_corrected(header: Mapping[str, Any], source: str | None = None) -> None:
-    """Refuse an exposure from which the fringes were taken already.
+    """Refuse an exposure from which the fringes were taken already, by this package or another (`CORRECTED_BY`).
 
     Raises
     ------
     InputError
         The header says so.
     """
-    if header.get(CORRECTED):
-        raise InputError(CORRECTED, header[CORRECTED], "an exposure with its fringes", source=source)
+    for keyword in CORRECTED_BY:
+        said = header.get(keyword)
+        if said and str(said).strip().upper() not in _NO:
+            raise InputError(keyword, said, "an exposure with its fringes", source=source)
 
 
 def refuse_noiseless(header: Mapping[str, Any], source: str | None = None) -> None:

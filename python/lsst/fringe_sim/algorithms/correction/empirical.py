@@ -1,0 +1,350 @@
+"""Templates from observed frames: weighted principal components of frames without background and objects."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError, UndeterminedError
+from .background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
+from .denoise import shrink_noise
+from .objects import fit_frame
+
+__all__ = ["ObservedTemplates", "TemplateOptions", "fit_templates"]
+
+FloatArray = NDArray[np.float64]
+
+IN_MEMORY = 512 * 2**20
+"""Bytes of frames beyond which they lie in a file, so that memory does not grow with their number."""
+
+BAND_BYTES = 64 * 2**20
+"""Bytes of all frames that are worked on at a time."""
+
+LEARNING_ROUNDS = 3
+"""Times that background and objects are found anew with the fringes known so far."""
+
+STEPS = 6
+"""Alternations between scores and patterns; each is a weighted least-squares solution given the other."""
+
+FOLDS = 4
+"""Groups of frames, each of which is left out in turn."""
+
+CHECK_PX = 16
+"""Side of the squares of a chequerboard: scores from the white ones predict the black ones, and the other way
+round."""
+
+
+@dataclass(frozen=True)
+class TemplateOptions:
+    """How templates are made.
+
+    Attributes
+    ----------
+    components : `int` or `None`
+        Number of templates; `None` for as many as predict frames that were left out.
+    most : `int`
+        Largest number that is tried.
+    least_frames : `int`
+        Frames that must see a pixel.
+    spacing_px : `float`
+        Distance between the knots of the background [px].
+    amplifiers : `AmplifierGrid`
+        Amplifiers with levels of their own.
+    """
+
+    components: int | None = None
+    most: int = 4
+    least_frames: int = 3
+    spacing_px: float = SPACING_PX
+    amplifiers: AmplifierGrid = ONE_AMPLIFIER
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedTemplates:
+    """Templates and what they were made of.
+
+    Attributes
+    ----------
+    patterns : `numpy.ndarray`, float32, shape ``(K, ny, nx)``
+        Templates in units of the sky, strongest first.
+    variance : `numpy.ndarray`, float32, shape ``(K, ny, nx)``
+        Variance of their noise.
+    coverage : `numpy.ndarray`, int32, shape ``(ny, nx)``
+        Frames that see each pixel.
+    scores : `numpy.ndarray`, shape ``(N, K)``
+        Scale of every template in every frame, in the unit of the frames.
+    gain : `numpy.ndarray`
+        What 0, 1, 2, … templates take of the squared pulls of frames that they were not made of, as far as they were
+        tried; empty if their number was given.
+    """
+
+    patterns: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    coverage: NDArray[np.int32]
+    scores: FloatArray
+    gain: FloatArray
+
+
+def fit_templates(
+    frames: Sequence[Callable[[], tuple[NDArray[Any], NDArray[np.float32]]]],
+    options: TemplateOptions | None = None,
+    prior: Sequence[NDArray[np.float32]] = (),
+    advance: Callable[[], None] = lambda: None,
+) -> ObservedTemplates:
+    """Find the fringes that frames of one sensor share.
+
+    Parameters
+    ----------
+    frames : sequence of callables
+        Each returns the image of a frame and the weight of its pixels (`steady_weight`), both of shape ``(ny, nx)``.
+        One is asked at a time, and again in every round.
+    options : `TemplateOptions`, optional
+        How.
+    prior : sequence of `numpy.ndarray`, optional
+        Patterns that are expected, as those of a model: what the frames do not decide is taken from them.
+    advance : callable, optional
+        Called after each frame of each round.
+
+    Raises
+    ------
+    InputError
+        Fewer than three frames, or of different shapes.
+    UndeterminedError
+        No template predicts frames that it was not made of.
+
+    Notes
+    -----
+    Frame j is ``B_j + Σ_k a_jk T_k`` and noise. Given the scores a, every pixel of the templates is a weighted mean
+    over the frames that see it; given the templates, the scores of a frame are a weighted fit over its pixels. Both
+    are repeated in turn (weighted principal components, Bailey 2012, PASP 124, 1015), with the noise taken out of the
+    templates in between (`shrink_noise`).
+    """
+    chosen = options or TemplateOptions()
+    if len(frames) < 3:
+        raise InputError("frames for templates", len(frames), "three or more, of different places on the sky")
+    shape = frames[0]()[0].shape
+    background = BackgroundTerms(shape, chosen.spacing_px, chosen.amplifiers)
+    with _Stack(len(frames), shape) as stack:
+        patterns: list[NDArray[np.float32]] = list(prior)
+        level = np.ones(len(frames))
+        gain = np.zeros(0)
+        number = chosen.components or 1
+        for turn in range(LEARNING_ROUNDS):
+            for place, frame in enumerate(frames):
+                level[place] = stack.fill(place, frame, patterns, background)
+                advance()
+            if turn == LEARNING_ROUNDS - 1 and chosen.components is None:
+                gain = _held_out_gain(stack, min(chosen.most, len(frames) // 3), prior)
+                number = int(np.argmax(gain))
+                if number == 0:
+                    raise UndeterminedError(
+                        "gain of a template in frames that it was not made of", float(gain[1]),
+                        "above 0: more frames, or stronger fringes",
+                    )  # fmt: skip
+            found = _decompose(stack, number, prior)
+            patterns = [each.astype(np.float32) for each in found.patterns]
+        coverage = stack.coverage()
+    unit = _per_sky(found.scores, level)
+    return ObservedTemplates(
+        (found.patterns * unit[:, None, None]).astype(np.float32),
+        (found.variance * unit[:, None, None] ** 2).astype(np.float32),
+        coverage,
+        found.scores / unit,
+        gain,
+    )
+
+
+def _per_sky(scores: FloatArray, level: FloatArray) -> FloatArray:
+    """Factor of each pattern after which a frame of sky b holds it with a scale of about b."""
+    strength = np.sqrt((scores**2).sum(axis=0) / (level**2).sum())
+    return np.asarray(np.where(scores.T @ level < 0, -strength, strength))
+
+
+class _Stack:
+    """Frames less their backgrounds, and the weights of their pixels, in memory or in a file."""
+
+    def __init__(self, frames: int, shape: tuple[int, int]) -> None:
+        size = (frames, *shape)
+        self._file: Any = None
+        if 8 * int(np.prod(size)) > IN_MEMORY:
+            self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by __exit__
+            both: NDArray[np.float32] = np.memmap(self._file, dtype=np.float32, shape=(2, *size), mode="w+")
+        else:
+            both = np.zeros((2, *size), dtype=np.float32)
+        self.values, self.weight = both
+        self.frames, self.shape = frames, shape
+
+    def __enter__(self) -> _Stack:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def fill(
+        self,
+        place: int,
+        frame: Callable[[], tuple[NDArray[Any], NDArray[np.float32]]],
+        patterns: Sequence[NDArray[np.float32]],
+        background: BackgroundTerms,
+    ) -> float:
+        """Take the background off a frame, leave out its objects, and return the level of its sky."""
+        image, weight = frame()
+        if image.shape != self.shape:
+            raise InputError(f"shape of frame {place}", image.shape, f"{self.shape}, as of the first")
+        made = fit_frame(image, weight, patterns, background)
+        kept = np.where(made.objects, 0, made.fit.weight)
+        self.weight[place] = kept / max(made.fit.chi2_per_pixel, 1e-30)
+        self.values[place] = np.where(kept > 0, image - made.background, 0)
+        return float(np.median(made.background))
+
+    def bands(self) -> list[slice]:
+        rows = max(1, BAND_BYTES // (4 * self.frames * self.shape[1]))
+        return [slice(start, start + rows) for start in range(0, self.shape[0], rows)]
+
+    def coverage(self) -> NDArray[np.int32]:
+        seen = np.zeros(self.shape, dtype=np.int32)
+        for weight in self.weight:
+            seen += weight > 0
+        return seen
+
+
+@dataclass(frozen=True, eq=False)
+class _Decomposition:
+    patterns: FloatArray
+    variance: FloatArray
+    scores: FloatArray
+
+
+def _decompose(
+    stack: _Stack, number: int, prior: Sequence[NDArray[np.float32]], frames: NDArray[Any] | None = None
+) -> _Decomposition:
+    """Patterns and scores of some frames, of all by default."""
+    chosen = np.arange(stack.frames) if frames is None else frames
+    scores = _first_scores(stack, number, prior, chosen)
+    for _ in range(STEPS):
+        orthonormal, _ = np.linalg.qr(scores)
+        patterns, variance, known = _patterns_of(stack, orthonormal, chosen)
+        # Orthonormal scores give all patterns the same noise; among these the principal ones are orthogonal.
+        gram = np.tensordot(patterns, patterns, axes=([1, 2], [1, 2]))
+        _, turn = np.linalg.eigh(gram)
+        patterns = np.tensordot(turn.T[::-1], patterns, axes=1)
+        patterns, variance = _shrunk(patterns, variance, known, prior)
+        scores = _scores_of(stack, patterns, chosen)
+    return _Decomposition(patterns, variance, scores)
+
+
+def _shrunk(
+    patterns: FloatArray, variance: FloatArray, known: NDArray[np.bool_], prior: Sequence[NDArray[np.float32]]
+) -> tuple[FloatArray, FloatArray]:
+    made, left = np.empty_like(patterns), np.empty_like(patterns)
+    basis = np.stack([each[known] for each in prior], axis=1) if prior else None
+    for number, pattern in enumerate(patterns):
+        expected: Any = 0.0
+        if basis is not None:
+            factor = np.linalg.lstsq(basis, pattern[known], rcond=None)[0]
+            expected = np.tensordot(factor, np.stack(list(prior)), axes=1)
+        departure, kept = shrink_noise(pattern - expected, variance, known)
+        made[number] = expected + departure
+        left[number] = kept * variance
+    return made, left
+
+
+def _first_scores(
+    stack: _Stack, number: int, prior: Sequence[NDArray[np.float32]], chosen: NDArray[Any]
+) -> FloatArray:
+    """Scores of the patterns that are expected, then principal axes of the frames with zeros for what is missing."""
+    gram = np.zeros((chosen.size, chosen.size))
+    for band in stack.bands():
+        whole = stack.values[chosen, band] * np.sqrt(stack.weight[chosen, band])
+        flat = whole.reshape(chosen.size, -1).astype(np.float64)
+        gram += flat @ flat.T
+    # The noise of a frame stands in its own element only; what the others share is put there instead.
+    np.fill_diagonal(gram, 0.0)
+    for _ in range(20):
+        values, vectors = np.linalg.eigh(gram)
+        lead = vectors[:, -number:]
+        np.fill_diagonal(gram, np.einsum("ik,k,ik->i", lead, np.maximum(values[-number:], 0.0), lead))
+    noise = np.array([1.0 / np.sqrt(max(float(stack.weight[j].max()), 1e-30)) for j in chosen])
+    scores = lead[:, ::-1] * noise[:, None]
+    if prior:
+        expected = _scores_of(stack, np.stack([np.asarray(each, dtype=float) for each in prior]), chosen)
+        scores[:, : min(number, len(prior))] = expected[:, :number]
+    return scores
+
+
+def _patterns_of(
+    stack: _Stack, scores: FloatArray, chosen: NDArray[Any]
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Every pixel of the patterns from the frames that see it, its variance, and whether enough of them do."""
+    number = scores.shape[1]
+    patterns = np.zeros((number, *stack.shape))
+    variance = np.zeros(stack.shape)
+    known = np.zeros(stack.shape, dtype=bool)
+    products = np.einsum("jk,jl->jkl", scores, scores).reshape(chosen.size, -1)
+    for band in stack.bands():
+        weight = stack.weight[chosen, band].astype(np.float64)
+        normal = np.tensordot(weight, products, axes=([0], [0])).reshape(*weight.shape[1:], number, number)
+        moment = np.tensordot(weight * stack.values[chosen, band], scores, axes=([0], [0]))
+        # A frame alone decides no pixel that K frames are needed for.
+        seen = (weight > 0).sum(axis=0) > number
+        least = np.linalg.eigvalsh(normal)[..., 0]
+        seen &= least > 0.05 * np.median(least)
+        solution = np.linalg.solve(normal[seen], moment[seen][..., None])[..., 0]
+        for k in range(number):
+            patterns[k, band][seen] = solution[:, k]
+        variance[band][seen] = np.trace(np.linalg.inv(normal[seen]), axis1=-2, axis2=-1) / number
+        known[band] = seen
+    return patterns, variance, known
+
+
+def _scores_of(
+    stack: _Stack, patterns: FloatArray, chosen: NDArray[Any], part: NDArray[Any] | None = None
+) -> FloatArray:
+    """Scores of frames by weighted least squares over their pixels, or over a part of them."""
+    flat = patterns.reshape(len(patterns), -1)
+    scores = np.zeros((chosen.size, len(patterns)))
+    for place, frame in enumerate(chosen):
+        weight = stack.weight[frame].ravel().astype(np.float64)
+        if part is not None:
+            weight *= part.ravel()
+        weighted = flat * weight
+        normal = weighted @ flat.T
+        normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal) + 1e-300
+        scores[place] = np.linalg.solve(normal, weighted @ stack.values[frame].ravel())
+    return scores
+
+
+def _held_out_gain(stack: _Stack, most: int, prior: Sequence[NDArray[np.float32]]) -> FloatArray:
+    """What 0, 1, 2, … patterns take of the squared pulls of frames that they were not made of, until it falls."""
+    rows, columns = (np.arange(side) // CHECK_PX for side in stack.shape)
+    white = (np.add.outer(rows, columns) % 2).astype(float)
+    gain = [0.0]
+    for number in range(1, most + 1):
+        gain.append(sum(_fold_gain(stack, number, prior, fold, white) for fold in range(FOLDS)))
+        if gain[-1] < gain[-2]:
+            break
+    return np.array(gain)
+
+
+def _fold_gain(
+    stack: _Stack, number: int, prior: Sequence[NDArray[np.float32]], fold: int, white: FloatArray
+) -> float:
+    left = np.arange(fold, stack.frames, FOLDS)
+    others = np.setdiff1d(np.arange(stack.frames), left)
+    if left.size == 0 or others.size <= number:
+        return 0.0
+    patterns = _decompose(stack, number, prior, others).patterns
+    gain = 0.0
+    for part in (white, 1.0 - white):
+        scores = _scores_of(stack, patterns, left, 1.0 - part)
+        for score, frame in zip(scores, left, strict=True):
+            fringes = np.tensordot(score, patterns, axes=1)
+            both = 2.0 * stack.values[frame] * fringes - fringes**2
+            gain += float((part * stack.weight[frame] * both).sum())
+    return gain

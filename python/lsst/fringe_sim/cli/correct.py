@@ -1,0 +1,196 @@
+"""``fringe-sim correct``."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..errors import InputError, UndeterminedError
+from .observed import TemplateFolder, background_options, background_path, grid_of, images_of, stem_of
+from .output import OutputFolder, output_folder
+from .progress import progress
+
+if TYPE_CHECKING:
+    from ..algorithms.fringe_correction import CorrectionOptions
+    from ..algorithms.observed_frames import CorrectedFrame, FrameRecord
+    from ..products.observed_files import ObservedImage
+
+__all__ = ["correct"]
+
+EXIT_REFUSED = 1
+
+OWN_CARD = re.compile(r"FRING(COR|TID|PRB|VER|S[CE]\d+)")
+"""Keywords that a correction writes, and its undoing removes."""
+
+
+@click.command()
+@click.argument("frames", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option(
+    "--templates",
+    "folder",
+    required=True,
+    type=click.Path(exists=True, path_type=Path),
+    help="Folder of 'fringe-sim templates', or with fringe_*.fits of a model.",
+)
+@background_options
+@click.option(
+    "--pixel-scale",
+    type=click.FloatRange(0.0, min_open=True),
+    default=0.2,
+    show_default=True,
+    help="Size of a pixel [arcsec]: fringes are judged on scales up to 20 arcsec.",
+)
+@click.option("--undo", is_flag=True, help="Put the fringes back that an earlier run has subtracted.")
+@output_folder(
+    "Folder for frames, table and report.",
+    *("*_corrected.fits", "*_restored.fits", "frames.ecsv", "report.html"),
+)
+@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+def correct(
+    frames: tuple[Path, ...],
+    folder: Path,
+    background: Path | None,
+    background_px: float,
+    amplifiers: tuple[int, int] | None,
+    pixel_scale: float,
+    undo: bool,
+    out: OutputFolder,
+    dry_run: bool,
+) -> None:
+    """Subtract fringe templates from observed frames, and prove frame by frame that it helped.
+
+    Files keep their layout: pixels change, and the header says by how much. A frame to which the templates add
+    structure is not written; the report shows it, and the exit status is 1.
+
+    \b
+    Examples:
+      fringe-sim correct night/*.fits --templates templates --out corrected
+      fringe-sim correct corrected/*_corrected.fits --templates templates --out restored --undo
+    """
+    from ..algorithms.fringe_correction import CorrectionOptions
+
+    images, known = images_of(frames), TemplateFolder(folder)
+    _check_headers(images, undo)
+    if dry_run:
+        click.echo(f"would {'restore' if undo else 'correct'} {len(images)} images")
+        return
+    target = out.prepare()
+    if undo:
+        _restore(images, known, target)
+        return
+    options = CorrectionOptions(background_px, grid_of(amplifiers))
+    done, refused = _corrected(images, known, options, background, pixel_scale, target)
+    _write_report(target, done, refused)
+    for line in [*map(_describe, done), *refused]:
+        click.echo(line)
+    click.echo(str(target / "report.html"))
+    if refused or not all(each.proof.passed for each in done):
+        raise click.exceptions.Exit(EXIT_REFUSED)
+
+
+def _check_headers(images: list[ObservedImage], undo: bool) -> None:
+    from ..products import CORRECTED, refuse_corrected
+
+    for image in images:
+        header = image.header()
+        if undo and not header.get(CORRECTED):
+            raise InputError(
+                CORRECTED, None, "a frame that was corrected by this program", source=str(image.path)
+            )
+        if not undo:
+            refuse_corrected(header, str(image.path))
+
+
+def _corrected(
+    images: list[ObservedImage],
+    known: TemplateFolder,
+    options: CorrectionOptions,
+    background: Path | None,
+    pixel_scale: float,
+    target: Path,
+) -> tuple[list[FrameRecord], list[str]]:
+    """Frames that could be fitted, of which those that passed are written; and why others could not."""
+    from ..algorithms.observed_frames import correct_frame
+    from ..products.observed_files import write_images
+
+    done: list[FrameRecord] = []
+    refused: list[str] = []
+    with progress("correcting frames", len(images)) as advance:
+        for path, parts in _by_file(images).items():
+            made: dict[int, CorrectedFrame] = {}
+            for image in parts:
+                name = stem_of(path) if len(parts) == 1 else f"{stem_of(path)}[{image.name}]"
+                frame = image.read(background_path(background, image))
+                try:
+                    each = correct_frame(frame, known.of(frame.detector), options, pixel_arcsec=pixel_scale)
+                except UndeterminedError as error:
+                    refused.append(f"{name}: not corrected: {error}")
+                else:
+                    done.append(each.record(name))
+                    if each.proof.passed:
+                        made[image.index] = each
+                advance()
+            if made:
+                cards = {index: _cards(each) for index, each in made.items()}
+                pixels = {index: each.frame.image for index, each in made.items()}
+                flags = {index: each.correction.uncorrected for index, each in made.items()}
+                first = {"FRINGTID": next(iter(made.values())).correction.template_id, "FRINGUND": None}
+                write_images(path, target / f"{stem_of(path)}_corrected.fits", pixels, cards, flags, first)
+    return done, refused
+
+
+def _by_file(images: list[ObservedImage]) -> dict[Path, list[ObservedImage]]:
+    files: dict[Path, list[ObservedImage]] = {}
+    for image in images:
+        files.setdefault(image.path, []).append(image)
+    return files
+
+
+def _cards(each: CorrectedFrame) -> dict[str, Any]:
+    from .. import __version__
+
+    return {**each.correction.cards, "FRINGPRB": each.proof.probability, "FRINGVER": __version__}
+
+
+def _restore(images: list[ObservedImage], known: TemplateFolder, target: Path) -> None:
+    from ..algorithms.fringe_correction import undo_correction
+    from ..products.observed_files import write_images
+
+    for path, parts in _by_file(images).items():
+        pixels, cards, flags = {}, {}, {}
+        for image in parts:
+            header, frame = image.header(), image.read()
+            pixels[image.index] = undo_correction(frame.image, known.of(frame.detector), header)
+            cards[image.index] = dict.fromkeys(key for key in header if OWN_CARD.fullmatch(key))
+            flags[image.index] = frame.mask < 0
+        name = f"{stem_of(path).removesuffix('_corrected')}_restored.fits"
+        write_images(path, target / name, pixels, cards, flags, {"FRINGTID": None, "FRINGUND": True})
+        click.echo(f"{stem_of(path)}: fringes put back")
+
+
+def _write_report(target: Path, done: list[FrameRecord], refused: list[str]) -> None:
+    from ..algorithms.observed_frames import summary_table
+    from ..files import table_text, write_whole
+    from ..report.correction_page import write_correction_report
+
+    write_whole(target / "frames.ecsv", table_text(summary_table(done)))
+    write_correction_report(target / "report.html", done, refused)
+
+
+def _describe(record: FrameRecord) -> str:
+    proof = record.proof
+    if not proof.passed:
+        return (
+            f"{record.name}: not corrected: the templates add structure ({proof.worst}, probability "
+            f"{proof.probability:.1e}); see the report"
+        )
+    scales = ", ".join(
+        f"{scale:.4g} ± {sigma:.2g}" for scale, sigma in zip(record.scale, record.sigma, strict=True)
+    )
+    return (
+        f"{record.name}: scales {scales}; structure beyond the noise {proof.structure_before:.2f} before, "
+        f"{proof.structure_after:.2f} after"
+    )

@@ -1,0 +1,137 @@
+"""``fringe-sim templates``."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ..errors import InputError
+from .observed import TemplateFolder, background_options, background_path, grid_of, images_of, latest_date
+from .output import OutputFolder, output_folder
+from .progress import progress
+
+if TYPE_CHECKING:
+    from ..algorithms.correction.empirical import TemplateOptions
+    from ..products import FringeFrame, FringeTemplates
+    from ..products.observed_files import ObservedImage
+
+__all__ = ["templates"]
+
+LEAST_FRAMES = 3
+
+
+@click.command()
+@click.argument("frames", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@background_options
+@click.option(
+    "--components", type=click.IntRange(1), help="Templates; by default as many as predict other frames."
+)
+@click.option(
+    "--least-frames",
+    type=click.IntRange(1),
+    default=LEAST_FRAMES,
+    show_default=True,
+    help="Frames that must see a pixel.",
+)
+@click.option(
+    "--prior",
+    type=click.Path(exists=True, path_type=Path),
+    help="Templates of a model, a file or a folder: what the frames do not decide is taken from them.",
+)
+@output_folder("Folder for templates, figure and report.", "templates_*.fits", "report.html")
+@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+def templates(
+    frames: tuple[Path, ...],
+    background: Path | None,
+    background_px: float,
+    amplifiers: tuple[int, int] | None,
+    components: int | None,
+    least_frames: int,
+    prior: Path | None,
+    out: OutputFolder,
+    dry_run: bool,
+) -> None:
+    """Make fringe templates of each sensor from observed frames in one filter.
+
+    FRAMES are FITS files after the removal of the instrument's signature, or folders with them: of Rubin, of the
+    DECam Community Pipeline, of ZTF, or plain; every image in a file is a sensor of its own. Objects are found and
+    left out; the telescope should have moved between the frames.
+
+    \b
+    Examples:
+      fringe-sim templates night/*.fits --out templates
+      fringe-sim templates night --amplifiers 8x2 --prior model/fringe_0.fits --out templates
+    """
+    from ..algorithms.correction.empirical import LEARNING_ROUNDS, TemplateOptions
+    from ..report.correction_page import write_templates_report
+
+    sensors = _by_sensor(images_of(frames))
+    options = TemplateOptions(
+        components, least_frames=least_frames, spacing_px=background_px, amplifiers=grid_of(amplifiers)
+    )
+    expected = None if prior is None else TemplateFolder(prior)
+    if dry_run:
+        for name, images in sensors.items():
+            click.echo(f"would make templates of {name} from {len(images)} frames")
+        return
+    folder = out.prepare()
+    made = {}
+    steps = LEARNING_ROUNDS * sum(len(images) for images in sensors.values())
+    with progress("finding fringes", steps) as advance:
+        for name, images in sensors.items():
+            known = [] if expected is None else expected.of(name)
+            made[name] = _made(images, options, known, background, advance)
+            made[name].write_fits(folder / f"templates_{_file_name(name)}.fits")
+    for name, product in made.items():
+        click.echo(_describe(name, product))
+    click.echo(str(write_templates_report(folder / "report.html", made)))
+
+
+def _by_sensor(images: list[ObservedImage]) -> dict[str, list[ObservedImage]]:
+    """Images of each sensor; corrected ones are refused."""
+    from ..products import refuse_corrected
+    from ..products.observed_files import detector_of
+
+    sensors = defaultdict(list)
+    for image in images:
+        header = image.header()
+        refuse_corrected(header, str(image.path))
+        sensors[detector_of(header)].append(image)
+    for name, found in sensors.items():
+        if len(found) < LEAST_FRAMES:
+            raise InputError(f"frames of sensor {name!r}", len(found), f"{LEAST_FRAMES} or more")
+    return dict(sensors)
+
+
+def _made(
+    images: list[ObservedImage],
+    options: TemplateOptions,
+    prior: list[FringeFrame],
+    background: Path | None,
+    advance: Callable[[], None],
+) -> FringeTemplates:
+    """Templates of one sensor; each frame is read anew in every round."""
+    from ..algorithms.observed_frames import make_templates
+    from ..model.provenance import software_cards
+
+    loaders = [partial(image.read, background_path(background, image)) for image in images]
+    date = latest_date([image.header() for image in images])
+    return make_templates(loaders, date, options, prior, software_cards(), advance)
+
+
+def _file_name(sensor: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in sensor) or "sensor"
+
+
+def _describe(name: str, product: FringeTemplates) -> str:
+    good = product.mask == 0
+    rms = ", ".join(f"{100.0 * float(each[good].std()):.4f} %" for each in product.patterns)
+    return (
+        f"{name or 'sensor'}: {len(product.patterns)} templates from {len(product.scores)} frames, rms {rms}; "
+        f"{100.0 * float((~good).mean()):.2f} % of the pixels are seen by too few"
+    )

@@ -1,0 +1,356 @@
+"""FITS files of observed frames, as pipelines write them, and the same files with corrected pixels.
+
+What pipelines do not agree on is said once in `_Layout`: where masks and variances are, and what their numbers mean.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from ..errors import FrameFormatError
+from ..files import all_or_nothing
+from ..resources import open_user_fits, refuse_damage
+from .mask import MASK_PLANES, mask_bits
+from .observed_frame import ObservedFrame
+
+__all__ = ["UNCORRECTED", "ObservedImage", "detector_of", "is_companion", "observed_images", "write_images"]
+
+UNCORRECTED = "UNCORRECTED"
+"""End of the name of an extension that is 1 where a template has no value."""
+
+IntArray = NDArray[np.int32]
+
+_MASKS = ("MASK", "DQ", "BPM")
+_VARIANCES = ("VARIANCE", "VAR")
+_INVERSES = ("WEIGHT", "WHT", "IVAR")
+_ERRORS = ("ERR", "ERROR", "UNCERT", "SIGMA")
+_NOT_SKY = (*_MASKS, *_VARIANCES, *_INVERSES, *_ERRORS, UNCORRECTED)
+
+_DETECTORS = ("DETNAME", "DETECTOR", "CCDNAME", "DETPOS", "EXTNAME", "CCDNUM", "CCDID")
+_FILTERS = ("FILTER", "FILTNAM", "FILTERID")
+
+_DECAM_CODES_SINCE = (3, 5, 0)
+"""Version of the DECam Community Pipeline from which a mask holds codes, before which it holds bits."""
+
+_DECAM_CODES = {1: "BAD", 2: "NO_DATA", 3: "SAT", 4: "SAT", 5: "CR", 6: "SUSPECT", 7: "SUSPECT", 8: "SUSPECT"}
+"""Bad pixel, no value, saturated, bleed trail, cosmic ray, low weight, transient, long streak."""
+
+_DECAM_BITS = {0: "BAD", 1: "SAT", 2: "INTRP", 4: "CR", 6: "SAT", 7: "SUSPECT"}
+"""Bad pixel, saturated, interpolated, cosmic ray, bleed trail, transient."""
+
+_ZTF_BITS = {
+    1: "DETECTED",
+    11: "DETECTED",
+    8: "SAT",
+    10: "NO_DATA",
+    0: "SUSPECT",
+    5: "SUSPECT",
+    12: "SUSPECT",
+}
+"""Source, source of the PSF catalogue, saturated, no number, track, ghost, halo; all others are bad pixels."""
+
+_HARMLESS = ("NOT_DEBLENDED", "INEXACT_PSF", "SENSOR_EDGE", "INJECTED", "INJECTED_CORE", "STREAK_FIT")
+"""Planes of Rubin's masks that say nothing against the background of a pixel."""
+
+
+@dataclass(frozen=True)
+class ObservedImage:
+    """One image of a file, read when it is wanted.
+
+    Attributes
+    ----------
+    path : `pathlib.Path`
+        The file.
+    index : `int`
+        Number of the HDU.
+    name : `str`
+        Name of the HDU, or the stem of the file.
+    """
+
+    path: Path
+    index: int
+    name: str
+
+    def read(self, background: Path | None = None) -> ObservedFrame:
+        """Read image, mask and variance.
+
+        Parameters
+        ----------
+        background : `pathlib.Path`, optional
+            File with the background that was subtracted, of the same layout; it is added again.
+
+        Raises
+        ------
+        InputError
+            A damaged file, or companions of another size.
+        """
+        with _opened(self.path) as hdus:
+            header = _merged(hdus, self.index)
+            image = np.array(hdus[self.index].data, dtype=np.float32)
+            layout = _layout_of(self)
+            mask = layout.mask(self, hdus, header)
+            variance = layout.variance(self, hdus, header)
+        if background is not None:
+            image += _companion(background, self, image.shape)
+        if mask is None:
+            mask = np.zeros(image.shape, dtype=np.int32)
+        for what, array in (("mask", mask), ("variance", variance)):
+            if array is not None and array.shape != image.shape:
+                raise FrameFormatError(
+                    f"shape of the {what}", array.shape, f"{image.shape}", source=str(self.path)
+                )
+        mask = mask | np.where(np.isfinite(image), 0, mask_bits("NO_DATA")).astype(np.int32)
+        return ObservedFrame(
+            image=image,
+            mask=mask,
+            variance=variance,
+            unit=str(header.get("BUNIT", "")).strip(),
+            metadata={},
+            detector=detector_of(header),
+            physical_filter=_first_of(header, _FILTERS),
+        )
+
+    def header(self) -> dict[str, Any]:
+        """Keywords of the image, and those of the primary header that it does not have itself."""
+        with _opened(self.path) as hdus:
+            return _merged(hdus, self.index)
+
+
+def observed_images(path: Path) -> list[ObservedImage]:
+    """The images of the sky in a file: all of two axes that are no mask, variance or weight.
+
+    Raises
+    ------
+    InputError
+        No FITS file, a damaged one, or one without images.
+    """
+    with _opened(path) as hdus:
+        found = [
+            ObservedImage(path, number, hdu.name if number and hdu.name else path.name.partition(".")[0])
+            for number, hdu in enumerate(hdus)
+            if hdu.is_image and len(hdu.shape) == 2 and not hdu.name.upper().endswith(_NOT_SKY)
+        ]
+    if not found:
+        raise FrameFormatError("images", 0, "one or more of two axes (y, x)", source=str(path))
+    return found
+
+
+def detector_of(header: Mapping[str, Any]) -> str:
+    """Name of the sensor that a header states; empty if it states none."""
+    return _first_of(header, _DETECTORS)
+
+
+def write_images(
+    source: Path,
+    target: Path,
+    images: Mapping[int, NDArray[Any]],
+    cards: Mapping[int, Mapping[str, Any]],
+    uncorrected: Mapping[int, NDArray[np.bool_]],
+    primary: Mapping[str, Any],
+) -> None:
+    """Write a file again with other pixels; all else in it stays, and no image is compressed with loss.
+
+    Parameters
+    ----------
+    source, target : `pathlib.Path`
+        The file, and the one to be written.
+    images : mapping of `int` to `numpy.ndarray`
+        New pixels by number of the HDU.
+    cards : mapping of `int` to mapping
+        Keywords of each of these HDUs; those with the value `None` are removed.
+    uncorrected : mapping of `int` to `numpy.ndarray` of `bool`
+        Pixels that are as they were; named in an extension of their own, which is absent where there are none.
+    primary : mapping
+        Keywords of the primary header; those with the value `None` are removed.
+
+    Raises
+    ------
+    OSError
+        The folder does not exist or cannot be written, or the disk is full.
+    """
+    with _opened(source) as hdus:
+        made, flags = [], []
+        for number, hdu in enumerate(hdus):
+            if hdu.name.endswith(UNCORRECTED):
+                continue
+            if number not in images:
+                made.append(hdu.copy())
+                continue
+            header = hdu.header.copy()
+            _set_cards(header, cards[number])
+            kind = fits.PrimaryHDU if number == 0 else fits.ImageHDU
+            made.append(kind(images[number], header))
+            if uncorrected[number].any():
+                name = f"{hdu.name}_{UNCORRECTED}" if number and hdu.name else UNCORRECTED
+                flags.append(fits.ImageHDU(uncorrected[number].astype(np.uint8), name=name))
+        _set_cards(made[0].header, primary)
+        with all_or_nothing(target) as temporary, open(temporary, "wb") as stream:
+            fits.HDUList(made + flags).writeto(stream, output_verify="fix", checksum=True)
+
+
+def _set_cards(header: fits.Header, cards: Mapping[str, Any]) -> None:
+    for keyword, value in cards.items():
+        if value is None:
+            header.remove(keyword, ignore_missing=True)
+        else:
+            header[keyword] = value
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[fits.HDUList]:
+    with (
+        refuse_damage("file", "a complete FITS file", str(path)),
+        open_user_fits(path, warning="truncated", memmap=False) as hdus,
+    ):
+        yield hdus
+
+
+def _merged(hdus: fits.HDUList, index: int) -> dict[str, Any]:
+    return {**dict(hdus[0].header), **dict(hdus[index].header)}
+
+
+def _first_of(header: Mapping[str, Any], keywords: tuple[str, ...]) -> str:
+    values = (str(header.get(keyword, "")).strip() for keyword in keywords)
+    return next((value for value in values if value and value.upper() not in ("IMAGE", "SCI", "PRIMARY")), "")
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where a pipeline puts masks and variances."""
+
+    mask: Callable[[ObservedImage, fits.HDUList, Mapping[str, Any]], IntArray | None]
+    variance: Callable[[ObservedImage, fits.HDUList, Mapping[str, Any]], NDArray[np.float32] | None]
+
+
+def _layout_of(image: ObservedImage) -> _Layout:
+    if _sibling(image.path, "_ood") is not None or _sibling(image.path, "_oow") is not None:
+        return _Layout(_decam_mask, _decam_variance)
+    if "sciimg" in image.path.name:
+        return _Layout(_ztf_mask, lambda *_: None)
+    return _Layout(_own_mask, _own_variance)
+
+
+def _sibling(path: Path, kind: str) -> Path | None:
+    """The file of another kind beside this one, as c4d_…_ood_z_v1.fits.fz beside c4d_…_ooi_z_v1.fits.fz."""
+    other = path.with_name(re.sub(r"_ooi(?=[_.])", kind, path.name))
+    return other if other != path and other.is_file() else None
+
+
+def _companion(path: Path, image: ObservedImage, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
+    """The image of the same name in another file, or the one of the same number."""
+    with _opened(path) as hdus:
+        own = image.name in hdus and image.index > 0
+        index = image.name if own else min(image.index, len(hdus) - 1)
+        if hdus[index].data is None:
+            index = next((n for n, hdu in enumerate(hdus) if hdu.is_image and hdu.data is not None), 0)
+        data = hdus[index].data
+        if data is None or (shape is not None and data.shape != shape):
+            found = None if data is None else data.shape
+            raise FrameFormatError("image", found, f"one of shape {shape}", source=str(path))
+        return np.array(data)
+
+
+def _named(planes: Mapping[int, str], stored: NDArray[Any], *, bits: bool, others: str = "BAD") -> IntArray:
+    """Mask of this package from bits or codes of another."""
+    mask = np.zeros(stored.shape, dtype=np.int32)
+    rest = stored.astype(np.int64)
+    for number, name in planes.items():
+        chosen = (rest >> number & 1) == 1 if bits else rest == number
+        mask[chosen] |= mask_bits(name)
+        rest = rest & ~(1 << number) if bits else np.where(chosen, 0, rest)
+    mask[rest != 0] |= mask_bits(others)
+    return mask
+
+
+def _decam_mask(image: ObservedImage, _: fits.HDUList, header: Mapping[str, Any]) -> IntArray | None:
+    path = _sibling(image.path, "_ood")
+    if path is None:
+        return None
+    stored = _companion(path, image)
+    digits = re.findall(r"\d+", str(header.get("PLVER", "")))
+    version = tuple(int(part) for part in digits[:3])
+    if version and version < _DECAM_CODES_SINCE:
+        return _named(_DECAM_BITS, stored, bits=True)
+    return _named(_DECAM_CODES, stored, bits=False)
+
+
+def _decam_variance(
+    image: ObservedImage, _: fits.HDUList, __: Mapping[str, Any]
+) -> NDArray[np.float32] | None:
+    path = _sibling(image.path, "_oow")
+    return None if path is None else _inverse(_companion(path, image))
+
+
+def _ztf_mask(image: ObservedImage, _: fits.HDUList, __: Mapping[str, Any]) -> IntArray | None:
+    path = image.path.with_name(image.path.name.replace("sciimg", "mskimg"))
+    return _named(_ZTF_BITS, _companion(path, image), bits=True) if path.is_file() else None
+
+
+def _own_mask(image: ObservedImage, hdus: fits.HDUList, _: Mapping[str, Any]) -> IntArray | None:
+    hdu = _beside(hdus, image, _MASKS)
+    if hdu is None:
+        return None
+    planes = {
+        int(bit): _plane(str(keyword)[3:])
+        for keyword, bit in hdu.header.items()
+        if str(keyword).startswith("MP_") and str(keyword)[3:] not in _HARMLESS
+    }
+    harmless = sum(1 << int(hdu.header[f"MP_{name}"]) for name in _HARMLESS if f"MP_{name}" in hdu.header)
+    return _named(planes, np.asarray(hdu.data).astype(np.int64) & ~harmless, bits=True)
+
+
+def _plane(name: str) -> str:
+    if name in MASK_PLANES:
+        return name
+    return "SUSPECT" if name == "VIGNETTED" else "BAD"
+
+
+def _own_variance(
+    image: ObservedImage, hdus: fits.HDUList, _: Mapping[str, Any]
+) -> NDArray[np.float32] | None:
+    variance = _beside(hdus, image, _VARIANCES)
+    if variance is not None:
+        return np.array(variance.data, dtype=np.float32)
+    weight = _beside(hdus, image, _INVERSES)
+    if weight is not None:
+        return _inverse(weight.data)
+    error = _beside(hdus, image, _ERRORS)
+    if error is None:
+        return None
+    # ccdproc says of its UNCERT what it is.
+    kind = str(error.header.get("UTYPE", "")).lower()
+    if kind.startswith("inverse"):
+        return _inverse(error.data)
+    values = np.array(error.data, dtype=np.float32)
+    return values if kind.startswith("variance") else values**2
+
+
+def _inverse(weight: NDArray[Any]) -> NDArray[np.float32]:
+    """Variance of an inverse variance; NaN where that is 0, and nothing is known."""
+    known = np.asarray(weight, dtype=np.float64)
+    return np.divide(1.0, known, out=np.full(known.shape, np.nan), where=known > 0).astype(np.float32)
+
+
+def _beside(hdus: fits.HDUList, image: ObservedImage, names: tuple[str, ...]) -> Any:
+    """HDU with one of these names that belongs to an image: of its version, or that begins with its name."""
+    own = hdus[image.index]
+    shape = own.shape
+    for hdu in hdus:
+        named = hdu.name.upper() in {*names, *(f"{own.name}_{name}".upper() for name in names)}
+        if named and hdu.is_image and hdu.shape == shape and (hdu.ver == own.ver or len(hdus) <= 4):
+            return hdu
+    return None
+
+
+def is_companion(path: Path) -> bool:
+    """Whether a file is, by its name, the mask or the weight of a frame and no frame."""
+    return re.search(r"_oo[dw][_.]|mskimg|wtimg|rmsimg", path.name) is not None

@@ -1,0 +1,102 @@
+"""Pages of templates from observed frames and of corrected frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+from matplotlib.figure import Figure
+
+from ..algorithms.observed_frames import FrameRecord, summary_table
+from ..products import FringeTemplates
+from .page import Report
+from .style import figure, finite_range, show_image
+
+__all__ = ["frame_figure", "write_correction_report", "write_templates_report"]
+
+PERCENT = 100.0
+MOST_PICTURES = 3
+
+
+def write_templates_report(path: Path, made: Mapping[str, FringeTemplates]) -> Path:
+    """Write the page of templates, one section per sensor."""
+    report = Report("Fringe templates", f"{len(made)} sensors, from observed frames.")
+    for name, product in made.items():
+        report.section(
+            name or "Sensor",
+            f"{len(product.patterns)} templates from {len(product.scores)} frames in "
+            f"{product.physical_filter or 'a filter without a name'}.",
+        )
+        report.figure(
+            _templates_figure(product),
+            "Templates in percent of the sky, and how many frames see each pixel.",
+        )
+        table = Table({"frame": np.arange(len(product.scores))})
+        for number, scores in enumerate(product.scores.T):
+            table[f"scale {number}"] = np.round(scores, 2)
+        report.table(table, f"scales_{name or 'sensor'}")
+    return report.write(path)
+
+
+def write_correction_report(path: Path, records: Sequence[FrameRecord], refused: Sequence[str]) -> Path:
+    """Write the page of a night: one row per frame, pictures of the worst and of all that were refused."""
+    table = summary_table(records)
+    passed = sum(each.proof.passed for each in records)
+    report = Report(
+        "Fringe correction",
+        f"{passed} of {len(table) + len(refused)} images corrected.",
+    )
+    report.section(
+        "Frames",
+        "Structure beyond the noise in apertures up to 20 arcsec, as a fraction of it; fringes that the errors of "
+        "the scales leave; the uniform background indicator, 1 and a twelfth for white noise; and the probability "
+        "that a good template does so badly.",
+    )
+    if len(table):
+        shown = table.copy()
+        for column in shown.itercols():
+            if column.dtype.kind == "f":
+                column.info.format = ".3g"
+        marks = ["good" if each.proof.passed else "bad" for each in records]
+        report.table(shown, "frames", download=table, marks=marks)
+    report.remarks([(line.partition(": ")[0], line.partition(": ")[2]) for line in refused])
+    order = sorted(range(len(records)), key=lambda item: records[item].proof.probability)
+    bad = [item for item in order if not records[item].proof.passed]
+    chosen = (bad + [item for item in order if item not in bad])[: max(MOST_PICTURES, len(bad))]
+    if chosen:
+        report.section("Pictures", "Frames without background and objects, before and after.")
+    for item in chosen:
+        each = records[item]
+        verdict = "corrected" if each.proof.passed else f"refused: {each.proof.worst}"
+        report.figure(frame_figure(each), f"{each.name}: {verdict}.")
+    return report.write(path)
+
+
+def frame_figure(record: FrameRecord) -> Figure:
+    """A frame less background and objects before its correction, what was subtracted, and what is left."""
+    limits = finite_range(record.pictures[0], 1.0, symmetric=True)
+    with figure(13.0, 3.9) as made:
+        for axes, image, title in zip(
+            made.subplots(1, 3), record.pictures, ("before", "subtracted", "after"), strict=True
+        ):
+            show_image(axes, image, label="counts", title=title, diverging=True, limits=limits)
+    return made
+
+
+def _templates_figure(product: FringeTemplates) -> Figure:
+    count = len(product.patterns)
+    with figure(4.4 * (count + 1), 3.9) as made:
+        panels = np.ravel(made.subplots(1, count + 1))
+        for number, axes in enumerate(panels[:count]):
+            show_image(
+                axes,
+                PERCENT * product.patterns[number],
+                mask=product.mask,
+                label="percent of the sky",
+                title=f"template {number}",
+                diverging=True,
+            )
+        show_image(panels[count], product.coverage, label="frames", title="coverage")
+    return made

@@ -1,0 +1,143 @@
+"""Fringe correction: after flat-fielding, before background subtraction."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from lsst.pex.config import Field
+from lsst.pipe.base import (
+    InputQuantizedConnection,
+    OutputQuantizedConnection,
+    PipelineTask,
+    PipelineTaskConfig,
+    PipelineTaskConnections,
+    QuantumContext,
+    Struct,
+)
+from lsst.pipe.base.connectionTypes import Input, Output, PrerequisiteInput
+
+from ..algorithms.fringe_correction import CorrectionOptions
+from ..algorithms.observed_frames import correct_frame, summary_table
+from ..errors import InputError
+from ..products import FringeTemplates, ObservedFrame
+from .observed_fringe import BackgroundConfig
+from .quantum import common_header, data_id_of, sensor_of, unusable
+
+__all__ = ["FringeCorrectionConfig", "FringeCorrectionConnections", "FringeCorrectionTask"]
+
+
+class FringeCorrectionConnections(PipelineTaskConnections, dimensions=("instrument", "exposure", "detector")):
+    """A frame and templates in, the corrected frame and its row of the table out."""
+
+    config: FringeCorrectionConfig
+
+    frame = Input(
+        doc="Frame after the removal of the instrument's signature, with its fringes.",
+        name="post_isr_image",
+        storageClass="ObservedFrame",
+        dimensions=("instrument", "exposure", "detector"),
+    )
+    templates = Input(
+        doc="Fringe templates of the sensor in the filter of the frame.",
+        name="fringeTemplates",
+        storageClass="FringeTemplates",
+        dimensions=("instrument", "physical_filter", "detector"),
+        isCalibration=True,
+    )
+    corrected = Output(
+        doc="The frame without fringes.",
+        name="fringeCorrected",
+        storageClass="ObservedFrame",
+        dimensions=("instrument", "exposure", "detector"),
+    )
+    summary = Output(
+        doc="Scales, structure before and after, and whether the templates may be trusted; one row.",
+        name="fringeCorrectionSummary",
+        storageClass="AstropyTable",
+        dimensions=("instrument", "exposure", "detector"),
+    )
+
+    def __init__(self, *, config: FringeCorrectionConfig | None = None) -> None:
+        if config is not None and config.certified_templates:
+            fields = ("doc", "name", "storageClass", "dimensions", "isCalibration")
+            same = {name: getattr(self.templates, name) for name in fields}
+            self.templates = PrerequisiteInput(**same)
+
+
+class FringeCorrectionConfig(
+    BackgroundConfig, PipelineTaskConfig, pipelineConnections=FringeCorrectionConnections
+):
+    """Configuration of `FringeCorrectionTask`."""
+
+    certified_templates: Field[bool] = Field(
+        dtype=bool,
+        default=False,
+        doc="Whether the templates come from a calibration collection, by the time of the exposure; otherwise from "
+        "the run in which they are made.",
+    )
+    pixel_arcsec: Field[float] = Field(
+        dtype=float,
+        default=0.2,
+        doc="Size of a pixel [arcsec]: fringes are judged on scales up to 20 arcsec.",
+        check=lambda value: value > 0.0,
+    )
+
+
+class FringeCorrectionTask(PipelineTask):
+    """Subtract fringe templates from a frame; refuse those that add structure."""
+
+    ConfigClass = FringeCorrectionConfig
+    config: FringeCorrectionConfig
+    _DefaultName = "fringeCorrection"
+
+    def runQuantum(
+        self,
+        butlerQC: QuantumContext,
+        inputRefs: InputQuantizedConnection,
+        outputRefs: OutputQuantizedConnection,
+    ) -> None:
+        """Read, correct, store."""
+        data_id = data_id_of(butlerQC)
+        name = f"{sensor_of(data_id).name}, exposure {data_id['exposure']}"
+        with unusable(name):
+            result = self.run(butlerQC.get(inputRefs.frame), butlerQC.get(inputRefs.templates), name)
+        butlerQC.put(result, outputRefs)
+
+    def run(self, frame: ObservedFrame, templates: FringeTemplates, name: str = "") -> Struct:
+        """Correct one frame.
+
+        Parameters
+        ----------
+        frame : `ObservedFrame`
+            Frame with its fringes.
+        templates : `FringeTemplates`
+            Templates of its sensor.
+        name : `str`, optional
+            Name of the frame in the table.
+
+        Returns
+        -------
+        result : `~lsst.pipe.base.Struct`
+            ``corrected``, an `ObservedFrame`, and ``summary``, an `astropy.table.Table` with one row.
+
+        Raises
+        ------
+        InputError
+            A frame that was corrected already, or to which the templates add structure.
+        UndeterminedError
+            Its pixels do not decide the scales.
+        """
+        options = CorrectionOptions(self.config.background_px, self.config.grid)
+        made = correct_frame(frame, templates.frames(), options, pixel_arcsec=self.config.pixel_arcsec)
+        if not made.proof.passed:
+            allowed = f"what a good template gives (worst: {made.proof.worst})"
+            raise InputError("probability of the correction", made.proof.probability, allowed)
+        self.log.info(
+            "%s: structure beyond the noise %.2f before, %.2f after",
+            *(name, made.proof.structure_before, made.proof.structure_after),
+        )
+        metadata = {**made.frame.metadata, **common_header(self.config)}
+        return Struct(
+            corrected=dataclasses.replace(made.frame, metadata=metadata),
+            summary=summary_table([made.record(name)]),
+        )

@@ -1,0 +1,155 @@
+"""From the observed frames of a sensor to the templates that remove their fringes."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from lsst.pex.config import Config, Field
+from lsst.pipe.base import (
+    InputQuantizedConnection,
+    NoWorkFound,
+    OutputQuantizedConnection,
+    PipelineTask,
+    PipelineTaskConfig,
+    PipelineTaskConnections,
+    QuantumContext,
+    Struct,
+)
+from lsst.pipe.base.connectionTypes import Input, Output
+
+from ..algorithms.correction import AmplifierGrid
+from ..algorithms.correction.empirical import TemplateOptions
+from ..algorithms.observed_frames import make_templates
+from ..products import ObservedFrame
+from .quantum import common_header, data_id_of, run_datetime, sensor_of, unusable
+
+__all__ = ["BackgroundConfig", "ObservedFringeConfig", "ObservedFringeConnections", "ObservedFringeTask"]
+
+LEAST_FRAMES = 3
+
+
+class ObservedFringeConnections(
+    PipelineTaskConnections, dimensions=("instrument", "physical_filter", "detector")
+):
+    """The frames of a sensor in a filter in, its templates out."""
+
+    frames = Input(
+        doc="Frames after the removal of the instrument's signature, with their fringes.",
+        name="post_isr_image",
+        storageClass="ObservedFrame",
+        dimensions=("instrument", "exposure", "detector"),
+        multiple=True,
+        deferLoad=True,
+    )
+    templates = Output(
+        doc="Fringe templates with variance and coverage.",
+        name="fringeTemplates",
+        storageClass="FringeTemplates",
+        dimensions=("instrument", "physical_filter", "detector"),
+        isCalibration=True,
+    )
+
+    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
+        """Put the frames in the order of time; two have no template."""
+        connection, refs = inputs["frames"]
+        if len(refs) < LEAST_FRAMES:
+            raise NoWorkFound(label, "frames", connection)
+        ordered = sorted(refs, key=lambda ref: ref.dataId["exposure"])
+        inputs["frames"] = (connection, ordered)
+        super().adjustQuantum(inputs, outputs, label, data_id)
+        return {"frames": (connection, ordered)}, {}
+
+
+class BackgroundConfig(Config):
+    """What is fitted beside the fringes."""
+
+    background_px: Field[float] = Field(
+        dtype=float,
+        default=256.0,
+        doc="Distance between the knots of the smooth background [px].",
+        check=lambda value: value >= 8.0,
+    )
+    amplifier_columns: Field[int] = Field(
+        dtype=int, default=1, doc="Amplifiers beside each other.", check=lambda n: n > 0
+    )
+    amplifier_rows: Field[int] = Field(
+        dtype=int, default=1, doc="Amplifiers on top of each other.", check=lambda n: n > 0
+    )
+
+    @property
+    def grid(self) -> AmplifierGrid:
+        """Amplifiers with levels of their own."""
+        return AmplifierGrid(self.amplifier_rows, self.amplifier_columns)
+
+
+class ObservedFringeConfig(
+    BackgroundConfig, PipelineTaskConfig, pipelineConnections=ObservedFringeConnections
+):
+    """Configuration of `ObservedFringeTask`."""
+
+    components: Field[int] = Field(
+        dtype=int, optional=True, doc="Number of templates; by default as many as predict other frames."
+    )
+    least_frames: Field[int] = Field(dtype=int, default=LEAST_FRAMES, doc="Frames that must see a pixel.")
+
+
+class ObservedFringeTask(PipelineTask):
+    """Find the fringes that the frames of a sensor share."""
+
+    ConfigClass = ObservedFringeConfig
+    config: ObservedFringeConfig
+    _DefaultName = "observedFringe"
+
+    def runQuantum(
+        self,
+        butlerQC: QuantumContext,
+        inputRefs: InputQuantizedConnection,
+        outputRefs: OutputQuantizedConnection,
+    ) -> None:
+        """Read the frames one by one, decompose, store."""
+        data_id = data_id_of(butlerQC)
+        detector = sensor_of(data_id)
+        loaders = [butlerQC.get(ref).get for ref in inputRefs.frames]
+        last = max(ref.dataId.records["exposure"].timespan.end for ref in inputRefs.frames)
+        moment: datetime.datetime = last.utc.to_datetime()
+        created = run_datetime(outputRefs.templates.run, moment)
+        with unusable(f"{detector.name}, {data_id['physical_filter']}"):
+            result = self.run(loaders, created)
+        butlerQC.put(result, outputRefs)
+
+    def run(self, frames: Sequence[Callable[[], ObservedFrame]], creation_datetime: str) -> Struct:
+        """Make the templates of one sensor in one filter.
+
+        Parameters
+        ----------
+        frames : sequence of callables
+            Each returns a frame; they are asked several times, one at a time.
+        creation_datetime : `str`
+            When the calibration is made, ``YYYY-MM-DDThh:mm:ss``.
+
+        Returns
+        -------
+        result : `~lsst.pipe.base.Struct`
+            ``templates``, a `FringeTemplates`.
+
+        Raises
+        ------
+        InputError
+            Too few frames, or frames that do not belong together.
+        UndeterminedError
+            The frames do not decide a template.
+        """
+        options = TemplateOptions(
+            self.config.components,
+            least_frames=self.config.least_frames,
+            spacing_px=self.config.background_px,
+            amplifiers=self.config.grid,
+        )
+        made = make_templates(frames, creation_datetime, options, metadata=common_header(self.config))
+        self.log.info(
+            "%s in %s: %d templates from %d frames",
+            *(made.detector, made.physical_filter, len(made.patterns), len(frames)),
+        )
+        return Struct(templates=made)

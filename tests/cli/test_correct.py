@@ -1,0 +1,140 @@
+"""``fringe-sim templates`` and ``fringe-sim correct`` on files of a small night."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from observed_night import observed_night
+
+from lsst.fringe_sim.cli.main import run
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("night")
+    frames = observed_night(np.random.default_rng(44), 4, side=72, stars=4)
+    for number, image in enumerate(frames.images):
+        hdu = fits.PrimaryHDU(image)
+        hdu.header.update({"DETNAME": "S11", "FILTER": "y", "CRVAL1": 3.5, "DATE-OBS": "2026-01-02T03:04:05"})
+        hdu.writeto(folder / f"visit_{number}.fits")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(night: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("made") / "templates"
+    assert run(["templates", str(night), "--amplifiers", "2x1", "--components", "1", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def corrected(night: Path, made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("made") / "corrected"
+    words = ["correct", str(night), "--templates", str(made), "--amplifiers", "2x1", "--out", str(out)]
+    assert run(words) == 0
+    return out
+
+
+def test_templates_and_report_are_written(made: Path) -> None:
+    assert {file.name for file in made.iterdir()} == {"templates_S11.fits", "report.html"}
+    header = fits.getheader(made / "templates_S11.fits")
+    assert header["CALIB_CREATION_DATETIME"] == "2026-01-02T03:04:05"
+    assert header["NFRAMES"] == 4
+
+
+def test_one_row_per_frame_and_one_page(corrected: Path) -> None:
+    table = Table.read(corrected / "frames.ecsv")
+    assert len(table) == 4
+    assert all(table["passed"])
+    assert (table["structure_after"] < 0.5 * table["structure_before"]).all()
+    assert "visit_3" in (corrected / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_header_says_what_was_done_and_keeps_what_it_said(corrected: Path) -> None:
+    header = fits.getheader(corrected / "visit_2_corrected.fits")
+    assert header["FRINGCOR"] == 1
+    assert header["FRINGSC0"] == pytest.approx(2000.0, rel=0.6)
+    assert header["FRINGSE0"] > 0.0
+    assert (header["CRVAL1"], header["DATE-OBS"]) == (3.5, "2026-01-02T03:04:05")
+
+
+def test_a_second_correction_is_refused(
+    corrected: Path, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["correct", str(corrected), "--templates", str(made), "--out", str(tmp_path / "again")]) == 1
+    assert "FRINGCOR is 1" in capsys.readouterr().err
+    assert run(["templates", str(corrected), "--out", str(tmp_path / "more")]) == 1
+
+
+def test_undo_restores_the_frames(night: Path, corrected: Path, made: Path, tmp_path: Path) -> None:
+    words = ["correct", str(corrected), "--templates", str(made), "--undo", "--out", str(tmp_path)]
+    assert run(words) == 0
+    before, (after, header) = (
+        fits.getdata(night / "visit_1.fits"),
+        fits.getdata(tmp_path / "visit_1_restored.fits", header=True),
+    )
+    np.testing.assert_allclose(after, before, rtol=3e-7)
+    assert not [card for card in header if card.startswith("FRINGS") or card == "FRINGCOR"]
+    assert header["CRVAL1"] == 3.5
+    assert (
+        run(["correct", str(night), "--templates", str(made), "--undo", "--out", str(tmp_path / "no")]) == 1
+    )
+
+
+def test_a_template_of_another_sensor_is_refused(
+    night: Path, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = fits.getdata(night / "visit_0.fits")
+    fits.PrimaryHDU(image, fits.Header({"DETNAME": "S12"})).writeto(tmp_path / "other.fits")
+    words = [
+        "correct",
+        str(tmp_path / "other.fits"),
+        "--templates",
+        str(made),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert run(words) == 1
+    assert "one with templates: S11" in capsys.readouterr().err
+
+
+def test_a_frame_to_which_templates_add_structure_is_not_written(
+    night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from lsst.fringe_sim.products import FringeFrame
+
+    rng = np.random.default_rng(7)
+    image = fits.getdata(night / "visit_0.fits").astype(float)
+    pattern = (image - image.mean()) / image.mean() + 0.02 * rng.standard_normal(image.shape)
+    pattern = np.clip(pattern, -0.05, 0.05)
+    flat = np.zeros(image.shape)
+    rolled = np.roll(pattern, 1, axis=0) * (rng.random(image.shape) < 0.5)
+    frame = FringeFrame(
+        rolled - rolled.mean(), flat.astype(int), flat, "y", "2026-01-01T00:00:00", detector="S11"
+    )
+    (tmp_path / "model").mkdir()
+    frame.write_fits(tmp_path / "model" / "fringe_0.fits")
+    out = tmp_path / "out"
+    words = [
+        "correct",
+        str(night / "visit_0.fits"),
+        "--templates",
+        str(tmp_path / "model"),
+        "--out",
+        str(out),
+    ]
+    assert run(words) == 1
+    assert "add structure" in capsys.readouterr().out
+    assert not list(out.glob("*.fits"))
+    assert "refused" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_dry_run_writes_nothing(night: Path, made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert run(["templates", str(night), "--out", str(out), "--dry-run"]) == 0
+    assert run(["correct", str(night), "--templates", str(made), "--out", str(out), "--dry-run"]) == 0
+    assert not out.exists()

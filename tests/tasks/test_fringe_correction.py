@@ -1,0 +1,112 @@
+"""The tasks that make templates of observed frames and correct them: alone, and by the real programs."""
+
+from __future__ import annotations
+
+import datetime
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lsst.daf.butler import Butler
+from observed_night import ObservedNight, observed_night
+from task_commands import Command
+
+from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.middleware import MonoCamFringe
+from lsst.fringe_sim.middleware.night import NightPlan, define_night
+from lsst.fringe_sim.products import FringeTemplates, ObservedFrame
+from lsst.fringe_sim.tasks import (
+    FringeCorrectionConfig,
+    FringeCorrectionTask,
+    ObservedFringeConfig,
+    ObservedFringeTask,
+)
+
+NOW = "2026-11-21T03:43:40"
+PIPELINES = "resource://lsst.fringe_sim/pipelines"
+
+
+def frame_of(image: np.ndarray) -> ObservedFrame:
+    return ObservedFrame(image, np.zeros(image.shape, dtype=np.int32), unit="electron", detector="S11")
+
+
+@pytest.fixture(scope="module")
+def night() -> ObservedNight:
+    return observed_night(np.random.default_rng(8), 5, side=72, stars=4)
+
+
+@pytest.fixture(scope="module")
+def templates(night: ObservedNight) -> FringeTemplates:
+    task = ObservedFringeTask(config=ObservedFringeConfig(components=1, amplifier_columns=2))
+    made = task.run([partial(frame_of, image) for image in night.images[:4]], NOW)
+    product: FringeTemplates = made.templates
+    return product
+
+
+def test_templates_say_what_they_are_made_of(templates: FringeTemplates) -> None:
+    assert templates.detector == "S11"
+    assert templates.creation_datetime == NOW
+    assert templates.metadata["NFRAMES"] == 4
+    assert "CFGHASH" in templates.metadata
+
+
+def test_a_frame_is_corrected_once(night: ObservedNight, templates: FringeTemplates) -> None:
+    task = FringeCorrectionTask(config=FringeCorrectionConfig(amplifier_columns=2))
+    made = task.run(frame_of(night.images[4]), templates, "frame 4")
+    assert list(made.summary["name"]) == ["frame 4"]
+    assert made.summary["structure_after"][0] < 0.6 * made.summary["structure_before"][0]
+    assert made.corrected.metadata["FRINGCOR"] == 1
+    with pytest.raises(InputError, match="FRINGCOR"):
+        task.run(made.corrected, templates)
+
+
+@pytest.mark.middleware
+@pytest.mark.slow
+def test_a_simulated_night_through_the_pipelines(command: Command, empty_repo: Path, tmp_path: Path) -> None:
+    """Frames with noise from one pipeline, templates and corrected frames from the other."""
+    repo = Path(shutil.copytree(empty_repo, tmp_path / "repo"))
+    with Butler.from_config(str(repo), writeable=True) as butler:
+        MonoCamFringe().register(butler.registry)
+        hours = (19.0, 20.0, 21.0, 22.0, 23.0)
+        define_night(butler, "MonoCam", [NightPlan(datetime.date(2026, 1, 15), hours)])
+    common = (
+        "pipetask",
+        "run",
+        "-b",
+        repo,
+        "--register-dataset-types",
+        "-j",
+        "1",
+        "-d",
+        "instrument = 'MonoCam'",
+    )
+    done = command(
+        *(
+            *common,
+            "-i",
+            "MonoCam/raw/all",
+            "-o",
+            "u/sky",
+            "-p",
+            f"{PIPELINES}/monocam/skyFringe.yaml#skyFringeSim",
+        ),
+        *("-c", "skyFringeSim:stand_in_shape=[160, 120]", "-c", "skyFringeSim:noise=True"),
+    )
+    assert done.code == 0, done.text
+    done = command(
+        *(*common, "-i", "u/sky", "-o", "u/clean", "-p", f"{PIPELINES}/monocam/fringeCorrection.yaml"),
+        *("-c", "observedFringe:connections.frames=skyFringe", "-c", "observedFringe:components=1"),
+        *("-c", "fringeCorrection:connections.frame=skyFringe"),
+    )
+    assert done.code == 0, done.text
+    with Butler.from_config(str(repo), collections=["u/clean"], instrument="MonoCam") as butler:
+        rows = [butler.get(ref) for ref in butler.query_datasets("fringeCorrectionSummary")]
+        frames = [butler.get(ref) for ref in butler.query_datasets("fringeCorrected")]
+    assert len(rows) == len(frames) == 5
+    assert all(frame.metadata["FRINGCOR"] == 1 for frame in frames)
+    before, after = (np.array([row[f"structure_{when}"][0] for row in rows]) for when in ("before", "after"))
+    # So few pixels of so smooth a stand-in hold little of a fringe that no background takes.
+    assert after.mean() < before.mean()
+    assert (after < before + 0.05).all()
