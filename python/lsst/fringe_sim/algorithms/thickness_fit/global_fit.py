@@ -257,14 +257,14 @@ class _Solver:
             if described is not None:
                 return described
         nuisance = first_nuisances(cells, templates, self.free)
+        fitted = nuisance.applied_to(templates)
         for turn in range(_MOST_SOLUTIONS):
-            fitted = nuisance.applied_to(templates)
             even = subtract_offset(cells, nuisance.light(cells, self.free))
             state = self._state(even, fitted, nuisance, "sensor", self.range_um)
             before, state = state, self._learn(state, ranked=turn == 0)
             if _agree(before, state):
                 break
-            nuisance = state.nuisance
+            fitted, nuisance = state.templates, state.nuisance
         return state
 
     def _described(self, cells: Cells, templates: FringeTemplates) -> _State | None:

@@ -21,7 +21,7 @@ from .amplitudes import Amplitudes
 from .borders import gather_pixels
 from .cells import Cells, effective_number
 from .evidence import refine_row
-from .nuisances import NuisanceFit, Nuisances, light_patterns, patterns_of_cells
+from .nuisances import OVERTONES, NuisanceFit, Nuisances, light_patterns, patterns_of_cells
 from .pixels import CellSurface
 from .templates import FringeTemplates
 
@@ -57,8 +57,9 @@ _CONTRAST_BY_WAVELENGTH = 0.3
 """Standard deviation of the logarithm of the contrast of one wavelength about the mean of all."""
 _FADING = 0.1
 """Standard deviation of the logarithmic loss of contrast per thickness [1/µm]."""
-_OVERTONES = 0.5
-"""Standard deviation of the factor on the overtones about 1."""
+_OVERTONE, _OVERTONE_BY_WAVELENGTH = 0.5, 0.2
+"""Standard deviations of what is added of the overtones of the model: what wavelengths share, and what each has
+besides."""
 _LEAST_SHIFT_NM = 0.02
 """Least standard deviation of the wavelengths: that of a calibrated monochromator."""
 _TEMPLATE_MARGIN_UM = 0.5
@@ -284,7 +285,7 @@ def learn(
     fit : `NuisanceFit`
     """
     if overtones is None and free.contrast == "wavelength":
-        overtones = base.even_overtones()
+        overtones = base.overtones()
     problem = _Problem.of(cells, base, free, overtones)
     fit, thickness = replace(start, middle_um=float(np.median(cells.thickness_um))), cells.thickness_um
     for _ in range(rounds):
@@ -317,14 +318,14 @@ class _Problem:
     @property
     def shared(self) -> int:
         """Number of parameters that all wavelengths share."""
-        return {"fixed": 0, "common": 1, "wavelength": 2}[self.free.contrast]
+        return 0 if self.free.contrast == "fixed" else 1
 
     @property
     def own(self) -> int:
         """Number of parameters of each wavelength: light, contrast, wavelength."""
         return (
             self.cells.pattern.shape[1]
-            + (self.free.contrast == "wavelength")
+            + (1 + OVERTONES) * (self.free.contrast == "wavelength")
             + (self.free.wavelength_accuracy_nm > 0.0)
         )
 
@@ -333,9 +334,9 @@ class _Problem:
     ) -> tuple[NDArray[np.float32], FloatArray, FloatArray, FloatArray]:
         """Refined thickness, model amplitude, its slope, and what is left of the cells."""
         wavelengths = self.base.n_wavelengths
-        even = self.overtones if len(self.overtones) else None
+        waves = self.overtones if len(self.overtones) else None
         fitted = self.base.as_found(
-            fit.contrast, fit.shift_nm, fit.fading, fit.overtones, fit.middle_um, even
+            fit.contrast, fit.shift_nm, fit.fading, fit.overtones, fit.middle_um, waves
         ).normalised_to(thickness)
         table = fitted.table()
         value = self.cells.value.copy()
@@ -410,22 +411,25 @@ class _Problem:
     ) -> tuple[FloatArray, FloatArray]:
         """What each parameter changes in each cell: of each wavelength by itself, and of those that share it."""
         count = self.cells.pattern.shape[1]
+        far = thickness.astype(float)
         each = np.empty((*model.shape, self.own))
         each[..., :count] = (1.0 + model)[..., None] * self.cells.pattern[:, None, :]
         if self.free.contrast == "wavelength":
             each[..., count] = model
-            count += 1
-        far = thickness.astype(float)
+            seen = far[:, None] + self.base.turn_um(far[:, None]) * fit.shift_nm
+            place = np.rint((seen - self.base.start_um) / self.base.step_um).astype(int)
+            place = np.clip(place, 0, len(self.overtones) - 1)
+            wave = self.overtones[place, np.arange(self.base.n_wavelengths)]
+            scale = fit.contrast / self.base.mean_response
+            each[..., count + 1 : count + 1 + OVERTONES] = scale[:, None] * wave
+            count += 1 + OVERTONES
         if self.free.wavelength_accuracy_nm > 0.0:
-            each[..., count] = -slope * far[:, None] * self.base.group / self.base.wavelength_nm
+            each[..., count] = slope * self.base.turn_um(far[:, None])
         common = np.empty((*model.shape, self.shared))
         if self.free.contrast == "common":
             common[..., 0] = model
         elif self.free.contrast == "wavelength":
             common[..., 0] = -model * (far - fit.middle_um)[:, None]
-            place = np.clip(np.rint((far - self.base.start_um) / self.base.step_um).astype(int), 0, None)
-            place = np.minimum(place, len(self.overtones) - 1)
-            common[..., 1] = fit.contrast * self.overtones[place] / self.base.mean_response
         return each, common
 
     def _prior(self, fit: NuisanceFit) -> tuple[FloatArray, FloatArray]:
@@ -446,7 +450,12 @@ class _Problem:
             spread = np.eye(wavelengths) - 1.0 / wavelengths
             precision[:, count, :, count] = spread / _CONTRAST_BY_WAVELENGTH**2
             precision[bands, count, bands, count] += _FREE
-            count += 1
+            together = np.full((wavelengths, wavelengths), _OVERTONE**2)
+            tied = np.linalg.inv(together + _OVERTONE_BY_WAVELENGTH**2 * np.eye(wavelengths))
+            for k in range(OVERTONES):
+                where[:, count + 1 + k] = fit.overtones[:, k]
+                precision[:, count + 1 + k, :, count + 1 + k] = tied
+            count += 1 + OVERTONES
         if self.free.wavelength_accuracy_nm > 0.0:
             where[:, count] = fit.shift_nm
             precision[bands, count, bands, count] = _shift_precision(fit, self.free.wavelength_accuracy_nm)
@@ -457,8 +466,7 @@ class _Problem:
         if self.free.contrast == "common":
             whole[size, size] = _FREE
         elif self.free.contrast == "wavelength":
-            whole[size, size], whole[size + 1, size + 1] = _FADING**-2.0, _OVERTONES**-2.0
-            stands[size:] = fit.fading, fit.overtones - 1.0
+            whole[size, size], stands[size] = _FADING**-2.0, fit.fading
         return whole, stands
 
     def _moved(self, fit: NuisanceFit, moved: FloatArray) -> tuple[NuisanceFit, float]:
@@ -473,9 +481,9 @@ class _Problem:
             # A contrast cannot turn negative: that would be half an order.
             contrast = contrast * np.exp(np.clip(table[:, count], -0.7, 0.7))
             change = max(change, 0.1 * float(np.abs(table[:, count]).max()))
-            count += 1
             fading = float(np.clip(fading + np.clip(rest[0], -0.1, 0.1), -0.5, 0.5))
-            overtones = float(np.clip(overtones + np.clip(rest[1], -0.3, 0.3), 0.0, 2.0))
+            overtones = overtones + np.clip(table[:, count + 1 : count + 1 + OVERTONES], -0.3, 0.3)
+            count += 1 + OVERTONES
         elif self.free.contrast == "common":
             contrast = contrast * np.exp(np.clip(rest[0], -0.7, 0.7))
             change = max(change, 0.1 * float(np.abs(rest[0])))
@@ -507,7 +515,7 @@ class _Problem:
         contrast_sigma, shift_sigma, scale = np.zeros(wavelengths), np.zeros(wavelengths), 0.0
         if self.free.contrast == "wavelength":
             contrast_sigma = fit.contrast * table[:, count]
-            count += 1
+            count += 1 + OVERTONES
         elif self.free.contrast == "common":
             contrast_sigma = fit.contrast * diagonal[wavelengths * own]
         if self.free.wavelength_accuracy_nm > 0.0:
@@ -582,10 +590,9 @@ class CommonOrder:
     slip: float
 
 
-_NEAR_ORDERS = (-1.0, 1.0, -2.0, 2.0)
 _MOST_ORDERS = 8
 _CLEAR = 100.0
-"""Chi-square difference beyond which farther orders need not be asked."""
+"""Chi-square difference beyond which the orders behind one need not be asked."""
 
 
 def rank_orders(
@@ -613,7 +620,7 @@ def rank_orders(
     range_um : `tuple` [`float`, `float`]
         Thicknesses that are possible [µm].
     """
-    overtones = base.even_overtones() if free.contrast == "wavelength" else None
+    overtones = base.overtones() if free.contrast == "wavelength" else None
     thickness, here = learn(cells, base, free, start, overtones=overtones)
     cells = replace(cells, thickness_um=thickness)
 
@@ -624,16 +631,16 @@ def rank_orders(
             return replace(here, penalty=np.inf)
         return learn(moved, base, free, guess, _ROUNDS_ELSEWHERE, overtones)[1]
 
-    tried = {0.0: here} | {shift: at(shift) for shift in _NEAR_ORDERS}
-    for away in range(3, _MOST_ORDERS + 1):
-        best = min(tried, key=lambda shift: tried[shift].penalty)
-        if abs(best) < away - 2 and all(
-            tried[shift].penalty > tried[best].penalty + _CLEAR * _doubt(tried[best])
-            for shift in tried
-            if shift != best
-        ):
-            break
-        for shift in (-float(away), float(away)):
+    tried = {0.0: here} | {shift: at(shift) for shift in (-1.0, 1.0)}
+
+    def clear(shift: float) -> bool:
+        best = min(fit.penalty for fit in tried.values())
+        return tried[shift].penalty > best + _CLEAR
+
+    for side in (-1.0, 1.0):
+        shift = side
+        while abs(shift) < _MOST_ORDERS and not clear(shift):
+            shift += side
             tried[shift] = at(shift)
     best = min(tried, key=lambda shift: tried[shift].penalty)
     doubt = _doubt(tried[best])
@@ -662,8 +669,8 @@ def _guess_at_order(
     if free.wavelength_accuracy_nm == 0.0:
         return moved, start
     wavelength = base.wavelength_nm
-    away = move_um * (1.0 - wavelength / wavelength.mean()) * wavelength
-    shift = start.shift_nm + away / (float(np.median(moved.thickness_um)) * base.group)
+    away = move_um * (1.0 - wavelength / wavelength.mean())
+    shift = start.shift_nm - away / base.turn_um(float(np.median(moved.thickness_um)))
     return moved, replace(start, shift_nm=shift)
 
 

@@ -33,6 +33,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
+OVERTONES = 4
+"""Numbers that describe the overtones at one wavelength."""
 GAIN_ACCURACY = 0.005
 """How well gains of amplifiers are known: a few 1e-3 from iron-55, or from the variance of pairs of flats."""
 
@@ -132,8 +134,8 @@ class NuisanceFit:
         Wavelength of each flat minus that of its label [nm].
     fading : `float`
         Logarithmic loss of contrast per thickness [1/µm].
-    overtones : `float`
-        Factor on the overtones of the fringe beside its fundamental.
+    overtones : `numpy.ndarray`, shape ``(n_wavelengths, 4)``
+        What is added of the overtones of the model, as factors on `FringeTemplates.overtones`.
     middle_um : `float`
         Thickness at which ``contrast`` holds [µm].
     scale_sigma : `float`
@@ -150,7 +152,7 @@ class NuisanceFit:
     shift_nm: FloatArray
     shift_sigma_nm: FloatArray
     fading: float = 0.0
-    overtones: float = 1.0
+    overtones: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     middle_um: float = 0.0
     scale_sigma: float = 0.0
     misfit: FloatArray = field(default_factory=lambda: np.ones(0))
@@ -161,7 +163,10 @@ class NuisanceFit:
     def none(cls, wavelengths: int, patterns: int = 0) -> NuisanceFit:
         """Even light, the contrast of the model, wavelengths as labelled."""
         zero = np.zeros(wavelengths)
-        return cls(np.zeros((wavelengths, patterns)), np.ones(wavelengths), zero, zero, zero)
+        return cls(
+            np.zeros((wavelengths, patterns)), np.ones(wavelengths), zero, zero, zero,
+            overtones=np.zeros((wavelengths, OVERTONES)),
+        )  # fmt: skip
 
     def light(self, cells: Cells, free: Nuisances) -> NDArray[np.float32]:
         """Light on all cells, less one, shape ``(n_wavelengths, ncy, ncx)``; no wavelengths if it is even."""
