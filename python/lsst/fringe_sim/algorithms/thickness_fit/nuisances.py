@@ -142,8 +142,14 @@ class NuisanceFit:
         Standard uncertainty of the scale of the thickness, which all pixels share.
     misfit : `numpy.ndarray`, shape ``(n_wavelengths,)``
         Mean squared residual of the cells over their variance, at each wavelength.
-    penalty : `float`
+    mean_response : `numpy.ndarray`, shape ``(n_wavelengths,)``
+        Mean response over the sensor to which level and contrast belong; empty if it is not known.
+    chi2, prior : `float`
         Chi-square of the cells looked at, and of what the prior says of the nuisances.
+    excess : `float`
+        Part of the chi-square per degree of freedom that is significantly more than noise.
+    cells : `int`
+        Number of cells looked at.
     """
 
     coefficients: FloatArray
@@ -156,7 +162,10 @@ class NuisanceFit:
     middle_um: float = 0.0
     scale_sigma: float = 0.0
     misfit: FloatArray = field(default_factory=lambda: np.ones(0))
-    penalty: float = np.inf
+    mean_response: FloatArray = field(default_factory=lambda: np.empty(0))
+    chi2: float = np.inf
+    prior: float = 0.0
+    excess: float = 0.0
     cells: int = 0
 
     @classmethod
@@ -183,7 +192,8 @@ class NuisanceFit:
 
     def applied_to(self, base: FringeTemplates) -> FringeTemplates:
         """Templates of a sensor with this contrast and these wavelengths."""
-        return base.as_found(self.contrast, self.shift_nm, self.fading, self.overtones, self.middle_um)
+        found = base.as_found(self.contrast, self.shift_nm, self.fading, self.overtones, self.middle_um)
+        return replace(found, mean_response=self.mean_response) if self.mean_response.size else found
 
 
 def subtract_offset(cells: Cells, light: NDArray[np.float32]) -> Cells:
