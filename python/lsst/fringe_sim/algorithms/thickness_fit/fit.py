@@ -37,6 +37,9 @@ STEPS_PER_ORDER = 300
 """Template thicknesses in one fringe order: 1 nm of epoxy; linear interpolation is then good to 3e-5 of the swing."""
 FEWEST_WAVELENGTHS = 4
 """With fewer wavelengths than this a pixel is flagged: phase, order and fit quality cannot all be told."""
+_TURNING_NM = 0.1
+"""Step of the derivative in wavelength: a fringe of the thickest layer then turns by less than 0.1 rad."""
+_TURNING_STRIDE = 10
 _ROWS = 64
 """Rows that are flagged at a time by one thread."""
 
@@ -239,11 +242,41 @@ def make_templates(
     start = max(low - order, step)
     count = int(np.ceil((high + order - start) / step)) + 1
     response = model.response_on_grid(wavelength_nm, start, step, count)
-    beside = system.stack.indices(wavelength_nm + 1.0, system.temperature_k)[
-        system.stack.position(system.varying)
-    ]
-    group = 1.0 - wavelength_nm * (beside.real - index.real) / index.real
-    return FringeTemplates(np.ascontiguousarray(response.T), start, step, wavelength_nm, group=group)
+    response = np.ascontiguousarray(response.T)
+    near = system.stack.indices(wavelength_nm + 1.0, system.temperature_k)[system.stack.position(system.varying)]
+    group = 1.0 - wavelength_nm * (near.real - index.real) / index.real
+    beside = _turn_beside(model, wavelength_nm, response, group, (start, step))
+    return FringeTemplates(response, start, step, wavelength_nm, group=group, beside_um=beside)
+
+
+def _turn_beside(
+    model: FringeModel,
+    wavelength_nm: NDArray[np.float64],
+    response: NDArray[np.float64],
+    group: NDArray[np.float64],
+    grid_um: tuple[float, float],
+) -> NDArray[np.float64]:
+    """What the thin layers beside the varying one add to how its fringe turns, as `FringeTemplates` takes it.
+
+    The derivative of the response in wavelength is that in thickness times a straight line in thickness, whose slope is
+    the group index, and a change of level and swing.
+    """
+    start, step = grid_um
+    sparse = slice(1, len(response) - 1, _TURNING_STRIDE)
+    count = len(range(*sparse.indices(len(response))))
+    ahead, behind = (
+        model.response_on_grid(wavelength_nm + side, start + step, step * _TURNING_STRIDE, count)
+        for side in (_TURNING_NM, -_TURNING_NM)
+    )
+    turned = (ahead - behind) / (2.0 * _TURNING_NM)
+    slope = -np.gradient(response, step, axis=0)[sparse].T / wavelength_nm[:, None]
+    thickness = start + step + step * _TURNING_STRIDE * np.arange(count)
+    beside = np.zeros(wavelength_nm.size)
+    for band, level in enumerate(response[sparse].T):
+        rest = turned[band] - slope[band] * thickness * group[band]
+        terms = np.stack([slope[band], level, thickness * level, np.ones(count)], axis=1)
+        beside[band] = np.linalg.lstsq(terms, rest, rcond=None)[0][0]
+    return beside
 
 
 def with_observable(model: FringeModel, observable: str) -> FringeModel:

@@ -29,7 +29,7 @@ from .orders import SURE, solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
 from .relaxation import SettledCells, settle_orders
 from .rescue import rescue_pixels
-from .shared_misfit import doubt_from_shared_misfit
+from .shared_misfit import doubt_from_shared_misfit, leaves_only_noise
 from .templates import FringeTemplates
 
 __all__ = ["GlobalFit", "choose_cell_size", "global_fit", "normalise_to_cells", "spans_orders"]
@@ -50,9 +50,6 @@ _NINTH_DECILE = 1.28
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
-_HOPELESS = 25.0
-"""Reduced chi-square of cells beyond which the model as it is need not be solved: the mean over the range of
-thicknesses in the place of that of the sensor costs a few."""
 _MISFIT = 1.5
 """Reduced chi-square of cells from which on a model is known to be wrong; what it leaves over is shared by many."""
 _MEAN_TOLERANCE = 2e-6
@@ -257,14 +254,14 @@ class _Solver:
             if described is not None:
                 return described
         nuisance = first_nuisances(cells, templates, self.free)
+        fitted = nuisance.applied_to(templates)
         for turn in range(_MOST_SOLUTIONS):
-            fitted = nuisance.applied_to(templates)
             even = subtract_offset(cells, nuisance.light(cells, self.free))
             state = self._state(even, fitted, nuisance, "sensor", self.range_um)
             before, state = state, self._learn(state, ranked=turn == 0)
             if _agree(before, state):
                 break
-            nuisance = state.nuisance
+            fitted, nuisance = state.templates, state.nuisance
         return state
 
     def _described(self, cells: Cells, templates: FringeTemplates) -> _State | None:
@@ -276,41 +273,33 @@ class _Solver:
         nothing = NuisanceFit.none(templates.n_wavelengths)
         probe = held._state(cells, templates, nothing, "range", self.range_um)
         narrow = held._mean_is_open(probe) or not held._is_wide(probe)
-        if not narrow and probe.misfit > _HOPELESS:
-            return None
-        state = held.solve(cells, templates)
-        misfit, scatter = self._misfit_of_pixels(state)
-        if misfit > 1.0 + scatter:
-            return None
         if narrow:
-            return state
+            state = held._solve_held(cells, templates, probe)
+            return state if self._leaves_only_noise(state) else None
+        if not self._leaves_only_noise(held.adjust(replace(probe, normalisation="sensor"))):
+            return None
+        state = held._solve_held(cells, templates, probe)
         count = patterns_of_cells(cells, self.free, *np.zeros((2, 1), np.intp))[0].shape[-1]
         start = NuisanceFit.none(templates.n_wavelengths, count)
         return self._learn(replace(state, free=self.free, nuisance=start, described=True), ranked=False)
 
-    def _misfit_of_pixels(self, state: _State) -> tuple[float, float]:
-        """Median reduced chi-square of single pixels, and three of its standard deviations under noise."""
+    def _leaves_only_noise(self, state: _State) -> bool:
+        """Whether a solution leaves over nothing that neighbouring pixels share."""
         if not np.isfinite(state.thickness_um).any():
-            return np.inf, 0.0
+            return False
         surface = calm_surface(_surface(state, self.order_um), self.threads)
-        begun = _sample_on(self.data, surface, state.templates, self.threads)
-        sample, (_, fitted) = begun[0], normalise_to_cells(*begun)
-        found = order_evidence(
-            sample, fitted, self.order_um, range_um=state.range_um, temper=1.0, threads=self.threads
-        )
-        known = np.isfinite(found.chi2)
-        freedom = np.maximum(sample.n_wavelengths - 1, 1)[known]
-        misfit = float(np.median(found.chi2[known] / freedom)) if known.any() else np.inf
-        return misfit, 3.0 * float(np.sqrt(np.pi / max(freedom.sum(), 1)))
+        fitted = _normalise_to_pixels(self.data, state.templates, surface, self.threads)
+        return leaves_only_noise(self.data, fitted, surface)
 
-    def _solve_held(self, cells: Cells, templates: FringeTemplates) -> _State:
-        """Solve the orders where nothing is free but the mean response."""
+    def _solve_held(self, cells: Cells, templates: FringeTemplates, probe: _State | None = None) -> _State:
+        """Solve the orders where nothing is free but the mean response; ``probe`` is the first solution if known."""
         nuisance = NuisanceFit.none(templates.n_wavelengths)
         nuisance = replace(nuisance, contrast=templates.contrast)
         fitted, normalisation = templates, "range"
         searched, slip = False, 0.0
         for _ in range(_MOST_SOLUTIONS):
-            state = self._state(cells, fitted, nuisance, normalisation, self.range_um)
+            state = probe or self._state(cells, fitted, nuisance, normalisation, self.range_um)
+            probe = None
             if normalisation == "range" and self._mean_is_open(state):
                 state = self._narrow(cells, state)
                 searched, slip = state.searched, state.common_slip
@@ -449,7 +438,7 @@ class _Solver:
             slip, margin = state.common_slip, state.margin
         thickness = state.thickness_um + np.float32(shift * self.order_um)
         cells = subtract_offset(whole, fit.light(state.cells, state.free))
-        fitted = fit.applied_to(base).normalised_to(thickness)
+        fitted = fit.applied_to(base)
         return replace(
             state,
             cells=cells,
@@ -473,8 +462,8 @@ class _Solver:
         if sample.thickness_um.size == 0:
             return state
         base = self.base or model
-        thickness, fit = learn(sample, base, state.free, state.nuisance)
-        return replace(state, templates=fit.applied_to(base).normalised_to(thickness), nuisance=fit)
+        fit = learn(sample, base, state.free, state.nuisance)[1]
+        return replace(state, templates=fit.applied_to(base), nuisance=fit)
 
 
 def _among(shape: NDArray[np.float32], others: list[NDArray[np.float32]], order_um: float) -> bool:

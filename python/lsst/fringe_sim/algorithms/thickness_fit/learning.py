@@ -21,7 +21,7 @@ from .amplitudes import Amplitudes
 from .borders import gather_pixels
 from .cells import Cells, effective_number
 from .evidence import refine_row
-from .nuisances import NuisanceFit, Nuisances, light_patterns, patterns_of_cells
+from .nuisances import OVERTONES, NuisanceFit, Nuisances, light_patterns, patterns_of_cells
 from .pixels import CellSurface
 from .templates import FringeTemplates
 
@@ -45,7 +45,7 @@ _LEAST_KEPT = 0.7
 """Share of its contrast that a block must keep."""
 _PHASE_SIGMA = 0.1
 """Uncertainty of the phase of a block [rad] at which its noise raises the contrast by half a per cent."""
-_ROUNDS = 10
+_ROUNDS = 8
 _TOLERANCE = 3e-5
 _UNSOUND = 9.0
 """Cells whose chi-square is this many times the median have no say."""
@@ -57,8 +57,9 @@ _CONTRAST_BY_WAVELENGTH = 0.3
 """Standard deviation of the logarithm of the contrast of one wavelength about the mean of all."""
 _FADING = 0.1
 """Standard deviation of the logarithmic loss of contrast per thickness [1/µm]."""
-_OVERTONES = 0.5
-"""Standard deviation of the factor on the overtones about 1."""
+_OVERTONE, _OVERTONE_BY_WAVELENGTH = 0.5, 0.2
+"""Standard deviations of what is added of the overtones of the model: what wavelengths share, and what each has
+besides."""
 _LEAST_SHIFT_NM = 0.02
 """Least standard deviation of the wavelengths: that of a calibrated monochromator."""
 _TEMPLATE_MARGIN_UM = 0.5
@@ -284,11 +285,14 @@ def learn(
     fit : `NuisanceFit`
     """
     if overtones is None and free.contrast == "wavelength":
-        overtones = base.even_overtones()
+        overtones = base.overtones()
     problem = _Problem.of(cells, base, free, overtones)
     fit, thickness = replace(start, middle_um=float(np.median(cells.thickness_um))), cells.thickness_um
+    fit = problem.normalised(fit, thickness)
     for _ in range(rounds):
         thickness, fit, change = problem.step(fit, thickness)
+        # A mean that follows the thickness one step behind lets both swing; a free level makes up for any mean.
+        fit = fit if free.patterned else problem.normalised(fit, thickness)
         if change < _TOLERANCE:
             break
     return problem.conclude(fit, thickness)
@@ -317,26 +321,35 @@ class _Problem:
     @property
     def shared(self) -> int:
         """Number of parameters that all wavelengths share."""
-        return {"fixed": 0, "common": 1, "wavelength": 2}[self.free.contrast]
+        return 0 if self.free.contrast == "fixed" else 1
 
     @property
     def own(self) -> int:
         """Number of parameters of each wavelength: light, contrast, wavelength."""
         return (
             self.cells.pattern.shape[1]
-            + (self.free.contrast == "wavelength")
+            + (1 + OVERTONES) * (self.free.contrast == "wavelength")
             + (self.free.wavelength_accuracy_nm > 0.0)
         )
+
+    def normalised(self, fit: NuisanceFit, thickness: NDArray[np.float32]) -> NuisanceFit:
+        """With the mean response over these thicknesses."""
+        waves = self.overtones if len(self.overtones) else None
+        found = self.base.as_found(
+            fit.contrast, fit.shift_nm, fit.fading, fit.overtones, fit.middle_um, waves
+        ).normalised_to(thickness)
+        return replace(fit, mean_response=found.mean_response)
 
     def residual(
         self, fit: NuisanceFit, thickness: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], FloatArray, FloatArray, FloatArray]:
         """Refined thickness, model amplitude, its slope, and what is left of the cells."""
         wavelengths = self.base.n_wavelengths
-        even = self.overtones if len(self.overtones) else None
+        waves = self.overtones if len(self.overtones) else None
         fitted = self.base.as_found(
-            fit.contrast, fit.shift_nm, fit.fading, fit.overtones, fit.middle_um, even
-        ).normalised_to(thickness)
+            fit.contrast, fit.shift_nm, fit.fading, fit.overtones, fit.middle_um, waves
+        )
+        fitted = replace(fitted, mean_response=fit.mean_response)
         table = fitted.table()
         value = self.cells.value.copy()
         if fit.coefficients.size:
@@ -410,25 +423,28 @@ class _Problem:
     ) -> tuple[FloatArray, FloatArray]:
         """What each parameter changes in each cell: of each wavelength by itself, and of those that share it."""
         count = self.cells.pattern.shape[1]
+        far = thickness.astype(float)
         each = np.empty((*model.shape, self.own))
         each[..., :count] = (1.0 + model)[..., None] * self.cells.pattern[:, None, :]
         if self.free.contrast == "wavelength":
             each[..., count] = model
-            count += 1
-        far = thickness.astype(float)
+            seen = far[:, None] + self.base.turn_um(far[:, None]) * fit.shift_nm
+            place = np.rint((seen - self.base.start_um) / self.base.step_um).astype(int)
+            place = np.clip(place, 0, len(self.overtones) - 1)
+            wave = self.overtones[place, np.arange(self.base.n_wavelengths)]
+            scale = fit.contrast / fit.mean_response
+            each[..., count + 1 : count + 1 + OVERTONES] = scale[:, None] * wave
+            count += 1 + OVERTONES
         if self.free.wavelength_accuracy_nm > 0.0:
-            each[..., count] = -slope * far[:, None] * self.base.group / self.base.wavelength_nm
+            each[..., count] = slope * self.base.turn_um(far[:, None])
         common = np.empty((*model.shape, self.shared))
         if self.free.contrast == "common":
             common[..., 0] = model
         elif self.free.contrast == "wavelength":
             common[..., 0] = -model * (far - fit.middle_um)[:, None]
-            place = np.clip(np.rint((far - self.base.start_um) / self.base.step_um).astype(int), 0, None)
-            place = np.minimum(place, len(self.overtones) - 1)
-            common[..., 1] = fit.contrast * self.overtones[place] / self.base.mean_response
         return each, common
 
-    def _prior(self, fit: NuisanceFit) -> tuple[FloatArray, FloatArray]:
+    def _prior(self, fit: NuisanceFit, expected: bool = False) -> tuple[FloatArray, FloatArray]:
         """Precision of the prior, and where the parameters stand relative to its middle."""
         wavelengths, own, count = self.base.n_wavelengths, self.own, self.cells.pattern.shape[1]
         precision = np.zeros((wavelengths, own, wavelengths, own))
@@ -446,10 +462,17 @@ class _Problem:
             spread = np.eye(wavelengths) - 1.0 / wavelengths
             precision[:, count, :, count] = spread / _CONTRAST_BY_WAVELENGTH**2
             precision[bands, count, bands, count] += _FREE
-            count += 1
+            together = np.full((wavelengths, wavelengths), _OVERTONE**2)
+            tied = np.linalg.inv(together + _OVERTONE_BY_WAVELENGTH**2 * np.eye(wavelengths))
+            for k in range(OVERTONES):
+                where[:, count + 1 + k] = fit.overtones[:, k]
+                precision[:, count + 1 + k, :, count + 1 + k] = tied
+            count += 1 + OVERTONES
         if self.free.wavelength_accuracy_nm > 0.0:
             where[:, count] = fit.shift_nm
-            precision[bands, count, bands, count] = _shift_precision(fit, self.free.wavelength_accuracy_nm)
+            precision[bands, count, bands, count] = _shift_precision(
+                fit, self.free.wavelength_accuracy_nm, expected
+            )
         size = wavelengths * own
         whole = np.zeros((size + self.shared, size + self.shared))
         whole[:size, :size] = precision.reshape(size, size)
@@ -457,8 +480,7 @@ class _Problem:
         if self.free.contrast == "common":
             whole[size, size] = _FREE
         elif self.free.contrast == "wavelength":
-            whole[size, size], whole[size + 1, size + 1] = _FADING**-2.0, _OVERTONES**-2.0
-            stands[size:] = fit.fading, fit.overtones - 1.0
+            whole[size, size], stands[size] = _FADING**-2.0, fit.fading
         return whole, stands
 
     def _moved(self, fit: NuisanceFit, moved: FloatArray) -> tuple[NuisanceFit, float]:
@@ -473,9 +495,9 @@ class _Problem:
             # A contrast cannot turn negative: that would be half an order.
             contrast = contrast * np.exp(np.clip(table[:, count], -0.7, 0.7))
             change = max(change, 0.1 * float(np.abs(table[:, count]).max()))
-            count += 1
             fading = float(np.clip(fading + np.clip(rest[0], -0.1, 0.1), -0.5, 0.5))
-            overtones = float(np.clip(overtones + np.clip(rest[1], -0.3, 0.3), 0.0, 2.0))
+            overtones = overtones + np.clip(table[:, count + 1 : count + 1 + OVERTONES], -0.3, 0.3)
+            count += 1 + OVERTONES
         elif self.free.contrast == "common":
             contrast = contrast * np.exp(np.clip(rest[0], -0.7, 0.7))
             change = max(change, 0.1 * float(np.abs(rest[0])))
@@ -500,6 +522,9 @@ class _Problem:
         """Uncertainties, misfit of each flat, and the chi-square with that of the prior."""
         thickness, model, slope, rest = self.residual(fit, thickness)
         normal, _ = self._system(fit, thickness, model, slope, rest)
+        precision, _ = self._prior(fit)
+        believed, _ = self._prior(fit, expected=True)
+        precision, normal = believed, normal - precision + believed
         variance = np.linalg.inv(normal)
         wavelengths, own, count = self.base.n_wavelengths, self.own, self.cells.pattern.shape[1]
         diagonal = np.sqrt(np.maximum(np.diag(variance), 0.0))
@@ -507,7 +532,7 @@ class _Problem:
         contrast_sigma, shift_sigma, scale = np.zeros(wavelengths), np.zeros(wavelengths), 0.0
         if self.free.contrast == "wavelength":
             contrast_sigma = fit.contrast * table[:, count]
-            count += 1
+            count += 1 + OVERTONES
         elif self.free.contrast == "common":
             contrast_sigma = fit.contrast * diagonal[wavelengths * own]
         if self.free.wavelength_accuracy_nm > 0.0:
@@ -518,40 +543,55 @@ class _Problem:
             scale = float(np.sqrt(max(float(along @ block @ along), 0.0)))
         weight = self.cells.weight[:, :wavelengths].astype(float)
         sound = _sound(rest, weight)
-        freedom = 1.0 - 1.0 / wavelengths
-        misfit = (
-            (weight * rest**2)[sound].sum(axis=0) / np.maximum((weight[sound] > 0).sum(axis=0), 1) / freedom
-        )
-        precision, where = self._prior(fit)
+        seen = (weight[sound] > 0).sum(axis=0)
+        # The thickness of each cell takes one degree of freedom, and each nuisance as much as it is not held.
+        held = np.diag(variance @ precision)[: wavelengths * own].reshape(wavelengths, own).sum(axis=1)
+        freedom = np.maximum(seen * (1.0 - 1.0 / wavelengths) - (own - held), 1.0)
+        squares = (weight * rest**2)[sound].sum(axis=0)
+        excess = squares.sum() / freedom.sum() - 1.0 - _SIGNIFICANT * np.sqrt(2.0 / freedom.sum())
         each_cell = (weight * rest**2).sum(axis=1)
         capped = np.minimum(each_cell, _UNSOUND * np.median(each_cell))
-        width = _shift_width(fit.shift_nm, self.free.wavelength_accuracy_nm)
-        prior = float(where @ precision @ where) + 2.0 * wavelengths * float(np.log(width))
         return thickness, replace(
             fit,
-            contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale, misfit=misfit,
-            penalty=self.cells.temper * float(capped.sum()) + prior, cells=len(capped),
+            contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale, misfit=squares / freedom,
+            chi2=self.cells.temper * float(capped.sum()), prior=self._prior_chi2(fit),
+            excess=max(float(excess), 0.0), cells=len(capped),
         )  # fmt: skip
 
+    def _prior_chi2(self, fit: NuisanceFit) -> float:
+        """Twice the negative logarithm of the prior, but for a constant."""
+        precision, where = self._prior(fit)
+        accuracy = self.free.wavelength_accuracy_nm
+        if accuracy == 0.0:
+            return float(where @ precision @ where)
+        at = np.arange(self.base.n_wavelengths) * self.own + self.own - 1
+        where[at] = 0.0
+        width = spread_of_wavelengths(fit.shift_nm, accuracy)
+        return float(where @ precision @ where) + float(_wavelength_prior(fit.shift_nm, width))
 
-def _shift_width(shift_nm: FloatArray, accuracy_nm: float) -> float:
-    """Standard deviation of wavelengths about their labels, at most as stated; one far off does not widen it."""
-    if accuracy_nm == 0.0:
-        return 1.0
-    return float(np.clip(spread_of_wavelengths(shift_nm), min(_LEAST_SHIFT_NM, accuracy_nm), accuracy_nm))
+
+def _wavelength_prior(shift_nm: FloatArray, width_nm: FloatArray | float) -> FloatArray:
+    """Twice the negative logarithm of the probability of offsets that scatter with some width, now and then far off."""
+    width = np.asarray(width_nm, dtype=float)[..., None]
+    tail = (_TAIL + 1.0) * np.log1p(shift_nm**2 / (_TAIL * width**2)) + 2.0 * np.log(width)
+    return np.asarray(tail.sum(axis=-1))
 
 
-def spread_of_wavelengths(shift_nm: FloatArray) -> float:
-    """Standard deviation of most wavelengths about their labels [nm]."""
-    return max(1.4826 * float(np.median(np.abs(shift_nm))), _LEAST_SHIFT_NM)
+def spread_of_wavelengths(shift_nm: FloatArray, accuracy_nm: float = np.inf) -> float:
+    """Most probable standard deviation of most wavelengths about their labels [nm], at most as stated."""
+    most = min(accuracy_nm, max(float(np.abs(shift_nm).max()), _LEAST_SHIFT_NM))
+    widths = np.geomspace(min(_LEAST_SHIFT_NM, most), most, 50)
+    return float(widths[np.argmin(_wavelength_prior(shift_nm, widths))])
 
 
-def _shift_precision(fit: NuisanceFit, accuracy_nm: float) -> FloatArray:
-    """Precision of the prior of each wavelength: that of a distribution with long tails, where it stands now."""
+def _shift_precision(fit: NuisanceFit, accuracy_nm: float, expected: bool = False) -> FloatArray:
+    """Precision of the prior of each wavelength where it stands now; ``expected`` is what it says about the scale."""
     if not np.any(fit.shift_nm):
         return np.full(fit.shift_nm.shape, accuracy_nm**-2.0)
-    width = _shift_width(fit.shift_nm, accuracy_nm)
-    return np.asarray((_TAIL + 1.0) / (_TAIL * width**2 + fit.shift_nm**2))
+    width = spread_of_wavelengths(fit.shift_nm, accuracy_nm)
+    step = (_TAIL + 1.0) / (_TAIL * width**2 + fit.shift_nm**2)
+    # The Fisher information of Student's distribution; steps need the weights of the scale mixture that it is.
+    return np.asarray(np.minimum(step, (_TAIL + 1.0) / ((_TAIL + 3.0) * width**2)) if expected else step)
 
 
 def _sound(rest: FloatArray, weight: FloatArray) -> NDArray[np.bool_]:
@@ -582,10 +622,9 @@ class CommonOrder:
     slip: float
 
 
-_NEAR_ORDERS = (-1.0, 1.0, -2.0, 2.0)
 _MOST_ORDERS = 8
 _CLEAR = 100.0
-"""Chi-square difference beyond which farther orders need not be asked."""
+"""Chi-square difference beyond which the orders behind one need not be asked."""
 
 
 def rank_orders(
@@ -613,7 +652,7 @@ def rank_orders(
     range_um : `tuple` [`float`, `float`]
         Thicknesses that are possible [µm].
     """
-    overtones = base.even_overtones() if free.contrast == "wavelength" else None
+    overtones = base.overtones() if free.contrast == "wavelength" else None
     thickness, here = learn(cells, base, free, start, overtones=overtones)
     cells = replace(cells, thickness_um=thickness)
 
@@ -621,32 +660,35 @@ def rank_orders(
         moved, guess = _guess_at_order(cells, base, free, here, shift * order_um)
         inside = (moved.thickness_um > range_um[0]) & (moved.thickness_um < range_um[1])
         if inside.mean() < _INSIDE:
-            return replace(here, penalty=np.inf)
+            return replace(here, chi2=np.inf)
         return learn(moved, base, free, guess, _ROUNDS_ELSEWHERE, overtones)[1]
 
-    tried = {0.0: here} | {shift: at(shift) for shift in _NEAR_ORDERS}
-    for away in range(3, _MOST_ORDERS + 1):
-        best = min(tried, key=lambda shift: tried[shift].penalty)
-        if abs(best) < away - 2 and all(
-            tried[shift].penalty > tried[best].penalty + _CLEAR * _doubt(tried[best])
-            for shift in tried
-            if shift != best
-        ):
-            break
-        for shift in (-float(away), float(away)):
+    tried = {0.0: here} | {shift: at(shift) for shift in (-1.0, 1.0)}
+
+    def costs() -> dict[float, float]:
+        """Chi-square of all, each where the model error of the best is counted as noise."""
+        noise = _noise_with_model_error(min(tried.values(), key=lambda fit: fit.chi2 + fit.prior))
+        return {shift: fit.chi2 / noise + fit.prior for shift, fit in tried.items()}
+
+    def clear(shift: float) -> bool:
+        cost = costs()
+        return cost[shift] > min(cost.values()) + _CLEAR
+
+    for side in (-1.0, 1.0):
+        shift = side
+        while abs(shift) < _MOST_ORDERS and not clear(shift):
+            shift += side
             tried[shift] = at(shift)
-    best = min(tried, key=lambda shift: tried[shift].penalty)
-    doubt = _doubt(tried[best])
-    excess = np.array([(tried[s].penalty - tried[best].penalty) / doubt for s in tried if s != best])
+    cost = costs()
+    best = min(cost, key=lambda shift: cost[shift])
+    excess = np.array([cost[shift] - cost[best] for shift in tried if shift != best])
     odds = float(np.exp(-0.5 * excess).sum())
     return CommonOrder(best, tried[best], float(excess.min()), odds / (1.0 + odds))
 
 
-def _doubt(fit: NuisanceFit) -> float:
-    """What a chi-square difference is to be divided by: model error does not average out over cells."""
-    scatter = _SIGNIFICANT * np.sqrt(2.0 / (fit.misfit.size * max(fit.cells, 1)))
-    excess = max(float(fit.misfit.mean()) - 1.0 - scatter, 0.0)
-    return 1.0 + excess * (1.0 + fit.cells / _ALIKE)
+def _noise_with_model_error(fit: NuisanceFit) -> float:
+    """Variance of cells with model error over that of their noise: it does not average out over cells."""
+    return 1.0 + fit.excess * (1.0 + fit.cells / _ALIKE)
 
 
 _SIGNIFICANT = 3.0
@@ -662,11 +704,11 @@ def _guess_at_order(
     if free.wavelength_accuracy_nm == 0.0:
         return moved, start
     wavelength = base.wavelength_nm
-    away = move_um * (1.0 - wavelength / wavelength.mean()) * wavelength
-    shift = start.shift_nm + away / (float(np.median(moved.thickness_um)) * base.group)
+    away = move_um * (1.0 - wavelength / wavelength.mean())
+    shift = start.shift_nm - away / base.turn_um(float(np.median(moved.thickness_um)))
     return moved, replace(start, shift_nm=shift)
 
 
-_ROUNDS_ELSEWHERE = 6
+_ROUNDS_ELSEWHERE = 5
 _INSIDE = 0.99
 """Share of a sensor that must lie in the range of thicknesses."""

@@ -33,6 +33,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
+OVERTONES = 4
+"""Numbers that describe the overtones at one wavelength."""
 GAIN_ACCURACY = 0.005
 """How well gains of amplifiers are known: a few 1e-3 from iron-55, or from the variance of pairs of flats."""
 
@@ -132,16 +134,22 @@ class NuisanceFit:
         Wavelength of each flat minus that of its label [nm].
     fading : `float`
         Logarithmic loss of contrast per thickness [1/µm].
-    overtones : `float`
-        Factor on the overtones of the fringe beside its fundamental.
+    overtones : `numpy.ndarray`, shape ``(n_wavelengths, 4)``
+        What is added of the overtones of the model, as factors on `FringeTemplates.overtones`.
     middle_um : `float`
         Thickness at which ``contrast`` holds [µm].
     scale_sigma : `float`
         Standard uncertainty of the scale of the thickness, which all pixels share.
     misfit : `numpy.ndarray`, shape ``(n_wavelengths,)``
         Mean squared residual of the cells over their variance, at each wavelength.
-    penalty : `float`
+    mean_response : `numpy.ndarray`, shape ``(n_wavelengths,)``
+        Mean response over the sensor to which level and contrast belong; empty if it is not known.
+    chi2, prior : `float`
         Chi-square of the cells looked at, and of what the prior says of the nuisances.
+    excess : `float`
+        Part of the chi-square per degree of freedom that is significantly more than noise.
+    cells : `int`
+        Number of cells looked at.
     """
 
     coefficients: FloatArray
@@ -150,18 +158,24 @@ class NuisanceFit:
     shift_nm: FloatArray
     shift_sigma_nm: FloatArray
     fading: float = 0.0
-    overtones: float = 1.0
+    overtones: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     middle_um: float = 0.0
     scale_sigma: float = 0.0
     misfit: FloatArray = field(default_factory=lambda: np.ones(0))
-    penalty: float = np.inf
+    mean_response: FloatArray = field(default_factory=lambda: np.empty(0))
+    chi2: float = np.inf
+    prior: float = 0.0
+    excess: float = 0.0
     cells: int = 0
 
     @classmethod
     def none(cls, wavelengths: int, patterns: int = 0) -> NuisanceFit:
         """Even light, the contrast of the model, wavelengths as labelled."""
         zero = np.zeros(wavelengths)
-        return cls(np.zeros((wavelengths, patterns)), np.ones(wavelengths), zero, zero, zero)
+        return cls(
+            np.zeros((wavelengths, patterns)), np.ones(wavelengths), zero, zero, zero,
+            overtones=np.zeros((wavelengths, OVERTONES)),
+        )  # fmt: skip
 
     def light(self, cells: Cells, free: Nuisances) -> NDArray[np.float32]:
         """Light on all cells, less one, shape ``(n_wavelengths, ncy, ncx)``; no wavelengths if it is even."""
@@ -178,7 +192,8 @@ class NuisanceFit:
 
     def applied_to(self, base: FringeTemplates) -> FringeTemplates:
         """Templates of a sensor with this contrast and these wavelengths."""
-        return base.as_found(self.contrast, self.shift_nm, self.fading, self.overtones, self.middle_um)
+        found = base.as_found(self.contrast, self.shift_nm, self.fading, self.overtones, self.middle_um)
+        return replace(found, mean_response=self.mean_response) if self.mean_response.size else found
 
 
 def subtract_offset(cells: Cells, light: NDArray[np.float32]) -> Cells:

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from .amplitudes import Amplitudes
 from .borders import gather_pixels
 from .evidence import refine_row
+from .pixels import CellSurface
 from .templates import FringeTemplates
 
-__all__ = ["doubt_from_shared_misfit"]
+__all__ = ["doubt_from_shared_misfit", "leaves_only_noise"]
 
 _MOST_PIXELS = 4000
+_MOST_PAIRS = 40_000
 _SHIFTS = (-3, -2, -1, 1, 2, 3)
 """Orders from the solution with which the shared misfit is compared."""
 _NOISE_SIGMA = 3.0
@@ -75,6 +77,44 @@ def doubt_from_shared_misfit(
             excess = (_pull(templates, value, weight, found) ** 2).sum(axis=1) - chi2
             odds += float(np.exp(-0.5 * max(float(excess[inside].mean()), 0.0) / shared))
     return odds / (1.0 + odds)
+
+
+def leaves_only_noise(data: Amplitudes, templates: FringeTemplates, surface: CellSurface) -> bool:
+    """Whether what a model leaves over in neighbouring pixels has nothing in common.
+
+    The median over pairs of pixels is not moved by some that have a wrong order.
+
+    Parameters
+    ----------
+    data : `Amplitudes`
+        The flats.
+    templates : `FringeTemplates`
+        The model, normalised to the sensor.
+    surface : `CellSurface`
+        Where the pixels begin.
+    """
+    apart = 1 + int(np.ceil(_APART * data.noise_correlation_px))
+    _, ny, nx = data.shape
+    if nx <= apart:
+        return False
+    stride = max(int(np.sqrt(ny * nx / _MOST_PAIRS)), 1)
+    rows, columns = np.arange(0, ny, stride), np.arange(0, nx - apart, stride)
+    pulls = []
+    for shift in (0, apart):
+        start = np.ascontiguousarray(surface.at(rows, columns + shift)).ravel()
+        y, x = (index.ravel() for index in np.meshgrid(rows, columns + shift, indexing="ij"))
+        value, weight = gather_pixels(data, y, x)
+        found = np.full_like(start, np.nan)
+        refine_row(value, weight, templates.table(), templates.start_um, templates.step_um, start, found)
+        pulls.append(_pull(templates, value, weight, np.nan_to_num(found, nan=templates.start_um)))
+        pulls[-1][~np.isfinite(found)] = np.nan
+    product = (pulls[0] * pulls[1]).sum(axis=1)
+    product = product[np.isfinite(product)]
+    if product.size == 0:
+        return False
+    middle = float(np.median(product))
+    scatter = 1.4826 * float(np.median(np.abs(product - middle)))
+    return middle <= _NOISE_SIGMA * 1.2533 * scatter / np.sqrt(product.size)
 
 
 def _pull(

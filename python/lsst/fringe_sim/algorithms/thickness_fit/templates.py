@@ -40,6 +40,9 @@ class FringeTemplates:
         Factor on the amplitude of each wavelength; 1 by default.
     group : `numpy.ndarray`, shape ``(n_wavelengths,)``, optional
         Group index of the layer over its index; 1 by default.
+    beside_um : `numpy.ndarray`, shape ``(n_wavelengths,)``, optional
+        By how much thicker the layer seems where the wavelength changes, because the phase of the thin layers beside
+        it turns too [µm]; 0 by default.
     fading, middle_um : `float`, optional
         Logarithmic loss of contrast per thickness [1/µm], and the thickness [µm] at which there is none.
 
@@ -56,6 +59,7 @@ class FringeTemplates:
     mean_response: FloatArray = field(default_factory=lambda: np.empty(0))
     contrast: FloatArray = field(default_factory=lambda: np.empty(0))
     group: FloatArray = field(default_factory=lambda: np.empty(0))
+    beside_um: FloatArray = field(default_factory=lambda: np.empty(0))
     fading: float = 0.0
     middle_um: float = 0.0
 
@@ -80,6 +84,8 @@ class FringeTemplates:
         contrast = np.ones(wavelength.size) if contrast.size == 0 else contrast
         group = np.asarray(self.group, dtype=float)
         group = np.ones(wavelength.size) if group.size == 0 else group
+        beside = np.asarray(self.beside_um, dtype=float)
+        beside = np.zeros(wavelength.size) if beside.size == 0 else beside
         for name, value in (("mean response", mean), ("contrast", contrast), ("group index", group)):
             if value.shape != wavelength.shape or not np.all(value > 0):
                 raise InputError(f"template {name}", value.tolist(), f"{wavelength.size} positive numbers")
@@ -89,6 +95,7 @@ class FringeTemplates:
             ("mean_response", mean),
             ("contrast", contrast),
             ("group", group),
+            ("beside_um", beside),
         ):
             object.__setattr__(self, name, array)
 
@@ -155,9 +162,9 @@ class FringeTemplates:
         contrast: ArrayLike,
         shift_nm: FloatArray,
         fading: float,
-        overtones: float,
+        overtones: FloatArray,
         middle_um: float,
-        even: FloatArray | None = None,
+        waves: FloatArray | None = None,
     ) -> Self:
         """Copy for flats whose contrast, wavelengths and waveform are a little different.
 
@@ -169,19 +176,21 @@ class FringeTemplates:
             What is added to each wavelength [nm]. The phase of a fringe is that of the thickness over the wavelength.
         fading, middle_um : `float`
             See the class.
-        overtones : `float`
-            Factor on the even overtones of the fringe.
-        even : `numpy.ndarray`, optional
-            These overtones, if they are known; shape of ``response``.
+        overtones : `numpy.ndarray`, shape ``(n_wavelengths, 4)``
+            Factors on the functions of `overtones`, which are added.
+        waves : `numpy.ndarray`, optional
+            These functions, if they are known.
         """
         response = self.response
-        if overtones != 1.0:
-            response = response - (1.0 - overtones) * (self.even_overtones() if even is None else even)
+        if np.any(overtones):
+            response = response + np.einsum(
+                "wq,nwq->nw", overtones, self.overtones() if waves is None else waves
+            )
         if np.any(shift_nm):
             grid = self.thickness_um
-            factor = 1.0 - self.group * shift_nm / self.wavelength_nm
+            move = self.turn_um(grid[:, None]) * shift_nm
             response = np.stack(
-                [np.interp(grid * f, grid, column) for f, column in zip(factor, response.T, strict=True)],
+                [np.interp(grid + m, grid, column) for m, column in zip(move.T, response.T, strict=True)],
                 axis=1,
             )
         found = replace(self, response=response, fading=fading, middle_um=middle_um)
@@ -196,15 +205,29 @@ class FringeTemplates:
             self, response=self.response[rows], start_um=self.start_um + first * self.step_um
         ), rows
 
-    def even_overtones(self) -> FloatArray:
-        """Part of the response that repeats after half an order, less its mean; shape of ``response``."""
-        half = 0.5 * self.order_um() * self.wavelength_nm / self.wavelength_nm.mean()
-        grid = self.thickness_um
-        even = [
-            0.5 * column + 0.25 * (np.interp(grid + h, grid, column) + np.interp(grid - h, grid, column))
-            for h, column in zip(half, self.response.T, strict=True)
-        ]
-        return np.stack(even, axis=1) - self.response.mean(axis=0)
+    def turn_um(self, thickness_um: ArrayLike) -> FloatArray:
+        """Change of thickness that changes the fringe as 1 nm of wavelength does, along the last axis [µm/nm]."""
+        thickness = np.asarray(thickness_um, dtype=float)
+        return np.asarray(-(thickness * self.group + self.beside_um) / self.wavelength_nm)
+
+    def overtones(self) -> FloatArray:
+        """Second and third overtone of the response, each followed by its quadrature, along a last axis of length 4.
+
+        What repeats after half an order are the even overtones, and what repeats after a third those of 3, 6, ...
+        """
+        grid, step = self.thickness_um, self.step_um
+        out = np.empty((*self.response.shape, 4))
+        for band, column in enumerate(self.response.T):
+            order = self.order_um(np.arange(self.n_wavelengths) == band)
+            level = column.mean()
+            for k, number in enumerate((2, 3)):
+                moves = order * np.arange(number) / number
+                moves = np.where(moves > 0.5 * order, moves - order, moves)
+                both = np.concatenate([moves, -moves])
+                wave = sum(np.interp(grid + move, grid, column) for move in both) / both.size - level
+                out[:, band, 2 * k] = wave
+                out[:, band, 2 * k + 1] = np.gradient(wave, step) * order / (2.0 * np.pi * number)
+        return out
 
     def order_um(self, weight: ArrayLike | None = None) -> float:
         """Thickness of one fringe order [µm]: the shift at which all wavelengths together repeat best.
