@@ -13,17 +13,18 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from ..errors import ConvergenceError, OutOfRangeError, StackError, UnknownNameError
 from ..resources import read_table, read_yaml
+from .film_fields import add_mode, light_in
+from .line_shapes import LINE_SHAPES, LINE_STEP_NM
+from .signal_table import SignalTable
 
 __all__ = ["Film", "FlatFieldOptics", "SignalTable", "material_index"]
 
@@ -44,15 +45,6 @@ SCALE_PIVOT_NM = 935.0
 
 TABLE_STEP_UM = 0.003
 """Spacing of the thickness grid [µm]: a hundred points per fringe order."""
-
-LINE_STEP_NM = 0.03
-"""Spacing of wavelength nodes [nm]: fifteen per fringe of detection layer and support together."""
-
-LINE_REACH = 6.0
-"""Half width of the sampled Gaussian line in standard deviations; 2e-9 of the light is left out."""
-
-LORENTZIAN_REACH = 10.0
-"""Full widths at half maximum after which a Lorentzian line is cut off: 3 % of an endless one lie beyond."""
 
 HEIGHT_STEP_NM = 25.0
 """Largest spacing of the thicknesses inside a pixel [nm]: a fifth of a fringe in silicon."""
@@ -192,8 +184,8 @@ class FlatFieldOptics:
         if self.position(self.rough_face) == 0:
             raise UnknownNameError("rough face", self.rough_face, [film.name for film in self.films[1:]])
         for shape, part in ((self.line_shape, 1.0), *self.other_lines):
-            if shape not in _LINE_SHAPES:
-                raise UnknownNameError("line shape", shape, _LINE_SHAPES)
+            if shape not in LINE_SHAPES:
+                raise UnknownNameError("line shape", shape, LINE_SHAPES)
             if not 0.0 <= part <= 1.0:
                 raise OutOfRangeError(f"part of the light in the {shape} line", part, "0 to 1")
         if len(self.theta) != len(self.theta_weight) or not math.isclose(sum(self.theta_weight), 1.0):
@@ -258,7 +250,7 @@ class FlatFieldOptics:
         total = np.zeros(thickness.shape)
         for s_wave in modes[polarization]:
             weight = np.full(1, 1.0 / len(modes[polarization]))
-            _add_mode(total, _light(self, wavelength, weight, theta, s_wave, 0.0), thickness)
+            add_mode(total, light_in(self, wavelength, weight, theta, s_wave, 0.0), thickness)
         return total
 
     def flat_field(self, thickness_um: ArrayLike, wavelength_nm: float) -> FloatArray:
@@ -296,18 +288,18 @@ class FlatFieldOptics:
         total = np.zeros(thickness.shape)
         for support_um, part in _heights(self.support_spread_um, 1e-3 * self.height_step_nm):
             for weight, theta, s_wave, height_um in self._modes():
-                light = _light(
+                light = light_in(
                     self, wavelength, part * weight * line_weight, theta, s_wave, height_um, support_um
                 )
-                _add_mode(total, light, thickness)
+                add_mode(total, light, thickness)
         return total
 
     def _line(self, nominal_nm: float) -> tuple[FloatArray, FloatArray]:
         """Wavelengths [nm] and weights of one flat."""
-        offset, weight = _LINE_SHAPES[self.line_shape](self.bandwidth_fwhm_nm, self.line_step_nm)
+        offset, weight = LINE_SHAPES[self.line_shape](self.bandwidth_fwhm_nm, self.line_step_nm)
         for shape, part in self.other_lines:
             if part > 0.0:
-                more, its_weight = _LINE_SHAPES[shape](self.bandwidth_fwhm_nm, self.line_step_nm)
+                more, its_weight = LINE_SHAPES[shape](self.bandwidth_fwhm_nm, self.line_step_nm)
                 offset = np.concatenate([offset, more])
                 weight = np.concatenate([(1.0 - part) * weight, part * its_weight])
         wavelength = self.true_wavelength(nominal_nm) + offset
@@ -377,45 +369,6 @@ class FlatFieldOptics:
                 else:
                     yield 0.5 * weight, theta, True, float(height_um)
                     yield 0.5 * weight, theta, False, float(height_um)
-
-
-@dataclass(frozen=True, eq=False)
-class SignalTable:
-    """Signal as a function of thickness, on a uniform grid.
-
-    Attributes
-    ----------
-    grid_um : `numpy.ndarray`, shape ``(D,)``
-        Thickness of the varying layer [µm].
-    signal : `numpy.ndarray`, shape ``(W, D)``
-        Detected over incident photons of each flat.
-    wavelengths_nm : `tuple` [`float`, ...]
-        Nominal wavelength of each flat [nm].
-    relative_error : `float`
-        Largest relative difference found to a direct calculation with finer wavelength nodes.
-    """
-
-    grid_um: FloatArray
-    signal: FloatArray
-    wavelengths_nm: tuple[float, ...]
-    relative_error: float = math.nan
-
-    def evaluate(self, row: int, thickness_um: NDArray[np.floating]) -> FloatArray:
-        """Signal of flat number ``row`` at any thickness within the grid, by cubic spline.
-
-        Raises
-        ------
-        OutOfRangeError
-            A thickness that is not on the grid (or not a number).
-        """
-        thickness = np.asarray(thickness_um)
-        low, high = float(self.grid_um[0]), float(self.grid_um[-1])
-        smallest, largest = float(np.min(thickness)), float(np.max(thickness))
-        if not (smallest >= low and largest <= high):
-            raise OutOfRangeError("thickness [um]", (smallest, largest), f"{low:g} to {high:g}")
-        pieces = np.ascontiguousarray(CubicSpline(self.grid_um, self.signal[row]).c.T)
-        step = (high - low) / (len(self.grid_um) - 1)
-        return _evaluate_pieces(pieces, low, step, thickness.ravel()).reshape(thickness.shape)
 
 
 def material_index(medium: str, wavelength_nm: FloatArray, temperature_k: float) -> ComplexArray:
@@ -509,33 +462,6 @@ def _cold_silicon(wavelength_nm: FloatArray, temperature_k: float) -> tuple[Floa
     return np.asarray(powers @ n), np.exp(powers @ log_k)
 
 
-def _gaussian_line(fwhm_nm: float, step_nm: float) -> tuple[FloatArray, FloatArray]:
-    """Offsets [nm] and weights; equidistant nodes, exponentially convergent for a Gaussian."""
-    sigma = fwhm_nm / math.sqrt(8.0 * math.log(2.0))
-    count = max(40, math.ceil(LINE_REACH * sigma / step_nm))
-    offset: FloatArray = np.arange(-count, count + 1, dtype=float) * (LINE_REACH * sigma / count)
-    weight = np.exp(-0.5 * (offset / sigma) ** 2)
-    return offset, weight / weight.sum()
-
-
-def _triangular_line(fwhm_nm: float, step_nm: float) -> tuple[FloatArray, FloatArray]:
-    """Offsets [nm] and weights; Gauss–Legendre on either flank."""
-    count = max(20, math.ceil(fwhm_nm / step_nm))
-    x, w = np.polynomial.legendre.leggauss(count)
-    flank = 0.5 * (x + 1.0)
-    offset = fwhm_nm * np.concatenate([flank - 1.0, flank])
-    weight = np.concatenate([w * flank, w * (1.0 - flank)])
-    return offset, weight / weight.sum()
-
-
-def _lorentzian_line(fwhm_nm: float, step_nm: float) -> tuple[FloatArray, FloatArray]:
-    """Offsets [nm] and weights; equal parts of the light, up to ten times the width."""
-    reach = math.atan(2.0 * LORENTZIAN_REACH)
-    count = math.ceil(2.0 * reach * LORENTZIAN_REACH * fwhm_nm / step_nm)
-    x, w = np.polynomial.legendre.leggauss(count)
-    return 0.5 * fwhm_nm * np.tan(reach * x), 0.5 * w
-
-
 def _heights(rms_um: float, step_um: float) -> list[tuple[float, float]]:
     """Departures [µm] and weights of a thickness that varies; equidistant nodes converge fast under a Gaussian."""
     if rms_um == 0.0:
@@ -544,220 +470,6 @@ def _heights(rms_um: float, step_um: float) -> list[tuple[float, float]]:
     node = np.linspace(-HEIGHT_REACH, HEIGHT_REACH, 2 * count + 1)
     weight = np.exp(-0.5 * node * node)
     return list(zip((rms_um * node).tolist(), (weight / weight.sum()).tolist(), strict=True))
-
-
-_LINE_SHAPES: Mapping[str, Callable[[float, float], tuple[FloatArray, FloatArray]]] = MappingProxyType(
-    {"gaussian": _gaussian_line, "triangular": _triangular_line, "lorentzian": _lorentzian_line}
-)
-
-
-@dataclass(frozen=True, eq=False)
-class _Light:
-    """All that one angle and polarisation need apart from the thickness; Q wavelengths.
-
-    Fields ``(E, H)`` stand at the lower face of the varying film as ``bottom`` and are carried by the film's own
-    matrix to its upper face. ``incident`` carries them on from there to the ambient medium. ``top_above`` and
-    ``top_below`` give the fields at the upper face of the detection film, from those above and below the varying
-    film; ``low_above`` and ``low_below`` at its lower face.
-    """
-
-    weight: FloatArray  # (Q,) includes 1 / incident power
-    phase: ComplexArray  # (Q,) phase thickness per µm of the varying film
-    admittance: ComplexArray  # (Q,) of the varying film
-    ambient: FloatArray  # (Q,) admittance of the ambient medium
-    bottom: ComplexArray  # (Q, 2)
-    incident: ComplexArray  # (Q, 2, 2)
-    top_above: ComplexArray  # (Q, 2, 2)
-    top_below: ComplexArray  # (Q, 2)
-    low_above: ComplexArray  # (Q, 2, 2)
-    low_below: ComplexArray  # (Q, 2)
-    extra_um: float  # departure of the varying film from its mean thickness
-
-
-def _light(
-    optics: FlatFieldOptics,
-    wavelength_nm: FloatArray,
-    weight: FloatArray,
-    theta: float,
-    s_wave: bool,
-    height_um: float,
-    support_um: float = 0.0,
-) -> _Light:
-    thickness = [film.thickness_um for film in optics.films]
-    if support_um:
-        thickness[optics.position("support")] += support_um
-    wave_number = 2.0 * np.pi / (1e-3 * wavelength_nm)  # rad/µm
-    index = np.stack([film.index(wavelength_nm, optics.temperature_k) for film in optics.films])
-    along = index[0].real * math.sin(theta)
-    normal = np.sqrt(index * index - along * along)  # n cos(theta); the principal root decays downwards
-    admittance = normal if s_wave else index * index / normal
-    last = len(optics.films) - 1
-    v, d = optics.position(optics.varying), optics.position(optics.detection)
-
-    smooth = np.broadcast_to(np.eye(2, dtype=complex), (len(wavelength_nm), 2, 2))
-    rough = optics.position(optics.rough_face) if optics.roughness_nm > 0.0 else -1
-
-    def into(film: int) -> ComplexArray:
-        """Matrix from the upper face of a film, inside it, to the lower face of the film above it."""
-        if film != rough:
-            return smooth  # tangential fields are continuous
-        height = 1e-3 * optics.roughness_nm * wave_number
-        return _rough_face(admittance[[film - 1, film]], normal[[film - 1, film]] * height)
-
-    def through(first: int, stop: int) -> ComplexArray:
-        """Matrix from the upper face of film ``stop`` to the upper face of film ``first``, scaled."""
-        product = smooth
-        for j in range(first, stop):
-            film = _film_matrix(admittance[j], wave_number * normal[j] * thickness[j])
-            product = product @ film @ into(j + 1)
-        return product
-
-    def decay(first: int, stop: int) -> ComplexArray:
-        """The factor that the scaled matrices of the films first … stop - 1 leave out."""
-        exponent = np.zeros(len(wavelength_nm), dtype=complex)
-        for j in range(first, stop):
-            exponent += 1j * wave_number * normal[j] * thickness[j]
-        return np.exp(exponent)
-
-    substrate = np.stack([np.ones(len(wavelength_nm)), admittance[last]], axis=1)
-    none_matrix = np.zeros((len(wavelength_nm), 2, 2), dtype=complex)
-    none_vector = np.zeros((len(wavelength_nm), 2), dtype=complex)
-
-    def face(film: int) -> tuple[ComplexArray, ComplexArray]:
-        """Fields at the upper face of a film, from those at the upper and at the lower face of the varying one."""
-        if film <= v:
-            scale = decay(1, film)[:, np.newaxis, np.newaxis]
-            return scale * through(film, v), none_vector
-        below = np.einsum("qij,qj->qi", through(film, last), substrate)
-        return none_matrix, below * (decay(1, v) * decay(v + 1, film))[:, np.newaxis]
-
-    top_above, top_below = face(d)
-    low_above, low_below = face(d + 1)
-    low_above, low_below = into(d + 1) @ low_above, np.einsum("qij,qj->qi", into(d + 1), low_below)
-    return _Light(
-        weight=weight,
-        phase=wave_number * normal[v],
-        admittance=admittance[v],
-        ambient=admittance[0].real.copy(),
-        bottom=np.einsum("qij,qj->qi", into(v + 1) @ through(v + 1, last), substrate),
-        incident=np.ascontiguousarray(into(1) @ through(1, v)),
-        top_above=np.ascontiguousarray(top_above),
-        top_below=np.ascontiguousarray(top_below),
-        low_above=np.ascontiguousarray(low_above),
-        low_below=np.ascontiguousarray(low_below),
-        extra_um=height_um,
-    )
-
-
-def _film_matrix(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
-    """Characteristic matrix times ``exp(i phase)``, which keeps opaque films finite; shape ``(Q, 2, 2)``."""
-    round_trip = np.exp(2j * phase)
-    matrix = np.empty((*phase.shape, 2, 2), dtype=complex)
-    matrix[..., 0, 0] = matrix[..., 1, 1] = 0.5 * (1.0 + round_trip)
-    matrix[..., 0, 1] = 0.5 * (1.0 - round_trip) / admittance
-    matrix[..., 1, 0] = 0.5 * (1.0 - round_trip) * admittance
-    return matrix
-
-
-def _rough_face(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
-    """Matrix of a face whose height is normally distributed, for the mean (specular) field.
-
-    Raised by h, a face changes the phase of the wave that it reflects upwards by 2 q1 h, downwards by -2 q2 h, and of
-    what it lets through by (q1 - q2) h, with q the normal wave number on either side. The mean of exp(i a h) is
-    exp(-a² σ² / 2).
-
-    ``admittance`` (2, Q). ``phase`` (2, Q): normal wave number above and below times the rms height.
-    """
-    above, below = admittance
-    reflected = (above - below) / (above + below)
-    from_above = reflected * np.exp(-2.0 * phase[0] ** 2)
-    from_below = -reflected * np.exp(-2.0 * phase[1] ** 2)
-    passed = np.exp(-0.5 * (phase[0] - phase[1]) ** 2) / (above + below)
-    down, up = 2.0 * above * passed, 2.0 * below * passed
-    # Waves (down, up) above the face from those below it.
-    waves = np.empty((admittance.shape[1], 2, 2), dtype=complex)
-    waves[:, 0, 0] = 1.0 / down
-    waves[:, 0, 1] = -from_below / down
-    waves[:, 1, 0] = from_above / down
-    waves[:, 1, 1] = up - from_above * from_below / down
-    to_fields, to_waves = np.empty_like(waves), np.empty_like(waves)
-    to_fields[:, 0, :] = 1.0
-    to_fields[:, 1, 0], to_fields[:, 1, 1] = above, -above
-    to_waves[:, :, 0] = 0.5
-    to_waves[:, 0, 1], to_waves[:, 1, 1] = 0.5 / below, -0.5 / below
-    return to_fields @ waves @ to_waves
-
-
-def _add_mode(total: FloatArray, light: _Light, thickness_um: FloatArray) -> None:
-    """Add the weighted absorbed fraction of one angle and polarisation to ``total``."""
-    _add_absorption(
-        total,
-        thickness_um + light.extra_um,
-        light.weight,
-        light.phase,
-        light.admittance,
-        light.ambient,
-        light.bottom,
-        light.incident,
-        light.top_above,
-        light.top_below,
-        light.low_above,
-        light.low_below,
-    )
-
-
-@numba.njit(cache=True)
-def _add_absorption(
-    total: FloatArray,
-    thickness: FloatArray,
-    weight: FloatArray,
-    phase: ComplexArray,
-    admittance: ComplexArray,
-    ambient: FloatArray,
-    bottom: ComplexArray,
-    incident: ComplexArray,
-    top_above: ComplexArray,
-    top_below: ComplexArray,
-    low_above: ComplexArray,
-    low_below: ComplexArray,
-) -> None:  # pragma: no cover - compiled
-    for q in range(weight.size):
-        y, e_bottom, h_bottom = admittance[q], bottom[q, 0], bottom[q, 1]
-        c, t, low = incident[q], top_above[q], low_above[q]
-        for i in range(thickness.size):
-            once = np.exp(1j * phase[q] * thickness[i])
-            even, odd = 0.5 * (1.0 + once * once), 0.5 * (1.0 - once * once)
-            e = even * e_bottom + odd * h_bottom / y
-            h = odd * y * e_bottom + even * h_bottom
-            e_top = t[0, 0] * e + t[0, 1] * h + once * top_below[q, 0]
-            h_top = t[1, 0] * e + t[1, 1] * h + once * top_below[q, 1]
-            e_low = low[0, 0] * e + low[0, 1] * h + once * low_below[q, 0]
-            h_low = low[1, 0] * e + low[1, 1] * h + once * low_below[q, 1]
-            flux = (
-                e_top.real * h_top.real
-                + e_top.imag * h_top.imag
-                - e_low.real * h_low.real
-                - e_low.imag * h_low.imag
-            )
-            e_front = c[0, 0] * e + c[0, 1] * h
-            h_front = c[1, 0] * e + c[1, 1] * h
-            forward = 0.5 * (e_front + h_front / ambient[q])
-            total[i] += weight[q] * flux / (ambient[q] * (forward.real**2 + forward.imag**2))
-
-
-@numba.njit(cache=True)
-def _evaluate_pieces(
-    pieces: FloatArray, low: float, step: float, position: NDArray[np.floating]
-) -> FloatArray:  # pragma: no cover - compiled
-    result = np.empty(position.size)
-    last = pieces.shape[0] - 1
-    for i in range(position.size):
-        where = (position[i] - low) / step
-        piece = min(int(where), last)
-        x = position[i] - (low + piece * step)
-        c = pieces[piece]
-        result[i] = ((c[0] * x + c[1]) * x + c[2]) * x + c[3]
-    return result
 
 
 def _check_films(films: tuple[Film, ...]) -> None:

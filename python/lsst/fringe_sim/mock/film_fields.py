@@ -1,0 +1,214 @@
+"""Fields in a stack of films for one angle and polarisation, and the light that a film absorbs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from .optics import FlatFieldOptics
+
+__all__ = ["Light", "add_mode", "light_in"]
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """All that one angle and polarisation need apart from the thickness; Q wavelengths.
+
+    Fields ``(E, H)`` stand at the lower face of the varying film as ``bottom`` and are carried by the film's own
+    matrix to its upper face. ``incident`` carries them on from there to the ambient medium. ``top_above`` and
+    ``top_below`` give the fields at the upper face of the detection film, from those above and below the varying
+    film; ``low_above`` and ``low_below`` at its lower face.
+    """
+
+    weight: FloatArray  # (Q,) includes 1 / incident power
+    phase: ComplexArray  # (Q,) phase thickness per µm of the varying film
+    admittance: ComplexArray  # (Q,) of the varying film
+    ambient: FloatArray  # (Q,) admittance of the ambient medium
+    bottom: ComplexArray  # (Q, 2)
+    incident: ComplexArray  # (Q, 2, 2)
+    top_above: ComplexArray  # (Q, 2, 2)
+    top_below: ComplexArray  # (Q, 2)
+    low_above: ComplexArray  # (Q, 2, 2)
+    low_below: ComplexArray  # (Q, 2)
+    extra_um: float  # departure of the varying film from its mean thickness
+
+
+def light_in(
+    optics: FlatFieldOptics,
+    wavelength_nm: FloatArray,
+    weight: FloatArray,
+    theta: float,
+    s_wave: bool,
+    height_um: float,
+    support_um: float = 0.0,
+) -> Light:
+    """Fields for one angle and polarisation; ``support_um`` is added to the support."""
+    thickness = [film.thickness_um for film in optics.films]
+    if support_um:
+        thickness[optics.position("support")] += support_um
+    wave_number = 2.0 * np.pi / (1e-3 * wavelength_nm)  # rad/µm
+    index = np.stack([film.index(wavelength_nm, optics.temperature_k) for film in optics.films])
+    along = index[0].real * math.sin(theta)
+    normal = np.sqrt(index * index - along * along)  # n cos(theta); the principal root decays downwards
+    admittance = normal if s_wave else index * index / normal
+    last = len(optics.films) - 1
+    v, d = optics.position(optics.varying), optics.position(optics.detection)
+
+    smooth = np.broadcast_to(np.eye(2, dtype=complex), (len(wavelength_nm), 2, 2))
+    rough = optics.position(optics.rough_face) if optics.roughness_nm > 0.0 else -1
+
+    def into(film: int) -> ComplexArray:
+        """Matrix from the upper face of a film, inside it, to the lower face of the film above it."""
+        if film != rough:
+            return smooth  # tangential fields are continuous
+        height = 1e-3 * optics.roughness_nm * wave_number
+        return _rough_face(admittance[[film - 1, film]], normal[[film - 1, film]] * height)
+
+    def through(first: int, stop: int) -> ComplexArray:
+        """Matrix from the upper face of film ``stop`` to the upper face of film ``first``, scaled."""
+        product = smooth
+        for j in range(first, stop):
+            film = _film_matrix(admittance[j], wave_number * normal[j] * thickness[j])
+            product = product @ film @ into(j + 1)
+        return product
+
+    def decay(first: int, stop: int) -> ComplexArray:
+        """The factor that the scaled matrices of the films first … stop - 1 leave out."""
+        exponent = np.zeros(len(wavelength_nm), dtype=complex)
+        for j in range(first, stop):
+            exponent += 1j * wave_number * normal[j] * thickness[j]
+        return np.exp(exponent)
+
+    substrate = np.stack([np.ones(len(wavelength_nm)), admittance[last]], axis=1)
+    none_matrix = np.zeros((len(wavelength_nm), 2, 2), dtype=complex)
+    none_vector = np.zeros((len(wavelength_nm), 2), dtype=complex)
+
+    def face(film: int) -> tuple[ComplexArray, ComplexArray]:
+        """Fields at the upper face of a film, from those at the upper and at the lower face of the varying one."""
+        if film <= v:
+            scale = decay(1, film)[:, np.newaxis, np.newaxis]
+            return scale * through(film, v), none_vector
+        below = np.einsum("qij,qj->qi", through(film, last), substrate)
+        return none_matrix, below * (decay(1, v) * decay(v + 1, film))[:, np.newaxis]
+
+    top_above, top_below = face(d)
+    low_above, low_below = face(d + 1)
+    low_above, low_below = into(d + 1) @ low_above, np.einsum("qij,qj->qi", into(d + 1), low_below)
+    return Light(
+        weight=weight,
+        phase=wave_number * normal[v],
+        admittance=admittance[v],
+        ambient=admittance[0].real.copy(),
+        bottom=np.einsum("qij,qj->qi", into(v + 1) @ through(v + 1, last), substrate),
+        incident=np.ascontiguousarray(into(1) @ through(1, v)),
+        top_above=np.ascontiguousarray(top_above),
+        top_below=np.ascontiguousarray(top_below),
+        low_above=np.ascontiguousarray(low_above),
+        low_below=np.ascontiguousarray(low_below),
+        extra_um=height_um,
+    )
+
+
+def _film_matrix(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
+    """Characteristic matrix times ``exp(i phase)``, which keeps opaque films finite; shape ``(Q, 2, 2)``."""
+    round_trip = np.exp(2j * phase)
+    matrix = np.empty((*phase.shape, 2, 2), dtype=complex)
+    matrix[..., 0, 0] = matrix[..., 1, 1] = 0.5 * (1.0 + round_trip)
+    matrix[..., 0, 1] = 0.5 * (1.0 - round_trip) / admittance
+    matrix[..., 1, 0] = 0.5 * (1.0 - round_trip) * admittance
+    return matrix
+
+
+def _rough_face(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
+    """Matrix of a face whose height is normally distributed, for the mean (specular) field.
+
+    Raised by h, a face changes the phase of the wave that it reflects upwards by 2 q1 h, downwards by -2 q2 h, and of
+    what it lets through by (q1 - q2) h, with q the normal wave number on either side. The mean of exp(i a h) is
+    exp(-a² σ² / 2).
+
+    ``admittance`` (2, Q). ``phase`` (2, Q): normal wave number above and below times the rms height.
+    """
+    above, below = admittance
+    reflected = (above - below) / (above + below)
+    from_above = reflected * np.exp(-2.0 * phase[0] ** 2)
+    from_below = -reflected * np.exp(-2.0 * phase[1] ** 2)
+    passed = np.exp(-0.5 * (phase[0] - phase[1]) ** 2) / (above + below)
+    down, up = 2.0 * above * passed, 2.0 * below * passed
+    # Waves (down, up) above the face from those below it.
+    waves = np.empty((admittance.shape[1], 2, 2), dtype=complex)
+    waves[:, 0, 0] = 1.0 / down
+    waves[:, 0, 1] = -from_below / down
+    waves[:, 1, 0] = from_above / down
+    waves[:, 1, 1] = up - from_above * from_below / down
+    to_fields, to_waves = np.empty_like(waves), np.empty_like(waves)
+    to_fields[:, 0, :] = 1.0
+    to_fields[:, 1, 0], to_fields[:, 1, 1] = above, -above
+    to_waves[:, :, 0] = 0.5
+    to_waves[:, 0, 1], to_waves[:, 1, 1] = 0.5 / below, -0.5 / below
+    return to_fields @ waves @ to_waves
+
+
+def add_mode(total: FloatArray, light: Light, thickness_um: FloatArray) -> None:
+    """Add the weighted absorbed fraction of one angle and polarisation to ``total``."""
+    _add_absorption(
+        total,
+        thickness_um + light.extra_um,
+        light.weight,
+        light.phase,
+        light.admittance,
+        light.ambient,
+        light.bottom,
+        light.incident,
+        light.top_above,
+        light.top_below,
+        light.low_above,
+        light.low_below,
+    )
+
+
+@numba.njit(cache=True)
+def _add_absorption(
+    total: FloatArray,
+    thickness: FloatArray,
+    weight: FloatArray,
+    phase: ComplexArray,
+    admittance: ComplexArray,
+    ambient: FloatArray,
+    bottom: ComplexArray,
+    incident: ComplexArray,
+    top_above: ComplexArray,
+    top_below: ComplexArray,
+    low_above: ComplexArray,
+    low_below: ComplexArray,
+) -> None:  # pragma: no cover - compiled
+    for q in range(weight.size):
+        y, e_bottom, h_bottom = admittance[q], bottom[q, 0], bottom[q, 1]
+        c, t, low = incident[q], top_above[q], low_above[q]
+        for i in range(thickness.size):
+            once = np.exp(1j * phase[q] * thickness[i])
+            even, odd = 0.5 * (1.0 + once * once), 0.5 * (1.0 - once * once)
+            e = even * e_bottom + odd * h_bottom / y
+            h = odd * y * e_bottom + even * h_bottom
+            e_top = t[0, 0] * e + t[0, 1] * h + once * top_below[q, 0]
+            h_top = t[1, 0] * e + t[1, 1] * h + once * top_below[q, 1]
+            e_low = low[0, 0] * e + low[0, 1] * h + once * low_below[q, 0]
+            h_low = low[1, 0] * e + low[1, 1] * h + once * low_below[q, 1]
+            flux = (
+                e_top.real * h_top.real
+                + e_top.imag * h_top.imag
+                - e_low.real * h_low.real
+                - e_low.imag * h_low.imag
+            )
+            e_front = c[0, 0] * e + c[0, 1] * h
+            h_front = c[1, 0] * e + c[1, 1] * h
+            forward = 0.5 * (e_front + h_front / ambient[q])
+            total[i] += weight[q] * flux / (ambient[q] * (forward.real**2 + forward.imag**2))
