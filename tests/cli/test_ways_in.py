@@ -181,6 +181,25 @@ def test_a_file_with_a_hole_is_refused(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.parametrize("first", [b"", b"\0" * 5])
+def test_a_compressed_image_that_claims_too_much_is_refused(tmp_path: Path, first: bytes) -> None:
+    """Also behind what is not FITS, where astropy may look for the next header."""
+    image = fits.CompImageHDU(np.zeros((40, 50), np.int32), compression_type="RICE_1")
+    path = tmp_path / "claims.fits"
+    fits.HDUList([fits.PrimaryHDU(), image]).writeto(path)
+    content = path.read_bytes()
+    with open_user_fits(path) as hdus:
+        assert hdus[1].data.shape == (40, 50)
+    for axis in (b"ZNAXIS1", b"ZNAXIS2"):
+        place = content.index(axis)
+        content = content[:place] + (axis + b" = %20d" % 60_000).ljust(80) + content[place + 80 :]
+    if first:  # a card that the standard does not know, so that sizes are open to interpretation
+        content = content.replace(b"SIMPLE  =                    T", b"SIMPLE  =                    F", 1)
+    path.write_bytes(content)
+    with pytest.raises(FrameFormatError, match="bytes in the file"), open_user_fits(path):
+        pass
+
+
 def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo.fits")
     (tmp_path / "device.fits").symlink_to("/dev/zero")

@@ -378,11 +378,14 @@ def test_command_reports_and_sets_its_exit_status(repo: Path, tmp_path: Path, in
     assert "path is" in nothing.output
 
 
-def test_a_repository_of_others_is_prepared_first(tmp_path: Path, invoke: Invoke) -> None:
+def test_a_repository_of_others_is_prepared_first(
+    tmp_path: Path, invoke: Invoke, caplog: pytest.LogCaptureFixture
+) -> None:
     repo = tmp_path / "repo"
     Butler.makeRepo(str(repo))
     with Butler.from_config(str(repo), writeable=True) as butler:
         Ts8Fringe().register(butler.registry)
+    assert f"butler prepare-fringe-repo {repo}" in caplog.text
     series(tmp_path / "raw")
     refused = invoke("ingest-fringe-raws", repo, tmp_path / "raw", "--transfer", "copy")
     assert refused.exit_code == 1
@@ -393,6 +396,10 @@ def test_a_repository_of_others_is_prepared_first(tmp_path: Path, invoke: Invoke
     assert after["registry"] == before["registry"]
     assert "nothing is missing" in invoke("prepare-fringe-repo", repo).output
     assert invoke("ingest-fringe-raws", repo, tmp_path / "raw", "--transfer", "copy").exit_code == 0
+    caplog.clear()
+    with Butler.from_config(str(repo), writeable=True) as butler:
+        Ts8Fringe().register(butler.registry)
+    assert not caplog.records
     with Butler.from_config(str(repo)) as butler:
         assert isinstance(butler.get(raws(butler)[0]), RawFrame)
 
