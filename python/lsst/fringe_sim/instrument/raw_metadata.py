@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from ..errors import FrameFormatError, UnknownNameError
+from ..errors import FrameFormatError, UnknownNameError, named_units
 from .camera import Camera, Detector
 from .raw_checks import refuse_other_instrument, refuse_stutter
 from .raw_header import RawHeader, header_value
@@ -58,6 +58,7 @@ TEMPERATURE_RANGE_C = (-200.0, 60.0)
 ZERO_CELSIUS_K = 273.15
 
 
+@named_units
 @dataclasses.dataclass(frozen=True)
 class RawMetadata:
     """What the headers of a raw frame say about the exposure.

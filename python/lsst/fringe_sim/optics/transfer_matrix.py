@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, OutOfRangeError, StackError
+from ..errors import InputError, OutOfRangeError, StackError, named_units
 
 __all__ = [
     "POLARIZATIONS",
@@ -69,6 +69,7 @@ class WaveFields:
         return _flux(self.forward_bottom, self.backward_bottom, admittance)
 
 
+@named_units
 def layer_absorption(
     n: ArrayLike,
     d: ArrayLike,
@@ -134,6 +135,7 @@ def pure_polarizations(polarization: str, theta: FloatArray) -> tuple[str, ...]:
     return ("s", "p") if np.any(theta) else ("s",)
 
 
+@named_units
 def layer_admittance(
     index: ComplexArray, theta: FloatArray, polarization: str
 ) -> tuple[ComplexArray, ComplexArray]:
