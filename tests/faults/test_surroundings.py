@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import resource
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def command(given: Path, name: str, out: Path) -> list[str]:
     kind = {
-        "sky": ["--thickness", str(given / "map.fits"), "--setup", "lsst_e2v"],
+        "sky": ["--thickness", str(given / "map.fits"), "--setup", "monocam"],
         "fit": [str(given / "cube.fits"), "--setup", "ts8_e2v"],
         "discover": [str(given / "cube.fits"), "--setup", "ts8_e2v", "--seed", "3", "--cells", "400"],
     }
@@ -80,6 +81,21 @@ def files_of(words: list[str], out: Path, **environment: str) -> dict[str, bytes
     return {name: content.replace(os.fsencode(out), b"OUT") for name, content in found.items()}
 
 
+@pytest.fixture(scope="module")
+def usual(given: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, bytes]]:
+    """What a command writes in usual surroundings."""
+
+    @functools.cache
+    def made(name: str) -> dict[str, bytes]:
+        out = tmp_path_factory.mktemp("usual") / "out"
+        return files_of(command(given, name, out), out)
+
+    return made
+
+
+Usual = Callable[[str], dict[str, bytes]]
+
+
 def compared(found: Mapping[str, bytes], wanted: Mapping[str, bytes]) -> None:
     assert found.keys() == wanted.keys()
     assert not [name for name in wanted if found[name] != wanted[name]]
@@ -96,7 +112,7 @@ def test_any_number_of_threads_gives_the_same_bytes(name: str, given: Path, tmp_
     compared(made[64], made[1])
 
 
-def test_without_a_cache_of_compiled_functions(given: Path, tmp_path: Path) -> None:
+def test_without_a_cache_of_compiled_functions(given: Path, tmp_path: Path, usual: Usual) -> None:
     """A cache in a place where no folder can be made: every process compiles for itself, to the same bytes."""
     (tmp_path / "file").touch()
     nowhere = str(tmp_path / "file" / "cache")
@@ -107,21 +123,19 @@ def test_without_a_cache_of_compiled_functions(given: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("place", ["/dev/full", "/proc/self", "missing"])
-def test_without_room_for_temporary_files(place: str, given: Path, tmp_path: Path) -> None:
-    """TMPDIR is no folder, cannot be written, or is not there: products are written beside their places."""
-    usual = files_of(command(given, "sky", tmp_path / "usual"), tmp_path / "usual")
+def test_without_room_for_temporary_files(place: str, given: Path, tmp_path: Path, usual: Usual) -> None:
+    """TMPDIR is no folder, cannot be written, or is not there: products are made beside their places."""
     folder = place if place.startswith("/") else str(tmp_path / place)
-    compared(files_of(command(given, "sky", tmp_path / "out"), tmp_path / "out", TMPDIR=folder), usual)
+    compared(files_of(command(given, "sky", tmp_path / "out"), tmp_path / "out", TMPDIR=folder), usual("sky"))
 
 
 @pytest.mark.parametrize(
     "locale",
     [{"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}, {"LC_ALL": "POSIX", "PYTHONIOENCODING": "latin-1"}],
 )
-def test_locales_that_are_not_utf8(locale: dict[str, str], given: Path, tmp_path: Path) -> None:
-    usual = files_of(command(given, "sky", tmp_path / "usual"), tmp_path / "usual")
+def test_locales_that_are_not_utf8(locale: dict[str, str], given: Path, tmp_path: Path, usual: Usual) -> None:
     out = tmp_path / "für"
-    compared(files_of(command(given, "sky", out), out, PYTHONUTF8="0", **locale), usual)
+    compared(files_of(command(given, "sky", out), out, PYTHONUTF8="0", **locale), usual("sky"))
 
 
 @pytest.mark.parametrize("name", ["sky", "fit"])

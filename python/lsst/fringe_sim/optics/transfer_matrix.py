@@ -30,6 +30,9 @@ __all__ = [
 
 POLARIZATIONS = ("s", "p", "mixed")
 
+MOST_WAVELENGTHS = 1e12
+"""In one layer; the rounding of a double then moves the phase by 2 pi 1e12 2.2e-16 = 1.4e-3 rad."""
+
 ComplexArray = NDArray[np.complex128]
 FloatArray = NDArray[np.float64]
 
@@ -345,6 +348,10 @@ def _check(index: ComplexArray, thickness: FloatArray, wavelength: FloatArray, t
     _demand(good, wavelength, OutOfRangeError, "wavelength", "a positive number")
     good = (theta >= 0.0) & (theta < 0.5 * np.pi)
     _demand(good, theta, OutOfRangeError, "angle of incidence [rad]", "0 to below pi/2")
+    with np.errstate(over="ignore"):
+        waves = inner / wavelength * np.abs(index[1:-1])
+    allowed = f"up to {MOST_WAVELENGTHS:g}: the phase of more is lost in the rounding"
+    _demand(waves <= MOST_WAVELENGTHS, waves, StackError, "wavelengths in a layer", allowed)
 
 
 def _demand(good: np.ndarray, values: np.ndarray, error: type[InputError], field: str, allowed: str) -> None:
