@@ -229,6 +229,7 @@ def test_linked_names_are_documented(site: Path) -> None:
 @pytest.mark.slow
 def test_catalogues_are_complete(site: Path) -> None:
     from lsst.fringe_sim.effects import EFFECTS
+    from lsst.fringe_sim.instrument.header_keywords import RAW_KEYWORDS
     from lsst.fringe_sim.model import setup_names
     from lsst.fringe_sim.tasks import EpoxyFitConfig
 
@@ -243,5 +244,7 @@ def test_catalogues_are_complete(site: Path) -> None:
     assert all(field in tasks for field in EpoxyFitConfig._fields if field not in of_the_framework)
     provenance = (site / "reference" / "provenance.html").read_text(encoding="utf-8")
     assert all(name in provenance for name in list_resources("media", ".ecsv"))
+    headers = (site / "reference" / "headers.html").read_text(encoding="utf-8")
+    assert all(item.name in headers for item in RAW_KEYWORDS)
     changes = (site / "reference" / "changes.html").read_text(encoding="utf-8")
     assert "simulate_sky_frame" in changes

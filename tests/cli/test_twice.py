@@ -121,10 +121,9 @@ def test_a_second_time_changes_nothing(name: str, given: dict[str, str], tmp_pat
     assert run([name, *arguments]) == 0
     first = contents(out)
     assert first
-    if name != "plan-flats":
-        assert run([name, *arguments]) == 1
-        assert contents(out) == first
-        arguments.append("--overwrite")
+    assert run([name, *arguments]) == 1
+    assert contents(out) == first
+    arguments.append("--overwrite")
     assert run([name, *arguments]) == 0
     assert contents(out) == first
 

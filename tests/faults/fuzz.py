@@ -4,9 +4,10 @@
     python tests/faults/fuzz.py --seconds 60
 
 runs all targets with new random cases, so many or for so much processor time, and prints the seeds and how many cases
-were used and how many refused. A case fails if it raises anything but `FringeSimError`, takes more than `LONGEST_S`,
-needs more than `MOST_BYTES` of memory beyond what the process had, opens a file outside the folder of the case and
-the installed program, or makes a map or a flat with good pixels that are no numbers.
+were used and how many refused. First it tries the files of `corpus/`, one folder for each target; the file of a case
+that fails goes there, reduced, and stays. A case fails if it raises anything but `FringeSimError`, takes more than
+`LONGEST_S`, needs more than `MOST_BYTES` of memory beyond what the process had, opens a file outside its folder and
+the program, makes a map or a flat with good pixels that are no numbers, or light out of nothing.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ import argparse
 import collections
 import contextlib
 import functools
+import hashlib
 import os
 import resource
 import secrets
+import shutil
 import signal
 import sys
 import tempfile
@@ -41,11 +44,13 @@ from fuzz_files import alter_fits, plain_header
 from raw_frame_maker import random_image, raw_hdus, small_detector
 
 from lsst.fringe_sim.algorithms.flat_prep import prepare_flat
+from lsst.fringe_sim.algorithms.pca import fit_pca
 from lsst.fringe_sim.algorithms.thickness_fit import fit_thickness
 from lsst.fringe_sim.cli.amplitudes import read_line_list
 from lsst.fringe_sim.cli.inputs import read_settings, read_thickness
 from lsst.fringe_sim.cli.lab_frames import read_cube
 from lsst.fringe_sim.cli.provenance import describe, read_header
+from lsst.fringe_sim.cli.sky_frames import read_sky_frames
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.errors import FringeSimError
 from lsst.fringe_sim.instrument.bandpass import Bandpass
@@ -53,6 +58,7 @@ from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_metadata
 from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
 from lsst.fringe_sim.model import FringeModel, Setup
+from lsst.fringe_sim.optics import Layer, LayerStack, get_medium, layer_absorption
 from lsst.fringe_sim.resources import resource_path
 
 LONGEST_S = 20.0
@@ -145,6 +151,7 @@ _PROGRAM = tuple(
         sys.prefix,
         sys.base_prefix,
         Path(__file__).parents[2],
+        os.environ.get("NUMBA_CACHE_DIR") or "/dev/null",
         "/dev/null",
         "/usr/share/zoneinfo",
         "/proc/self",
@@ -182,6 +189,11 @@ PRODUCTS = {
     for name in sorted(product_makers.MAKERS)
 }
 """Every product, once with checksums and once as a file from elsewhere, which has none."""
+_NONE = np.zeros((6, 8), np.int32)
+SKY_FRAMES = plain_header(product_makers.sky((6, 8), mask=_NONE), product="SkyFringe")
+SOUND_FRAME = plain_header(product_makers.sky((6, 8), 9, mask=_NONE), product="SkyFringe")[0]
+MAP = plain_header(product_makers.thickness((6, 8), mask=_NONE, layer="adhesive"), product="ThicknessMap")[0]
+SKY = Setup.from_name("lsst_e2v")
 
 
 def _file(folder: Path, content: bytes, name: str = "case.fits") -> Path:
@@ -192,7 +204,11 @@ def _file(folder: Path, content: bytes, name: str = "case.fits") -> Path:
 
 def raw_frame(data: st.DataObject, folder: Path) -> None:
     """A raw frame, and the flat that is made of it."""
-    path = _file(folder, alter_fits(data, RAW_BYTES))
+    use_raw_frame(_file(folder, alter_fits(data, RAW_BYTES)), folder)
+
+
+def use_raw_frame(path: Path, folder: Path) -> None:
+    """Its metadata, its pixels, and the flat."""
     with guarded("raw frames", folder):
         read_raw_metadata(path)
         frame = RawFrame.read(path)
@@ -204,7 +220,12 @@ def product(data: st.DataObject, folder: Path) -> None:
     """A product from disk, also without the checksums that would show the damage; provenance of the same file."""
     name = data.draw(st.sampled_from(sorted(PRODUCTS)))
     content = PRODUCTS[name][data.draw(st.integers(0, 1))]
-    path = _file(folder, alter_fits(data, content))
+    use_product(_file(folder, alter_fits(data, content), f"{name}.fits"), folder)
+
+
+def use_product(path: Path, folder: Path) -> None:
+    """The product after which the file is named, and its provenance."""
+    name = path.stem.partition("-")[0]
     with guarded(f"product {name}", folder):
         product_makers.p.__dict__[name].read_fits(path)
     with guarded("provenance", folder):
@@ -213,9 +234,32 @@ def product(data: st.DataObject, folder: Path) -> None:
 
 def thickness_file(data: st.DataObject, folder: Path) -> None:
     """A thickness map from anywhere."""
-    path = _file(folder, alter_fits(data, PRODUCTS["ThicknessMap"][-1]))
+    use_thickness(_file(folder, alter_fits(data, PRODUCTS["ThicknessMap"][-1])), folder)
+
+
+def use_thickness(path: Path, folder: Path) -> None:
+    """The map as commands read it."""
     with guarded("thickness maps", folder):
         read_thickness(path)
+
+
+def sky_frame_file(data: st.DataObject, folder: Path) -> None:
+    """A frame of the sky, spoiled, beside a sound one, as a search reads them."""
+    content = SKY_FRAMES[data.draw(st.integers(0, 1))]
+    use_sky_frame(_file(folder, alter_fits(data, content)), folder)
+
+
+def use_sky_frame(path: Path, folder: Path) -> None:
+    """Both frames with the map of their sensor; then templates of them."""
+    night = folder / "night"
+    night.mkdir(exist_ok=True)
+    shutil.copy(path, night / "case.fits")
+    _file(night, SOUND_FRAME, "sound.fits")
+    _file(folder, MAP, "map.fits")
+    with guarded("sky frames", folder):
+        found = read_sky_frames([str(night)], SKY, str(folder / "map.fits"))
+        components = fit_pca(found.sky.frames, n_components=1)
+        _honest(components.mean, components.mask)
 
 
 def _honest(image: Any, mask: Any) -> None:
@@ -269,7 +313,11 @@ def cube(data: st.DataObject, folder: Path) -> None:
 
 def cube_file(data: st.DataObject, folder: Path) -> None:
     """The file of a cube, spoiled, as the commands read it, and fitted if it is still one."""
-    path = _file(folder, alter_fits(data, PRODUCTS["FringeCube"][data.draw(st.integers(0, 1))]))
+    use_cube(_file(folder, alter_fits(data, PRODUCTS["FringeCube"][data.draw(st.integers(0, 1))])), folder)
+
+
+def use_cube(path: Path, folder: Path) -> None:
+    """The cube, fitted if it is still one."""
     with guarded("files of fringe cubes", folder):
         _fit(path, "global")
 
@@ -402,17 +450,26 @@ def effects_file(data: st.DataObject, folder: Path) -> None:
     """A file of effects, and the model with them."""
     keys = data.draw(st.lists(st.one_of(st.sampled_from(NAMES), st.text(max_size=20)), max_size=3))
     valid = yaml.safe_dump({key: data.draw(_near(1.5)) for key in keys} or {"bandwidth": {"fwhm": 2.4}})
-    path = _file(folder, _yaml_text(data, valid), "effects.yaml")
-    setup = data.draw(st.sampled_from(["ts8_e2v", "ts8_itl"]))
-    with guarded("effects files", folder):
-        model = FringeModel.from_setup(setup, read_settings(path))
-        model.response([13.0, 13.1], [900.0, 960.0])
+    use_effects(_file(folder, _yaml_text(data, valid), "effects.yaml"), folder)
+
+
+def use_effects(path: Path, folder: Path) -> None:
+    """Models of both vendors with the effects."""
+    for setup in ("ts8_e2v", "ts8_itl"):
+        with guarded("effects files", folder):
+            model = FringeModel.from_setup(setup, read_settings(path))
+            model.response([13.0, 13.1], [900.0, 960.0])
 
 
 def setup_file(data: st.DataObject, folder: Path) -> None:
     """A set-up of the user, and the response of its sensor."""
     name = data.draw(st.sampled_from(["ts8_e2v", "ts8_itl", "bnl_ts8_e2v", "lsst_e2v"]))
-    path = _file(folder, _yaml_text(data, resource_path("setups", f"{name}.yaml").read_text()), "own.yaml")
+    valid = resource_path("setups", f"{name}.yaml").read_text()
+    use_setup(_file(folder, _yaml_text(data, valid), "own.yaml"), folder)
+
+
+def use_setup(path: Path, folder: Path) -> None:
+    """The set-up, and what its sensor answers."""
     with guarded("set-up files", folder):
         found = Setup.from_file(path)
         if found.kind == "monochromator":
@@ -422,11 +479,49 @@ def setup_file(data: st.DataObject, folder: Path) -> None:
 def camera_file(data: st.DataObject, folder: Path) -> None:
     """A camera of the user."""
     name = data.draw(st.sampled_from(["monocam", "hsc"]))
-    path = _file(
-        folder, _yaml_text(data, resource_path("instrument", f"{name}.yaml").read_text()), "own.yaml"
-    )
+    valid = resource_path("instrument", f"{name}.yaml").read_text()
+    use_camera(_file(folder, _yaml_text(data, valid), "own.yaml"), folder)
+
+
+def use_camera(path: Path, folder: Path) -> None:
+    """The camera."""
     with guarded("camera files", folder):
         Camera.from_file(path)
+
+
+MEDIA = ("vacuum", "MgF2", "Ta2O5", "Si", "SiO2", "epoxy", "Si3N4", "HfO2")
+ODD = ("thickness", "wavelength", "temperature", "theta", "roughness", "medium", "name", "end", "number")
+
+
+def layer_stack(data: st.DataObject, folder: Path) -> None:
+    """Layers of anything, and the light in them: fractions that add up to 1. At most one thing is odd."""
+    odd = data.draw(st.sampled_from([*ODD, *[""] * len(ODD)]))
+
+    def number(what: str, low: float, high: float) -> float:
+        return data.draw(_numbers(low, high) if odd == what else st.floats(low, high))
+
+    count = data.draw(st.integers(0, 2) if odd == "number" else st.integers(2, 7))
+    with guarded("layer stacks", folder):
+        layers = []
+        for place in range(count):
+            end = place in (0, count - 1) and odd != "end"
+            name = data.draw(st.text(max_size=3)) if odd == "name" else f"layer{place}"
+            layers.append(
+                Layer(
+                    name,
+                    get_medium(data.draw(st.text(max_size=5) if odd == "medium" else st.sampled_from(MEDIA))),
+                    float("inf") if end else number("thickness", 0.0, 200.0),
+                    roughness_nm=number("roughness", 0.0, 20.0),
+                )
+            )
+        stack = LayerStack(tuple(layers))
+        wavelength = np.array([number("wavelength", 600.0, 1000.0) for _ in range(2)])
+        index = stack.indices(wavelength, number("temperature", 170.0, 300.0))
+        parts = layer_absorption(
+            index, stack.thickness_um[:, None], 1e-3 * wavelength, number("theta", 0.0, 1.5)
+        )
+        if not (np.isfinite(parts).all() and np.abs(parts.sum(axis=0) - 1.0).max() < 1e-6):
+            raise AssertionError(f"light that is lost or made: {parts.sum(axis=0)}")
 
 
 def line_list(data: st.DataObject, folder: Path) -> None:
@@ -463,7 +558,11 @@ wavelength intensity
 def line_file(data: st.DataObject, folder: Path) -> None:
     """A line list as a file of the user."""
     text = _alter_text(data, LINES) if data.draw(st.integers(0, 5)) else data.draw(st.sampled_from(HOSTILE))
-    path = _file(folder, text.encode("utf-8", "surrogatepass"), "lines.ecsv")
+    use_lines(_file(folder, text.encode("utf-8", "surrogatepass"), "lines.ecsv"), folder)
+
+
+def use_lines(path: Path, folder: Path) -> None:
+    """The list as commands read it."""
     with guarded("files of line lists", folder):
         read_line_list(path)
 
@@ -478,7 +577,11 @@ def effects_override(data: st.DataObject, folder: Path) -> None:
     text = _alter_text(data, valid)
     if not data.draw(st.integers(0, 3)):
         text += data.draw(st.sampled_from(CODE)).format(folder)
-    path = _file(folder, text.encode("utf-8", "surrogatepass"), "effects.py")
+    use_override(_file(folder, text.encode("utf-8", "surrogatepass"), "effects.py"), folder)
+
+
+def use_override(path: Path, folder: Path) -> None:
+    """The model with its effects, and nothing executed."""
     with guarded("effects overrides", folder):
         FringeModel.from_setup("ts8_e2v", read_settings(path))
     if (folder / "executed").exists():
@@ -502,7 +605,11 @@ def any_document(data: st.DataObject, folder: Path) -> None:
     if suffix == ".ecsv":
         valid = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\n# meta: {SETUP: x}\na\n1\n"
     text = _alter_text(data, valid) if data.draw(st.booleans()) else data.draw(st.sampled_from(HOSTILE))
-    path = _file(folder, text.encode("utf-8", "surrogatepass"), f"case{suffix}")
+    use_document(_file(folder, text.encode("utf-8", "surrogatepass"), f"case{suffix}"), folder)
+
+
+def use_document(path: Path, folder: Path) -> None:
+    """Its provenance."""
     with guarded("documents", folder):
         describe(read_header(str(path)))
 
@@ -510,7 +617,9 @@ def any_document(data: st.DataObject, folder: Path) -> None:
 TARGETS: dict[Callable[[st.DataObject, Path], None], int] = {
     raw_frame: 5,
     product: 5,
-    thickness_file: 1,
+    thickness_file: 2,
+    sky_frame_file: 2,
+    layer_stack: 3,
     cube: 4,
     cube_file: 2,
     effects_file: 2,
@@ -523,13 +632,68 @@ TARGETS: dict[Callable[[st.DataObject, Path], None], int] = {
 }
 """Targets and their share of the cases."""
 
+QUICK = (raw_frame, product, thickness_file, sky_frame_file, layer_stack, setup_file, camera_file, line_file)
+"""Targets of which a case takes milliseconds."""
+
+CORPUS = Path(__file__).parent / "corpus"
+
+USES: dict[str, Callable[[Path, Path], None]] = {
+    "raw_frame": use_raw_frame,
+    "product": use_product,
+    "thickness_file": use_thickness,
+    "sky_frame_file": use_sky_frame,
+    "cube": use_cube,
+    "cube_file": use_cube,
+    "effects_file": use_effects,
+    "setup_file": use_setup,
+    "camera_file": use_camera,
+    "line_file": use_lines,
+    "effects_override": use_override,
+    "any_document": use_document,
+}
+"""What is done with the file of a case, by the name of its target; line lists and stacks have none."""
+
+
+def try_corpus() -> int:
+    """Try every file that failed once, or that somebody has put there; return their number."""
+    found = sorted(path for path in CORPUS.glob("*/*") if path.is_file())
+    for path in found:
+        with tempfile.TemporaryDirectory() as name:
+            copy = Path(shutil.copy(path, name))
+            print(f"corpus/{path.parent.name}/{path.name}", flush=True)
+            USES[path.parent.name](copy, Path(name))
+    return len(found)
+
+
+def keep(target: str, folder: Path) -> None:
+    """Put the file of a failing case into the corpus."""
+    for path in folder.iterdir():
+        if path.is_file() and target in USES:
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+            (CORPUS / target).mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, CORPUS / target / f"{path.stem}-{digest}{path.suffix}")
+
+
 ROUND = 10 * sum(TARGETS.values())
 """Cases between two looks at the clock."""
 
 
 @functools.cache
+def warm_up_quickly() -> None:
+    """Let what quick targets call be compiled or read from the cache."""
+    MODEL.response([13.0, 13.1], [900.0, 960.0])
+    with tempfile.TemporaryDirectory() as name:
+        for use, content in ((use_raw_frame, RAW_BYTES), (use_sky_frame, SKY_FRAMES[0])):
+            with contextlib.suppress(TimeoutError):
+                use(_file(Path(name), content), Path(name))
+    TALLY.used.clear()
+    TALLY.slowest_s = 0.0
+
+
+@functools.cache
 def warm_up() -> None:
     """Let everything be compiled on sound input: a case has not the time for it."""
+    warm_up_quickly()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cube.fits"
         wavelength = np.linspace(880.0, 990.0, 6)
@@ -547,7 +711,7 @@ def warm_up() -> None:
 
 def run_target(target: Callable[[st.DataObject, Path], None], cases: int, seed: int | None = None) -> None:
     """Run so many cases of a target; a failing one is reduced and raised."""
-    warm_up()
+    (warm_up_quickly if target in QUICK else warm_up)()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
 
@@ -564,7 +728,11 @@ def run_target(target: Callable[[st.DataObject, Path], None], cases: int, seed: 
         def case(data: st.DataObject) -> None:
             target(data, folder)
 
-        (case if seed is None else with_seed(seed)(case))()
+        try:
+            (case if seed is None else with_seed(seed)(case))()
+        except BaseException:
+            keep(target.__name__, folder)  # the last case that ran is the reduced one
+            raise
 
 
 def run_cases(
@@ -586,16 +754,21 @@ def main() -> None:
     )
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seconds", type=float, help="processor time, in place of a number of cases")
+    parser.add_argument(
+        "--quick", action="store_true", help="only targets of which a case takes milliseconds"
+    )
     parser.add_argument("--only", help="one target, by the name of its function")
     parser.add_argument("--seed", type=int, help="of one target, as it was printed; by default new ones")
     arguments = parser.parse_args()
     chosen = {target: share for target, share in TARGETS.items() if arguments.only in (None, target.__name__)}
+    chosen = {target: share for target, share in chosen.items() if target in QUICK or not arguments.quick}
+    print(f"{try_corpus()} files of the corpus")
     if arguments.seed is not None:
         (target,) = chosen
         run_target(target, arguments.cases, arguments.seed)
     else:
         rng = np.random.default_rng(secrets.randbits(128))
-        warm_up()
+        (warm_up_quickly if arguments.quick else warm_up)()
         began = time.process_time()
         while True:
             run_cases(chosen, arguments.cases if arguments.seconds is None else ROUND, rng)

@@ -9,26 +9,37 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
-
 SECONDS = 60
 LEAST = 250
 """Cases: one round. A minute of processor time is good for a thousand and more."""
 
 
-def test_fresh_cases() -> None:
-    """In a process of its own, which may limit memory and watch every file that is opened."""
+QUICK = 300
+"""Cases in every quick run."""
+
+
+def fuzz(*arguments: object) -> int:
+    """Cases that were tried, in a process of its own, which may limit memory and watch every file that is opened."""
     program = Path(__file__).with_name("fuzz.py")
     done = subprocess.run(
-        [sys.executable, str(program), "--seconds", str(SECONDS)],
+        [sys.executable, str(program), *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         check=False,
     )
-    # With the seeds: a failing target is run again with --only NAME --seed SEED.
+    # With the seeds: a failing target is run again with --only NAME --seed SEED, or from the corpus.
     print(done.stdout)
     assert done.returncode == 0, done.stdout[-8000:]
     total = re.search(r"^(\d+) cases, slowest", done.stdout, re.MULTILINE)
     assert total is not None
-    assert int(total[1]) >= LEAST
+    return int(total[1])
+
+
+def test_what_failed_once_and_cheap_fresh_cases() -> None:
+    assert fuzz("--cases", QUICK, "--quick") >= QUICK
+
+
+@pytest.mark.slow
+def test_fresh_cases() -> None:
+    assert fuzz("--seconds", SECONDS) >= LEAST

@@ -72,8 +72,9 @@ def small_detector(vendor: str = "e2v", shape: tuple[int, int] = (24, 40)) -> De
 def header_with(
     changes: Mapping[str, Any] | None = None, base: Mapping[str, Any] = TS8_HEADER
 ) -> dict[str, Any]:
-    """The header with some values changed; `None` takes a keyword out."""
-    merged = {**base, **(changes or {})}
+    """The header with some values changed; `None` takes a keyword out. Another date takes the Julian one out."""
+    changes = changes or {}
+    merged = {**base, **({} if changes.get("DATE-OBS") is None else {"MJD-OBS": None}), **changes}
     return {keyword: value for keyword, value in merged.items() if value is not None}
 
 

@@ -12,7 +12,7 @@ from raw_frame_maker import LSSTCAM_HEADER, TS8_HEADER, header_with, write_raw
 
 from lsst.fringe_sim.errors import FrameFormatError
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
-from lsst.fringe_sim.middleware.translators import FringeLsstCamTranslator
+from lsst.fringe_sim.middleware.translators import FringeLsstCamTranslator, FringeTs8Translator
 
 
 def interpret(base: dict[str, Any], **changes: Any) -> RawMetadata:
@@ -69,6 +69,47 @@ def test_exposures_begin_when_obs_lsst_says(stated: str | None, scale: str) -> N
     assert abs((begin - Time("2021-12-13T04:58:56.398", scale=scale)).to_value("s")) < 1e-3
 
 
+OF_2023 = {**camera("20230512", "C", 21, "TS"), "EXPTIME": 15.0, "TIMESYS": None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "begin"),
+    [
+        # TS_C_20230512_000021 and TS_C_20220711_000174, whose DATE-OBS is their DATE-TRG, and TS_C_20230523_000127.
+        (
+            {"DATE-OBS": "2023-05-12T19:17:59.150", "DATE-TRG": "2023-05-12T19:17:59.150"},
+            "2023-05-12T19:17:44.150",
+        ),
+        (
+            {
+                **camera("20220711", "C", 174, "TS"),
+                "DATE-OBS": "2022-07-11T17:14:45.995",
+                "DATE-TRG": "2022-07-11T17:14:45.995",
+                "EXPTIME": 210.0,
+            },
+            "2022-07-11T17:11:15.995",
+        ),
+        (
+            {
+                **camera("20230523", "C", 127, "TS"),
+                "DATE-OBS": "2023-05-23T19:36:19.477",
+                "DATE-TRG": "2023-05-23T19:36:34.638",
+                "DATE-BEG": "2023-05-23T19:36:19.477",
+                "TIMESYS": "TAI",
+            },
+            "2023-05-23T19:36:19.477",
+        ),
+    ],
+)
+def test_the_end_of_an_exposure_of_ts8_is_not_its_begin(changes: dict[str, Any], begin: str) -> None:
+    header = header_with({**OF_2023, **changes}, TS8_HEADER)
+    found = FringeTs8Translator(header, filename="raw.fits").to_datetime_begin()
+    assert abs((found - Time(begin, scale="tai")).to_value("s")) < 1e-3
+    # The number of the exposure has the digits of DATE-OBS as it stands.
+    digits = "".join(letter for letter in changes["DATE-OBS"][:21] if letter.isdigit())
+    assert FringeTs8Translator(header, filename="raw.fits").to_exposure_id() == int(digits)
+
+
 def test_the_begin_is_preferred_and_the_shutter_measures() -> None:
     about = RawMetadata.from_header(
         header_with({"DATE-BEG": "2021-12-13T04:58:40.000", "SHUTTIME": 14.98}, LSSTCAM_HEADER),
@@ -91,6 +132,9 @@ def test_the_begin_is_preferred_and_the_shutter_measures() -> None:
         ({"CREATOR": "PHOSIM"}, "CREATOR"),
         ({"CONTRLLR": "H"}, "CONTRLLR"),
         ({"SHUTTIME": -1.0}, "SHUTTIME"),
+        ({"MJD-OBS": 59561.0}, "MJD-OBS"),
+        ({"DATE-BEG": "2021-12-13T04:58:40", "MJD-BEG": 59561.21}, "MJD-BEG"),
+        ({"AMSTART": 0.7}, "AMSTART"),
     ],
 )
 def test_contradictions_are_refused(changes: dict[str, Any], keyword: str) -> None:
@@ -160,6 +204,6 @@ def test_the_size_of_the_other_vendor_is_refused() -> None:
 
     sensor = Camera.from_name("lsstCam").detector("R22_S21")
     with pytest.raises(FrameFormatError, match="DETSIZE"):
-        refuse_other_vendor(None, sensor, (4000, 4072), "raw.fits")
+        refuse_other_vendor(None, None, sensor, (4000, 4072), "raw.fits")
     for shape in ((4004, 4096), (160, 192)):
-        refuse_other_vendor("E2V", sensor, shape, "raw.fits")
+        refuse_other_vendor("E2V", "CCD250", sensor, shape, "raw.fits")

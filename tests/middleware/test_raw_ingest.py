@@ -22,6 +22,7 @@ from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.raw_files import find_raw_files
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_header
 from lsst.fringe_sim.middleware import Ts8Fringe, get_cli_subcommands, raw_ingest
+from lsst.fringe_sim.middleware.night import airmass_of
 from lsst.fringe_sim.middleware.raw_ingest import IngestReport, ingest_raws
 from lsst.fringe_sim.middleware.translators import TRANSLATORS
 
@@ -106,6 +107,24 @@ def test_frames_of_the_camera_go_to_the_camera(butler: Butler, tmp_path: Path) -
     records = butler.query_dimension_records("exposure", instrument="LSSTCam")
     assert {record.physical_filter for record in records} == {"none", "y_04", "monochromator"}
     assert len(raws(butler, "LSSTCam/raw/all")) == 3
+
+
+def test_what_is_taken_for_granted_is_said(repo: Path, tmp_path: Path, invoke: Invoke) -> None:
+    """Without INSTRUME and TSTAND the other keywords decide about sensor and exposure number."""
+    write_raw(tmp_path / "raw.fits", {"TSTAND": None, "RAFTBAY": "R11", "SLOTNAME": "S01"})
+    result = invoke("ingest-fringe-raws", str(repo), str(tmp_path / "raw.fits"))
+    assert (
+        "1 raw frames: neither INSTRUME nor TSTAND = TS8 in the header: taken as a frame of lsstCam"
+        in result.output
+    )
+
+
+def test_the_airmass_reaches_the_record(butler: Butler, tmp_path: Path) -> None:
+    about = {"IMGTYPE": "OBJECT", "AMSTART": 1.2}
+    write_raw(tmp_path / "raw.fits", about, base=LSSTCAM_HEADER)
+    ingest_raws(butler, [str(tmp_path / "raw.fits")])
+    (record,) = butler.query_dimension_records("exposure", instrument="LSSTCam")
+    assert airmass_of(record) == pytest.approx(1.2)
 
 
 def test_translators_are_chosen_by_the_header(tmp_path: Path) -> None:
@@ -359,11 +378,14 @@ def test_command_reports_and_sets_its_exit_status(repo: Path, tmp_path: Path, in
     assert "path is" in nothing.output
 
 
-def test_a_repository_of_others_is_prepared_first(tmp_path: Path, invoke: Invoke) -> None:
+def test_a_repository_of_others_is_prepared_first(
+    tmp_path: Path, invoke: Invoke, caplog: pytest.LogCaptureFixture
+) -> None:
     repo = tmp_path / "repo"
     Butler.makeRepo(str(repo))
     with Butler.from_config(str(repo), writeable=True) as butler:
         Ts8Fringe().register(butler.registry)
+    assert f"butler prepare-fringe-repo {repo}" in caplog.text
     series(tmp_path / "raw")
     refused = invoke("ingest-fringe-raws", repo, tmp_path / "raw", "--transfer", "copy")
     assert refused.exit_code == 1
@@ -374,6 +396,10 @@ def test_a_repository_of_others_is_prepared_first(tmp_path: Path, invoke: Invoke
     assert after["registry"] == before["registry"]
     assert "nothing is missing" in invoke("prepare-fringe-repo", repo).output
     assert invoke("ingest-fringe-raws", repo, tmp_path / "raw", "--transfer", "copy").exit_code == 0
+    caplog.clear()
+    with Butler.from_config(str(repo), writeable=True) as butler:
+        Ts8Fringe().register(butler.registry)
+    assert not caplog.records
     with Butler.from_config(str(repo)) as butler:
         assert isinstance(butler.get(raws(butler)[0]), RawFrame)
 

@@ -196,6 +196,8 @@ def test_trailing_axes_broadcast() -> None:
         (([1.0, 2.0, 1.0], [np.inf, -0.1, np.inf], 0.5), StackError, "inner layer"),
         (([1.0, 2.0, 1.0], [np.inf, np.nan, np.inf], 0.5), StackError, "inner layer"),
         (([1.0, 2.0, 1.0], [np.inf, np.inf, np.inf], 0.5), StackError, "inner layer"),
+        (([1.0, 2.0, 1.0], [np.inf, 1e308, np.inf], 0.5), StackError, "wavelengths in a layer"),
+        (([1.0, 2.0, 1.0], [np.inf, 1e13, np.inf], 0.5), StackError, "wavelengths in a layer"),
         (([1.0, 2.0 - 0.1j, 1.0], [np.inf, 0.1, np.inf], 0.5), StackError, "index"),
         (([1.0, 0.0, 1.0], [np.inf, 0.1, np.inf], 0.5), StackError, "index"),
         (([1.0 + 0.1j, 2.0], [np.inf, np.inf], 0.5), StackError, "ambient"),

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from lsst.pex.config import FieldValidationError
@@ -8,6 +10,7 @@ from lsst.fringe_sim.effects import EFFECTS, Effect
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.model.effects_override import effects_override
 from lsst.fringe_sim.tasks import (
     EpoxyFitConfig,
     FringeModelConfig,
@@ -187,3 +190,55 @@ def test_an_entry_that_is_not_there_is_said(field: str, name: str) -> None:
         getattr(made, field)[name]
     assert name not in getattr(made, field)
     assert getattr(made, field).get(name) is None
+
+
+FOUND = {"bandwidth.fwhm": 2.4, "roughness.sigma": 25.0, "contrast_loss.factor": 0.5}
+
+
+def apply_override(tmp_path: Path, text: str) -> FringeModelConfig:
+    """As ``pipetask -C`` does: the file is executed, then the configuration is validated."""
+    path = tmp_path / "effects.py"
+    path.write_text(text)
+    made = FringeModelConfig()
+    made.load(str(path))
+    made.validate()
+    return made
+
+
+def test_an_override_of_a_search_is_taken_whole(tmp_path: Path) -> None:
+    text = effects_override(FOUND, "ts8_e2v", "named", known={"temperature.kelvin": 175.0})
+    made = apply_override(tmp_path, text)
+    assert dict(made.effects) == {"temperature.kelvin": 175.0, **FOUND}
+    made.effects["epoxy_index.offset"] = 0.01
+    made.validate()
+    made.effects["roughness.sigma"] = 30.0
+    with pytest.raises(FieldValidationError, match="written_effects"):
+        made.validate()
+    made.written_effects = ""
+    made.validate()
+
+
+@pytest.mark.slow
+def test_an_override_that_was_cut_short_is_refused(tmp_path: Path) -> None:
+    """At every byte. One that ends before the first statement does says nothing at all, and cannot be told."""
+    text = effects_override(FOUND, "ts8_e2v", "named", known={"temperature.kelvin": 175.0})
+    statement = text.index(" = ")
+    accepted = []
+    for length in range(len(text.rstrip().rpartition("\n")[0])):
+        try:
+            made = apply_override(tmp_path, text[:length])
+        except (FieldValidationError, SyntaxError, NameError, LookupError, AttributeError):
+            continue
+        if dict(made.effects) != {"temperature.kelvin": 175.0, **FOUND}:
+            accepted.append(length)
+    assert accepted == [0, len("config"), statement, statement + 1]
+
+
+@pytest.mark.parametrize(
+    "change", [("2.4", "2.5"), ("roughness.sigma'] =", "roughness.kind'] ="), ("25.0", "2")]
+)
+def test_an_override_that_was_changed_is_refused(tmp_path: Path, change: tuple[str, str]) -> None:
+    text = effects_override(FOUND, "ts8_e2v", "named")
+    assert change[0] in text
+    with pytest.raises(FieldValidationError, match="written_effects"):
+        apply_override(tmp_path, text.replace(*change))

@@ -13,7 +13,7 @@ from typing import Any
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-from . import api, commands, physics, provenance, tasks
+from . import api, commands, headers, physics, provenance, tasks
 
 GENERATORS: dict[str, Callable[..., str]] = {
     "api": api.module_reference,
@@ -23,10 +23,12 @@ GENERATORS: dict[str, Callable[..., str]] = {
     "commands": commands.fringe_sim_commands,
     "butler-commands": commands.butler_commands,
     "effects": physics.effects,
+    "file-keywords": headers.file_keywords,
     "mask-planes": physics.mask_planes,
     "media": physics.media,
     "pipelines": tasks.pipelines,
     "provenance": provenance.tables,
+    "raw-keywords": headers.raw_keywords,
     "setups": physics.setups,
     "stacks": physics.stacks,
     "tasks": tasks.task_reference,

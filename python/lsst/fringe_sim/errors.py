@@ -8,9 +8,11 @@ value and what is allowed.
 from __future__ import annotations
 
 import difflib
+import functools
+import inspect
 import math
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
 
 __all__ = [
     "ConvergenceError",
@@ -23,6 +25,8 @@ __all__ = [
     "StackError",
     "UndeterminedError",
     "UnknownNameError",
+    "has_unit",
+    "named_units",
     "printable_name",
     "shown",
     "to_number",
@@ -242,6 +246,84 @@ def without_unit(field: str, value: Any, unit: str = "") -> Any:
         raise InputError(
             field, f"a quantity in {value.unit}", f"one in {unit}, or numbers" if unit else "plain numbers"
         ) from None
+
+
+UNIT_OF_SUFFIX = {"um": "um", "nm": "nm", "k": "K", "deg": "deg", "arcsec": "arcsec", "s": "s", "h": "h"}
+"""Unit of a parameter by what follows the last underscore of its name."""
+UNIT_OF_NAME = {"theta": "rad", "hour": "h", "hours": "h", "wavelength": "nm", "d": "nm"}
+"""Unit of a parameter by its name; thickness ``d`` and ``wavelength`` have the same one, whatever it is."""
+
+Callee = TypeVar("Callee", bound=Callable[..., Any])
+
+
+def named_units(callee: Callee) -> Callee:
+    """Convert quantities of astropy to the unit that the name of a parameter states, as ``nm`` of ``wavelength_nm``.
+
+    Numbers and arrays pass as they are. Of a class, the parameters of its construction are converted. Without this,
+    numpy takes the number out of a quantity and leaves its unit behind.
+
+    Parameters
+    ----------
+    callee : callable
+        Function, method or class.
+
+    Raises
+    ------
+    InputError
+        From the callee: a quantity of another kind; the parameter is named.
+    """
+    if inspect.isclass(callee):
+        callee.__init__ = named_units(callee.__init__)  # type: ignore[method-assign]
+        return callee
+    names = list(inspect.signature(callee).parameters)
+    units = {name: unit for name in names if (unit := _unit_of(name))}
+    places = {names.index(name): name for name in units}
+
+    relative = {"d", "wavelength"} <= units.keys()
+
+    @functools.wraps(callee)
+    def with_plain_numbers(*args: Any, **kwargs: Any) -> Any:
+        stated = {places[place] for place in places if place < len(args) and has_unit(args[place])}
+        stated |= {name for name in units.keys() & kwargs.keys() if has_unit(kwargs[name])}
+        if not stated:
+            return callee(*args, **kwargs)
+        if relative and len(stated & {"d", "wavelength"}) == 1:
+            raise InputError("unit", f"stated of {stated & {'d', 'wavelength'}} only", "of d and wavelength")
+        plain = [
+            _plain(places[place], value, units[places[place]]) if places.get(place) in stated else value
+            for place, value in enumerate(args)
+        ]
+        named = {
+            name: _plain(name, value, units[name]) if name in stated else value
+            for name, value in kwargs.items()
+        }
+        return callee(*plain, **named)
+
+    return with_plain_numbers  # type: ignore[return-value]
+
+
+def _unit_of(name: str) -> str | None:
+    first, underscore, last = name.rpartition("_")
+    if not underscore:
+        return UNIT_OF_NAME.get(name)
+    return None if first == "per" or first.endswith("_per") else UNIT_OF_SUFFIX.get(last)
+
+
+def has_unit(value: Any) -> bool:
+    """Whether a value, or one in a list, is a quantity of astropy or a column with a unit."""
+    if isinstance(value, tuple | list):
+        return any(map(has_unit, value))
+    return getattr(value, "unit", None) is not None
+
+
+def _plain(name: str, value: Any, unit: str) -> Any:
+    if not isinstance(value, tuple | list):
+        return without_unit(name, value, unit)
+    # 0 and infinity are the same in all units.
+    bare = [item for item in value if not has_unit(item) and isinstance(item, int | float)]
+    if any(item != 0 and math.isfinite(item) for item in bare):
+        raise InputError(name, f"{bare} beside quantities", "a unit for each number")
+    return type(value)(_plain(name, item, unit) if has_unit(item) else item for item in value)
 
 
 def _shorten(names: list[str], most: int = 24) -> str:

@@ -93,6 +93,8 @@ _HEADER_END = re.compile(rb"END {77}(?: {80})*$")
 _SIZE_KEYWORD = re.compile(rb"BITPIX|NAXIS\d*|[PG]COUNT|GROUPS")
 _PLAIN_NUMBER = re.compile(rb"\w+ *= +([-+]?\d{1,18}) *(?:/.*)?", re.DOTALL)
 _COUNTS = (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT")
+_PIXEL_BYTES = 4
+_COMPRESSED_AXIS = re.compile(rb"ZNAXIS(\d[\d ])= +(\d{1,30}) ")
 _ENDLESS = re.compile(
     rb"(?:NAXIS  |TFIELDS) = *[-+]?0*[1-9]\d{3}|(?:NAXIS[1-9 ][\d ]{2}|TFIELDS |[PG]COUNT  )= *-"
 )
@@ -431,6 +433,7 @@ def check_axes(stream: IO[bytes], source: str) -> None:
         _refuse_expansion(content.tell(), most, source)
         piece = rest + piece
         _refuse_endless(piece, source)
+        _refuse_compressed(piece, most, source)
         rest = piece[len(piece) // _CARD * _CARD - _CARD :] if len(piece) >= _CARD else piece
     stream.seek(0)
 
@@ -448,8 +451,10 @@ def _after_plain_units(content: IO[bytes], most: int, source: str) -> bytes:
             header += block
             if len(block) < _BLOCK or len(header) > _LONGEST_HEADER:
                 _refuse_endless(header, source)
+                _refuse_compressed(header, most, source)
                 return header
         _refuse_endless(header, source)
+        _refuse_compressed(header, most, source)
         size = _data_size(header)
         if size is None:
             return header
@@ -477,6 +482,15 @@ def _data_size(header: bytes) -> int | None:
     bits = abs(values[b"BITPIX"]) * values.get(b"GCOUNT", 1)
     size = bits // 8 * (values.get(b"PCOUNT", 0) + (math.prod(axes) if axes else 0))
     return size + -size % _BLOCK if 0 <= size < _MOST_BYTES else None
+
+
+def _refuse_compressed(header: bytes, most: int, source: str) -> None:
+    """Refuse tile-compressed images that claim to be far larger than the file; astropy makes room for them first."""
+    pixels = 0
+    for match in _COMPRESSED_AXIS.finditer(header):
+        if match.start() % _CARD == 0:
+            pixels = (pixels if match[1].strip() not in (b"", b"1") else 1) * int(match[2])
+            _refuse_expansion(pixels * _PIXEL_BYTES, most, source)
 
 
 def _refuse_endless(piece: bytes, source: str) -> None:

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 from ..model import FringeModel
 from .flat_rivals import SEARCH_STRIDE, ChosenFlats, Curves, PlannedFlat, RankedFlat, Rivals
 
@@ -76,6 +76,7 @@ class FlatForecast:
         return bool(self.region_slip.max() <= slip_limit)
 
 
+@named_units
 def forecast_flats(
     model: FringeModel,
     flats: Sequence[PlannedFlat],
@@ -133,6 +134,7 @@ def nyquist_thickness_um(model: FringeModel, wavelength_nm: Sequence[float]) -> 
     return np.asarray(0.5 / np.abs(np.diff(orders_per_um)))
 
 
+@named_units
 def rank_flats(
     model: FringeModel,
     flats: Sequence[PlannedFlat],
@@ -172,6 +174,7 @@ def rank_flats(
     return tuple(ranked for _, ranked in sorted(found, key=lambda item: item[0]))
 
 
+@named_units
 def recommend_flats(
     model: FringeModel,
     candidates: Sequence[PlannedFlat],

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_propagation
 
-from ..errors import FrameFormatError, InputError
+from ..errors import FrameFormatError, InputError, named_units
 from ..instrument.camera import Detector
 from ..instrument.raw_frame import RawFrame
 from ..products.combined_bias import CombinedBias
@@ -329,6 +329,7 @@ def _mask_bad_columns(frame: RawFrame, image: Image, mask: Mask, options: FlatPr
 # The whole ------------------------------------------------------------------------------------------------
 
 
+@named_units
 def prepare_flat(
     frame: RawFrame,
     bias: CombinedBias | None,

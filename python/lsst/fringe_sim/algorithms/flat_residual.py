@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects import ImageGeometry, apply_to_image
-from ..errors import InputError
+from ..errors import InputError, named_units
 from ..model import FringeModel
 from ..products import FringeCube, ThicknessMap
 from .thickness_fit import Nuisances, fit_thickness
@@ -29,6 +29,7 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class FlatResidual:
     """Flats of a sensor beside a model at its best thickness.
@@ -54,6 +55,7 @@ class FlatResidual:
         return np.array([np.sqrt(values.mean()) if values.size else np.nan for values in squares])
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class ResidualPair:
     """Flats minus model, with the unchanged model and with what was found.
@@ -89,6 +91,7 @@ def relative_flats(cube: FringeCube) -> FloatArray:
     return image / _plane_mean(image) - 1.0
 
 
+@named_units
 def flat_residual(
     cube: FringeCube,
     model: FringeModel,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..effects import Effect
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 from ..model import FringeModel
 from ..optics import Beam
 from ..optics.illumination import GaussianProfile, TriangularProfile
@@ -21,6 +21,7 @@ LEVEL_E = 20_000.0
 """Usual level of a flat [electrons per pixel]."""
 
 
+@named_units
 @dataclass(frozen=True)
 class FlatSeries:
     """Flats that are taken under the same conditions.
@@ -58,10 +59,12 @@ class FlatSeries:
         """The same light for as long as another level takes [electrons]."""
         return replace(self, level_e=level_e, dark_time_s=self._longer(level_e / self.level_e))
 
+    @named_units
     def at_bandwidth(self, fwhm_nm: float, setup_fwhm_nm: float) -> FlatSeries:
         """The same level behind a slit of another width than the set-up's [nm]: exposures get longer."""
         return replace(self, bandwidth_fwhm_nm=fwhm_nm, dark_time_s=self._longer(setup_fwhm_nm / fwhm_nm))
 
+    @named_units
     def at_wavelengths(self, wavelength_nm: tuple[float, ...]) -> FlatSeries:
         """Flats at other wavelengths [nm]; as long as those of the nearest."""
         if not self.dark_time_s:

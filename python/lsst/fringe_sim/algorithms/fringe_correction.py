@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 from ..products import CORRECTED, FringeFrame, refuse_corrected
 from .correction.background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .correction.objects import ROUNDS, FrameFit, fit_frame
@@ -277,6 +277,7 @@ def residual_fringe(
     )
 
 
+@named_units
 def component_patterns(thickness_um: ArrayLike, response: SkyResponse) -> NDArray[np.float32]:
     """Fringe pattern of every component of the sky: the physical alternative to components found in frames.
 

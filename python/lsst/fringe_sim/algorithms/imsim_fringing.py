@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 from ..instrument.camera import Camera
 from ..instrument.night import AirglowField
 from ..instrument.sky import SkySpectrum
@@ -47,6 +47,7 @@ class SkyDirection(Protocol):
         """Offsets of another direction in the tangent plane of this one."""
 
 
+@named_units
 class CCDFringing:
     """Fringe pattern of one e2v sensor in a y-band exposure, relative to the sky.
 

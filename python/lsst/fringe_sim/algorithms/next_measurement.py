@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ..effects import Effect, known_effects
-from ..errors import InputError, UnknownNameError
+from ..errors import InputError, UnknownNameError, named_units
 from ..model import FringeModel
 from .flat_series import LEVEL_E, FlatSeries
 from .measurement_forecast import Forecast, Report, Sample, Tested
@@ -152,6 +152,7 @@ class RankedMeasurement:
         return f"{self.measurement.title}: {self.pairs[0].text}"
 
 
+@named_units
 def candidate_measurements(
     model: FringeModel,
     wavelength_nm: Sequence[float] | None = None,
@@ -200,6 +201,7 @@ def candidate_measurements(
     return tuple(found)
 
 
+@named_units
 def rank_measurements(
     model: FringeModel,
     effects: Mapping[str, Mapping[str, float]],

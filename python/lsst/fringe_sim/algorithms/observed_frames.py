@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, named_units
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
 from .correction.background import BackgroundTerms
 from .correction.empirical import TemplateOptions, fit_templates
@@ -150,6 +150,7 @@ def make_templates(
     )
 
 
+@named_units
 def correct_frame(
     frame: ObservedFrame,
     templates: Sequence[FringeFrame],

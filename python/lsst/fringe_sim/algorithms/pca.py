@@ -17,7 +17,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 from ..model import ResponseTable
 from ..products import FringeComponents, FringeFrame, SkyFringe, mask_bits, refuse_corrected
 from .frame_stack import TILE_BYTES, FrameStack
@@ -163,6 +163,7 @@ class ThicknessComponents:
     scores: FloatArray
     unit: float
 
+    @named_units
     def images(
         self,
         thickness_um: ArrayLike,
@@ -206,6 +207,7 @@ class ThicknessComponents:
         )
 
 
+@named_units
 def decompose_thickness(
     thickness_um: ArrayLike,
     response: SkyResponse,
@@ -274,6 +276,7 @@ def decompose_thickness(
     )
 
 
+@named_units
 def fit_pca_from_thickness(
     thickness_um: ArrayLike,
     response: SkyResponse,

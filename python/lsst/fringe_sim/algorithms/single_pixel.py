@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from ..errors import InputError, named_units
 from ..model import FringeModel
 from ..resources import read_table
 
@@ -22,6 +22,7 @@ GRID_STEP_UM = 0.002
 """Spacing of the searched thicknesses [µm]; 150 per fringe order."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class SinglePixelFit:
     """Best thickness of one pixel, with the misfit at all others.
@@ -59,6 +60,7 @@ def published_pixel() -> tuple[FloatArray, FloatArray]:
     return np.asarray(wavelength, dtype=float), np.asarray(table["amplitude"], dtype=float)
 
 
+@named_units
 def fit_single_pixel(
     wavelength_nm: ArrayLike,
     amplitude: ArrayLike,

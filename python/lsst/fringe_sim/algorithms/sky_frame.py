@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..effects import ImageGeometry, apply_to_image
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 from ..instrument.bandpass import Bandpass
 from ..instrument.night import NightHistory
 from ..instrument.sky import SkySpectrum
@@ -42,6 +42,7 @@ _BASELINE_HOUR = 19.0
 """Local time of hour 0 of a night [h]."""
 
 
+@named_units
 def simulate_sky_frame(
     thickness_um: ArrayLike,
     model: FringeModel,
@@ -158,6 +159,7 @@ def simulate_sky_frame(
     )
 
 
+@named_units
 def simulate_night(
     thickness_um: ArrayLike,
     model: FringeModel,
@@ -215,6 +217,7 @@ def simulate_night(
         )
 
 
+@named_units
 def throughput_electrons(
     sky: SkySpectrum, bandpass: Bandpass, model: FringeModel, exposure_s: float | None = None
 ) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..effects import apply_to_sky
-from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ..instrument.bandpass import Bandpass
 from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
 from ..instrument.telescope import reduce_beam
@@ -46,6 +46,7 @@ _BOUND_ANGLES = 6
 """Angles that stand for a beam where no phases are involved."""
 
 
+@named_units
 @dataclass(frozen=True)
 class SkyQuadrature:
     """How finely a sky is summed.
@@ -185,6 +186,7 @@ def component_factors(
     return factors
 
 
+@named_units
 def sky_response(
     model: FringeModel,
     sky: SkySpectrum,

@@ -15,7 +15,7 @@ import click
 
 from ..errors import InputError
 
-__all__ = ["OutputFolder", "output_folder"]
+__all__ = ["OutputFolder", "output_folder", "refuse_used_file"]
 
 LOCK = ".fringe-sim.lock"
 OURS = (b"ORIGIN  = 'lsst.fringe_sim'", b"FRINGTID=", b"FRINGUND=")
@@ -164,6 +164,21 @@ def _is_ours(path: Path) -> bool:
     with path.open("rb") as stream:
         header = stream.read(HEADER_BYTES)
     return any(word in header for word in OURS)
+
+
+def refuse_used_file(option: str, file: Path, overwrite: bool) -> None:
+    """Refuse a file that is there already, or cannot be written, before long work.
+
+    Raises
+    ------
+    InputError
+        It is there and is not to be replaced, is no regular file, or its folder is not there.
+    """
+    if file.exists() and not (overwrite and file.is_file()):
+        allowed = "a file, not something else" if overwrite else "a new file; --overwrite replaces it"
+        raise InputError(option, str(file), allowed)
+    if not os.access(file.parent, os.W_OK):
+        raise InputError(option, str(file), "a file in a folder that is there and can be written")
 
 
 def output_folder(

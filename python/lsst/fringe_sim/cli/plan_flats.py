@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..files import table_text, write_whole
+from .output import refuse_used_file
 from .parameters import LABORATORY, THICKNESS_RANGE, WAVELENGTHS, ChosenEffects, Quantity, model_effects
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -63,6 +64,7 @@ RANKED_ROWS = 5
 @model_effects()
 @click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
 @click.option("--ecsv", type=click.Path(path_type=Path), help="File for the forecast at every thickness.")
+@click.option("--overwrite", is_flag=True, help="Replace the file of --ecsv.")
 @click.option("--dry-run", is_flag=True, help="Check everything, say what would be done, write nothing.")
 def plan_flats(
     setup: Setup,
@@ -80,6 +82,7 @@ def plan_flats(
     effects: ChosenEffects,
     as_json: bool,
     ecsv: Path | None,
+    overwrite: bool,
     dry_run: bool,
 ) -> None:
     """Say what a list of flats will tell about the layer, which flat to add, and which few would do.
@@ -103,6 +106,8 @@ def plan_flats(
     )
     from ..model import FringeModel
 
+    if ecsv is not None:
+        refuse_used_file("--ecsv", ecsv, overwrite)
     model = FringeModel.from_setup(setup, effects.settings)
     nominal = wavelengths or setup.wavelengths_nm
     width = setup.bandwidth_fwhm_nm if bandwidth is None else bandwidth

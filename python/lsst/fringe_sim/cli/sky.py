@@ -97,7 +97,7 @@ def sky(
         )
         return
     model = _model(setup, settings, sensor)
-    contrast = _laboratory_contrast(thickness)
+    contrast = laboratory_contrast(thickness)
     given: list[str | Path] = [*([] if thickness == BUILT_IN else [thickness]), *effects.files]
     cards = _cards(model, given, contrast, section)
     folder = out.prepare()
@@ -208,7 +208,7 @@ def _check_exposure(exptime: float | None, night: bool) -> None:
         raise OutOfRangeError("exposure time [s]", exptime, "positive")
 
 
-def _laboratory_contrast(thickness: str) -> tuple[float, float] | None:
+def laboratory_contrast(thickness: str) -> tuple[float, float] | None:
     """Contrast of the laboratory flats over that of the model, and its uncertainty, if the map states them."""
     from ..resources import open_user_fits
 

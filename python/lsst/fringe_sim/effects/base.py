@@ -16,7 +16,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import UnknownNameError
+from ..errors import UnknownNameError, named_units
 from ..instrument.sky import SkySpectrum
 from ..optics.system import OpticalSystem
 from .geometry import ImageGeometry
@@ -36,6 +36,7 @@ Values = Mapping[str, float]
 """Values of parameters by their names."""
 
 
+@named_units
 @dataclass(frozen=True)
 class Parameter:
     """One number that says how strong an effect is.
@@ -134,6 +135,7 @@ class Residuals:
     geometry: ImageGeometry
 
 
+@named_units
 @dataclass(frozen=True)
 class ResponseContext:
     """What an effect on the response may know besides the response itself.

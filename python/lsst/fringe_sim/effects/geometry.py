@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, named_units
 
 __all__ = ["AMPLIFIERS", "ImageGeometry"]
 
@@ -17,6 +17,7 @@ AMPLIFIERS = tuple(f"C{row}{column}" for row in (0, 1) for column in range(8))
 """Amplifiers of an LSST sensor in the order of `ImageGeometry.amplifier`: lower row first, x increasing."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class ImageGeometry:
     """Positions of the samples of an image cube on the sensor.
@@ -66,6 +67,7 @@ class ImageGeometry:
             )
 
     @classmethod
+    @named_units
     def of_pixels(
         cls,
         shape: tuple[int, int],

@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, MissingPackageError, OutOfRangeError, ResourceError, UnknownNameError
+from ..errors import (
+    InputError,
+    MissingPackageError,
+    OutOfRangeError,
+    ResourceError,
+    UnknownNameError,
+    named_units,
+)
 from ..resources import list_resources, read_table, read_yaml
 
 __all__ = ["Atmosphere", "Bandpass", "bandpass_names"]
@@ -27,6 +34,7 @@ _LEAST_DETECTOR = 1e-3
 """Below this quantum efficiency (times air) a throughput cannot be divided by it."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class Atmosphere:
     """Transmission of the air.
@@ -52,6 +60,7 @@ class Atmosphere:
     scattering_exponent: float
     absorption_growth: float = 0.6
 
+    @named_units
     def total(self, wavelength_nm: ArrayLike, airmass: float = 1.0) -> FloatArray:
         """Transmission of scattering and absorption together, for a continuum."""
         wavelength = np.asarray(wavelength_nm, dtype=float)
@@ -62,6 +71,7 @@ class Atmosphere:
         absorbed = np.minimum(table / clear, 1.0) ** growth
         return absorbed * (clear * np.maximum(table / clear, 1.0)) ** (airmass / self.reference_airmass)
 
+    @named_units
     def scattering(self, wavelength_nm: ArrayLike, airmass: float = 1.0) -> FloatArray:
         """Transmission of scattering alone, for emission lines whose molecular absorption is known by line."""
         relative = np.asarray(wavelength_nm, dtype=float) / 1000.0
@@ -69,6 +79,7 @@ class Atmosphere:
         return np.exp(-depth * _checked_airmass(airmass))
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class Bandpass:
     """Filter and optics without detector and air.
@@ -162,10 +173,12 @@ class Bandpass:
         np.divide(response, other, out=optics, where=usable)
         return cls(filter_name, wavelength, optics, efficiency, air)
 
+    @named_units
     def transmission(self, wavelength_nm: ArrayLike) -> FloatArray:
         """Transmission of everything but detector and air; zero outside the table."""
         return _inside(wavelength_nm, self.wavelength_nm, self.optics)
 
+    @named_units
     def quantum_efficiency(self, wavelength_nm: ArrayLike) -> FloatArray:
         """Quantum efficiency that the throughput tables assume; zero outside the table."""
         return _inside(wavelength_nm, self.wavelength_nm, self.detector)

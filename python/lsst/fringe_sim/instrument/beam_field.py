@@ -10,7 +10,7 @@ import batoid
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, OutOfRangeError, ResourceError
+from ..errors import InputError, OutOfRangeError, ResourceError, named_units
 from ..optics import Beam
 from .ray_bundle import (
     BEAM_NODES,
@@ -42,6 +42,7 @@ _ROUNDING_M2 = 1e-9
 """Rounding of squared radii [m²]."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class BeamField:
     """Beams at any distance from the axis of an axisymmetric telescope, from a few traced field radii.
@@ -120,6 +121,7 @@ class BeamField:
         ray, squared, inner, outer = (np.concatenate(part, axis=-1) for part in zip(*edges, strict=True))
         return cls(radii, telescope.field_radius_deg, np.stack(sines), ray, squared, inner, outer)
 
+    @named_units
     def sin_squared_at(self, field_x_deg: float, field_y_deg: float = 0.0) -> tuple[FloatArray, float]:
         """``sin²θ`` of the rays that arrive at a field position, and the unvignetted share of the pupil.
 
@@ -140,11 +142,13 @@ class BeamField:
         sine = (weight @ self.sin_squared)[kept]
         return sine, sine.size / kept.size
 
+    @named_units
     def beam(self, field_x_deg: float, field_y_deg: float = 0.0, nodes: int = BEAM_NODES) -> Beam:
         """Angles of incidence at one field position; errors as for `sin_squared_at`."""
         sine, _ = self.sin_squared_at(field_x_deg, field_y_deg)
         return beam_of_quantiles(quantiles(sine, QUANTILES), nodes)
 
+    @named_units
     def kept_fraction(self, field_x_deg: float, field_y_deg: float = 0.0) -> float:
         """Unvignetted share of the pupil at one field position."""
         return self.sin_squared_at(field_x_deg, field_y_deg)[1]

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ..errors import InputError, UnknownNameError
+from ..errors import InputError, UnknownNameError, named_units
 
 __all__ = ["Amplifier", "Detector", "RawSegment"]
 
@@ -84,6 +84,7 @@ class Amplifier:
         return slice(self.y0, self.y0 + self.height), slice(self.x0, self.x0 + self.width)
 
 
+@named_units
 @dataclasses.dataclass(frozen=True)
 class Detector:
     """One sensor.

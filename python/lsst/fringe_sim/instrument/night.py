@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 from ..resources import read_table
 
 __all__ = ["AirglowField", "NightHistory", "StochasticNight", "join_nights", "random_nights"]
@@ -18,6 +18,7 @@ __all__ = ["AirglowField", "NightHistory", "StochasticNight", "join_nights", "ra
 FloatArray = NDArray[np.float64]
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class NightHistory:
     """Relative intensity of the OH bands at several times.
@@ -87,6 +88,7 @@ class NightHistory:
         return dict(zip(bands, scale.tolist(), strict=True))
 
 
+@named_units
 @dataclass(frozen=True)
 class StochasticNight:
     """Random nights: log-normal band intensities, correlated in time and between levels.
@@ -121,6 +123,7 @@ class StochasticNight:
         if not 0.0 < self.correlation_h < math.inf:
             raise OutOfRangeError("correlation time [h]", self.correlation_h, "positive")
 
+    @named_units
     def draw(self, hours: ArrayLike, rng: np.random.Generator) -> NightHistory:
         """One night.
 
@@ -155,6 +158,7 @@ class StochasticNight:
         return NightHistory(times, levels, np.exp(logarithm - 0.5 * variance))
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class AirglowField:
     """Brightness of the airglow over the field of view relative to its centre.
@@ -181,6 +185,7 @@ class AirglowField:
         return cls(x, y, level)
 
     @classmethod
+    @named_units
     def gradient(
         cls, slope_per_deg: float, direction_deg: float = 0.0, radius_deg: float = 2.1
     ) -> AirglowField:
@@ -194,6 +199,7 @@ class AirglowField:
         level = 1.0 + slope_per_deg * (along[0] * nodes[:, None] + along[1] * nodes[None, :])
         return cls(nodes, nodes, level)
 
+    @named_units
     def at(self, x_deg: ArrayLike, y_deg: ArrayLike) -> FloatArray:
         """Relative brightness at field angles [deg], which broadcast.
 

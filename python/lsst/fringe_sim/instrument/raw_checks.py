@@ -10,12 +10,25 @@ from typing import Any
 from ..errors import FrameFormatError
 from .detector import Detector
 
-__all__ = ["refuse_other_day", "refuse_other_instrument", "refuse_other_vendor"]
+__all__ = [
+    "refuse_binning",
+    "refuse_other_day",
+    "refuse_other_instrument",
+    "refuse_other_unit",
+    "refuse_other_vendor",
+    "refuse_stutter",
+]
 
 OBSERVATION_PREFIX = {"lsstCam": "MC", "ts8": "TS"}
 """First letters of ``OBSID``: main camera, test stand. CC is ComCam, AT the auxiliary telescope."""
 
 SIMULATORS = ("PHOSIM", "IMSIM")
+
+MODELS = {"CCD250": "e2v", "3800C": "itl"}
+"""Vendor by ``CCD_TYPE``."""
+
+COUNTS = frozenset({"", "adu", "dn", "count", "counts"})
+"""What ``BUNIT`` may say of numbers of the converter, without regard to case."""
 
 FULL_SHAPE = {"e2v": (4004, 4096), "itl": (4000, 4072)}
 """Rows and columns of a whole sensor, by vendor."""
@@ -30,7 +43,7 @@ def refuse_other_instrument(text: Mapping[str, str], camera: str, source: str) -
     Parameters
     ----------
     text : mapping
-        ``OBSID``, ``TESTTYPE``, ``CREATOR`` and ``CONTRLLR``, empty where the header has none.
+        ``OBSID``, ``CAMCODE``, ``TESTTYPE``, ``CREATOR`` and ``CONTRLLR``, empty where the header has none.
     camera : `str`
         What the frame is taken for.
     source : `str`
@@ -46,6 +59,9 @@ def refuse_other_instrument(text: Mapping[str, str], camera: str, source: str) -
     if match and wanted and match.group(1) != wanted:
         allowed = f"{wanted}_… of {camera}: this is a frame of another instrument"
         raise FrameFormatError("OBSID", text["OBSID"], allowed, source=source)
+    if wanted and text["CAMCODE"] not in ("", wanted):
+        allowed = f"{wanted} of {camera}: this is a frame of another instrument"
+        raise FrameFormatError("CAMCODE", text["CAMCODE"], allowed, source=source)
     for keyword in ("CREATOR", "TESTTYPE"):
         if text[keyword].upper().startswith(SIMULATORS):
             allowed = "a frame of the instrument, not of another simulator of it"
@@ -68,13 +84,52 @@ def refuse_other_day(stated: int, begin: datetime.datetime, derived: int, source
         raise FrameFormatError("DAYOBS", stated, allowed, source=source)
 
 
-def refuse_other_vendor(maker: Any, sensor: Detector, shape: tuple[int, int], source: str) -> None:
+def refuse_binning(header: Mapping[str, Any], source: str) -> None:
+    """Refuse ``BINX`` and ``BINY`` other than 1.
+
+    Raises
+    ------
+    FrameFormatError
+        Pixels are binned.
+    """
+    for keyword in ("BINX", "BINY"):
+        if header[keyword] not in (None, 1):
+            raise FrameFormatError(keyword, header[keyword], "1: pixels that are not binned", source=source)
+
+
+def refuse_other_unit(unit: Any, where: str, source: str) -> None:
+    """Refuse a ``BUNIT`` that is not that of numbers of the converter.
+
+    Raises
+    ------
+    FrameFormatError
+        It is another one.
+    """
+    if str(unit or "").strip().lower() not in COUNTS:
+        raise FrameFormatError(f"{where}BUNIT", unit, "adu", source=source)
+
+
+def refuse_stutter(rows: Any, observation_type: str, source: str) -> None:
+    """Refuse charge that was moved during an exposure which does not say so.
+
+    Raises
+    ------
+    FrameFormatError
+        ``STUTTER ROWS`` is more than 0 and the type is not stuttered.
+    """
+    if rows not in (None, 0) and observation_type != "stuttered":
+        raise FrameFormatError("STUTTER ROWS", rows, f"0 in a {observation_type} frame", source=source)
+
+
+def refuse_other_vendor(
+    maker: Any, model: Any, sensor: Detector, shape: tuple[int, int], source: str
+) -> None:
     """Refuse a sensor of one vendor in a place where the table has one of the other.
 
     Parameters
     ----------
-    maker : `object`
-        ``CCD_MANU``, `None` if absent.
+    maker, model : `object`
+        ``CCD_MANU`` and ``CCD_TYPE``, `None` if absent.
     sensor : `Detector`
         What the table has there.
     shape : `tuple` [`int`, `int`]
@@ -92,6 +147,9 @@ def refuse_other_vendor(maker: Any, sensor: Detector, shape: tuple[int, int], so
     where = f"of {sensor.name}, {sensor.vendor}"
     if stated in FULL_SHAPE and vendor in FULL_SHAPE and stated != vendor:
         raise FrameFormatError("CCD_MANU", maker, f"the maker {where}", source=source)
+    made_by = MODELS.get(str(model).strip().upper())
+    if made_by is not None and vendor in FULL_SHAPE and made_by != vendor:
+        raise FrameFormatError("CCD_TYPE", model, f"the model {where}", source=source)
     if vendor in FULL_SHAPE and shape in {size for name, size in FULL_SHAPE.items() if name != vendor}:
         rows, columns = FULL_SHAPE[vendor]
         found = f"{shape[1]} x {shape[0]} pixels"

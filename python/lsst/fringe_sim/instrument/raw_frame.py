@@ -4,17 +4,12 @@ The geometry of each amplifier comes from its ``DATASEC``, ``DETSEC`` and ``DETS
 sensor or a cut-down one reads as well as a 4k × 4k one. What a header lacks is derived where the rest decides it,
 else refused with one `FrameFormatError` that names file, keyword, value and what is allowed. Nothing here touches
 pixel values.
-
-The y sense of ``DETSEC`` is swapped between the two rows of amplifiers in real files (DM-36115): ``Segment1x``
-stands in the upper half of the assembled CCD but is written with the lower rows of ``DETSIZE``. The names of the
-amplifiers tell which sense a file uses.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,8 +21,10 @@ from astropy.io import fits
 from ..errors import FrameFormatError, InputError, UnknownNameError
 from ..resources import DAMAGE, first_line, open_user_fits
 from .camera import Camera
-from .raw_checks import refuse_other_vendor
-from .raw_metadata import OBSERVATION_TYPES, RawMetadata, header_value
+from .raw_checks import refuse_binning, refuse_other_unit, refuse_other_vendor
+from .raw_header import header_value
+from .raw_layout import N_AMPLIFIERS, Section, amplifier_layouts, image_shape
+from .raw_metadata import OBSERVATION_TYPES, RawMetadata
 
 __all__ = [
     "N_AMPLIFIERS",
@@ -42,69 +39,6 @@ __all__ = [
 
 SETTING_NM = 1.0
 """What two readings of one setting of the monochromator may differ by; steps between flats are 5 nm or more."""
-
-N_AMPLIFIERS = 16
-"""Outputs of an LSST science sensor."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Section:
-    """A FITS section ``[x1:x2,y1:y2]``: inclusive, counted from 1; reversed where an axis runs backwards."""
-
-    x1: int
-    x2: int
-    y1: int
-    y2: int
-
-    @classmethod
-    def parse(cls, text: object, *, keyword: str = "section", source: str | None = None) -> Section:
-        """Read a section from a header value.
-
-        Raises
-        ------
-        FrameFormatError
-            The value is not ``[x1:x2,y1:y2]`` with integers from 1 on.
-        """
-        match = _SECTION.fullmatch(text) if isinstance(text, str) else None
-        bounds = [int(group) for group in match.groups()] if match else []
-        if not bounds or min(bounds) < 1:
-            raise FrameFormatError(
-                keyword, text, "[x1:x2,y1:y2] with integers counted from 1", source=source
-            ) from None
-        return cls(*bounds)
-
-    @property
-    def flip_x(self) -> bool:
-        """Whether x runs backwards."""
-        return self.x1 > self.x2
-
-    @property
-    def flip_y(self) -> bool:
-        """Whether y runs backwards."""
-        return self.y1 > self.y2
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return abs(self.y2 - self.y1) + 1, abs(self.x2 - self.x1) + 1
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        """The section as ``[y, x]`` slices, without its direction."""
-        return (
-            slice(min(self.y1, self.y2) - 1, max(self.y1, self.y2)),
-            slice(min(self.x1, self.x2) - 1, max(self.x1, self.x2)),
-        )
-
-    def mirrored_y(self, n_rows: int) -> Section:
-        """Return the section with y counted from the other end of ``n_rows`` rows."""
-        return Section(self.x1, self.x2, n_rows + 1 - self.y1, n_rows + 1 - self.y2)
-
-    def __str__(self) -> str:
-        return f"[{self.x1}:{self.x2},{self.y1}:{self.y2}]"
-
-
-_SECTION = re.compile(r"\s*\[\s*(\d{1,9})\s*:\s*(\d{1,9})\s*,\s*(\d{1,9})\s*:\s*(\d{1,9})\s*\]\s*", re.ASCII)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -199,8 +133,8 @@ class RawFrame:
         with _open_fits(source) as hdus:
             header = _merged_header(hdus)
             metadata = RawMetadata.from_header(header, source=source)
-            layouts, shape = _amplifier_layouts(hdus, source)
-            _refuse_other_vendor(header, metadata, shape)
+            layouts, shape = amplifier_layouts(hdus, source)
+            _refuse_other_pixels(header, metadata, shape)
             amplifiers = tuple(
                 RawAmplifier(data=_integer_pixels(hdus[layout.hdu], source), **vars(layout))
                 for layout in layouts
@@ -226,8 +160,7 @@ class RawFrame:
 def read_raw_header(path: str | Path) -> fits.Header:
     """Check a raw frame and read its header, but not its pixels.
 
-    Everything that `RawFrame.read` refuses about the layout is refused here too, as far as headers and the
-    length of the file show it.
+    Everything that `RawFrame.read` refuses is refused here too, as far as headers and the length of the file show it.
 
     Returns
     -------
@@ -238,11 +171,10 @@ def read_raw_header(path: str | Path) -> fits.Header:
     ------
     FrameFormatError
         The file is not a complete raw frame in the LSST layout.
+    UnknownNameError
+        The sensor that the header names is not in the camera.
     """
-    source = str(path)
-    with _open_fits(source) as hdus:
-        _amplifier_layouts(hdus, source)
-        return _merged_header(hdus)
+    return _read_without_pixels(path)[0]
 
 
 def read_raw_metadata(path: str | Path) -> RawMetadata:
@@ -255,18 +187,26 @@ def read_raw_metadata(path: str | Path) -> RawMetadata:
     UnknownNameError
         The sensor that the header names is not in the camera.
     """
+    return _read_without_pixels(path)[1]
+
+
+def _read_without_pixels(path: str | Path) -> tuple[fits.Header, RawMetadata]:
     source = str(path)
     with _open_fits(source) as hdus:
-        _, shape = _amplifier_layouts(hdus, source)
+        _, shape = amplifier_layouts(hdus, source)
         header = _merged_header(hdus)
     metadata = RawMetadata.from_header(header, source=source)
-    _refuse_other_vendor(header, metadata, shape)
-    return metadata
+    _refuse_other_pixels(header, metadata, shape)
+    return header, metadata
 
 
-def _refuse_other_vendor(header: fits.Header, metadata: RawMetadata, shape: tuple[int, int]) -> None:
-    sensor = Camera.from_name(metadata.camera).detector(metadata.detector)
-    refuse_other_vendor(header_value(header, "CCD_MANU"), sensor, shape, metadata.source)
+def _refuse_other_pixels(header: fits.Header, metadata: RawMetadata, shape: tuple[int, int]) -> None:
+    """Pixels must be those of the sensor that the header names, one by one, and as they were read."""
+    sensor, source = Camera.from_name(metadata.camera).detector(metadata.detector), metadata.source
+    maker, model = header_value(header, "CCD_MANU"), header_value(header, "CCD_TYPE")
+    refuse_other_vendor(maker, model, sensor, shape, source)
+    refuse_binning({keyword: header_value(header, keyword) for keyword in ("BINX", "BINY")}, source)
+    refuse_other_unit(header_value(header, "BUNIT"), "", source)
 
 
 # Reading the file -----------------------------------------------------------------------------------------
@@ -316,226 +256,9 @@ def _refuse_other_wavelength(header: fits.Header, hdu: Any) -> None:
 
 def _integer_pixels(hdu: Any, source: str) -> npt.NDArray[np.integer[Any]]:
     data = hdu.data
-    if data is None or data.shape != _image_shape(hdu, source):
+    if data is None or data.shape != image_shape(hdu, source):
         found = None if data is None else data.shape
         raise FrameFormatError(f"{hdu.name} pixels", found, "a complete image", source=source)
     if data.dtype.kind not in "iu":
         raise FrameFormatError(f"{hdu.name} BITPIX", data.dtype.name, "integer ADU", source=source)
     return data if data.dtype.isnative else data.astype(data.dtype.newbyteorder("="))
-
-
-# Geometry -------------------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass(frozen=True)
-class _AmplifierLayout:
-    """Everything of a `RawAmplifier` but its pixels."""
-
-    name: str
-    channel: int
-    hdu: int
-    datasec: Section
-    detsec: Section
-    imaging: tuple[slice, slice]
-    serial_prescan: tuple[slice, slice]
-    serial_overscan: tuple[slice, slice]
-    parallel_overscan: tuple[slice, slice]
-    destination: tuple[slice, slice]
-    flip_y: bool
-    flip_x: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class _Sections:
-    """Sections of one amplifier as its header has them."""
-
-    name: str
-    channel: int
-    hdu: int
-    raw_shape: tuple[int, int]
-    datasec: Section
-    detsec: Section
-
-
-def _amplifier_layouts(
-    hdus: Sequence[Any], source: str
-) -> tuple[tuple[_AmplifierLayout, ...], tuple[int, int]]:
-    """Layout of every amplifier, and rows and columns of the assembled CCD."""
-    images = [(number, hdu) for number, hdu in enumerate(hdus) if number > 0 and _is_image(hdu)]
-    if len(images) != N_AMPLIFIERS:
-        raise FrameFormatError("number of amplifier HDUs", len(images), str(N_AMPLIFIERS), source=source)
-    sections = [
-        _read_sections(number, hdu, order, source) for order, (number, hdu) in enumerate(images, start=1)
-    ]
-    _refuse_repeated([amp.name for amp in sections], source)
-    shape = _detector_shape(hdus[0].header, [hdu.header for _, hdu in images], sections, source)
-    for amp in sections:
-        _refuse_outside(f"{amp.name} DETSEC", amp.detsec, shape, source)
-    mirrored = _detsec_is_mirrored(sections, shape, source)
-    _refuse_gaps(sections, shape, source)
-    return tuple(_layout(amp, shape, mirrored) for amp in sections), shape
-
-
-def _is_image(hdu: Any) -> bool:
-    return isinstance(hdu, fits.ImageHDU | fits.CompImageHDU) and hdu.header.get("NAXIS") == 2
-
-
-def _image_shape(hdu: Any, source: str) -> tuple[int, int]:
-    shape = tuple(hdu.header.get(keyword) for keyword in ("NAXIS2", "NAXIS1"))
-    if not all(isinstance(size, int) and size > 0 for size in shape):
-        raise FrameFormatError(f"{hdu.name} NAXIS2, NAXIS1", shape, "positive integers", source=source)
-    return shape[0], shape[1]
-
-
-def _read_sections(number: int, hdu: Any, order: int, source: str) -> _Sections:
-    channel = _channel(hdu.header, order, source)
-    name = _amplifier_name(hdu.name, channel)
-    raw_shape = _image_shape(hdu, source)
-    datasec, detsec = (
-        Section.parse(header_value(hdu.header, keyword), keyword=f"{name} {keyword}", source=source)
-        for keyword in ("DATASEC", "DETSEC")
-    )
-    if datasec.flip_x or datasec.flip_y:
-        raise FrameFormatError(f"{name} DATASEC", str(datasec), "increasing limits", source=source)
-    _refuse_outside(f"{name} DATASEC", datasec, raw_shape, source)
-    if datasec.shape != detsec.shape:
-        raise FrameFormatError(
-            f"{name} DETSEC", str(detsec), f"a section of the size of DATASEC {datasec}", source=source
-        )
-    _refuse_changed_pixels(hdu.header, name, source)
-    if hdu.header.get("BITPIX", 0) < 0:
-        raise FrameFormatError(
-            f"{name} BITPIX", hdu.header["BITPIX"], "8, 16, 32 or 64: integer ADU", source=source
-        )
-    return _Sections(name, channel, number, raw_shape, datasec, detsec)
-
-
-def _refuse_changed_pixels(header: Mapping[str, Any], name: str, source: str) -> None:
-    """Pixels must be those of the sensor, and numbers those of the converter."""
-    binning = header_value(header, "CCDSUM")
-    if binning is not None and str(binning).split() != ["1", "1"]:
-        raise FrameFormatError(f"{name} CCDSUM", binning, "1 1: pixels that are not binned", source=source)
-    scale = header_value(header, "BSCALE")
-    if scale not in (None, 1):
-        raise FrameFormatError(f"{name} BSCALE", scale, "1: ADU as they were read", source=source)
-    blank = header_value(header, "BLANK")
-    if blank is not None and header.get("BITPIX", 0) > 0:
-        raise FrameFormatError(f"{name} BLANK", blank, "no such card: every pixel has its ADU", source=source)
-
-
-def _channel(header: Mapping[str, Any], order: int, source: str) -> int:
-    value = header_value(header, "CHANNEL")
-    if value is None:
-        return order
-    if not isinstance(value, int) or not 1 <= value <= N_AMPLIFIERS:
-        raise FrameFormatError("CHANNEL", value, f"an integer from 1 to {N_AMPLIFIERS}", source=source)
-    return value
-
-
-def _amplifier_name(extname: str, channel: int) -> str:
-    """``Segment10`` is C10; without such a name the channel decides: 1–8 are C10–C17, 9–16 are C07–C00."""
-    match = re.fullmatch(r"SEGMENT([01][0-7])", extname.upper())
-    if match:
-        return f"C{match.group(1)}"
-    return f"C1{channel - 1}" if channel <= 8 else f"C0{16 - channel}"
-
-
-def _refuse_repeated(names: Sequence[str], source: str) -> None:
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise FrameFormatError(
-            "EXTNAME and CHANNEL", ", ".join(repeated), "one HDU for each amplifier", source=source
-        )
-
-
-def _detector_shape(
-    primary: Mapping[str, Any],
-    headers: Iterable[Mapping[str, Any]],
-    sections: Sequence[_Sections],
-    source: str,
-) -> tuple[int, int]:
-    """Rows and columns of the assembled CCD: ``DETSIZE``, or the extent of all ``DETSEC`` where it is absent."""
-    stated = [header_value(header, "DETSIZE") for header in (*headers, primary)]
-    sizes = {Section.parse(v, keyword="DETSIZE", source=source) for v in stated if v is not None}
-    if len(sizes) > 1:
-        raise FrameFormatError(
-            "DETSIZE", ", ".join(sorted(map(str, sizes))), "one size for all amplifiers", source=source
-        )
-    if not sizes:
-        return (
-            max(max(amp.detsec.y1, amp.detsec.y2) for amp in sections),
-            max(max(amp.detsec.x1, amp.detsec.x2) for amp in sections),
-        )
-    (size,) = sizes
-    if (size.x1, size.y1) != (1, 1):
-        raise FrameFormatError("DETSIZE", str(size), "a section that begins at [1:…,1:…]", source=source)
-    return size.shape
-
-
-def _refuse_outside(keyword: str, section: Section, shape: tuple[int, int], source: str) -> None:
-    rows, columns = section.slices
-    if rows.stop > shape[0] or columns.stop > shape[1]:
-        raise FrameFormatError(
-            keyword, str(section), f"a section within [1:{shape[1]},1:{shape[0]}]", source=source
-        )
-
-
-def _detsec_is_mirrored(sections: Sequence[_Sections], shape: tuple[int, int], source: str) -> bool:
-    """Whether the y of ``DETSEC`` counts from the top of the assembled CCD (DM-36115).
-
-    ``C1x`` belongs to the upper half of the assembled CCD. If its ``DETSEC`` has the lower rows, the file counts
-    from the top.
-    """
-    mirrored = {
-        (amp.detsec.y1 + amp.detsec.y2 < shape[0] + 1) == amp.name.startswith("C1") for amp in sections
-    }
-    if len(mirrored) > 1:
-        raise FrameFormatError(
-            "DETSEC",
-            "C0x and C1x in the same half",
-            "all Segment0x in one half of DETSIZE and all Segment1x in the other",
-            source=source,
-        )
-    return mirrored.pop()
-
-
-def _refuse_gaps(sections: Sequence[_Sections], shape: tuple[int, int], source: str) -> None:
-    """Amplifiers must cover the CCD once: their areas add up, and no two of them overlap."""
-    covered = sum(amp.detsec.shape[0] * amp.detsec.shape[1] for amp in sections)
-    boxes = [(amp.name, *amp.detsec.slices) for amp in sections]
-    for i, (name, rows, columns) in enumerate(boxes):
-        for other, other_rows, other_columns in boxes[:i]:
-            if _overlap(rows, other_rows) and _overlap(columns, other_columns):
-                raise FrameFormatError(
-                    "DETSEC", f"{other} and {name} overlap", "sections without common pixels", source=source
-                )
-    if covered != shape[0] * shape[1]:
-        raise FrameFormatError(
-            "DETSEC",
-            f"{covered} pixels in all",
-            f"sections that cover DETSIZE, {shape[1]} × {shape[0]} pixels",
-            source=source,
-        )
-
-
-def _overlap(a: slice, b: slice) -> bool:
-    return bool(a.start < b.stop and b.start < a.stop)
-
-
-def _layout(amp: _Sections, shape: tuple[int, int], mirrored: bool) -> _AmplifierLayout:
-    rows, columns = amp.datasec.slices
-    placed = amp.detsec.mirrored_y(shape[0]) if mirrored else amp.detsec
-    return _AmplifierLayout(
-        name=amp.name,
-        channel=amp.channel,
-        hdu=amp.hdu,
-        datasec=amp.datasec,
-        detsec=amp.detsec,
-        imaging=(rows, columns),
-        serial_prescan=(rows, slice(0, columns.start)),
-        serial_overscan=(rows, slice(columns.stop, amp.raw_shape[1])),
-        parallel_overscan=(slice(rows.stop, amp.raw_shape[0]), columns),
-        destination=placed.slices,
-        flip_y=placed.flip_y,
-        flip_x=placed.flip_x,
-    )

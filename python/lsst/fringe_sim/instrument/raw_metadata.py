@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import math
 import re
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from astropy.io import fits
-from astropy.time import Time
-
-from ..errors import FrameFormatError, InputError, UnknownNameError, to_number
+from ..errors import FrameFormatError, UnknownNameError, named_units
 from .camera import Camera, Detector
-from .raw_checks import refuse_other_day, refuse_other_instrument
+from .raw_checks import refuse_other_instrument, refuse_stutter
+from .raw_header import RawHeader, header_value
+from .raw_times import DAY_ROLLOVER_H, begin_of_exposure, day_and_sequence, exposure_id, time_scale
 
 __all__ = ["DAY_ROLLOVER_H", "OBSERVATION_TYPES", "RawMetadata", "header_value"]
 
@@ -60,22 +57,8 @@ TEMPERATURE_RANGE_C = (-200.0, 60.0)
 
 ZERO_CELSIUS_K = 273.15
 
-CONTROLLERS = "OCHPQS"
-"""Data-acquisition controllers of the LSST Camera; the place adds thousands of years to the exposure number."""
 
-LAST_DAY_OF_OWN_COUNT = {"C": 20231004, "P": 20250417, "Q": 20250417, "S": 20250417}
-"""Last observing day on which a controller counted for itself; since then it shares the count of O (obs_lsst)."""
-
-TS8_NUMBERED_SINCE = datetime.datetime(2023, 5, 24, 23)
-"""Since then exposures of TS8 are numbered like those of the camera (obs_lsst)."""
-
-OF_RUBIN = ("ts8", "lsstCam")
-"""Cameras whose headers state times in TAI unless they say otherwise (obs_lsst)."""
-
-DAY_ROLLOVER_H = {"ts8": 8.0, "lsstCam": 12.0, "monocam": 12.0}
-"""UTC hour at which the observing day begins, as obs_lsst has it."""
-
-
+@named_units
 @dataclasses.dataclass(frozen=True)
 class RawMetadata:
     """What the headers of a raw frame say about the exposure.
@@ -108,6 +91,8 @@ class RawMetadata:
         Number of the sensor in its camera.
     filter_name : `str`
         Name of the filter; empty if the header states none.
+    airmass : `float` or `None`
+        Airmass at the begin of an exposure through a telescope, if the header states one.
     run : `str`
         ``RUNNUM``; empty if absent.
     date_obs : `datetime.datetime`
@@ -139,6 +124,7 @@ class RawMetadata:
     serial: str
     detector: int
     filter_name: str
+    airmass: float | None
     run: str
     date_obs: datetime.datetime
     time_scale: str
@@ -194,76 +180,23 @@ class RawMetadata:
         UnknownNameError
             The sensor that the header names is not in the camera.
         """
-        return _interpret(_Header(header, source))
+        return _interpret(RawHeader(header, source))
 
 
-def header_value(header: Mapping[str, Any], keyword: str) -> Any:
-    """Value of a keyword; `None` if it is absent, undefined or blank.
-
-    Raises
-    ------
-    FrameFormatError
-        The card is not FITS (other cards of the header may be), or there are several with different values.
-    """
-    try:
-        value = header.get(keyword)
-        if isinstance(header, fits.Header) and keyword in header and header.count(keyword) > 1:
-            _refuse_different(header, keyword)
-    except fits.VerifyError:
-        raise FrameFormatError(keyword, "a card that cannot be parsed", "a value as FITS has it") from None
-    if isinstance(value, fits.card.Undefined) or (isinstance(value, str) and not value.strip()):
-        return None
-    return value.strip() if isinstance(value, str) else value
-
-
-def _refuse_different(header: fits.Header, keyword: str) -> None:
-    values = [header[keyword, number] for number in range(header.count(keyword))]
-    if any(value != values[0] for value in values):
-        raise FrameFormatError(keyword, " and ".join(map(str, values)), "one value, not several that differ")
-
-
-@dataclasses.dataclass(frozen=True)
-class _Header:
-    """Header of a frame, asked for values of a certain kind."""
-
-    cards: Mapping[str, Any]
-    source: str
-
-    def value(self, keyword: str) -> Any:
-        try:
-            return header_value(self.cards, keyword)
-        except FrameFormatError as error:
-            raise error.in_source(self.source) from None
-
-    def text(self, keyword: str) -> str:
-        value = self.value(keyword)
-        return "" if value is None else str(value)
-
-    def number(self, keyword: str, value: Any, allowed: str, accept: Callable[[float], bool]) -> float:
-        """``value`` as a finite number that is accepted, or an error that names the keyword."""
-        try:
-            number = to_number(keyword, value)
-        except InputError:
-            number = math.nan
-        if not (math.isfinite(number) and accept(number)):
-            raise self.refuse(keyword, value, allowed)
-        return number
-
-    def refuse(self, keyword: str, value: Any, allowed: str) -> FrameFormatError:
-        return FrameFormatError(keyword, value, allowed, source=self.source)
-
-
-def _interpret(header: _Header) -> RawMetadata:
+def _interpret(header: RawHeader) -> RawMetadata:
     camera = _camera(header)
     refuse_other_instrument(
-        {key: header.text(key) for key in ("OBSID", "TESTTYPE", "CREATOR", "CONTRLLR")}, camera, header.source
+        {key: header.text(key) for key in ("OBSID", "CAMCODE", "TESTTYPE", "CREATOR", "CONTRLLR")},
+        camera,
+        header.source,
     )
     observation_type = _observation_type(header)
+    refuse_stutter(header.value("STUTTER ROWS"), observation_type, header.source)
     exposure_time, dark_time = _times(header, observation_type)
     temperature, temperature_source = _temperature(header)
     detector = _detector(header, camera)
-    start, scale = _date_obs(header), _time_scale(header, camera)
-    day_obs, seq_num = _day_and_sequence(header, camera, start)
+    start, scale = begin_of_exposure(header, camera), time_scale(header, camera)
+    day_obs, seq_num = day_and_sequence(header, camera, start)
     return RawMetadata(
         source=header.source,
         camera=camera,
@@ -280,12 +213,13 @@ def _interpret(header: _Header) -> RawMetadata:
         serial=header.text("LSST_NUM").removesuffix("-Dev"),
         detector=detector.id,
         filter_name=_filter_name(header),
+        airmass=_airmass(header),
         run=header.text("RUNNUM"),
         date_obs=start,
         time_scale=scale,
         day_obs=day_obs,
         seq_num=seq_num,
-        exposure_id=_exposure_id(header, camera, start, day_obs, seq_num),
+        exposure_id=exposure_id(header, camera, start, day_obs, seq_num),
         notes=_notes(header, camera),
     )
 
@@ -299,7 +233,7 @@ _CAMERAS = {
 }
 
 
-def _camera(header: _Header) -> str:
+def _camera(header: RawHeader) -> str:
     """Camera or test stand that took the frame; the place of the sensor tells where nothing says it outright."""
     if header.value("INSTRUME") is not None:
         instrument = header.text("INSTRUME").upper()
@@ -319,7 +253,7 @@ def _camera(header: _Header) -> str:
     )
 
 
-def _notes(header: _Header, camera: str) -> tuple[str, ...]:
+def _notes(header: RawHeader, camera: str) -> tuple[str, ...]:
     """The instrument decides about sensor and exposure number: say so where the header does not name it."""
     if header.value("INSTRUME") is not None or "TS8" in header.text("TSTAND").upper():
         return ()
@@ -327,7 +261,7 @@ def _notes(header: _Header, camera: str) -> tuple[str, ...]:
     return (f"neither INSTRUME nor TSTAND = TS8 in the header: taken as a frame of {camera}, for its {told}",)
 
 
-def _bay(header: _Header) -> str | None:
+def _bay(header: RawHeader) -> str | None:
     """Raft bay of the LSST Camera, from either keyword that holds it."""
     for keyword in ("RAFTBAY", "RAFTNAME"):
         if re.fullmatch(r"R\d\d", header.text(keyword)):
@@ -335,13 +269,13 @@ def _bay(header: _Header) -> str | None:
     return None
 
 
-def _module(header: _Header) -> str | None:
+def _module(header: RawHeader) -> str | None:
     """Raft module, ``RTM-020``."""
     match = re.search(r"RTM-\d{3}", header.text("RAFTNAME"))
     return match.group(0) if match else None
 
 
-def _detector(header: _Header, camera: str) -> Detector:
+def _detector(header: RawHeader, camera: str) -> Detector:
     """The sensor. In a camera its place decides; on the test stand its serial number, for rafts were rebuilt."""
     table = Camera.from_name(camera)
     if len(table.detectors) == 1:
@@ -361,7 +295,7 @@ def _detector(header: _Header, camera: str) -> Detector:
     raise unknown.in_source(header.source)
 
 
-def _observation_type(header: _Header) -> str:
+def _observation_type(header: RawHeader) -> str:
     """From ``IMGTYPE``; where it is absent, from ``TESTTYPE``."""
     keyword = "IMGTYPE" if header.value("IMGTYPE") is not None else "TESTTYPE"
     spelled = header.text(keyword).upper()
@@ -372,7 +306,7 @@ def _observation_type(header: _Header) -> str:
     return OBSERVATION_TYPES[known]
 
 
-def _wavelength(header: _Header, observation_type: str) -> float | None:
+def _wavelength(header: RawHeader, observation_type: str) -> float | None:
     """``MONOWL``. ``MONOCH-WAVELENG`` is not used: it can still hold the value of an earlier exposure."""
     if observation_type in WITHOUT_LIGHT:
         return None
@@ -387,7 +321,7 @@ def _wavelength(header: _Header, observation_type: str) -> float | None:
     )
 
 
-def _bandpass(header: _Header) -> float | None:
+def _bandpass(header: RawHeader) -> float | None:
     value = header.value("MONOCH-BANDPASS")
     if value is None:
         return None
@@ -395,7 +329,7 @@ def _bandpass(header: _Header) -> float | None:
     return header.number("MONOCH-BANDPASS", value, "0 or a width in nm", lambda nm: 0 <= nm < 1000) or None
 
 
-def _times(header: _Header, observation_type: str) -> tuple[float, float]:
+def _times(header: RawHeader, observation_type: str) -> tuple[float, float]:
     """Exposure time (that of the shutter where it was measured) and dark time, seconds; 0 for a bias without them."""
     value = header.value("EXPTIME")
     if value is None and observation_type == "bias":
@@ -411,7 +345,7 @@ def _times(header: _Header, observation_type: str) -> tuple[float, float]:
     return exposure, header.number("DARKTIME", dark, "seconds, 0 or more", lambda s: s >= 0)
 
 
-def _temperature(header: _Header) -> tuple[float | None, str]:
+def _temperature(header: RawHeader) -> tuple[float | None, str]:
     low, high = TEMPERATURE_RANGE_C
     for keyword in ("CCDTEMP", "SENSTEMP", "TEMP_SET"):
         value = header.value(keyword)
@@ -423,88 +357,16 @@ def _temperature(header: _Header) -> tuple[float | None, str]:
     return None, ""
 
 
-def _filter_name(header: _Header) -> str:
+def _filter_name(header: RawHeader) -> str:
     """Filter of the LSST Camera: its parts joined by ``~``, empty places left out."""
     parts = [header.text(keyword) for keyword in ("FILTER", "FILTER1", "FILTER2")]
     named = [part for part in parts if part and part.lower() not in {"empty", "none"}]
     return "~".join(dict.fromkeys(named))
 
 
-_DATES = (
-    ("DATE-BEG", "isot"),
-    ("MJD-BEG", "mjd"),
-    ("DATE-OBS", "isot"),
-    ("MJD-OBS", "mjd"),
-    ("MJD", "mjd"),
-)
-"""Keywords of the start of the exposure, and their formats. ``DATE-OBS`` was once its end (obs_lsst)."""
-
-
-def _time_scale(header: _Header, camera: str) -> str:
-    scale = header.text("TIMESYS").lower()
-    if scale not in ("", "utc", "tai"):
-        raise header.refuse("TIMESYS", header.value("TIMESYS"), "UTC or TAI")
-    return scale or ("tai" if camera in OF_RUBIN else "utc")
-
-
-def _date_obs(header: _Header) -> datetime.datetime:
-    for keyword, scale in _DATES:
-        value = header.value(keyword)
-        if value is None:
-            continue
-        try:
-            text = str(value).rstrip("Z").replace(" ", "T") if scale == "isot" else float(value)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                return Time(text, format=scale, scale="utc").to_datetime()
-        except (TypeError, ValueError, OverflowError):
-            allowed = "YYYY-MM-DDThh:mm:ss.sss" if scale == "isot" else "a modified Julian date"
-            raise header.refuse(keyword, value, allowed) from None
-    raise header.refuse("DATE-OBS", None, "YYYY-MM-DDThh:mm:ss.sss, or MJD-OBS")
-
-
-def _day_and_sequence(header: _Header, camera: str, start: datetime.datetime) -> tuple[int, int]:
-    """``DAYOBS`` and ``SEQNUM``; where absent, the day on which the night began and the seconds since then."""
-    day_start = start - datetime.timedelta(hours=DAY_ROLLOVER_H[camera])
-    stated = header.value("DAYOBS")
-    derived = int(day_start.strftime("%Y%m%d"))
-    day = derived if stated is None else _day(header, stated)
-    refuse_other_day(day, start, derived, header.source)
-    value = header.value("SEQNUM")
-    if value is None:
-        midnight = day_start.replace(hour=0, minute=0, second=0, microsecond=0)
-        return day, int((day_start - midnight).total_seconds())
-    number = header.number("SEQNUM", value, "an integer from 0 to 99999", lambda n: 0 <= n < 100000)
-    if number != int(number):
-        raise header.refuse("SEQNUM", value, "an integer from 0 to 99999")
-    return day, int(number)
-
-
-def _day(header: _Header, value: Any) -> int:
-    digits = str(value).replace("-", "")
-    try:
-        datetime.datetime.strptime(digits, "%Y%m%d")
-    except ValueError:
-        raise header.refuse("DAYOBS", value, "a date YYYYMMDD") from None
-    return int(digits)
-
-
-def _exposure_id(header: _Header, camera: str, start: datetime.datetime, day_obs: int, seq_num: int) -> int:
-    """Number of the exposure, as obs_lsst has it.
-
-    In the cameras the day and the sequence number, moved by 1000 years for each controller that counts for itself. On
-    TS8 the same since ``OBSID`` begins with TS_C; before, ``SEQNUM`` repeated within a day, and the digits of
-    ``DATE-OBS`` down to tenths of a second are the number.
-    """
-    numbered = start > TS8_NUMBERED_SINCE and header.text("OBSID").startswith("TS_C_")
-    if camera == "ts8" and not numbered:
-        digits = re.sub(r"\D", "", header.text("DATE-OBS")[:21])
-        if len(digits) == 15:
-            return int(digits)
-        return int(start.strftime("%Y%m%d%H%M%S")) * 10 + start.microsecond // 100_000
-    controller = header.text("CONTRLLR").upper() or "O"
-    if controller not in CONTROLLERS:
-        raise header.refuse("CONTRLLR", controller, f"one of {', '.join(CONTROLLERS)}")
-    if day_obs > LAST_DAY_OF_OWN_COUNT.get(controller, day_obs):
-        controller = "O"
-    return (day_obs + CONTROLLERS.index(controller) * 10_000_000) * 100_000 + seq_num
+def _airmass(header: RawHeader) -> float | None:
+    """``AMSTART``; `None` where it is absent, or 0 as where there is no telescope."""
+    value = header.value("AMSTART")
+    if value is None or value == 0:
+        return None
+    return header.number("AMSTART", value, "1 to 40", lambda airmass: 1 <= airmass <= 40)

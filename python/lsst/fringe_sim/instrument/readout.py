@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 from .bandpass import Bandpass
 
 if TYPE_CHECKING:
@@ -126,6 +126,7 @@ def zero_point(bandpass: Bandpass, collecting_area_m2: float, airmass: float | N
     return 2.5 * math.log10(electrons)
 
 
+@named_units
 def electrons_to_magnitude(
     electrons: ArrayLike, zero_point_mag: float, exposure_s: float, pixel_scale_arcsec: float
 ) -> FloatArray:
@@ -137,6 +138,7 @@ def electrons_to_magnitude(
     return magnitude
 
 
+@named_units
 def electrons_to_microjansky(
     electrons: ArrayLike, zero_point_mag: float, exposure_s: float, pixel_scale_arcsec: float
 ) -> FloatArray:

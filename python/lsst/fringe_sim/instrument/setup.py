@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, UnknownNameError, printable_name, to_number
+from ..errors import InputError, UnknownNameError, named_units, printable_name, to_number
 from ..optics.illumination import (
     Beam,
     GaussianProfile,
@@ -39,6 +39,7 @@ WAVELENGTH_ACCURACY_NM = 0.5
 """Accuracy of a monochromator where the set-up states none [nm]; an assumption, of the order of what makers state."""
 
 
+@named_units
 @dataclass(frozen=True)
 class Setup:
     """Sensor, temperature and light of one instrument or test stand.
@@ -177,6 +178,7 @@ class Setup:
         setup.stack.position(setup.varying)
         return setup
 
+    @named_units
     def missing_nm(self, found_nm: Iterable[float]) -> tuple[float, ...]:
         """Usual wavelengths that are not among those found [nm]."""
         found = tuple(found_nm)
@@ -197,6 +199,7 @@ class Setup:
             return MonochromaticProfile()
         return _PROFILES[self.profile_name](self.bandwidth_fwhm_nm)
 
+    @named_units
     def beam(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0) -> Beam:
         """Angles of incidence at a field position [deg]; the position matters only behind a telescope."""
         if self.beam_kind == "collimated":
@@ -207,6 +210,7 @@ class Setup:
 
         return telescope_beam(self.telescope, field_x_deg, field_y_deg)
 
+    @named_units
     def optical_system(
         self, *, field_x_deg: float = 0.0, field_y_deg: float = 0.0, observable: str = "detection"
     ) -> OpticalSystem:

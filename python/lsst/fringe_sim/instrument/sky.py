@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ..resources import read_table
 from .oh_levels import SECOND_RADIATION_CM_K, RotationalLevels, boltzmann
 
@@ -58,6 +58,7 @@ _SOLAR_TEMPERATURE_K = 5900.0
 """Colour temperature of the Sun between 500 and 1000 nm, where its flux falls by a factor 0.39 (ASTM E-490)."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class EmissionLines:
     """Airglow lines.
@@ -113,6 +114,7 @@ class EmissionLines:
             raise OutOfRangeError("transmission of the air", worst, "0 to 1")
 
     @classmethod
+    @named_units
     def oh(
         cls,
         rotational_temperature_k: float | None = None,
@@ -233,6 +235,7 @@ class EmissionLines:
         return replace(self, photon_radiance=self.photon_radiance * factor, levels=changed)
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class ContinuumTerm:
     """Light without lines.
@@ -253,6 +256,7 @@ class ContinuumTerm:
     photon_radiance: FloatArray
     origin: Literal["airglow", "celestial", "local"]
 
+    @named_units
     def radiance(self, wavelength_nm: ArrayLike) -> FloatArray:
         """Photon radiance per nm.
 
@@ -271,6 +275,7 @@ class ContinuumTerm:
         return np.interp(wavelength, self.wavelength_nm, self.photon_radiance)
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class SpectralComponent:
     """Light of one origin as it reaches the sensor; only its level changes during a night.
@@ -309,6 +314,7 @@ class SkySpectrum:
     airmass: float = 1.0
 
     @classmethod
+    @named_units
     def dark(
         cls,
         lines: EmissionLines | None = None,
@@ -332,6 +338,7 @@ class SkySpectrum:
         """Spectrum whose OH bands are multiplied by factors."""
         return replace(self, lines=self.lines.scaled(band_scale))
 
+    @named_units
     def components(
         self, bandpass: Bandpass, continuum_step_nm: float = CONTINUUM_STEP_NM
     ) -> list[SpectralComponent]:
@@ -410,6 +417,7 @@ def airglow_continuum(solar_flux_sfu: float = 129.0) -> ContinuumTerm:
     )
 
 
+@named_units
 def zodiacal_light(helioecliptic_longitude_deg: float, ecliptic_latitude_deg: float) -> ContinuumTerm:
     """Zodiacal light of Leinert et al. 1998, Table 17, with the reddening given there.
 
@@ -444,6 +452,7 @@ def zodiacal_light(helioecliptic_longitude_deg: float, ecliptic_latitude_deg: fl
     )
 
 
+@named_units
 def moonlight(
     phase_angle_deg: float, separation_deg: float, moon_zenith_deg: float, target_zenith_deg: float = 0.0
 ) -> ContinuumTerm:
@@ -527,6 +536,7 @@ def _vibrational_factor(upper: NDArray[np.int64], temperature_k: float) -> Float
     return np.array([factor[int(each)] for each in upper])
 
 
+@named_units
 def blend_components(components: Sequence[SpectralComponent], rms_shift_nm: float) -> list[SpectralComponent]:
     """Fewer nodes with the same photons and the same mean wavelength in every component.
 

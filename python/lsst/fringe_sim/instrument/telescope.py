@@ -17,7 +17,7 @@ import batoid
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OutOfRangeError, ResourceError, UnknownNameError
+from ..errors import OutOfRangeError, ResourceError, UnknownNameError, named_units
 from ..optics import Beam
 from ..resources import list_resources, read_yaml
 from .ray_bundle import (
@@ -44,6 +44,7 @@ FloatArray = NDArray[np.float64]
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
+@named_units
 @dataclass(frozen=True)
 class TracedOptics:
     """Optics traced with batoid.
@@ -66,6 +67,7 @@ class TracedOptics:
     rings: int = 400
     spokes: int = 1200
 
+    @named_units
     def trace(self, field_x_deg: float, field_y_deg: float) -> RayBundle:
         """Trace the light of one field position down to the sensor.
 
@@ -100,6 +102,7 @@ class TracedOptics:
         depth = np.abs(velocity[:, 2])
         return RayBundle(velocity[:, 0] / depth, velocity[:, 1] / depth, float(kept.mean()))
 
+    @named_units
     def launch(self, field_x_deg: float, field_y_deg: float, spokes: int, reach: float) -> batoid.RayVector:
         """Rays of a field position at midpoints of equal areas of the pupil, azimuth 0 to ``reach`` [rad]."""
         optic = batoid_optic(self.prescription)
@@ -141,6 +144,7 @@ class ConeOptics:
 
     axisymmetric = True
 
+    @named_units
     def trace(self, field_x_deg: float, field_y_deg: float) -> RayBundle:
         """Rays of the cone; the same at every field position."""
         share = (np.arange(self.rings) + 0.5) / self.rings
@@ -153,6 +157,7 @@ class ConeOptics:
         )
 
 
+@named_units
 @dataclass(frozen=True)
 class Telescope:
     """A telescope with its camera.
@@ -229,6 +234,7 @@ class Telescope:
         """Sky area of a pixel [arcsec²]."""
         return self.pixel_scale_arcsec**2
 
+    @named_units
     def trace(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0) -> RayBundle:
         """Rays that arrive at one field position.
 
@@ -240,6 +246,7 @@ class Telescope:
         self._check_field(field_x_deg, field_y_deg)
         return self.optics.trace(field_x_deg, field_y_deg)
 
+    @named_units
     def beam(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0, nodes: int = BEAM_NODES) -> Beam:
         """Angles of incidence at one field position, as a Gauss rule.
 
@@ -255,6 +262,7 @@ class Telescope:
             field_x_deg, field_y_deg = math.hypot(field_x_deg, field_y_deg), 0.0
         return beam_of_quantiles(_traced_quantiles(self.optics, field_x_deg, field_y_deg)[0], nodes)
 
+    @named_units
     def kept_fraction(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0) -> float:
         """Share of the pupil that light from one field position passes; vignetting is its fall off axis."""
         self._check_field(field_x_deg, field_y_deg)
@@ -272,6 +280,7 @@ class Telescope:
             )
 
 
+@named_units
 def telescope_beam(
     telescope: str | Telescope, field_x_deg: float = 0.0, field_y_deg: float = 0.0, nodes: int = BEAM_NODES
 ) -> Beam:

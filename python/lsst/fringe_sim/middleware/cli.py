@@ -87,6 +87,8 @@ def ingest_fringe_raws(
         report = ingest_raws(butler, paths, transfer=transfer, run=output_run, dry_run=dry_run)
     for message in report.refused:
         click.echo(f"refused: {message}", err=True)
+    for note in report.notes:
+        click.echo(note, err=True)
     if dry_run:
         for exposure in report.ingested:
             info = exposure.info

@@ -6,6 +6,7 @@ here has the data id under which a repository of real images will look for it.
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -27,6 +28,8 @@ __all__ = [
     "Ts8Fringe",
     "sensor_of",
 ]
+
+_LOG = logging.getLogger(__name__)
 
 NO_FILTER = "none"
 """Physical filter of frames without light and of white light."""
@@ -96,7 +99,8 @@ class FringeInstrument(Instrument):
     def register(self, registry: Any, *, update: bool = False) -> None:
         """Register the instrument, its detectors and its physical filters.
 
-        Registering again changes nothing.
+        Registering again changes nothing. Where the repository lacks the storage classes and formatters of this
+        package, a warning says how to add them: an instrument alone does no harm there.
 
         Raises
         ------
@@ -104,6 +108,7 @@ class FringeInstrument(Instrument):
             The repository has this instrument with another definition, as it has when Rubin's own package
             registered it.
         """
+        _warn_unprepared(registry)
         camera = self.camera()
         try:
             with registry.transaction():
@@ -159,6 +164,18 @@ class FringeInstrument(Instrument):
         if match is None:
             raise InputError("physical filter", physical_filter, f"{', '.join(known)}, or a name like y_04")
         return match.group(1).lower()
+
+
+def _warn_unprepared(registry: Any) -> None:
+    from .repository import unprepared  # an instrument is made far more often than it is registered
+
+    # The middleware hands over the registry of the butler that it has opened, and nothing else.
+    config = getattr(getattr(registry, "_butler", None), "_config", None)
+    if config is not None:
+        repo = "REPO" if config.configFile is None else config.configFile.dirname().ospath
+        found = unprepared(config, repo)
+        if found is not None:
+            _LOG.warning("%s", found)
 
 
 class LsstCamFringe(FringeInstrument):

@@ -8,7 +8,9 @@ data id of one that is there, as a second mock series of the same hour has it, i
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,7 +39,7 @@ from .formatters import RawFrameFormatter
 from .instruments import INSTRUMENTS, FringeInstrument
 from .translators import TRANSLATORS
 
-__all__ = ["RAW", "IngestReport", "RawExposure", "ingest_raws", "raw_dataset_type"]
+__all__ = ["RAW", "IngestReport", "RawExposure", "examine", "ingest_raws", "raw_dataset_type"]
 
 RAW = "raw"
 """Dataset type of raw frames."""
@@ -58,6 +60,8 @@ class RawExposure:
         What its header says.
     instrument : `str`
         Name of the instrument.
+    notes : `tuple` [`str`, ...]
+        What was taken for granted because the header does not state it.
     data_id : `dict`
         Its instrument, exposure and detector.
     """
@@ -65,6 +69,7 @@ class RawExposure:
     path: str
     info: ObservationInfo
     instrument: str
+    notes: tuple[str, ...] = ()
 
     @property
     def data_id(self) -> dict[str, Any]:
@@ -94,6 +99,12 @@ class IngestReport:
     present: tuple[RawExposure, ...]
     refused: tuple[str, ...]
     run: Mapping[str, str]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was taken for granted, with the number of frames that do not state it."""
+        found = Counter(note for exposure in (*self.ingested, *self.present) for note in exposure.notes)
+        return tuple(f"{number} raw frames: {note}" for note, number in found.items())
 
 
 def raw_dataset_type(butler: Butler) -> DatasetType:
@@ -149,7 +160,7 @@ def ingest_raws(
     usable: list[RawExposure] = []
     for file in files:
         try:
-            usable.append(_examine(file, registered))
+            usable.append(examine(file, registered))
         except InputError as error:
             refused.append(_one_line(error))
     usable, contradicting = _agreeing(usable)
@@ -187,7 +198,7 @@ def _registered_instruments(butler: Butler) -> dict[str, type[FringeInstrument]]
     return {cls.getName(): cls for cls in INSTRUMENTS.values() if cls.getName() in names}
 
 
-def _examine(path: str, registered: Mapping[str, type[FringeInstrument]]) -> RawExposure:
+def examine(path: str, registered: Mapping[str, type[FringeInstrument]]) -> RawExposure:
     """Read the header of one file.
 
     Raises
@@ -196,7 +207,8 @@ def _examine(path: str, registered: Mapping[str, type[FringeInstrument]]) -> Raw
         The file is no raw frame, or the repository does not know its instrument or its filter.
     """
     header = read_raw_header(path)
-    camera = RawMetadata.from_header(header, source=path).camera
+    metadata = RawMetadata.from_header(header, source=path)
+    camera = metadata.camera
     instrument = INSTRUMENTS[camera]
     if instrument.getName() not in registered:
         raise InputError(
@@ -216,7 +228,7 @@ def _examine(path: str, registered: Mapping[str, type[FringeInstrument]]) -> Raw
         # Whatever the translation stumbles over, the other files go in.
         allowed = "one that the middleware can translate"
         raise FrameFormatError("header", first_line(error), allowed, source=path) from error
-    return RawExposure(path, info, instrument.getName())
+    return RawExposure(path, info, instrument.getName(), metadata.notes)
 
 
 def _check_time(info: ObservationInfo) -> None:
@@ -287,10 +299,16 @@ def _exposure_record(info: ObservationInfo) -> dict[str, Any]:
         "seq_end": info.group_counter_end,
         "target_name": info.object,
         "science_program": info.science_program,
+        "zenith_angle": _zenith_angle(info.boresight_airmass),
         "has_simulated": info.has_simulated_content,
         "can_see_sky": info.can_see_sky,
         "timespan": Timespan(info.datetime_begin, info.datetime_end),
     }
+
+
+def _zenith_angle(airmass: float | None) -> float | None:
+    """Degrees, as in records of simulated nights."""
+    return None if airmass is None else math.degrees(math.acos(1.0 / airmass))
 
 
 def _seconds(duration: u.Quantity | None) -> float | None:

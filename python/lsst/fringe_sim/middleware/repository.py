@@ -17,7 +17,7 @@ from lsst.daf.butler import Butler, ButlerConfig, Config
 from ..errors import InputError
 from ..files import write_whole
 
-__all__ = ["open_repository", "prepare_repository", "recover_repository", "require_prepared"]
+__all__ = ["open_repository", "prepare_repository", "recover_repository", "require_prepared", "unprepared"]
 
 SEED = "resource://lsst.fringe_sim/configs/butler.yaml"
 """Storage classes and formatters that a repository needs for the datasets of this package."""
@@ -72,11 +72,19 @@ def require_prepared(repo: str) -> None:
     InputError
         There is no such repository, or it lacks storage classes or formatters.
     """
-    missing = _missing(_config(repo))
-    if missing:
-        names = ", ".join(dict.fromkeys(key[-1] for key in missing))
-        allowed = f"one that knows them; butler prepare-fringe-repo {repo} adds what is missing"
-        raise InputError("storage classes and formatters", f"without {names}", allowed, source=repo)
+    found = unprepared(_config(repo), repo)
+    if found is not None:
+        raise found
+
+
+def unprepared(config: Config, repo: str) -> InputError | None:
+    """What a repository of this configuration lacks for datasets of this package; `None` if nothing."""
+    missing = _missing(config)
+    if not missing:
+        return None
+    names = ", ".join(dict.fromkeys(key[-1] for key in missing))
+    allowed = f"one that knows them; butler prepare-fringe-repo {repo} adds what is missing"
+    return InputError("storage classes and formatters", f"without {names}", allowed, source=repo)
 
 
 def prepare_repository(repo: str) -> list[str]:
@@ -116,7 +124,7 @@ def _config(repo: str) -> ButlerConfig:
         raise _refusal(repo, error) from error
 
 
-def _missing(config: ButlerConfig) -> list[tuple[str, ...]]:
+def _missing(config: Config) -> list[tuple[str, ...]]:
     """Keys of the seed that a configuration has not."""
     seed = Config(SEED)
     return [

@@ -48,7 +48,6 @@ _EXTENSIONS = {
 _NOT_KNOWN: dict[str, Any] = {
     "telescope": None,
     "location": None,
-    "boresight_airmass": None,
     "boresight_rotation_angle": None,
     "boresight_rotation_coord": None,
     "tracking_radec": None,
@@ -130,6 +129,7 @@ _FROM_METADATA: dict[str, Callable[[RawMetadata], Any]] = {
     "datetime_begin": _begin,
     "datetime_end": lambda m: _begin(m) + m.exposure_time_s * u.s,
     "can_see_sky": lambda m: m.observation_type == "science",
+    "boresight_airmass": lambda m: m.airmass,
     "detector_num": lambda m: m.detector,
     "detector_name": lambda m: m.slot,
     "detector_group": lambda m: m.raft,

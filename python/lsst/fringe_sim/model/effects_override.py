@@ -8,10 +8,11 @@ from collections.abc import Mapping
 
 from ..errors import InputError
 
-__all__ = ["effects_override", "read_effects_override"]
+__all__ = ["effects_override", "read_effects_override", "refuse_other_effects", "written_effects"]
 
 _STATEMENT = re.compile(r"""config\.effects\[(["'])([\w.]+)\1\]\s*=\s*([^#]+?)\s*(?:#.*)?""")
 
+_WRITTEN = "config.written_effects = "
 _BEGINNING = "# Effects found in data of set-up "
 _END = "# End; SHA-256 of the lines above: "
 
@@ -26,7 +27,9 @@ def effects_override(
 ) -> str:
     """Text of an override that puts effects into fit, sky simulation and templates.
 
-    Its last line states the hash of the others, so that a file that was cut short is not taken for a shorter one.
+    Its first line states the names of the effects and a hash of their values, which the configuration of a task
+    compares with what it got; its last line the hash of all others. A file that was cut short is not taken for a
+    shorter one.
 
     Parameters
     ----------
@@ -39,7 +42,8 @@ def effects_override(
     detector : `str`, optional
         Name of the sensor.
     """
-    lines = [f"{_BEGINNING}{_quoted(setup)}; verdict: {_quoted(verdict)}."]
+    lines = [f"{_WRITTEN}{written_effects({**(known or {}), **settings})!r}"]
+    lines.append(f"{_BEGINNING}{_quoted(setup)}; verdict: {_quoted(verdict)}.")
     if detector is not None:
         lines.append(f"# Sensor {_quoted(detector)}.")
     lines.append("# Use with -C label:effects.py on any task that reads effects.")
@@ -51,6 +55,38 @@ def effects_override(
 
 def _statements(settings: Mapping[str, float]) -> list[str]:
     return [f"config.effects[{str(key)!r}] = {float(value)!r}" for key, value in settings.items()]
+
+
+def written_effects(settings: Mapping[str, float]) -> str:
+    """Names of effects, sorted, and a hash of their values."""
+    names = sorted(settings)
+    values = "\n".join(f"{name}={float(settings[name])!r}" for name in names)
+    return " ".join([*names, _hash(values)[:16]])
+
+
+def refuse_other_effects(written: str, settings: Mapping[str, float]) -> None:
+    """Refuse effects that are not those that an override says it was written with; others may stand beside them.
+
+    Parameters
+    ----------
+    written : `str`
+        What `written_effects` returned; empty without such an override.
+    settings : mapping
+        Values by ``effect.parameter``.
+
+    Raises
+    ------
+    InputError
+        An effect is missing or has another value.
+    """
+    *names, _ = written.split() or [""]
+    if written and written_effects({name: settings[name] for name in names if name in settings}) != written:
+        raise InputError(
+            "written_effects",
+            written,
+            "that of the effects which were set: the override was cut short or changed (run the search again), or "
+            "another one changes its values (then set written_effects to '')",
+        )
 
 
 def _quoted(name: str) -> str:
@@ -86,7 +122,7 @@ def read_effects_override(text: str, source: str | None = None) -> dict[str, flo
     complete = _is_complete(text, source)
     found: dict[str, float] = {}
     for line in map(str.rstrip, text.splitlines()):
-        if not line or line.lstrip().startswith("#"):
+        if not line or line.lstrip().startswith("#") or (complete and line.startswith(_WRITTEN)):
             continue
         statement = _STATEMENT.fullmatch(line)
         try:
@@ -103,7 +139,7 @@ def read_effects_override(text: str, source: str | None = None) -> dict[str, flo
 
 def _is_complete(text: str, source: str | None) -> bool:
     """Whether a search wrote a text to its end; `False` for one written by hand, which says nothing of it."""
-    if not text.startswith(_BEGINNING):
+    if not text.startswith((_WRITTEN, _BEGINNING)):
         return False
     content, mark, stated = text.rpartition(_END)
     if not mark or stated.strip() != _hash(content):

@@ -21,7 +21,7 @@ from ..effects import (
     known_effects,
 )
 from ..effects.active import settings_of
-from ..errors import InputError, without_unit
+from ..errors import InputError, named_units, without_unit
 from ..instrument.setup import Setup
 from ..optics.harmonics import ROUNDING
 from ..optics.illumination import DEFAULT_STEP_NM, Illumination
@@ -66,6 +66,7 @@ class FringeModel:
         object.__setattr__(self, "system", apply_to_system(self.effects, self.base_system))
 
     @classmethod
+    @named_units
     def from_setup(
         cls,
         setup: str | Setup,
@@ -155,6 +156,7 @@ class FringeModel:
                 image = image + part * (evaluate(inside) - image)
         return image
 
+    @named_units
     def response(self, thickness_um: ArrayLike, wavelength_nm: ArrayLike) -> FloatArray:
         """Response to monochromator flats, outside local effects.
 
@@ -182,6 +184,7 @@ class FringeModel:
         thickness = self._thickness(thickness_um)
         return self.respond(self.system.flat_fields(wavelength), thickness, wavelength)
 
+    @named_units
     def flat_image(self, thickness_um: ArrayLike, geometry: ImageGeometry) -> FloatArray:
         """Images of monochromator flats, each over its mean, with the effects of light, sensor and read-out.
 
@@ -208,6 +211,7 @@ class FringeModel:
         image /= image.mean(axis=(1, 2), keepdims=True)
         return apply_to_image(self.effects, self.base_system, image, geometry)
 
+    @named_units
     def respond(
         self, illumination: Illumination, thickness_um: ArrayLike, wavelength_nm: ArrayLike | None = None
     ) -> FloatArray:
@@ -216,6 +220,7 @@ class FringeModel:
         response = reduced.averaged(illumination.weight, thickness_um)
         return self.finish(reduced, illumination, response, wavelength_nm)
 
+    @named_units
     def respond_on_grid(
         self,
         illumination: Illumination,
@@ -236,6 +241,7 @@ class FringeModel:
         )
         return self.finish(reduced, illumination, response, wavelength_nm)
 
+    @named_units
     def response_on_grid(
         self, wavelength_nm: ArrayLike, start_um: float, step_um: float, count: int
     ) -> FloatArray:
@@ -244,6 +250,7 @@ class FringeModel:
         illumination = self.system.flat_fields(wavelength)
         return self.respond_on_grid(illumination, start_um, step_um, count, wavelength)
 
+    @named_units
     def table(
         self,
         thickness_range_um: tuple[float, float],
@@ -267,6 +274,7 @@ class FringeModel:
         illumination = self.system.flat_fields(wavelength)
         return self.table_of(illumination, (low, high), wavelength_nm=wavelength, tolerance=tolerance)
 
+    @named_units
     def table_of(
         self,
         illumination: Illumination,
@@ -293,6 +301,7 @@ class FringeModel:
         labels = illumination.mean_wavelength_nm if wavelength_nm is None else wavelength_nm
         return tabulate(sample, thickness_range_um, labels, tolerance=tolerance)
 
+    @named_units
     def thickness_derivative(self, thickness_um: ArrayLike, wavelength_nm: ArrayLike) -> FloatArray:
         """Exact derivative of `response` with respect to thickness [1/µm].
 
@@ -308,6 +317,7 @@ class FringeModel:
         thickness = self._thickness(thickness_um)
         return self.system.reduce(illumination).averaged_derivative(illumination.weight, thickness)
 
+    @named_units
     def fringe_order_um(self, wavelength_nm: ArrayLike) -> FloatArray:
         """Thickness of one fringe order at normal incidence, λ / 2n of the varying layer [µm].
 
@@ -317,6 +327,7 @@ class FringeModel:
         medium = self.system.stack.layers[self.system.stack.position(self.system.varying)].medium
         return 0.5e-3 * wavelength / medium.index(wavelength, self.system.temperature_k).real
 
+    @named_units
     def quadrature_error(self, wavelength_nm: ArrayLike, thickness_um: ArrayLike) -> float:
         """Largest change of the response when the wavelength nodes are twice as dense."""
         wavelength, thickness = self._wavelength(wavelength_nm), self._thickness(thickness_um)
@@ -325,6 +336,7 @@ class FringeModel:
         difference = self.respond(coarse, thickness) - self.respond(fine, thickness)
         return float(np.abs(difference).max())
 
+    @named_units
     def finish(
         self,
         reduced: PhaseResponse,

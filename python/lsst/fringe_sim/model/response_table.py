@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from ..compiled import contiguous, kernel, run_shares
-from ..errors import ConvergenceError, InputError, OutOfRangeError
+from ..errors import ConvergenceError, InputError, OutOfRangeError, named_units
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
 
@@ -33,6 +33,7 @@ _LEAST_PIXELS = 20_000
 _REFINEMENTS = 6
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class ResponseTable:
     """Response on a uniform grid of thickness, interpolated by a cubic spline.
@@ -92,6 +93,7 @@ class ResponseTable:
         cells = np.concatenate([self.polynomials, end], axis=1)
         return cells.astype(np.float32).reshape(len(self.values), -1)
 
+    @named_units
     def lookup(self, thickness_um: ArrayLike) -> FloatArray:
         """Interpolated response.
 
@@ -115,6 +117,7 @@ class ResponseTable:
         out = self._interpolated(flat, 0)
         return out.reshape(len(out), *thickness.shape)
 
+    @named_units
     def thickness_derivative(self, thickness_um: ArrayLike) -> FloatArray:
         """Derivative of `lookup` [1/µm]; same shape and errors."""
         thickness = np.asarray(thickness_um, dtype=float)
@@ -123,6 +126,7 @@ class ResponseTable:
         out = self._interpolated(flat, 1)
         return (out / self.step_um).reshape(len(out), *thickness.shape)
 
+    @named_units
     def frame(
         self, thickness_um: ArrayLike, row: int = 0, out: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
@@ -195,6 +199,7 @@ class ResponseTable:
             raise OutOfRangeError("thickness [um]", float(thickness[wrong][0]), allowed)
 
 
+@named_units
 def response_table(
     system: OpticalSystem,
     illumination: Illumination,
@@ -245,6 +250,7 @@ def response_table(
     )
 
 
+@named_units
 def tabulate(
     sample: Sampler,
     thickness_range_um: tuple[float, float],

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import spline_filter1d
 
-from ..errors import ConvergenceError, InputError, OutOfRangeError
+from ..errors import ConvergenceError, InputError, OutOfRangeError, named_units
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
 from ..optics.two_phase_response import ThicknessGrid, TwoPhaseResponse
@@ -27,6 +27,7 @@ _SAFETY = 1.3
 """The error in the middle of the cells, where it peaks, is multiplied by this."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class TwoLayerTable:
     """Response on a grid of two thicknesses, interpolated by a bicubic spline.
@@ -69,6 +70,7 @@ class TwoLayerTable:
         filtered = spline_filter1d(self.values, 3, axis=1, mode="mirror")
         return spline_filter1d(filtered, 3, axis=2, mode="mirror").astype(np.float32)
 
+    @named_units
     def frame(
         self,
         lower_um: ArrayLike,
@@ -134,6 +136,7 @@ class TwoLayerTable:
                 )
 
 
+@named_units
 def two_layer_table(
     system: OpticalSystem,
     illumination: Illumination,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 
 __all__ = [
     "Beam",
@@ -55,11 +55,13 @@ class SpectralProfile(ABC):
 class MonochromaticProfile(SpectralProfile):
     """A single wavelength."""
 
+    @named_units
     def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
         """One node; see `SpectralProfile.nodes`."""
         return np.zeros(1), np.ones(1)
 
 
+@named_units
 @dataclass(frozen=True)
 class GaussianProfile(SpectralProfile):
     """Gaussian line, as the paper assumes (section 2.2).
@@ -78,6 +80,7 @@ class GaussianProfile(SpectralProfile):
     def __post_init__(self) -> None:
         _check_width(self.fwhm_nm)
 
+    @named_units
     def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
         """Trapezoidal nodes, which converge exponentially here; see `SpectralProfile.nodes`."""
         sigma = self.fwhm_nm * SIGMA_PER_FWHM
@@ -88,6 +91,7 @@ class GaussianProfile(SpectralProfile):
         return offset, weight / weight.sum()
 
 
+@named_units
 @dataclass(frozen=True)
 class TriangularProfile(SpectralProfile):
     """Slit function of a monochromator with equal entrance and exit slits.
@@ -103,6 +107,7 @@ class TriangularProfile(SpectralProfile):
     def __post_init__(self) -> None:
         _check_width(self.fwhm_nm)
 
+    @named_units
     def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
         """Gauss–Legendre nodes on both flanks; see `SpectralProfile.nodes`."""
         per_flank = max(8, math.ceil(self.fwhm_nm / step_nm))
@@ -114,6 +119,7 @@ class TriangularProfile(SpectralProfile):
         return offset, weight / weight.sum()
 
 
+@named_units
 @dataclass(frozen=True)
 class WingedGaussianProfile(SpectralProfile):
     """Gaussian line on a weak, wide Lorentzian: scattered light of the grating.
@@ -143,6 +149,7 @@ class WingedGaussianProfile(SpectralProfile):
         if not 0.0 < self.wing_reach_nm <= 100.0:
             raise OutOfRangeError("reach of the wing [nm]", self.wing_reach_nm, "above 0 and up to 100")
 
+    @named_units
     def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
         """Nodes of the core and, unless it is empty, of the wing; see `SpectralProfile.nodes`."""
         offset, weight = GaussianProfile(self.fwhm_nm).nodes(step_nm)
@@ -156,6 +163,7 @@ class WingedGaussianProfile(SpectralProfile):
         return np.concatenate([offset, place]), np.concatenate(joint)
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class TabulatedProfile(SpectralProfile):
     """Measured line: straight lines between tabulated points.
@@ -176,6 +184,7 @@ class TabulatedProfile(SpectralProfile):
         object.__setattr__(self, "offset_nm", offset)
         object.__setattr__(self, "light", light)
 
+    @named_units
     def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
         """Gauss–Legendre nodes between the points; see `SpectralProfile.nodes`."""
         place, share = _gauss_panels(self.offset_nm, 4.0 * step_nm, 4)
@@ -183,6 +192,7 @@ class TabulatedProfile(SpectralProfile):
         return place, share / share.sum()
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class LampSpectrum:
     """Spectrum of the lamp in front of the monochromator, e.g. the arc lines of xenon.
@@ -203,6 +213,7 @@ class LampSpectrum:
         object.__setattr__(self, "wavelength_nm", wavelength)
         object.__setattr__(self, "light", light)
 
+    @named_units
     def at(self, wavelength_nm: ArrayLike) -> FloatArray:
         """Relative number of photons at these wavelengths [nm].
 
@@ -221,6 +232,7 @@ class LampSpectrum:
         return np.interp(wavelength, self.wavelength_nm, self.light)
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class Beam:
     """Distribution of the angle of incidence on the sensor.
@@ -255,6 +267,7 @@ class Beam:
         object.__setattr__(self, "weight", weight)
 
     @classmethod
+    @named_units
     def collimated(cls, theta: float = 0.0) -> Beam:
         """Parallel light at one angle [rad]."""
         return cls(np.array([theta]), np.ones(1))
@@ -290,6 +303,7 @@ class Beam:
         return float(self.weight @ self.theta)
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class Illumination:
     """Quadrature over wavelength and angle, for one or several exposures.
@@ -318,6 +332,7 @@ class Illumination:
         return mean
 
     @classmethod
+    @named_units
     def flat_fields(
         cls,
         wavelength_nm: ArrayLike,
@@ -358,6 +373,7 @@ class Illumination:
         return cls(wave, theta, photons / total)
 
     @classmethod
+    @named_units
     def spectrum(cls, wavelength_nm: ArrayLike, weight: ArrayLike, beam: Beam) -> Illumination:
         """One exposure to a spectrum of lines (or of continuum nodes); Eq. 5 of the paper.
 

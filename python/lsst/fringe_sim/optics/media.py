@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import OutOfRangeError, ResourceError, UnknownNameError
+from ..errors import OutOfRangeError, ResourceError, UnknownNameError, named_units
 from ..resources import read_table, read_yaml
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ COLD_TABLE = "nk_Si_franta2017_T.ecsv"
 WARM_TABLE = "nk_Si_green2008.ecsv"
 
 
+@named_units
 @dataclass(frozen=True)
 class Medium:
     """A homogeneous, isotropic optical medium.
@@ -65,6 +66,7 @@ class Medium:
         """Whether it is one of the tables of crystalline silicon."""
         return self.name.partition("_")[0] == "Si"
 
+    @named_units
     def index(self, wavelength_nm: ArrayLike, temperature_k: ArrayLike = 300.0) -> NDArray[np.complex128]:
         """Complex refractive index ``n + i k``.
 
@@ -204,6 +206,7 @@ def _lagrange(temperature: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(weights, axis=-1)
 
 
+@named_units
 def constant_medium(
     name: str,
     n: float,

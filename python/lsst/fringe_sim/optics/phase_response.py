@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..compiled import contiguous
-from ..errors import ConvergenceError, InputError, OutOfRangeError
+from ..errors import ConvergenceError, InputError, OutOfRangeError, named_units
 from .closed_form import at_thicknesses, derivative_bounds, on_grid
 from .coherence import phase_states
 from .harmonics import MOST_RATIO, ROUNDING, series_at, series_on_grid
@@ -41,6 +41,7 @@ _LARGEST_RATIO = 0.9
 """Ratio of two harmonics above which the series is too long to pay."""
 
 
+@named_units
 @dataclass(frozen=True)
 class PhaseResponse:
     """Coefficients of the closed form, one set per node (wavelength, angle, polarisation).
@@ -91,6 +92,7 @@ class PhaseResponse:
         }
         return replace(self, **sums)
 
+    @named_units
     def evaluate(self, thickness_um: ArrayLike) -> FloatArray:
         """Response at every node.
 
@@ -113,6 +115,7 @@ class PhaseResponse:
         top = a + b * size**2 + e * size + 2.0 * (c * z).real
         return (share * top / np.abs(1.0 + g * z) ** 2).sum(axis=0)
 
+    @named_units
     def thickness_derivative(self, thickness_um: ArrayLike) -> FloatArray:
         """Exact derivative of `evaluate` with respect to thickness [1/µm]; same shape."""
         thickness = _checked_thickness(thickness_um)
@@ -155,6 +158,7 @@ class PhaseResponse:
         )
         return out.reshape(shape)
 
+    @named_units
     def averaged(self, weight: ArrayLike, thickness_um: ArrayLike) -> FloatArray:
         """Weighted sum over the last node axis.
 
@@ -171,6 +175,7 @@ class PhaseResponse:
         """
         return self._averaged(weight, thickness_um, 0)
 
+    @named_units
     def averaged_on_grid(
         self, weight: ArrayLike, start_um: float, step_um: float, count: int, *, tolerance: float = ROUNDING
     ) -> FloatArray:
@@ -190,6 +195,7 @@ class PhaseResponse:
             out = on_grid(arrays, weights, *grid)
         return out[0] if squeeze else out
 
+    @named_units
     def averaged_derivative_on_grid(
         self, weight: ArrayLike, start_um: float, step_um: float, count: int, order: int = 1
     ) -> FloatArray:
@@ -205,6 +211,7 @@ class PhaseResponse:
     def _series_pays(self) -> bool:
         return bool(np.abs(self.g).max() < _LARGEST_RATIO and not np.any(self.kappa.imag))
 
+    @named_units
     def averaged_derivative(self, weight: ArrayLike, thickness_um: ArrayLike) -> FloatArray:
         """Thickness derivative of `averaged` [1/µm]; same shape."""
         return self._averaged(weight, thickness_um, 1)
@@ -219,6 +226,7 @@ class PhaseResponse:
             out = at_thicknesses(arrays, weights, flat, order)
         return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
 
+    @named_units
     def derivative_bound(self, weight: ArrayLike, order: int, from_um: float = 0.0) -> FloatArray:
         """Upper bound of the magnitude of a thickness derivative of `averaged`.
 
@@ -265,6 +273,7 @@ class PhaseResponse:
         )
 
 
+@named_units
 def reduce_to_phase(
     n: ArrayLike,
     d: ArrayLike,

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, ResourceError, StackError, UnknownNameError
+from ..errors import InputError, ResourceError, StackError, UnknownNameError, named_units
 from ..resources import list_resources, read_yaml
 from .media import Medium, get_medium
 
 __all__ = ["Layer", "LayerStack"]
 
 
+@named_units
 @dataclass(frozen=True)
 class Layer:
     """One plane-parallel layer.
@@ -157,6 +158,7 @@ class LayerStack:
             raise UnknownNameError("layer", name, self.names, source=self.name)
         return self.names.index(name)
 
+    @named_units
     def indices(self, wavelength_nm: ArrayLike, temperature_k: ArrayLike = 300.0) -> NDArray[np.complex128]:
         """Complex index of every layer, shape ``(L, ...)`` with the broadcast shape of the arguments."""
         by_medium: dict[int, NDArray[np.complex128]] = {}
@@ -172,6 +174,7 @@ class LayerStack:
         layers[position] = replace(layers[position], **changes)  # type: ignore[arg-type]
         return replace(self, layers=tuple(layers))
 
+    @named_units
     def with_thickness(self, name: str, thickness_um: float) -> LayerStack:
         """Stack in which the layer ``name`` has another thickness [µm]."""
         return self.replace_layer(name, thickness_um=float(thickness_um))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputError
+from ..errors import InputError, named_units
 from .diffuse import DiffuseReturn
 from .illumination import DEFAULT_STEP_NM, Beam, Illumination, LampSpectrum, SpectralProfile
 from .phase_response import PhaseResponse, reduce_to_phase
@@ -24,6 +24,7 @@ OBSERVABLES = ("detection", "total")
 """``detection``: absorbed in the detection layer. ``total``: 1 - R - T of the stack, as the paper's fit used."""
 
 
+@named_units
 @dataclass(frozen=True)
 class OpticalSystem:
     """Stack, illumination and observable.
@@ -84,12 +85,14 @@ class OpticalSystem:
         """System in which some attributes of one layer of the stack are changed."""
         return replace(self, stack=self.stack.replace_layer(layer, **changes))
 
+    @named_units
     def true_wavelength(self, nominal_nm: ArrayLike) -> np.ndarray:
         """Wavelength that the monochromator really delivers [nm]."""
         nominal = np.asarray(nominal_nm, dtype=float)
         stretched = self.wavelength_stretch * (nominal - self.stretch_pivot_nm)
         return nominal + self.wavelength_offset_nm + stretched + self._single_errors(nominal)
 
+    @named_units
     def nominal_wavelength(self, true_nm: ArrayLike) -> np.ndarray:
         """Wavelength to which the monochromator is set where it delivers ``true_nm`` [nm]."""
         true = np.asarray(true_nm, dtype=float)
@@ -105,6 +108,7 @@ class OpticalSystem:
             total += np.interp(nominal_nm, *np.transpose(errors))
         return total
 
+    @named_units
     def flat_fields(self, wavelength_nm: ArrayLike, step_nm: float = DEFAULT_STEP_NM) -> Illumination:
         """Illumination of monochromator flats at nominal wavelengths [nm]."""
         wavelength = self.true_wavelength(wavelength_nm)

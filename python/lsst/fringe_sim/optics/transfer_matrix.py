@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, OutOfRangeError, StackError
+from ..errors import InputError, OutOfRangeError, StackError, named_units
 
 __all__ = [
     "POLARIZATIONS",
@@ -29,6 +29,9 @@ __all__ = [
 ]
 
 POLARIZATIONS = ("s", "p", "mixed")
+
+MOST_WAVELENGTHS = 1e12
+"""In one layer; the rounding of a double then moves the phase by 2 pi 1e12 2.2e-16 = 1.4e-3 rad."""
 
 ComplexArray = NDArray[np.complex128]
 FloatArray = NDArray[np.float64]
@@ -69,6 +72,7 @@ class WaveFields:
         return _flux(self.forward_bottom, self.backward_bottom, admittance)
 
 
+@named_units
 def layer_absorption(
     n: ArrayLike,
     d: ArrayLike,
@@ -134,6 +138,7 @@ def pure_polarizations(polarization: str, theta: FloatArray) -> tuple[str, ...]:
     return ("s", "p") if np.any(theta) else ("s",)
 
 
+@named_units
 def layer_admittance(
     index: ComplexArray, theta: FloatArray, polarization: str
 ) -> tuple[ComplexArray, ComplexArray]:
@@ -343,6 +348,10 @@ def _check(index: ComplexArray, thickness: FloatArray, wavelength: FloatArray, t
     _demand(good, wavelength, OutOfRangeError, "wavelength", "a positive number")
     good = (theta >= 0.0) & (theta < 0.5 * np.pi)
     _demand(good, theta, OutOfRangeError, "angle of incidence [rad]", "0 to below pi/2")
+    with np.errstate(over="ignore"):
+        waves = inner / wavelength * np.abs(index[1:-1])
+    allowed = f"up to {MOST_WAVELENGTHS:g}: the phase of more is lost in the rounding"
+    _demand(waves <= MOST_WAVELENGTHS, waves, StackError, "wavelengths in a layer", allowed)
 
 
 def _demand(good: np.ndarray, values: np.ndarray, error: type[InputError], field: str, allowed: str) -> None:

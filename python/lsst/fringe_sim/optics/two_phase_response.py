@@ -19,7 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from ..errors import InputError, named_units
 from .phase_response import _checked_thickness
 from .transfer_matrix import (
     ComplexArray,
@@ -41,6 +41,7 @@ _BLOCK = 16
 """Thicknesses of the lower layer that share one set of phase factors of the upper one."""
 
 
+@named_units
 @dataclass(frozen=True)
 class ThicknessGrid:
     """Uniform grid ``start + step * arange(count)`` [µm]."""
@@ -90,6 +91,7 @@ class TwoPhaseResponse:
         """Shape of the nodes, without the polarisation axis."""
         return self.scale.shape[1:]
 
+    @named_units
     def averaged(self, weight: ArrayLike, lower_um: ArrayLike, upper_um: ArrayLike) -> FloatArray:
         """Weighted mean over the last node axis.
 
@@ -106,6 +108,7 @@ class TwoPhaseResponse:
         """
         return self._at_points(weight, lower_um, upper_um)[0]
 
+    @named_units
     def averaged_derivatives(
         self, weight: ArrayLike, lower_um: ArrayLike, upper_um: ArrayLike
     ) -> tuple[FloatArray, FloatArray]:
@@ -150,6 +153,7 @@ class TwoPhaseResponse:
         return tuple(group(getattr(self, name)) for name in _COEFFICIENTS), spread
 
 
+@named_units
 def reduce_to_two_phases(
     n: ArrayLike,
     d: ArrayLike,

@@ -40,6 +40,7 @@ __all__ = [
     "read_keyword",
     "read_mask",
     "read_metadata",
+    "refuse_other_unit",
     "write_hdus",
 ]
 
@@ -329,6 +330,18 @@ def in_unit(
             f"unit of {field}", found, f"{unit}, or one that converts to it", source=source
         ) from None
     return values if factor == 1.0 else (values * np.float64(factor)).astype(values.dtype.newbyteorder("="))
+
+
+def refuse_other_unit(field: str, found: object, unit: str, *, source: str) -> None:
+    """Refuse a unit that is not the one wanted, however its power is written; a file may state none.
+
+    Raises
+    ------
+    FrameFormatError
+        It is another one.
+    """
+    if re.sub(r"[*^() ]", "", str(found or "")) not in ("", re.sub(r"[*^() ]", "", unit)):
+        raise FrameFormatError(f"unit of {field}", found, unit or "no unit", source=source)
 
 
 def read_mask(hdus: fits.HDUList, name: str = "MASK", *, source: str, native: bool = True) -> NDArray[Any]:

@@ -149,8 +149,12 @@ class Image(Extension):
         if self.optional and self.name not in hdus:
             return {self.field: None}
         data = io.read_image(hdus, self.name, source=source, native=native)
+        stated = hdus[self.name].header.get("BUNIT")
         if self.unit and "{" not in self.unit:
-            data = io.in_unit(self.name, data, hdus[self.name].header.get("BUNIT"), self.unit, source=source)
+            data = io.in_unit(self.name, data, stated, self.unit, source=source)
+        elif self.unit is not None:
+            unit = self.unit.format(unit=str(hdus[1].header.get("BUNIT", "")).strip())
+            io.refuse_other_unit(self.name, stated, unit, source=source)
         return {self.field: data}
 
 

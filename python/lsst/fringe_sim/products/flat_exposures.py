@@ -10,7 +10,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FrameFormatError, InputError, OutOfRangeError, without_unit
+from ..errors import FrameFormatError, InputError, OutOfRangeError, named_units, without_unit
 from . import _check as check
 from . import _fits as io
 from .fits_product import Extension
@@ -18,6 +18,7 @@ from .fits_product import Extension
 __all__ = ["ExposureTable", "FlatExposures"]
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class FlatExposures:
     """How each plane of a cube was illuminated.

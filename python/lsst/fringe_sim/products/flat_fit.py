@@ -10,7 +10,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..errors import FrameFormatError
+from ..errors import FrameFormatError, named_units
 from . import _fits as io
 from .fits_product import Extension
 
@@ -29,6 +29,7 @@ FLAT_COLUMNS = (
 """Columns of the table in a file, with their units."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class FlatFit:
     """Numbers of each flat, in the order of the cube, and a coarse map.

@@ -11,7 +11,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError
+from ..errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError, named_units
 from . import _check as check
 from . import _fits as io
 from .fits_product import DETECTOR, NARROW_MASK, Card, FitsProduct, Image
@@ -153,6 +153,7 @@ class FringeCube(FitsProduct):
         )
 
     @classmethod
+    @named_units
     def from_arrays(
         cls,
         images: ArrayLike,

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import named_units
 from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
 
 __all__ = ["FringeFlat"]
 
 
+@named_units
 @dataclass(frozen=True, eq=False, repr=False)
 class FringeFlat(SensorProduct):
     """Fringe pattern of one sensor under monochromatic light.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FrameFormatError, InputError, OutOfRangeError
+from ..errors import FrameFormatError, InputError, OutOfRangeError, named_units
 from ..resources import open_user_fits, refuse_damage
 from .fringe_cube import FringeCube
 from .mask import mask_bits
@@ -116,6 +116,7 @@ def is_plain(path: str | Path) -> bool:
         return len(_images(hdus)) == 1
 
 
+@named_units
 def read_plain_flats(
     paths: Iterable[str | Path],
     *,

@@ -10,7 +10,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..errors import InputError, UnknownNameError
+from ..errors import InputError, UnknownNameError, named_units
 from . import _fits as io
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
 
@@ -50,6 +50,7 @@ def bands_of_header(metadata: Mapping[str, Any]) -> dict[str, float]:
     return {key[len(_BAND) :]: float(value) for key, value in metadata.items() if key.startswith(_BAND)}
 
 
+@named_units
 @dataclass(frozen=True, eq=False, repr=False)
 class SkyFringe(SensorProduct):
     """Night sky seen by one sensor in one exposure.

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FrameFormatError, InputError, without_unit
+from ..errors import FrameFormatError, InputError, named_units, without_unit
 from . import _check as check
 from .mask import mask_bits
 from .same_light import refuse_equal_pixels, refuse_mixed_models
@@ -56,6 +56,7 @@ class SkyFrames:
                 raise FrameFormatError("sky frame", f"shape {frame.shape}", allowed)
 
     @classmethod
+    @named_units
     def from_arrays(
         cls,
         images: ArrayLike,

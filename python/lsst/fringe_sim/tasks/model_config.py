@@ -18,6 +18,7 @@ from ..effects.active import settings_of
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
+from ..model.effects_override import refuse_other_effects
 from ..model.provenance import model_cards
 from .camera_config import CameraConfig
 
@@ -113,6 +114,12 @@ class FringeModelConfig(CameraConfig):
         doc="Physical effects that the set-up lacks: value by 'name.parameter', as 'bandwidth.fwhm'. "
         "Those of the laboratory's light and bench are left out on the sky.",
     )
+    written_effects: Field[str] = Field(
+        dtype=str,
+        default="",
+        doc="Names of the effects that an override of a search sets, and a hash of their values: one that was cut "
+        "short or changed is refused. The override sets it.",
+    )
     rafts: ConfigDictField = _EntriesField(
         keytype=str, itemtype=RaftConfig, default={}, doc="What single rafts have of their own, by raft."
     )
@@ -133,6 +140,10 @@ class FringeModelConfig(CameraConfig):
         """
         super().validate()
         kind = type(self)
+        try:
+            refuse_other_effects(self.written_effects, dict(self.effects))
+        except InputError as error:
+            raise FieldValidationError(kind.written_effects, self, str(error)) from error
         self.check_rafts(kind.rafts, self.rafts)
         self.check_sensors(kind.sensors, self.sensors)
         self._check_model(kind.effects, "")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ...errors import OutOfRangeError
+from ...errors import OutOfRangeError, named_units
 from .selection import Hypothesis
 
 __all__ = ["SearchOptions"]
 
 
+@named_units
 @dataclass(frozen=True)
 class SearchOptions:
     """Thresholds and sizes of a search; the defaults were chosen on other seeds than those of the recorded challenge.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BarycentricInterpolator
 
 from ...effects import Effect, ImageGeometry, known_effects
-from ...errors import InputError
+from ...errors import InputError, named_units
 from ...instrument.bandpass import Bandpass
 from ...instrument.detector import Detector
 from ...instrument.night import NightHistory
@@ -325,6 +325,7 @@ def _moved_to(places: FloatArray, part: SpectralComponent) -> FloatArray:
     return np.asarray(np.bincount(near, part.photons, places.size), dtype=float)
 
 
+@named_units
 def discover_sky(
     frames: Sequence[SkyFringe],
     thickness_um: ArrayLike,
@@ -403,6 +404,7 @@ def discover_sky(
     return search_exposures(cube, model, own, rng, options or SKY_SEARCH, report, light)
 
 
+@named_units
 def placement_in_frames(
     frames: Sequence[SkyFringe], detector: Detector, pixel_scale_arcsec: float
 ) -> SensorPlacement | None:

@@ -11,6 +11,7 @@ from typing import Any
 
 from astropy.table import Table
 
+from ...errors import named_units
 from ...files import table_text, write_together
 from ...model.effects_override import effects_override
 
@@ -82,6 +83,7 @@ class NamedEffect:
     significance: float = math.nan
 
 
+@named_units
 @dataclass(frozen=True)
 class Where:
     """Where model and data disagree before anything is added.

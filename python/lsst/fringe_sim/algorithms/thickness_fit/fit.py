@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compiled import kernel, run_threaded
-from ...errors import InputError, OutOfRangeError, UnknownNameError
+from ...errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ...model import FringeModel
 from ...optics.system import OBSERVABLES
 from ...products import FlatFit, FringeCube, ThicknessMap, mask_bits, refuse_noiseless
@@ -44,6 +44,7 @@ _ROWS = 64
 """Rows that are flagged at a time by one thread."""
 
 
+@named_units
 def fit_thickness(
     cube: FringeCube,
     model: FringeModel,
@@ -243,7 +244,9 @@ def make_templates(
     count = int(np.ceil((high + order - start) / step)) + 1
     response = model.response_on_grid(wavelength_nm, start, step, count)
     response = np.ascontiguousarray(response.T)
-    near = system.stack.indices(wavelength_nm + 1.0, system.temperature_k)[system.stack.position(system.varying)]
+    near = system.stack.indices(wavelength_nm + 1.0, system.temperature_k)[
+        system.stack.position(system.varying)
+    ]
     group = 1.0 - wavelength_nm * (near.real - index.real) / index.real
     beside = _turn_beside(model, wavelength_nm, response, group, (start, step))
     return FringeTemplates(response, start, step, wavelength_nm, group=group, beside_um=beside)

@@ -1,0 +1,80 @@
+"""Values of a FITS header, one keyword at a time; what is read is declared in `HEADER_KEYWORDS`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from astropy.io import fits
+
+from ..errors import FrameFormatError, InputError, to_number
+from .header_keywords import RAW_KEYWORDS
+
+__all__ = ["RawHeader", "header_value"]
+
+_DECLARED = frozenset(keyword.name for keyword in RAW_KEYWORDS)
+
+
+def header_value(header: Mapping[str, Any], keyword: str) -> Any:
+    """Value of a keyword; `None` if it is absent, undefined or blank.
+
+    Raises
+    ------
+    FrameFormatError
+        The card is not FITS (other cards of the header may be), or there are several with different values.
+    LookupError
+        The keyword is not declared: a fault of the program.
+    """
+    if keyword not in _DECLARED:
+        raise LookupError(f"{keyword} is not declared in RAW_KEYWORDS")
+    try:
+        value = header.get(keyword)
+        if isinstance(header, fits.Header) and keyword in header and header.count(keyword) > 1:
+            _refuse_different(header, keyword)
+    except fits.VerifyError:
+        raise FrameFormatError(keyword, "a card that cannot be parsed", "a value as FITS has it") from None
+    if isinstance(value, fits.card.Undefined) or (isinstance(value, str) and not value.strip()):
+        return None
+    return value.strip() if isinstance(value, str) else value
+
+
+def _refuse_different(header: fits.Header, keyword: str) -> None:
+    values = [header[keyword, number] for number in range(header.count(keyword))]
+    if any(value != values[0] for value in values):
+        raise FrameFormatError(keyword, " and ".join(map(str, values)), "one value, not several that differ")
+
+
+@dataclasses.dataclass(frozen=True)
+class RawHeader:
+    """Header of a frame, asked for values of a certain kind."""
+
+    cards: Mapping[str, Any]
+    source: str
+
+    def value(self, keyword: str) -> Any:
+        """Value of a keyword; see `header_value`."""
+        try:
+            return header_value(self.cards, keyword)
+        except FrameFormatError as error:
+            raise error.in_source(self.source) from None
+
+    def text(self, keyword: str) -> str:
+        """Value as text, empty if there is none."""
+        value = self.value(keyword)
+        return "" if value is None else str(value)
+
+    def number(self, keyword: str, value: Any, allowed: str, accept: Callable[[float], bool]) -> float:
+        """``value`` as a finite number that is accepted, or an error that names the keyword."""
+        try:
+            number = to_number(keyword, value)
+        except InputError:
+            number = math.nan
+        if not (math.isfinite(number) and accept(number)):
+            raise self.refuse(keyword, value, allowed)
+        return number
+
+    def refuse(self, keyword: str, value: Any, allowed: str) -> FrameFormatError:
+        """An error over a value."""
+        return FrameFormatError(keyword, value, allowed, source=self.source)

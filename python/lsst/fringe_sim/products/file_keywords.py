@@ -1,0 +1,68 @@
+"""Keywords of maps, cubes and frames from outside beyond the cards of each product, and who does what with them.
+
+The table of the documentation is made from this one and from the cards of the products.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["FILE_KEYWORDS", "FileKeyword"]
+
+USED, CHECKED, REFUSED = "used", "checked", "refused"
+"""It decides something of the result; another value than the one allowed is refused; its presence is refused."""
+
+
+@dataclass(frozen=True)
+class FileKeyword:
+    """A keyword of a kind of file, who reads it, and what becomes of it."""
+
+    file: str
+    name: str
+    readers: str
+    treatment: str
+    what: str
+
+
+_MAP, _CUBE, _SKY, _ANY = "thickness map", "fringe cube", "sky frame", "any product"
+_SEARCH, _SKY_READERS = "fit, discover, Tasks", "sky, discover, Tasks"
+
+FILE_KEYWORDS: tuple[FileKeyword, ...] = (
+    FileKeyword(
+        _MAP,
+        "BUNIT",
+        _SKY_READERS,
+        USED,
+        "unit of length, converted to µm; a unit of another kind is refused",
+    ),
+    FileKeyword(_MAP, "LAYER", _SKY_READERS, CHECKED, "the layer that varies in the set-up"),
+    FileKeyword(_MAP, "DETSEC", _SKY_READERS, USED, "part of the sensor; pixels that it has not are refused"),
+    FileKeyword(_MAP, "CCDSEC", _SKY_READERS, USED, "the same where DETSEC is absent"),
+    FileKeyword(_MAP, "CONTRAST", "sky", USED, "contrast of the laboratory, for the second forecast"),
+    FileKeyword(_MAP, "CONTRSIG", "sky", USED, "its uncertainty"),
+    FileKeyword(
+        _CUBE, "BUNIT", _SEARCH, USED, "electron or relative, else refused; that of VARIANCE is its square"
+    ),
+    FileKeyword(_CUBE, "LAYER", _SEARCH, USED, "layer of THICKNESS"),
+    FileKeyword(_CUBE, "SMOOTHPX", _SEARCH, USED, "correlation length of the noise, px"),
+    FileKeyword(_SKY, "BUNIT", "discover, templates, Tasks", USED, "electron or fraction, else refused"),
+    FileKeyword(_SKY, "NOISE", "discover", REFUSED, "false: there is no noise by which pixels are weighed"),
+    FileKeyword(_SKY, "FRINGCOR", "templates, Tasks", REFUSED, "fringes were subtracted before"),
+    FileKeyword(_SKY, "SETUP", "discover, templates, Tasks", CHECKED, "the same in all frames"),
+    FileKeyword(_SKY, "BEAMS", "discover, templates, Tasks", CHECKED, "the same in all frames"),
+    FileKeyword(_SKY, "EFFECTn", "discover, templates, Tasks", CHECKED, "the same in all frames"),
+    FileKeyword(_SKY, "EFFVALn", "discover, templates, Tasks", CHECKED, "the same in all frames"),
+    FileKeyword(_SKY, "TABLEn", "discover, templates, Tasks", CHECKED, "the same in all frames"),
+    FileKeyword(
+        _SKY, "RDNOISE", "discover, templates", USED, "read noise in electrons; none where it is absent"
+    ),
+    FileKeyword(_ANY, "PRODUCT", "all", CHECKED, "the kind of file that the reader wants"),
+    FileKeyword(_ANY, "PRODVER", "all", CHECKED, "the version of the layout"),
+    FileKeyword(_ANY, "NEXTEND", "all", CHECKED, "the number of extensions"),
+    FileKeyword(_ANY, "CHECKSUM", "all", CHECKED, "right, and there in a file of this package"),
+    FileKeyword(_ANY, "DATASUM", "all", CHECKED, "right, and there in a file of this package"),
+    FileKeyword(
+        _ANY, "MP_<plane>", "all", USED, "bit of a plane of the mask; a plane that is not known is refused"
+    ),
+)
+"""All of them."""

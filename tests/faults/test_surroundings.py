@@ -1,0 +1,182 @@
+"""Commands in odd surroundings: no cache, no temporary files, other locales, any number of threads; ten in a row."""
+
+from __future__ import annotations
+
+import functools
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_once import made_once
+
+from lsst.fringe_sim.algorithms import fit_thickness
+from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FringeCube, ThicknessMap
+from lsst.fringe_sim.products.mask import mask_bits
+
+pytestmark = pytest.mark.slow
+
+WAVELENGTHS_NM = np.arange(880.0, 1000.0, 10.0)
+PAGES = {"report.html"}
+"""Pages state the time of their making."""
+
+
+def field_um(rows: int, columns: int) -> np.ndarray:
+    y, x = np.mgrid[:rows, :columns] / 32
+    return 13.5 + 0.8 * x + 0.5 * y**2
+
+
+def cube_of(wavelength: np.ndarray, shape: tuple[int, int] = (32, 32), **given: np.ndarray) -> FringeCube:
+    """Flats of a small sensor with photon noise."""
+    response = FringeModel.from_setup("ts8_e2v").response(field_um(*shape), wavelength)
+    response /= response.mean(axis=(1, 2), keepdims=True)
+    image = np.random.default_rng(3).poisson(30_000 * response).astype(np.float32)
+    kind = {"bandwidth_fwhm_nm": 2.0, "temperature_k": 183.15, **given}
+    return FringeCube.from_arrays(image, wavelength, variance=image, **kind)
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cube, a map and a set-up."""
+
+    def make(folder: Path) -> None:
+        cube_of(WAVELENGTHS_NM).write_fits(folder / "cube.fits")
+        value, empty = field_um(32, 32), np.zeros((32, 32))
+        ThicknessMap(value, empty + 0.01, empty, empty, empty.astype(int), "adhesive").write_fits(
+            folder / "map.fits"
+        )
+
+    return made_once(tmp_path_factory, "surroundings", make)
+
+
+def command(given: Path, name: str, out: Path) -> list[str]:
+    kind = {
+        "sky": ["--thickness", str(given / "map.fits"), "--setup", "monocam"],
+        "fit": [str(given / "cube.fits"), "--setup", "ts8_e2v"],
+        "discover": [str(given / "cube.fits"), "--setup", "ts8_e2v", "--seed", "3", "--cells", "400"],
+    }
+    return [name, *kind[name], "--out", str(out)]
+
+
+def files_of(words: list[str], out: Path, **environment: str) -> dict[str, bytes]:
+    """What a command writes in a process of its own; without pages, and without the folder it wrote to."""
+    started = {key: value for key, value in os.environ.items() if not key.startswith(("LC_", "LANG"))}
+    done = subprocess.run(
+        [sys.executable, "-m", "lsst.fringe_sim", *words],
+        capture_output=True,
+        check=False,
+        env={**started, **environment},
+    )
+    assert done.returncode == 0, done.stderr.decode("utf-8", "replace")[-3000:]
+    assert b"Traceback" not in done.stderr
+    found = {path.name: path.read_bytes() for path in out.iterdir() if path.name not in PAGES}
+    assert found
+    return {name: content.replace(os.fsencode(out), b"OUT") for name, content in found.items()}
+
+
+@pytest.fixture(scope="module")
+def usual(given: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, bytes]]:
+    """What a command writes in usual surroundings."""
+
+    @functools.cache
+    def made(name: str) -> dict[str, bytes]:
+        out = tmp_path_factory.mktemp("usual") / "out"
+        return files_of(command(given, name, out), out)
+
+    return made
+
+
+Usual = Callable[[str], dict[str, bytes]]
+
+
+def compared(found: Mapping[str, bytes], wanted: Mapping[str, bytes]) -> None:
+    assert found.keys() == wanted.keys()
+    assert not [name for name in wanted if found[name] != wanted[name]]
+
+
+@pytest.mark.parametrize("name", ["sky", "discover"])
+def test_any_number_of_threads_gives_the_same_bytes(name: str, given: Path, tmp_path: Path) -> None:
+    made = {}
+    for number in (1, 2, 64):
+        out = tmp_path / str(number)
+        threads = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(number))
+        made[number] = files_of(command(given, name, out), out, **threads)
+    compared(made[2], made[1])
+    compared(made[64], made[1])
+
+
+def test_without_a_cache_of_compiled_functions(given: Path, tmp_path: Path, usual: Usual) -> None:
+    """A cache in a place where no folder can be made: every process compiles for itself, to the same bytes."""
+    (tmp_path / "file").touch()
+    nowhere = str(tmp_path / "file" / "cache")
+    usual = files_of(command(given, "fit", tmp_path / "usual"), tmp_path / "usual")
+    compared(
+        files_of(command(given, "fit", tmp_path / "out"), tmp_path / "out", NUMBA_CACHE_DIR=nowhere), usual
+    )
+
+
+@pytest.mark.parametrize("place", ["/dev/full", "/proc/self", "missing"])
+def test_without_room_for_temporary_files(place: str, given: Path, tmp_path: Path, usual: Usual) -> None:
+    """TMPDIR is no folder, cannot be written, or is not there: products are made beside their places."""
+    folder = place if place.startswith("/") else str(tmp_path / place)
+    compared(files_of(command(given, "sky", tmp_path / "out"), tmp_path / "out", TMPDIR=folder), usual("sky"))
+
+
+@pytest.mark.parametrize(
+    "locale",
+    [{"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}, {"LC_ALL": "POSIX", "PYTHONIOENCODING": "latin-1"}],
+)
+def test_locales_that_are_not_utf8(locale: dict[str, str], given: Path, tmp_path: Path, usual: Usual) -> None:
+    out = tmp_path / "für"
+    compared(files_of(command(given, "sky", out), out, PYTHONUTF8="0", **locale), usual("sky"))
+
+
+@pytest.mark.parametrize("name", ["sky", "fit"])
+def test_ten_runs_in_one_process_take_no_more_memory(name: str, given: Path, tmp_path: Path) -> None:
+    """In a process of its own: largest memory [KiB] after each run."""
+    words = command(given, name, tmp_path / "out")
+    program = (
+        "import gc, sys\nfrom pathlib import Path\nfrom lsst.fringe_sim.cli.main import run\n"
+        f"for number in range(10):\n    assert run({[*words, '--overwrite']!r}) == 0\n    gc.collect()\n"
+        "    pages = Path('/proc/self/statm').read_text().split()[1]\n    print('pages', pages, file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    pages = [int(line.split()[1]) for line in done.stderr.splitlines() if line.startswith("pages")]
+    mebibytes = np.array(pages) * resource.getpagesize() / 2**20
+    print(name, mebibytes.round(1).tolist())
+    assert len(mebibytes) == 10
+    # What allocators keep settles in the first runs; a leak of one image of the sensor would be smaller than this.
+    assert np.polyfit(np.arange(5), mebibytes[5:], 1)[0] < 1.0
+
+
+def test_two_hundred_wavelengths() -> None:
+    wavelength = np.linspace(880.0, 1000.0, 200)
+    fitted = fit_thickness(cube_of(wavelength), FringeModel.from_setup("ts8_e2v"))
+    good = fitted.mask == 0
+    assert good.mean() > 0.95
+    assert np.abs(fitted.value - field_um(32, 32))[good].max() < 0.02
+
+
+def test_one_wavelength() -> None:
+    """It cannot tell the order: refused, or every pixel says so."""
+    try:
+        fitted = fit_thickness(cube_of(np.array([960.0])), FringeModel.from_setup("ts8_e2v"))
+    except InputError:
+        return
+    assert np.all(fitted.mask & mask_bits("SLIP", "NO_DATA", "LOW_SIGNAL"))
+
+
+def test_one_wavelength_and_a_known_thickness(tmp_path: Path) -> None:
+    """The search needs no more."""
+    known = {"thickness": field_um(32, 32), "thickness_sigma": np.full((32, 32), 0.005), "layer": "adhesive"}
+    cube_of(np.array([960.0]), **known).write_fits(tmp_path / "cube.fits")
+    words = ["discover", str(tmp_path / "cube.fits"), "--setup", "ts8_e2v", "--out", str(tmp_path / "out")]
+    assert run([*words, "--cells", "400"]) == 0
+    assert (tmp_path / "out" / "discovery.json").is_file()

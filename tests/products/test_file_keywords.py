@@ -1,0 +1,140 @@
+"""Keywords of maps, cubes and sky frames are used, checked or refused as `FILE_KEYWORDS` says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import product_makers as make
+import pytest
+from astropy.io import fits
+
+from lsst.fringe_sim import products as p
+from lsst.fringe_sim.algorithms.pca import fit_pca
+from lsst.fringe_sim.cli.inputs import read_section
+from lsst.fringe_sim.cli.sky import laboratory_contrast
+from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.instrument.camera import Camera
+from lsst.fringe_sim.products.file_keywords import FILE_KEYWORDS
+
+SENSOR = Camera.from_name("lsstCam").detector("R22_S11")
+GOOD = np.zeros((3, 4), np.int32)
+
+
+def with_card(path: Path, keyword: str, value: Any, hdu: int = 0) -> Path:
+    """The file with another card, and checksums that fit."""
+    with fits.open(path, mode="update", checksum=True) as hdus:
+        if value is None:
+            del hdus[hdu].header[keyword]
+        else:
+            hdus[hdu].header[keyword] = value
+    return path
+
+
+def read_map(path: Path) -> Any:
+    found = p.ThicknessMap.read_any(path, "epoxy")
+    section = read_section(path, SENSOR, found.shape)
+    return found.value.tobytes(), found.mask.tobytes(), str(section), laboratory_contrast(str(path))
+
+
+def read_cube(path: Path) -> Any:
+    cube = p.FringeCube.read_fits(path)
+    return cube.unit, cube.layer, cube.metadata, cube.mask.tobytes()
+
+
+def read_sky(path: Path) -> Any:
+    """Frames beside one of the model that they have."""
+    frame = p.SkyFringe.read_fits(path)
+    p.refuse_noiseless(frame.metadata)
+    p.refuse_corrected(frame.metadata)
+    others = [make.sky(mask=GOOD, number=number, metadata=MODEL) for number in (5, 6)]
+    p.SkyFrames([*others, frame], make.thickness(mask=GOOD))
+    return frame.fraction().tobytes(), fit_pca([*others, frame], n_components=1).metadata
+
+
+MODEL = {"SETUP": "lsst_e2v", "BEAMS": "pixel", "EFFECT0": "roughness.sigma", "EFFVAL0": 2.0, "TABLE0": "a 1"}
+"""Cards of a model."""
+
+FILES: dict[str, tuple[Callable[[], Any], Callable[[Path], Any]]] = {
+    "thickness map": (lambda: make.thickness(mask=GOOD), read_map),
+    "fringe cube": (lambda: make.cube(mask=np.zeros((2, 3, 4), np.int32)), read_cube),
+    "sky frame": (lambda: make.sky(mask=GOOD, metadata=MODEL), read_sky),
+    "any product": (lambda: make.thickness(mask=GOOD | p.mask_bits("SLIP")), read_map),
+}
+
+VALUES: dict[tuple[str, str], tuple[int, tuple[Any, ...]]] = {
+    ("thickness map", "BUNIT"): (1, ("nm", "K")),
+    ("thickness map", "LAYER"): (0, ("silicon",)),
+    ("thickness map", "DETSEC"): (0, ("[11:14,21:23]", "[11:14,9021:9023]")),
+    ("thickness map", "CCDSEC"): (0, ("[11:14,21:23]", "[11:14,9021:9023]")),
+    ("fringe cube", "BUNIT"): (1, ("adu", "relative")),
+    ("fringe cube", "LAYER"): (0, ("other",)),
+    ("fringe cube", "SMOOTHPX"): (0, (1.5,)),
+    ("sky frame", "BUNIT"): (1, ("adu",)),
+    ("sky frame", "NOISE"): (0, (False,)),
+    ("sky frame", "FRINGCOR"): (0, (2,)),
+    ("sky frame", "SETUP"): (0, ("hsc",)),
+    ("sky frame", "BEAMS"): (0, ("centre",)),
+    ("sky frame", "EFFECTn"): (0, ("bandwidth.fwhm",)),
+    ("sky frame", "EFFVALn"): (0, (3.0,)),
+    ("sky frame", "TABLEn"): (0, ("a 2",)),
+    ("sky frame", "RDNOISE"): (0, (7.0,)),
+    ("any product", "PRODUCT"): (0, ("SkyFringe",)),
+    ("any product", "PRODVER"): (0, (7,)),
+    ("any product", "NEXTEND"): (0, (3,)),
+    ("any product", "MP_<plane>"): (5, (17,)),
+}
+"""HDU and other values."""
+
+
+@pytest.mark.parametrize("case", FILE_KEYWORDS, ids=[f"{item.file} {item.name}" for item in FILE_KEYWORDS])
+def test_another_value_has_the_declared_consequence(case: Any, tmp_path: Path) -> None:
+    maker, reader = FILES[case.file]
+    maker().write_fits(tmp_path / "former.fits")
+    if case.name in ("CHECKSUM", "DATASUM"):
+        assert_checksums_are_compared(tmp_path / "former.fits", case.name)
+        return
+    if case.name.startswith("CONTR"):
+        both = {"CONTRAST": 0.2, "CONTRSIG": 0.01}
+        maker().write_fits(tmp_path / "former.fits", both)
+        hdu, values = 0, (0.4,)
+    else:
+        hdu, values = VALUES[case.file, case.name]
+    keyword = {"MP_<plane>": "MP_SLIP"}.get(case.name, case.name.replace("n", "0"))
+    before = reader(tmp_path / "former.fits")
+    outcomes = set()
+    for number, value in enumerate(values):
+        path = tmp_path / f"{number}.fits"
+        path.write_bytes((tmp_path / "former.fits").read_bytes())
+        try:
+            after = reader(with_card(path, keyword, value, hdu))
+            outcomes.add("same" if after == before else "changed")
+        except InputError:
+            outcomes.add("refused")
+    if case.treatment == "used":
+        assert outcomes <= {"changed", "refused"}
+    else:
+        assert outcomes == {"refused"}
+
+
+def assert_checksums_are_compared(path: Path, keyword: str) -> None:
+    content = path.read_bytes()
+    place = content.index(keyword.encode(), 2880)
+    path.write_bytes(content[: place + 11] + b"9999" + content[place + 15 :])
+    with pytest.raises(InputError):
+        read_map(path)
+    path.write_bytes(content)
+    with fits.open(path) as hdus:
+        del hdus[1].header[keyword]
+        hdus.writeto(path.with_name("without.fits"))
+    with pytest.raises(InputError):
+        read_map(path.with_name("without.fits"))
+
+
+def test_every_keyword_is_tried() -> None:
+    """Those with a function of their own are CHECKSUM, DATASUM and the contrast."""
+    own = {("thickness map", "CONTRAST"), ("thickness map", "CONTRSIG")}
+    own |= {("any product", "CHECKSUM"), ("any product", "DATASUM")}
+    assert {(item.file, item.name) for item in FILE_KEYWORDS} == VALUES.keys() | own
