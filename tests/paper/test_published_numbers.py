@@ -55,6 +55,13 @@ def test_ranges_hold_their_ends() -> None:
     assert number(published=[3, math.inf]).stated == "> 3"
 
 
+@pytest.mark.parametrize("microjansky", [0.4, 0.449, 0.451, 0.6, 0.733, 0.749, 0.752, 0.9])
+def test_one_number_in_two_units_has_one_verdict(microjansky) -> None:
+    """The fringes of the abstract, and how far they are over 10 % of 26 AB mag arcsec⁻²."""
+    brightness, over = published_number("fringe_brightness"), published_number("over_limit")
+    assert brightness.compare(microjansky).status == over.compare(microjansky / 0.014454).status
+
+
 def test_where_the_paper_gives_no_number_only_the_correction_counts() -> None:
     silent = number(published=None, corrected=2.0, note="why")
     assert silent.compare(2.0).status == "erratum"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -70,9 +72,11 @@ def follow(rng, wave_nm: float, reflectance: float, total_reflection: float) -> 
 )
 def test_photons_one_by_one(wave_nm, reflectance, total_reflection, rng) -> None:
     system = Setup.from_name("ts8_e2v").optical_system()
-    settings = {"diffuse_gate_side": {"reflectance": reflectance, "total_reflection": total_reflection}}
-    changed = apply_to_system(activate_effects(settings, EFFECTS), system)
-    found = changed.diffuse.fate(changed.stack, "detection", [wave_nm], 183.15)
+    changed = apply_to_system(
+        activate_effects({"diffuse_gate_side.reflectance": reflectance}, EFFECTS), system
+    )
+    gate_side = replace(changed.diffuse, total_reflection=total_reflection)
+    found = gate_side.fate(changed.stack, "detection", [wave_nm], 183.15)
     own = follow(rng, wave_nm, reflectance, total_reflection)
     # Three standard deviations of so many photons.
     assert found[0].item() == pytest.approx(own[0], abs=0.0062)

@@ -350,8 +350,7 @@ class DiffuseGateSide(PlainNullEffect):
 
     The plane wave loses that part on the way down and on the way up, so that fringes fade. The returned light crosses
     the silicon, leaves through the front within the escape cone or is reflected there, and comes to the gate side
-    again. What is not absorbed on the way and not returned again is lost below the gates; with `total_reflection` the
-    rest of the gate side is flat and reflects totally what comes beyond the critical angle.
+    again. What is not absorbed on the way and not returned again is lost below the gates.
     """
 
     name = "diffuse_gate_side"
@@ -360,21 +359,17 @@ class DiffuseGateSide(PlainNullEffect):
     reference = "Yablonovitch 1982, doi 10.1364/JOSA.72.000899 (light scattered and trapped in silicon)"
     parameters = (
         Parameter("reflectance", "", 0.0, (0.0, 0.95), 0.2, "part of the gate side that returns light"),
-        Parameter("total_reflection", "", 0.0, (0.0, 1.0), 0.5, "part of the rest that is flat"),
     )
-    search = SearchHints(refinements={"total_reflection": 1}, natural_bounds=(0.0,))
+    search = SearchHints(natural_bounds=(0.0,))
 
     def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
         """Put a layer without thickness below the detection layer, in which light is scattered."""
-        if values["reflectance"] == 0.0:
-            return system
         place = system.stack.position(system.detection)
         medium, below = system.stack.layers[place].medium, system.stack.names[place + 1]
         stack, names = system.stack, ("gate_side_upper", "gate_side_lower")
         for name in names:
             stack = stack.with_inserted(Layer(name, medium, 0.0), before=below)
-        scatters = DiffuseReturn(*names, values["reflectance"], values["total_reflection"])
-        return replace(system, stack=stack, diffuse=scatters)
+        return replace(system, stack=stack, diffuse=DiffuseReturn(*names, values["reflectance"]))
 
 
 class ContrastLoss(PlainNullEffect):

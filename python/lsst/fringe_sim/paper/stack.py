@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from ..model import FringeModel
 from ..optics import Beam, LayerStack, Medium, get_medium
-from ..optics.illumination import GaussianProfile
+from ..optics.illumination import SIGMA_PER_FWHM, GaussianProfile
 from ..optics.system import OpticalSystem
 from .section import Context, Curve, Graph, Section, missing
 
@@ -19,6 +19,8 @@ FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
 LAB_K = 183.0
+SHARP_NM = 0.1
+"""Bandwidth [nm] that leaves 97 % of the fringes of the silicon, with which those of 1 nm are compared."""
 NINETY_NINE = float(np.log(100.0))
 """Optical depths that absorb 99 %."""
 
@@ -87,6 +89,24 @@ def _spacing(wavelength_nm: FloatArray, ripple: FloatArray) -> float:
     return float((crossing[-1] - crossing[0]) / (len(crossing) - 1))
 
 
+def _coherence(stack: LayerStack, wavelength_nm: FloatArray) -> float:
+    """What 1 nm of bandwidth leaves of the fringes of the silicon, over the law of a Gaussian line."""
+    sharp, blurred = (
+        _ripple(wavelength_nm, _absorption(stack, wavelength_nm, fwhm)) for fwhm in (SHARP_NM, 1.0)
+    )
+    place = _spacing(wavelength_nm, blurred)
+    law = np.exp(-2.0 * (np.pi * SIGMA_PER_FWHM / place) ** 2 * (1.0 - SHARP_NM**2))
+    return float(
+        _fundamental(wavelength_nm, blurred, place) / _fundamental(wavelength_nm, sharp, place) / law
+    )
+
+
+def _fundamental(wavelength_nm: FloatArray, ripple: FloatArray, spacing_nm: float) -> float:
+    """Amplitude of the part of a ripple that has a spacing."""
+    wave = np.exp(2j * np.pi * wavelength_nm / spacing_nm)
+    return float(np.abs((ripple * wave).sum()))
+
+
 def bandwidth(context: Context) -> Section:
     """Figure 1."""
     wide = np.arange(820.0, 1000.0, 0.5)
@@ -95,6 +115,7 @@ def bandwidth(context: Context) -> Section:
     narrow = _ripple(close, _absorption(stack, close, 1.0))
     values = {
         "spacing_silicon_seen": _spacing(close, narrow),
+        "bnl_coherence": _coherence(stack, close),
         "ripple_narrow": PERCENT * 0.5 * float(np.ptp(narrow)),
         "ripple_wide": PERCENT * 0.5 * float(np.ptp(_ripple(close, _absorption(stack, close, 2.0)))),
         **missing("absorption_level", "absorption_level_less", "absorption_fringe"),
