@@ -131,6 +131,10 @@ def test_frames_that_do_not_belong_together_are_refused(rng):
     named = [partial(frame_of, image, detector=name) for image, name in zip(images, "aab", strict=True)]
     with pytest.raises(InputError, match="detector of a frame"):
         make_templates(named, NOW, options)
+    with pytest.raises(InputError, match="equal pixels in 0 and 3"):
+        templates_of([*images, images[0]], options)
+    with pytest.raises(InputError, match="noise of a pixel"):
+        templates_of([1e-30 * image for image in images], options)
     done = [partial(frame_of, image, metadata={"FRINGCOR": 1}) for image in images]
     with pytest.raises(InputError, match="FRINGCOR"):
         make_templates(done, NOW, options)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
+from ..products.same_light import refuse_equal_pixels
 from .correction.background import BackgroundTerms
 from .correction.empirical import TemplateOptions, fit_templates
 from .correction.quality import FrameProof, prove
@@ -20,6 +22,9 @@ from .correction.scales import steady_weight
 from .fringe_correction import CorrectionOptions, FringeCorrection, correct_fringes
 
 __all__ = ["CorrectedFrame", "FrameRecord", "correct_frame", "make_templates", "summary_table"]
+
+LEAST_FRAMES = 3
+"""Two frames cannot tell what they share from what either has alone."""
 
 APERTURE_ARCSEC = 20.0
 """Scale up to which fringes are judged: that of the criterion of the Dark Energy Survey."""
@@ -117,25 +122,15 @@ def make_templates(
     Raises
     ------
     InputError
-        Fewer than three frames, frames of different sensors, filters, units or sizes, or corrected ones.
+        Fewer than three frames, one frame twice, frames of different sensors, filters, units or sizes, or corrected
+        ones.
     UndeterminedError
         The frames do not decide a template.
     """
     chosen = options or TemplateOptions()
-    first = frames[0]() if frames else None
-    if first is None:
-        raise InputError("frames for templates", 0, "three or more, of different places on the sky")
-
-    def loader(frame: Callable[[], ObservedFrame]) -> Callable[[], tuple[Any, NDArray[np.float32]]]:
-        def load() -> tuple[Any, NDArray[np.float32]]:
-            read = frame()
-            _refuse_other(read, first)
-            return read.image, _weight(read)
-
-        return load
-
+    first = _first_of_alike(frames)
     expected = [np.where(each.mask == 0, each.image, 0).astype(np.float32) for each in prior]
-    found = fit_templates([loader(frame) for frame in frames], chosen, expected, advance)
+    found = fit_templates([partial(_loaded, frame) for frame in frames], chosen, expected, advance)
     unseen = found.coverage < chosen.least_frames
     return FringeTemplates(
         coverage=found.coverage.astype(np.float32),
@@ -230,6 +225,27 @@ def _thumbnail(image: NDArray[Any]) -> NDArray[np.float64]:
     number = known.sum(axis=(1, 3))
     total = np.where(known, blocks, 0.0).sum(axis=(1, 3))
     return np.divide(total, number, out=np.full((ny, nx), np.nan), where=number > 0)
+
+
+def _first_of_alike(frames: Sequence[Callable[[], ObservedFrame]]) -> ObservedFrame:
+    """The first frame, when all have been read and found to belong together."""
+    if len(frames) < LEAST_FRAMES:
+        raise InputError("frames for templates", len(frames), "three or more, of different places on the sky")
+    first = frames[0]()
+
+    def images() -> Iterator[NDArray[np.float32]]:
+        for frame in frames:
+            read = frame()
+            _refuse_other(read, first)
+            yield read.image
+
+    refuse_equal_pixels("frames for templates", images())
+    return first
+
+
+def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    read = frame()
+    return read.image, _weight(read)
 
 
 def _weight(frame: ObservedFrame) -> NDArray[np.float32]:
