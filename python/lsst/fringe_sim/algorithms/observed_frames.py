@@ -64,9 +64,10 @@ class CorrectedFrame:
         good = fitted.fit.weight > 0
         after = np.where(good, fitted.residual, np.nan)
         before = after + np.where(good, self.fringes - self.fringes[good].mean(), np.nan)
-        pictures = tuple(_thumbnail(each) for each in (before, self.fringes, after))
+        step = max(1, min(self.frame.shape) // PICTURE_PX)
+        pictures = tuple(_block_means(each, step) for each in (before, self.fringes, after))
         found = self.correction
-        return FrameRecord(name, self.frame.detector, found.scale, found.sigma, self.proof, pictures)
+        return FrameRecord(name, self.frame.detector, found.scale, found.sigma, self.proof, pictures, step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +84,8 @@ class FrameRecord:
         Before and after.
     pictures : `tuple` [`numpy.ndarray`, ...]
         Frame before, fringes, frame after, averaged over squares.
+    step_px : `int`
+        Side of the squares [px].
     """
 
     name: str
@@ -91,6 +94,7 @@ class FrameRecord:
     sigma: NDArray[np.float64]
     proof: FrameProof
     pictures: tuple[NDArray[np.float64], ...]
+    step_px: int = 1
 
 
 def make_templates(
@@ -216,9 +220,8 @@ def _at(values: NDArray[np.float64], number: int) -> float:
     return float(values[number]) if number < values.size else 0.0
 
 
-def _thumbnail(image: NDArray[Any]) -> NDArray[np.float64]:
+def _block_means(image: NDArray[Any], side: int) -> NDArray[np.float64]:
     """Means over squares of the pixels that are numbers."""
-    side = max(1, min(image.shape) // PICTURE_PX)
     ny, nx = (size // side for size in image.shape)
     blocks = image[: ny * side, : nx * side].reshape(ny, side, nx, side).astype(np.float64)
     known = np.isfinite(blocks)

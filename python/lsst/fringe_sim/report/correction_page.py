@@ -51,7 +51,7 @@ def write_correction_report(path: Path, records: Sequence[FrameRecord], refused:
     report.section(
         "Frames",
         "Structure beyond the noise in apertures up to 20 arcsec, as a fraction of it; fringes that the errors of "
-        "the scales leave; the uniform background indicator, 1 and a twelfth for white noise; and the probability "
+        "the scales leave; the uniform background indicator, 0.98 for white noise; and the probability "
         "that a good template does so badly.",
     )
     if len(table):
@@ -81,7 +81,15 @@ def frame_figure(record: FrameRecord) -> Figure:
         for axes, image, title in zip(
             made.subplots(1, 3), record.pictures, ("before", "subtracted", "after"), strict=True
         ):
-            show_image(axes, image, label="counts", title=title, diverging=True, limits=limits)
+            show_image(
+                axes,
+                image,
+                label="counts",
+                title=title,
+                diverging=True,
+                limits=limits,
+                step_px=record.step_px,
+            )
     return made
 
 

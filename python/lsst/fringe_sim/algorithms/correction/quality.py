@@ -167,7 +167,7 @@ def excess_structure(residual: NDArray[Any], weight: NDArray[Any], aperture_px: 
 def uniform_background_indicator(residual: NDArray[Any], good: NDArray[np.bool_]) -> float:
     """Scatter of the flux in empty apertures over what the noise of pixels lets expect (Medford et al. 2021).
 
-    1 and a twelfth for white noise, more where the noise is correlated over an aperture.
+    0.98 for white noise, more where the noise is correlated over an aperture.
 
     Parameters
     ----------
