@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,10 @@ PERCENT = 100.0
 MOST_PICTURES = 3
 
 
-def write_templates_report(path: Path, made: Mapping[str, FringeTemplates]) -> Path:
-    """Write the page of templates, one section per sensor."""
-    report = Report("Fringe templates", f"{len(made)} sensors, from observed frames.")
-    for name, product in made.items():
+def write_templates_report(path: Path, made: Iterable[tuple[str, FringeTemplates]]) -> Path:
+    """Write the page of templates, one section per sensor; they are asked for one at a time."""
+    report = Report("Fringe templates", "From observed frames, sensor by sensor.")
+    for name, product in made:
         report.section(
             name or "Sensor",
             f"{len(product.patterns)} templates from {len(product.scores)} frames in "
