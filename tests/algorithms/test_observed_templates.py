@@ -9,7 +9,7 @@ import pytest
 from foreign_sky import ForeignClutter, ForeignSky, foreign_map, foreign_night
 from observed_night import observed_night
 
-from lsst.fringe_sim.algorithms.correction import AmplifierGrid, BackgroundTerms, fit_scales
+from lsst.fringe_sim.algorithms.correction import AmplifierGrid, BackgroundTerms, empirical, fit_scales
 from lsst.fringe_sim.algorithms.correction.denoise import shrink_noise
 from lsst.fringe_sim.algorithms.correction.empirical import TemplateOptions
 from lsst.fringe_sim.algorithms.fringe_correction import CorrectionOptions
@@ -44,6 +44,7 @@ def part_left(fringes, corrected, amplifiers):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.rng("templates take the fringes out of other frames")
 def test_templates_take_the_fringes_out_of_other_frames(rng):
     night = observed_night(rng, 12)
@@ -131,6 +132,10 @@ def test_frames_that_do_not_belong_together_are_refused(rng):
     named = [partial(frame_of, image, detector=name) for image, name in zip(images, "aab", strict=True)]
     with pytest.raises(InputError, match="detector of a frame"):
         make_templates(named, NOW, options)
+    with pytest.raises(InputError, match="equal pixels in 0 and 3"):
+        templates_of([*images, images[0]], options)
+    with pytest.raises(InputError, match="noise of a pixel"):
+        templates_of([1e-30 * image for image in images], options)
     done = [partial(frame_of, image, metadata={"FRINGCOR": 1}) for image in images]
     with pytest.raises(InputError, match="FRINGCOR"):
         make_templates(done, NOW, options)
@@ -143,6 +148,18 @@ def test_templates_survive_the_disk(rng, tmp_path):
     back = FringeTemplates.read_fits(tmp_path / "templates.fits")
     for name in ("patterns", "variance", "coverage", "scores", "mask"):
         np.testing.assert_array_equal(getattr(back, name), getattr(made, name))
+
+
+@pytest.mark.rng("frames in a file give the same templates")
+def test_frames_in_a_file_give_the_same_templates(rng, monkeypatch):
+    """Beyond a size the frames of a sensor lie on disk, and bands of rows are worked on."""
+    images = observed_night(rng, 4).images
+    options = TemplateOptions(components=1)
+    first = templates_of(images, options)
+    monkeypatch.setattr(empirical, "IN_MEMORY", 0)
+    monkeypatch.setattr(empirical, "BAND_BYTES", 4 * 4 * 96 * 20)
+    second = templates_of(images, options)
+    np.testing.assert_allclose(second.patterns, first.patterns, atol=1e-3 * first.patterns.std())
 
 
 @pytest.mark.rng("one row per frame")

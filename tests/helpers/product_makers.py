@@ -158,6 +158,33 @@ def bias(shape: tuple[int, int] = (3, 4), number: int = 1, **changes: Any) -> p.
     return p.CombinedBias(**(values | changes))
 
 
+def templates(shape: tuple[int, int] = (3, 4), number: int = 1, **changes: Any) -> p.FringeTemplates:
+    values: dict[str, Any] = {
+        "coverage": np.full(shape, 6.0),
+        "patterns": pixels((2, *shape), number),
+        "variance": pixels((2, *shape), number + 1) ** 2,
+        "scores": pixels((6, 2), number + 2).astype(np.float64) / 3,
+        "mask": masks(shape, number),
+        "creation_datetime": "2022-03-04T05:06:07",
+        "detector": "R22_S11",
+        "physical_filter": "y_10",
+    }
+    return p.FringeTemplates(**(values | changes))
+
+
+def observed(shape: tuple[int, int] = (3, 4), number: int = 1, **changes: Any) -> p.ObservedFrame:
+    mask = masks(shape, number)
+    values: dict[str, Any] = {
+        "image": with_holes(2700 * (1 + pixels(shape, number)), mask, number, changes),
+        "mask": mask,
+        "variance": with_holes(2700 + pixels(shape, number + 1), mask, number, changes),
+        "unit": "electron",
+        "detector": "R22_S11",
+        "physical_filter": "y_10",
+    }
+    return p.ObservedFrame(**(values | changes))
+
+
 MAKERS: dict[str, Callable[..., Any]] = {
     "FringeFlat": flat,
     "FringeCube": cube,
@@ -166,4 +193,6 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "FringeComponents": components,
     "SkyFringe": sky,
     "CombinedBias": bias,
+    "FringeTemplates": templates,
+    "ObservedFrame": observed,
 }

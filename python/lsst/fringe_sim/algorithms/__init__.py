@@ -10,6 +10,7 @@ from ..lazy import on_first_use
 _LAZY = {
     "coadd_correlation": ".image_correlation",
     "combine_biases": ".flat_prep",
+    "correct_fringes": ".fringe_correction",
     "discover": ".discovery",
     "fit_pca": ".pca",
     "fit_single_pixel": ".single_pixel",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, named_units
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
+from ..products.same_light import refuse_equal_pixels
 from .correction.background import BackgroundTerms
 from .correction.empirical import TemplateOptions, fit_templates
 from .correction.quality import FrameProof, prove
@@ -20,6 +22,9 @@ from .correction.scales import steady_weight
 from .fringe_correction import CorrectionOptions, FringeCorrection, correct_fringes
 
 __all__ = ["CorrectedFrame", "FrameRecord", "correct_frame", "make_templates", "summary_table"]
+
+LEAST_FRAMES = 3
+"""Two frames cannot tell what they share from what either has alone."""
 
 APERTURE_ARCSEC = 20.0
 """Scale up to which fringes are judged: that of the criterion of the Dark Energy Survey."""
@@ -59,9 +64,10 @@ class CorrectedFrame:
         good = fitted.fit.weight > 0
         after = np.where(good, fitted.residual, np.nan)
         before = after + np.where(good, self.fringes - self.fringes[good].mean(), np.nan)
-        pictures = tuple(_thumbnail(each) for each in (before, self.fringes, after))
+        step = max(1, min(self.frame.shape) // PICTURE_PX)
+        pictures = tuple(_block_means(each, step) for each in (before, self.fringes, after))
         found = self.correction
-        return FrameRecord(name, self.frame.detector, found.scale, found.sigma, self.proof, pictures)
+        return FrameRecord(name, self.frame.detector, found.scale, found.sigma, self.proof, pictures, step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +84,8 @@ class FrameRecord:
         Before and after.
     pictures : `tuple` [`numpy.ndarray`, ...]
         Frame before, fringes, frame after, averaged over squares.
+    step_px : `int`
+        Side of the squares [px].
     """
 
     name: str
@@ -86,6 +94,7 @@ class FrameRecord:
     sigma: NDArray[np.float64]
     proof: FrameProof
     pictures: tuple[NDArray[np.float64], ...]
+    step_px: int = 1
 
 
 def make_templates(
@@ -117,25 +126,15 @@ def make_templates(
     Raises
     ------
     InputError
-        Fewer than three frames, frames of different sensors, filters, units or sizes, or corrected ones.
+        Fewer than three frames, one frame twice, frames of different sensors, filters, units or sizes, or corrected
+        ones.
     UndeterminedError
         The frames do not decide a template.
     """
     chosen = options or TemplateOptions()
-    first = frames[0]() if frames else None
-    if first is None:
-        raise InputError("frames for templates", 0, "three or more, of different places on the sky")
-
-    def loader(frame: Callable[[], ObservedFrame]) -> Callable[[], tuple[Any, NDArray[np.float32]]]:
-        def load() -> tuple[Any, NDArray[np.float32]]:
-            read = frame()
-            _refuse_other(read, first)
-            return read.image, _weight(read)
-
-        return load
-
+    first = _first_of_alike(frames)
     expected = [np.where(each.mask == 0, each.image, 0).astype(np.float32) for each in prior]
-    found = fit_templates([loader(frame) for frame in frames], chosen, expected, advance)
+    found = fit_templates([partial(_loaded, frame) for frame in frames], chosen, expected, advance)
     unseen = found.coverage < chosen.least_frames
     return FringeTemplates(
         coverage=found.coverage.astype(np.float32),
@@ -222,15 +221,35 @@ def _at(values: NDArray[np.float64], number: int) -> float:
     return float(values[number]) if number < values.size else 0.0
 
 
-def _thumbnail(image: NDArray[Any]) -> NDArray[np.float64]:
+def _block_means(image: NDArray[Any], side: int) -> NDArray[np.float64]:
     """Means over squares of the pixels that are numbers."""
-    side = max(1, min(image.shape) // PICTURE_PX)
     ny, nx = (size // side for size in image.shape)
     blocks = image[: ny * side, : nx * side].reshape(ny, side, nx, side).astype(np.float64)
     known = np.isfinite(blocks)
     number = known.sum(axis=(1, 3))
     total = np.where(known, blocks, 0.0).sum(axis=(1, 3))
     return np.divide(total, number, out=np.full((ny, nx), np.nan), where=number > 0)
+
+
+def _first_of_alike(frames: Sequence[Callable[[], ObservedFrame]]) -> ObservedFrame:
+    """The first frame, when all have been read and found to belong together."""
+    if len(frames) < LEAST_FRAMES:
+        raise InputError("frames for templates", len(frames), "three or more, of different places on the sky")
+    first = frames[0]()
+
+    def images() -> Iterator[NDArray[np.float32]]:
+        for frame in frames:
+            read = frame()
+            _refuse_other(read, first)
+            yield read.image
+
+    refuse_equal_pixels("frames for templates", images())
+    return first
+
+
+def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    read = frame()
+    return read.image, _weight(read)
 
 
 def _weight(frame: ObservedFrame) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +18,15 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..products import FringeFrame
     from ..products.observed_files import ObservedImage
 
-__all__ = ["TemplateFolder", "background_options", "background_path", "grid_of", "images_of", "stem_of"]
+__all__ = [
+    "TemplateFolder",
+    "background_options",
+    "background_path",
+    "grid_of",
+    "images_of",
+    "latest_date",
+    "stem_of",
+]
 
 SPACING_PX = 256.0
 
@@ -103,23 +112,11 @@ class TemplateFolder:
     """Templates by sensor, from ``fringe-sim templates`` or of a model."""
 
     def __init__(self, path: Path) -> None:
-        from ..products import FringeFrame, FringeTemplates
-
-        self.path = path
-        self._by_detector: dict[str, list[FringeFrame]] = defaultdict(list)
-        files = [path] if path.is_file() else sorted(path.glob("templates_*.fits"))
-        for file in files:
-            if path.is_file() and _product(file) == "FringeFrame":
-                frame = FringeFrame.read_fits(file)
-                self._by_detector[frame.detector].append(frame)
-                continue
-            made = FringeTemplates.read_fits(file)
-            self._by_detector[made.detector] = made.frames()
-        if not files:
-            for file in sorted(path.glob("fringe_*.fits")):
-                frame = FringeFrame.read_fits(file)
-                self._by_detector[frame.detector].append(frame)
-        if not self._by_detector:
+        self._files: dict[str, list[Path]] = defaultdict(list)
+        found = [path] if path.is_file() else sorted(path.glob("templates_*.fits"))
+        for file in found or sorted(path.glob("fringe_*.fits")):
+            self._files[_keyword(file, "DETNAME")].append(file)
+        if not self._files:
             allowed = "a folder with templates_*.fits of 'fringe-sim templates', or fringe_*.fits of a model"
             raise InputError("--templates", str(path), allowed)
 
@@ -129,21 +126,34 @@ class TemplateFolder:
         Raises
         ------
         InputError
-            There are none of it.
+            There are none of it, or a file is damaged.
         """
-        if detector in self._by_detector:
-            return self._by_detector[detector]
-        names = sorted(self._by_detector)
-        if len(names) == 1 and (not names[0] or not detector):
-            return self._by_detector[names[0]]
-        raise InputError("sensor of a frame", detector, f"one with templates: {', '.join(names)}")
+        names = sorted(self._files)
+        if detector not in self._files and (len(names) > 1 or (names[0] and detector)):
+            raise InputError("sensor of a frame", detector, f"one with templates: {', '.join(names)}")
+        return _read_templates(tuple(self._files[detector if detector in self._files else names[0]]))
 
 
-def _product(path: Path) -> str:
-    from ..resources import open_user_fits
+@functools.lru_cache(maxsize=1)
+def _read_templates(files: tuple[Path, ...]) -> list[FringeFrame]:
+    """Templates of one sensor: those of the last one are kept, for its next frame."""
+    from ..products import FringeFrame, FringeTemplates
 
-    with open_user_fits(path) as hdus:
-        return str(hdus[0].header.get("PRODUCT", ""))
+    frames: list[FringeFrame] = []
+    for file in files:
+        if _keyword(file, "PRODUCT") == "FringeFrame":
+            frames.append(FringeFrame.read_fits(file))
+        else:
+            frames.extend(FringeTemplates.read_fits(file).frames())
+    return frames
+
+
+def _keyword(path: Path, keyword: str) -> str:
+    """Value in the primary header of a FITS file; empty if there is none."""
+    from ..resources import open_user_fits, refuse_damage
+
+    with refuse_damage("file", "a complete FITS file", str(path)), open_user_fits(path) as hdus:
+        return str(hdus[0].header.get(keyword, ""))
 
 
 def latest_date(headers: Sequence[Mapping[str, Any]]) -> str:

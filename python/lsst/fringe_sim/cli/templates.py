@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,16 +80,19 @@ def templates(
             click.echo(f"would make templates of {name} from {len(images)} frames")
         return
     folder = out.prepare()
-    made = {}
     steps = LEARNING_ROUNDS * sum(len(images) for images in sensors.values())
-    with progress("finding fringes", steps) as advance:
+
+    def made(advance: Callable[[], None]) -> Iterator[tuple[str, FringeTemplates]]:
         for name, images in sensors.items():
             known = [] if expected is None else expected.of(name)
-            made[name] = _made(images, options, known, background, advance)
-            made[name].write_fits(folder / f"templates_{_file_name(name)}.fits")
-    for name, product in made.items():
-        click.echo(_describe(name, product))
-    click.echo(str(write_templates_report(folder / "report.html", made)))
+            product = _made(images, options, known, background, advance)
+            product.write_fits(folder / f"templates_{_file_name(name)}.fits")
+            click.echo(_describe(name, product))
+            yield name, product
+
+    with progress("finding fringes", steps) as advance:
+        page = write_templates_report(folder / "report.html", made(advance))
+    click.echo(str(page))
 
 
 def _by_sensor(images: list[ObservedImage]) -> dict[str, list[ObservedImage]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ def pixels_digest(image: NDArray[Any]) -> str:
     return hashlib.blake2b(np.ascontiguousarray(image, "<f4").tobytes(), digest_size=16).hexdigest()
 
 
-def refuse_equal_pixels(field: str, images: Sequence[NDArray[Any]]) -> None:
+def refuse_equal_pixels(field: str, images: Iterable[NDArray[Any]]) -> None:
     """Refuse images of which two have equal pixels; images of one value have no light to tell."""
     seen: dict[str, int] = {}
     for number, image in enumerate(images):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,10 @@ PERCENT = 100.0
 MOST_PICTURES = 3
 
 
-def write_templates_report(path: Path, made: Mapping[str, FringeTemplates]) -> Path:
-    """Write the page of templates, one section per sensor."""
-    report = Report("Fringe templates", f"{len(made)} sensors, from observed frames.")
-    for name, product in made.items():
+def write_templates_report(path: Path, made: Iterable[tuple[str, FringeTemplates]]) -> Path:
+    """Write the page of templates, one section per sensor; they are asked for one at a time."""
+    report = Report("Fringe templates", "From observed frames, sensor by sensor.")
+    for name, product in made:
         report.section(
             name or "Sensor",
             f"{len(product.patterns)} templates from {len(product.scores)} frames in "
@@ -51,7 +51,7 @@ def write_correction_report(path: Path, records: Sequence[FrameRecord], refused:
     report.section(
         "Frames",
         "Structure beyond the noise in apertures up to 20 arcsec, as a fraction of it; fringes that the errors of "
-        "the scales leave; the uniform background indicator, 1 and a twelfth for white noise; and the probability "
+        "the scales leave; the uniform background indicator, 0.98 for white noise; and the probability "
         "that a good template does so badly.",
     )
     if len(table):
@@ -81,7 +81,15 @@ def frame_figure(record: FrameRecord) -> Figure:
         for axes, image, title in zip(
             made.subplots(1, 3), record.pictures, ("before", "subtracted", "after"), strict=True
         ):
-            show_image(axes, image, label="counts", title=title, diverging=True, limits=limits)
+            show_image(
+                axes,
+                image,
+                label="counts",
+                title=title,
+                diverging=True,
+                limits=limits,
+                step_px=record.step_px,
+            )
     return made
 
 

@@ -113,7 +113,7 @@ def fit_templates(
     Raises
     ------
     InputError
-        Fewer than three frames, or of different shapes.
+        Frames of different shapes.
     UndeterminedError
         No template predicts frames that it was not made of.
 
@@ -125,8 +125,6 @@ def fit_templates(
     templates in between (`shrink_noise`).
     """
     chosen = options or TemplateOptions()
-    if len(frames) < 3:
-        raise InputError("frames for templates", len(frames), "three or more, of different places on the sky")
     shape = frames[0]()[0].shape
     background = BackgroundTerms(shape, chosen.spacing_px, chosen.amplifiers)
     with _Stack(len(frames), shape) as stack:

@@ -158,6 +158,8 @@ def excess_structure(residual: NDArray[Any], weight: NDArray[Any], aperture_px: 
     good = weight > 0
     # The noise of a pixel is that of differences of neighbours, which no smooth structure enters.
     noise = _pixel_variance(residual, good) / (aperture_px**2 * share[seen])
+    if not np.mean(noise) > 0.0:
+        return math.nan
     excess = float(np.mean(mean[seen] ** 2) / np.mean(noise) - 1.0)
     return math.sqrt(max(excess, 0.0))
 
@@ -165,7 +167,7 @@ def excess_structure(residual: NDArray[Any], weight: NDArray[Any], aperture_px: 
 def uniform_background_indicator(residual: NDArray[Any], good: NDArray[np.bool_]) -> float:
     """Scatter of the flux in empty apertures over what the noise of pixels lets expect (Medford et al. 2021).
 
-    1 and a twelfth for white noise, more where the noise is correlated over an aperture.
+    0.98 for white noise, more where the noise is correlated over an aperture.
 
     Parameters
     ----------
@@ -293,7 +295,7 @@ def _from_scales(
     smooth = np.stack([_means(each - each[good].mean(), good, side)[0][good] for each in patterns])
     power = float(np.trace(fit.covariance @ (smooth @ smooth.T))) / smooth.shape[1]
     noise = fit.chi2_per_pixel / float(np.mean(weight[good])) / side**2
-    return math.sqrt(power / noise)
+    return math.sqrt(power / noise) if noise > 0.0 else math.nan
 
 
 def _disc(radius: float) -> FloatArray:

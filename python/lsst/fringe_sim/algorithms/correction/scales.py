@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from ...errors import UndeterminedError
+from ...errors import OutOfRangeError, UndeterminedError
 from .background import BackgroundTerms
 
 __all__ = ["ScaleFit", "fit_scales", "steady_weight"]
@@ -36,6 +36,9 @@ where the image is large enough, 4 pixels a side where it is not."""
 ROUNDS, UNCHANGED = 6, 2e-4
 """Most rounds of clipping, and the part of the pixels below which it ends: Gaussian noise has 6e-5 beyond
 four standard deviations."""
+
+LARGEST_NOISE = 1e15
+"""Noise of a pixel, and one over it, whose square and its products with pixels are numbers in single precision."""
 
 SAMPLE = 200_000
 """Pixels that tell a scatter to 0.2 %."""
@@ -160,13 +163,20 @@ def steady_weight(
         Variance of the pixels; if not known, one for all, from differences of neighbours.
     image : `numpy.ndarray`
         The frame.
+
+    Raises
+    ------
+    OutOfRangeError
+        A noise below 1e-15 or above 1e15.
     """
     if variance is None:
         both = good[:, 1:] & good[:, :-1]
-        difference = (image[:, 1:] - image[:, :-1])[both]
+        difference = image[:, 1:][both].astype(np.float64) - image[:, :-1][both]
         spread = 1.4826 * float(np.median(np.abs(difference))) / math.sqrt(2.0) if difference.size else 0.0
+        _refuse_unit(spread)
         return np.where(good, 1.0 / spread**2 if spread > 0.0 else 1.0, 0.0).astype(np.float32)
     known = good & np.isfinite(variance) & (variance > 0)
+    _refuse_unit(math.sqrt(float(np.median(variance[known]))) if known.any() else 0.0)
     weight = np.zeros(good.shape, dtype=np.float32)
     for y in range(0, good.shape[0], CELL_PX):
         for x in range(0, good.shape[1], CELL_PX):
@@ -175,6 +185,13 @@ def steady_weight(
             if values.size:
                 weight[cell] = np.where(known[cell], 1.0 / np.median(values), 0.0)
     return weight
+
+
+def _refuse_unit(noise: float) -> None:
+    """Refuse numbers whose squares single precision does not hold."""
+    if noise > 0.0 and not 1.0 / LARGEST_NOISE < noise < LARGEST_NOISE:
+        allowed = f"{1.0 / LARGEST_NOISE:.0e} to {LARGEST_NOISE:.0e}, in another unit"
+        raise OutOfRangeError("noise of a pixel", noise, allowed)
 
 
 def rounding_of(level: ArrayLike) -> float:
