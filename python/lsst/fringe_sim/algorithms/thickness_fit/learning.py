@@ -668,16 +668,17 @@ def rank_orders(
     """
     overtones = base.overtones() if free.contrast == "wavelength" else None
     thickness, here = learn(cells, base, free, start, overtones=overtones)
-    cells = replace(cells, thickness_um=thickness)
+    tried, places = {0.0: here}, {0.0: thickness}
 
-    def at(shift: float) -> NuisanceFit:
-        moved, guess = _guess_at_order(cells, base, free, here, shift * order_um)
+    def ask(shift: float, side: float) -> None:
+        """Begin at the order beside this one: from far away, too few steps would reach the best."""
+        near = replace(cells, thickness_um=places[shift - side])
+        moved, guess = _guess_at_order(near, base, free, tried[shift - side], side * order_um)
         inside = (moved.thickness_um > range_um[0]) & (moved.thickness_um < range_um[1])
         if inside.mean() < _INSIDE:
-            return replace(here, chi2=np.inf)
-        return learn(moved, base, free, guess, _ROUNDS_ELSEWHERE, overtones)[1]
-
-    tried = {0.0: here} | {shift: at(shift) for shift in (-1.0, 1.0)}
+            tried[shift] = replace(here, chi2=np.inf)
+        else:
+            places[shift], tried[shift] = learn(moved, base, free, guess, _ROUNDS_ELSEWHERE, overtones)
 
     def costs() -> dict[float, float]:
         """Chi-square of all, each where the model error of the best is counted as noise."""
@@ -690,9 +691,10 @@ def rank_orders(
 
     for side in (-1.0, 1.0):
         shift = side
+        ask(shift, side)
         while abs(shift) < _MOST_ORDERS and not clear(shift):
             shift += side
-            tried[shift] = at(shift)
+            ask(shift, side)
     cost = costs()
     best = min(cost, key=lambda shift: cost[shift])
     excess = np.array([cost[shift] - cost[best] for shift in tried if shift != best])
@@ -723,6 +725,6 @@ def _guess_at_order(
     return moved, replace(start, shift_nm=shift)
 
 
-_ROUNDS_ELSEWHERE = 5
+_ROUNDS_ELSEWHERE = 6
 _INSIDE = 0.99
 """Share of a sensor that must lie in the range of thicknesses."""
