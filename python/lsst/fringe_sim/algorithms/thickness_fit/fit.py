@@ -243,7 +243,9 @@ def make_templates(
     count = int(np.ceil((high + order - start) / step)) + 1
     response = model.response_on_grid(wavelength_nm, start, step, count)
     response = np.ascontiguousarray(response.T)
-    near = system.stack.indices(wavelength_nm + 1.0, system.temperature_k)[system.stack.position(system.varying)]
+    near = system.stack.indices(wavelength_nm + 1.0, system.temperature_k)[
+        system.stack.position(system.varying)
+    ]
     group = 1.0 - wavelength_nm * (near.real - index.real) / index.real
     beside = _turn_beside(model, wavelength_nm, response, group, (start, step))
     return FringeTemplates(response, start, step, wavelength_nm, group=group, beside_um=beside)
@@ -258,8 +260,8 @@ def _turn_beside(
 ) -> NDArray[np.float64]:
     """What the thin layers beside the varying one add to how its fringe turns, as `FringeTemplates` takes it.
 
-    The derivative of the response in wavelength is that in thickness times a straight line in thickness, whose slope is
-    the group index, and a change of level and swing.
+    The derivative of the response in wavelength is that in thickness times a straight line in thickness, whose slope
+    is the group index, and a change of level and swing.
     """
     start, step = grid_um
     sparse = slice(1, len(response) - 1, _TURNING_STRIDE)

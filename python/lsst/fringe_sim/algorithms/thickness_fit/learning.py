@@ -587,8 +587,8 @@ def _widths_of_wavelengths(accuracy_nm: float) -> FloatArray:
 def _scale_sigma(shift_nm: FloatArray, wavelength_nm: FloatArray, accuracy_nm: float) -> float:
     """Standard uncertainty of the scale of the thickness, to which only the labels of the wavelengths testify.
 
-    The flats tell how far the wavelengths are off relative to each other. What all of them are off by is as uncertain as
-    the labels scatter, and their scatter is uncertain itself.
+    The flats tell how far the wavelengths are off relative to each other. What all of them are off by is as uncertain
+    as the labels scatter, and their scatter is uncertain itself.
     """
     widths = _widths_of_wavelengths(accuracy_nm)
     common = np.linspace(-4.0, 4.0, 401) * max(accuracy_nm, _LEAST_SHIFT_NM)
