@@ -7,8 +7,9 @@ a script, this prints a table: ``python tests/helpers/laboratory_flats.py [--map
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import field_matrices
@@ -26,6 +27,7 @@ __all__ = ["ROWS", "Laboratory", "Result", "judge", "make_flats"]
 TEN_NM = np.arange(880.0, 991.0, 10.0)
 ORDER_UM = 0.3
 GRID_UM = 0.002
+CERTAIN = 25.0
 READ_NOISE_E = 7.0
 
 
@@ -106,9 +108,13 @@ class Result:
 
 
 def make_flats(
-    laboratory: Laboratory, thickness_um: np.ndarray, rng: np.random.Generator, bands: np.ndarray = TEN_NM
+    laboratory: Laboratory,
+    thickness_um: np.ndarray,
+    rng: np.random.Generator,
+    bands: np.ndarray = TEN_NM,
+    noisy: bool = True,
 ) -> FringeCube:
-    """Flats of a map in electrons over their mean."""
+    """Flats of a map in electrons over their mean; without noise, but with its variances, if not ``noisy``."""
     sensor = ForeignSensor(line=laboratory.line, epoxy_k=laboratory.epoxy_k)
     true_nm = bands + laboratory.offsets_nm * rng.standard_normal(bands.size)
     true_nm[bands.size // 2] += laboratory.mislabelled_nm
@@ -128,7 +134,7 @@ def make_flats(
         images.append(laboratory.electrons * image / image.mean())
     counts = np.array(images)
     variance = counts + READ_NOISE_E**2
-    counts = counts + np.sqrt(variance) * rng.standard_normal(counts.shape)
+    counts = counts + noisy * np.sqrt(variance) * rng.standard_normal(counts.shape)
     return FringeCube(
         (counts / laboratory.electrons).astype(np.float32),
         (variance / laboratory.electrons**2).astype(np.float32),
@@ -167,17 +173,34 @@ def judge(fitted: ThicknessMap, truth: np.ndarray, seconds: float = 0.0) -> Resu
     )
 
 
+def draw_map(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Thickness of a sensor [um]."""
+    mean, span = rng.uniform(10.0, 18.0), rng.uniform(1.0, 2.5) * size / 256.0
+    return random_field((size, size), rng, mean=mean, span=span)
+
+
 def one(
     laboratory: Laboratory, seed: int, model: FringeModel, size: int, **options: Any
 ) -> tuple[ThicknessMap, Result]:
     """Fit one map that a seed draws."""
     rng = np.random.default_rng(seed)
-    shape = (size, size)
-    truth = random_field(shape, rng, mean=rng.uniform(10.0, 18.0), span=rng.uniform(1.0, 2.5) * size / 256.0)
+    truth = draw_map(rng, size)
     cube = make_flats(laboratory, truth, rng)
     start = time.process_time()
     fitted = fit_thickness(cube, model, **options)
     return fitted, judge(fitted, truth, time.process_time() - start)
+
+
+def decidable(laboratory: Laboratory, seed: int, model: FringeModel, size: int) -> bool:
+    """Whether the expected chi-square of the best rival of the true order is 25 or more, all nuisances being free.
+
+    The chi-square differences of flats without noise, with its variances, are those expected.
+    """
+    rng = np.random.default_rng(seed)
+    truth = draw_map(rng, size)
+    fitted = fit_thickness(make_flats(laboratory, truth, rng, noisy=False), model)
+    right = abs(float(np.median(fitted.value - truth))) < 0.5 * ORDER_UM
+    return right and float(fitted.metadata["ORDMARG"]) >= CERTAIN
 
 
 def main() -> None:
@@ -189,6 +212,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--contrast", default=None)
     parser.add_argument("--method", default="global")
+    parser.add_argument("--contrasts", type=float, nargs="*", default=[None])
+    parser.add_argument("--electrons", type=float, nargs="*", default=[None])
+    parser.add_argument("--decidable", action="store_true", help="ask whether the order can be told at all")
     arguments = parser.parse_args()
     model = FringeModel.from_setup("ts8_e2v")
     options: dict[str, Any] = {"method": arguments.method}
@@ -197,12 +223,21 @@ def main() -> None:
     for name, laboratory in ROWS.items():
         if arguments.rows and not any(part in name for part in arguments.rows):
             continue
-        for seed in range(arguments.first, arguments.first + arguments.maps):
-            try:
-                result = str(one(laboratory, seed, model, arguments.size, **options)[1])
-            except Exception as error:
-                result = f"{type(error).__name__}: {error}"
-            print(f"{name:32s} map {seed}  {result}", flush=True)
+        for contrast, electrons in itertools.product(arguments.contrasts, arguments.electrons):
+            asked = replace(
+                laboratory,
+                contrast=laboratory.contrast if contrast is None else contrast,
+                electrons=laboratory.electrons if electrons is None else electrons,
+            )
+            for seed in range(arguments.first, arguments.first + arguments.maps):
+                try:
+                    result = str(one(asked, seed, model, arguments.size, **options)[1])
+                    if arguments.decidable:
+                        result += f"  decidable {decidable(asked, seed, model, arguments.size)}"
+                except Exception as error:
+                    result = f"{type(error).__name__}: {error}"
+                case = f"c {asked.contrast:4.2f}  {asked.electrons:6.0f} e-"
+                print(f"{name:32s} {case}  map {seed}  {result}", flush=True)
 
 
 if __name__ == "__main__":

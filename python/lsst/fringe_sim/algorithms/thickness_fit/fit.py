@@ -261,8 +261,8 @@ def _turn_beside(
 ) -> NDArray[np.float64]:
     """What the thin layers beside the varying one add to how its fringe turns, as `FringeTemplates` takes it.
 
-    The derivative of the response in wavelength is that in thickness times a straight line in thickness, whose slope is
-    the group index, and a change of level and swing.
+    The derivative of the response in wavelength is that in thickness times a straight line in thickness, whose slope
+    is the group index, and a change of level and swing.
     """
     start, step = grid_um
     sparse = slice(1, len(response) - 1, _TURNING_STRIDE)

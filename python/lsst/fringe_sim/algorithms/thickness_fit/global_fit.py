@@ -47,6 +47,10 @@ Slopes inside the cells make up for most of it; beyond this, cells of some phase
 """
 _NINTH_DECILE = 1.28
 """Of a normal distribution, in standard deviations."""
+_CLEAREST = 4
+"""Wavelengths from which the size of the cells is chosen."""
+_CUT_NOISE = 0.902
+"""Mean of the squares of normal deviates that are cut at eight times their median."""
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
@@ -563,7 +567,7 @@ def choose_cell_size(data: Amplitudes) -> int:
     """Largest cell over which the steepest tenth of the sensor still shows its fringes, to within the noise.
 
     The structure function ``<(a(x + s) - a(x))²> / 2 var(a)`` of a fringe is ``1 - cos`` of its phase over the
-    distance ``s``; it is taken in blocks, at the wavelength of largest contrast, with the noise subtracted.
+    distance ``s``; it is taken in blocks, at the wavelengths with the clearest fringes, with the noise subtracted.
 
     Parameters
     ----------
@@ -586,19 +590,20 @@ def choose_cell_size(data: Amplitudes) -> int:
         return max(LARGEST_CELL_PX, least)
     noise = np.array([np.nanmean(variance[k]) for k in seen])
     excess = np.array([np.nanvar(image[k]) for k in seen]) - noise
-    best = int(np.argmax(excess))
-    band, signal = int(seen[best]), float(excess[best])
-    if not signal > 0.0:
+    best = np.argsort(-excess / noise)[:_CLEAREST]
+    best = best[excess[best] > 0.0]
+    if best.size == 0:
         return max(LARGEST_CELL_PX, least)
-    strips = [_strip(data, slice(band, band + 1), int(row), height)[0][0] for row in rows]
+    noise, signal, seen = noise[best], excess[best], seen[best]
+    strips = [_strip(data, slice(None), int(row), height)[0][seen] for row in rows]
     for size in (8, 4, 2):
         if size <= least:
             break
         if size >= max(ny, nx):
             continue
-        structure = _structure(strips, size, float(noise[best]), signal)
+        structure = _structure(strips, size, noise, signal)
         # The mean over a ramp of phase f is sin(f/2) / (f/2) of its middle: about 1 - (1 - cos f) / 12.
-        lost = structure / 12.0 * size * np.sqrt(signal / noise[best])
+        lost = structure / 12.0 * size * np.sqrt(signal[0] / noise[0])
         if structure < _STEEPEST_STRUCTURE and lost < _LARGEST_LOSS:
             return max(size, least)
     return max(least, 1)
@@ -620,22 +625,24 @@ def _strip(
 def _structure(
     strips: list[NDArray[np.float32]],
     lag: int,
-    noise: float,
-    signal: float,
+    noise: NDArray[np.floating],
+    signal: NDArray[np.floating],
 ) -> float:
     """Ninth decile over blocks of the structure function at one distance."""
     values = []
+    share = signal / noise**2 / np.sum((signal / noise) ** 2)
     for image in strips:
-        width = max(image.shape[1] // 16, 2 * lag)
-        for left in range(0, image.shape[1], width):
-            block = image[:, left : left + width]
-            for step in (block[lag:] - block[:-lag], block[:, lag:] - block[:, :-lag]):
-                good = step[np.isfinite(step)]
-                if good.size >= 16:
-                    square = good**2
+        width = max(image.shape[2] // 16, 4 * lag)
+        for left in range(0, image.shape[2], width):
+            block = image[:, :, left : left + width]
+            for step in (block[:, lag:] - block[:, :-lag], block[:, :, lag:] - block[:, :, :-lag]):
+                square = (step**2).reshape(len(step), -1)
+                count = np.isfinite(square).sum(axis=1)
+                if square.size and count.min() >= 16:
                     # Spikes are cut: neither a fringe nor noise has squares so far above the median.
-                    square = np.minimum(square, 8.0 * np.median(square))
+                    square = np.minimum(square, 8.0 * np.nanmedian(square, axis=1)[:, None])
+                    excess = np.nanmean(square, axis=1) - 2.0 * _CUT_NOISE * noise
                     # Where noise rules, the ninth decile would be that of the noise of these means.
-                    scatter = _NINTH_DECILE * 2.0 * noise * np.sqrt(2.0 / good.size)
-                    values.append((square.mean() - 2.0 * noise - scatter) / (2.0 * signal))
+                    scatter = _NINTH_DECILE * np.sqrt(np.sum((share * 2.0 * noise) ** 2 * 2.0 / count))
+                    values.append(0.5 * (np.sum(share * excess) - scatter))
     return float(np.percentile(values, 90)) if values else np.inf

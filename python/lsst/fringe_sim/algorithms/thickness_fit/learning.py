@@ -65,7 +65,7 @@ _LEAST_SHIFT_NM = 0.02
 _TEMPLATE_MARGIN_UM = 0.5
 _FREE = 1e-4
 """Precision of what has no prior."""
-_TAIL = 3.0
+_TAIL = 6.0
 """Degrees of freedom of the distribution of wavelengths about their labels: now and then one is far off."""
 _INDEPENDENT = 100
 """Independent places of a sensor at most, before the fringes are known: they hide light of their own scale."""
@@ -444,7 +444,7 @@ class _Problem:
             common[..., 0] = -model * (far - fit.middle_um)[:, None]
         return each, common
 
-    def _prior(self, fit: NuisanceFit, expected: bool = False) -> tuple[FloatArray, FloatArray]:
+    def _prior(self, fit: NuisanceFit) -> tuple[FloatArray, FloatArray]:
         """Precision of the prior, and where the parameters stand relative to its middle."""
         wavelengths, own, count = self.base.n_wavelengths, self.own, self.cells.pattern.shape[1]
         precision = np.zeros((wavelengths, own, wavelengths, own))
@@ -470,9 +470,7 @@ class _Problem:
             count += 1 + OVERTONES
         if self.free.wavelength_accuracy_nm > 0.0:
             where[:, count] = fit.shift_nm
-            precision[bands, count, bands, count] = _shift_precision(
-                fit, self.free.wavelength_accuracy_nm, expected
-            )
+            precision[bands, count, bands, count] = _shift_precision(fit, self.free.wavelength_accuracy_nm)
         size = wavelengths * own
         whole = np.zeros((size + self.shared, size + self.shared))
         whole[:size, :size] = precision.reshape(size, size)
@@ -523,8 +521,6 @@ class _Problem:
         thickness, model, slope, rest = self.residual(fit, thickness)
         normal, _ = self._system(fit, thickness, model, slope, rest)
         precision, _ = self._prior(fit)
-        believed, _ = self._prior(fit, expected=True)
-        precision, normal = believed, normal - precision + believed
         variance = np.linalg.inv(normal)
         wavelengths, own, count = self.base.n_wavelengths, self.own, self.cells.pattern.shape[1]
         diagonal = np.sqrt(np.maximum(np.diag(variance), 0.0))
@@ -537,10 +533,7 @@ class _Problem:
             contrast_sigma = fit.contrast * diagonal[wavelengths * own]
         if self.free.wavelength_accuracy_nm > 0.0:
             shift_sigma = table[:, count]
-            each = np.arange(wavelengths) * own + count
-            block = variance[np.ix_(each, each)]
-            along = np.full(wavelengths, 1.0 / wavelengths) / self.base.wavelength_nm
-            scale = float(np.sqrt(max(float(along @ block @ along), 0.0)))
+            scale = _scale_sigma(fit.shift_nm, self.base.wavelength_nm, self.free.wavelength_accuracy_nm)
         weight = self.cells.weight[:, :wavelengths].astype(float)
         sound = _sound(rest, weight)
         seen = (weight[sound] > 0).sum(axis=0)
@@ -567,31 +560,52 @@ class _Problem:
         at = np.arange(self.base.n_wavelengths) * self.own + self.own - 1
         where[at] = 0.0
         width = spread_of_wavelengths(fit.shift_nm, accuracy)
-        return float(where @ precision @ where) + float(_wavelength_prior(fit.shift_nm, width))
+        return float(where @ precision @ where) + float(_wavelength_prior(fit.shift_nm, width, accuracy))
 
 
-def _wavelength_prior(shift_nm: FloatArray, width_nm: FloatArray | float) -> FloatArray:
-    """Twice the negative logarithm of the probability of offsets that scatter with some width, now and then far off."""
+def _wavelength_prior(shift_nm: FloatArray, width_nm: FloatArray | float, accuracy_nm: float) -> FloatArray:
+    """Twice the negative logarithm of the probability of offsets that scatter with some width, now and then far off.
+
+    The width itself is probable up to what is stated, and less and less beyond.
+    """
     width = np.asarray(width_nm, dtype=float)[..., None]
     tail = (_TAIL + 1.0) * np.log1p(shift_nm**2 / (_TAIL * width**2)) + 2.0 * np.log(width)
-    return np.asarray(tail.sum(axis=-1))
+    return np.asarray(tail.sum(axis=-1) + (width[..., 0] / accuracy_nm) ** 2)
 
 
 def spread_of_wavelengths(shift_nm: FloatArray, accuracy_nm: float = np.inf) -> float:
-    """Most probable standard deviation of most wavelengths about their labels [nm], at most as stated."""
-    most = min(accuracy_nm, max(float(np.abs(shift_nm).max()), _LEAST_SHIFT_NM))
-    widths = np.geomspace(min(_LEAST_SHIFT_NM, most), most, 50)
-    return float(widths[np.argmin(_wavelength_prior(shift_nm, widths))])
+    """Most probable standard deviation of most wavelengths about their labels [nm]."""
+    widths = _widths_of_wavelengths(min(accuracy_nm, max(float(np.abs(shift_nm).max()), _LEAST_SHIFT_NM)))
+    return float(widths[np.argmin(_wavelength_prior(shift_nm, widths, accuracy_nm))])
 
 
-def _shift_precision(fit: NuisanceFit, accuracy_nm: float, expected: bool = False) -> FloatArray:
-    """Precision of the prior of each wavelength where it stands now; ``expected`` is what it says about the scale."""
+def _widths_of_wavelengths(accuracy_nm: float) -> FloatArray:
+    """Standard deviations of wavelengths about their labels that are possible where some accuracy is stated [nm]."""
+    return np.geomspace(min(_LEAST_SHIFT_NM, accuracy_nm), 3.0 * accuracy_nm, 50)
+
+
+def _scale_sigma(shift_nm: FloatArray, wavelength_nm: FloatArray, accuracy_nm: float) -> float:
+    """Standard uncertainty of the scale of the thickness, to which only the labels of the wavelengths testify.
+
+    The flats tell how far the wavelengths are off relative to each other. What all of them are off by is as uncertain
+    as the labels scatter, and their scatter is uncertain itself.
+    """
+    widths = _widths_of_wavelengths(accuracy_nm)
+    common = np.linspace(-4.0, 4.0, 401) * max(accuracy_nm, _LEAST_SHIFT_NM)
+    moved = shift_nm + common[:, None] * wavelength_nm / wavelength_nm.mean()
+    cost = np.stack([_wavelength_prior(moved, np.full(common.size, width), accuracy_nm) for width in widths])
+    share = np.exp(-0.5 * (cost - cost.min())).sum(axis=0)
+    share /= share.sum()
+    middle = float(share @ common)
+    return float(np.sqrt(share @ (common - middle) ** 2)) / float(wavelength_nm.mean())
+
+
+def _shift_precision(fit: NuisanceFit, accuracy_nm: float) -> FloatArray:
+    """Precision of the prior of each wavelength: that of a distribution with long tails, where it stands now."""
     if not np.any(fit.shift_nm):
         return np.full(fit.shift_nm.shape, accuracy_nm**-2.0)
     width = spread_of_wavelengths(fit.shift_nm, accuracy_nm)
-    step = (_TAIL + 1.0) / (_TAIL * width**2 + fit.shift_nm**2)
-    # The Fisher information of Student's distribution; steps need the weights of the scale mixture that it is.
-    return np.asarray(np.minimum(step, (_TAIL + 1.0) / ((_TAIL + 3.0) * width**2)) if expected else step)
+    return np.asarray((_TAIL + 1.0) / (_TAIL * width**2 + fit.shift_nm**2))
 
 
 def _sound(rest: FloatArray, weight: FloatArray) -> NDArray[np.bool_]:
@@ -654,16 +668,17 @@ def rank_orders(
     """
     overtones = base.overtones() if free.contrast == "wavelength" else None
     thickness, here = learn(cells, base, free, start, overtones=overtones)
-    cells = replace(cells, thickness_um=thickness)
+    tried, places = {0.0: here}, {0.0: thickness}
 
-    def at(shift: float) -> NuisanceFit:
-        moved, guess = _guess_at_order(cells, base, free, here, shift * order_um)
+    def ask(shift: float, side: float) -> None:
+        """Begin at the order beside this one: from far away, too few steps would reach the best."""
+        near = replace(cells, thickness_um=places[shift - side])
+        moved, guess = _guess_at_order(near, base, free, tried[shift - side], side * order_um)
         inside = (moved.thickness_um > range_um[0]) & (moved.thickness_um < range_um[1])
         if inside.mean() < _INSIDE:
-            return replace(here, chi2=np.inf)
-        return learn(moved, base, free, guess, _ROUNDS_ELSEWHERE, overtones)[1]
-
-    tried = {0.0: here} | {shift: at(shift) for shift in (-1.0, 1.0)}
+            tried[shift] = replace(here, chi2=np.inf)
+        else:
+            places[shift], tried[shift] = learn(moved, base, free, guess, _ROUNDS_ELSEWHERE, overtones)
 
     def costs() -> dict[float, float]:
         """Chi-square of all, each where the model error of the best is counted as noise."""
@@ -676,9 +691,10 @@ def rank_orders(
 
     for side in (-1.0, 1.0):
         shift = side
+        ask(shift, side)
         while abs(shift) < _MOST_ORDERS and not clear(shift):
             shift += side
-            tried[shift] = at(shift)
+            ask(shift, side)
     cost = costs()
     best = min(cost, key=lambda shift: cost[shift])
     excess = np.array([cost[shift] - cost[best] for shift in tried if shift != best])
@@ -709,6 +725,6 @@ def _guess_at_order(
     return moved, replace(start, shift_nm=shift)
 
 
-_ROUNDS_ELSEWHERE = 5
+_ROUNDS_ELSEWHERE = 6
 _INSIDE = 0.99
 """Share of a sensor that must lie in the range of thicknesses."""
