@@ -243,9 +243,9 @@ def test_a_fit_far_behind_gives_up_and_one_that_is_near_does_not() -> None:
         for name in ("bandwidth", "silicon_thickness")
     )
     rival = fit_model(problem, right, np.array([0.1]), start).chi2
-    free = fit_model(problem, wrong, np.array([0.3]), start)
-    near = fit_model(problem, wrong, np.array([0.3]), start, rival=free.chi2 - 50.0)
-    behind = fit_model(problem, wrong, np.array([0.3]), start, rival=rival)
+    free = fit_model(problem, wrong, np.array([0.6]), start)
+    near = fit_model(problem, wrong, np.array([0.6]), start, rival=free.chi2 - 50.0)
+    behind = fit_model(problem, wrong, np.array([0.6]), start, rival=rival)
     assert free.converged
     assert near.chi2 == free.chi2
     assert FEWEST_ITERATIONS <= behind.iterations < free.iterations
