@@ -1,10 +1,9 @@
-"""Commands in odd surroundings: no cache, no temporary files, other locales, any number of threads; ten in a row."""
+"""Commands in odd surroundings: no temporary files, other locales, any number of threads, one wavelength."""
 
 from __future__ import annotations
 
 import functools
 import os
-import resource
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -15,7 +14,6 @@ import pytest
 from made_once import made_once
 
 from lsst.fringe_sim.algorithms import fit_thickness
-from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube, ThicknessMap
@@ -112,16 +110,6 @@ def test_any_number_of_threads_gives_the_same_bytes(name: str, given: Path, tmp_
     compared(made[64], made[1])
 
 
-def test_without_a_cache_of_compiled_functions(given: Path, tmp_path: Path, usual: Usual) -> None:
-    """A cache in a place where no folder can be made: every process compiles for itself, to the same bytes."""
-    (tmp_path / "file").touch()
-    nowhere = str(tmp_path / "file" / "cache")
-    usual = files_of(command(given, "fit", tmp_path / "usual"), tmp_path / "usual")
-    compared(
-        files_of(command(given, "fit", tmp_path / "out"), tmp_path / "out", NUMBA_CACHE_DIR=nowhere), usual
-    )
-
-
 @pytest.mark.parametrize("place", ["/dev/full", "/proc/self", "missing"])
 def test_without_room_for_temporary_files(place: str, given: Path, tmp_path: Path, usual: Usual) -> None:
     """TMPDIR is no folder, cannot be written, or is not there: products are made beside their places."""
@@ -138,32 +126,6 @@ def test_locales_that_are_not_utf8(locale: dict[str, str], given: Path, tmp_path
     compared(files_of(command(given, "sky", out), out, PYTHONUTF8="0", **locale), usual("sky"))
 
 
-@pytest.mark.parametrize("name", ["sky", "fit"])
-def test_ten_runs_in_one_process_take_no_more_memory(name: str, given: Path, tmp_path: Path) -> None:
-    """In a process of its own: largest memory [KiB] after each run."""
-    words = command(given, name, tmp_path / "out")
-    program = (
-        "import gc, sys\nfrom pathlib import Path\nfrom lsst.fringe_sim.cli.main import run\n"
-        f"for number in range(10):\n    assert run({[*words, '--overwrite']!r}) == 0\n    gc.collect()\n"
-        "    pages = Path('/proc/self/statm').read_text().split()[1]\n    print('pages', pages, file=sys.stderr)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    pages = [int(line.split()[1]) for line in done.stderr.splitlines() if line.startswith("pages")]
-    mebibytes = np.array(pages) * resource.getpagesize() / 2**20
-    print(name, mebibytes.round(1).tolist())
-    assert len(mebibytes) == 10
-    # What allocators keep settles in the first runs; a leak of one image of the sensor would be smaller than this.
-    assert np.polyfit(np.arange(5), mebibytes[5:], 1)[0] < 1.0
-
-
-def test_two_hundred_wavelengths() -> None:
-    wavelength = np.linspace(880.0, 1000.0, 200)
-    fitted = fit_thickness(cube_of(wavelength), FringeModel.from_setup("ts8_e2v"))
-    good = fitted.mask == 0
-    assert good.mean() > 0.95
-    assert np.abs(fitted.value - field_um(32, 32))[good].max() < 0.02
-
-
 def test_one_wavelength() -> None:
     """It cannot tell the order: refused, or every pixel says so."""
     try:
@@ -171,12 +133,3 @@ def test_one_wavelength() -> None:
     except InputError:
         return
     assert np.all(fitted.mask & mask_bits("SLIP", "NO_DATA", "LOW_SIGNAL"))
-
-
-def test_one_wavelength_and_a_known_thickness(tmp_path: Path) -> None:
-    """The search needs no more."""
-    known = {"thickness": field_um(32, 32), "thickness_sigma": np.full((32, 32), 0.005), "layer": "adhesive"}
-    cube_of(np.array([960.0]), **known).write_fits(tmp_path / "cube.fits")
-    words = ["discover", str(tmp_path / "cube.fits"), "--setup", "ts8_e2v", "--out", str(tmp_path / "out")]
-    assert run([*words, "--cells", "400"]) == 0
-    assert (tmp_path / "out" / "discovery.json").is_file()
