@@ -151,7 +151,7 @@ def test_it_reproduces_the_measured_efficiency() -> None:
 def test_level_and_fringes_of_the_sky_come_from_the_same_model() -> None:
     sky = SkySpectrum(EmissionLines.oh())
     plain, diffuse = (
-        sky_response(FringeModel.from_setup("lsst_e2v", settings), sky, thickness_range_um=(14.0, 15.0))
+        sky_response(FringeModel.from_setup("lsst_e2v", settings), sky, thickness_range_um=(14.0, 22.0))
         for settings in ({}, {"diffuse_gate_side.reflectance": 0.35})
     )
     # The measured efficiency gives 2893 electrons where that of plane layers gives 2057.
