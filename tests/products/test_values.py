@@ -283,12 +283,17 @@ def test_quantities_are_converted(changes: dict[str, Any], field: str, expected:
         lambda: cube(thickness=np.full((3, 4), 14.0) * u.s),
         lambda: cube(image=np.ones((2, 3, 4)) * u.um),
         lambda: FlatExposures([960.0] * u.K, 2.0, 183.0),
-        lambda: FlatExposures([960.0 * u.nm, 970.0 * u.nm], 2.0, 183.0),
+        lambda: FlatExposures([960.0 * u.nm, 970.0 * u.K], 2.0, 183.0),
     ],
 )
 def test_quantities_of_another_kind_are_refused(make: Any) -> None:
     with pytest.raises(InputError):
         make()
+
+
+def test_a_list_of_quantities_is_converted_one_by_one() -> None:
+    exposures = FlatExposures([960.0 * u.nm, 0.97 * u.um], 2.0, 183.0)
+    np.testing.assert_allclose(exposures.wavelength_nm, [960.0, 970.0])
 
 
 def test_a_cube_from_arrays() -> None:
