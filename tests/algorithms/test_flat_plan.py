@@ -18,7 +18,7 @@ from lsst.fringe_sim.algorithms.thickness_fit.evidence import order_evidence
 from lsst.fringe_sim.algorithms.thickness_fit.fit import make_templates
 from lsst.fringe_sim.algorithms.thickness_fit.templates import pad_wavelengths
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
-from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.model import FringeModel, Setup
 
 TEN_NM = tuple(np.arange(880.0, 991.0, 10.0))
 RANGE_UM = (7.0, 12.0)
@@ -37,8 +37,9 @@ def model() -> FringeModel:
 
 @pytest.fixture(scope="module")
 def weak() -> FringeModel:
-    """Contrast as real sensors have it."""
-    return FringeModel.from_setup("ts8_e2v", {"contrast_loss.factor": 0.15})
+    """Contrast as real sensors have it, with the silicon for which the numbers below were chosen."""
+    setup = Setup.from_name("ts8_e2v").with_silicon("Si_green2008")
+    return FringeModel.from_setup(setup, {"contrast_loss.factor": 0.15})
 
 
 def amplitude(model: FringeModel, thickness_um: np.ndarray, wavelengths) -> np.ndarray:

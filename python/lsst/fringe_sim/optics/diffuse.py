@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import named_units
 from .stack import LayerStack
 from .transfer_matrix import layer_absorption
 
@@ -58,6 +59,7 @@ class DiffuseReturn:
         passed = np.sqrt(1.0 - self.reflectance)
         return float(1.0 / (1.0 - passed)), float(-passed / (1.0 - passed))
 
+    @named_units
     def fate(
         self, stack: LayerStack, detection: str, wavelength_nm: ArrayLike, temperature_k: float
     ) -> tuple[FloatArray, FloatArray]:
