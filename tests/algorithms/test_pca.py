@@ -22,7 +22,7 @@ from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.mock.thickness import e2v_321
-from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.model import FringeModel, Setup
 from lsst.fringe_sim.products import mask_bits
 
 NOW = "2026-11-21T00:00:00"
@@ -44,7 +44,8 @@ def thickness():
 
 @pytest.fixture(scope="module")
 def model():
-    return FringeModel.from_setup("lsst_e2v")
+    """The sensor with the silicon of the paper."""
+    return FringeModel.from_setup(Setup.from_name("lsst_e2v").with_silicon("Si_green2008"))
 
 
 @pytest.fixture(scope="module")
