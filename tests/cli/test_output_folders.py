@@ -16,12 +16,12 @@ from lsst.fringe_sim.cli.output import OutputFolder
 FRAMES = ("--size", "64x64", "--wavelengths", "900", "--bias-frames", "1", "--seed", "1")
 
 
-def test_every_command_with_a_folder_can_replace_what_is_there() -> None:
+def test_every_command_that_writes_can_replace_what_is_there() -> None:
     context = click.Context(cli)
     for name in cli.list_commands(context):
         command = cli.get_command(context, name)
         options = {option for item in command.params for option in item.opts}
-        assert ("--overwrite" in options) == bool({"--out", "out"} & options), name
+        assert ("--overwrite" in options) == bool({"--out", "out", "--ecsv"} & options), name
 
 
 @pytest.fixture
