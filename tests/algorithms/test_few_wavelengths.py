@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from flat_cubes import TEN_NM, relative_flats
-from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.algorithms.thickness_fit import make_templates
@@ -27,7 +26,8 @@ def wrong_and_unflagged(fitted, truth) -> float:
     return float(np.mean((np.abs(fitted.value - truth) > HALF_ORDER_UM) & (fitted.mask == 0)))
 
 
-@pytest.mark.parametrize("seed", first_is_quick([0, 1, 3, 4]))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 3, 4])
 def test_neighbouring_wavelengths_find_the_order(seed, model) -> None:
     """A mean response that is half a per cent off tears the relief; a torn relief has a wrong mean response."""
     rng = np.random.default_rng(seed)

@@ -9,6 +9,7 @@ import pytest
 from astropy.io import fits
 from flat_cubes import TEN_NM, relative_flats
 from hard_maps import HARD_MAPS
+from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.errors import InputError, UnknownNameError
@@ -30,7 +31,7 @@ def slipped(value: np.ndarray, truth: np.ndarray, good: np.ndarray) -> float:
     return float(np.mean(np.abs(value - truth)[good] > HALF_ORDER_UM))
 
 
-@pytest.mark.parametrize("name", sorted(HARD_MAPS))
+@pytest.mark.parametrize("name", first_is_quick(sorted(HARD_MAPS)))
 @pytest.mark.rng("hard maps without a slip")
 def test_hard_maps_without_a_slip(name, model, rng) -> None:
     truth = HARD_MAPS[name](SHAPE)
@@ -57,6 +58,7 @@ def test_uncertainty_holds(model, rng) -> None:
     assert np.median(fitted.chi2[good]) == pytest.approx(0.94, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.rng("noise at which single pixels slip")
 def test_noise_at_which_single_pixels_slip(model, rng) -> None:
     """Contrast lowered to that of real sensors, noise at which a lone pixel goes wrong every third time."""
@@ -93,6 +95,7 @@ def test_walk_of_the_paper_is_right_on_a_smooth_map(model, rng) -> None:
         assert slipped(walk.value, truth, walk.mask == 0) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.rng("any order of wavelengths")
 def test_any_order_of_wavelengths(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=16.0, span=3.0)
@@ -103,6 +106,7 @@ def test_any_order_of_wavelengths(model, rng) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.rng("missing wavelengths cost certainty")
 def test_missing_wavelengths_cost_certainty(model, rng) -> None:
     truth = random_field(SHAPE, rng, mean=16.0, span=3.0)

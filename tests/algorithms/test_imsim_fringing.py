@@ -54,6 +54,7 @@ def test_the_map_is_the_sky_frame_of_the_package(centre, thickness_um) -> None:
     assert found.mean() == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_fringes_are_weaker_at_the_edge_of_the_field(centre, thickness_um) -> None:
     edge = CCDFringing(at(1.0, 1.0), BORESIGHT, 5, False, thickness_um=thickness_um)
     assert edge.field_x_deg == pytest.approx(1.0, abs=1e-9)

@@ -128,6 +128,7 @@ def sealed(gap_nm: float, seed: int) -> SealedCase:
             return case
 
 
+@pytest.mark.slow
 def test_its_thickness_is_that_of_the_sensor_once_it_is_known() -> None:
     """Without it the fit bends the thickness; with it pixels on the island are as good as others."""
     case = sealed(150.0, 5)

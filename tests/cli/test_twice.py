@@ -53,6 +53,8 @@ ELSEWHERE = {
     "demo": "tests/cli/test_demo.py::test_running_it_again_does_nothing_twice",
     "discover": "tests/algorithms/discovery/test_search.py",
     "challenge": "tests/mock/test_hidden_effects.py",
+    "templates": "tests/cli/test_correct.py",
+    "correct": "tests/cli/test_correct.py",
     "reproduce-paper": "tests/cli/test_reproduce_paper.py",
 }
 """Minutes of work: the same seed gives the same answer there."""

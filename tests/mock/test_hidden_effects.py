@@ -140,6 +140,7 @@ def test_a_wedge_of_silicon_is_that_of_every_column() -> None:
     assert np.ptp(signal.flat(1)[0]) > 0.002 * signal.flat(1).mean()
 
 
+@pytest.mark.slow
 def test_light_that_comes_back_incoherently_leaves_a_wedge_as_it_is() -> None:
     """No fringes are left, and silicon that is thicker absorbs as much more as it does with them."""
     optics, _ = setup_optics("ts8_e2v")

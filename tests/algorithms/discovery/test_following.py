@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery.following import ThicknessFollower
 from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare
@@ -73,7 +72,8 @@ def test_one_thickness_has_no_slope(null_sensor) -> None:
     assert np.isfinite(ThicknessFollower(problem, level, INDEX).places({})).all()
 
 
-@pytest.mark.parametrize("seed", first_is_quick([23, 11]))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [23, 11])
 def test_a_gap_is_promising(seed: int) -> None:
     """With the thickness held, a gap of a hundredth of a wavelength promises nothing, and no fit is tried."""
     prepared = prepared_case(15.0, seed)

@@ -94,6 +94,7 @@ def test_where_the_model_fits_nothing_grows(blurred) -> None:
     assert grown_thickness(problem, _fit_at(problem, sigma, truth), truth) is None
 
 
+@pytest.mark.slow
 def test_a_blur_that_is_seen_is_not_taken_for_pixels_without_area(blurred) -> None:
     """With it points and areas are the same but for its size."""
     problem, truth, sigma = blurred

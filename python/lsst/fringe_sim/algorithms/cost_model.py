@@ -48,6 +48,8 @@ QUANTUM_COSTS: Mapping[str, QuantumCost] = MappingProxyType(
         "skyEffectDiscovery": QuantumCost(740.0, 6144 * MIB),
         "skyFringeSim": QuantumCost(16.3, 1262 * MIB),
         "fringePca": QuantumCost(10.7, 3428 * MIB),
+        "observedFringe": QuantumCost(570.0, 4096 * MIB),
+        "fringeCorrection": QuantumCost(62.0, 2500 * MIB),
         "fringeForecast": QuantumCost(21.4, 1255 * MIB),
         "focalPlaneSummary": QuantumCost(0.1, 339 * MIB),
     }
@@ -55,7 +57,9 @@ QUANTUM_COSTS: Mapping[str, QuantumCost] = MappingProxyType(
 """By task, as ``python tests/bps/measure_quanta.py`` has measured them: twelve flats, three biases, eleven hours.
 
 The search for effects found none; with effects it takes longer. That on the sky has not been measured on a full
-sensor: its time is that of a small one with an effect, its memory that of eleven frames, counted.
+sensor: its time is that of a small one with an effect, its memory that of eleven frames, counted. Neither have the
+two tasks of observed frames: their times are sixteen times those of 1024 x 1024 pixels, of eleven frames for
+templates, and their memory is that of the images they hold, counted.
 """
 
 
