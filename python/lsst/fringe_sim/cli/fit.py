@@ -143,7 +143,9 @@ def fit(
     said = remarks(fitted.metadata, fitted.flats)
     if not good.any():
         raise InputError("good pixels of the thickness map", 0, f"one or more. {'; '.join(said)}".strip())
-    fitted.write_fits(folder / "thickness.fits", {"SETUP": setup.name, "NFLATS": cube.shape[0], **cards}, section=section)
+    fitted.write_fits(
+        folder / "thickness.fits", {"SETUP": setup.name, "NFLATS": cube.shape[0], **cards}, section=section
+    )
     write_thickness_report(folder, cube, fitted, model, method)
     low, high = np.percentile(fitted.value[good], [1.0, 99.0])
     click.echo(
