@@ -69,7 +69,7 @@ def test_level_is_that_of_the_measured_quantum_efficiency(thickness, usual, tmp_
     assert run(["sky", "--thickness", thickness, "--level", "model", "--out", str(tmp_path)]) == 0
     measured, model = (SkyFringe.read_fits(out / "sky_R22_S11_00.fits") for out in (usual, tmp_path))
     assert measured.mean_electrons == pytest.approx(2717, rel=0.1)
-    assert model.mean_electrons == pytest.approx(1825, rel=0.02)
+    assert model.mean_electrons == pytest.approx(2057, rel=0.02)
     rms = [float(frame.metadata["FRINGRMS"]) for frame in (measured, model)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-5)
 
