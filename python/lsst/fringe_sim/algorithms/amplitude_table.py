@@ -23,7 +23,7 @@ from ..instrument.bandpass import Bandpass
 from ..instrument.camera import Camera
 from ..instrument.sky import EmissionLines, SkySpectrum
 from ..instrument.telescope import reduce_beam
-from ..model import FringeModel, ResponseTable
+from ..model import FringeModel, ResponseTable, Setup
 from ..optics import Illumination
 from ..products.thickness_map import thickness_span_um
 from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
@@ -145,13 +145,16 @@ def amplitude_table(
     skies: Sequence[SkyCase] | None = None,
     effects: Mapping[str, Any] | None = None,
     cases: Sequence[AmplitudeCase] = CASES,
+    *,
+    silicon: str | None = None,
 ) -> Table:
     """Amplitudes of the fringes of every set-up.
 
     ``adhesive_um`` (ny, nx): thickness of the adhesive of E2V-CCD250-321; every 16th pixel will do. ``skies``:
     spectra of the night sky; PALACE with and without continua by default. ``effects``: effects that the set-ups
     lack, by ``name.parameter``; those of the laboratory are left out on the sky. Without any, this is the
-    undamped model of the paper. Returns one row per case and sky. Amplitudes in per cent of the mean: of the
+    undamped model of the paper. ``silicon``: another table of silicon than that of the set-ups, as the
+    ``Si_green2008`` of the paper. Returns one row per case and sky. Amplitudes in per cent of the mean: of the
     frame itself (``rms``, ``half_peak_to_peak``, ``half_range_1_99``), and ``rms_flat_fielded`` after division
     by a flat field of white light, which takes out how absorption changes with the thickness of silicon.
     """
@@ -163,7 +166,7 @@ def amplitude_table(
     chosen = SkyCase.palace() if skies is None else tuple(skies)
     rows = []
     for case in cases:
-        model = _model(case, settings)
+        model = _model(case, settings, silicon)
         thickness = adhesive if case.own_map else _stand_in(case.setup)
         for sky in chosen if case.on_sky else (None,):
             found, flat_fielded = _amplitudes(case, model, thickness, sky)
@@ -236,9 +239,11 @@ _MEASURED_MONOCAM = 2.0
 """Amplitude of MonoCam's fringes in Table 2 [%]."""
 
 
-def _model(case: AmplitudeCase, settings: Mapping[str, Any]) -> FringeModel:
+def _model(case: AmplitudeCase, settings: Mapping[str, Any], silicon: str | None) -> FringeModel:
     """Model with those effects that the stack and the light of a case can have."""
-    bare = FringeModel.from_setup(case.setup, field_x_deg=case.field_deg)
+    setup = Setup.from_name(case.setup)
+    setup = setup if silicon is None else setup.with_silicon(silicon)
+    bare = FringeModel.from_setup(setup, field_x_deg=case.field_deg)
     given = settings_of(activate_effects(settings, known_effects()), on_sky=case.on_sky)
     return bare.with_effects({key: value for key, value in given.items() if _applies(bare, {key: value})})
 
