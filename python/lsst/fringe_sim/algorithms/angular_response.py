@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +26,7 @@ from .sky_response import (
     white_light,
 )
 
-__all__ = ["ANGLES", "CONTINUUM_ANGLES", "AngularResponse", "angular_response"]
+__all__ = ["ANGLES", "CONTINUUM_ANGLES", "AngularResponse", "angular_response", "of_other_silicon"]
 
 FloatArray = NDArray[np.float64]
 
@@ -104,8 +104,7 @@ def angular_response(
     few_rays = reduce_beam(model.system.beam, fineness.continuum_angles)
     table, photons, level = tabulate_components(model, sky, band, thickness_range_um, fineness, few_rays)
     grid = (table.start_um, table.step_um, table.values.shape[1])
-    lines, continua = split_components(sky, band, fineness.continuum_step_nm)
-    merged = blend_components(lines, fineness.line_shift_nm) if lines else []
+    merged, continua = _components(sky, band, fineness)
     few = math.ceil(angles * CONTINUUM_ANGLES / ANGLES)
     samples = error_samples((table.start_um, table.stop_um))
     of_lines = [_single_angles(model, item, limits, angles, grid, samples) for item in merged]
@@ -127,6 +126,40 @@ def angular_response(
         error / level,
         sky.airmass,
     )
+
+
+def of_other_silicon(
+    known: AngularResponse,
+    model: FringeModel,
+    sky: SkySpectrum,
+    bandpass: Bandpass | None = None,
+    quadrature: SkyQuadrature | None = None,
+) -> AngularResponse:
+    """Another response on the grids of one that is known, with its errors, for silicon of another thickness.
+
+    Errors are found once: they do not depend on a part in a thousand of the silicon.
+    """
+    fineness = SkyQuadrature() if quadrature is None else quadrature
+    band = bandpass_of(model) if bandpass is None else bandpass
+    angles, points = known.flat.shape
+    grid = (known.start_um, known.step_um, points)
+    merged, continua = _components(sky_with_effects(model, sky), band, fineness)
+    few = math.ceil(angles * CONTINUUM_ANGLES / ANGLES)
+    refine = _legendre_interpolation(few, angles)
+    of_lines = [_single_angles(model, item, known.limits, angles, grid)[0] for item in merged]
+    white = white_light(band, fineness.continuum_step_nm)
+    *smooth, flat = (
+        refine @ _single_angles(model, item, known.limits, few, grid)[0] for item in [*continua, white]
+    )
+    return replace(known, values=np.stack([*of_lines, *smooth]), flat=flat)
+
+
+def _components(
+    sky: SkySpectrum, band: Bandpass, fineness: SkyQuadrature
+) -> tuple[list[SpectralComponent], list[SpectralComponent]]:
+    """Merged lines of each band, and continua."""
+    lines, continua = split_components(sky, band, fineness.continuum_step_nm)
+    return blend_components(lines, fineness.line_shift_nm) if lines else [], continua
 
 
 def _single_angles(

@@ -23,8 +23,8 @@ from ..instrument.beam_field import BeamField
 from ..instrument.sky import SkySpectrum
 from ..instrument.telescope import Telescope, TracedOptics
 from ..model import FringeModel, ResponseTable
-from .angular_response import ANGLES, AngularResponse, angular_response
-from .island_response import response_with_islands
+from .angular_response import ANGLES, AngularResponse, angular_response, of_other_silicon
+from .island_response import parts_of, response_with_islands
 from .sensor_placement import SensorPlacement
 from .sky_frame import SkyQuadrature, is_band, sky_response
 from .sky_response import (
@@ -132,6 +132,15 @@ class SensorResponse:
     def factors(self, scale: Mapping[str, float] | None = None) -> FloatArray:
         """Factor on every component, 1 unless named; errors as of `SkyResponse.factors`."""
         return component_factors(self.component, self.field.angular.photons, scale)
+
+    def of_other_silicon(
+        self, model: FringeModel, sky: SkySpectrum, quadrature: SkyQuadrature | None = None
+    ) -> SensorResponse:
+        """The same for silicon of another thickness. Frames are divided by one flat field of the whole sensor."""
+        angular = of_other_silicon(self.field.angular, model, sky, None, quadrature)
+        flats = [float((self.field.weights @ each.flat).mean()) for each in (self.field.angular, angular)]
+        values = angular.values * (flats[0] / flats[1])
+        return replace(self, field=replace(self.field, angular=replace(angular, values=values)))
 
     def sky(self, scale: Mapping[str, float] | None = None) -> FieldTable:
         """Electrons s⁻¹ m⁻² arcsec⁻² over field radius and thickness."""
@@ -247,16 +256,22 @@ def sensor_response(
     placement: SensorPlacement,
     thickness_range_um: tuple[float, float] | None = None,
     quadrature: SkyQuadrature | None = None,
+    like: Response | None = None,
 ) -> Response:
     """Response of one sensor with the beam of every pixel and with its local effects.
 
     Commands and Tasks make their frames with it, so that one map has one sky.
 
     It has the one beam of the model behind a cone, and behind a telescope whose beams do not depend on
-    the distance from the axis alone.
+    the distance from the axis alone. ``like``: that of the same sensor with silicon of another thickness, whose
+    grids and errors it takes over.
     """
+    known = iter(parts_of(like))
 
     def respond(own: FringeModel) -> Response:
+        earlier = next(known, None)
+        if isinstance(earlier, SensorResponse):
+            return earlier.of_other_silicon(own, sky, quadrature)
         beams = beam_field(own.setup.telescope)
         if beams is None:
             return sky_response(own, sky, None, thickness_range_um, quadrature)

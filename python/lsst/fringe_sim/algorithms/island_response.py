@@ -15,7 +15,7 @@ from ..model import FringeModel
 if TYPE_CHECKING:
     from .sky_response import FrameTable, Response
 
-__all__ = ["IslandResponse", "IslandTable", "response_with_islands"]
+__all__ = ["IslandResponse", "IslandTable", "parts_of", "response_with_islands"]
 
 FloatArray = NDArray[np.float64]
 
@@ -29,6 +29,13 @@ def response_with_islands(model: FringeModel, respond: Callable[[FringeModel], R
     outside = respond(model)
     islands = tuple((item, respond(inside)) for item, inside in model.islands)
     return IslandResponse(model, outside, islands) if islands else outside
+
+
+def parts_of(response: Response | None) -> tuple[Response, ...]:
+    """What `response_with_islands` asked for, in its order."""
+    if isinstance(response, IslandResponse):
+        return (response.outside, *(inside for _, inside in response.islands))
+    return () if response is None else (response,)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from ..products.thickness_map import thickness_span_um
 from .fringe_amplitudes import fringe_amplitudes
 from .image_noise import add_exposure_noise
 from .island_response import response_with_islands
+from .laboratory_shift import phase_change, widened_um
 from .photon_migration import spread_charge
 from .sky_response import Response, SkyQuadrature, SkyResponse, is_band, sky_response, sky_with_effects
 
@@ -56,6 +57,7 @@ def simulate_sky_frame(
     read_noise_e: float = 0.0,
     charge_kernel: ArrayLike | None = None,
     seed: int | None = None,
+    phase_sigma: float = 0.0,
     hour: float = 24.0,
     detector: str = "",
     physical_filter: str = "",
@@ -89,6 +91,9 @@ def simulate_sky_frame(
         Where the photons of a pixel are absorbed (`PhotonMigration.pixel_kernel`); all of them in it if not given.
     seed : `int`, optional
         Seed of photon and read noise; a frame without noise if not given.
+    phase_sigma : `float`, optional
+        Standard uncertainty of the phase of the adhesive between laboratory and sky [rad per 10 K]: what it does to
+        the frame, ``PHASERMS``, is stated in the header. A given response must cover the range of `widened_um`.
     hour, detector, physical_filter
         Go into the product.
 
@@ -116,12 +121,13 @@ def simulate_sky_frame(
         raise OutOfRangeError("exposure time [s]", exposure, "positive")
     if response is None:
         dark = SkySpectrum.dark(airmass=model.setup.airmass) if sky is None else sky
-        span = thickness_span_um(thickness[known])
+        span = widened_um(model, thickness_span_um(thickness[known]), phase_sigma)
         response = response_with_islands(model, lambda own: sky_response(own, dark, thickness_range_um=span))
 
     level = response.sky(scale)
     setup = model.setup
     to_electrons = exposure * setup.effective_area_m2 * setup.pixel_scale_arcsec**2
+    shift = phase_change(level, thickness, model, phase_sigma)
     image = level.frame(thickness)
     image *= np.asarray(airglow_level, dtype=np.float32)
     if charge_kernel is not None:
@@ -153,10 +159,18 @@ def simulate_sky_frame(
             "FRING198": amplitudes.half_range_1_99,
             NOISE: seed is not None,
             "RDNOISE": read_noise_e if seed is not None else 0.0,
+            **_phase_cards(phase_sigma, shift),
         },
         detector=detector,
         physical_filter=physical_filter,
     )
+
+
+def _phase_cards(sigma: float, change: NDArray[np.float32] | None) -> dict[str, float]:
+    """Uncertainty of the phase of the adhesive [rad per 10 K], and the rms that it leaves open."""
+    if change is None:
+        return {}
+    return {"PHASESIG": sigma, "PHASERMS": float(np.nanstd(change, dtype=np.float64))}
 
 
 @named_units
@@ -171,6 +185,7 @@ def simulate_night(
     seed: int | None = None,
     read_noise_e: float = 0.0,
     charge_kernel: ArrayLike | None = None,
+    phase_sigma: float = 0.0,
     detector: str = "",
     physical_filter: str = "",
 ) -> Iterator[SkyFringe]:
@@ -178,7 +193,7 @@ def simulate_night(
 
     Parameters
     ----------
-    thickness_um, model, response, exposure_s, read_noise_e, charge_kernel, detector, physical_filter
+    thickness_um, model, response, exposure_s, read_noise_e, charge_kernel, phase_sigma, detector, physical_filter
         See `simulate_sky_frame`.
     night : `NightHistory`
         Intensity of the OH bands through the night.
@@ -211,6 +226,7 @@ def simulate_night(
             read_noise_e=read_noise_e,
             charge_kernel=charge_kernel,
             seed=None if seed is None else int(children[time]),
+            phase_sigma=phase_sigma,
             hour=_BASELINE_HOUR + float(night.hours[time]),
             detector=detector,
             physical_filter=physical_filter,

@@ -30,7 +30,7 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
 @LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file.")
-@output_folder("Folder for map, figures, report.", "thickness.fits", "report.html")
+@output_folder("Folder for maps, figures, report.", "thickness.fits", "silicon.fits", "report.html")
 @click.option(
     "--method",
     type=click.Choice(FIT_METHODS),
@@ -105,8 +105,8 @@ def fit(
     import numpy as np
 
     from ..algorithms.flat_conditions import model_of_flats
-    from ..algorithms.thickness_fit import SiliconSearch, fit_thickness, remarks, says_misfit
-    from ..model import FringeModel
+    from ..algorithms.thickness_fit import SiliconSearch, fit_thickness, remarks, says_misfit, silicon_map
+    from ..model import LABORATORY_TEMPERATURE, FringeModel
     from ..model.provenance import input_cards
     from ..report.thickness_page import write_thickness_report
     from .inputs import effect_cards, read_settings
@@ -136,16 +136,22 @@ def fit(
     section = section_of_cube(cube, setup)
     model = model_of_flats(model, cube.exposures)
     folder = out.prepare()
-    cards = {**effect_cards(model), **input_cards([*used, *([effects_file] if effects_file else [])])}
+    cards = {
+        **effect_cards(model),
+        **input_cards([*used, *([effects_file] if effects_file else [])]),
+        LABORATORY_TEMPERATURE: model.system.temperature_k,
+    }
     click.echo("fitting the thickness", err=True)
     fitted = fit_thickness(cube, model, method, nuisances=free, silicon=search)
     good = fitted.mask == 0
     said = remarks(fitted.metadata, fitted.flats)
     if not good.any():
         raise InputError("good pixels of the thickness map", 0, f"one or more. {'; '.join(said)}".strip())
-    fitted.write_fits(
-        folder / "thickness.fits", {"SETUP": setup.name, "NFLATS": cube.shape[0], **cards}, section=section
-    )
+    about = {"SETUP": setup.name, "NFLATS": cube.shape[0], **cards}
+    fitted.write_fits(folder / "thickness.fits", about, section=section)
+    of_silicon = silicon_map(fitted, model)
+    if of_silicon is not None:
+        of_silicon.write_fits(folder / "silicon.fits", about, section=section)
     write_thickness_report(folder, cube, fitted, model, method)
     low, high = np.percentile(fitted.value[good], [1.0, 99.0])
     click.echo(
@@ -156,7 +162,7 @@ def fit(
         click.echo(sentence)
     if search is not None:
         click.echo(_silicon_line(fitted))
-    for name in ("thickness.fits", "report.html"):
+    for name in ("thickness.fits", *(["silicon.fits"] if of_silicon is not None else []), "report.html"):
         click.echo(str(folder / name))
     if strict and says_misfit(fitted.metadata):
         raise InputError("--strict", "a misfit", f"flats that the model describes. {'; '.join(said)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     import numpy as np
     from numpy.typing import NDArray
 
+    from ..algorithms.sky_response import Response
     from ..instrument.detector import Detector
     from ..instrument.night import NightHistory
     from ..instrument.setup import Setup
@@ -31,12 +33,27 @@ __all__ = ["sky"]
 
 PERCENT = 100.0
 MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
+NO_DATE = "1970-01-01T00:00:00"  # of templates of a model: two runs agree to the byte
 
 
 @click.command()
 @SKY.option("lsst_e2v", "Sensor and telescope: name or file.")
 @click.option(
     "--thickness", required=True, help="Map of the varying layer: a FITS file [µm], or 'e2v_321' (built in)."
+)
+@click.option(
+    "--silicon-thickness",
+    default=None,
+    metavar="FILE",
+    help="Map of the silicon on the same pixels, as 'fringe-sim fit --silicon' writes it; even without.",
+)
+@click.option(
+    "--phase-sigma",
+    type=click.FloatRange(0.0, 2.0),
+    default=0.3,
+    show_default=True,
+    help="Uncertainty of the phase of the adhesive between laboratory and sky [rad per 10 K]; its value, 0, is the "
+    "effect epoxy_temperature.phase_per_10k.",
 )
 @click.option("--detector", default=None, help="Place in the focal plane; decides the beam.")
 @click.option("--exptime", type=Quantity("s"), default=None, help="Exposure time; by default the set-up's.")
@@ -49,19 +66,33 @@ MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
     show_default=True,
     help="Mean level: that of the measured quantum efficiency, or what the stack itself detects.",
 )
+@click.option(
+    "--templates/--no-templates",
+    default=False,
+    help="Also write templates for 'fringe-sim correct': the sky, and how that phase changes it.",
+)
 @click.option("--noiseless/--noise", default=False, help="Without photon and read noise, as for templates.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the noise.")
 @model_effects()
-@output_folder("Folder for frames, figure and report.", "sky_*_[0-9][0-9].fits", "sky.png", "report.html")
+@output_folder(
+    "Folder for frames, figure and report.",
+    "sky_*_[0-9][0-9].fits",
+    "fringe_*.fits",
+    "sky.png",
+    "report.html",
+)
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def sky(
     setup: Setup,
     thickness: str,
+    silicon_thickness: str | None,
+    phase_sigma: float,
     detector: str | None,
     exptime: float | None,
     airmass: float | None,
     night: bool,
     level: str,
+    templates: bool,
     noiseless: bool,
     seed: int,
     effects: ChosenEffects,
@@ -75,6 +106,7 @@ def sky(
     \b
     Examples:
       fringe-sim sky --thickness fit/thickness.fits --detector R22_S11 --out sky
+      fringe-sim sky --thickness fit/thickness.fits --silicon-thickness fit/silicon.fits --out sky_of_both
       fringe-sim sky --setup monocam --thickness e2v_321 --noiseless --exptime 60s --out sky
       fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky_with_effects
     """
@@ -88,6 +120,7 @@ def sky(
     _check_exposure(exptime, night)
     sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
     layer, section = _layer(thickness, sensor, setup.varying)
+    silicon = None if silicon_thickness is None else _silicon(silicon_thickness, layer)
     settings = sky_settings(effects.settings)
     history = NightHistory.guo2022() if night else None
     count = 1 if history is None else len(history)
@@ -96,9 +129,10 @@ def sky(
             f"would simulate {count} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
         )
         return
-    model = _model(setup, settings, sensor)
+    model = _model(setup, settings, sensor).at_laboratory_temperature(map_header(thickness))
     contrast = laboratory_contrast(thickness)
-    given: list[str | Path] = [*([] if thickness == BUILT_IN else [thickness]), *effects.files]
+    maps = [name for name in (thickness, silicon_thickness) if name not in (BUILT_IN, None)]
+    given: list[str | Path] = [*maps, *effects.files]
     cards = _cards(model, given, contrast, section)
     folder = out.prepare()
     common: dict[str, Any] = {
@@ -108,16 +142,32 @@ def sky(
         "physical_filter": setup.bandpass,
     }
     exposure = Exposure(exptime, airmass or setup.airmass, history, level == "measured")
-    series, scales = _frames(layer, model, sensor, section, exposure, common)
+    layers = Layers(layer, silicon, section, phase_sigma)
+    response = _response(layers, model, sensor, exposure)
+    series, scales = _frames(layers, model, response, exposure, common)
     made = _written(series, scales, folder / f"sky_{sensor.name}", cards, section)
+    if templates:
+        _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
     save_figure(sky_figure(made), folder / "sky.png")
     page = write_sky_report(folder / "report.html", made, setup.name, seed)
     for frame in made:
         click.echo(_describe(frame))
+    if "PHASERMS" in made[0].metadata:
+        click.echo(_open_phase(made[0], model))
     if contrast is not None:
         click.echo(_both_forecasts(made[0], *contrast))
     click.echo(str(folder))
     click.echo(str(page))
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """What is known of the layers of a sensor."""
+
+    thickness_um: FloatArray  # NaN where one of the two layers is not known
+    silicon_um: FloatArray | None  # as the stack has it if not given
+    section: SensorSection | None
+    phase_sigma: float  # of the adhesive between laboratory and sky [rad per 10 K]
 
 
 @dataclass(frozen=True)
@@ -163,26 +213,36 @@ def _cards(
     return cards
 
 
-def _frames(
-    layer: FloatArray,
-    model: FringeModel,
-    sensor: Detector,
-    section: SensorSection | None,
-    exposure: Exposure,
-    common: Mapping[str, Any],
-) -> tuple[Iterable[SkyFringe], list[dict[str, float]]]:
-    """Frames, made one after the other as they are asked for, and the bands of each relative to the dark sky."""
-    from ..algorithms.field_response import SensorPlacement, sensor_response
-    from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, throughput_electrons
-    from ..instrument.bandpass import Bandpass
+def _response(layers: Layers, model: FringeModel, sensor: Detector, exposure: Exposure) -> Response:
+    """Response of the sensor to the dark sky."""
+    from ..algorithms.sensor_placement import SensorPlacement
+    from ..algorithms.sky_of_maps import silicon_nodes_um, sky_of_maps
     from ..instrument.sky import SkySpectrum
     from ..products.thickness_map import thickness_span_um
 
-    dark = SkySpectrum.dark(airmass=exposure.airmass)
     click.echo("tabulating the response to the sky", err=True)
-    place = SensorPlacement.of(sensor, model.setup.pixel_scale_arcsec, section)
-    response = sensor_response(model, dark, place, thickness_span_um(layer, MARGIN_UM))
-    night, seconds = exposure.night, exposure.exptime_s
+    made = sky_of_maps(
+        model,
+        SkySpectrum.dark(airmass=exposure.airmass),
+        SensorPlacement.of(sensor, model.setup.pixel_scale_arcsec, layers.section),
+        thickness_span_um(layers.thickness_um, MARGIN_UM),
+        None if layers.silicon_um is None else silicon_nodes_um(model, layers.silicon_um),
+        phase_sigma=layers.phase_sigma,
+    )
+    return made.on(layers.silicon_um)
+
+
+def _frames(
+    layers: Layers, model: FringeModel, response: Response, exposure: Exposure, common: Mapping[str, Any]
+) -> tuple[Iterable[SkyFringe], list[dict[str, float]]]:
+    """Frames, made one after the other as they are asked for, and the bands of each relative to the dark sky."""
+    from ..algorithms.sky_frame import simulate_night, simulate_sky_frame, throughput_electrons
+    from ..instrument.bandpass import Bandpass
+    from ..instrument.sky import SkySpectrum
+
+    dark = SkySpectrum.dark(airmass=exposure.airmass)
+    night, seconds, layer = exposure.night, exposure.exptime_s, layers.thickness_um
+    common = {**common, "phase_sigma": layers.phase_sigma}
     scales = [dict.fromkeys(response.bands, 1.0)]
     if night is not None:
         scales = [night.band_scale(time, response.bands) for time in range(len(night))]
@@ -199,6 +259,34 @@ def _frames(
     return [frame], scales
 
 
+def _write_templates(
+    layers: Layers,
+    model: FringeModel,
+    response: Response,
+    stem: Path,
+    cards: Mapping[str, str | float],
+    sensor: Detector,
+) -> None:
+    """The template of the sky, and that of the phase of the adhesive where it is open."""
+    from ..algorithms.laboratory_shift import template_pair
+
+    made = template_pair(
+        layers.thickness_um, model, response, layers.phase_sigma, NO_DATE, detector=sensor.name
+    )
+    for number, template in enumerate(made):
+        template.write_fits(f"{stem}_{number}.fits", cards, section=layers.section)
+
+
+def _open_phase(frame: SkyFringe, model: FringeModel) -> str:
+    """What the phase of the adhesive leaves open."""
+    setup, rms = model.setup, PERCENT * float(frame.metadata["PHASERMS"])
+    colder = (setup.laboratory_temperature_k or setup.temperature_k) - setup.temperature_k
+    return (
+        f"the map was measured {colder:.0f} K warmer: an unknown phase of the adhesive of "
+        f"± {float(frame.metadata['PHASESIG']):.2g} rad per 10 K changes the pattern by {rms:.4f} % rms"
+    )
+
+
 def _check_exposure(exptime: float | None, night: bool) -> None:
     if night and exptime is not None:
         raise InputError(
@@ -208,17 +296,22 @@ def _check_exposure(exptime: float | None, night: bool) -> None:
         raise OutOfRangeError("exposure time [s]", exptime, "positive")
 
 
-def laboratory_contrast(thickness: str) -> tuple[float, float] | None:
-    """Contrast of the laboratory flats over that of the model, and its uncertainty, if the map states them."""
+def map_header(thickness: str) -> Mapping[str, Any]:
+    """First header of the file of a map; empty for the built-in one."""
     from ..resources import open_user_fits
 
     if thickness == BUILT_IN:
-        return None
+        return {}
     with open_user_fits(thickness) as hdus:
-        header = hdus[0].header
-        if "CONTRAST" not in header or "CONTRSIG" not in header:
-            return None
-        return float(header["CONTRAST"]), float(header["CONTRSIG"])
+        return dict(hdus[0].header)
+
+
+def laboratory_contrast(thickness: str) -> tuple[float, float] | None:
+    """Contrast of the laboratory flats over that of the model, and its uncertainty, if the map states them."""
+    header = map_header(thickness)
+    if "CONTRAST" not in header or "CONTRSIG" not in header:
+        return None
+    return float(header["CONTRAST"]), float(header["CONTRSIG"])
 
 
 def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:
@@ -229,6 +322,16 @@ def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:
         f"if it is lost in the laboratory only, {contrast * rms:.4f} % if it is lost on the sky as well; the frames "
         "hold the first. A frame of the sky of this sensor decides, or a cause that 'fringe-sim discover' names"
     )
+
+
+def _silicon(path: str, layer: FloatArray) -> FloatArray:
+    """Thickness of the silicon [µm] on the pixels of another layer, which loses those where it is not known."""
+    from ..algorithms.sky_of_maps import DETECTION, known_silicon_um
+    from ..products import ThicknessMap
+
+    silicon = known_silicon_um(ThicknessMap.read_any(path, DETECTION), layer.shape)
+    layer[silicon != silicon] = math.nan  # not known
+    return silicon
 
 
 def _layer(thickness: str, sensor: Detector, name: str) -> tuple[FloatArray, SensorSection | None]:

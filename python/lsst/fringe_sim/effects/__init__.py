@@ -8,6 +8,7 @@ from .active import (
     apply_to_sky,
     apply_to_system,
 )
+from .at_telescope import EpoxyTemperature, SensorTemperature
 from .base import Effect, Parameter, Residuals, ResponseContext, SearchHints
 from .catalogue import effects_from, known_effects
 from .geometry import AMPLIFIERS, ImageGeometry
@@ -99,6 +100,8 @@ EFFECTS: tuple[Effect, ...] = (
     BlackCoating(),
     DiffuseGateSide(),
     Void(),
+    SensorTemperature(),
+    EpoxyTemperature(),
     # illumination
     Bandwidth(),
     LineWing(),

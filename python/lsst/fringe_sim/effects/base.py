@@ -187,6 +187,8 @@ class Effect(Described, ABC):
     """Whether it changes the stack in a part of the sensor only, that of `coverage`."""
     laboratory_only: ClassVar[bool] = False
     """Whether it belongs to lamp, bench or cryostat, which a sensor does not take along to the telescope."""
+    sky_only: ClassVar[bool] = False
+    """Whether it belongs to the sensor at the telescope alone: neither flats nor maps made from them know of it."""
     reference: ClassVar[str]
     search: ClassVar[SearchHints] = SearchHints()
     """What a search must know of it."""

@@ -74,6 +74,9 @@ class Setup:
         Of a sky exposure; zero in the laboratory.
     wavelength_accuracy_nm : `float`
         Standard deviation of the wavelengths of the monochromator about what headers state [nm].
+    laboratory_temperature_k : `float`, optional
+        Of a sensor at a telescope: temperature at which its thickness was measured, where the map does not state it;
+        that of the sensor if not given.
     """
 
     name: str
@@ -99,6 +102,7 @@ class Setup:
     exposure_s: float
     airmass: float
     wavelength_accuracy_nm: float = WAVELENGTH_ACCURACY_NM
+    laboratory_temperature_k: float | None = None
 
     @classmethod
     def from_name(cls, name: str) -> Setup:
@@ -142,6 +146,7 @@ class Setup:
             )
         laboratory = kind == "monochromator"
         bandwidth = light.number("bandwidth_fwhm_nm", low=0.0, high=200.0) if laboratory else 0.0
+        temperature_k = reader.number("temperature_k", low=100.0, high=400.0)
         setup = cls(
             name=name,
             title=reader.text("title"),
@@ -153,7 +158,7 @@ class Setup:
             ),
             varying=reader.text("varying"),
             thickness_range_um=(low, high),
-            temperature_k=reader.number("temperature_k", low=100.0, high=400.0),
+            temperature_k=temperature_k,
             kind=kind,
             bandwidth_fwhm_nm=bandwidth,
             profile_name=light.choice("profile", tuple(_PROFILES)) if laboratory else "",
@@ -173,6 +178,11 @@ class Setup:
                 light.number("wavelength_accuracy_nm", low=0.0, high=20.0, default=WAVELENGTH_ACCURACY_NM)
                 if laboratory
                 else 0.0
+            ),
+            laboratory_temperature_k=(
+                None
+                if laboratory
+                else reader.number("laboratory_temperature_k", low=100.0, high=400.0, default=temperature_k)
             ),
         )
         setup.stack.position(setup.varying)
@@ -224,6 +234,7 @@ class Setup:
             beam=self.beam(field_x_deg, field_y_deg),
             varying=self.varying,
             observable=observable,
+            laboratory_temperature_k=self.laboratory_temperature_k,
         )
 
 

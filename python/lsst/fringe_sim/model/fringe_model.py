@@ -21,18 +21,21 @@ from ..effects import (
     known_effects,
 )
 from ..effects.active import settings_of
-from ..errors import InputError, named_units, without_unit
+from ..errors import InputError, named_units, to_number, without_unit
 from ..instrument.setup import Setup
 from ..optics.harmonics import ROUNDING
 from ..optics.illumination import DEFAULT_STEP_NM, Illumination
-from ..optics.media import check_range
+from ..optics.media import TEMPERATURE_RANGE_K, check_range
 from ..optics.phase_response import PhaseResponse
 from ..optics.system import OpticalSystem
 from .response_table import DEFAULT_TOLERANCE, ResponseTable, response_table, tabulate
 
-__all__ = ["FringeModel"]
+__all__ = ["LABORATORY_TEMPERATURE", "FringeModel"]
 
 FloatArray = NDArray[np.float64]
+
+LABORATORY_TEMPERATURE = "LABTEMP"
+"""Keyword of the temperature of the sensor during the flats from which a thickness map was made [K]."""
 
 BEYOND_THE_RANGE = 10.0
 """Factor by which a thickness may leave the range of its set-up; any wrong unit is wrong by a thousand or more."""
@@ -112,6 +115,23 @@ class FringeModel:
         """Same set-up and light with other effects in place of the present ones."""
         known = known_effects() if catalogue is None else catalogue
         return replace(self, effects=activate_effects(effects, known))
+
+    def at_laboratory_temperature(self, header: Mapping[str, Any]) -> FringeModel:
+        """The model for a thickness map with this header, which may state at which temperature it was measured.
+
+        Raises
+        ------
+        InputError
+            The temperature is not one.
+        """
+        if self.setup.kind != "sky" or LABORATORY_TEMPERATURE not in header:
+            return self
+        kelvin = to_number(LABORATORY_TEMPERATURE, header[LABORATORY_TEMPERATURE], "a temperature in K")
+        check_range(f"{LABORATORY_TEMPERATURE} [K]", np.array([kelvin]), *TEMPERATURE_RANGE_K)
+        setup = replace(self.setup, laboratory_temperature_k=kelvin)
+        return replace(
+            self, setup=setup, base_system=replace(self.base_system, laboratory_temperature_k=kelvin)
+        )
 
     @property
     def effect_settings(self) -> dict[str, float]:

@@ -58,6 +58,8 @@ class OpticalSystem:
         Spectrum of the lamp behind the monochromator; white if not given.
     diffuse : `DiffuseReturn`, optional
         What the gate side scatters back into the silicon; nothing if not given.
+    laboratory_temperature_k : `float`, optional
+        Temperature at which thicknesses were measured, for a sensor at a telescope [K].
     """
 
     stack: LayerStack
@@ -74,6 +76,7 @@ class OpticalSystem:
     wavelength_errors_nm: tuple[tuple[tuple[float, float], ...], ...] = ()
     lamp: LampSpectrum | None = None
     diffuse: DiffuseReturn | None = None
+    laboratory_temperature_k: float | None = None
 
     def __post_init__(self) -> None:
         self.stack.position(self.varying)

@@ -25,11 +25,12 @@ from lsst.pipe.base.connectionTypes import Input, Output
 from lsst.utils.logging import getLogger
 
 from ..algorithms import fit_thickness
+from ..algorithms.flat_conditions import model_of_flats
 from ..algorithms.template_errors import template_errors
-from ..algorithms.thickness_fit import SILICON_FIELDS, Nuisances, SiliconSearch, remarks
+from ..algorithms.thickness_fit import SILICON_FIELDS, Nuisances, SiliconSearch, remarks, silicon_map
 from ..errors import InputError
 from ..instrument.detector import Detector
-from ..model import Setup
+from ..model import LABORATORY_TEMPERATURE, Setup
 from ..products import FringeCube, FringeFlat, ThicknessMap, describe_mask
 from .model_config import FringeModelConfig
 from .quantum import common_header, data_id_of, sensor_of, unusable
@@ -56,6 +57,17 @@ class EpoxyFitConnections(PipelineTaskConnections, dimensions=("instrument", "de
         storageClass="ThicknessMap",
         dimensions=("instrument", "detector"),
     )
+
+    silicon = Output(
+        doc="Thickness of the silicon in front of it, where the flats tell it; only if it is fitted.",
+        name="siliconThickness",
+        storageClass="ThicknessMap",
+        dimensions=("instrument", "detector"),
+    )
+
+    def __init__(self, *, config: EpoxyFitConfig | None = None) -> None:
+        if config is not None and config.silicon == "fixed":
+            del self.silicon
 
     def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
         """Put the flats in the order of their wavelengths."""
@@ -180,7 +192,9 @@ class EpoxyFitTask(PipelineTask):
         flats = (butlerQC.get(ref).get() for ref in inputRefs.flats)
         with unusable(detector.name):
             result = self.run(flats, len(inputRefs.flats), detector)
-        butlerQC.put(result, outputRefs)
+        butlerQC.put(result.thickness, outputRefs.thickness)
+        if result.silicon is not None:
+            butlerQC.put(result.silicon, outputRefs.silicon)
 
     def run(self, flats: Iterable[FringeFlat], number: int, detector: Detector) -> Struct:
         """Fit one sensor.
@@ -197,7 +211,8 @@ class EpoxyFitTask(PipelineTask):
         Returns
         -------
         result : `~lsst.pipe.base.Struct`
-            ``thickness``, a `ThicknessMap`.
+            ``thickness``, a `ThicknessMap`, and ``silicon``, one of the silicon; `None` if it is not fitted, or if the
+            flats do not decide.
 
         Raises
         ------
@@ -219,9 +234,16 @@ class EpoxyFitTask(PipelineTask):
             "INTERR": errors[1],
             "NFLATS": number,
             "MISSING": missing,
+            LABORATORY_TEMPERATURE: model_of_flats(model, cube.exposures).system.temperature_k,
         }
         self._report(fitted, detector)
-        return Struct(thickness=dataclasses.replace(fitted, detector=detector.name, metadata=metadata))
+        silicon = silicon_map(fitted, model)
+        if silicon is not None:
+            silicon = dataclasses.replace(
+                silicon, detector=detector.name, metadata={**metadata, **silicon.metadata}
+            )
+        thickness = dataclasses.replace(fitted, detector=detector.name, metadata=metadata)
+        return Struct(thickness=thickness, silicon=silicon)
 
     def _options(self, setup: Setup) -> dict[str, Any]:
         config = self.config

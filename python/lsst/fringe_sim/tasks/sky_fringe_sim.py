@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField
+from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField, RangeField
 from lsst.pipe.base import (
     InputQuantizedConnection,
     OutputQuantizedConnection,
@@ -21,10 +21,11 @@ from lsst.pipe.base import (
     QuantumContext,
     Struct,
 )
-from lsst.pipe.base.connectionTypes import Output
+from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.photon_migration import photon_migration
 from ..algorithms.sky_frame import simulate_sky_frame, throughput_electrons
+from ..algorithms.sky_of_maps import known_silicon_um, silicon_nodes_um
 from ..errors import OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
@@ -79,6 +80,12 @@ class SkyFringeSimConnections(PipelineTaskConnections, dimensions=("instrument",
     config: SkyFringeSimConfig
 
     thickness = thickness_input()
+    silicon = Input(
+        doc="Thickness of the silicon on the same pixels; only where the configuration asks for it.",
+        name="siliconThickness",
+        storageClass="ThicknessMap",
+        dimensions=("instrument", "detector"),
+    )
     sky = Output(
         doc="Night sky with its fringes, in electrons.",
         name="skyFringe",
@@ -89,6 +96,8 @@ class SkyFringeSimConnections(PipelineTaskConnections, dimensions=("instrument",
     def __init__(self, *, config: SkyFringeSimConfig | None = None) -> None:
         if config is not None and config.stand_in:
             self.thickness = without_constraint(self.thickness)
+        if config is not None and config.silicon != "map":
+            del self.silicon
 
     def adjust_all_quanta(self, adjuster: QuantaAdjuster) -> None:
         """Keep the exposures of the sky in the band of the set-up: laboratory frames have exposures too."""
@@ -126,6 +135,24 @@ class SkyFringeSimConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnections
             "model": "what the stack itself detects",
             "throughput": "what the measured quantum efficiency in the throughput tables detects",
         },
+    )
+    silicon: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default="even",
+        doc="Thickness of the silicon above the varying layer.",
+        allowed={
+            "even": "that of the stack, the same everywhere",
+            "map": "that of a map, which a fit to flats with a narrow line makes",
+        },
+    )
+    phase_sigma: Any = RangeField(
+        dtype=float,
+        default=0.3,
+        min=0.0,
+        max=2.0,
+        inclusiveMax=True,
+        doc="Standard uncertainty of the phase of the adhesive between the temperatures of laboratory and sky, rad per "
+        "10 K; what it leaves open goes into the header. Its value is the effect epoxy_temperature.phase_per_10k.",
     )
     noise: Field[bool] = Field(
         dtype=bool,
@@ -180,11 +207,20 @@ class SkyFringeSimTask(PipelineTask):
                 airmass=airmass_of(record) or setup.airmass,
                 physical_filter=str(data_id["physical_filter"]),
             )
-            thickness = butlerQC.get(inputRefs.thickness) if hasattr(inputRefs, "thickness") else None
-            result = self.run(thickness, exposure, detector)
+            thickness, silicon = (
+                butlerQC.get(getattr(inputRefs, name)) if hasattr(inputRefs, name) else None
+                for name in ("thickness", "silicon")
+            )
+            result = self.run(thickness, exposure, detector, silicon)
         butlerQC.put(result, outputRefs)
 
-    def run(self, thickness: ThicknessMap | None, exposure: SkyExposure, detector: Detector) -> Struct:
+    def run(
+        self,
+        thickness: ThicknessMap | None,
+        exposure: SkyExposure,
+        detector: Detector,
+        silicon: ThicknessMap | None = None,
+    ) -> Struct:
         """Simulate one frame.
 
         Parameters
@@ -195,6 +231,8 @@ class SkyFringeSimTask(PipelineTask):
             When, how long, through what.
         detector : `Detector`
             The sensor; its place in the focal plane decides the beam.
+        silicon : `ThicknessMap`, optional
+            Thickness of its silicon on the same pixels; that of the stack everywhere if not given.
 
         Returns
         -------
@@ -213,8 +251,15 @@ class SkyFringeSimTask(PipelineTask):
         if choice.left_out:
             self.log.info("%s: on the sky without %s", detector.name, ", ".join(choice.left_out))
         known = layer.known_um()
+        silicon_um = None if silicon is None else known_silicon_um(silicon, known.shape)
+        if silicon_um is not None:
+            known = np.where(np.isfinite(silicon_um), known, np.float32(np.nan))
         sky_model = self.config.sky_model(detector, exposure.airmass, known, layer.metadata)
-        model, sky, response = sky_model.response()
+        sky_model = dataclasses.replace(sky_model, phase_sigma=self.config.phase_sigma)
+        if silicon_um is not None:
+            nodes = silicon_nodes_um(sky_model.fringe_model(), silicon_um)
+            sky_model = dataclasses.replace(sky_model, silicon_nodes_um=nodes)
+        model, sky, response = sky_model.response(silicon_um)
         scale = self._band_scale(exposure, sky.lines)
         frame = simulate_sky_frame(
             known,
@@ -226,6 +271,7 @@ class SkyFringeSimTask(PipelineTask):
             read_noise_e=detector.read_noise,
             charge_kernel=_charge_kernel(sky_model) if self.config.migration else None,
             seed=self._seed(exposure, detector) if self.config.noise else None,
+            phase_sigma=self.config.phase_sigma,
             hour=exposure.hour,
             detector=detector.name,
             physical_filter=exposure.physical_filter,
@@ -240,6 +286,7 @@ class SkyFringeSimTask(PipelineTask):
             "LEVEL": self.config.level,
             "BEAMS": self.config.beams,
             "STANDIN": thickness is None,
+            "SIMAP": silicon is not None,
             **band_cards(scale),
             **frame.metadata,
         }

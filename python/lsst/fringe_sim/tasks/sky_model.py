@@ -14,15 +14,18 @@ from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField
 from lsst.pipe.base.connectionTypes import Input
 
-from ..algorithms.field_response import SensorPlacement, sensor_response
+from ..algorithms.field_response import SensorPlacement
 from ..algorithms.island_response import response_with_islands
 from ..algorithms.sky_frame import sky_response
+from ..algorithms.sky_of_maps import SiliconSeries, sky_of_maps
 from ..algorithms.sky_response import Response
 from ..algorithms.thickness_stand_in import stand_in_thickness
-from ..errors import InputError
+from ..effects import activate_effects, known_effects
+from ..effects.active import settings_of
+from ..errors import InputError, to_number
 from ..instrument.detector import Detector
 from ..instrument.sky import EmissionLines, SkySpectrum
-from ..model import FringeModel, Setup
+from ..model import LABORATORY_TEMPERATURE, FringeModel, Setup
 from ..model.provenance import effects_of_header
 from ..products import SensorSection, ThicknessMap
 from ..products.thickness_map import thickness_span_um
@@ -54,35 +57,53 @@ class SkyModel:
     rotational_temperature_k: float | None
     vibrational_temperature_k: float | None
     thickness_range_um: tuple[float, float]  # thicknesses of the map
+    laboratory_temperature_k: float | None = None  # at which it was measured, if it states that
+    phase_sigma: float = 0.0  # of the adhesive between laboratory and sky [rad per 10 K]
+    silicon_nodes_um: tuple[float, ...] | None = None  # thicknesses of the silicon; that of the stack without
 
     def fringe_model(self) -> FringeModel:
         """Sensor behind the telescope."""
         setup, effects = self.choice
-        return ModelChoice(setup, dict(effects)).model(
+        model = ModelChoice(setup, dict(effects)).model(
             field_x_deg=self.placement.field_x_deg, field_y_deg=self.placement.field_y_deg
         )
+        stated = self.laboratory_temperature_k
+        return model if stated is None else model.at_laboratory_temperature({LABORATORY_TEMPERATURE: stated})
 
     def spectrum(self) -> SkySpectrum:
         """Dark sky with all OH bands at their reference intensity."""
         lines = EmissionLines.oh(self.rotational_temperature_k, self.vibrational_temperature_k)
         return SkySpectrum.dark(lines, self.airmass, solar_flux_sfu=self.solar_flux_sfu)
 
-    def response(self) -> tuple[FringeModel, SkySpectrum, Response]:
+    def response(
+        self, silicon_um: NDArray[np.floating] | None = None
+    ) -> tuple[FringeModel, SkySpectrum, Response]:
         """Model, sky and response, shared by the exposures of a night that this process simulates.
 
-        The response takes seconds, a frame tenths of one.
+        The response takes seconds, for every thickness of the silicon, a frame tenths of one. ``silicon_um``: map of
+        the silicon, if it has one.
         """
-        return _response(self)
+        model, sky, series = _response(self)
+        return model, sky, series.on(silicon_um)
 
 
 @functools.lru_cache(maxsize=4)
-def _response(sky_model: SkyModel) -> tuple[FringeModel, SkySpectrum, Response]:
+def _response(sky_model: SkyModel) -> tuple[FringeModel, SkySpectrum, SiliconSeries]:
     model, sky = sky_model.fringe_model(), sky_model.spectrum()
-    span = sky_model.thickness_range_um
-    if sky_model.beams == "centre":
-        one_beam = response_with_islands(model, lambda own: sky_response(own, sky, thickness_range_um=span))
-        return model, sky, one_beam
-    return model, sky, sensor_response(model, sky, sky_model.placement, span)
+
+    def in_one_beam(own: FringeModel, span: tuple[float, float], like: Response | None) -> Response:
+        return response_with_islands(own, lambda part: sky_response(part, sky, thickness_range_um=span))
+
+    series = sky_of_maps(
+        model,
+        sky,
+        sky_model.placement,
+        sky_model.thickness_range_um,
+        sky_model.silicon_nodes_um,
+        phase_sigma=sky_model.phase_sigma,
+        respond=in_one_beam if sky_model.beams == "centre" else None,
+    )
+    return model, sky, series
 
 
 class SkyModelConfig(FringeModelConfig):
@@ -171,6 +192,7 @@ class SkyModelConfig(FringeModelConfig):
         section = SensorSection.of_image(detector, (rows, columns), header or {})
         choice = self.choice_of(detector)
         setup = Setup.from_name(choice.setup)
+        stated = (header or {}).get(LABORATORY_TEMPERATURE)
         return SkyModel(
             choice=(choice.setup, tuple(sorted(choice.applied_effects.items()))),
             placement=SensorPlacement.of(detector, setup.pixel_scale_arcsec, section),
@@ -180,6 +202,7 @@ class SkyModelConfig(FringeModelConfig):
             rotational_temperature_k=self.rotational_temperature_k,
             vibrational_temperature_k=self.vibrational_temperature_k,
             thickness_range_um=thickness_span_um(thickness_um),
+            laboratory_temperature_k=None if stated is None else to_number(LABORATORY_TEMPERATURE, stated),
         )
 
 
@@ -215,11 +238,18 @@ def _check_map(thickness: ThicknessMap, choice: ModelChoice) -> None:
     if "SETUP" not in thickness.metadata:
         return  # not fitted here
     fitted = effects_of_header(thickness.metadata)
-    on_sky = ModelChoice(choice.setup, fitted).applied_effects
-    if on_sky != choice.applied_effects:
+    on_sky = _of_the_map(ModelChoice(choice.setup, fitted).applied_effects)
+    wanted = _of_the_map(choice.applied_effects)
+    if on_sky != wanted:
         raise InputError(
             "effects on the sky",
-            choice.applied_effects,
+            wanted,
             f"{on_sky}, with which the thickness was fitted",
             source=thickness.detector or None,
         )
+
+
+def _of_the_map(settings: Mapping[str, float]) -> dict[str, float]:
+    """Those effects on which the thickness depends that flats give: not those of the sky alone."""
+    active = activate_effects(settings, known_effects())
+    return settings_of(item for item in active if not item.effect.sky_only)

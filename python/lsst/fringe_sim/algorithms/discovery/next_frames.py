@@ -135,7 +135,7 @@ def _laboratory_flats(model: FringeModel) -> list[tuple[FlatMeasurement, FringeM
     settings = {
         f"{item.effect.name}.{key}": value
         for item in model.effects
-        if not item.effect.laboratory_only
+        if not (item.effect.laboratory_only or item.effect.sky_only)
         for key, value in item.values.items()
     }
     return [(FlatMeasurement("laboratory", title, series), FringeModel.from_setup(setup, settings))]

@@ -110,9 +110,13 @@ def discover(
     refuse_noiseless(cube.metadata, cube.detector or None)
     check_setup(cube, model)
     known = {item.effect.name for item in model.effects}
-    # Flats do not see the spectrum of the night sky.
+    # Flats do not see the spectrum of the night sky, nor the sensor at the telescope.
     catalogue = known_effects() if effects is None else effects
-    own = [effect for effect in catalogue if effect.acts_on != "spectrum" or effect.name in known]
+    own = [
+        effect
+        for effect in catalogue
+        if not (effect.sky_only or effect.acts_on == "spectrum") or effect.name in known
+    ]
     return search_exposures(cube, model, own, rng, options, report)
 
 

@@ -14,6 +14,7 @@ from .silicon import (
     SiliconModel,
     SiliconSearch,
     find_silicon,
+    silicon_map,
 )
 from .templates import FringeTemplates
 
@@ -36,5 +37,6 @@ __all__ = [
     "make_templates",
     "remarks",
     "says_misfit",
+    "silicon_map",
     "walk_fit",
 ]

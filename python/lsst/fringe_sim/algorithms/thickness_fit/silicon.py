@@ -27,6 +27,7 @@ from scipy.special import ndtr
 from ...compiled import kernel
 from ...errors import InputError, OutOfRangeError
 from ...model import FringeModel
+from ...products import ThicknessMap, mask_bits
 from ..thickness_fit_options import SILICON_FIELDS
 from .amplitudes import Amplitudes
 from .borders import gather_pixels
@@ -42,6 +43,7 @@ __all__ = [
     "SiliconTables",
     "find_silicon",
     "silicon_free",
+    "silicon_map",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -186,7 +188,51 @@ class SiliconFit:
             for number, (value, sigma) in enumerate(zip(self.coefficients, spread, strict=True)):
                 found[f"SICOEF{number}"] = round(float(value), 7)
                 found[f"SISIGM{number}"] = round(float(sigma), 8)
+            correlation = self.covariance / np.outer(spread, spread)
+            for first, second in itertools.combinations(range(spread.size), 2):
+                found[f"SICORR{first}{second}"] = round(float(correlation[first, second]), 6)
         return found
+
+
+def silicon_map(fitted: ThicknessMap, model: FringeModel) -> ThicknessMap | None:
+    """Thickness of the silicon on the pixels of a map that was fitted together with it; `None` if it was not decided.
+
+    Parameters
+    ----------
+    fitted : `ThicknessMap`
+        Map of the other layer, with the keywords of `SiliconFit.cards`.
+    model : `FringeModel`
+        The model of that fit.
+    """
+    header = fitted.metadata
+    if not header.get("SIFIT"):
+        return None
+    count = sum(key.startswith("SICOEF") for key in header)
+    coefficients, spread = (
+        np.array([float(header[f"{word}{number}"]) for number in range(count)])
+        for word in ("SICOEF", "SISIGM")
+    )
+    covariance = np.diag(spread**2)
+    for first, second in itertools.combinations(range(count), 2):
+        shared = float(header[f"SICORR{first}{second}"]) * spread[first] * spread[second]
+        covariance[first, second] = covariance[second, first] = shared
+    search = SiliconSearch({1: 0, 3: 1, 6: 2}[count])
+    system, slip = model.system, float(header["SISLIP"])
+    shape = (fitted.value.shape[0], fitted.value.shape[1])
+    forecast = SiliconForecast(0.0, slip, float(header["SIORDER"]), np.zeros(0), True, str(header["SIWHY"]))
+    found = SiliconFit(search, coefficients, covariance, 1.0, slip, forecast)
+    offset, sigma = found.offset_um(shape)
+    nominal = system.stack.layers[system.stack.position(system.detection)].thickness_um
+    return ThicknessMap(
+        value=(nominal + offset).astype(np.float32),
+        sigma=sigma.astype(np.float32),
+        chi2=np.zeros(shape, np.float32),
+        slip_probability=np.full(shape, slip, np.float32),
+        mask=fitted.mask & mask_bits("NO_DATA"),
+        layer=system.detection,
+        metadata={key: value for key, value in header.items() if key.startswith("SI")},
+        detector=fitted.detector,
+    )
 
 
 @dataclass(frozen=True, eq=False)
