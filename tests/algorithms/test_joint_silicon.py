@@ -12,13 +12,14 @@ from lsst.fringe_sim.algorithms.thickness_fit import (
     SiliconModel,
     SiliconSearch,
     find_silicon,
+    silicon_map,
 )
 from lsst.fringe_sim.algorithms.thickness_fit.fit import amplitudes_from_cube
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.errors import FringeSimError, InputError, OutOfRangeError
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import FlatExposures, FringeCube
+from lsst.fringe_sim.products import FlatExposures, FringeCube, ThicknessMap
 
 SHAPE = (96, 104)
 BROAD = np.arange(880.0, 991.0, 10.0)
@@ -97,6 +98,10 @@ def test_one_silicon_for_the_sensor(rng, tmp_path, capsys) -> None:
     assert run(["fit", str(tmp_path / "cube.fits"), "--silicon", "sensor", "--out", str(out)]) == 0
     assert "silicon minus that of the model" in capsys.readouterr().out
     assert fits.getheader(out / "thickness.fits")["SICOEF0"] == found["SICOEF0"]
+    silicon = ThicknessMap.read_any(out / "silicon.fits", "detection")
+    np.testing.assert_allclose(silicon.value, 100.0 + found["SICOEF0"], rtol=1e-7)
+    np.testing.assert_allclose(silicon.sigma, found["SISIGM0"], rtol=1e-5)
+    assert silicon.metadata["LABTEMP"] == model.setup.temperature_k
 
 
 @pytest.mark.slow
@@ -109,6 +114,13 @@ def test_tilted_silicon(rng) -> None:
     expected = (-0.52, 0.11, 0.0)
     for number, value in enumerate(expected):
         assert found[f"SICOEF{number}"] == pytest.approx(value, abs=5.0 * found[f"SISIGM{number}"] + 5e-6)
+    silicon = silicon_map(fitted, model)
+    assert silicon is not None
+    offset = np.broadcast_to(-0.52 + 0.11 * places(SHAPE[1]), SHAPE)
+    error = silicon.value.astype(float) - (100.0 + offset)
+    assert np.abs(error).max() < 5.0 * silicon.sigma.max() + 2e-5  # single precision of 100 um
+    # The mean of the sensor is known better than its edges.
+    assert silicon.sigma[48, 52] < silicon.sigma[0, 0]
     pull = pulls(fitted, truth)
     assert pull.mean() == pytest.approx(0.0, abs=0.05)
     assert pull.std() == pytest.approx(1.0, abs=0.1)
@@ -122,6 +134,7 @@ def test_broad_flats_cannot_tell_and_say_so(rng, tmp_path, capsys) -> None:
     out = tmp_path / "fit"
     assert run(["fit", str(tmp_path / "cube.fits"), "--silicon", "sensor", "--out", str(out)]) == 0
     assert "silicon not fitted" in capsys.readouterr().out
+    assert not (out / "silicon.fits").exists()
     header = fits.getheader(out / "thickness.fits")
     assert header["SIFIT"] is False
     assert "SICOEF0" not in header

@@ -10,6 +10,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.cli.observed import TemplateFolder
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.products import SkyFringe, ThicknessMap, mask_bits
@@ -17,6 +18,7 @@ from lsst.fringe_sim.tasks import SkyFringeSimTask
 from lsst.fringe_sim.tasks.sky_fringe_sim import SkyExposure
 
 AIRMASS = 1.3
+LAYERS = (("thickness", "adhesive"), ("silicon", "detection"))
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,49 @@ def test_the_sky_of_the_command_is_that_of_the_task(thickness, tmp_path) -> None
     exposure = SkyExposure(1, 20260115, 23.0, 30.0, AIRMASS, "y_10")
     theirs = task.run(mapped, exposure, Camera.from_name("lsstCam").detector("R10_S00")).sky
     np.testing.assert_allclose(frame.image[known], theirs.image[known], rtol=2e-6)
+
+
+@pytest.mark.slow
+def test_maps_of_both_layers_have_one_sky(tmp_path) -> None:
+    """The same in command and task; templates beside it that a correction takes."""
+    layer = e2v_321((40, 41)).astype(np.float32)
+    silicon = np.broadcast_to(np.linspace(100.02, 100.05, 41), layer.shape).astype(np.float32)
+    silicon = np.where(np.arange(40)[:, None] < 2, np.nan, silicon)
+    for name, image in (("thickness", layer), ("silicon", silicon)):
+        fits.PrimaryHDU(image).writeto(tmp_path / f"{name}.fits")
+    maps = [
+        "--thickness",
+        str(tmp_path / "thickness.fits"),
+        "--silicon-thickness",
+        str(tmp_path / "silicon.fits"),
+    ]
+    given = ["--detector", "R10_S00", "--airmass", str(AIRMASS), "--noiseless", "--templates"]
+    assert run(["sky", *maps, *given, "--out", str(tmp_path / "out")]) == 0
+    frame = SkyFringe.read_fits(tmp_path / "out" / "sky_R10_S00_00.fits")
+    assert np.all(frame.mask[:2] != 0)
+    assert np.all(frame.mask[2:] == 0)
+    task = SkyFringeSimTask(config=SkyFringeSimTask.ConfigClass(noise=False, night="steady", silicon="map"))
+    exposure = SkyExposure(1, 20260115, 23.0, 30.0, AIRMASS, "y_10")
+    read = [ThicknessMap.read_any(tmp_path / f"{name}.fits", of) for name, of in LAYERS]
+    theirs = task.run(read[0], exposure, Camera.from_name("lsstCam").detector("R10_S00"), read[1]).sky
+    np.testing.assert_array_equal(theirs.mask, frame.mask)
+    np.testing.assert_allclose(frame.image[2:], theirs.image[2:], rtol=2e-6)
+    assert theirs.metadata["PHASERMS"] == pytest.approx(frame.metadata["PHASERMS"], rel=1e-4)
+    templates = TemplateFolder(tmp_path / "out").of("R10_S00")
+    assert [each.metadata["TEMPKIND"] for each in templates] == ["sky", "phase"]
+    np.testing.assert_allclose(
+        templates[0].image[2:], frame.fraction()[2:] - frame.fraction()[2:].mean(), atol=2e-6
+    )
+    assert templates[1].image[2:].std(dtype=float) == pytest.approx(frame.metadata["PHASERMS"], rel=1e-3)
+
+
+def test_a_map_of_the_silicon_has_the_pixels_of_the_other(thickness, tmp_path, capsys) -> None:
+    other = tmp_path / "silicon.fits"
+    fits.PrimaryHDU(np.full((7, 8), 100.0, np.float32)).writeto(other)
+    arguments = ["--silicon-thickness", str(other), "--out", str(tmp_path / "out")]
+    assert run(["sky", "--thickness", thickness, *arguments]) == 1
+    assert "shape of the map of the silicon" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -35,7 +35,10 @@ PLACES = [(effect, parameter) for effect, parameter in CASES if parameter.name i
 
 @pytest.fixture(scope="module")
 def base() -> FringeModel:
-    return FringeModel.from_setup("ts8_e2v")
+    """A sensor with the lines of the laboratory, and with the temperature of a telescope."""
+    model = FringeModel.from_setup("ts8_e2v")
+    system = dataclasses.replace(model.base_system, laboratory_temperature_k=193.15)
+    return dataclasses.replace(model, base_system=system)
 
 
 @pytest.fixture(scope="module")

@@ -30,6 +30,8 @@ CATALOGUE = (
     "oh_bands",
     "converging_beam",
     "sky_continuum",
+    "epoxy_temperature",
+    "sensor_temperature",
 )
 GRID = (12.0, 0.004, 500)
 
@@ -145,6 +147,8 @@ def test_cells_of_many_pixels_see_the_mean_of_their_beams() -> None:
         ("lsst_e2v", "", {}),
         ("lsst_e2v", "contrast_loss", {"contrast_loss.factor": 0.75}),
         ("monocam", "rotational_temperature", {"rotational_temperature.offset": 25.0}),
+        ("monocam", "epoxy_temperature", {"epoxy_temperature.phase_per_10k": 0.2}),
+        ("monocam", "sensor_temperature", {"sensor_temperature.offset": 6.0}),
     ],
 )
 def test_a_hidden_effect_is_found_on_the_sky(setup: str, name: str, settings: dict[str, float]) -> None:

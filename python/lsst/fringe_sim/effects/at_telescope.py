@@ -14,8 +14,8 @@ PHASE_NM, PER_K = 960.0, 10.0
 """Wavelength at which the phase of the adhesive is stated [nm], and the change of temperature that it is for [K]."""
 
 ADHESIVE_PHASE_SIGMA = 0.3
-"""Uncertainty of that phase [rad per 10 K]. Epoxies have (5 to 10) 10⁻⁵ per kelvin in length and as much, of the other
-sign, in index; either alone turns a fringe of 14 µm by 0.1 to 0.3 rad, and the sign of their sum is not known."""
+"""Uncertainty of that phase [rad per 10 K]. Epoxies change by about 10⁻⁴ per kelvin in length and as much, of the
+other sign, in index; either alone turns a fringe of 14 µm by 0.2 to 0.4 rad, and the sum's sign is not known."""
 
 
 def adhesive_change(system: OpticalSystem, phase_per_10k: float) -> float:
@@ -57,7 +57,7 @@ class EpoxyTemperature(PlainNullEffect):
     title = "adhesive at another temperature than in the laboratory"
     acts_on = "stack"
     sky_only = True
-    reference = "expansion and thermo-optic coefficient of epoxies, each about 1e-4 per kelvin; the vendor states none"
+    reference = "expansion and change of index of epoxies, each about 1e-4 per kelvin; the vendor states none"
     parameters = (
         Parameter(
             "phase_per_10k", "rad", 0.0, (-2.0, 2.0), ADHESIVE_PHASE_SIGMA,

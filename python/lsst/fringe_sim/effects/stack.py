@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from ..optics import Layer, Medium, get_medium
 from ..optics.diffuse import DiffuseReturn
-from ..optics.system import OpticalSystem
+from ..optics.system import OpticalSystem, Structure
 from .base import Effect, FloatArray, Parameter, PlainNullEffect, ResponseContext, SearchHints, Values
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "EpoxyAbsorption",
     "EpoxyIndex",
     "GateOxide",
+    "GateStructure",
     "GateThickness",
     "InsertedLayer",
     "Insulation",
@@ -370,6 +371,25 @@ class DiffuseGateSide(PlainNullEffect):
         for name in names:
             stack = stack.with_inserted(Layer(name, medium, 0.0), before=below)
         return replace(system, stack=stack, diffuse=DiffuseReturn(*names, values["reflectance"]))
+
+
+class GateStructure(PlainNullEffect):
+    """In a part of every pixel gates of neighbouring phases overlap: there is one more layer of polysilicon.
+
+    Its fringes are out of step with those of the rest, by an angle that depends on the wavelength.
+    """
+
+    name = "gate_structure"
+    title = "overlapping gates"
+    acts_on = "stack"
+    reference = f"{_LAGE} (gates of 0.3-0.34 um, measured on single sensors)"
+    parameters = (Parameter("part", "", 0.0, (0.0, 1.0), 0.2, "part of a pixel in which gates overlap"),)
+    search = SearchHints(natural_bounds=(0.0, 1.0))
+
+    def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
+        """Add the overlap, as thick as the gates."""
+        added_um = _layer(system, "gates").thickness_um
+        return replace(system, structure=Structure("gates", added_um, values["part"]))
 
 
 class ContrastLoss(PlainNullEffect):

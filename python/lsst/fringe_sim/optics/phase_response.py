@@ -92,6 +92,12 @@ class PhaseResponse:
         }
         return replace(self, **sums)
 
+    def mixed_with(self, other: PhaseResponse, part: float) -> PhaseResponse:
+        """Mean over a pixel of which a part has another response."""
+        arrays = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _COEFFICIENTS}
+        shares = [(1.0 - part) * np.asarray(self.share), part * np.asarray(other.share)]
+        return replace(self, **arrays, share=np.concatenate(shares))
+
     @named_units
     def evaluate(self, thickness_um: ArrayLike) -> FloatArray:
         """Response at every node.

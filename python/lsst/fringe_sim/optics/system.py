@@ -15,13 +15,23 @@ from .phase_response import PhaseResponse, reduce_to_phase
 from .stack import LayerStack
 from .two_phase_response import TwoPhaseResponse, reduce_to_two_phases
 
-__all__ = ["OBSERVABLES", "OpticalSystem"]
+__all__ = ["OBSERVABLES", "OpticalSystem", "Structure"]
 
 INVERSIONS = 40
 """Fixed-point steps from a true wavelength to the nominal one; each leaves a part of the slope of the errors."""
 
 OBSERVABLES = ("detection", "total")
 """``detection``: absorbed in the detection layer. ``total``: 1 - R - T of the stack, as the paper's fit used."""
+
+
+@named_units
+@dataclass(frozen=True)
+class Structure:
+    """A part of every pixel in which one layer is thicker; coarse beside a wavelength, so that intensities add."""
+
+    layer: str
+    added_um: float
+    part: float
 
 
 @named_units
@@ -58,6 +68,8 @@ class OpticalSystem:
         Spectrum of the lamp behind the monochromator; white if not given.
     diffuse : `DiffuseReturn`, optional
         What the gate side scatters back into the silicon; nothing if not given.
+    structure : `Structure`, optional
+        Part of every pixel in which a layer is thicker; none if not given.
     laboratory_temperature_k : `float`, optional
         Temperature at which thicknesses were measured, for a sensor at a telescope [K].
     """
@@ -76,6 +88,7 @@ class OpticalSystem:
     wavelength_errors_nm: tuple[tuple[tuple[float, float], ...], ...] = ()
     lamp: LampSpectrum | None = None
     diffuse: DiffuseReturn | None = None
+    structure: Structure | None = None
     laboratory_temperature_k: float | None = None
 
     def __post_init__(self) -> None:
@@ -119,6 +132,11 @@ class OpticalSystem:
 
     def reduce(self, illumination: Illumination) -> PhaseResponse:
         """Closed form of the response in the thickness of the varying layer, one set per node."""
+        if self.structure is not None:
+            here = replace(self, structure=None)
+            layer = self.stack.layers[self.stack.position(self.structure.layer)]
+            there = here.with_layer(layer.name, thickness_um=layer.thickness_um + self.structure.added_um)
+            return here.reduce(illumination).mixed_with(there.reduce(illumination), self.structure.part)
         index = self.stack.indices(illumination.wavelength_nm, self.temperature_k)
         thickness = np.where(np.isinf(self.stack.thickness_um), 0.0, self.stack.thickness_um)
         if self.observable == "detection":
@@ -165,6 +183,8 @@ class OpticalSystem:
             raise InputError("observable", self.observable, "detection (with two varying layers)")
         if self.diffuse is not None:
             raise InputError("diffuse return", self.diffuse.reflectance, "none (with two varying layers)")
+        if self.structure is not None:
+            raise InputError("structure", self.structure.layer, "none (with two varying layers)")
         if np.any(self.stack.thickness_spread_um):
             raise InputError(
                 "thickness spread", self.stack.thickness_spread_um.tolist(), "zero in all layers"

@@ -211,8 +211,8 @@ class EpoxyFitTask(PipelineTask):
         Returns
         -------
         result : `~lsst.pipe.base.Struct`
-            ``thickness``, a `ThicknessMap`, and ``silicon``, one of the silicon; `None` if it is not fitted, or if the
-            flats do not decide.
+            ``thickness``, a `ThicknessMap`, and ``silicon``, one of the silicon; `None` if it is not fitted, or if
+            the flats do not decide.
 
         Raises
         ------

@@ -151,7 +151,7 @@ class SkyFringeSimConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnections
         min=0.0,
         max=2.0,
         inclusiveMax=True,
-        doc="Standard uncertainty of the phase of the adhesive between the temperatures of laboratory and sky, rad per "
+        doc="Standard uncertainty of the phase of the adhesive between laboratory and sky temperature, rad per "
         "10 K; what it leaves open goes into the header. Its value is the effect epoxy_temperature.phase_per_10k.",
     )
     noise: Field[bool] = Field(
