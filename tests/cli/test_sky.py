@@ -68,8 +68,8 @@ def test_the_sky_of_the_command_is_that_of_the_task(thickness, tmp_path) -> None
 @pytest.mark.slow
 def test_maps_of_both_layers_have_one_sky(tmp_path) -> None:
     """The same in command and task; templates beside it that a correction takes."""
-    layer = e2v_321((40, 41)).astype(np.float32)
-    silicon = np.broadcast_to(np.linspace(100.02, 100.05, 41), layer.shape).astype(np.float32)
+    layer = np.linspace(14.0, 14.6, 40 * 41, dtype=np.float32).reshape(40, 41)
+    silicon = np.broadcast_to(np.linspace(100.02, 100.04, 41), layer.shape).astype(np.float32)
     silicon = np.where(np.arange(40)[:, None] < 2, np.nan, silicon)
     for name, image in (("thickness", layer), ("silicon", silicon)):
         fits.PrimaryHDU(image).writeto(tmp_path / f"{name}.fits")

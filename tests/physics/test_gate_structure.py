@@ -1,4 +1,4 @@
-"""Gates that overlap in a part of a pixel, against own lines, and what tells them from other layers of the gate side."""
+"""Gates that overlap in a part of a pixel, against own lines, and what tells them from other layers there."""
 
 from __future__ import annotations
 
