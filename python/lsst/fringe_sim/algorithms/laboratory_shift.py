@@ -21,6 +21,7 @@ from .sky_response import FrameTable, Response
 
 __all__ = ["ADHESIVE_PHASE_SIGMA", "phase_change", "template_pair", "widened_um"]
 
+FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
 LARGEST_SIGMA = 2.0
@@ -52,9 +53,13 @@ def phase_change(
     if factor == 0.0:
         return None
     thickness = np.asarray(thickness_um)
-    longer, shorter = (table.frame(thickness * (1.0 + sign * factor)) for sign in (1.0, -1.0))
-    longer, shorter = (frame / np.nanmean(frame, dtype=np.float64) for frame in (longer, shorter))
+    longer, shorter = (_over_mean(table.frame(thickness * (1.0 + sign * factor))) for sign in (1.0, -1.0))
     return np.asarray(0.5 * (longer - shorter), dtype=np.float32)
+
+
+def _over_mean(frame: FloatImage) -> FloatArray:
+    """Frame in units of the mean of its known pixels."""
+    return frame / frame.mean(dtype=np.float64, where=np.isfinite(frame))
 
 
 def template_pair(
@@ -77,12 +82,14 @@ def template_pair(
     table = response.sky(scale)
     frame = table.frame(thickness)
     change = phase_change(table, thickness, model, sigma)
-    patterns = [frame / np.nanmean(frame, dtype=np.float64), *([] if change is None else [change])]
+    patterns: list[NDArray[Any]] = [_over_mean(frame), *([] if change is None else [change])]
     mask = np.where(np.isfinite(frame), np.int32(0), np.int32(mask_bits("NO_DATA")))
     cards = {**(metadata or {}), "PHASESIG": sigma}
     return [
         FringeFrame(
-            image=np.where(mask, 0.0, pattern - np.nanmean(pattern, dtype=np.float64)).astype(np.float32),
+            image=np.where(mask, 0.0, pattern - pattern.mean(dtype=np.float64, where=mask == 0)).astype(
+                np.float32
+            ),
             mask=mask,
             variance=np.zeros(mask.shape, np.float32),
             physical_filter=model.setup.bandpass,

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -94,7 +95,9 @@ class PhaseResponse:
 
     def mixed_with(self, other: PhaseResponse, part: float) -> PhaseResponse:
         """Mean over a pixel of which a part has another response."""
-        arrays = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _COEFFICIENTS}
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _COEFFICIENTS
+        }
         shares = [(1.0 - part) * np.asarray(self.share), part * np.asarray(other.share)]
         return replace(self, **arrays, share=np.concatenate(shares))
 

@@ -76,7 +76,7 @@ class SkyModel:
         return SkySpectrum.dark(lines, self.airmass, solar_flux_sfu=self.solar_flux_sfu)
 
     def response(
-        self, silicon_um: NDArray[np.floating] | None = None
+        self, silicon_um: NDArray[np.float64] | None = None
     ) -> tuple[FringeModel, SkySpectrum, Response]:
         """Model, sky and response, shared by the exposures of a night that this process simulates.
 
