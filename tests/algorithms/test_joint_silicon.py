@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -9,6 +11,8 @@ from astropy.io import fits
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.algorithms.thickness_fit import (
     Nuisances,
+    SiliconFit,
+    SiliconForecast,
     SiliconModel,
     SiliconSearch,
     find_silicon,
@@ -76,6 +80,30 @@ def pulls(fitted, truth: np.ndarray) -> np.ndarray:
     error = (fitted.value - truth)[good]
     assert np.count_nonzero(np.abs(error) > 0.5 * ORDER_UM) == 0
     return np.asarray(error / fitted.sigma[good])
+
+
+def test_the_header_of_a_fit_holds_the_map_of_its_silicon() -> None:
+    """Value and uncertainty with all correlations; none where the flats did not decide."""
+    search = SiliconSearch(degree=2)
+    spread = np.array([2e-4, 3e-4, 1e-4, 5e-4, 2e-4, 4e-4])
+    correlation = np.eye(6)
+    correlation[0, 3] = correlation[3, 0] = -0.7
+    forecast = SiliconForecast(1e-4, 1e-6, 0.13, np.zeros(2), True, "seen")
+    coefficients = np.array([0.3, -0.02, 0.01, 0.04, 0.0, -0.03])
+    covariance = correlation * np.outer(spread, spread)
+    found = SiliconFit(search, coefficients, covariance, 1.0, 1e-6, forecast)
+    one = np.ones(SHAPE, np.float32)
+    fitted = ThicknessMap(
+        14.0 * one, 0.001 * one, one, 0.0 * one, np.zeros(SHAPE, np.int32), "adhesive", found.cards()
+    )
+    model = FringeModel.from_setup("ts8_e2v")
+    silicon = silicon_map(fitted, model)
+    assert silicon is not None
+    offset, sigma = found.offset_um(SHAPE)
+    np.testing.assert_allclose(silicon.value, 100.0 + offset, atol=1e-5)
+    np.testing.assert_allclose(silicon.sigma, sigma, rtol=1e-3)
+    undecided = replace(fitted, metadata={**fitted.metadata, "SIFIT": False})
+    assert silicon_map(undecided, model) is None
 
 
 @pytest.mark.slow
