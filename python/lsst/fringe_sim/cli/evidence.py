@@ -11,7 +11,6 @@ from .output import OutputFolder, output_folder
 from .parameters import effects_from_option
 from .progress import progress
 
-
 __all__ = ["evidence"]
 
 

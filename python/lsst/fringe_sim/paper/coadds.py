@@ -30,6 +30,9 @@ FIRST_HOUR = 19.0
 CORNER_PX, WINDOW_PX = 1500.0, 1000
 """Part of every sensor from which pieces are cut."""
 
+RAFT_UM = (13.8, 28.5)
+"""Adhesive of all nine sensors, if the thinnest place of each has 14 µm."""
+
 TREECORR_PX = 64
 
 
@@ -71,8 +74,8 @@ def components(context: Context) -> Section:
 
 def coadd(context: Context) -> Section:
     """Figure 16."""
-    table = lines_only(context.setup("lsst_e2v")).sky()
     maps = _raft_maps(context)
+    table = lines_only(context.setup("lsst_e2v"), range_um=RAFT_UM if maps else RANGE_UM).sky()
     layers = maps or [context.detail_um]
     patterns = []
     for layer in layers:
@@ -100,11 +103,15 @@ def coadd(context: Context) -> Section:
         Curve(last.separation_px, result.model[-1], f"ξ₁/N + (1 − 1/N) ξ_floor, N = {counts[-1]}", ".")
     )
     rms = PERCENT * float(np.sqrt(np.mean([pattern.var() for pattern in patterns])))
-    sensors = "the nine sensors of the raft" if maps else "one sensor, where the paper has nine (their maps are not at hand)"
+    sensors = (
+        "the nine sensors of the raft"
+        if maps
+        else "one sensor, where the paper has nine (their maps are not at hand)"
+    )
     return Section(
         "Coadds: Fig. 16",
-        f"Coadds of randomly placed and rotated pieces of {sensors} (fringes {rms:.2f} % rms, uncorrected) with photon "
-        "noise.",
+        f"Coadds of randomly placed and rotated pieces of {sensors} (fringes {rms:.2f} % rms, uncorrected) with "
+        "photon noise.",
         {"coadd_800": excess, "coadd_treecorr": _against_treecorr(patterns[0])},
         (Graph("correlation of coadds", "separation [px]", "ξ [sky²]", tuple(curves), logarithmic=True),),
         "Correlation of more and more exposures against that of as many exposures of noise; a line ends where the "
@@ -122,15 +129,15 @@ def _raft_maps(context: Context) -> list[FloatArray]:
         with fits.open(path) as hdus:
             relative = hdus["FINE"].data.astype(float)
             places = hdus["YSRC"].data.astype(float), hdus["XSRC"].data.astype(float)
-        # Only the range of each map is published, not its zero; what is above the tabulated thicknesses is folded back.
-        layer = MAP_RANGE_UM[0] + np.abs(relative - np.nanmin(relative)) % (RANGE_UM[1] - MAP_RANGE_UM[0] - 0.1)
+        # Only the range of each map is published, not its zero.
+        layer = MAP_RANGE_UM[0] + relative - np.nanmin(relative)
         at = CORNER_PX + np.arange(WINDOW_PX, dtype=float)
-        layers.append(np.clip(RectBivariateSpline(*places, layer)(at, at), *RANGE_UM))
+        layers.append(np.clip(RectBivariateSpline(*places, layer)(at, at), *RAFT_UM))
     return layers
 
 
 def _against_treecorr(pattern: FloatArray) -> float:
-    """Largest departure of the correlation of a piece of a pattern from that of TreeCorr, relative to its variance [%]."""
+    """Largest departure of the correlation of a piece of a pattern from TreeCorr's, over its variance [%]."""
     try:
         import treecorr
     except ImportError:
@@ -144,4 +151,6 @@ def _against_treecorr(pattern: FloatArray) -> float:
         min_sep=bins.smallest_px, max_sep=bins.largest_px, nbins=bins.count, bin_slop=0.0, brute=True
     )
     theirs.process(catalogue)
-    return PERCENT * float(np.nanmax(np.abs(correlation_function(image, bins=bins).xi - theirs.xi)) / image.var())
+    return PERCENT * float(
+        np.nanmax(np.abs(correlation_function(image, bins=bins).xi - theirs.xi)) / image.var()
+    )

@@ -35,7 +35,7 @@ FIT_CONTRAST = 0.15
 
 UNLIKE = {
     "diffuse_gate_side.reflectance": 0.35,
-    "epoxy_absorption.k": 0.0023,
+    "epoxy_absorption.k": 0.0015,
     "thickness_spread.sigma": 30.0,
     "epoxy_index.cauchy": 0.003,
 }
@@ -43,7 +43,7 @@ UNLIKE = {
 
 UNLIKE_SILICON = "Si_franta2017"
 
-FIT_SHAPE = (200, 204)
+FIT_SHAPE, UNLIKE_SHAPE = (200, 204), (120, 122)
 ROW = 3015
 """Row 3000 of the frame trimmed by 15 rows."""
 
@@ -171,7 +171,9 @@ def flat_contrast(context: Context) -> Section:
 def row_3000(context: Context) -> Section:
     """Figure 6."""
     names = ("row_phase", "row_ratio", "row_correlation")
-    text = "Row 3000 of the 960 nm flat (the figure calls it a column), beside 1 − R − T on the published map."
+    text = (
+        "Row 3000 of the 960 nm flat (the figure calls it a column), beside 1 − R − T on the published map."
+    )
     flat, layer = context.map_path(MEASURED_FLAT), context.map_path(MEASURED_MAP)
     if flat is None or layer is None:
         return Section("A row: Fig. 6", f"{text} Flat and map are not at hand.", missing(*names))
@@ -227,10 +229,14 @@ def thickness_fit(context: Context) -> Section:
     """Section 3.3, on flats whose thickness is known: of the very model of the fit, and of another one."""
     model = FringeModel.from_setup(context.setup(LAB), {"contrast_loss.factor": FIT_CONTRAST})
     other = FringeModel.from_setup(Setup.from_name(LAB).with_silicon(UNLIKE_SILICON), UNLIKE)
-    detail = context.detail_um[: FIT_SHAPE[0], : FIT_SHAPE[1]]
     order = float(model.fringe_order_um(WAVELENGTH_NM))
     values, pictures = {}, []
-    for true, suffix, told in ((model, "", "own model"), (other, "_unlike", "another model")):
+    whole = context.detail_um[: FIT_SHAPE[0], : FIT_SHAPE[1]]
+    part = whole[: UNLIKE_SHAPE[0], : UNLIKE_SHAPE[1]]
+    for true, detail, suffix, told in (
+        (model, whole, "", "own model"),
+        (other, part, "_unlike", "another model"),
+    ):
         cube = _flats(true, detail, context.rng("thickness fit"))
         for method, item, name in (
             ("guo2022", "walk_slips", "walk from pixel to pixel"),
@@ -247,11 +253,11 @@ def thickness_fit(context: Context) -> Section:
             pictures.append(Picture(f"{name}, {told}", "fitted − true [nm]", error, True))
     return Section(
         "Thickness fit: section 3.3",
-        f"{len(cube.wavelength_nm)} simulated flats of {detail.shape[1]} × {detail.shape[0]} px with "
+        f"{len(cube.wavelength_nm)} simulated flats of {whole.shape[1]} × {whole.shape[0]} px with "
         f"{PERCENT * FIT_NOISE:g} % of noise and the measured contrast of 2 %, fitted with the algorithm of the "
         "paper and with the one that is the default here. Both use the detection layer. The flats are once those of "
-        "the model that is fitted, and once of another: silicon of another table, a diffuse gate side, an adhesive that "
-        "absorbs, varies inside a pixel and disperses.",
+        f"the model that is fitted, and once, {part.shape[1]} × {part.shape[0]} px, of another: silicon of another "
+        "table, a diffuse gate side, an adhesive that absorbs, varies inside a pixel and disperses.",
         values,
         tuple(pictures),
         "Error of the fitted thickness.",

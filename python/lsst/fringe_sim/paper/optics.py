@@ -91,7 +91,9 @@ def _against_figure_8(context: Context) -> tuple[dict[str, float], tuple[Graph, 
     ]
     values = {
         "lines_found": PERCENT * float(intensity[found].sum() / intensity.sum()),
-        "lines_strength": float(np.corrcoef(np.log(intensity[found][strong]), np.log(strength[found][strong]))[0, 1]),
+        "lines_strength": float(
+            np.corrcoef(np.log(intensity[found][strong]), np.log(strength[found][strong]))[0, 1]
+        ),
         "red_bands": shares[0] / shares[1],
     }
     curves = tuple(

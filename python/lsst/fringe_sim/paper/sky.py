@@ -51,11 +51,16 @@ HSC_SCALE = 60.0
 
 
 @functools.lru_cache(maxsize=8)
-def lines_only(setup: Setup, field_deg: float = 0.0, silicon_offset_um: float = 0.0) -> SkyResponse:
+def lines_only(
+    setup: Setup,
+    field_deg: float = 0.0,
+    silicon_offset_um: float = 0.0,
+    range_um: tuple[float, float] = RANGE_UM,
+) -> SkyResponse:
     """Response to the OH lines alone, as in the paper."""
     effects = {"silicon_thickness.offset": silicon_offset_um} if silicon_offset_um else None
     model = FringeModel.from_setup(setup, effects, field_x_deg=field_deg)
-    return sky_response(model, SkySpectrum(EmissionLines.oh(), airmass=AIRMASS), thickness_range_um=RANGE_UM)
+    return sky_response(model, SkySpectrum(EmissionLines.oh(), airmass=AIRMASS), thickness_range_um=range_um)
 
 
 def monocam(context: Context) -> Section:
@@ -97,7 +102,11 @@ def hsc(context: Context) -> Section:
     half = PERCENT * fringe_amplitudes(frame).half_peak_to_peak
     curves = [Curve(_places(frame), _diagonal(frame), "this package, random relief")]
     measured = _measured_hsc(context)
-    pictures = () if measured is None else (Picture("HSC sky, measured", "sky / mean − 1 [%]", measured, True, 3.28),)
+    pictures = (
+        ()
+        if measured is None
+        else (Picture("HSC sky, measured", "sky / mean − 1 [%]", measured, True, 3.28),)
+    )
     published = context.curve("HSC-data-sim_measured_diagonal")
     if published is not None:
         place = np.asarray(published["diagonal_pixel"], dtype=float)
@@ -105,8 +114,8 @@ def hsc(context: Context) -> Section:
         curves.append(Curve(place / place.max(), amplitude, "measured frame of Fig. 13", "--"))
     return Section(
         "Hyper Suprime-Cam: section 5.2, Fig. 13",
-        "A random relief of 1.74 µm in 200 µm of silicon, HSC optics and filter. Only amplitudes can be compared: the rms "
-        "of the whole frame, with the continuum of a dark sky in it, with that of the measured one.",
+        "A random relief of 1.74 µm in 200 µm of silicon, HSC optics and filter. Only amplitudes can be compared: "
+        "the rms of the whole frame, with the continuum of a dark sky in it, with that of the measured one.",
         {"hsc": half, "hsc_observed": half, "hsc_frame": _hsc_frame(context, layer, measured)},
         (
             Picture("HSC sky", *_relative(frame), True),

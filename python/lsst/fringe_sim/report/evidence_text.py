@@ -24,7 +24,8 @@ def _sets(found: Comparison) -> list[str]:
 
 def _kinds(found: Comparison) -> list[str]:
     lines = [
-        f"each kind of data foretold from all others by {found.best.name}; rms misfit, ln of contrast, efficiency and sky",
+        f"each kind of data foretold from all others by {found.best.name}; rms misfit (of logarithms but for the "
+        "pixel, shape, phase and map)",
         f"{'kind':30}{'paper':>9}{'plane':>9}{'this':>9}{'factor':>8}{'Δ ln P':>9}",
     ]
     for row in found.rows:
@@ -37,7 +38,9 @@ def _kinds(found: Comparison) -> list[str]:
 
 def _wavelengths(found: Comparison) -> list[str]:
     base = found.wavelengths["paper, as published"]
-    lines = ["each wavelength of the pixel foretold from the others and all other kinds; rms error, factor to the paper"]
+    lines = [
+        "each wavelength of the pixel foretold from the others and all other kinds; rms error, factor to the paper"
+    ]
     lines += [f"{name:42}{error:9.5f}{base / error:8.2f}" for name, error in found.wavelengths.items()]
     return lines
 
@@ -47,7 +50,9 @@ def _verdict(found: Comparison) -> list[str]:
     lines = [f"verdict: {_class(members)}"]
     for fit in members:
         along = found.goes_to_the_sky(fit)
-        words = ", ".join(f"{name} {'goes to the sky' if goes else 'stays on the bench'}" for name, goes in along.items())
+        words = ", ".join(
+            f"{name} {'goes to the sky' if goes else 'stays on the bench'}" for name, goes in along.items()
+        )
         sky, plane = found.forecast[fit.name]
         lines.append(
             f"  {fit.name}: {words or 'nothing is missing'}; LSST sky in the field centre {sky:.3f} % rms "

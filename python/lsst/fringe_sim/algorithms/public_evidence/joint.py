@@ -1,7 +1,7 @@
 """Joint likelihood of a set of effects given all kinds of public data, on a grid of its parameters.
 
-Every kind may be off by a common factor of its stated uncertainty, at least 1, of which every magnitude is as likely: no
-kind is believed because its noise was stated optimistically.
+Every kind may be off by a common factor of its stated uncertainty, at least 1, of which every magnitude is as likely:
+no kind is believed because its noise was stated optimistically.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 MOST_PARAMETERS = 3
 COARSE_NODES = (0, 11, 7, 5)
-"""Values of each parameter at which everything is computed, by the number of parameters; a second time where it matters."""
+"""Values of each parameter that are computed, by the number of parameters; a second time where it matters."""
 
 FINE_NODES = (0, 81, 25, 11)
 NEGLIGIBLE = 1e-5
@@ -57,7 +57,7 @@ class Axis:
         return np.asarray(np.clip(values, self.low, self.high))
 
     def log_prior(self, values: FloatArray) -> FloatArray:
-        """Logarithm of the prior mass of fine nodes: a Cauchy distribution of the scale of the catalogue in its bounds."""
+        """Logarithm of the prior mass of fine nodes: a Cauchy distribution of the catalogue's scale in its bounds."""
         scale = self.parameter.prior_scale
         place = (values - self.null) / scale
         bounds = (np.array(self.parameter.bounds) - self.null) / scale
@@ -186,7 +186,9 @@ class JointFit:
                 self.predictor.predict(
                     kind, {axis.key: float(value) for axis, value in zip(axes, point, strict=True)}
                 )
-                for point in (np.stack(np.meshgrid(*coarse, indexing="ij"), -1).reshape(-1, count) if axes else [()])
+                for point in (
+                    np.stack(np.meshgrid(*coarse, indexing="ij"), -1).reshape(-1, count) if axes else [()]
+                )
             ]
             values = np.stack(points).reshape(*(len(nodes) for nodes in coarse), *points[0].shape)
             for place, (nodes, wanted) in enumerate(zip(coarse, fine, strict=True)):
@@ -248,7 +250,8 @@ class JointFit:
         mass = self._log_posterior
         place = np.unravel_index(int(np.argmax(mass)), mass.shape)
         return {
-            axis.key: float(values[n]) for axis, values, n in zip(self.axes, self._table.values, place, strict=True)
+            axis.key: float(values[n])
+            for axis, values, n in zip(self.axes, self._table.values, place, strict=True)
         }
 
     def shift_um(self) -> tuple[float, float]:

@@ -1,8 +1,8 @@
 """Kinds of public data: what each holds, what a model says of it, and how far off that is.
 
-A prediction is an array ``[..., S]`` whose last axis runs over shifts of the published map of the adhesive; kinds that do
-not depend on the shift have one entry there. All are smooth in the parameters of effects, so that they are computed on a
-few values and interpolated.
+A prediction is an array ``[..., S]`` whose last axis runs over shifts of the published map of the adhesive; kinds
+that do not depend on the shift have one entry there. All are smooth in the parameters of effects, so that they are
+computed on a few values and interpolated.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ CONTRAST_SCATTER = 0.08
 """Scatter of the logarithm of the contrast among blocks, about a smooth run over the sensor."""
 
 POSITION_TERMS = 0.1
-"""Width of the free change of that logarithm from the middle of the sensor to its edge, for each term up to second order."""
+"""Width of the free change of that logarithm from the middle to the edge, for each term up to second order."""
 
 CONTRAST_CALIBRATION = 0.05
 SHAPE_SIGMA = 0.03
@@ -220,7 +220,7 @@ class PixelFlats(_Gaussian):
 
 @dataclass(frozen=True, eq=False)
 class FlatContrast(_Gaussian):
-    """Logarithm of the contrast of the blocks of one flat; its level and a smooth run over the sensor are uncertain."""
+    """Logarithm of the contrast of the blocks of a flat; level and a smooth run over the sensor are uncertain."""
 
     thickness_um: FloatArray
     wavelength_nm: float
@@ -254,7 +254,7 @@ class FlatContrast(_Gaussian):
 
 @dataclass(frozen=True, eq=False)
 class FlatShape(_Gaussian):
-    """Second harmonic of a flat over its first, in the frame of the first: in phase with its maxima, and beside."""
+    """Second harmonic of a flat over its first, in the frame of the first: in phase with it, and beside."""
 
     wavelength_nm: float
 

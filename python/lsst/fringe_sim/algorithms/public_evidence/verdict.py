@@ -19,7 +19,6 @@ from .joint import JointFit, Predictor, parse_set
 from .kinds import (
     LAB,
     SHIFT_UM,
-    FlatContrast,
     Kind,
     Models,
     PixelFlats,
@@ -85,8 +84,8 @@ class KindRow:
     name : `str`
         Kind.
     paper, plane, foretold : `float`
-        Rms misfit of the model of the paper, of plane layers without any effect, and of what the best set says after the
-        other kinds; of logarithms for contrasts, efficiencies and amplitudes.
+        Rms misfit of the model of the paper, of plane layers without any effect, and of what the best set says
+        after the other kinds; of logarithms for contrasts, efficiencies and amplitudes.
     log_probability : `float`
         Logarithm of the probability of these data given the others, less that of plane layers.
     """
@@ -161,14 +160,14 @@ class Comparison:
             "paper, as published": _refitted(kind, absolute, free=False),
             "paper, offset and slope free": _refitted(kind, absolute, free=True),
         }
-        for fit in dict.fromkeys((self.best, *self.fits)):
+        for fit in (*self.members, next(fit for fit in self.fits if not fit.axes)):
             found[fit.name] = kind.values - fit.foretold_wavelengths(kind)
         return {name: float(np.sqrt((error**2).mean())) for name, error in found.items()}
 
     @cached_property
     def forecast(self) -> dict[str, tuple[float, float]]:
-        """Rms fringes of the LSST sky in the field centre [%] for every member, and where its bench alone is at fault."""
-        return {fit.name: _on_lsst(fit.best) for fit in (*self.members, *self.fits[-1:])}
+        """Rms fringes of the LSST sky in the field centre [%] for every member, and for plane layers."""
+        return {fit.name: _on_lsst(fit.best) for fit in self.members}
 
     @cached_property
     def decisions(self) -> tuple[tuple[Measurement, dict[str, float], float], ...]:
