@@ -1,4 +1,4 @@
-"""All public data together: likelihoods against direct integrals, and what the data of each kind say by themselves."""
+"""All public data together: likelihoods against direct integrals, and what each kind of data says by itself."""
 
 from __future__ import annotations
 

@@ -30,7 +30,8 @@ def _kinds(found: Comparison) -> list[str]:
     ]
     for row in found.rows:
         lines.append(
-            f"{row.name:30}{row.paper:9.4f}{row.plane:9.4f}{row.foretold:9.4f}{row.factor:8.2f}"
+            f"{row.name:30}{row.paper:9.4f}{row.plane:9.4f}{row.foretold:9.4f}"
+            f"{'fitted' if row.paper_fitted else f'{row.factor:.2f}':>8}"
             f"{row.log_probability:9.1f}"
         )
     return lines

@@ -275,7 +275,7 @@ class FlatShape(_Gaussian):
 
 @dataclass(frozen=True, eq=False)
 class FlatPhase(_Gaussian):
-    """Phase of the fringe of a flat against the published map: which shifts of the map are allowed, but for orders."""
+    """Phase of the fringe of a flat against the published map: which shifts are allowed, but for whole orders."""
 
     wavelength_nm: float
 

@@ -19,9 +19,11 @@ from .joint import JointFit, Predictor, parse_set
 from .kinds import (
     LAB,
     SHIFT_UM,
+    FlatPhase,
     Kind,
     Models,
     PixelFlats,
+    PublishedMap,
     harmonics,
     models_with,
     public_kinds,
@@ -88,6 +90,8 @@ class KindRow:
         after the other kinds; of logarithms for contrasts, efficiencies and amplitudes.
     log_probability : `float`
         Logarithm of the probability of these data given the others, less that of plane layers.
+    paper_fitted : `bool`
+        Whether the paper has fitted its map to these data, so that it foretells nothing.
     """
 
     name: str
@@ -95,11 +99,12 @@ class KindRow:
     plane: float
     foretold: float
     log_probability: float
+    paper_fitted: bool
 
     @property
     def factor(self) -> float:
-        """How much better than the paper's model."""
-        return self.paper / self.foretold
+        """How much better than the paper's model; NaN for what the paper fitted to these very data."""
+        return math.nan if self.paper_fitted else self.paper / self.foretold
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +151,7 @@ class Comparison:
                     _at_published_map(kind, kind.predict(models_with({}))),
                     float(kind.misfit(foretold)[0]),
                     self.best.log_predictive(kind) - plane.log_predictive(kind),
+                    isinstance(kind, FlatPhase | PublishedMap),
                 )
             )
         return tuple(rows)
