@@ -29,7 +29,10 @@ MOST_PARAMETERS = 3
 COARSE_NODES = (0, 11, 7, 5)
 """Values of each parameter that are computed, by the number of parameters; a second time where it matters."""
 
-FINE_NODES = (0, 81, 25, 11)
+FINE_NODES = (0, 61, 21, 9)
+RESOLVED = 2
+"""Times that the grid is made finer about the posterior; nothing is computed anew for it."""
+
 NEGLIGIBLE = 1e-5
 """Posterior mass that a range of parameters may leave out, relative to its largest value."""
 
@@ -154,15 +157,29 @@ class JointFit:
 
     @cached_property
     def _table(self) -> _Table:
-        table = self._tabulate(self.axes)
-        return self._tabulate(self._narrowed(table)) if self.axes else table
+        axes = self.axes
+        table = self._tabulate(axes, tuple(axis.nodes(_of(FINE_NODES, axes)) for axis in axes))
+        if not axes:
+            return table
+        # Computed where the posterior is, with all kinds or without any one of them; then resolved where it is.
+        near = self._narrowed(table, (None, *self.kinds))
+        for _ in range(RESOLVED):
+            close = self._narrowed(table, (None,))
+            fine = tuple(
+                np.unique(
+                    np.concatenate([one.nodes(_of(FINE_NODES, axes) // 2), two.nodes(_of(FINE_NODES, axes))])
+                )
+                for one, two in zip(near, close, strict=True)
+            )
+            table = self._tabulate(near, fine)
+        return table
 
-    def _narrowed(self, table: _Table) -> tuple[Axis, ...]:
-        """Ranges that hold the posterior, with all kinds and without each of them."""
+    def _narrowed(self, table: _Table, left_out: Sequence[Kind | None]) -> tuple[Axis, ...]:
+        """Ranges that hold the posterior without each of some kinds."""
         likelihoods = self._likelihoods(table)
         masses = [
-            np.asarray(logsumexp(_product(self.kinds, likelihoods, table.log_prior, left_out), axis=-1))
-            for left_out in (None, *self.kinds)
+            np.asarray(logsumexp(_product(self.kinds, likelihoods, table.log_prior, kind), axis=-1))
+            for kind in left_out
         ]
         axes = []
         for number, (axis, values) in enumerate(zip(self.axes, table.values, strict=True)):
@@ -176,23 +193,21 @@ class JointFit:
             axes.append(Axis(axis.effect, axis.parameter, axis.null, float(min(lows)), float(max(highs))))
         return tuple(axes)
 
-    def _tabulate(self, axes: tuple[Axis, ...]) -> _Table:
+    def _tabulate(self, axes: tuple[Axis, ...], fine: tuple[FloatArray, ...]) -> _Table:
         count = len(axes)
-        coarse = [axis.nodes(COARSE_NODES[count]) for axis in axes]
-        fine = tuple(axis.nodes(FINE_NODES[count]) for axis in axes)
+        coarse = [axis.nodes(_of(COARSE_NODES, axes)) for axis in axes]
+        points = np.stack(np.meshgrid(*coarse, indexing="ij"), -1).reshape(-1, count) if axes else [()]
         predictions = []
         for kind in self.kinds:
-            points = [
+            computed = [
                 self.predictor.predict(
                     kind, {axis.key: float(value) for axis, value in zip(axes, point, strict=True)}
                 )
-                for point in (
-                    np.stack(np.meshgrid(*coarse, indexing="ij"), -1).reshape(-1, count) if axes else [()]
-                )
+                for point in points
             ]
-            values = np.stack(points).reshape(*(len(nodes) for nodes in coarse), *points[0].shape)
+            values = np.stack(computed).reshape(*(len(nodes) for nodes in coarse), *computed[0].shape)
             for place, (nodes, wanted) in enumerate(zip(coarse, fine, strict=True)):
-                values = PchipInterpolator(nodes, values, axis=place)(wanted)
+                values = PchipInterpolator(nodes, values, axis=place)(np.clip(wanted, nodes[0], nodes[-1]))
             predictions.append(values)
         prior = np.zeros(())
         for place, (axis, wanted) in enumerate(zip(axes, fine, strict=True)):
@@ -279,6 +294,11 @@ class JointFit:
             own = kind.foretold(prediction, number)[..., np.newaxis, :]
             found.append(float(_mean(log, own)[0, 0]))
         return np.array(found)
+
+
+def _of(nodes: tuple[int, ...], axes: Sequence[Axis]) -> int:
+    """Number of nodes of each of so many axes."""
+    return nodes[len(axes)]
 
 
 def log_likelihood(kind: Kind, prediction: FloatArray) -> FloatArray:
