@@ -13,7 +13,7 @@ from typing import Any
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-from . import api, commands, headers, paper, physics, provenance, tasks
+from . import api, commands, headers, physics, provenance, tasks
 
 GENERATORS: dict[str, Callable[..., str]] = {
     "api": api.module_reference,
@@ -26,8 +26,6 @@ GENERATORS: dict[str, Callable[..., str]] = {
     "file-keywords": headers.file_keywords,
     "mask-planes": physics.mask_planes,
     "media": physics.media,
-    "paper-counts": paper.counts,
-    "paper-numbers": paper.numbers,
     "pipelines": tasks.pipelines,
     "provenance": provenance.tables,
     "raw-keywords": headers.raw_keywords,
