@@ -172,7 +172,8 @@ def row_3000(context: Context) -> Section:
     response = total.response(thickness, [WAVELENGTH_NM])[0]
     simulated = response - response.mean()
     phase = 2.0 * np.pi * thickness / float(total.fringe_order_um(WAVELENGTH_NM))
-    trend = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, len(columns)), ROW_TREND)
+    places = np.linspace(-1.0, 1.0, len(columns))
+    trend: FloatArray = np.asarray(np.polynomial.legendre.legvander(places, ROW_TREND), dtype=np.float64)
     seen, drawn = (_fitted_fringe(trend, phase, values) for values in (measured, simulated))
     level = trend @ np.linalg.lstsq(trend, measured, rcond=None)[0]
     values = {
