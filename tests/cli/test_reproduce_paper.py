@@ -31,7 +31,7 @@ OPEN = {
 }
 """Where neither the paper nor a correction is met; each has a reason in the table."""
 
-NOISY = {"coadd_800", "hsc"}
+NOISY = {"coadd_800", "hsc", "hsc_frame"}
 """Depend on random fields; judged at the full number of exposures only."""
 
 
