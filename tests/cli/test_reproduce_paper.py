@@ -25,10 +25,13 @@ OPEN = {
     "hsc",
     "silicon_change",
     "over_limit",
+    "row_ratio",
+    "lines_strength",
+    "red_bands",
 }
 """Where neither the paper nor a correction is met; each has a reason in the table."""
 
-NOISY = {"coadd_800", "hsc"}
+NOISY = {"coadd_800", "hsc", "hsc_frame"}
 """Depend on random fields; judged at the full number of exposures only."""
 
 

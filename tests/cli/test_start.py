@@ -36,6 +36,7 @@ def imported_by(*arguments: str) -> set[str]:
         ("demo", "--help"),
         ("challenge", "--help"),
         ("reproduce-paper", "--help"),
+        ("evidence", "--help"),
         ("provenance", "--help"),
         ("fit", "raws"),
         ("fit", "raws", "--setup", "ts8_e2v", "--out", "fit", "--method", "none"),

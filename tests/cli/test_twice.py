@@ -56,6 +56,7 @@ ELSEWHERE = {
     "templates": "tests/cli/test_correct.py",
     "correct": "tests/cli/test_correct.py",
     "reproduce-paper": "tests/cli/test_reproduce_paper.py",
+    "evidence": "tests/cli/test_evidence.py",
 }
 """Minutes of work: the same seed gives the same answer there."""
 

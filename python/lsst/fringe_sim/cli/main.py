@@ -39,6 +39,7 @@ _COMMANDS = {
     "focal-plane": ("focal_plane", "Forecast the fringes of every sensor of the LSST Camera."),
     "amplitudes": ("amplitudes", "Tabulate the fringe amplitudes of every set-up of the paper."),
     "discover": ("discover", "Find the effect that the model lacks."),
+    "evidence": ("evidence", "Judge effects by all public data together."),
     "reproduce-paper": ("reproduce_paper", "Recompute the paper, number by number."),
     "export": ("export", "Write products as NetCDF, for xarray."),
     "provenance": ("provenance", "Say what a product was made with and from."),

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
 
-from ..algorithms.fringe_amplitudes import fringe_amplitudes
-from ..algorithms.image_correlation import LogBins, coadd_correlation
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from ..algorithms.image_correlation import LogBins, coadd_correlation, correlation_function
 from ..algorithms.pca import fit_pca_from_thickness
 from ..instrument.night import NightHistory
+from .laboratory import MAP_RANGE_UM, RAFT
 from .section import Context, Curve, Graph, Section
-from .sky import lines_only
+from .sky import RANGE_UM, lines_only
 
 __all__ = ["coadd", "components"]
+
+FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
 SKY_E = 2717.0
@@ -20,6 +27,13 @@ SKY_E = 2717.0
 REGION_PX = 240
 NULL_SCATTER_BELOW_PX = 10.0
 FIRST_HOUR = 19.0
+CORNER_PX, WINDOW_PX = 1500.0, 1000
+"""Part of every sensor from which pieces are cut."""
+
+RAFT_UM = (13.8, 28.5)
+"""Adhesive of all nine sensors, if the thinnest place of each has 14 µm."""
+
+TREECORR_PX = 64
 
 
 def components(context: Context) -> Section:
@@ -29,6 +43,7 @@ def components(context: Context) -> Section:
     found = fit_pca_from_thickness(context.thickness_um, response, scales)
     ratio = np.zeros(2)
     ratio[: min(2, len(found.explained_variance_ratio))] = found.explained_variance_ratio[:2]
+    left = PERCENT * max(0.0, 1.0 - float(np.sum(found.explained_variance_ratio[:2])))
     number = np.arange(1.0, 1.0 + len(found.explained_variance_ratio))
     hours = FIRST_HOUR + np.asarray(night.hours, dtype=float)
     scores = tuple(
@@ -38,7 +53,11 @@ def components(context: Context) -> Section:
     return Section(
         "Components of a night: section 5.4",
         "Eleven hourly frames with the variation of the OH bands that the paper takes from Noll et al. (2015).",
-        {"first_component": PERCENT * ratio[0], "second_component": PERCENT * ratio[1]},
+        {
+            "first_component": PERCENT * ratio[0],
+            "second_component": PERCENT * ratio[1],
+            "corrected": left,
+        },
         (
             Graph(
                 "scree",
@@ -55,11 +74,16 @@ def components(context: Context) -> Section:
 
 def coadd(context: Context) -> Section:
     """Figure 16."""
-    frame = lines_only(context.setup("lsst_e2v")).sky().lookup(context.detail_um)[0]
-    relative = frame / frame.mean() - 1.0
+    maps = _raft_maps(context)
+    table = lines_only(context.setup("lsst_e2v"), range_um=RAFT_UM if maps else RANGE_UM).sky()
+    layers = maps or [context.detail_um]
+    patterns = []
+    for layer in layers:
+        frame = table.lookup(layer)[0]
+        patterns.append(frame / frame.mean() - 1.0)
     counts = tuple(sorted({count for count in (1, 10, 100, context.coadds) if count <= context.coadds}))
     result = coadd_correlation(
-        [relative],
+        patterns,
         counts,
         1.0 / np.sqrt(SKY_E),
         context.rng("coadd"),
@@ -78,13 +102,55 @@ def coadd(context: Context) -> Section:
     curves.append(
         Curve(last.separation_px, result.model[-1], f"ξ₁/N + (1 − 1/N) ξ_floor, N = {counts[-1]}", ".")
     )
-    rms = PERCENT * fringe_amplitudes(frame).rms
+    rms = PERCENT * float(np.sqrt(np.mean([pattern.var() for pattern in patterns])))
+    sensors = (
+        "the nine sensors of the raft"
+        if maps
+        else "one sensor, where the paper has nine (their maps are not at hand)"
+    )
     return Section(
         "Coadds: Fig. 16",
-        f"Coadds of randomly placed and rotated pieces of one sensor (fringes {rms:.2f} % rms, uncorrected) with "
-        "photon noise. The paper takes nine sensors of one raft; the maps of the others are not shipped.",
-        {"coadd_800": excess},
+        f"Coadds of randomly placed and rotated pieces of {sensors} (fringes {rms:.2f} % rms, uncorrected) with "
+        "photon noise.",
+        {"coadd_800": excess, "coadd_treecorr": _against_treecorr(patterns[0])},
         (Graph("correlation of coadds", "separation [px]", "ξ [sky²]", tuple(curves), logarithmic=True),),
         "Correlation of more and more exposures against that of as many exposures of noise; a line ends where the "
         "correlation turns negative.",
+    )
+
+
+def _raft_maps(context: Context) -> list[FloatArray]:
+    """Pixel by pixel, a part of the published map of every sensor; none where one is missing or out of range."""
+    layers = []
+    for slot, serial in RAFT:
+        path = context.map_path(f"RTM-020_{slot}_{serial}_epoxy_map.fits")
+        if path is None:
+            return []
+        with fits.open(path) as hdus:
+            relative = hdus["FINE"].data.astype(float)
+            places = hdus["YSRC"].data.astype(float), hdus["XSRC"].data.astype(float)
+        # Only the range of each map is published, not its zero.
+        layer = MAP_RANGE_UM[0] + relative - np.nanmin(relative)
+        at = CORNER_PX + np.arange(WINDOW_PX, dtype=float)
+        layers.append(np.clip(RectBivariateSpline(*places, layer)(at, at), *RAFT_UM))
+    return layers
+
+
+def _against_treecorr(pattern: FloatArray) -> float:
+    """Largest departure of the correlation of a piece of a pattern from TreeCorr's, over its variance [%]."""
+    try:
+        import treecorr
+    except ImportError:
+        return math.nan
+    image = pattern[:TREECORR_PX, :TREECORR_PX]
+    image = image - image.mean()
+    bins = LogBins(1.0, 0.5 * TREECORR_PX, 12)
+    y, x = np.indices(image.shape, dtype=float)
+    catalogue = treecorr.Catalog(x=x.ravel(), y=y.ravel(), k=image.ravel())
+    theirs = treecorr.KKCorrelation(
+        min_sep=bins.smallest_px, max_sep=bins.largest_px, nbins=bins.count, bin_slop=0.0, brute=True
+    )
+    theirs.process(catalogue)
+    return PERCENT * float(
+        np.nanmax(np.abs(correlation_function(image, bins=bins).xi - theirs.xi)) / image.var()
     )

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import median_filter
 
 from ..algorithms.single_pixel import fit_single_pixel, published_pixel
@@ -14,7 +17,7 @@ from ..model import FringeModel
 from ..products import FlatExposures, FringeCube
 from .section import Context, Curve, Graph, Picture, Section, missing
 
-__all__ = ["flat_contrast", "one_pixel", "raft", "thickness_fit"]
+__all__ = ["flat_contrast", "one_pixel", "raft", "row_3000", "thickness_fit"]
 
 FloatArray = NDArray[np.float64]
 
@@ -31,6 +34,13 @@ FIT_CONTRAST = 0.15
 """Brings the simulated flats to the measured contrast of about 2 %."""
 
 FIT_SHAPE = (200, 204)
+ROW = 3015
+"""Row 3000 of the frame trimmed by 15 rows."""
+
+MEASURED_FLAT = "E2V-321_960nm_flat_measured.fits"
+MEASURED_MAP = "RTM-020_S01_E2V-321_epoxy_map.fits"
+MEASURED_LOWEST_UM = 14.022
+ROW_TREND = 4
 RAFT = (
     ("S20", "E2V-350"),
     ("S21", "E2V-365"),
@@ -146,6 +156,64 @@ def flat_contrast(context: Context) -> Section:
         ),
         "Fringe profile at 960 nm, the flat of the whole sensor, and the thickness that makes it.",
     )
+
+
+def row_3000(context: Context) -> Section:
+    """Figure 6."""
+    names = ("row_phase", "row_ratio", "row_correlation")
+    text = (
+        "Row 3000 of the 960 nm flat (the figure calls it a column), beside 1 − R − T on the published map."
+    )
+    flat, layer = context.map_path(MEASURED_FLAT), context.map_path(MEASURED_MAP)
+    if flat is None or layer is None:
+        return Section("A row: Fig. 6", f"{text} Flat and map are not at hand.", missing(*names))
+    columns, measured, thickness = _row(flat, layer)
+    total = FringeModel.from_setup(context.setup(LAB), observable="total")
+    response = total.response(thickness, [WAVELENGTH_NM])[0]
+    simulated = response - response.mean()
+    phase = 2.0 * np.pi * thickness / float(total.fringe_order_um(WAVELENGTH_NM))
+    places = np.linspace(-1.0, 1.0, len(columns))
+    trend: FloatArray = np.asarray(np.polynomial.legendre.legvander(places, ROW_TREND), dtype=np.float64)
+    seen, drawn = (_fitted_fringe(trend, phase, values) for values in (measured, simulated))
+    level = trend @ np.linalg.lstsq(trend, measured, rcond=None)[0]
+    values = {
+        "row_phase": float(np.angle(drawn / seen)) / (2.0 * np.pi),
+        "row_ratio": abs(drawn) / abs(seen),
+        "row_correlation": float(np.corrcoef(measured - level, simulated)[0, 1]),
+    }
+    curves = (
+        Curve(columns, PERCENT * (measured - level), "measured (Fig. 2), less its trend", "."),
+        Curve(columns, PERCENT * simulated, "1 − R − T less its mean, as published"),
+    )
+    return Section(
+        "A row: Fig. 6",
+        f"{text} Pixels of the figure are single ones, with the noise of photons; the paper smooths them.",
+        values,
+        (Graph("row 3000", "column [px]", "fringe amplitude [%]", curves),),
+        "Data and simulation along a row.",
+    )
+
+
+def _row(flat: Path, layer: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Columns, measured amplitudes and published thickness [µm] of the row of the figure nearest to it."""
+    with fits.open(flat) as hdus:
+        image = hdus[0].data.astype(float)
+        rows, columns = (hdus[name].data.astype(float) for name in ("YSRC", "XSRC"))
+    near = int(np.argmin(np.abs(rows - ROW)))
+    with fits.open(layer) as hdus:
+        places = hdus["YSRC"].data.astype(float), hdus["XSRC"].data.astype(float)
+        interpolate = RegularGridInterpolator(places, hdus["FINE"].data.astype(float) + MEASURED_LOWEST_UM)
+    inside = (columns >= places[1][0]) & (columns <= places[1][-1])
+    at = columns[inside]
+    thickness = interpolate(np.stack([np.full(at.shape, rows[near]), at], axis=1))
+    return at, image[near, inside] / np.nanmean(image) - 1.0, np.asarray(thickness, dtype=float)
+
+
+def _fitted_fringe(trend: FloatArray, phase: FloatArray, values: FloatArray) -> complex:
+    """Complex amplitude of a fringe whose phase is known, beside a trend."""
+    columns = np.concatenate([trend, np.stack([np.cos(phase), np.sin(phase)], axis=1)], axis=1)
+    found = np.linalg.lstsq(columns, values, rcond=None)[0]
+    return complex(found[-2], -found[-1])
 
 
 def thickness_fit(context: Context) -> Section:

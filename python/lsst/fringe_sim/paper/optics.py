@@ -14,7 +14,7 @@ from ..instrument.telescope import RayBundle, Telescope
 from ..model import FringeModel
 from ..optics import Beam, Illumination
 from ..resources import read_table
-from .section import Context, Curve, Graph, Section
+from .section import Context, Curve, Graph, Section, missing
 
 __all__ = ["angles", "oh_lines", "photon_walk"]
 
@@ -25,6 +25,13 @@ SECOND_RADIATION_CONSTANT = 1.4387769
 """hc/k [cm K]."""
 
 NAMED_BANDS = ("7-3", "8-4", "3-0", "9-5", "4-1", "5-2")
+RED_BANDS = ("4-1", "5-2")
+NEAR_NM = 0.05
+"""Distance within which two lists mean one line: doublets are merged in one and split in the other."""
+
+STRONG = 0.01
+"""Strength from which lines are compared, relative to the strongest: the figure reads fainter ones badly."""
+
 EDGE_DEG = 1.44
 BINS = (10, 20, 50, 100)
 BEAM_NODES = 192
@@ -42,6 +49,7 @@ def oh_lines(context: Context) -> Section:
     photons = np.concatenate([item.photons for item in bands])
     light = Illumination.spectrum(wavelength, photons, Beam.collimated())
     named = sum(item.photons.sum() for item in bands if item.name in NAMED_BANDS)
+    compared, drawn = _against_figure_8(context)
     curves = tuple(
         Curve(item.wavelength_nm, item.photons / photons.sum(), item.name, ".")
         for item in bands
@@ -56,10 +64,44 @@ def oh_lines(context: Context) -> Section:
             "vibrational_temperature": _vibrational_temperature(),
             "line_weights": float(light.weight.sum()),
             "six_bands": float(named / photons.sum()),
+            **compared,
         },
-        (Graph("LSST y band", "wavelength [nm]", "weight of a line [1]", curves, True, FAINTEST),),
+        (Graph("LSST y band", "wavelength [nm]", "weight of a line [1]", curves, True, FAINTEST), *drawn),
         f"Normalised weight of every OH line above {FAINTEST:g}, by vibrational band.",
     )
+
+
+def _against_figure_8(context: Context) -> tuple[dict[str, float], tuple[Graph, ...]]:
+    """Every line of the figure against those of the same band of PALACE nearby."""
+    theirs, ours = context.lines_of_figure_8(), read_table("sky", "oh_lines_palace_yband.ecsv")
+    if theirs is None:
+        return missing("lines_found", "lines_strength", "red_bands"), ()
+    wavelength, intensity = (np.asarray(theirs[name], dtype=float) for name in ("wavelength", "intensity"))
+    own_wavelength, own = (np.asarray(ours[name], dtype=float) for name in ("wavelength", "photon_radiance"))
+    near = np.abs(wavelength[:, None] - own_wavelength) < NEAR_NM
+    near &= np.asarray(theirs["band"], dtype=str)[:, None] == np.asarray(ours["band"], dtype=str)
+    found = near.any(axis=1)
+    # Several lines of the figure may share one of PALACE, and the doublets of PALACE one of the figure.
+    strength = (near * own / np.maximum(near.sum(axis=0), 1)).sum(axis=1)
+    ratio = np.log(intensity[found] / strength[found])
+    strong = intensity[found] > STRONG * intensity.max()
+    shares = [
+        float(values[np.isin(np.asarray(table["band"], dtype=str), RED_BANDS)].sum() / values.sum())
+        for table, values in ((theirs, intensity), (ours[near.any(axis=0)], own[near.any(axis=0)]))
+    ]
+    values = {
+        "lines_found": PERCENT * float(intensity[found].sum() / intensity.sum()),
+        "lines_strength": float(
+            np.corrcoef(np.log(intensity[found][strong]), np.log(strength[found][strong]))[0, 1]
+        ),
+        "red_bands": shares[0] / shares[1],
+    }
+    curves = tuple(
+        Curve(wavelength[found][own_band], np.exp(ratio[own_band] - np.median(ratio[strong])), band, ".")
+        for band in NAMED_BANDS
+        for own_band in [np.asarray(theirs["band"], dtype=str)[found] == band]
+    )
+    return values, (Graph("Figure 8 over PALACE", "wavelength [nm]", "ratio over its median", curves, True),)
 
 
 def _rotational_temperature() -> float:

@@ -22,6 +22,7 @@ SECTIONS: tuple[Callable[[Context], Section], ...] = (
     stack.absorption_depth,
     laboratory.one_pixel,
     laboratory.flat_contrast,
+    laboratory.row_3000,
     laboratory.thickness_fit,
     laboratory.raft,
     optics.oh_lines,
