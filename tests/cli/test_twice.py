@@ -53,6 +53,7 @@ ELSEWHERE = {
     "demo": "tests/cli/test_demo.py::test_running_it_again_does_nothing_twice",
     "discover": "tests/algorithms/discovery/test_search.py",
     "challenge": "tests/mock/test_hidden_effects.py",
+    "mock-visits": "tests/mock/test_visits.py::test_the_command",
     "templates": "tests/cli/test_correct.py",
     "correct": "tests/cli/test_correct.py",
     "reproduce-paper": "tests/cli/test_reproduce_paper.py",

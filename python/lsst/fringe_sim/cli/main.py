@@ -31,6 +31,7 @@ _COMMANDS = {
     "setups": ("catalogue", "List the set-ups: sensors, telescopes, test stands."),
     "effects": ("catalogue", "List the physical effects and their parameters."),
     "mock-flats": ("mock_flats", "Write raw laboratory frames of a simulated sensor."),
+    "mock-visits": ("mock_visits", "Write visits of a simulated sensor: fringes, stars, galaxies."),
     "plan-flats": ("plan_flats", "Say which flats a thickness fit needs."),
     "fit": ("fit", "Fit the layer thickness to raw flats."),
     "sky": ("sky", "Simulate the fringes of the night sky."),

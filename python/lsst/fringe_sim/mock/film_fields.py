@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -11,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from .optics import FlatFieldOptics
+    from .optics import Film, FlatFieldOptics
 
-__all__ = ["Light", "add_mode", "light_in"]
+__all__ = ["Light", "add_mode", "add_periodic_mode", "light_in"]
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -42,6 +43,13 @@ class Light:
     extra_um: float  # departure of the varying film from its mean thickness
 
 
+@functools.lru_cache(maxsize=8)
+def _indices(films: tuple[Film, ...], wavelengths: bytes, temperature_k: float) -> ComplexArray:
+    """Index of every film at every wavelength; the same for all angles."""
+    wavelength_nm = np.frombuffer(wavelengths)
+    return np.stack([film.index(wavelength_nm, temperature_k) for film in films])
+
+
 def light_in(
     optics: FlatFieldOptics,
     wavelength_nm: FloatArray,
@@ -56,7 +64,7 @@ def light_in(
     if support_um:
         thickness[optics.position("support")] += support_um
     wave_number = 2.0 * np.pi / (1e-3 * wavelength_nm)  # rad/µm
-    index = np.stack([film.index(wavelength_nm, optics.temperature_k) for film in optics.films])
+    index = _indices(optics.films, wavelength_nm.tobytes(), optics.temperature_k)
     along = index[0].real * math.sin(theta)
     normal = np.sqrt(index * index - along * along)  # n cos(theta); the principal root decays downwards
     admittance = normal if s_wave else index * index / normal
@@ -175,6 +183,32 @@ def add_mode(total: FloatArray, light: Light, thickness_um: FloatArray) -> None:
     )
 
 
+PHASES = 32
+"""Phases of a fringe that determine its harmonics; those beyond the sixteenth are fainter than a millionth."""
+
+
+def add_periodic_mode(total: FloatArray, light: Light, thickness_um: FloatArray) -> None:
+    """`add_mode` for a varying layer that absorbs nothing, so that all fringes are alike: by their harmonics."""
+    number = np.arange(PHASES // 2)
+    to_harmonics = np.exp(-2j * np.pi * number[:, np.newaxis] * np.arange(PHASES) / PHASES) / PHASES
+    to_harmonics[1:] *= 2.0
+    _add_harmonics(
+        total,
+        thickness_um + light.extra_um,
+        to_harmonics,
+        light.weight,
+        light.phase,
+        light.admittance,
+        light.ambient,
+        light.bottom,
+        light.incident,
+        light.top_above,
+        light.top_below,
+        light.low_above,
+        light.low_below,
+    )
+
+
 @numba.njit(cache=True)
 def _add_absorption(
     total: FloatArray,
@@ -212,3 +246,51 @@ def _add_absorption(
             h_front = c[1, 0] * e + c[1, 1] * h
             forward = 0.5 * (e_front + h_front / ambient[q])
             total[i] += weight[q] * flux / (ambient[q] * (forward.real**2 + forward.imag**2))
+
+
+@numba.njit(cache=True)
+def _add_harmonics(
+    total: FloatArray,
+    thickness: FloatArray,
+    to_harmonics: ComplexArray,
+    weight: FloatArray,
+    phase: ComplexArray,
+    admittance: ComplexArray,
+    ambient: FloatArray,
+    bottom: ComplexArray,
+    incident: ComplexArray,
+    top_above: ComplexArray,
+    top_below: ComplexArray,
+    low_above: ComplexArray,
+    low_below: ComplexArray,
+) -> None:  # pragma: no cover - compiled
+    samples = np.empty(to_harmonics.shape[1])
+    places = np.arange(samples.size) / samples.size
+    harmonic = np.empty(to_harmonics.shape[0], np.complex128)
+    for q in range(weight.size):
+        one = slice(q, q + 1)
+        samples[:] = 0.0
+        _add_absorption(
+            samples,
+            np.pi / phase[q].real * places,
+            weight[one],
+            phase[one],
+            admittance[one],
+            ambient[one],
+            bottom[one],
+            incident[one],
+            top_above[one],
+            top_below[one],
+            low_above[one],
+            low_below[one],
+        )
+        for h in range(harmonic.size):
+            harmonic[h] = 0.0
+            for i in range(samples.size):
+                harmonic[h] += to_harmonics[h, i] * samples[i]
+        for i in range(thickness.size):
+            turn = np.exp(2j * phase[q].real * thickness[i])
+            wave = 0.0j
+            for h in range(harmonic.size - 1, 0, -1):
+                wave = (wave + harmonic[h]) * turn
+            total[i] += harmonic[0].real + wave.real

@@ -272,10 +272,10 @@ class FlatFieldOptics:
         signal = self._coherent(thickness, float(wavelength_nm))
         if self.coherent_part == 1.0:
             return signal
-        mean = self._coherent(self._one_order_um(float(wavelength_nm)), float(wavelength_nm)).mean()
+        mean = self._coherent(self.one_order_um(float(wavelength_nm)), float(wavelength_nm)).mean()
         return np.asarray(mean + self.coherent_part * (signal - mean))
 
-    def _one_order_um(self, nominal_nm: float) -> FloatArray:
+    def one_order_um(self, nominal_nm: float) -> FloatArray:
         """Thicknesses of the varying layer that go evenly through one fringe [µm]."""
         wavelength, film = self.true_wavelength(nominal_nm), self.films[self.position(self.varying)]
         index = film.index(np.array([wavelength]), self.temperature_k)[0].real
@@ -286,7 +286,7 @@ class FlatFieldOptics:
         """Detected fraction where all light comes back coherently."""
         wavelength, line_weight = self._line(nominal_nm)
         total = np.zeros(thickness.shape)
-        for support_um, part in _heights(self.support_spread_um, 1e-3 * self.height_step_nm):
+        for support_um, part in heights_and_weights(self.support_spread_um, 1e-3 * self.height_step_nm):
             for weight, theta, s_wave, height_um in self._modes():
                 light = light_in(
                     self, wavelength, part * weight * line_weight, theta, s_wave, height_um, support_um
@@ -361,7 +361,9 @@ class FlatFieldOptics:
 
     def _modes(self) -> Iterator[tuple[float, float, bool, float]]:
         """Weight, angle [rad], s-wave or not, and departure of the varying layer from its mean [µm]."""
-        for height_um, height_weight in _heights(1e-3 * self.spread_nm, 1e-3 * self.height_step_nm):
+        for height_um, height_weight in heights_and_weights(
+            1e-3 * self.spread_nm, 1e-3 * self.height_step_nm
+        ):
             for theta, theta_weight in zip(self.theta, self.theta_weight, strict=True):
                 weight = float(height_weight * theta_weight)
                 if theta == 0.0:  # s and p are the same there
@@ -462,7 +464,7 @@ def _cold_silicon(wavelength_nm: FloatArray, temperature_k: float) -> tuple[Floa
     return np.asarray(powers @ n), np.exp(powers @ log_k)
 
 
-def _heights(rms_um: float, step_um: float) -> list[tuple[float, float]]:
+def heights_and_weights(rms_um: float, step_um: float) -> list[tuple[float, float]]:
     """Departures [µm] and weights of a thickness that varies; equidistant nodes converge fast under a Gaussian."""
     if rms_um == 0.0:
         return [(0.0, 1.0)]

@@ -204,24 +204,14 @@ def setup_optics(setup: str, silicon: str | None = None) -> tuple[FlatFieldOptic
     InputError
         It is not illuminated by a monochromator.
     """
-    content = _read_setup(setup)
+    content = read_setup_file(setup)
     light = content["illumination"]
     if light["kind"] != "monochromator":
         raise InputError("illumination.kind", light["kind"], "monochromator (flats need one)", source=setup)
     beam = light["beam"]["kind"]
     if beam != "collimated":
         raise InputError("illumination.beam.kind", beam, "collimated", source=setup)
-    own = silicon or str(content.get("silicon", "Si"))
-    if own.partition("_")[0] != "Si":
-        raise InputError("silicon", own, "Si or a table that begins with Si_", source=setup)
-    films = tuple(
-        Film(
-            str(layer["name"]),
-            own if layer["medium"] == "Si" else str(layer["medium"]),
-            float(layer["thickness_um"]),
-        )
-        for layer in _read_named("stack", "stacks", content["stack"])["layers"]
-    )
+    films = films_of(content, setup, silicon)
     optics = FlatFieldOptics(
         films=films,
         temperature_k=float(content["temperature_k"]),
@@ -230,6 +220,29 @@ def setup_optics(setup: str, silicon: str | None = None) -> tuple[FlatFieldOptic
         varying=str(content["varying"]),
     )
     return optics, str(content["camera"])
+
+
+def films_of(content: Mapping[str, Any], setup: str, silicon: str | None = None) -> tuple[Film, ...]:
+    """Films of a set-up's stack; ``silicon`` as for `setup_optics`.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such stack.
+    InputError
+        No table of silicon.
+    """
+    own = silicon or str(content.get("silicon", "Si"))
+    if own.partition("_")[0] != "Si":
+        raise InputError("silicon", own, "Si or a table that begins with Si_", source=setup)
+    return tuple(
+        Film(
+            str(layer["name"]),
+            own if layer["medium"] == "Si" else str(layer["medium"]),
+            float(layer["thickness_um"]),
+        )
+        for layer in _read_named("stack", "stacks", content["stack"])["layers"]
+    )
 
 
 def write_mock_flats(
@@ -297,7 +310,7 @@ def write_mock_flats(
     """
     optics, camera = setup_optics(setup, silicon)
     sensor = _sensor(camera, detector, size)
-    thickness = _check_thickness(thickness_um, sensor.shape)
+    thickness = checked_thickness(thickness_um, sensor.shape)
     wavelengths = _check_wavelengths(wavelengths_nm)
     for name, value, least in (("n_bias", n_bias, 0), ("repeats", repeats, 1), ("level_e", level_e, 1.0)):
         if not least <= value < math.inf:
@@ -339,7 +352,7 @@ def _read_named(what: str, folder: str, name: str) -> dict[str, Any]:
     return read_yaml(folder, f"{name}.yaml")
 
 
-def _read_setup(setup: str) -> dict[str, Any]:
+def read_setup_file(setup: str) -> dict[str, Any]:
     """Content of a shipped set-up, or of a YAML file."""
     if not setup.lower().endswith((".yaml", ".yml")):
         return _read_named("set-up", "setups", setup)
@@ -348,7 +361,7 @@ def _read_setup(setup: str) -> dict[str, Any]:
 
 
 def _nominal_celsius(setup: str) -> float:
-    return round(float(_read_setup(setup)["temperature_k"]) - 273.15, 3)
+    return round(float(read_setup_file(setup)["temperature_k"]) - 273.15, 3)
 
 
 def _sensor(camera: str, detector: int | str, size: str | None) -> Detector:
@@ -358,7 +371,7 @@ def _sensor(camera: str, detector: int | str, size: str | None) -> Detector:
     return sensor if size is None else sensor.cut_down(parse_size(size))
 
 
-def _check_thickness(thickness_um: NDArray[np.floating], shape: tuple[int, int]) -> FloatArray:
+def checked_thickness(thickness_um: NDArray[np.floating], shape: tuple[int, int]) -> FloatArray:
     thickness = np.asarray(thickness_um, dtype=float)
     if thickness.shape != shape:
         raise InputError(

@@ -1,0 +1,114 @@
+"""``fringe-sim mock-visits``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from .mock_flats import thickness_map
+from .output import OutputFolder, output_folder
+from .parameters import BUILT_IN, SIZE, ChosenEffects, model_effects
+from .progress import progress
+
+__all__ = ["mock_visits"]
+
+
+@click.command("mock-visits")
+@output_folder("Folder for the visits.", "visit_*.fits", argument=True)
+@click.option("--setup", default="lsst_e2v", show_default=True, help="Set-up behind a telescope.")
+@click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
+@click.option(
+    "--thickness",
+    default=BUILT_IN,
+    show_default=True,
+    help="Map of the varying layer: a FITS file [µm], 'random', or 'e2v_321' (model of a measured sensor).",
+)
+@click.option("--visits", type=click.IntRange(1, 1000), default=12, show_default=True, help="How many.")
+@click.option(
+    "--stars", type=click.FloatRange(0.0), default=3.0, show_default=True, help="Per square arcminute."
+)
+@click.option(
+    "--moon", type=click.FloatRange(0.0), default=0.5, show_default=True, help="Largest, in dark skies."
+)
+@model_effects("Hidden effect; may be repeated.", "YAML with hidden effects.", own=False)
+@click.option(
+    "--size", type=SIZE, default=None, help="Cut-down sensor, columns x rows; full size if not given."
+)
+@click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all randomness.")
+@click.option(
+    "--truth",
+    type=click.Path(path_type=Path),
+    help="Another folder, for the fringes of each visit as FITS [e⁻].",
+)
+@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+def mock_visits(
+    out: OutputFolder,
+    setup: str,
+    detector: str | None,
+    thickness: str,
+    visits: int,
+    stars: float,
+    moon: float,
+    effects: ChosenEffects,
+    size: tuple[int, int] | None,
+    seed: int,
+    truth: Path | None,
+    dry_run: bool,
+) -> None:
+    """Write y-band visits of a simulated sensor: fringes, stars, galaxies, moonlight, cosmic rays, noise.
+
+    They are as after the removal of the instrument's signature, in the layout of Rubin's exposures, for `templates`
+    and `correct`. Nothing in the files tells the thickness, the effects or the seed.
+
+    \b
+    Examples:
+      fringe-sim mock-visits night --seed 1 --size 512x504
+      fringe-sim mock-visits night --seed 1 --visits 30 --effect epoxy_absorption.k=0.001 --truth truth
+    """
+    import numpy as np
+
+    from ..instrument.camera import Camera
+    from ..instrument.setup import Setup
+    from ..mock.hidden_effects import validate_effects
+    from ..mock.visits import VisitConditions, write_mock_visits
+
+    chosen = Setup.from_file(setup) if setup.endswith((".yaml", ".yml")) else Setup.from_name(setup)
+    sensor = Camera.from_name(chosen.camera).detector(detector or chosen.detector)
+    shape = (size[1], size[0]) if size else sensor.shape
+    rng = np.random.default_rng(seed)
+    validate_effects(effects.settings)
+    layer = thickness_map(thickness, chosen, shape, rng)
+    if dry_run:
+        click.echo(f"would write {visits} visits of {sensor.name}, {shape[1]} x {shape[0]} pixels, to {out}")
+        return
+    folder = out.prepare()
+    with progress("writing visits", visits) as advance:
+        written = write_mock_visits(
+            folder,
+            setup=setup,
+            detector=sensor.name,
+            thickness_um=layer,
+            visits=visits,
+            rng=rng,
+            effects=effects.settings,
+            size=f"{shape[1]}x{shape[0]}" if size else None,
+            conditions=VisitConditions(stars_per_arcmin2=stars, moon=moon),
+            progress=lambda path: advance(),
+        )
+    if truth is not None:
+        _write_truth(truth, {visit.path.name: visit.fringes for visit in written})
+    click.echo(f"{len(written)} visits in {folder}")
+
+
+def _write_truth(folder: Path, fringes: dict[str, object]) -> None:
+    from astropy.io import fits
+
+    from ..files import all_or_nothing
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in fringes.items():
+        hdu = fits.PrimaryHDU(image)
+        hdu.header["BUNIT"] = ("electron", "light of the sky less its mean")
+        with all_or_nothing(folder / name) as temporary:
+            hdu.writeto(temporary)

@@ -1,0 +1,360 @@
+"""Visits of a simulated sensor behind its telescope: fringes of the night sky, stars, galaxies, disturbances.
+
+The fringes are those of `FlatFieldOptics`, summed over lines and angles; sources are drawn by GalSim. The images are
+as after the removal of the instrument's signature: electrons, with a mask of what that removal knows.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from ..effects import known_effects
+from ..errors import InputError, OutOfRangeError
+from ..files import all_or_nothing
+from ..instrument.bandpass import Bandpass
+from ..instrument.camera import Camera, Detector
+from ..instrument.night import StochasticNight
+from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
+from ..instrument.telescope import telescope_beam
+from .film_fields import add_mode, add_periodic_mode, light_in
+from .hidden_effect import ActiveHiddenEffect
+from .hidden_effects import validate_effects, with_hidden_optics
+from .optics import FlatFieldOptics, heights_and_weights
+from .raw_frames import checked_thickness, films_of, parse_size, read_setup_file
+from .signal_table import SignalTable
+from .visit_sources import MASK_PLANES, Pointing, Scene, VisitConditions, VisitImage
+
+__all__ = ["MockVisit", "VisitConditions", "detected_sky", "write_mock_visits"]
+
+FloatArray = NDArray[np.float64]
+
+STEP_UM = 0.01
+"""Spacing of the table over thickness [µm]: thirty points per fringe, between which a cubic is right to 1e-5."""
+
+BEAM_NODES = 64
+"""Angles of the beam; twice as many change the fringes of the centre of the LSST by less than 1e-5."""
+
+BLEND_NM = 0.005
+"""Rms shift of lines that are summed as one [nm]; a fringe of all the silicon is 1.3 nm wide."""
+
+FIELD_NODES = 2
+"""Distances from the axis at which the beam is traced; between them light changes with the square of the distance."""
+
+CONTINUUM_NODES, CONTINUUM_STEP_NM = 8, 0.1
+"""Angles and spacing of the wavelengths of continua: with 96 angles fringes differ by 3e-4, with 0.5 nm by 6e-2."""
+
+PARTS = 3
+"""Moments of an exposure over which the drifting bands are averaged."""
+
+FIRST_VISIT = datetime.datetime(2026, 1, 15, 1, 0, tzinfo=datetime.UTC)
+
+
+@dataclass(frozen=True, eq=False)
+class MockVisit:
+    """A visit and what is true of it.
+
+    Attributes
+    ----------
+    path : `pathlib.Path`
+        Its file.
+    fringes : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        Light of the sky less its mean over the sensor [e⁻].
+    level_e : `float`
+        Mean light of the sky [e⁻].
+    sources : `numpy.ndarray`
+        Sources on the sensor: ``x``, ``y`` [px], ``magnitude``, ``electrons``, ``galaxy``.
+    """
+
+    path: Path
+    fringes: NDArray[np.float32]
+    level_e: float
+    sources: NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedSky:
+    """Light of the components of a dark sky that a sensor detects, pixel by pixel.
+
+    Attributes
+    ----------
+    names : `tuple` [`str`, ...]
+        OH bands, then continua.
+    n_bands : `int`
+        How many of them are bands.
+    light : `numpy.ndarray`, float32, shape ``(len(names), ny, nx)``
+        Electrons per second and pixel.
+    """
+
+    names: tuple[str, ...]
+    n_bands: int
+    light: NDArray[np.float32]
+
+
+def detected_sky(
+    setup: str, sensor: Detector, thickness_um: NDArray[np.floating], effects: Mapping[str, Any] | None = None
+) -> DetectedSky:
+    """Sum the light of the night sky over lines, angles and polarisations, for every pixel of a sensor.
+
+    Parameters
+    ----------
+    setup : `str`
+        Name of a set-up behind a telescope, or its YAML file.
+    sensor : `Detector`
+        Where in the field the sensor lies. A map of any size covers all of it.
+    thickness_um : `numpy.ndarray` [y, x]
+        Thickness of the layer that varies [µm].
+    effects : mapping, optional
+        Hidden effects of the sensor, as for `validate_effects`.
+
+    Raises
+    ------
+    InputError
+        A set-up without a telescope and a filter, or an effect that does not act on the layers of a whole sensor.
+    """
+    content = read_setup_file(setup)
+    light = content["illumination"]
+    if light["kind"] != "sky" or light["beam"]["kind"] != "telescope":
+        raise InputError("set-up", setup, "one with a sky and a telescope")
+    optics = with_hidden_optics(_optics(content, setup), _of_the_sensor(effects))
+    sky = SkySpectrum.dark(airmass=float(light["airmass"]))
+    parts = sky.components(Bandpass.from_name(str(light["bandpass"])), CONTINUUM_STEP_NM)
+    lines = frozenset(sky.lines.bands)
+    parts = [
+        *blend_components([part for part in parts if part.name in lines], BLEND_NM),
+        *(part for part in parts if part.name not in lines),
+    ]
+    radius = _field_radius_deg(sensor, thickness_um.shape, float(light["pixel_scale_arcsec"]))
+    nodes = np.sqrt(np.linspace(radius.min() ** 2, radius.max() ** 2, FIELD_NODES))
+    grid = _grid(thickness_um)
+    shares = _lagrange(nodes**2, radius**2)
+    total = np.zeros((len(parts), *thickness_um.shape), dtype=np.float32)
+    for node, share in zip(nodes, shares, strict=True):
+        many, few = (_angles(light["beam"], float(node), number) for number in (BEAM_NODES, CONTINUUM_NODES))
+        for row, part in enumerate(parts):
+            curve = _summed(optics, part, many if part.name in lines else few, grid)
+            total[row] += share * SignalTable(grid, curve[np.newaxis], (0.0,)).evaluate(0, thickness_um)
+    total *= np.float32(light["effective_area_m2"] * light["pixel_scale_arcsec"] ** 2)
+    names = tuple(part.name for part in parts)
+    return DetectedSky(names, sum(name in lines for name in names), total)
+
+
+def _angles(beam: Mapping[str, Any], radius_deg: float, nodes: int) -> tuple[FloatArray, FloatArray]:
+    """Angles of incidence [rad] and their weights."""
+    found = telescope_beam(str(beam["telescope"]), radius_deg, 0.0, nodes)
+    return found.theta, found.weight
+
+
+def _optics(content: Mapping[str, Any], setup: str) -> FlatFieldOptics:
+    # The line of a monochromator plays no part in sums over lines of the sky.
+    return FlatFieldOptics(
+        films=films_of(content, setup),
+        temperature_k=float(content["temperature_k"]),
+        bandwidth_fwhm_nm=1.0,
+        varying=str(content["varying"]),
+    )
+
+
+def _of_the_sensor(effects: Mapping[str, Any] | None) -> tuple[ActiveHiddenEffect, ...]:
+    """Active effects; those that the sky does not see, or that only a part of the sensor has, are refused."""
+    active = validate_effects(effects)
+    elsewhere = {effect.name for effect in known_effects() if effect.laboratory_only}
+    for effect, _ in active:
+        if effect.on_optics is None or effect.on_island is not None or effect.name in elsewhere:
+            raise InputError("hidden effect", effect.name, "one of the layers of the whole sensor")
+    return active
+
+
+def _field_radius_deg(sensor: Detector, shape: tuple[int, ...], scale_arcsec: float) -> FloatArray:
+    """Distance of every pixel from the optical axis [deg]."""
+    turn = math.radians(sensor.yaw_deg)
+    y, x = (
+        scale_arcsec / 3600.0 * pixels * ((np.arange(number) + 0.5) / number - 0.5)
+        for pixels, number in zip(sensor.shape, shape, strict=True)
+    )
+    along = sensor.field_x_deg + math.cos(turn) * x - math.sin(turn) * y[:, np.newaxis]
+    across = sensor.field_y_deg + math.sin(turn) * x + math.cos(turn) * y[:, np.newaxis]
+    return np.asarray(np.hypot(along, across))
+
+
+def _grid(thickness_um: NDArray[np.floating]) -> FloatArray:
+    low, high = float(np.min(thickness_um)), float(np.max(thickness_um))
+    points = math.ceil((high - low) / STEP_UM) + 9
+    return np.asarray(max(low - 4.0 * STEP_UM, 0.0) + STEP_UM * np.arange(points, dtype=float))
+
+
+def _lagrange(nodes: FloatArray, place: FloatArray) -> list[NDArray[np.float32]]:
+    """Weights of the nodes at every place."""
+    weights = []
+    for number, node in enumerate(nodes):
+        others = np.delete(nodes, number)
+        weights.append(np.prod([(place - other) / (node - other) for other in others], axis=0))
+    return [weight.astype(np.float32) for weight in weights]
+
+
+def _summed(
+    optics: FlatFieldOptics,
+    part: SpectralComponent,
+    angles: tuple[FloatArray, FloatArray],
+    grid_um: FloatArray,
+) -> FloatArray:
+    """Light of one component against thickness, with the fringes that come back coherently."""
+    modes = [
+        light_in(
+            optics,
+            part.wavelength_nm,
+            0.5 * weight * share * more * part.photons,
+            float(theta),
+            s_wave,
+            height_um,
+            support_um,
+        )
+        for support_um, more in heights_and_weights(optics.support_spread_um, 1e-3 * optics.height_step_nm)
+        for height_um, share in heights_and_weights(1e-3 * optics.spread_nm, 1e-3 * optics.height_step_nm)
+        for theta, weight in zip(*angles, strict=True)
+        for s_wave in (True, False)
+    ]
+
+    def coherent(thickness_um: FloatArray) -> FloatArray:
+        total = np.zeros(thickness_um.size)
+        for light in modes:
+            add = add_mode if light.phase.imag.any() else add_periodic_mode
+            add(total, light, thickness_um)
+        return total
+
+    seen = coherent(grid_um)
+    if optics.coherent_part == 1.0:
+        return seen
+    mean_nm = float(np.average(part.wavelength_nm, weights=part.photons))
+    mean = coherent(optics.one_order_um(mean_nm)).mean()
+    return np.asarray(mean + optics.coherent_part * (seen - mean))
+
+
+def write_mock_visits(
+    out_dir: str | Path,
+    *,
+    setup: str,
+    detector: int | str,
+    thickness_um: NDArray[np.floating],
+    visits: int,
+    rng: np.random.Generator,
+    effects: Mapping[str, Any] | None = None,
+    size: str | None = None,
+    conditions: VisitConditions | None = None,
+    first_visit: datetime.datetime = FIRST_VISIT,
+    progress: Callable[[Path], None] | None = None,
+) -> tuple[MockVisit, ...]:
+    """Write visits of one night, after the removal of the instrument's signature.
+
+    Parameters
+    ----------
+    out_dir : path-like
+        Folder for the files; made if it does not exist.
+    setup : `str`
+        Name of a set-up behind a telescope, or its YAML file.
+    detector : `int` or `str`
+        Number or name of the sensor in the set-up's camera.
+    thickness_um : `numpy.ndarray` [y, x]
+        Thickness of the layer that varies [µm], of the size of the sensor.
+    visits : `int`
+        Number of visits.
+    rng : `numpy.random.Generator`
+        Source of all randomness.
+    effects : mapping, optional
+        Hidden effects of the sensor, as for `validate_effects`.
+    size : `str`, optional
+        ``"NXxNY"`` for a cut-down sensor, whose pixels are spread over the same part of the field for the beam, and
+        have their usual size for sources.
+    conditions : `VisitConditions`, optional
+        Sources, seeing, light, and what disturbs.
+    first_visit : `datetime.datetime`, optional
+        Time of the first visit (UTC).
+    progress : callable, optional
+        Called with the path of each file once it is written.
+
+    Returns
+    -------
+    visits : `tuple` [`MockVisit`, ...]
+        The files, and the truth, which stands nowhere in them.
+
+    Raises
+    ------
+    InputError, OutOfRangeError, UnknownNameError
+        An argument cannot be used; nothing has been written then.
+    """
+    if visits < 1:
+        raise OutOfRangeError("visits", visits, "1 or more")
+    night = conditions or VisitConditions()
+    content = read_setup_file(setup)
+    whole = Camera.from_name(str(content["camera"])).detector(detector)
+    sensor = whole if size is None else whole.cut_down(parse_size(size))
+    thickness = checked_thickness(thickness_um, sensor.shape)
+    sky = detected_sky(setup, whole, thickness, effects)
+    scene_rng, band_rng, *visit_rngs = rng.spawn(2 + visits)
+    light = content["illumination"]
+    scene = Scene.draw(light, night, sensor.shape, scene_rng)
+    seconds = float(light["exposure_s"])
+    scales = _band_scales(sky, night.hours, visits, seconds, band_rng)
+    folder = Path(out_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for number, (scale, visit_rng) in enumerate(zip(scales, visit_rngs, strict=True)):
+        start = first_visit + datetime.timedelta(hours=night.hours * number / visits)
+        sky_e = seconds * np.tensordot(scale, sky.light, axes=1).astype(np.float32)
+        image = VisitImage.expose(scene, sky_e, sensor, seconds, visit_rng)
+        path = folder / f"visit_{number + 1:03d}_{sensor.name}.fits"
+        _write(path, image, _header(sensor, light, image.pointing, start, seconds))
+        written.append(MockVisit(path, sky_e - np.float32(sky_e.mean()), float(sky_e.mean()), image.sources))
+        if progress is not None:
+            progress(path)
+    return tuple(written)
+
+
+def _band_scales(
+    sky: DetectedSky, hours: float, visits: int, seconds: float, rng: np.random.Generator
+) -> FloatArray:
+    """Strength of every component in every visit, ``(visits, components)``; bands drift within an exposure."""
+    begin = np.linspace(0.0, hours, visits, endpoint=False)
+    moments = begin[:, np.newaxis] + seconds / 3600.0 * (np.arange(PARTS) + 0.5) / PARTS
+    history = StochasticNight().draw(moments.ravel(), rng)
+    bands = sky.names[: sky.n_bands]
+    scale = np.ones((moments.size, len(sky.names)))
+    for moment in range(moments.size):
+        found = history.band_scale(moment, bands)
+        scale[moment, : sky.n_bands] = [found[name] for name in bands]
+    return scale.reshape(visits, PARTS, len(sky.names)).mean(axis=1)
+
+
+def _header(
+    sensor: Detector, light: Mapping[str, Any], pointing: Pointing, start: datetime.datetime, seconds: float
+) -> fits.Header:
+    header = fits.Header()
+    header["DETNAME"] = (sensor.name, "sensor")
+    header["FILTER"] = ("y", "filter")
+    header["EXPTIME"] = (seconds, "[s] exposure")
+    header["TIMESYS"] = "UTC"
+    header["DATE-OBS"] = start.replace(tzinfo=None).isoformat(timespec="milliseconds")
+    header["AIRMASS"] = float(light["airmass"])
+    header["ROTPA"] = (math.degrees(pointing.angle_rad), "[deg] of the sensor's rows on the sky")
+    header.update(pointing.wcs(sensor.shape).to_header())
+    return header
+
+
+def _write(path: Path, image: VisitImage, header: fits.Header) -> None:
+    """A file with image, mask and variance, as Rubin's exposures have them."""
+    pixels = fits.ImageHDU(image.electrons, header, name="IMAGE")
+    pixels.header["BUNIT"] = "electron"
+    mask = fits.ImageHDU(image.mask, name="MASK")
+    for plane, bit in MASK_PLANES.items():
+        mask.header[f"MP_{plane}"] = bit
+    variance = fits.ImageHDU(image.variance, name="VARIANCE")
+    with all_or_nothing(path) as temporary:
+        fits.HDUList([fits.PrimaryHDU(), pixels, mask, variance]).writeto(temporary, checksum=True)
