@@ -150,9 +150,9 @@ def _read_templates(files: tuple[Path, ...]) -> list[FringeFrame]:
 
 def _keyword(path: Path, keyword: str) -> str:
     """Value in the primary header of a FITS file; empty if there is none."""
-    from ..resources import open_user_fits, refuse_damage
+    from ..resources import complete_fits
 
-    with refuse_damage("file", "a complete FITS file", str(path)), open_user_fits(path) as hdus:
+    with complete_fits(path) as hdus:
         return str(hdus[0].header.get(keyword, ""))
 
 

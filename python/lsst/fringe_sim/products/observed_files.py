@@ -6,8 +6,7 @@ What pipelines do not agree on is said once in `_Layout`: where masks and varian
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameFormatError
 from ..files import all_or_nothing
-from ..resources import open_user_fits, refuse_damage
+from ..resources import complete_fits
 from .mask import MASK_PLANES, mask_bits
 from .observed_frame import ObservedFrame
 
@@ -93,7 +92,7 @@ class ObservedImage:
         InputError
             A damaged file, or companions of another size.
         """
-        with _opened(self.path) as hdus:
+        with complete_fits(self.path) as hdus:
             header = _merged(hdus, self.index)
             image = np.array(hdus[self.index].data, dtype=np.float32)
             layout = _layout_of(self)
@@ -121,7 +120,7 @@ class ObservedImage:
 
     def header(self) -> dict[str, Any]:
         """Keywords of the image, and those of the primary header that it does not have itself."""
-        with _opened(self.path) as hdus:
+        with complete_fits(self.path) as hdus:
             return _merged(hdus, self.index)
 
 
@@ -133,7 +132,7 @@ def observed_images(path: Path) -> list[ObservedImage]:
     InputError
         No FITS file, a damaged one, or one without images.
     """
-    with _opened(path) as hdus:
+    with complete_fits(path) as hdus:
         found = [
             ObservedImage(path, number, hdu.name if number and hdu.name else path.name.partition(".")[0])
             for number, hdu in enumerate(hdus)
@@ -177,7 +176,7 @@ def write_images(
     OSError
         The folder does not exist or cannot be written, or the disk is full.
     """
-    with _opened(source) as hdus:
+    with complete_fits(source) as hdus:
         made, flags = [], []
         for number, hdu in enumerate(hdus):
             if hdu.name.endswith(UNCORRECTED):
@@ -203,15 +202,6 @@ def _set_cards(header: fits.Header, cards: Mapping[str, Any]) -> None:
             header.remove(keyword, ignore_missing=True)
         else:
             header[keyword] = value
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[fits.HDUList]:
-    with (
-        refuse_damage("file", "a complete FITS file", str(path)),
-        open_user_fits(path, warning="truncated", memmap=False) as hdus,
-    ):
-        yield hdus
 
 
 def _merged(hdus: fits.HDUList, index: int) -> dict[str, Any]:
@@ -247,7 +237,7 @@ def _sibling(path: Path, kind: str) -> Path | None:
 
 def _companion(path: Path, image: ObservedImage, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
     """The image of the same name in another file, or the one of the same number."""
-    with _opened(path) as hdus:
+    with complete_fits(path) as hdus:
         own = image.name in hdus and image.index > 0
         index = image.name if own else min(image.index, len(hdus) - 1)
         if hdus[index].data is None:
