@@ -111,8 +111,9 @@ def discover(
     check_setup(cube, model)
     known = {item.effect.name for item in model.effects}
     # Flats do not see the spectrum of the night sky.
-    catalogue = known_effects() if effects is None else effects
-    own = [effect for effect in catalogue if effect.acts_on != "spectrum" or effect.name in known]
+    own = [
+        effect for effect in known_effects(effects) if effect.acts_on != "spectrum" or effect.name in known
+    ]
     return search_exposures(cube, model, own, rng, options, report)
 
 
