@@ -15,7 +15,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..errors import FrameFormatError
+from ..errors import FrameFormatError, InputError, printable_name, to_number
 from ..files import all_or_nothing
 from ..resources import complete_fits
 from .mask import MASK_PLANES, mask_bits
@@ -56,6 +56,9 @@ _ZTF_BITS = {
     12: "SUSPECT",
 }
 """Source, source of the PSF catalogue, saturated, no number, track, ghost, halo; all others are bad pixels."""
+
+_BITS = 63
+"""Of a mask that is read as integers with a sign."""
 
 _HARMLESS = ("NOT_DEBLENDED", "INEXACT_PSF", "SENSOR_EDGE", "INJECTED", "INJECTED_CORE", "STREAK_FIT")
 """Planes of Rubin's masks that say nothing against the background of a pixel."""
@@ -107,7 +110,10 @@ class ObservedImage:
                 raise FrameFormatError(
                     f"shape of the {what}", array.shape, f"{image.shape}", source=str(self.path)
                 )
-        mask = mask | np.where(np.isfinite(image), 0, mask_bits("NO_DATA")).astype(np.int32)
+        known = np.isfinite(image)
+        if image[known].size > 1 and np.ptp(image[known]) == 0:
+            raise FrameFormatError("pixels", "all equal", "an image of the sky", source=str(self.path))
+        mask = mask | np.where(known, 0, mask_bits("NO_DATA")).astype(np.int32)
         return ObservedFrame(
             image=image,
             mask=mask,
@@ -130,16 +136,25 @@ def observed_images(path: Path) -> list[ObservedImage]:
     Raises
     ------
     InputError
-        No FITS file, a damaged one, or one without images.
+        No FITS file, a damaged one, one without images, or with two images of one sensor; or a name that is not
+        printable.
     """
+    printable_name("name of a file", path.name)
     with complete_fits(path) as hdus:
         found = [
             ObservedImage(path, number, hdu.name if number and hdu.name else path.name.partition(".")[0])
             for number, hdu in enumerate(hdus)
             if hdu.is_image and len(hdu.shape) == 2 and not hdu.name.upper().endswith(_NOT_SKY)
         ]
+        sensors = [detector_of(_merged(hdus, image.index)) for image in found]
     if not found:
         raise FrameFormatError("images", 0, "one or more of two axes (y, x)", source=str(path))
+    for image, sensor in zip(found, sensors, strict=True):
+        printable_name("sensor", sensor or "none", source=str(path))
+        if sensors.count(sensor) > 1:
+            named = f"{sensor or 'none'} in HDU {image.index}"
+            allowed = f"a name for each sensor of a file ({', '.join(_DETECTORS)})"
+            raise FrameFormatError("sensor", named, allowed, source=str(path))
     return found
 
 
@@ -289,13 +304,21 @@ def _own_mask(image: ObservedImage, hdus: fits.HDUList, _: Mapping[str, Any]) ->
     hdu = _beside(hdus, image, _MASKS)
     if hdu is None:
         return None
-    planes = {
-        int(bit): _plane(str(keyword)[3:])
+    bits = {
+        str(keyword)[3:]: _bit(str(keyword), bit)
         for keyword, bit in hdu.header.items()
-        if str(keyword).startswith("MP_") and str(keyword)[3:] not in _HARMLESS
+        if str(keyword).startswith("MP_")
     }
-    harmless = sum(1 << int(hdu.header[f"MP_{name}"]) for name in _HARMLESS if f"MP_{name}" in hdu.header)
+    harmless = sum(1 << bit for name, bit in bits.items() if name in _HARMLESS)
+    planes = {bit: _plane(name) for name, bit in bits.items() if name not in _HARMLESS}
     return _named(planes, np.asarray(hdu.data).astype(np.int64) & ~harmless, bits=True)
+
+
+def _bit(keyword: str, value: Any) -> int:
+    number = to_number(keyword, value)
+    if number not in range(_BITS):
+        raise InputError(keyword, value, f"a bit of a mask, 0 to {_BITS - 1}")
+    return int(number)
 
 
 def _plane(name: str) -> str:
