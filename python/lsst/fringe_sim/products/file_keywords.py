@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["FILE_KEYWORDS", "SENSOR_NAMES", "FileKeyword", "declared_names"]
+from .sky_frame import CORRECTED_BY
+
+__all__ = ["FILE_KEYWORDS", "FILTER_NAMES", "SENSOR_NAMES", "FileKeyword", "declared_names"]
 
 USED, CHECKED, REFUSED = "used", "checked", "refused"
 """It decides something of the result; another value than the one allowed is refused; its presence is refused."""
@@ -26,6 +28,9 @@ class FileKeyword:
 
 SENSOR_NAMES = ("DETNAME", "DETECTOR", "CCDNAME", "DETPOS", "CCDNUM", "CCDID")
 """Keywords by which cameras name a sensor; the first that is stated counts."""
+
+FILTER_NAMES = ("FILTER", "FILTNAM", "FILTERID")
+"""Keywords of the filter; the first that is stated counts."""
 
 _MAP, _CUBE, _SKY, _ANY = "thickness map", "fringe cube", "sky frame", "any product"
 _PLAIN, _OBSERVED = "plain flat", "observed frame"
@@ -83,6 +88,38 @@ FILE_KEYWORDS: tuple[FileKeyword, ...] = (
     *(FileKeyword(_PLAIN, name, _FITS, CHECKED, "the same sensor in all images") for name in SENSOR_NAMES),
     FileKeyword(_PLAIN, "DATASEC", _FITS, CHECKED, "as large as the image: no overscan in it"),
     FileKeyword(_PLAIN, "TRIMSEC", _FITS, CHECKED, "as large as the image: no overscan in it"),
+    FileKeyword(
+        _OBSERVED, "BUNIT", "templates", USED, "one unit in all frames; a correction is in that of its frame"
+    ),
+    *(
+        FileKeyword(
+            _OBSERVED,
+            name,
+            _CORRECTION,
+            USED,
+            "the sensor, of which the templates are; each image of a file has its own",
+        )
+        for name in (*SENSOR_NAMES, "EXTNAME")
+    ),
+    *(
+        FileKeyword(
+            _OBSERVED, name, _CORRECTION, USED, "the filter: one in all frames, and that of the templates"
+        )
+        for name in FILTER_NAMES
+    ),
+    *(
+        FileKeyword(_OBSERVED, name, _CORRECTION, REFUSED, "fringes were subtracted before")
+        for name in CORRECTED_BY
+    ),
+    FileKeyword(_OBSERVED, "DATE-OBS", "templates", USED, "the last one dates the templates"),
+    FileKeyword(_OBSERVED, "OBSDATE", "templates", USED, "the same where DATE-OBS is absent"),
+    FileKeyword(
+        _OBSERVED, "PLVER", _CORRECTION, USED, "version of the DECam pipeline: bits or codes in its masks"
+    ),
+    FileKeyword(
+        _OBSERVED, "UTYPE", _CORRECTION, USED, "of UNCERT: standard deviation, variance or its inverse"
+    ),
+    FileKeyword(_OBSERVED, "MP_<plane>", _CORRECTION, USED, "bit of a plane of the mask, 0 to 62"),
     FileKeyword(_ANY, "PRODUCT", "all", CHECKED, "the kind of file that the reader wants"),
     FileKeyword(_ANY, "PRODVER", "all", CHECKED, "the version of the layout"),
     FileKeyword(_ANY, "NEXTEND", "all", CHECKED, "the number of extensions"),

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError, printable_name, to_number
 from ..files import all_or_nothing
+from ..instrument.raw_header import header_value
 from ..resources import complete_fits
+from .file_keywords import FILTER_NAMES, SENSOR_NAMES, declared_names
 from .mask import MASK_PLANES, mask_bits
 from .observed_frame import ObservedFrame
 
@@ -34,8 +36,8 @@ _INVERSES = ("WEIGHT", "WHT", "IVAR")
 _ERRORS = ("ERR", "ERROR", "UNCERT", "SIGMA")
 _NOT_SKY = (*_MASKS, *_VARIANCES, *_INVERSES, *_ERRORS, UNCORRECTED)
 
-_DETECTORS = ("DETNAME", "DETECTOR", "CCDNAME", "DETPOS", "EXTNAME", "CCDNUM", "CCDID")
-_FILTERS = ("FILTER", "FILTNAM", "FILTERID")
+_DECLARED = declared_names("observed frame")
+_DETECTORS = (*SENSOR_NAMES[:4], "EXTNAME", *SENSOR_NAMES[4:])
 
 _DECAM_CODES_SINCE = (3, 5, 0)
 """Version of the DECam Community Pipeline from which a mask holds codes, before which it holds bits."""
@@ -118,10 +120,10 @@ class ObservedImage:
             image=image,
             mask=mask,
             variance=variance,
-            unit=str(header.get("BUNIT", "")).strip(),
+            unit=_text(header, "BUNIT"),
             metadata={},
             detector=detector_of(header),
-            physical_filter=_first_of(header, _FILTERS),
+            physical_filter=_first_of(header, FILTER_NAMES),
         )
 
     def header(self) -> dict[str, Any]:
@@ -223,8 +225,14 @@ def _merged(hdus: fits.HDUList, index: int) -> dict[str, Any]:
     return {**dict(hdus[0].header), **dict(hdus[index].header)}
 
 
+def _text(header: Mapping[str, Any], keyword: str) -> str:
+    """Value of a declared keyword; empty if there is none."""
+    value = header_value(header, keyword, _DECLARED)
+    return "" if value is None else str(value)
+
+
 def _first_of(header: Mapping[str, Any], keywords: tuple[str, ...]) -> str:
-    values = (str(header.get(keyword, "")).strip() for keyword in keywords)
+    values = (_text(header, keyword) for keyword in keywords)
     return next((value for value in values if value and value.upper() not in ("IMAGE", "SCI", "PRIMARY")), "")
 
 
@@ -281,7 +289,7 @@ def _decam_mask(image: ObservedImage, _: fits.HDUList, header: Mapping[str, Any]
     if path is None:
         return None
     stored = _companion(path, image)
-    digits = re.findall(r"\d+", str(header.get("PLVER", "")))
+    digits = re.findall(r"\d+", _text(header, "PLVER"))
     version = tuple(int(part) for part in digits[:3])
     if version and version < _DECAM_CODES_SINCE:
         return _named(_DECAM_BITS, stored, bits=True)
@@ -340,7 +348,7 @@ def _own_variance(
     if error is None:
         return None
     # ccdproc says of its UNCERT what it is.
-    kind = str(error.header.get("UTYPE", "")).lower()
+    kind = _text(error.header, "UTYPE").lower()
     if kind.startswith("inverse"):
         return _inverse(error.data)
     values = np.array(error.data, dtype=np.float32)
