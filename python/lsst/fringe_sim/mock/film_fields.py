@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from ..compiled import kernel
 
 if TYPE_CHECKING:
     from .optics import FlatFieldOptics
@@ -175,7 +176,7 @@ def add_mode(total: FloatArray, light: Light, thickness_um: FloatArray) -> None:
     )
 
 
-@numba.njit(cache=True)
+@kernel
 def _add_absorption(
     total: FloatArray,
     thickness: FloatArray,
