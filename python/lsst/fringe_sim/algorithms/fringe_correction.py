@@ -215,7 +215,7 @@ def undo_correction(
     return np.asarray(corrected + _fringes(patterns, _stated_scales(header, patterns), unknown, corrected))
 
 
-def _stated_scales(header: Mapping[str, Any], patterns: NDArray[Any]) -> NDArray[np.float64]:
+def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
     """Scales of all templates by a header of ours.
 
     Raises

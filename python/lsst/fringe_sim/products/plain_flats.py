@@ -192,12 +192,12 @@ def stack_plain_flats(
     biases = [image for image in images if image.kind == "bias"]
     refuse_other_sensors(images)
     once = _Once(advance)
-    level, n_bias = np.float32(0.0), 0
+    level, n_bias = np.zeros(flats[0].shape, np.float32), 0
     for bias in biases:
         counts = once.counts(bias)
         if counts is not None:
-            level, n_bias = level + bias.gain * counts, n_bias + 1
-    level = np.asarray(level / max(n_bias, 1), np.float32)
+            level, n_bias = level + np.float32(bias.gain) * counts, n_bias + 1
+    level /= np.float32(max(n_bias, 1))
     electrons = np.empty((len(flats), *flats[0].shape), np.float32)
     mask = np.zeros(electrons.shape, np.int16)
     kept: list[PlainImage] = []
