@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from made_once import made_once
+from observed_night import observed_night
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.cli.main import run
@@ -46,7 +48,7 @@ def cube_of(wavelength: np.ndarray, shape: tuple[int, int] = (32, 32), **given: 
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cube, a map and a set-up."""
+    """A cube, a map, frames of a night and their templates."""
 
     def make(folder: Path) -> None:
         cube_of(WAVELENGTHS_NM).write_fits(folder / "cube.fits")
@@ -54,6 +56,11 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ThicknessMap(value, empty + 0.01, empty, empty, empty.astype(int), "adhesive").write_fits(
             folder / "map.fits"
         )
+        (folder / "night").mkdir()
+        for number, image in enumerate(observed_night(np.random.default_rng(44), 3, 72, stars=4).images):
+            fits.PrimaryHDU(image).writeto(folder / "night" / f"{number}.fits")
+        words = ["templates", folder / "night", "--components", "1", "--out", folder / "templates"]
+        assert run([str(word) for word in words]) == 0
 
     return made_once(tmp_path_factory, "surroundings", make)
 
@@ -65,6 +72,7 @@ def command(given: Path, name: str, out: Path) -> list[str]:
         "discover": [str(given / "cube.fits"), "--setup", "ts8_e2v", "--seed", "3", "--cells", "400"],
         "mock-flats": ["--size", "64x64", "--wavelengths", "900,950", "--bias-frames", "1", "--seed", "1"],
         "export": [str(given / "map.fits")],
+        "correct": [str(given / "night" / "0.fits"), "--templates", str(given / "templates")],
     }
     if name == "mock-flats":
         return [name, str(out), *kind[name]]
@@ -146,7 +154,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("size", [0, 5000])
-@pytest.mark.parametrize("name", ["sky", "fit", "discover", "mock-flats", "export"])
+@pytest.mark.parametrize("name", ["sky", "fit", "discover", "mock-flats", "export", "correct"])
 def test_a_full_disk(
     name: str, size: int, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -180,7 +188,7 @@ MOST_GROWTH_BYTES = 2 << 20
 """In each run: the arrays of a run here are larger."""
 
 
-@pytest.mark.parametrize("name", ["sky", "fit", "discover"])
+@pytest.mark.parametrize("name", ["sky", "fit", "correct"])
 def test_ten_runs_in_one_process(name: str, given: Path, tmp_path: Path) -> None:
     """The same bytes each time, and memory that does not grow."""
     resident, made = [], []
