@@ -99,7 +99,7 @@ def test_a_template_of_another_sensor_is_refused(
         str(tmp_path / "out"),
     ]
     assert run(words) == 1
-    assert "one with templates: S11" in capsys.readouterr().err
+    assert "did you mean S11" in capsys.readouterr().out
 
 
 def test_a_frame_to_which_templates_add_structure_is_not_written(

@@ -208,6 +208,20 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
             pass
 
 
+@pytest.mark.parametrize("command", ["fit", "discover"])
+def test_a_path_that_leads_to_no_file(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A pipe, a device, a link to nothing: alone, and among what a pattern matches."""
+    os.mkfifo(tmp_path / "pipe.fits")
+    (tmp_path / "device.fits").symlink_to("/dev/zero")
+    (tmp_path / "nothing.fits").symlink_to(tmp_path / "nowhere")
+    for name in ("pipe.fits", "device.fits", "nothing.fits", "*.fits"):
+        path = str(tmp_path / name)
+        assert run([command, path, "--setup", "ts8_e2v", "--out", str(tmp_path / "out"), "--dry-run"]) == 1
+        assert f"path is '{path}'" in capsys.readouterr().err
+
+
 def test_a_long_value_is_not_repeated_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "effects.yaml"
     path.write_text("bandwidth: {fwhm: " + "x" * 600_000 + "}\n")

@@ -77,6 +77,8 @@ def test_a_module_on_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         ("EFFECTS = 3\n", "instances of subclasses of Effect"),
         ("import there_is_no_such_module\n", "there_is_no_such_module"),
         ("EFFECTS = [\n", "SyntaxError"),
+        ("raise SystemExit(0)\n", "SystemExit"),
+        (OWN.format(name="delamination").replace('name = "delamination"', "name = 3"), "identifier"),
         (OWN.format(name="bandwidth"), "no other effect"),
         (OWN.format(name="two words"), "identifier"),
         (OWN.format(name="delamination").replace('reference = "a test"', "pass"), "reference"),

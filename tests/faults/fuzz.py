@@ -33,6 +33,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from astropy.io import fits
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import seed as with_seed
 from hypothesis import strategies as st
@@ -44,6 +45,7 @@ from fuzz_files import alter_fits, plain_header
 from raw_frame_maker import random_image, raw_hdus, small_detector
 
 from lsst.fringe_sim.algorithms.flat_prep import prepare_flat
+from lsst.fringe_sim.algorithms.fringe_correction import CorrectionOptions, correct_fringes
 from lsst.fringe_sim.algorithms.pca import fit_pca
 from lsst.fringe_sim.algorithms.thickness_fit import fit_thickness
 from lsst.fringe_sim.cli.amplitudes import read_line_list
@@ -59,6 +61,7 @@ from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_metadata
 from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
 from lsst.fringe_sim.model import FringeModel, Setup
 from lsst.fringe_sim.optics import Layer, LayerStack, get_medium, layer_absorption
+from lsst.fringe_sim.products.observed_files import observed_images, write_images
 from lsst.fringe_sim.resources import resource_path
 
 LONGEST_S = 20.0
@@ -196,6 +199,42 @@ MAP = plain_header(product_makers.thickness((6, 8), mask=_NONE, layer="adhesive"
 SKY = Setup.from_name("lsst_e2v")
 
 
+def _plain_flat(wavelength_nm: float) -> bytes:
+    cards = {
+        "MONOWL": wavelength_nm,
+        "BUNIT": "adu",
+        "GAIN": 0.7,
+        "RDNOISE": 5.0,
+        "SATURATE": 60000,
+        "TEMPK": 180.0,
+    }
+    counts = np.random.default_rng(int(wavelength_nm)).poisson(20_000.0, (20, 30)).astype(np.int32)
+    header = fits.Header({**cards, "IMGTYPE": "FLAT", "DETNAME": "S1", "DATASEC": "[1:30,1:20]"})
+    return plain_header(fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(counts, header)]))
+
+
+PLAIN, SOUND_FLAT = _plain_flat(950.0), _plain_flat(960.0)
+PATTERN = np.sin(np.add.outer(np.arange(48) / 4.0, np.arange(48) / 7.0)).astype(np.float32)
+
+
+def _observed() -> bytes:
+    rng = np.random.default_rng(4)
+    image = rng.normal(1000.0 + 30.0 * PATTERN, 5.0).astype(np.float32)
+    cards = fits.Header({"BUNIT": "adu", "DETNAME": "S1", "FILTER": "y", "DATE-OBS": "2026-01-02T03:04:05"})
+    mask = fits.ImageHDU((rng.random(image.shape) < 0.02).astype(np.int32), name="MASK")
+    mask.header["MP_SAT"] = 0
+    parts = [
+        fits.PrimaryHDU(),
+        fits.ImageHDU(image, cards),
+        mask,
+        fits.ImageHDU(0 * image + 25, name="VARIANCE"),
+    ]
+    return plain_header(fits.HDUList(parts))
+
+
+OBSERVED = _observed()
+
+
 def _file(folder: Path, content: bytes, name: str = "case.fits") -> Path:
     path = folder / name
     path.write_bytes(content)
@@ -260,6 +299,46 @@ def use_sky_frame(path: Path, folder: Path) -> None:
         found = read_sky_frames([str(night)], SKY, str(folder / "map.fits"))
         components = fit_pca(found.sky.frames, n_components=1)
         _honest(components.mean, components.mask)
+
+
+def plain_flat_file(data: st.DataObject, folder: Path) -> None:
+    """A flat that is one image, with what its header says of it."""
+    use_plain_flat(_file(folder, alter_fits(data, PLAIN)), folder)
+
+
+def use_plain_flat(path: Path, folder: Path) -> None:
+    """The cube of it and of a sound one."""
+    sound = _file(folder, SOUND_FLAT, "sound.fits")
+    with guarded("plain flats", folder):
+        found = product_makers.p.read_plain_flats([path, sound], temperature_k=183.0, bandwidth_fwhm_nm=2.0)
+        _honest(found.image, found.mask)
+        _honest(found.variance, found.mask)
+
+
+def observed_file(data: st.DataObject, folder: Path) -> None:
+    """A frame from a pipeline, with mask and weight."""
+    use_observed(_file(folder, alter_fits(data, OBSERVED)), folder)
+
+
+def use_observed(path: Path, folder: Path) -> None:
+    """The frame corrected, and its file written again with other pixels."""
+    with guarded("observed frames", folder):
+        for image in observed_images(path):
+            frame = image.read()
+            _honest(frame.image, frame.mask)
+            done = correct_fringes(
+                frame.image,
+                PATTERN[np.newaxis],
+                variance=frame.variance,
+                mask=frame.mask,
+                options=CorrectionOptions(16.0),
+                header=image.header(),
+            )
+            _honest(done.image, frame.mask)
+            target, at = folder / "out.fits", image.index
+            write_images(path, target, {at: done.image}, {at: done.cards}, {at: done.uncorrected}, {})
+            (again,) = [each for each in observed_images(target) if each.index == at]
+            again.read()
 
 
 def _honest(image: Any, mask: Any) -> None:
@@ -619,6 +698,8 @@ TARGETS: dict[Callable[[st.DataObject, Path], None], int] = {
     product: 5,
     thickness_file: 2,
     sky_frame_file: 2,
+    plain_flat_file: 2,
+    observed_file: 2,
     layer_stack: 3,
     cube: 4,
     cube_file: 2,
@@ -632,7 +713,18 @@ TARGETS: dict[Callable[[st.DataObject, Path], None], int] = {
 }
 """Targets and their share of the cases."""
 
-QUICK = (raw_frame, product, thickness_file, sky_frame_file, layer_stack, setup_file, camera_file, line_file)
+QUICK = (
+    raw_frame,
+    product,
+    thickness_file,
+    sky_frame_file,
+    plain_flat_file,
+    observed_file,
+    layer_stack,
+    setup_file,
+    camera_file,
+    line_file,
+)
 """Targets of which a case takes milliseconds."""
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -642,6 +734,8 @@ USES: dict[str, Callable[[Path, Path], None]] = {
     "product": use_product,
     "thickness_file": use_thickness,
     "sky_frame_file": use_sky_frame,
+    "plain_flat_file": use_plain_flat,
+    "observed_file": use_observed,
     "cube": use_cube,
     "cube_file": use_cube,
     "effects_file": use_effects,
@@ -683,7 +777,12 @@ def warm_up_quickly() -> None:
     """Let what quick targets call be compiled or read from the cache."""
     MODEL.response([13.0, 13.1], [900.0, 960.0])
     with tempfile.TemporaryDirectory() as name:
-        for use, content in ((use_raw_frame, RAW_BYTES), (use_sky_frame, SKY_FRAMES[0])):
+        for use, content in (
+            (use_raw_frame, RAW_BYTES),
+            (use_sky_frame, SKY_FRAMES[0]),
+            (use_plain_flat, PLAIN),
+            (use_observed, OBSERVED),
+        ):
             with contextlib.suppress(TimeoutError):
                 use(_file(Path(name), content), Path(name))
     TALLY.used.clear()

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
+import resource
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from made_once import made_once
+from observed_night import observed_night
 
 from lsst.fringe_sim.algorithms import fit_thickness
+from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube, ThicknessMap
@@ -42,7 +48,7 @@ def cube_of(wavelength: np.ndarray, shape: tuple[int, int] = (32, 32), **given: 
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cube, a map and a set-up."""
+    """A cube, a map, frames of a night and their templates."""
 
     def make(folder: Path) -> None:
         cube_of(WAVELENGTHS_NM).write_fits(folder / "cube.fits")
@@ -50,6 +56,11 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ThicknessMap(value, empty + 0.01, empty, empty, empty.astype(int), "adhesive").write_fits(
             folder / "map.fits"
         )
+        (folder / "night").mkdir()
+        for number, image in enumerate(observed_night(np.random.default_rng(44), 3, 72, stars=4).images):
+            fits.PrimaryHDU(image).writeto(folder / "night" / f"{number}.fits")
+        words = ["templates", folder / "night", "--components", "1", "--out", folder / "templates"]
+        assert run([str(word) for word in words]) == 0
 
     return made_once(tmp_path_factory, "surroundings", make)
 
@@ -59,7 +70,12 @@ def command(given: Path, name: str, out: Path) -> list[str]:
         "sky": ["--thickness", str(given / "map.fits"), "--setup", "monocam"],
         "fit": [str(given / "cube.fits"), "--setup", "ts8_e2v"],
         "discover": [str(given / "cube.fits"), "--setup", "ts8_e2v", "--seed", "3", "--cells", "400"],
+        "mock-flats": ["--size", "64x64", "--wavelengths", "900,950", "--bias-frames", "1", "--seed", "1"],
+        "export": [str(given / "map.fits")],
+        "correct": [str(given / "night" / "0.fits"), "--templates", str(given / "templates")],
     }
+    if name == "mock-flats":
+        return [name, str(out), *kind[name]]
     return [name, *kind[name], "--out", str(out)]
 
 
@@ -124,6 +140,70 @@ def test_without_room_for_temporary_files(place: str, given: Path, tmp_path: Pat
 def test_locales_that_are_not_utf8(locale: dict[str, str], given: Path, tmp_path: Path, usual: Usual) -> None:
     out = tmp_path / "für"
     compared(files_of(command(given, "sky", out), out, PYTHONUTF8="0", **locale), usual("sky"))
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """A file that grows beyond it cannot be written, as on a full disk or beyond a quota."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("size", [0, 5000])
+@pytest.mark.parametrize("name", ["sky", "fit", "discover", "mock-flats", "export", "correct"])
+def test_a_full_disk(
+    name: str, size: int, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One sentence that names the file; nothing that is half of a file, and nothing that a reader takes."""
+    out = tmp_path / "out"
+    out.mkdir()
+    with files_of_at_most(size):
+        status = run(command(given, name, out))
+    said = capsys.readouterr().err
+    assert status == 1
+    (line,) = [line for line in said.splitlines() if line.startswith("fringe-sim:")]
+    assert "Traceback" not in said
+    assert str(out) in line
+    left = [path.name for path in out.rglob("*") if path.is_file()]
+    assert not [name for name in left if name.endswith((".fits", ".nc", ".part", ".json"))]
+    assert run([*command(given, name, out), *(["--overwrite"] if any(out.iterdir()) else [])]) == 0
+
+
+def test_two_hundred_wavelengths() -> None:
+    """Every 0.6 nm: the fit takes them all, and its errors are those that the noise makes."""
+    wavelength = np.linspace(880.0, 1000.0, 200)
+    fitted = fit_thickness(cube_of(wavelength), FringeModel.from_setup("ts8_e2v"))
+    good = fitted.mask == 0
+    assert good.mean() > 0.99
+    pull = ((fitted.value - field_um(32, 32)) / fitted.sigma)[good]
+    assert abs(np.median(pull)) < 1.0
+    assert 0.5 < np.std(pull) < 2.0
+
+
+MOST_GROWTH_BYTES = 2 << 20
+"""In each run: the arrays of a run here are larger."""
+
+
+@pytest.mark.parametrize("name", ["sky", "fit"])
+def test_ten_runs_in_one_process(name: str, given: Path, tmp_path: Path) -> None:
+    """The same bytes each time, and memory that does not grow."""
+    resident, made = [], []
+    for number in range(10):
+        out = tmp_path / str(number)
+        assert run(command(given, name, out)) == 0
+        found = {path.name: path.read_bytes() for path in out.iterdir() if path.name not in PAGES}
+        made.append({key: content.replace(os.fsencode(out), b"OUT") for key, content in found.items()})
+        gc.collect()
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        resident.append(pages * resource.getpagesize())
+    print(name, [round(size / 2**20, 1) for size in resident])
+    for other in made[1:]:
+        compared(other, made[0])
+    assert np.polyfit(np.arange(5), resident[5:], 1)[0] < MOST_GROWTH_BYTES
 
 
 def test_one_wavelength() -> None:

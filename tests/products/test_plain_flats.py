@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def test_pixels_without_a_number_and_full_ones_are_masked(tmp_path: Path) -> Non
 
 def test_the_command_fits_a_folder_of_them(flats: Path, tmp_path: Path, capsys) -> None:
     assert run(["fit", str(flats), "--setup", "ts8_e2v", "--out", str(tmp_path / "fit")]) == 0
-    assert "12 plain flats" in capsys.readouterr().err
+    assert "12 flats at 880, 890" in capsys.readouterr().err
     found = ThicknessMap.read_fits(tmp_path / "fit" / "thickness.fits")
     good = found.mask == 0
     assert good.mean() > 0.95
@@ -87,6 +88,12 @@ def test_the_command_fits_a_folder_of_them(flats: Path, tmp_path: Path, capsys) 
         ({"BUNIT": "adu", "GAIN": -1.0}, "positive"),
         ({"BUNIT": "jansky"}, "electron, or adu"),
         ({"IMGTYPE": "DARK"}, "one flat or more"),
+        ({"WAVELEN": 957.0}, "one wavelength"),
+        ({"RDNOISE": -3.0}, "0 or more"),
+        ({"SATURATE": "NaN"}, "positive"),
+        ({"TEMPK": -90.0}, "K from 73"),
+        ({"CCDTEMP": 183.0}, "°C from -200"),
+        ({"DATASEC": "[11:20,1:20]"}, "overscan"),
     ],
 )
 def test_what_is_missing_is_said(tmp_path: Path, cards: dict[str, Any], words: str) -> None:
@@ -102,3 +109,73 @@ def test_images_of_other_shapes_are_refused(tmp_path: Path) -> None:
     ]
     with pytest.raises(InputError, match=r"shape is \(21, 30\)"):
         read_plain_flats(paths, **LIGHT)
+
+
+def test_what_two_headers_say_differently_is_refused(tmp_path: Path) -> None:
+    image = fits.ImageHDU(np.ones((20, 30), np.float32), fits.Header({"BUNIT": "electron", "MONOWL": 950.0}))
+    fits.HDUList([fits.PrimaryHDU(header=fits.Header({"MONOWL": 957.0})), image]).writeto(tmp_path / "f.fits")
+    with pytest.raises(InputError, match=r"950\.0 and 957\.0"):
+        read_plain_flats([tmp_path / "f.fits"], **LIGHT)
+
+
+def test_flats_of_two_sensors_are_refused(tmp_path: Path) -> None:
+    paths = [
+        write(tmp_path / f"{k}.fits", np.ones((20, 30)), MONOWL=950.0 + k, BUNIT="e", DETNAME=f"S{k}")
+        for k in range(2)
+    ]
+    with pytest.raises(InputError, match="flats of one sensor"):
+        read_plain_flats(paths, **LIGHT)
+
+
+def test_a_copy_counts_once_and_is_named(flats: Path, tmp_path: Path, capsys) -> None:
+    shutil.copy(flats / "3.fits", flats / "renamed.fits")
+    assert read_plain_flats(flats.iterdir(), **LIGHT).shape[0] == 12
+    assert (
+        run(["discover", str(flats), "--cells", "100", "--time-budget", "1e-9", "--out", str(tmp_path)]) == 0
+    )
+    assert "renamed.fits" in capsys.readouterr().err
+
+
+def test_equal_pixels_at_another_wavelength_are_refused(flats: Path) -> None:
+    shutil.copy(flats / "3.fits", flats / "renamed.fits")
+    fits.setval(flats / "renamed.fits", "MONOWL", value=915.0, ext=1)
+    with pytest.raises(InputError, match="light of its own"):
+        read_plain_flats(flats.iterdir(), **LIGHT)
+
+
+@pytest.mark.parametrize("damage", [b"", b"no FITS file", None])
+def test_a_damaged_one_is_named_and_can_be_skipped(flats: Path, damage: bytes | None, capsys) -> None:
+    content = (flats / "4.fits").read_bytes()
+    (flats / "4.fits").write_bytes(content[: len(content) // 2] if damage is None else damage)
+    words = ["fit", str(flats), "--setup", "ts8_e2v", "--out", str(flats.parent / "out"), "--dry-run"]
+    assert run(words) == 1
+    said = capsys.readouterr().err
+    assert "4.fits" in said
+    assert "0.fits" not in said
+    assert run([*words, "--skip-bad"]) == 0
+    assert "11 flats" in capsys.readouterr().err
+
+
+def test_one_without_its_wavelength_is_named_and_can_be_skipped(flats: Path, capsys) -> None:
+    fits.delval(flats / "4.fits", "MONOWL", ext=1)
+    words = ["fit", str(flats), "--setup", "ts8_e2v", "--out", str(flats.parent / "out"), "--dry-run"]
+    assert run(words) == 1
+    assert "4.fits: MONOWL" in capsys.readouterr().err
+    assert run([*words, "--skip-bad"]) == 0
+
+
+def test_a_dry_run_reads_no_pixels(flats: Path, tmp_path: Path, capsys) -> None:
+    """Compressed pixels that cannot be unpacked, behind headers that are sound."""
+    for path in list(flats.iterdir()):
+        with fits.open(path) as hdus:
+            made = fits.CompImageHDU(hdus[-1].data, hdus[-1].header, compression_type="GZIP_1")
+            fits.HDUList([fits.PrimaryHDU(), made]).writeto(path, overwrite=True)
+        content = path.read_bytes()
+        place = content.index(b"\x1f\x8b")
+        path.write_bytes(content[: place + 10] + b"\xff" * 40 + content[place + 50 :])
+    words = ["fit", str(flats), "--setup", "ts8_e2v", "--out", str(tmp_path / "out")]
+    assert run([*words, "--dry-run"]) == 0
+    assert "would prepare 14 frames" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+    assert run(words) == 1
+    assert ".fits: file is" in capsys.readouterr().err

@@ -15,6 +15,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 import numba
@@ -29,17 +30,22 @@ _RELAXED = {"reassoc", "contract", "arcp", "nsz"}
 """Freedom of rounding; NaN and infinity keep their meaning."""
 
 
-def kernel(function: Callable[..., Any] | None = None, *, relaxed: bool = False) -> Any:
+def kernel(
+    function: Callable[..., Any] | None = None, *, relaxed: bool | set[str] = False, parallel: bool = False
+) -> Any:
     """Compile a function that Python calls.
 
     Parameters
     ----------
     function : callable, optional
         Numpy arrays and numbers in, and out.
-    relaxed : `bool`, optional
-        Whether sums and products may be reordered and contracted, as vector instructions need.
+    relaxed : `bool` or `set` [`str`], optional
+        Whether sums and products may be reordered and contracted, as vector instructions need; or which of the
+        freedoms of rounding of LLVM.
+    parallel : `bool`, optional
+        Whether its loops over ``prange`` run in threads of numba.
     """
-    return _compiled(function, fastmath=_RELAXED if relaxed else False)
+    return _compiled(function, fastmath=_RELAXED if relaxed is True else relaxed, parallel=parallel)
 
 
 def subkernel(
@@ -70,7 +76,7 @@ def subkernel(
 def _compiled(function: Callable[..., Any] | None, **options: Any) -> Any:
     def decorate(inner: Callable[..., Any]) -> Any:
         try:
-            return numba.njit(cache=_keep[0], nogil=True, error_model="numpy", **options)(inner)
+            made = numba.njit(cache=_keep[0], nogil=True, error_model="numpy", **options)(inner)
         except RuntimeError as error:
             if not _keep[0]:
                 raise
@@ -81,11 +87,51 @@ def _compiled(function: Callable[..., Any] | None, **options: Any) -> Any:
                 error,
             )
             return decorate(inner)
+        _work_without_cache(made)
+        return made
 
     return decorate if function is None else decorate(function)
 
 
 _keep = [True]
+
+
+def _work_without_cache(dispatcher: Any) -> None:
+    """Let a function be compiled where what is kept of it cannot be written, on a full disk, or is damaged.
+
+    Numba passes both errors on, and they would end the command that calls the function.
+    """
+    cache = getattr(dispatcher, "_cache", None)
+    if cache is None:  # compilation is switched off
+        return
+    save, load = cache.save_overload, cache.load_overload
+
+    def save_if_possible(signature: Any, data: Any) -> None:
+        try:
+            save(signature, data)
+        except OSError as error:
+            _say_once("compiled functions cannot be kept", error)
+
+    def load_if_possible(signature: Any, context: Any) -> Any:
+        try:
+            return load(signature, context)
+        except Exception as error:  # whatever unpickling half a file raises
+            _say_once("a compiled function that was kept cannot be read", error)
+            with suppress(OSError):
+                cache.flush()  # it is kept anew
+            return None
+
+    cache.save_overload, cache.load_overload = save_if_possible, load_if_possible
+
+
+def _say_once(what: str, error: Exception) -> None:
+    if what not in _said:
+        _said.add(what)
+        reason = f"{type(error).__name__}: {error}"
+        _LOG.warning("%s (%s); it is compiled anew, for a minute or so in each process.", what, reason)
+
+
+_said: set[str] = set()
 
 
 def contiguous(array: ArrayLike, dtype: DTypeLike | None = None) -> NDArray[Any]:

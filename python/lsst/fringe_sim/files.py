@@ -113,10 +113,22 @@ def _temporary(target: Path) -> Iterator[Path]:
             break
         os.close(descriptor)
     try:
-        yield temporary
+        with _named_after(target, temporary):
+            yield temporary
     finally:
         temporary.unlink(missing_ok=True)
         os.close(descriptor)
+
+
+@contextmanager
+def _named_after(target: Path, temporary: Path) -> Iterator[None]:
+    """Let an error over a temporary file name the one that was meant; a full disk names none."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename not in (None, str(temporary), temporary):
+            raise
+        raise OSError(error.errno, error.strerror or str(error), str(target)) from error
 
 
 def _clear(target: Path) -> None:

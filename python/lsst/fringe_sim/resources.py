@@ -28,6 +28,7 @@ from .errors import FrameFormatError, InputError, ResourceError, UnknownNameErro
 __all__ = [
     "DAMAGE",
     "check_axes",
+    "complete_fits",
     "first_line",
     "list_resources",
     "open_user_fits",
@@ -375,6 +376,22 @@ def open_user_fits(
         check_axes(stream, str(path))
         with fits.open(stream, **options) as hdus:
             yield hdus
+
+
+@contextmanager
+def complete_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
+    """Open a FITS file from outside, headers first; one that is damaged or cut short is refused by its name.
+
+    Raises
+    ------
+    FrameFormatError
+        The file is not FITS, or damaged.
+    """
+    with (
+        refuse_damage("file", "a complete FITS file", str(path)),
+        open_user_fits(path, warning="truncated", memmap=False) as hdus,
+    ):
+        yield hdus
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 
-from ..errors import InputError, OutOfRangeError, named_units
+from ..errors import InputError, OutOfRangeError, named_units, to_number
 from ..products import CORRECTED, FringeFrame, refuse_corrected
 from .correction.background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .correction.objects import ROUNDS, FrameFit, fit_frame
@@ -212,8 +212,25 @@ def undo_correction(
         raise InputError(TEMPLATE_ID, header.get(TEMPLATE_ID), f"{own}, which the templates given have")
     corrected = np.asarray(image)
     patterns, unknown = _templates(templates, (corrected.shape[0], corrected.shape[1]))
-    scale = np.array([float(header[f"FRINGSC{item}"]) for item in range(int(number))])
-    return np.asarray(corrected + _fringes(patterns, scale, unknown, corrected))
+    return np.asarray(corrected + _fringes(patterns, _stated_scales(header, patterns), unknown, corrected))
+
+
+def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
+    """Scales of all templates by a header of ours.
+
+    Raises
+    ------
+    InputError
+        It states none, or of another number of templates.
+    """
+    if header[CORRECTED] != len(patterns):
+        raise InputError(CORRECTED, header[CORRECTED], f"{len(patterns)}, the number of the templates")
+    names = [f"FRINGSC{item}" for item in range(len(patterns))]
+    scale = np.array([to_number(name, header.get(name)) for name in names])
+    for name, value in zip(names, scale, strict=True):
+        if not abs(value) < np.finfo(np.float32).max:
+            raise OutOfRangeError(name, float(value), "a finite number of electrons")
+    return scale
 
 
 def template_identity(templates: Sequence[FringeFrame] | ArrayLike) -> str:

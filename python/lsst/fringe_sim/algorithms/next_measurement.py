@@ -259,7 +259,7 @@ def rank_measurements(
     if model.setup.kind != "monochromator":
         raise InputError("set-up", model.setup.name, "a laboratory set-up with a monochromator")
     say = report or (lambda text: None)
-    catalogue = known_effects() if catalogue is None else catalogue
+    catalogue = known_effects(catalogue)
     known = {effect.name: effect for effect in catalogue}
     unknown = [name for name in (*effects, *nuisance_effects) if name not in known]
     if unknown:

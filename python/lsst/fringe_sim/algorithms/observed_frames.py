@@ -104,6 +104,7 @@ def make_templates(
     prior: Sequence[FringeFrame] = (),
     metadata: Mapping[str, Any] | None = None,
     advance: Callable[[], None] = lambda: None,
+    names: Sequence[str] = (),
 ) -> FringeTemplates:
     """Make the templates of one sensor in one filter.
 
@@ -122,6 +123,8 @@ def make_templates(
         Further header keywords.
     advance : callable, optional
         Called after each frame of each round.
+    names : sequence of `str`, optional
+        What messages call the frames.
 
     Raises
     ------
@@ -132,7 +135,7 @@ def make_templates(
         The frames do not decide a template.
     """
     chosen = options or TemplateOptions()
-    first = _first_of_alike(frames)
+    first = _first_of_alike(frames, names)
     expected = [np.where(each.mask == 0, each.image, 0).astype(np.float32) for each in prior]
     found = fit_templates([partial(_loaded, frame) for frame in frames], chosen, expected, advance)
     unseen = found.coverage < chosen.least_frames
@@ -231,7 +234,7 @@ def _block_means(image: NDArray[Any], side: int) -> NDArray[np.float64]:
     return np.divide(total, number, out=np.full((ny, nx), np.nan), where=number > 0)
 
 
-def _first_of_alike(frames: Sequence[Callable[[], ObservedFrame]]) -> ObservedFrame:
+def _first_of_alike(frames: Sequence[Callable[[], ObservedFrame]], names: Sequence[str]) -> ObservedFrame:
     """The first frame, when all have been read and found to belong together."""
     if len(frames) < LEAST_FRAMES:
         raise InputError("frames for templates", len(frames), "three or more, of different places on the sky")
@@ -243,7 +246,7 @@ def _first_of_alike(frames: Sequence[Callable[[], ObservedFrame]]) -> ObservedFr
             _refuse_other(read, first)
             yield read.image
 
-    refuse_equal_pixels("frames for templates", images())
+    refuse_equal_pixels("frames for templates", images(), names)
     return first
 
 

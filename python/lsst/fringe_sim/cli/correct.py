@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import InputError, UndeterminedError
-from .observed import TemplateFolder, background_options, background_path, grid_of, images_of, stem_of
+from ..errors import InputError
+from .observed import (
+    TemplateFolder,
+    background_options,
+    background_path,
+    grid_of,
+    images_of,
+    refuse_bad,
+    stem_of,
+    target_names,
+)
 from .output import OutputFolder, output_folder
 from .progress import progress
 
@@ -71,37 +81,40 @@ def correct(
       fringe-sim correct corrected/*_corrected.fits --templates templates --out restored --undo
     """
     from ..algorithms.fringe_correction import CorrectionOptions
+    from ..products import refuse_corrected
 
-    images, known = images_of(frames), TemplateFolder(folder)
-    _check_headers(images, undo)
+    images, unusable = images_of(frames, _refuse_uncorrected if undo else refuse_corrected)
+    known = TemplateFolder(folder)
+    known.check(images)
+    names = target_names(images, *(("_restored", "_corrected") if undo else ("_corrected",)))
     if dry_run:
         click.echo(f"would {'restore' if undo else 'correct'} {len(images)} images")
+        refuse_bad(unusable, skip_bad=False)
         return
     target = out.prepare()
     if undo:
-        _restore(images, known, target)
-        return
-    options = CorrectionOptions(background_px, grid_of(amplifiers))
-    done, refused = _corrected(images, known, options, background, pixel_scale, target)
-    _write_report(target, done, refused)
-    for line in [*map(_describe, done), *refused]:
+        refused = _restore(images, known, target, names)
+        passed = True
+    else:
+        options = CorrectionOptions(background_px, grid_of(amplifiers))
+        done, refused = _corrected(images, known, options, background, pixel_scale, target, names)
+        _write_report(target, done, [*unusable, *refused])
+        passed = all(each.proof.passed for each in done)
+        for record in done:
+            click.echo(_describe(record))
+    for line in [*unusable, *refused]:
         click.echo(line)
-    click.echo(str(target / "report.html"))
-    if refused or not all(each.proof.passed for each in done):
+    if not undo:
+        click.echo(str(target / "report.html"))
+    if unusable or refused or not passed:
         raise click.exceptions.Exit(EXIT_REFUSED)
 
 
-def _check_headers(images: list[ObservedImage], undo: bool) -> None:
-    from ..products import CORRECTED, refuse_corrected
+def _refuse_uncorrected(header: Mapping[str, Any], source: str) -> None:
+    from ..products import CORRECTED
 
-    for image in images:
-        header = image.header()
-        if undo and not header.get(CORRECTED):
-            raise InputError(
-                CORRECTED, None, "a frame that was corrected by this program", source=str(image.path)
-            )
-        if not undo:
-            refuse_corrected(header, str(image.path))
+    if not header.get(CORRECTED):
+        raise InputError(CORRECTED, None, "a frame that was corrected by this program", source=source)
 
 
 def _corrected(
@@ -111,6 +124,7 @@ def _corrected(
     background: Path | None,
     pixel_scale: float,
     target: Path,
+    names: Mapping[Path, str],
 ) -> tuple[list[FrameRecord], list[str]]:
     """Frames that could be fitted, of which those that passed are written; and why others could not."""
     from ..algorithms.observed_frames import correct_frame
@@ -123,10 +137,11 @@ def _corrected(
             made: dict[int, CorrectedFrame] = {}
             for image in parts:
                 name = stem_of(path) if len(parts) == 1 else f"{stem_of(path)}[{image.name}]"
-                frame = image.read(background_path(background, image))
                 try:
-                    each = correct_frame(frame, known.of(frame.detector), options, pixel_arcsec=pixel_scale)
-                except UndeterminedError as error:
+                    frame = image.read(background_path(background, image))
+                    found = known.of(frame.detector, frame.physical_filter)
+                    each = correct_frame(frame, found, options, pixel_arcsec=pixel_scale)
+                except InputError as error:
                     refused.append(f"{name}: not corrected: {error}")
                 else:
                     done.append(each.record(name))
@@ -138,7 +153,7 @@ def _corrected(
                 pixels = {index: each.frame.image for index, each in made.items()}
                 flags = {index: each.correction.uncorrected for index, each in made.items()}
                 first = {"FRINGTID": next(iter(made.values())).correction.template_id, "FRINGUND": None}
-                write_images(path, target / f"{stem_of(path)}_corrected.fits", pixels, cards, flags, first)
+                write_images(path, target / names[path], pixels, cards, flags, first)
     return done, refused
 
 
@@ -155,20 +170,29 @@ def _cards(each: CorrectedFrame) -> dict[str, Any]:
     return {**each.correction.cards, "FRINGPRB": each.proof.probability, "FRINGVER": __version__}
 
 
-def _restore(images: list[ObservedImage], known: TemplateFolder, target: Path) -> None:
+def _restore(
+    images: list[ObservedImage], known: TemplateFolder, target: Path, names: Mapping[Path, str]
+) -> list[str]:
+    """Put the fringes back; what is returned says why some could not be."""
     from ..algorithms.fringe_correction import undo_correction
     from ..products.observed_files import write_images
 
+    refused = []
     for path, parts in _by_file(images).items():
         pixels, cards, flags = {}, {}, {}
-        for image in parts:
-            header, frame = image.header(), image.read()
-            pixels[image.index] = undo_correction(frame.image, known.of(frame.detector), header)
-            cards[image.index] = dict.fromkeys(key for key in header if OWN_CARD.fullmatch(key))
-            flags[image.index] = frame.mask < 0
-        name = f"{stem_of(path).removesuffix('_corrected')}_restored.fits"
-        write_images(path, target / name, pixels, cards, flags, {"FRINGTID": None, "FRINGUND": True})
+        try:
+            for image in parts:
+                header, frame = image.header(), image.read()
+                pixels[image.index] = undo_correction(frame.image, known.of(frame.detector), header)
+                cards[image.index] = dict.fromkeys(key for key in header if OWN_CARD.fullmatch(key))
+                flags[image.index] = frame.mask < 0
+        except InputError as error:
+            refused.append(f"{stem_of(path)}: fringes not put back: {error}")
+            continue
+        first = {"FRINGTID": None, "FRINGUND": True}
+        write_images(path, target / names[path], pixels, cards, flags, first)
         click.echo(f"{stem_of(path)}: fringes put back")
+    return refused
 
 
 def _write_report(target: Path, done: list[FrameRecord], refused: list[str]) -> None:

@@ -110,7 +110,7 @@ def fit(
     from ..model.provenance import input_cards
     from ..report.thickness_page import write_thickness_report
     from .inputs import effect_cards, read_settings
-    from .lab_frames import given_cube
+    from .lab_frames import read_cube
 
     settings = dict(read_settings(effects_file)) if effects_file else {}
     settings.update(effect_settings(effects))
@@ -124,7 +124,7 @@ def fit(
             "--zones, --illumination-degree, --contrast", "given", "nothing with method guo2022 or --silicon"
         )
     free = None if asked == (None, None, None) else _free(*asked, setup.wavelength_accuracy_nm)
-    cube, used = given_cube(paths, setup)
+    cube, used = (read_cube(paths[0]) if len(paths) == 1 else None), paths
     if cube is None:
         kernel_px = SMOOTHING_PX[method] if smoothing is None else smoothing
         cube, used = _prepare(paths, setup, kernel_px, skip_bad, dry_run)

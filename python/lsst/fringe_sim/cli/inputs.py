@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 import numpy as np
-from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..effects import activate_effects, known_effects
@@ -21,34 +19,15 @@ from ..model.effects_override import read_effects_override
 from ..model.provenance import model_cards, software_cards
 from ..products import SensorSection, ThicknessMap
 from ..products.sensor_section import SECTION_KEYWORDS
-from ..resources import LONGEST_USER_FILE, open_user_fits, read_user_text, read_user_yaml, refuse_damage
+from ..resources import LONGEST_USER_FILE, complete_fits, read_user_text, read_user_yaml
 
 __all__ = [
-    "complete_fits",
     "effect_cards",
     "read_section",
     "read_settings",
     "read_thickness",
     "sky_settings",
 ]
-
-
-@contextmanager
-def complete_fits(
-    path: str | os.PathLike[str], warning: Literal["ignored", "truncated"] = "ignored"
-) -> Iterator[fits.HDUList]:
-    """Open a FITS file of the user; see `open_user_fits`.
-
-    Raises
-    ------
-    FrameFormatError
-        The file is not FITS, or damaged.
-    """
-    with (
-        refuse_damage("file", "a complete FITS file", str(path)),
-        open_user_fits(path, warning=warning, memmap=False) as hdus,
-    ):
-        yield hdus
 
 
 def read_thickness(path: str | os.PathLike[str], layer: str | None = None) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import click
 
@@ -17,23 +17,37 @@ from ..instrument.raw_files import find_raw_files, pixel_digest
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..model import Setup
 from ..products import FringeCube, FringeFlat
-from ..products.plain_flats import is_plain, read_plain_flats
-from .inputs import complete_fits
+from ..products.plain_flats import PlainImage, refuse_other_sensors, stack_plain_flats
+from ..resources import complete_fits
 
-__all__ = ["LabSeries", "find_series", "given_cube", "read_cube"]
+__all__ = ["LabSeries", "PlainSeries", "find_series", "read_cube"]
 
 LEAST_SIZE = (16, 64)
 """Rows and columns below which a frame is no sensor."""
 
 
+class FrameHeader(Protocol):
+    """What a series asks of a frame."""
+
+    @property
+    def source(self) -> str:
+        """The file."""
+
+    def require_wavelength_nm(self) -> float:
+        """Wavelength of a flat [nm]."""
+
+
+Header = TypeVar("Header", bound=FrameHeader)
+
+
 @dataclass(frozen=True)
-class LabSeries:
+class Series(Generic[Header]):
     """Bias frames and flats of one sensor."""
 
-    serial: str  # serial number of the sensor
+    serial: str  # serial number or name of the sensor; empty if it is not stated
     # biases, flats: what the headers say; ``source`` of each is the file
-    biases: tuple[RawMetadata, ...]
-    flats: tuple[RawMetadata, ...]
+    biases: tuple[Header, ...]
+    flats: tuple[Header, ...]
 
     @property
     def wavelengths_nm(self) -> tuple[float, ...]:
@@ -53,6 +67,10 @@ class LabSeries:
     def missing_nm(self, setup: Setup) -> tuple[float, ...]:
         """Usual wavelengths of a set-up of which there is no flat [nm]."""
         return setup.missing_nm(self.wavelengths_nm)
+
+
+class LabSeries(Series[RawMetadata]):
+    """Raw frames, with an image for each amplifier."""
 
     def read(self, setup: Setup, options: FlatPrepOptions, advance: Callable[[], None]) -> FringeCube:
         """Prepare all frames, one at a time.
@@ -100,28 +118,89 @@ class LabSeries:
             return replace(camera.detector(setup.detector), serial="", name=self.serial or setup.detector)
 
 
-def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries:
-    """Bias frames and flats among files, folders and patterns.
+class PlainSeries(Series[PlainImage]):
+    """Images of a sensor without a layout of its own; what their headers do not say, the set-up does."""
+
+    def read(self, setup: Setup, _: FlatPrepOptions, advance: Callable[[], None]) -> FringeCube:
+        """Stack all images; they are not smoothed."""
+        return stack_plain_flats(
+            (*self.biases, *self.flats),
+            temperature_k=setup.temperature_k,
+            bandwidth_fwhm_nm=setup.bandwidth_fwhm_nm,
+            f_number=setup.f_number,
+            advance=advance,
+            note=lambda line: click.echo(line, err=True),
+        )
+
+
+def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries | PlainSeries:
+    """Bias frames and flats among files, folders and patterns: raw frames, or one image in each file.
 
     ``skip_bad``: report files that cannot be read and go on without them.
     """
     files, refused = find_raw_files(paths)
+    plain = _plain_images(files)
+    if plain is not None:
+        images, bad = plain
+        _refuse_bad([*refused, *map(str, bad)], images, paths, skip_bad)
+        return _plain_series(images)
     frames: list[RawMetadata] = []
-    bad: list[FringeSimError] = []
+    bad = []
     for file in files:
         try:
             frames.append(_readable(file))
         except FringeSimError as error:
             bad.append(error)
-    for message in [*refused, *(str(error) for error in bad)]:
+    _refuse_bad([*refused, *map(str, bad)], frames, paths, skip_bad)
+    return _raw_series(_each_once(frames), paths)
+
+
+def _plain_images(files: Sequence[str]) -> tuple[list[PlainImage], list[FringeSimError]] | None:
+    """Images and what is wrong with other files; `None` if there are none, or a file that is no plain image.
+
+    Those that cannot be read do not decide what the others are.
+    """
+    images: list[PlainImage] = []
+    bad: list[FringeSimError] = []
+    for file in files:
+        try:
+            image = PlainImage.read(file)
+        except FringeSimError as error:
+            bad.append(error)
+            continue
+        if image is None:
+            return None
+        images.append(image)
+    return (images, bad) if images else None
+
+
+def _plain_series(images: Sequence[PlainImage]) -> PlainSeries:
+    refuse_other_sensors(images)
+    flats = sorted((image for image in images if image.kind == "flat"), key=PlainImage.require_wavelength_nm)
+    biases = tuple(image for image in images if image.kind == "bias")
+    if len(biases) + len(flats) < len(images):
+        others = ", ".join(image.source for image in images if image.kind not in ("bias", "flat"))
+        click.echo(f"neither flats nor bias images, left out: {others}", err=True)
+    name = next((flat.detector for flat in flats if flat.detector), "")
+    click.echo(
+        "plain flats" + ("" if biases else ", taken as bias-subtracted: there are no bias images"), err=True
+    )
+    return PlainSeries(name, biases, tuple(flats))
+
+
+def _refuse_bad(messages: Sequence[str], good: Sequence[Any], paths: Sequence[str], skip_bad: bool) -> None:
+    """Name what cannot be used; end here unless it is to be skipped and something else is left."""
+    for message in messages:
         click.echo(f"refused: {message}", err=True)
-    if refused and not frames:
-        raise InputError("PATH", " ".join(paths), "raw frames, or folders that hold some")
-    if (bad or refused) and not skip_bad:
+    if messages and skip_bad and not good:
+        raise InputError("PATH", " ".join(paths), "flats, or folders that hold some")
+    if messages and not skip_bad:
         raise FrameFormatError(
-            "raw frames", f"{len(bad) + len(refused)} unusable", "complete raw frames, or --skip-bad to go on"
+            "frames", f"{len(messages)} unusable", "complete frames, or --skip-bad to go on"
         )
-    frames = _each_once(frames)
+
+
+def _raw_series(frames: Sequence[RawMetadata], paths: Sequence[str]) -> LabSeries:
     for note in dict.fromkeys(note for frame in frames for note in frame.notes):
         click.echo(note, err=True)
     flats = [frame for frame in frames if frame.observation_type == "flat"]
@@ -163,40 +242,6 @@ def _each_once(frames: Sequence[RawMetadata]) -> list[RawMetadata]:
     if copies:
         click.echo(f"copies of other frames, not counted again: {', '.join(copies)}", err=True)
     return list(kept.values())
-
-
-def given_cube(paths: Sequence[str], setup: Setup) -> tuple[FringeCube | None, tuple[str, ...]]:
-    """Cube and files of what a command was given; `None` if that is neither a cube nor flats of one image each.
-
-    What the headers of such flats do not say, the set-up does.
-    """
-    cube = read_cube(paths[0]) if len(paths) == 1 else None
-    if cube is not None:
-        return cube, (paths[0],)
-    files, refused = find_raw_files(paths)
-    if refused or not files or not all(map(_is_plain, files)):
-        return None, ()
-    cube = read_plain_flats(
-        files,
-        temperature_k=setup.temperature_k,
-        bandwidth_fwhm_nm=setup.bandwidth_fwhm_nm,
-        f_number=setup.f_number,
-    )
-    listed = ", ".join(f"{wavelength:g}" for wavelength in cube.wavelength_nm)
-    biases = cube.metadata["NBIAS"]
-    subtracted = (
-        f"{biases} bias images subtracted" if biases else "taken as bias-subtracted: there are no bias images"
-    )
-    click.echo(f"{len(cube.wavelength_nm)} plain flats at {listed} nm; {subtracted}", err=True)
-    return cube, tuple(files)
-
-
-def _is_plain(file: str) -> bool:
-    """Whether a file is one image; one that cannot be read is left to what reads raw frames, and says so."""
-    try:
-        return is_plain(file)
-    except FringeSimError:
-        return False
 
 
 def read_cube(path: str) -> FringeCube | None:

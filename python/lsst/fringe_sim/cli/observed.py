@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import InputError
+from ..errors import InputError, UnknownNameError
 from .parameters import SIZE
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -25,7 +26,9 @@ __all__ = [
     "grid_of",
     "images_of",
     "latest_date",
+    "refuse_bad",
     "stem_of",
+    "target_names",
 ]
 
 SPACING_PX = 256.0
@@ -65,23 +68,79 @@ def grid_of(amplifiers: tuple[int, int] | None) -> AmplifierGrid:
     return AmplifierGrid(rows, columns)
 
 
-def images_of(paths: Sequence[Path], pattern: str = "*.fits*") -> list[ObservedImage]:
-    """Images in files, and in the files of folders; companions such as masks and weights are no frames.
+def images_of(
+    paths: Sequence[Path], accept: Callable[[Mapping[str, Any], str], None]
+) -> tuple[list[ObservedImage], list[str]]:
+    """Images in files and in the files of folders, and a line for each file that cannot be used.
+
+    Companions such as masks and weights are no frames. A file that is meant twice counts once.
+
+    ``accept``: raises `InputError` over a header, with the name of its file, of a frame that is not to be used.
 
     Raises
     ------
     InputError
-        There are none, or a file is damaged.
+        There are no files, or no usable one.
     """
     from ..products.observed_files import is_companion, observed_images
 
-    files: list[Path] = []
+    files: dict[Path, Path] = {}
     for path in paths:
-        found = sorted(path.glob(pattern)) if path.is_dir() else [path]
-        files.extend(file for file in found if not (path.is_dir() and is_companion(file)))
-    if not files:
+        found = sorted(path.glob("*.fits*")) if path.is_dir() else [path]
+        for file in found:
+            if not (path.is_dir() and is_companion(file)):
+                files.setdefault(file.resolve(), file)
+    images: list[ObservedImage] = []
+    bad: list[InputError] = []
+    for file in files.values():
+        try:
+            parts = observed_images(file)
+            for image in parts:
+                accept(image.header(), str(file))
+        except InputError as error:
+            bad.append(error)
+        else:
+            images.extend(parts)
+    if bad and not images:
+        raise bad[0]
+    if not images:
         raise InputError("frames", [str(path) for path in paths], "FITS files, or folders with them")
-    return [image for file in files for image in observed_images(file)]
+    return images, [str(error) for error in bad]
+
+
+def refuse_bad(messages: Sequence[str], skip_bad: bool) -> None:
+    """Name files that cannot be used, and end here unless they are to be skipped.
+
+    Raises
+    ------
+    InputError
+        There are some.
+    """
+    for message in messages:
+        click.echo(f"refused: {message}", err=True)
+    if messages and not skip_bad:
+        raise InputError("frames", f"{len(messages)} unusable", "complete frames, or --skip-bad to go on")
+
+
+def target_names(images: Sequence[ObservedImage], ending: str, former: str = "") -> dict[Path, str]:
+    """Name of the file that is written for each file; ``ending`` follows the stem, in place of ``former``.
+
+    Raises
+    ------
+    InputError
+        Two files would become one.
+    """
+    names = {path: f"{stem_of(path).removesuffix(former)}{ending}.fits" for path in _paths(images)}
+    taken: dict[str, Path] = {}
+    for path, name in names.items():
+        other = taken.setdefault(name, path)
+        if other != path:
+            raise InputError("frames", f"{other} and {path}", f"names that differ: both would become {name}")
+    return names
+
+
+def _paths(images: Sequence[ObservedImage]) -> list[Path]:
+    return list(dict.fromkeys(image.path for image in images))
 
 
 def background_path(folder: Path | None, image: ObservedImage) -> Path | None:
@@ -120,24 +179,46 @@ class TemplateFolder:
             allowed = "a folder with templates_*.fits of 'fringe-sim templates', or fringe_*.fits of a model"
             raise InputError("--templates", str(path), allowed)
 
-    def of(self, detector: str) -> list[FringeFrame]:
+    def check(self, images: Sequence[ObservedImage]) -> None:
+        """Read the templates of all sensors of images, before long work.
+
+        Raises
+        ------
+        InputError
+            A file is damaged, or there twice.
+        """
+        from ..products.observed_files import detector_of
+
+        for sensor in sorted({detector_of(image.header()) for image in images}):
+            with suppress(UnknownNameError):  # that is the matter of the frame
+                self.of(sensor)
+
+    def of(self, detector: str, physical_filter: str = "") -> list[FringeFrame]:
         """Templates of a sensor; the only ones there are for a sensor or templates without a name.
 
         Raises
         ------
         InputError
-            There are none of it, or a file is damaged.
+            There are none of it, or those of another filter, or a file is damaged or there twice.
         """
         names = sorted(self._files)
         if detector not in self._files and (len(names) > 1 or (names[0] and detector)):
-            raise InputError("sensor of a frame", detector, f"one with templates: {', '.join(names)}")
-        return _read_templates(tuple(self._files[detector if detector in self._files else names[0]]))
+            raise UnknownNameError("sensor of a frame", detector, names)
+        files = tuple(self._files[detector if detector in self._files else names[0]])
+        found = _read_templates(files)
+        # A model names its filter as its telescope does, which a file need not.
+        observed = [each.physical_filter for each in found if _keyword(files[0], "PRODUCT") != "FringeFrame"]
+        if physical_filter and any(name not in ("", physical_filter) for name in observed):
+            allowed = f"{observed[0]}, that of the templates"
+            raise InputError("filter of a frame", physical_filter, allowed)
+        return found
 
 
 @functools.lru_cache(maxsize=1)
 def _read_templates(files: tuple[Path, ...]) -> list[FringeFrame]:
     """Templates of one sensor: those of the last one are kept, for its next frame."""
     from ..products import FringeFrame, FringeTemplates
+    from ..products.same_light import refuse_equal_pixels
 
     frames: list[FringeFrame] = []
     for file in files:
@@ -145,14 +226,15 @@ def _read_templates(files: tuple[Path, ...]) -> list[FringeFrame]:
             frames.append(FringeFrame.read_fits(file))
         else:
             frames.extend(FringeTemplates.read_fits(file).frames())
+    refuse_equal_pixels(f"templates in {files[0].parent}", [each.image for each in frames])
     return frames
 
 
 def _keyword(path: Path, keyword: str) -> str:
     """Value in the primary header of a FITS file; empty if there is none."""
-    from ..resources import open_user_fits, refuse_damage
+    from ..resources import complete_fits
 
-    with refuse_damage("file", "a complete FITS file", str(path)), open_user_fits(path) as hdus:
+    with complete_fits(path) as hdus:
         return str(hdus[0].header.get(keyword, ""))
 
 

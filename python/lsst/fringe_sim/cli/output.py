@@ -106,7 +106,9 @@ class OutputFolder(os.PathLike[str]):
 
     def _clear(self) -> None:
         left = self._left()
-        foreign = [file.name for file in left if file.suffix == ".fits" and not _is_ours(file)]
+        # A link is taken away itself, and not what it points to.
+        whole = [file for file in left if file.suffix == ".fits" and not file.is_symlink()]
+        foreign = [file.name for file in whole if not _is_ours(file)]
         if foreign:
             raise InputError(
                 "output folder",

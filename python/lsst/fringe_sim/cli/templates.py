@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import InputError
-from .observed import TemplateFolder, background_options, background_path, grid_of, images_of, latest_date
+from .observed import (
+    TemplateFolder,
+    background_options,
+    background_path,
+    grid_of,
+    images_of,
+    latest_date,
+    refuse_bad,
+)
 from .output import OutputFolder, output_folder
 from .progress import progress
 
@@ -44,6 +52,7 @@ LEAST_FRAMES = 3
     help="Templates of a model, a file or a folder: what the frames do not decide is taken from them.",
 )
 @output_folder("Folder for templates, figure and report.", "templates_*.fits", "report.html")
+@click.option("--skip-bad", is_flag=True, help="Go on without frames that cannot be read.")
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def templates(
     frames: tuple[Path, ...],
@@ -54,6 +63,7 @@ def templates(
     least_frames: int,
     prior: Path | None,
     out: OutputFolder,
+    skip_bad: bool,
     dry_run: bool,
 ) -> None:
     """Make fringe templates of each sensor from observed frames in one filter.
@@ -68,9 +78,12 @@ def templates(
       fringe-sim templates night --amplifiers 8x2 --prior model/fringe_0.fits --out templates
     """
     from ..algorithms.correction.empirical import LEARNING_ROUNDS, TemplateOptions
+    from ..products import refuse_corrected
     from ..report.correction_page import write_templates_report
 
-    sensors = _by_sensor(images_of(frames))
+    images, unusable = images_of(frames, refuse_corrected)
+    refuse_bad(unusable, skip_bad)
+    sensors = _by_sensor(images)
     options = TemplateOptions(
         components, least_frames=least_frames, spacing_px=background_px, amplifiers=grid_of(amplifiers)
     )
@@ -96,18 +109,20 @@ def templates(
 
 
 def _by_sensor(images: list[ObservedImage]) -> dict[str, list[ObservedImage]]:
-    """Images of each sensor; corrected ones are refused."""
-    from ..products import refuse_corrected
+    """Images of each sensor; sensors of which the templates would have one name are refused."""
     from ..products.observed_files import detector_of
 
     sensors = defaultdict(list)
     for image in images:
-        header = image.header()
-        refuse_corrected(header, str(image.path))
-        sensors[detector_of(header)].append(image)
+        sensors[detector_of(image.header())].append(image)
+    files: dict[str, str] = {}
     for name, found in sensors.items():
         if len(found) < LEAST_FRAMES:
             raise InputError(f"frames of sensor {name!r}", len(found), f"{LEAST_FRAMES} or more")
+        other = files.setdefault(_file_name(name), name)
+        if other != name:
+            allowed = f"names that differ in letters and digits: both become {_file_name(name)}"
+            raise InputError("sensors", f"{other} and {name}", allowed)
     return dict(sensors)
 
 
@@ -124,7 +139,8 @@ def _made(
 
     loaders = [partial(image.read, background_path(background, image)) for image in images]
     date = latest_date([image.header() for image in images])
-    return make_templates(loaders, date, options, prior, software_cards(), advance)
+    names = [f"{image.path}[{image.name}]" for image in images]
+    return make_templates(loaders, date, options, prior, software_cards(), advance, names)
 
 
 def _file_name(sensor: str) -> str:

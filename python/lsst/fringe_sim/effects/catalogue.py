@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
@@ -26,8 +26,13 @@ _STATED = ("name", "title", "acts_on", "parameters", "reference")
 _own: ContextVar[tuple[Effect, ...]] = ContextVar("_own", default=())
 
 
-def known_effects() -> tuple[Effect, ...]:
+def known_effects(given: Iterable[Effect] | None = None) -> tuple[Effect, ...]:
     """All effects that may be named here, in the order in which they are applied.
+
+    Parameters
+    ----------
+    given : iterable of `Effect`, optional
+        A catalogue that takes the place of this one.
 
     Returns
     -------
@@ -40,7 +45,7 @@ def known_effects() -> tuple[Effect, ...]:
     InputError
         An installed package offers something else, or a name that is taken.
     """
-    return (*_installed(), *_own.get())
+    return (*_installed(), *_own.get()) if given is None else tuple(given)
 
 
 @contextmanager
@@ -102,7 +107,7 @@ def _module(source: str | Path) -> ModuleType:
         spec.loader.exec_module(module)
     except InputError:
         raise
-    except Exception as error:  # whatever the code of a stranger raises
+    except (Exception, SystemExit) as error:  # whatever the code of a stranger raises
         told = f"{type(error).__name__}: {error}"
         raise InputError("effects", told, "a module that can be imported", source=str(source)) from error
     return module
@@ -117,14 +122,21 @@ def _checked(offered: Any, known: tuple[Effect, ...], source: str) -> tuple[Effe
     for effect in effects:
         if not isinstance(effect, Effect):
             raise InputError("EFFECTS", repr(effect), "instances of subclasses of Effect", source=source)
-        missing = [name for name in _STATED if not hasattr(effect, name)]
+        missing = [name for name in _STATED if not _states(effect, name)]
         if missing:
             allowed = f"an effect that states its {', '.join(_STATED)}"
             raise InputError(
                 "effect", f"{type(effect).__name__} without {missing[0]}", allowed, source=source
             )
-        if not effect.name.isidentifier() or effect.name in taken:
+        if not str(effect.name).isidentifier() or effect.name in taken:
             allowed = "an identifier that no other effect of the catalogue has"
             raise InputError("name of an effect", effect.name, allowed, source=source)
         taken.add(effect.name)
     return effects
+
+
+def _states(effect: Effect, name: str) -> bool:
+    try:
+        return hasattr(effect, name)
+    except Exception:  # a property of a stranger
+        return False

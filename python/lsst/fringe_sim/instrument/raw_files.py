@@ -60,4 +60,5 @@ def _expand(path: str) -> Iterator[Path]:
         yield entry
     else:
         for name in glob.iglob(path, recursive=True):
-            yield from _expand(name)
+            if name != path:  # else a pipe, a device, or a link to nothing
+                yield from _expand(name)

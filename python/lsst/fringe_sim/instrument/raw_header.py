@@ -1,4 +1,4 @@
-"""Values of a FITS header, one keyword at a time; what is read is declared in `HEADER_KEYWORDS`."""
+"""Values of a FITS header, one keyword at a time; what is read is declared, for raw frames in `RAW_KEYWORDS`."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from astropy.io import fits
 from ..errors import FrameFormatError, InputError, to_number
 from .header_keywords import RAW_KEYWORDS
 
-__all__ = ["RawHeader", "header_value"]
+__all__ = ["DeclaredHeader", "header_value"]
 
 _DECLARED = frozenset(keyword.name for keyword in RAW_KEYWORDS)
 
 
-def header_value(header: Mapping[str, Any], keyword: str) -> Any:
-    """Value of a keyword; `None` if it is absent, undefined or blank.
+def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[str] = _DECLARED) -> Any:
+    """Value of a keyword; `None` if it is absent, undefined or blank. ``declared``: those that may be asked for.
 
     Raises
     ------
@@ -27,8 +27,8 @@ def header_value(header: Mapping[str, Any], keyword: str) -> Any:
     LookupError
         The keyword is not declared: a fault of the program.
     """
-    if keyword not in _DECLARED:
-        raise LookupError(f"{keyword} is not declared in RAW_KEYWORDS")
+    if keyword not in declared:
+        raise LookupError(f"{keyword} is not declared")
     try:
         value = header.get(keyword)
         if isinstance(header, fits.Header) and keyword in header and header.count(keyword) > 1:
@@ -47,18 +47,36 @@ def _refuse_different(header: fits.Header, keyword: str) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class RawHeader:
-    """Header of a frame, asked for values of a certain kind."""
+class DeclaredHeader:
+    """Header of a file, asked for values of a certain kind.
+
+    Attributes
+    ----------
+    cards : mapping
+        The header.
+    source : `str`
+        The file.
+    declared : `frozenset` [`str`]
+        Keywords that may be asked for.
+    others : `tuple` of mappings
+        Headers of other HDUs, which may state a keyword too, but not differently.
+    """
 
     cards: Mapping[str, Any]
     source: str
+    declared: frozenset[str] = _DECLARED
+    others: tuple[Mapping[str, Any], ...] = ()
 
     def value(self, keyword: str) -> Any:
         """Value of a keyword; see `header_value`."""
         try:
-            return header_value(self.cards, keyword)
+            stated = [header_value(cards, keyword, self.declared) for cards in (self.cards, *self.others)]
         except FrameFormatError as error:
             raise error.in_source(self.source) from None
+        values = [value for value in stated if value is not None]
+        if any(value != values[0] for value in values):
+            raise self.refuse(keyword, " and ".join(map(str, values)), "one value, not several that differ")
+        return values[0] if values else None
 
     def text(self, keyword: str) -> str:
         """Value as text, empty if there is none."""

@@ -15,7 +15,7 @@ from typing import Any
 from ..errors import FrameFormatError, UnknownNameError, named_units
 from .camera import Camera, Detector
 from .raw_checks import refuse_other_instrument, refuse_stutter
-from .raw_header import RawHeader, header_value
+from .raw_header import DeclaredHeader, header_value
 from .raw_times import DAY_ROLLOVER_H, begin_of_exposure, day_and_sequence, exposure_id, time_scale
 
 __all__ = ["DAY_ROLLOVER_H", "OBSERVATION_TYPES", "RawMetadata", "header_value"]
@@ -180,10 +180,10 @@ class RawMetadata:
         UnknownNameError
             The sensor that the header names is not in the camera.
         """
-        return _interpret(RawHeader(header, source))
+        return _interpret(DeclaredHeader(header, source))
 
 
-def _interpret(header: RawHeader) -> RawMetadata:
+def _interpret(header: DeclaredHeader) -> RawMetadata:
     camera = _camera(header)
     refuse_other_instrument(
         {key: header.text(key) for key in ("OBSID", "CAMCODE", "TESTTYPE", "CREATOR", "CONTRLLR")},
@@ -233,7 +233,7 @@ _CAMERAS = {
 }
 
 
-def _camera(header: RawHeader) -> str:
+def _camera(header: DeclaredHeader) -> str:
     """Camera or test stand that took the frame; the place of the sensor tells where nothing says it outright."""
     if header.value("INSTRUME") is not None:
         instrument = header.text("INSTRUME").upper()
@@ -253,7 +253,7 @@ def _camera(header: RawHeader) -> str:
     )
 
 
-def _notes(header: RawHeader, camera: str) -> tuple[str, ...]:
+def _notes(header: DeclaredHeader, camera: str) -> tuple[str, ...]:
     """The instrument decides about sensor and exposure number: say so where the header does not name it."""
     if header.value("INSTRUME") is not None or "TS8" in header.text("TSTAND").upper():
         return ()
@@ -261,7 +261,7 @@ def _notes(header: RawHeader, camera: str) -> tuple[str, ...]:
     return (f"neither INSTRUME nor TSTAND = TS8 in the header: taken as a frame of {camera}, for its {told}",)
 
 
-def _bay(header: RawHeader) -> str | None:
+def _bay(header: DeclaredHeader) -> str | None:
     """Raft bay of the LSST Camera, from either keyword that holds it."""
     for keyword in ("RAFTBAY", "RAFTNAME"):
         if re.fullmatch(r"R\d\d", header.text(keyword)):
@@ -269,13 +269,13 @@ def _bay(header: RawHeader) -> str | None:
     return None
 
 
-def _module(header: RawHeader) -> str | None:
+def _module(header: DeclaredHeader) -> str | None:
     """Raft module, ``RTM-020``."""
     match = re.search(r"RTM-\d{3}", header.text("RAFTNAME"))
     return match.group(0) if match else None
 
 
-def _detector(header: RawHeader, camera: str) -> Detector:
+def _detector(header: DeclaredHeader, camera: str) -> Detector:
     """The sensor. In a camera its place decides; on the test stand its serial number, for rafts were rebuilt."""
     table = Camera.from_name(camera)
     if len(table.detectors) == 1:
@@ -295,7 +295,7 @@ def _detector(header: RawHeader, camera: str) -> Detector:
     raise unknown.in_source(header.source)
 
 
-def _observation_type(header: RawHeader) -> str:
+def _observation_type(header: DeclaredHeader) -> str:
     """From ``IMGTYPE``; where it is absent, from ``TESTTYPE``."""
     keyword = "IMGTYPE" if header.value("IMGTYPE") is not None else "TESTTYPE"
     spelled = header.text(keyword).upper()
@@ -306,7 +306,7 @@ def _observation_type(header: RawHeader) -> str:
     return OBSERVATION_TYPES[known]
 
 
-def _wavelength(header: RawHeader, observation_type: str) -> float | None:
+def _wavelength(header: DeclaredHeader, observation_type: str) -> float | None:
     """``MONOWL``. ``MONOCH-WAVELENG`` is not used: it can still hold the value of an earlier exposure."""
     if observation_type in WITHOUT_LIGHT:
         return None
@@ -321,7 +321,7 @@ def _wavelength(header: RawHeader, observation_type: str) -> float | None:
     )
 
 
-def _bandpass(header: RawHeader) -> float | None:
+def _bandpass(header: DeclaredHeader) -> float | None:
     value = header.value("MONOCH-BANDPASS")
     if value is None:
         return None
@@ -329,7 +329,7 @@ def _bandpass(header: RawHeader) -> float | None:
     return header.number("MONOCH-BANDPASS", value, "0 or a width in nm", lambda nm: 0 <= nm < 1000) or None
 
 
-def _times(header: RawHeader, observation_type: str) -> tuple[float, float]:
+def _times(header: DeclaredHeader, observation_type: str) -> tuple[float, float]:
     """Exposure time (that of the shutter where it was measured) and dark time, seconds; 0 for a bias without them."""
     value = header.value("EXPTIME")
     if value is None and observation_type == "bias":
@@ -345,7 +345,7 @@ def _times(header: RawHeader, observation_type: str) -> tuple[float, float]:
     return exposure, header.number("DARKTIME", dark, "seconds, 0 or more", lambda s: s >= 0)
 
 
-def _temperature(header: RawHeader) -> tuple[float | None, str]:
+def _temperature(header: DeclaredHeader) -> tuple[float | None, str]:
     low, high = TEMPERATURE_RANGE_C
     for keyword in ("CCDTEMP", "SENSTEMP", "TEMP_SET"):
         value = header.value(keyword)
@@ -357,14 +357,14 @@ def _temperature(header: RawHeader) -> tuple[float | None, str]:
     return None, ""
 
 
-def _filter_name(header: RawHeader) -> str:
+def _filter_name(header: DeclaredHeader) -> str:
     """Filter of the LSST Camera: its parts joined by ``~``, empty places left out."""
     parts = [header.text(keyword) for keyword in ("FILTER", "FILTER1", "FILTER2")]
     named = [part for part in parts if part and part.lower() not in {"empty", "none"}]
     return "~".join(dict.fromkeys(named))
 
 
-def _airmass(header: RawHeader) -> float | None:
+def _airmass(header: DeclaredHeader) -> float | None:
     """``AMSTART``; `None` where it is absent, or 0 as where there is no telescope."""
     value = header.value("AMSTART")
     if value is None or value == 0:

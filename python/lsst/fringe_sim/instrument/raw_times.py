@@ -10,7 +10,7 @@ from typing import Any
 from astropy.time import Time
 
 from .raw_checks import refuse_other_day
-from .raw_header import RawHeader
+from .raw_header import DeclaredHeader
 
 __all__ = ["DAY_ROLLOVER_H", "begin_of_exposure", "day_and_sequence", "exposure_id", "time_scale"]
 
@@ -42,7 +42,7 @@ _DATES = (
 """Keywords of the begin of the exposure, and their formats."""
 
 
-def time_scale(header: RawHeader, camera: str) -> str:
+def time_scale(header: DeclaredHeader, camera: str) -> str:
     """Scale of the times: ``tai`` or ``utc``."""
     scale = header.text("TIMESYS").lower()
     if scale not in ("", "utc", "tai"):
@@ -50,7 +50,7 @@ def time_scale(header: RawHeader, camera: str) -> str:
     return scale or ("tai" if camera in OF_RUBIN else "utc")
 
 
-def begin_of_exposure(header: RawHeader, camera: str) -> datetime.datetime:
+def begin_of_exposure(header: DeclaredHeader, camera: str) -> datetime.datetime:
     """First of the keywords that state it.
 
     TS8 wrote the end of the exposure into ``DATE-OBS`` as long as ``DATE-TRG`` said the same: ``EXPTIME`` is taken
@@ -72,7 +72,7 @@ def begin_of_exposure(header: RawHeader, camera: str) -> datetime.datetime:
     return begin
 
 
-def _moment(header: RawHeader, keyword: str, kind: str) -> datetime.datetime | None:
+def _moment(header: DeclaredHeader, keyword: str, kind: str) -> datetime.datetime | None:
     value = header.value(keyword)
     if value is None:
         return None
@@ -87,7 +87,7 @@ def _moment(header: RawHeader, keyword: str, kind: str) -> datetime.datetime | N
     return found
 
 
-def day_and_sequence(header: RawHeader, camera: str, begin: datetime.datetime) -> tuple[int, int]:
+def day_and_sequence(header: DeclaredHeader, camera: str, begin: datetime.datetime) -> tuple[int, int]:
     """``DAYOBS`` and ``SEQNUM``; where absent, the day on which the night began and the seconds since then."""
     day_start = begin - datetime.timedelta(hours=DAY_ROLLOVER_H[camera])
     stated = header.value("DAYOBS")
@@ -104,7 +104,7 @@ def day_and_sequence(header: RawHeader, camera: str, begin: datetime.datetime) -
     return day, int(number)
 
 
-def _day(header: RawHeader, value: Any) -> int:
+def _day(header: DeclaredHeader, value: Any) -> int:
     digits = str(value).replace("-", "")
     try:
         datetime.datetime.strptime(digits, "%Y%m%d")
@@ -113,7 +113,9 @@ def _day(header: RawHeader, value: Any) -> int:
     return int(digits)
 
 
-def exposure_id(header: RawHeader, camera: str, begin: datetime.datetime, day_obs: int, seq_num: int) -> int:
+def exposure_id(
+    header: DeclaredHeader, camera: str, begin: datetime.datetime, day_obs: int, seq_num: int
+) -> int:
     """Number of the exposure, as obs_lsst has it.
 
     In the cameras the day and the sequence number, moved by 1000 years for each controller that counts for itself. On

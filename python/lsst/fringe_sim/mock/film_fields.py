@@ -7,9 +7,10 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from ..compiled import kernel
 
 if TYPE_CHECKING:
     from .optics import Film, FlatFieldOptics
@@ -209,7 +210,7 @@ def add_periodic_mode(total: FloatArray, light: Light, thickness_um: FloatArray)
     )
 
 
-@numba.njit(cache=True)
+@kernel
 def _add_absorption(
     total: FloatArray,
     thickness: FloatArray,
@@ -248,7 +249,7 @@ def _add_absorption(
             total[i] += weight[q] * flux / (ambient[q] * (forward.real**2 + forward.imag**2))
 
 
-@numba.njit(cache=True)
+@kernel
 def _add_harmonics(
     total: FloatArray,
     thickness: FloatArray,

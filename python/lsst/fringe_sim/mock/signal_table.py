@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from ..compiled import kernel
 from ..errors import OutOfRangeError
 
 __all__ = ["SignalTable"]
@@ -56,7 +56,7 @@ class SignalTable:
         return _evaluate_pieces(pieces, low, step, thickness.ravel()).reshape(thickness.shape)
 
 
-@numba.njit(cache=True)
+@kernel
 def _evaluate_pieces(
     pieces: FloatArray, low: float, step: float, position: NDArray[np.floating]
 ) -> FloatArray:  # pragma: no cover - compiled

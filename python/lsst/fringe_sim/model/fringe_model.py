@@ -106,15 +106,13 @@ class FringeModel:
         system = chosen.optical_system(
             field_x_deg=field_x_deg, field_y_deg=field_y_deg, observable=observable
         )
-        known = known_effects() if catalogue is None else catalogue
-        return cls(chosen, system, activate_effects(effects or {}, known))
+        return cls(chosen, system, activate_effects(effects or {}, known_effects(catalogue)))
 
     def with_effects(
         self, effects: Mapping[str, Any], catalogue: Sequence[Effect] | None = None
     ) -> FringeModel:
         """Same set-up and light with other effects in place of the present ones."""
-        known = known_effects() if catalogue is None else catalogue
-        return replace(self, effects=activate_effects(effects, known))
+        return replace(self, effects=activate_effects(effects, known_effects(catalogue)))
 
     def at_laboratory_temperature(self, header: Mapping[str, Any]) -> FringeModel:
         """The model for a thickness map with this header, which may state at which temperature it was measured.

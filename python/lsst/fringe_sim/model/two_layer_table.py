@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import spline_filter1d
 
+from ..compiled import kernel
 from ..errors import ConvergenceError, InputError, OutOfRangeError, named_units
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
@@ -227,7 +228,7 @@ def _weights(t: np.float32) -> tuple[Any, Any, Any, Any]:  # pragma: no cover - 
     )
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract", "reassoc"})
+@kernel(relaxed={"contract", "reassoc"}, parallel=True)
 def _frame_kernel(
     coefficients: NDArray,
     columns: int,

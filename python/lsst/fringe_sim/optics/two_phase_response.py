@@ -19,6 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..compiled import kernel
 from ..errors import InputError, named_units
 from .phase_response import _checked_thickness
 from .transfer_matrix import (
@@ -245,7 +246,7 @@ def _upside_down(coefficients: InterfaceCoefficients) -> InterfaceCoefficients:
     )
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@kernel(parallel=True)
 def _point_kernel(
     scale: NDArray,
     eta: NDArray,
@@ -293,7 +294,7 @@ def _point_kernel(
     return out
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True, fastmath={"contract", "arcp", "reassoc"})
+@kernel(relaxed={"contract", "arcp", "reassoc"}, parallel=True)
 def _grid_kernel(
     scale: NDArray,
     eta: NDArray,

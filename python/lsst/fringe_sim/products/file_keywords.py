@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["FILE_KEYWORDS", "FileKeyword"]
+from .sky_frame import CORRECTED_BY
+
+__all__ = ["FILE_KEYWORDS", "FILTER_NAMES", "SENSOR_NAMES", "FileKeyword", "declared_names"]
 
 USED, CHECKED, REFUSED = "used", "checked", "refused"
 """It decides something of the result; another value than the one allowed is refused; its presence is refused."""
@@ -24,8 +26,16 @@ class FileKeyword:
     what: str
 
 
+SENSOR_NAMES = ("DETNAME", "DETECTOR", "CCDNAME", "DETPOS", "CCDNUM", "CCDID")
+"""Keywords by which cameras name a sensor; the first that is stated counts."""
+
+FILTER_NAMES = ("FILTER", "FILTNAM", "FILTERID")
+"""Keywords of the filter; the first that is stated counts."""
+
 _MAP, _CUBE, _SKY, _ANY = "thickness map", "fringe cube", "sky frame", "any product"
+_PLAIN, _OBSERVED = "plain flat", "observed frame"
 _SEARCH, _SKY_READERS = "fit, discover, Tasks", "sky, discover, Tasks"
+_FITS, _CORRECTION = "fit, discover", "templates, correct"
 
 FILE_KEYWORDS: tuple[FileKeyword, ...] = (
     FileKeyword(
@@ -56,6 +66,60 @@ FILE_KEYWORDS: tuple[FileKeyword, ...] = (
     FileKeyword(
         _SKY, "RDNOISE", "discover, templates", USED, "read noise in electrons; none where it is absent"
     ),
+    FileKeyword(
+        _PLAIN, "IMGTYPE", _FITS, USED, "flat, as where it is absent, or bias or zero; others are left out"
+    ),
+    *(
+        FileKeyword(
+            _PLAIN,
+            name,
+            _FITS,
+            USED,
+            "wavelength in nm, 200 to 1300; two that differ by more than 1 nm are refused",
+        )
+        for name in ("MONOWL", "WAVELEN", "WAVELNTH")
+    ),
+    FileKeyword(_PLAIN, "TEMPK", _FITS, USED, "temperature in K, in place of that of the set-up"),
+    FileKeyword(_PLAIN, "CCDTEMP", _FITS, USED, "temperature in °C where TEMPK is absent"),
+    FileKeyword(_PLAIN, "BUNIT", _FITS, USED, "electron, or adu, else refused"),
+    FileKeyword(_PLAIN, "GAIN", _FITS, USED, "electrons for each adu"),
+    FileKeyword(_PLAIN, "RDNOISE", _FITS, USED, "read noise in electrons; none where it is absent"),
+    FileKeyword(_PLAIN, "SATURATE", _FITS, USED, "counts from which on a pixel is masked SAT"),
+    *(FileKeyword(_PLAIN, name, _FITS, CHECKED, "the same sensor in all images") for name in SENSOR_NAMES),
+    FileKeyword(_PLAIN, "DATASEC", _FITS, CHECKED, "as large as the image: no overscan in it"),
+    FileKeyword(_PLAIN, "TRIMSEC", _FITS, CHECKED, "as large as the image: no overscan in it"),
+    FileKeyword(
+        _OBSERVED, "BUNIT", "templates", USED, "one unit in all frames; a correction is in that of its frame"
+    ),
+    *(
+        FileKeyword(
+            _OBSERVED,
+            name,
+            _CORRECTION,
+            USED,
+            "the sensor, of which the templates are; each image of a file has its own",
+        )
+        for name in (*SENSOR_NAMES, "EXTNAME")
+    ),
+    *(
+        FileKeyword(
+            _OBSERVED, name, _CORRECTION, USED, "the filter: one in all frames, and that of the templates"
+        )
+        for name in FILTER_NAMES
+    ),
+    *(
+        FileKeyword(_OBSERVED, name, _CORRECTION, REFUSED, "fringes were subtracted before")
+        for name in CORRECTED_BY
+    ),
+    FileKeyword(_OBSERVED, "DATE-OBS", "templates", USED, "the last one dates the templates"),
+    FileKeyword(_OBSERVED, "OBSDATE", "templates", USED, "the same where DATE-OBS is absent"),
+    FileKeyword(
+        _OBSERVED, "PLVER", _CORRECTION, USED, "version of the DECam pipeline: bits or codes in its masks"
+    ),
+    FileKeyword(
+        _OBSERVED, "UTYPE", _CORRECTION, USED, "of UNCERT: standard deviation, variance or its inverse"
+    ),
+    FileKeyword(_OBSERVED, "MP_<plane>", _CORRECTION, USED, "bit of a plane of the mask, 0 to 62"),
     FileKeyword(_ANY, "PRODUCT", "all", CHECKED, "the kind of file that the reader wants"),
     FileKeyword(_ANY, "PRODVER", "all", CHECKED, "the version of the layout"),
     FileKeyword(_ANY, "NEXTEND", "all", CHECKED, "the number of extensions"),
@@ -66,3 +130,8 @@ FILE_KEYWORDS: tuple[FileKeyword, ...] = (
     ),
 )
 """All of them."""
+
+
+def declared_names(file: str) -> frozenset[str]:
+    """Keywords that are declared of a kind of file."""
+    return frozenset(item.name for item in FILE_KEYWORDS if item.file == file)

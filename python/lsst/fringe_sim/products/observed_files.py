@@ -6,8 +6,7 @@ What pipelines do not agree on is said once in `_Layout`: where masks and varian
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,11 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..errors import FrameFormatError
+from ..errors import FrameFormatError, InputError, printable_name, to_number
 from ..files import all_or_nothing
-from ..resources import open_user_fits, refuse_damage
+from ..instrument.raw_header import header_value
+from ..resources import complete_fits
+from .file_keywords import FILTER_NAMES, SENSOR_NAMES, declared_names
 from .mask import MASK_PLANES, mask_bits
 from .observed_frame import ObservedFrame
 
@@ -35,8 +36,8 @@ _INVERSES = ("WEIGHT", "WHT", "IVAR")
 _ERRORS = ("ERR", "ERROR", "UNCERT", "SIGMA")
 _NOT_SKY = (*_MASKS, *_VARIANCES, *_INVERSES, *_ERRORS, UNCORRECTED)
 
-_DETECTORS = ("DETNAME", "DETECTOR", "CCDNAME", "DETPOS", "EXTNAME", "CCDNUM", "CCDID")
-_FILTERS = ("FILTER", "FILTNAM", "FILTERID")
+_DECLARED = declared_names("observed frame")
+_DETECTORS = (*SENSOR_NAMES[:4], "EXTNAME", *SENSOR_NAMES[4:])
 
 _DECAM_CODES_SINCE = (3, 5, 0)
 """Version of the DECam Community Pipeline from which a mask holds codes, before which it holds bits."""
@@ -57,6 +58,9 @@ _ZTF_BITS = {
     12: "SUSPECT",
 }
 """Source, source of the PSF catalogue, saturated, no number, track, ghost, halo; all others are bad pixels."""
+
+_BITS = 63
+"""Of a mask that is read as integers with a sign."""
 
 _HARMLESS = ("NOT_DEBLENDED", "INEXACT_PSF", "SENSOR_EDGE", "INJECTED", "INJECTED_CORE", "STREAK_FIT")
 """Planes of Rubin's masks that say nothing against the background of a pixel."""
@@ -93,7 +97,7 @@ class ObservedImage:
         InputError
             A damaged file, or companions of another size.
         """
-        with _opened(self.path) as hdus:
+        with complete_fits(self.path) as hdus:
             header = _merged(hdus, self.index)
             image = np.array(hdus[self.index].data, dtype=np.float32)
             layout = _layout_of(self)
@@ -108,20 +112,23 @@ class ObservedImage:
                 raise FrameFormatError(
                     f"shape of the {what}", array.shape, f"{image.shape}", source=str(self.path)
                 )
-        mask = mask | np.where(np.isfinite(image), 0, mask_bits("NO_DATA")).astype(np.int32)
+        known = np.isfinite(image)
+        if image[known].size > 1 and np.ptp(image[known]) == 0:
+            raise FrameFormatError("pixels", "all equal", "an image of the sky", source=str(self.path))
+        mask = mask | np.where(known, 0, mask_bits("NO_DATA")).astype(np.int32)
         return ObservedFrame(
             image=image,
             mask=mask,
             variance=variance,
-            unit=str(header.get("BUNIT", "")).strip(),
+            unit=_text(header, "BUNIT"),
             metadata={},
             detector=detector_of(header),
-            physical_filter=_first_of(header, _FILTERS),
+            physical_filter=_first_of(header, FILTER_NAMES),
         )
 
     def header(self) -> dict[str, Any]:
         """Keywords of the image, and those of the primary header that it does not have itself."""
-        with _opened(self.path) as hdus:
+        with complete_fits(self.path) as hdus:
             return _merged(hdus, self.index)
 
 
@@ -131,16 +138,25 @@ def observed_images(path: Path) -> list[ObservedImage]:
     Raises
     ------
     InputError
-        No FITS file, a damaged one, or one without images.
+        No FITS file, a damaged one, one without images, or with two images of one sensor; or a name that is not
+        printable.
     """
-    with _opened(path) as hdus:
+    printable_name("name of a file", path.name)
+    with complete_fits(path) as hdus:
         found = [
             ObservedImage(path, number, hdu.name if number and hdu.name else path.name.partition(".")[0])
             for number, hdu in enumerate(hdus)
             if hdu.is_image and len(hdu.shape) == 2 and not hdu.name.upper().endswith(_NOT_SKY)
         ]
+        sensors = [detector_of(_merged(hdus, image.index)) for image in found]
     if not found:
         raise FrameFormatError("images", 0, "one or more of two axes (y, x)", source=str(path))
+    for image, sensor in zip(found, sensors, strict=True):
+        printable_name("sensor", sensor or "none", source=str(path))
+        if sensors.count(sensor) > 1:
+            named = f"{sensor or 'none'} in HDU {image.index}"
+            allowed = f"a name for each sensor of a file ({', '.join(_DETECTORS)})"
+            raise FrameFormatError("sensor", named, allowed, source=str(path))
     return found
 
 
@@ -177,7 +193,7 @@ def write_images(
     OSError
         The folder does not exist or cannot be written, or the disk is full.
     """
-    with _opened(source) as hdus:
+    with complete_fits(source) as hdus:
         made, flags = [], []
         for number, hdu in enumerate(hdus):
             if hdu.name.endswith(UNCORRECTED):
@@ -205,21 +221,18 @@ def _set_cards(header: fits.Header, cards: Mapping[str, Any]) -> None:
             header[keyword] = value
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[fits.HDUList]:
-    with (
-        refuse_damage("file", "a complete FITS file", str(path)),
-        open_user_fits(path, warning="truncated", memmap=False) as hdus,
-    ):
-        yield hdus
-
-
 def _merged(hdus: fits.HDUList, index: int) -> dict[str, Any]:
     return {**dict(hdus[0].header), **dict(hdus[index].header)}
 
 
+def _text(header: Mapping[str, Any], keyword: str) -> str:
+    """Value of a declared keyword; empty if there is none."""
+    value = header_value(header, keyword, _DECLARED)
+    return "" if value is None else str(value)
+
+
 def _first_of(header: Mapping[str, Any], keywords: tuple[str, ...]) -> str:
-    values = (str(header.get(keyword, "")).strip() for keyword in keywords)
+    values = (_text(header, keyword) for keyword in keywords)
     return next((value for value in values if value and value.upper() not in ("IMAGE", "SCI", "PRIMARY")), "")
 
 
@@ -247,7 +260,7 @@ def _sibling(path: Path, kind: str) -> Path | None:
 
 def _companion(path: Path, image: ObservedImage, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
     """The image of the same name in another file, or the one of the same number."""
-    with _opened(path) as hdus:
+    with complete_fits(path) as hdus:
         own = image.name in hdus and image.index > 0
         index = image.name if own else min(image.index, len(hdus) - 1)
         if hdus[index].data is None:
@@ -276,7 +289,7 @@ def _decam_mask(image: ObservedImage, _: fits.HDUList, header: Mapping[str, Any]
     if path is None:
         return None
     stored = _companion(path, image)
-    digits = re.findall(r"\d+", str(header.get("PLVER", "")))
+    digits = re.findall(r"\d+", _text(header, "PLVER"))
     version = tuple(int(part) for part in digits[:3])
     if version and version < _DECAM_CODES_SINCE:
         return _named(_DECAM_BITS, stored, bits=True)
@@ -299,13 +312,21 @@ def _own_mask(image: ObservedImage, hdus: fits.HDUList, _: Mapping[str, Any]) ->
     hdu = _beside(hdus, image, _MASKS)
     if hdu is None:
         return None
-    planes = {
-        int(bit): _plane(str(keyword)[3:])
+    bits = {
+        str(keyword)[3:]: _bit(str(keyword), bit)
         for keyword, bit in hdu.header.items()
-        if str(keyword).startswith("MP_") and str(keyword)[3:] not in _HARMLESS
+        if str(keyword).startswith("MP_")
     }
-    harmless = sum(1 << int(hdu.header[f"MP_{name}"]) for name in _HARMLESS if f"MP_{name}" in hdu.header)
+    harmless = sum(1 << bit for name, bit in bits.items() if name in _HARMLESS)
+    planes = {bit: _plane(name) for name, bit in bits.items() if name not in _HARMLESS}
     return _named(planes, np.asarray(hdu.data).astype(np.int64) & ~harmless, bits=True)
+
+
+def _bit(keyword: str, value: Any) -> int:
+    number = to_number(keyword, value)
+    if number not in range(_BITS):
+        raise InputError(keyword, value, f"a bit of a mask, 0 to {_BITS - 1}")
+    return int(number)
 
 
 def _plane(name: str) -> str:
@@ -327,7 +348,7 @@ def _own_variance(
     if error is None:
         return None
     # ccdproc says of its UNCERT what it is.
-    kind = str(error.header.get("UTYPE", "")).lower()
+    kind = _text(error.header, "UTYPE").lower()
     if kind.startswith("inverse"):
         return _inverse(error.data)
     values = np.array(error.data, dtype=np.float32)

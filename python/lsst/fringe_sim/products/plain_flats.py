@@ -3,117 +3,121 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FrameFormatError, InputError, OutOfRangeError, named_units
-from ..resources import open_user_fits, refuse_damage
+from ..errors import FrameFormatError, InputError, named_units
+from ..instrument.raw_frame import SETTING_NM
+from ..instrument.raw_header import DeclaredHeader
+from ..instrument.raw_layout import Section
+from ..instrument.raw_metadata import TEMPERATURE_RANGE_C, WAVELENGTH_RANGE_NM, ZERO_CELSIUS_K
+from ..resources import complete_fits
+from .file_keywords import SENSOR_NAMES, declared_names
 from .fringe_cube import FringeCube
 from .mask import mask_bits
+from .same_light import pixels_digest
 
-__all__ = ["PlainImage", "is_plain", "read_plain_flats"]
+__all__ = ["PlainImage", "read_plain_flats", "refuse_other_sensors", "stack_plain_flats"]
 
-WAVELENGTH = ("MONOWL", "WAVELEN", "WAVELNTH")
-"""Keywords of the wavelength [nm]; the first that is there counts."""
+DECLARED = declared_names("plain flat")
+
+WAVELENGTHS = ("MONOWL", "WAVELEN", "WAVELNTH")
+"""Keywords of the wavelength [nm]."""
 
 ELECTRONS = ("electron", "electrons", "e-", "e")
 ADU = ("adu", "dn", "count", "counts")
-RANGE_NM = (200.0, 1300.0)
-ZERO_CELSIUS_K = 273.15
+BIASES = ("bias", "zero")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class PlainImage:
-    """One image and what its header says of it.
+    """What the header of one image says; the pixels are read when they are wanted.
 
     Attributes
     ----------
     source : `str`
         The file.
     kind : `str`
-        ``IMGTYPE`` in lower case; ``flat`` where it is absent.
-    electrons : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Counts in electrons.
+        ``flat``, ``bias``, or else ``IMGTYPE`` in lower case; ``flat`` where it is absent. Of another kind than these
+        two nothing else is asked for.
+    shape : `tuple` [`int`, `int`]
+        Rows and columns.
+    detector : `str`
+        Name of the sensor; empty if it is not stated.
+    wavelength_nm, temperature_k : `float` or `None`
+        Of a flat; `None` where the temperature is not stated.
+    gain : `float`
+        Electrons for each count.
     read_noise_e : `float`
         Read noise in electrons; 0 where it is not stated.
-    mask : `numpy.ndarray`, int32, shape ``(ny, nx)``
-        Planes of `MASK_PLANES`: pixels without a number, or at ``SATURATE`` and above.
-    header : mapping
-        The header, with that of the primary HDU below it.
+    full : `float`
+        Counts at which a pixel is saturated.
     """
 
     source: str
     kind: str
-    electrons: NDArray[np.float32]
-    read_noise_e: float
-    mask: NDArray[np.int32]
-    header: dict[str, Any]
+    shape: tuple[int, int]
+    detector: str = ""
+    wavelength_nm: float | None = None
+    temperature_k: float | None = None
+    gain: float = 1.0
+    read_noise_e: float = 0.0
+    full: float = math.inf
 
     @classmethod
-    def read(cls, path: str | Path) -> PlainImage:
-        """Read one file.
+    def read(cls, path: str | Path) -> PlainImage | None:
+        """Read the headers of one file; `None` if it does not hold exactly one image.
 
         Raises
         ------
         FrameFormatError
-            Damaged, not one image, or counts in a unit that is not known.
+            No complete FITS file, a header that contradicts itself, or counts in a unit that is not known.
         """
-        source = str(path)
-        with _opened(source) as hdus:
+        with complete_fits(path) as hdus:
             images = _images(hdus)
             if len(images) != 1:
-                raise FrameFormatError("images", len(images), "one with two axes", source=source)
-            hdu = images[0]
-            header = {**hdus[0].header, **hdu.header}
-            counts = np.asarray(hdu.data, dtype=np.float32)
-        gain = _gain(header, source)
-        mask = np.where(np.isfinite(counts), 0, mask_bits("NO_DATA")).astype(np.int32)
-        full = header.get("SATURATE")
-        if full is not None:
-            mask[counts >= _number(full, "SATURATE", source)] |= mask_bits("SAT")
-        noise = _number(header.get("RDNOISE", 0.0), "RDNOISE", source)
-        kind = str(header.get("IMGTYPE", "flat")).strip().lower()
-        return cls(source, kind, counts * np.float32(gain), noise, mask, header)
+                return None
+            (hdu,) = images
+            others = () if hdu is hdus[0] else (hdus[0].header,)
+            header = DeclaredHeader(hdu.header, str(path), DECLARED, others)
+            return cls._of(header, tuple(hdu.shape))
 
-    @property
-    def wavelength_nm(self) -> float:
-        """Wavelength of the light [nm]; errors as of `read_plain_flats`."""
-        name = next((name for name in WAVELENGTH if name in self.header), None)
-        if name is None:
-            allowed = f"the wavelength in nm as {' or '.join(WAVELENGTH)}"
-            raise FrameFormatError(WAVELENGTH[0], "missing", allowed, source=self.source)
-        value = _number(self.header[name], name, self.source)
-        if not RANGE_NM[0] <= value <= RANGE_NM[1]:
-            allowed = f"{RANGE_NM[0]:g} to {RANGE_NM[1]:g}, in nm"
-            raise OutOfRangeError(name, value, allowed, source=self.source)
-        return value
+    @classmethod
+    def _of(cls, header: DeclaredHeader, shape: tuple[int, int]) -> PlainImage:
+        kind = header.text("IMGTYPE").lower() or "flat"
+        kind = "bias" if kind in BIASES else "flat" if "flat" in kind else kind
+        if kind not in ("bias", "flat"):
+            return cls(header.source, kind, shape)
+        _refuse_overscan(header, shape)
+        noise, full = header.value("RDNOISE"), header.value("SATURATE")
+        return cls(
+            source=header.source,
+            kind=kind,
+            shape=shape,
+            detector=next(filter(None, map(header.text, SENSOR_NAMES)), ""),
+            wavelength_nm=_wavelength(header) if kind == "flat" else None,
+            temperature_k=_temperature(header) if kind == "flat" else None,
+            gain=_gain(header),
+            read_noise_e=header.number("RDNOISE", noise or 0.0, "electrons, 0 or more", lambda e: e >= 0),
+            full=math.inf if full is None else header.number("SATURATE", full, "positive", lambda c: c > 0),
+        )
 
-    @property
-    def temperature_k(self) -> float | None:
-        """Temperature of the sensor [K] by ``TEMPK``, or ``CCDTEMP`` in °C; `None` where neither is there."""
-        if "TEMPK" in self.header:
-            return _number(self.header["TEMPK"], "TEMPK", self.source)
-        if "CCDTEMP" in self.header:
-            return _number(self.header["CCDTEMP"], "CCDTEMP", self.source) + ZERO_CELSIUS_K
-        return None
+    def require_wavelength_nm(self) -> float:
+        """Wavelength of a flat [nm]."""
+        if self.wavelength_nm is None:
+            raise InputError("IMGTYPE", self.kind, "flat", source=self.source)
+        return self.wavelength_nm
 
-
-def is_plain(path: str | Path) -> bool:
-    """Whether a file holds exactly one image, as no frame with an image for each of its amplifiers does.
-
-    Raises
-    ------
-    FrameFormatError
-        The file is no FITS file, or is damaged.
-    """
-    with _opened(str(path)) as hdus:
-        return len(_images(hdus)) == 1
+    def counts(self) -> NDArray[np.float32]:
+        """Pixels as they stand in the file, after ``BSCALE`` and ``BZERO``; NaN where it has ``BLANK``."""
+        with complete_fits(self.source) as hdus:
+            (hdu,) = _images(hdus)
+            return np.array(hdu.data, dtype=np.float32)
 
 
 @named_units
@@ -129,7 +133,8 @@ def read_plain_flats(
 
     The wavelength is read from ``MONOWL``, ``WAVELEN`` or ``WAVELNTH`` [nm]. ``BUNIT`` says electrons, or ADU with
     the ``GAIN`` in electrons for each. Images with ``IMGTYPE`` ``bias`` are averaged and subtracted; where there are
-    none, the flats are taken as bias-subtracted. ``RDNOISE`` [electrons] adds to the noise of the electrons.
+    none, the flats are taken as bias-subtracted. ``RDNOISE`` [electrons] adds to the noise of the electrons. A copy
+    of a file counts once.
 
     Parameters
     ----------
@@ -140,7 +145,7 @@ def read_plain_flats(
     bandwidth_fwhm_nm, f_number : `float`
         Line width of the light [nm], and its focal ratio, infinite for a parallel beam.
     detector : `str`, optional
-        Name of the sensor.
+        Name of the sensor, where the headers do not state it.
 
     Returns
     -------
@@ -150,44 +155,119 @@ def read_plain_flats(
     Raises
     ------
     FrameFormatError
-        A file that is not one image, of another shape than the others, without its wavelength or unit.
-    OutOfRangeError
-        A wavelength outside 200 to 1300 nm.
+        A file that is not one image, of another shape than the others, without its wavelength or unit; two of one
+        content under different headers.
     InputError
-        No flats among them.
+        No flats among them, or flats of several sensors.
     """
-    images = [PlainImage.read(path) for path in paths]
-    biases = [image for image in images if image.kind in ("bias", "zero")]
-    flats = [image for image in images if "flat" in image.kind]
-    if not flats:
-        kinds = ", ".join(sorted({image.kind for image in images})) or "no image"
-        raise InputError("flats", kinds, "one flat or more (IMGTYPE FLAT)")
-    _refuse_other_shapes(images)
-    flats.sort(key=lambda flat: flat.wavelength_nm)
-    level = np.mean([bias.electrons for bias in biases], axis=0) if biases else np.float32(0.0)
-    stated = [flat.temperature_k for flat in flats]
-    electrons = np.stack([flat.electrons - level for flat in flats])
-    noise = np.array([flat.read_noise_e for flat in flats])[:, np.newaxis, np.newaxis]
-    return FringeCube.from_arrays(
-        electrons,
-        [flat.wavelength_nm for flat in flats],
-        np.maximum(electrons, 1.0) + noise**2 * (1.0 + (1.0 / len(biases) if biases else 0.0)),
-        np.stack([flat.mask for flat in flats]),
+    images = []
+    for path in paths:
+        image = PlainImage.read(path)
+        if image is None:
+            raise FrameFormatError("images", "none or several", "one with two axes", source=str(path))
+        images.append(image)
+    return stack_plain_flats(
+        images,
+        temperature_k=temperature_k,
         bandwidth_fwhm_nm=bandwidth_fwhm_nm,
-        temperature_k=[temperature_k if found is None else found for found in stated],
         f_number=f_number,
         detector=detector,
-        metadata={"NBIAS": len(biases)},
     )
 
 
-@contextmanager
-def _opened(source: str) -> Iterator[Any]:
-    with (
-        refuse_damage("file", "a complete FITS file", source),
-        open_user_fits(source, warning="truncated", memmap=False) as hdus,
-    ):
-        yield hdus
+def stack_plain_flats(
+    images: Sequence[PlainImage],
+    *,
+    temperature_k: float,
+    bandwidth_fwhm_nm: float,
+    f_number: float,
+    detector: str = "",
+    advance: Callable[[], None] = lambda: None,
+    note: Callable[[str], None] = lambda line: None,
+) -> FringeCube:
+    """See `read_plain_flats`. ``note``: takes a line that names copies; ``advance``: called after each image."""
+    flats = sorted(
+        (image for image in images if image.kind == "flat"), key=lambda flat: flat.wavelength_nm or 0.0
+    )
+    biases = [image for image in images if image.kind == "bias"]
+    refuse_other_sensors(images)
+    once = _Once(advance)
+    level, n_bias = np.zeros(flats[0].shape, np.float32), 0
+    for bias in biases:
+        counts = once.counts(bias)
+        if counts is not None:
+            level, n_bias = level + np.float32(bias.gain) * counts, n_bias + 1
+    level /= np.float32(max(n_bias, 1))
+    electrons = np.empty((len(flats), *flats[0].shape), np.float32)
+    mask = np.zeros(electrons.shape, np.int16)
+    kept: list[PlainImage] = []
+    for flat in flats:
+        counts = once.counts(flat)
+        if counts is not None:
+            mask[len(kept)][counts >= flat.full] = mask_bits("SAT")
+            electrons[len(kept)] = np.float32(flat.gain) * counts - level
+            kept.append(flat)
+    if once.copies:
+        note(f"copies of other images, not counted again: {', '.join(once.copies)}")
+    electrons, mask = electrons[: len(kept)], mask[: len(kept)]
+    noise = np.array([flat.read_noise_e for flat in kept], np.float32)[:, np.newaxis, np.newaxis]
+    variance = np.maximum(electrons, np.float32(1.0))
+    variance += noise**2 * np.float32(1.0 + (1.0 / n_bias if n_bias else 0.0))
+    return FringeCube.from_arrays(
+        electrons,
+        [flat.require_wavelength_nm() for flat in kept],
+        variance,
+        mask,
+        bandwidth_fwhm_nm=bandwidth_fwhm_nm,
+        temperature_k=[temperature_k if flat.temperature_k is None else flat.temperature_k for flat in kept],
+        f_number=f_number,
+        detector=next((flat.detector for flat in kept if flat.detector), detector),
+        metadata={"NBIAS": n_bias},
+    )
+
+
+def refuse_other_sensors(images: Sequence[PlainImage]) -> None:
+    """Refuse images without flats among them, of several sizes, or of several sensors."""
+    if not any(image.kind == "flat" for image in images):
+        kinds = ", ".join(sorted({image.kind for image in images})) or "none"
+        raise InputError("flats", kinds, "one flat or more (IMGTYPE FLAT)")
+    used = [image for image in images if image.kind in ("bias", "flat")]
+    first, named = used[0], [image for image in used if image.detector]
+    for image in used:
+        if image.shape != first.shape:
+            allowed = f"{first.shape}, that of {first.source}"
+            raise FrameFormatError("shape", image.shape, allowed, source=image.source)
+        if image.detector and image.detector != named[0].detector:
+            allowed = f"{named[0].detector}, that of {named[0].source}: flats of one sensor"
+            raise FrameFormatError("sensor", image.detector, allowed, source=image.source)
+
+
+class _Once:
+    """Pixels of images, each only once."""
+
+    def __init__(self, advance: Callable[[], None]) -> None:
+        self._advance = advance
+        self._seen: dict[str, PlainImage] = {}
+        self.copies: list[str] = []
+
+    def counts(self, image: PlainImage) -> NDArray[np.float32] | None:
+        """Pixels, `None` of a copy; equal pixels under another header are refused.
+
+        Images of one value have no light to tell.
+        """
+        counts = image.counts()
+        self._advance()
+        if counts.shape != image.shape:
+            raise FrameFormatError("shape", counts.shape, f"{image.shape}, as before", source=image.source)
+        first = self._seen.setdefault(pixels_digest(counts), image)
+        if first is image or np.nanmin(counts) == np.nanmax(counts):
+            return counts
+        if replace(first, source=image.source) != image:
+            raise FrameFormatError(
+                "pixels", f"those of {first.source}", "light of its own", source=image.source
+            )
+        self.copies.append(image.source)
+        return None
 
 
 def _images(hdus: Sequence[Any]) -> list[Any]:
@@ -195,31 +275,55 @@ def _images(hdus: Sequence[Any]) -> list[Any]:
     return [hdu for hdu in hdus if getattr(hdu, "is_image", False) and len(hdu.shape) == 2]
 
 
-def _gain(header: dict[str, Any], source: str) -> float:
+def _wavelength(header: DeclaredHeader) -> float:
+    low, high = WAVELENGTH_RANGE_NM
+    allowed = f"a number from {low:g} to {high:g}, the wavelength in nm, as {' or '.join(WAVELENGTHS)}"
+    stated = {name: value for name in WAVELENGTHS if (value := header.value(name)) is not None}
+    if not stated:
+        raise header.refuse(WAVELENGTHS[0], "missing", allowed)
+    numbers = [
+        header.number(name, value, allowed, lambda nm: low <= nm <= high) for name, value in stated.items()
+    ]
+    if max(numbers) - min(numbers) > SETTING_NM:
+        raise header.refuse(" and ".join(stated), numbers, "one wavelength")
+    return numbers[0]
+
+
+def _temperature(header: DeclaredHeader) -> float | None:
+    """Temperature of the sensor [K] by ``TEMPK``, or ``CCDTEMP`` in °C; `None` where neither is there."""
+    low, high = TEMPERATURE_RANGE_C
+    for name, zero, unit in (("TEMPK", ZERO_CELSIUS_K, "K"), ("CCDTEMP", 0.0, "°C")):
+        value = header.value(name)
+        if value is not None:
+            allowed = f"{unit} from {low + zero:g} to {high + zero:g}"
+            number = header.number(name, value, allowed, lambda t, z=zero: low <= t - z <= high)  # type: ignore[misc]
+            return number - zero + ZERO_CELSIUS_K
+    return None
+
+
+def _gain(header: DeclaredHeader) -> float:
     """Electrons for each count."""
-    unit = str(header.get("BUNIT", "")).strip().lower()
+    unit = header.text("BUNIT").lower()
     if unit in ELECTRONS:
         return 1.0
     if unit not in ADU:
-        allowed = "electron, or adu with the GAIN in electrons for each"
-        raise FrameFormatError("BUNIT", unit or "missing", allowed, source=source)
-    if "GAIN" not in header:
-        raise FrameFormatError("GAIN", "missing", "electrons for each ADU", source=source)
-    gain = _number(header["GAIN"], "GAIN", source)
-    if not gain > 0.0:
-        raise OutOfRangeError("GAIN", gain, "a positive number of electrons for each ADU", source=source)
-    return gain
+        raise header.refuse(
+            "BUNIT", unit or "missing", "electron, or adu with the GAIN in electrons for each"
+        )
+    value = header.value("GAIN")
+    allowed = "a positive number of electrons for each ADU"
+    if value is None:
+        raise header.refuse("GAIN", "missing", allowed)
+    return header.number("GAIN", value, allowed, lambda gain: gain > 0)
 
 
-def _number(value: Any, name: str, source: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise FrameFormatError(name, value, "a number", source=source)
-    return float(value)
-
-
-def _refuse_other_shapes(images: Sequence[PlainImage]) -> None:
-    first = images[0]
-    for image in images:
-        if image.electrons.shape != first.electrons.shape:
-            allowed = f"{first.electrons.shape}, that of {first.source}"
-            raise FrameFormatError("shape", image.electrons.shape, allowed, source=image.source)
+def _refuse_overscan(header: DeclaredHeader, shape: tuple[int, int]) -> None:
+    """Refuse an image with more pixels than the sensor; one that was trimmed may state where it was."""
+    for name in ("DATASEC", "TRIMSEC"):
+        value = header.value(name)
+        if value is None:
+            continue
+        rows, columns = Section.parse(value, keyword=name, source=header.source).shape
+        if rows < shape[0] or columns < shape[1]:
+            allowed = f"the whole image of {shape[1]} x {shape[0]} pixels; trim its overscan"
+            raise header.refuse(name, value, allowed)

@@ -22,13 +22,17 @@ def pixels_digest(image: NDArray[Any]) -> str:
     return hashlib.blake2b(np.ascontiguousarray(image, "<f4").tobytes(), digest_size=16).hexdigest()
 
 
-def refuse_equal_pixels(field: str, images: Iterable[NDArray[Any]]) -> None:
-    """Refuse images of which two have equal pixels; images of one value have no light to tell."""
+def refuse_equal_pixels(field: str, images: Iterable[NDArray[Any]], names: Sequence[str] = ()) -> None:
+    """Refuse images of which two have equal pixels; images of one value have no light to tell.
+
+    ``names``: what the message calls them, in place of their numbers.
+    """
     seen: dict[str, int] = {}
     for number, image in enumerate(images):
         first = seen.setdefault(pixels_digest(image), number)
         if first != number and image.min() != image.max():
-            raise InputError(field, f"equal pixels in {first} and {number}", "each exposure once")
+            pair = f"{names[first]} and {names[number]}" if names else f"{first} and {number}"
+            raise InputError(field, f"equal pixels in {pair}", "each exposure once")
 
 
 def refuse_mixed_models(metadata: Sequence[Mapping[str, Any]]) -> None:
