@@ -11,10 +11,10 @@ from scipy.stats import chi2 as chi2_distribution
 
 from ...products import FlatFit
 from .cells import Cells
-from .learning import spread_of_wavelengths
 from .nuisances import NuisanceFit
 from .pixels import PixelFit
 from .templates import FringeTemplates
+from .wavelengths import spread_of_wavelengths
 
 __all__ = ["CERTAIN", "MISFIT", "contrast_map", "flat_fit", "model_error", "remarks", "says_misfit"]
 
@@ -122,14 +122,15 @@ def worst_flat(flats: FlatFit) -> tuple[int, float] | None:
     return (worst, float(away[worst])) if away[worst] > _OUTLIER else None
 
 
-def cards(flats: FlatFit, margin: float) -> dict[str, Any]:
-    """Header keywords: contrast, misfit of cells, certainty of the order, the flat that does not fit."""
+def cards(flats: FlatFit, margin: float, scale_sigma: float) -> dict[str, Any]:
+    """Header keywords: contrast, misfit of cells, certainty of order and scale, the flat that does not fit."""
     weight = 1.0 / np.maximum(flats.contrast_sigma, 1e-9) ** 2
     found: dict[str, Any] = {
         "CONTRAST": round(float(flats.contrast.mean()), 6),
         "CONTRSIG": round(float(1.0 / np.sqrt(weight.sum())) if np.any(flats.contrast_sigma) else 0.0, 6),
         "CELLMISF": round(float(flats.misfit.mean()), 3),
         "ORDMARG": round(min(margin, 1e6), 1),
+        "SCALESIG": float(f"{scale_sigma:.3g}"),
     }
     worst = worst_flat(flats)
     if worst is not None:
@@ -164,6 +165,11 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
         f"contrast {metadata['CONTRAST']:.3g} ± {metadata['CONTRSIG']:.1g} of the model's "
         f"({flats.contrast.min():.3g} to {flats.contrast.max():.3g} over the wavelengths)"
     ]
+    if float(metadata["SCALESIG"]) > 0.0:
+        said.append(
+            f"all thicknesses share an uncertainty of {metadata['SCALESIG']:.1g} of themselves, because the wavelengths "
+            f"are off by {np.sqrt(np.mean(flats.offset_nm**2)):.2g} nm rms; σ contains it"
+        )
     misfit = float(metadata["CELLMISF"])
     if misfit > MISFIT:
         worst = int(np.argmax(flats.misfit))

@@ -152,7 +152,7 @@ def fit_thickness(
         if joint.found.nuisance.misfit.size:
             flats = flat_fit(joint.found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
             coarse = joint.found.contrast_map
-            notes |= cards(flats, joint.found.margin)
+            notes |= cards(flats, joint.found.margin, joint.found.nuisance.scale_sigma)
         pixels, slip = joint.pixels, joint.slip
         notes |= {"ORDERUM": round(joint.found.order_um, 6), **joint.silicon.cards()}
     else:
@@ -170,7 +170,7 @@ def fit_thickness(
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
         flats = flat_fit(found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
         coarse = found.contrast_map
-        notes |= cards(flats, found.margin)
+        notes |= cards(flats, found.margin, found.nuisance.scale_sigma)
     limit = slip_limit if float(notes.get("ORDMARG", CERTAIN)) >= CERTAIN else -1.0
     everywhere = _assemble(pixels, slip, limit, cube, model.base_system.varying, notes, workers)
     everywhere = replace(everywhere, flats=flats, contrast_map=coarse)

@@ -20,9 +20,12 @@ from .cells import (
     effective_number,
     sample_pixels,
 )
+from .common_order import rank_orders
 from .conclusion import contrast_map, model_error
 from .evidence import OrderEvidence, order_evidence, refine_cells
-from .learning import LearningCells, first_nuisances, learn, rank_orders, sample_blocks
+from .first_nuisances import first_nuisances
+from .learning import learn
+from .learning_cells import LearningCells, sample_blocks
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, subtract_offset
 from .orders import SURE, solve_orders

@@ -27,6 +27,7 @@ __all__ = [
     "Nuisances",
     "add_offset",
     "light_patterns",
+    "light_widths",
     "patterns_of_cells",
     "subtract_offset",
 ]
@@ -37,6 +38,10 @@ OVERTONES = 4
 """Numbers that describe the overtones at one wavelength."""
 GAIN_ACCURACY = 0.005
 """How well gains of amplifiers are known: a few 1e-3 from iron-55, or from the variance of pairs of flats."""
+_GAIN_BY_WAVELENGTH = 0.2
+"""Standard deviation of the level of a zone at one wavelength, over that of its mean: levels are mostly gains."""
+_LIGHT, _LIGHT_BY_WAVELENGTH = 0.1, 0.02
+"""Standard deviations of each term of a slow illumination: what wavelengths share, and what each has of its own."""
 
 
 @dataclass(frozen=True)
@@ -252,3 +257,13 @@ def light_patterns(
         terms = [(k, total - k) for total in range(1, degree + 1) for k in range(total + 1)]
         parts.append(np.stack([along[:, a] * beside[:, b] for a, b in terms], axis=1))
     return np.concatenate(parts, axis=1), zones
+
+
+def light_widths(free: Nuisances, zones: int, count: int, shared: bool) -> FloatArray:
+    """Standard deviations of the coefficients of the light: what wavelengths share, or what each has besides."""
+    known = np.isfinite(free.gain_accuracy)
+    width = np.full(count, (_LIGHT if shared else _LIGHT_BY_WAVELENGTH) if known else 1.0)
+    width[0] = 1.0
+    gain = free.gain_accuracy * (1.0 if shared else _GAIN_BY_WAVELENGTH) if known else 1.0
+    width[1 : 1 + zones] = gain
+    return width
