@@ -92,8 +92,8 @@ ROWS: dict[str, Laboratory] = {
 class Result:
     """How a map compares with the truth: shares of pixels, σ in nm, width of the pulls of right orders.
 
-    ``own`` is the width of the pulls about their mean, without the uncertainty that all pixels share; ``common`` is that
-    mean over this uncertainty, one number for a sensor.
+    ``own`` is the width of the pulls about their mean, without the uncertainty that all pixels share; ``common`` is
+    that mean over this uncertainty, one number for a sensor.
     """
 
     wrong: float

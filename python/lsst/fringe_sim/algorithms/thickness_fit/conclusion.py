@@ -167,8 +167,8 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
     ]
     if float(metadata["SCALESIG"]) > 0.0:
         said.append(
-            f"all thicknesses share an uncertainty of {metadata['SCALESIG']:.1g} of themselves, because the wavelengths "
-            f"are off by {np.sqrt(np.mean(flats.offset_nm**2)):.2g} nm rms; σ contains it"
+            f"all thicknesses share an uncertainty of {metadata['SCALESIG']:.1g} of themselves, because the "
+            f"wavelengths are off by {np.sqrt(np.mean(flats.offset_nm**2)):.2g} nm rms; σ contains it"
         )
     misfit = float(metadata["CELLMISF"])
     if misfit > MISFIT:

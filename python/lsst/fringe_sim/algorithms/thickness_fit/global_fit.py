@@ -30,6 +30,7 @@ from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, subtract_offset
 from .orders import SURE, solve_orders
 from .pixels import CellSurface, PixelFit, calm_surface, fit_pixels
+from .posterior import widen_uncertainties
 from .relaxation import SettledCells, settle_orders
 from .rescue import rescue_pixels
 from .shared_misfit import doubt_from_shared_misfit, leaves_only_noise
@@ -194,6 +195,8 @@ def global_fit(
     pixels = rescue_pixels(
         fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
+    typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
+    widen_uncertainties(fringes, state.templates, pixels, order, typical, threads)
     pixels = model_error(pixels, state.nuisance.scale_sigma)
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))

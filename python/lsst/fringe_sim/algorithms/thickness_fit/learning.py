@@ -194,27 +194,25 @@ class _Problem:
             (weight * rest**2).sum(axis=0) / np.maximum((weight > 0).sum(axis=0), 1), 1.0
         )
         information = np.maximum((weight * slope**2).sum(axis=1), 1e-30)
-        lean = weight * slope / np.sqrt(information)[:, None]
+        # The direction in which a change of the thickness moves a cell is projected out.
+        lean = np.ascontiguousarray((weight * slope / np.sqrt(information)[:, None]).T)
+        heavy = np.ascontiguousarray(weight.T)
         each, common = self._design(fit, thickness, model, slope)
-        along = (each * lean[..., None]).reshape(len(rest), -1)
-        along_common = (common * lean[..., None]).sum(axis=1)
         size = wavelengths * own
-        normal = np.zeros((size + shared, size + shared))
-        weighted = each * weight[..., None]
-        blocks = np.matmul(np.moveaxis(each, 0, -1).transpose(0, 1, 2), np.moveaxis(weighted, 0, 1))
-        for band in range(wavelengths):
+        along = (each * lean[:, None]).reshape(size, -1)
+        along_common = (common * lean[:, None]).sum(axis=0)
+        weighted, turned = each * heavy[:, None], common.transpose(0, 2, 1)
+        normal = np.empty((size + shared, size + shared))
+        normal[:size, :size] = -along @ along.T
+        for band, block in enumerate(weighted @ each.transpose(0, 2, 1)):
             part = slice(band * own, (band + 1) * own)
-            normal[part, part] = blocks[band]
-            normal[part, size:] = weighted[:, band].T @ common[:, band]
-        normal[:size, :size] -= along.T @ along
-        normal[:size, size:] -= along.T @ along_common
+            normal[part, part] += block
+        normal[:size, size:] = (weighted @ turned).reshape(size, shared) - along @ along_common.T
         normal[size:, :size] = normal[:size, size:].T
-        normal[size:, size:] = (
-            np.einsum("nwq,nw,nwr->qr", common, weight, common) - along_common.T @ along_common
-        )
-        left = weight * rest - lean * (lean * rest).sum(axis=1)[:, None]
+        normal[size:, size:] = (common * heavy[:, None] @ turned).sum(axis=0) - along_common @ along_common.T
+        left = heavy * rest.T - lean * (lean * rest.T).sum(axis=0)
         right = np.concatenate(
-            [np.einsum("nwp,nw->wp", each, left).ravel(), np.einsum("nwq,nw->q", common, left)]
+            [(each @ left[..., None]).ravel(), (common @ left[..., None]).sum(axis=0).ravel()]
         )
         precision, where = self._prior(fit)
         return normal + precision, right - precision @ where
@@ -222,27 +220,27 @@ class _Problem:
     def _design(
         self, fit: NuisanceFit, thickness: NDArray[np.float32], model: FloatArray, slope: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """What each parameter changes in each cell: of each wavelength by itself, and of those that share it."""
+        """What parameters of each wavelength, and those that all share, change, wavelength by wavelength."""
         count = self.cells.pattern.shape[1]
         far = thickness.astype(float)
-        each = np.empty((*model.shape, self.own))
-        each[..., :count] = (1.0 + model)[..., None] * self.cells.pattern[:, None, :]
-        if self.free.contrast == "wavelength":
-            each[..., count] = model
+        wavelengths, cells = model.shape[1], model.shape[0]
+        each = np.empty((wavelengths, self.own, cells))
+        each[:, :count] = (1.0 + model.T)[:, None] * self.cells.pattern.T
+        if self.overtones is not None:
+            each[:, count] = model.T
             seen = far[:, None] + self.base.turn_um(far[:, None]) * fit.shift_nm
             place = np.rint((seen - self.base.start_um) / self.base.step_um).astype(int)
             place = np.clip(place, 0, len(self.overtones) - 1)
-            wave = self.overtones[place, np.arange(self.base.n_wavelengths)]
+            wave = self.overtones[place, np.arange(wavelengths)]
             scale = fit.contrast / fit.mean_response
-            each[..., count + 1 : count + 1 + OVERTONES] = scale[:, None] * wave
-            count += 1 + OVERTONES
+            each[:, count + 1 : count + 1 + OVERTONES] = (scale[:, None] * wave).transpose(1, 2, 0)
         if self.free.wavelength_accuracy_nm > 0.0:
-            each[..., count] = slope * self.base.turn_um(far[:, None])
-        common = np.empty((*model.shape, self.shared))
+            each[:, -1] = (slope * self.base.turn_um(far[:, None])).T
+        common = np.empty((wavelengths, self.shared, cells))
         if self.free.contrast == "common":
-            common[..., 0] = model
+            common[:, 0] = model.T
         elif self.free.contrast == "wavelength":
-            common[..., 0] = -model * (far - fit.middle_um)[:, None]
+            common[:, 0] = -model.T * (far - fit.middle_um)
         return each, common
 
     def _prior(self, fit: NuisanceFit) -> tuple[FloatArray, FloatArray]:
