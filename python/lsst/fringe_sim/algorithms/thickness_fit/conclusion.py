@@ -19,7 +19,7 @@ from .wavelengths import spread_of_wavelengths
 __all__ = ["CERTAIN", "MISFIT", "contrast_map", "flat_fit", "model_error", "remarks", "says_misfit"]
 
 CERTAIN = 25.0
-"""Chi-square difference to the next order of the whole sensor below which the order is not decided."""
+"""Chi-square difference to the next order of the whole sensor below which a person is told."""
 MISFIT = 1.2
 """Mean square of what is left of small blocks of pixels, over their variance, from which on the model is
 said not to fit."""
@@ -183,10 +183,12 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
             f"{label:g} nm does not fit: {metadata['WORSTSIG']:.0f} sigma; its wavelength would have to be "
             f"{label + offset:.1f} nm"
         )
-    if float(metadata["ORDMARG"]) < CERTAIN:
+    margin = max(float(metadata["ORDMARG"]), 0.0)
+    if margin < CERTAIN:
+        odds = np.exp(-0.5 * margin)
         said.append(
-            f"the order of the sensor is not decided: another one is worse by a chi-square of only "
-            f"{max(metadata['ORDMARG'], 0.0):.1f}; all pixels are flagged SLIP. Flats over a wider range of "
-            "wavelengths, or better known wavelengths, would decide"
+            f"the order of the sensor is not sure: another one is worse by a chi-square of only {margin:.1f}, which "
+            f"leaves it a probability of {odds / (1.0 + odds):.1g}; pixels are flagged SLIP where that is too much. "
+            "Flats over a wider range of wavelengths, or better known wavelengths, would decide"
         )
     return said
