@@ -34,6 +34,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
+_ROWS = 16
+"""Rows of cells whose light is made at a time."""
 OVERTONES = 4
 """Numbers that describe the overtones at one wavelength."""
 GAIN_ACCURACY = 0.005
@@ -187,12 +189,14 @@ class NuisanceFit:
         if not np.any(self.coefficients):
             return np.zeros((0, *cells.shape), np.float32)
         out = np.empty((len(self.coefficients), *cells.shape), np.float32)
-        columns = np.arange(cells.shape[1])
-        for row in range(
-            cells.shape[0]
-        ):  # patterns of all cells at once would need more memory than the cells
-            pattern, _ = patterns_of_cells(cells, free, np.full_like(columns, row), columns)
-            out[:, row] = np.expm1(self.coefficients @ pattern.T)
+        lines, columns = cells.shape
+        # Patterns of all cells at once would need more memory than the cells.
+        for first in range(0, lines, _ROWS):
+            rows, place = (part.ravel() for part in np.mgrid[first : min(first + _ROWS, lines), 0:columns])
+            pattern, _ = patterns_of_cells(cells, free, rows, place)
+            out[:, first : first + _ROWS] = np.expm1(self.coefficients @ pattern.T).reshape(
+                len(out), -1, columns
+            )
         return out
 
     def applied_to(self, base: FringeTemplates) -> FringeTemplates:

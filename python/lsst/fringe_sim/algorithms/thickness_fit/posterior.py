@@ -53,14 +53,13 @@ def widen_uncertainties(
         Number of threads; has no influence on the result.
     """
     table = templates.table()
-    slope = np.gradient(templates.amplitude(), axis=0)
-    information = ((slope**2) @ np.asarray(weight, dtype=float)).astype(np.float32)
+    limit = _widest(templates, np.asarray(weight, dtype=float), int(_REACH * order_um / templates.step_um))
 
     def work(band: int) -> None:
         rows = slice(band * BAND_ROWS, (band + 1) * BAND_ROWS)
         value, sigma = pixels.value[rows], pixels.sigma[rows]
         chosen = np.zeros(value.shape, np.bool_)
-        if _choose(information, templates.start_um, templates.step_um, value, sigma, chosen):
+        if _choose(limit, templates.start_um, templates.step_um, value, sigma, chosen):
             _widen(
                 *load_band(data, rows.start, rows.stop), table, templates.start_um, templates.step_um, order_um,
                 chosen, pixels.n_wavelengths[rows], value, sigma,
@@ -69,22 +68,31 @@ def widen_uncertainties(
     run_threaded(work, -(-len(pixels.value) // BAND_ROWS), threads)
 
 
+def _widest(templates: FringeTemplates, weight: NDArray[np.float64], reach: int) -> NDArray[np.float32]:
+    """Largest uncertainty at each thickness, in steps of the table, for which the likelihood is a parabola."""
+    information = np.gradient(templates.amplitude(), axis=0) ** 2 @ weight
+    limit = np.full(information.shape, np.inf, np.float32)
+    for move in range(1, reach + 1):
+        for here, there in (
+            (slice(move, None), slice(None, -move)),
+            (slice(None, -move), slice(move, None)),
+        ):
+            changed = np.abs(information[there] - information[here]) > _CHANGE * information[here]
+            limit[here][changed] = np.minimum(limit[here][changed], np.float32(move / 3.0))
+    return limit
+
+
 @kernel
-def _choose(information, start, step, value, sigma, chosen):  # type: ignore[no-untyped-def]
-    """Pixels at which the information changes much within their uncertainty; returns how many there are."""
-    top = information.shape[0] - 1.0
+def _choose(limit, start, step, value, sigma, chosen):  # type: ignore[no-untyped-def]
+    """Pixels whose uncertainty is above its limit; returns how many there are."""
+    top = limit.shape[0] - 1.0
     number = 0
     for r in range(value.shape[0]):
         for x in range(value.shape[1]):
             place, width = (value[r, x] - start) / step, sigma[r, x] / step
-            if not (0.0 <= place <= top and 0.0 < width < top):
-                continue
-            here = information[int(place)]
-            for k in (-3.0, -1.5, 1.5, 3.0):
-                there = information[int(min(max(place + k * width, 0.0), top))]
-                if abs(there - here) > _CHANGE * here:
-                    chosen[r, x] = True
-            number += chosen[r, x]
+            if 0.0 <= place <= top and limit[int(place)] < width < np.inf:
+                chosen[r, x] = True
+                number += 1
     return number
 
 

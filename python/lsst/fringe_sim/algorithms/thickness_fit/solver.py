@@ -132,7 +132,7 @@ class Solver:
         state = held._solve_held(cells, templates, probe)
         count = patterns_of_cells(cells, self.free, *np.zeros((2, 1), np.intp))[0].shape[-1]
         start = NuisanceFit.none(templates.n_wavelengths, count)
-        return self._learn(replace(state, free=self.free, nuisance=start, described=True), ranked=False)
+        return replace(state, free=self.free, nuisance=start, described=True)
 
     def _leaves_only_noise(self, state: State) -> bool:
         """Whether a solution leaves over nothing that neighbouring pixels share."""
