@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from .evidence import refine_row
 from .learning_cells import LearningCells
@@ -29,8 +30,8 @@ _ROUNDS = 8
 _TOLERANCE = 3e-5
 _SIGNIFICANT = 3.0
 """Standard deviations from which on a misfit counts."""
-_UNSOUND = 9.0
-"""Cells whose chi-square is this many times the median have no say."""
+_UNSOUND = 1e-4
+"""Probability of a chi-square, where the typical one is that of most cells, below which a cell has no say."""
 _CONTRAST_BY_WAVELENGTH = 0.3
 """Standard deviation of the logarithm of the contrast of one wavelength about the mean of all."""
 _FADING = 0.1
@@ -332,7 +333,7 @@ class _Problem:
         squares = (weight * rest**2)[sound].sum(axis=0)
         excess = squares.sum() / freedom.sum() - 1.0 - _SIGNIFICANT * np.sqrt(2.0 / freedom.sum())
         each_cell = (weight * rest**2).sum(axis=1)
-        capped = np.minimum(each_cell, _UNSOUND * np.median(each_cell))
+        capped = np.minimum(each_cell, _worst(each_cell, wavelengths))
         return thickness, replace(
             fit,
             contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale, misfit=squares / freedom,
@@ -359,6 +360,12 @@ def _change(before: NuisanceFit, after: NuisanceFit) -> float:
 
 
 def _sound(rest: FloatArray, weight: FloatArray) -> NDArray[np.bool_]:
-    """Cells that fit no worse than most."""
+    """Cells that fit no worse than most: others sit on a false minimum."""
     misfit = (weight * rest**2).sum(axis=1)
-    return np.asarray(misfit <= _UNSOUND * np.median(misfit))
+    return np.asarray(misfit <= _worst(misfit, rest.shape[1]))
+
+
+def _worst(misfit: FloatArray, wavelengths: int) -> float:
+    """Largest chi-square of a cell that is still believed."""
+    degrees = max(wavelengths - 1, 1)
+    return float(np.median(misfit) * chdtri(degrees, _UNSOUND) / chdtri(degrees, 0.5))
