@@ -200,7 +200,7 @@ class _Problem:
         heavy = np.ascontiguousarray(weight.T)
         each, common = self._design(fit, thickness, model, slope)
         size = wavelengths * own
-        along = (each * lean[:, None]).reshape(size, -1)
+        along = (each * lean[:, None]).reshape(size, len(rest))
         along_common = (common * lean[:, None]).sum(axis=0)
         weighted, turned = each * heavy[:, None], common.transpose(0, 2, 1)
         normal = np.empty((size + shared, size + shared))
