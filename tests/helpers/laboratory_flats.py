@@ -90,7 +90,11 @@ ROWS: dict[str, Laboratory] = {
 
 @dataclass(frozen=True)
 class Result:
-    """How a map compares with the truth: shares of pixels, σ in nm, width of the pulls of right orders."""
+    """How a map compares with the truth: shares of pixels, σ in nm, width of the pulls of right orders.
+
+    ``own`` is the width of the pulls about their mean, without the uncertainty that all pixels share; ``common`` is
+    that mean over this uncertainty, one number for a sensor.
+    """
 
     wrong: float
     masked: float
@@ -99,11 +103,14 @@ class Result:
     slip: float
     seconds: float
     misfit: float
+    own: float
+    common: float
 
     def __str__(self) -> str:
         return (
             f"wrong {self.wrong:8.1e}  masked {self.masked:7.1e}  sigma {self.sigma_nm:6.2f} nm  "
-            f"pulls {self.pull:5.2f}  slip {self.slip:7.1e}  misfit {self.misfit:5.2f}  {self.seconds:5.1f} s"
+            f"pulls {self.pull:5.2f}  own {self.own:5.2f}  "
+            f"common {self.common:+5.2f}  slip {self.slip:7.1e}  misfit {self.misfit:5.2f}  {self.seconds:5.1f} s"
         )
 
 
@@ -161,7 +168,11 @@ def judge(fitted: ThicknessMap, truth: np.ndarray, seconds: float = 0.0) -> Resu
     good = fitted.mask == 0
     error = (fitted.value - truth)[good]
     right = np.abs(error) < 0.5 * ORDER_UM
-    pull = (error / fitted.sigma[good])[right]
+    sigma = fitted.sigma[good].astype(float)
+    pull = (error / sigma)[right]
+    shared = float(fitted.metadata.get("SCALESIG", 0.0)) * fitted.value[good].astype(float)
+    mean = float(error[right].mean()) if right.any() else float("nan")
+    own = ((error - mean) / np.sqrt(np.maximum(sigma**2 - shared**2, 1e-12)))[right]
     return Result(
         float(1.0 - right.mean()) if right.size else 0.0,
         float(1.0 - good.mean()),
@@ -170,6 +181,8 @@ def judge(fitted: ThicknessMap, truth: np.ndarray, seconds: float = 0.0) -> Resu
         float(np.median(fitted.slip_probability)),
         seconds,
         float(fitted.metadata.get("MISFIT", 0.0)),
+        float(np.sqrt(np.mean(own**2))) if own.size else float("nan"),
+        mean / float(shared.mean()) if own.size and shared.any() else 0.0,
     )
 
 

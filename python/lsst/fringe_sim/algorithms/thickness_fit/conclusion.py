@@ -11,15 +11,15 @@ from scipy.stats import chi2 as chi2_distribution
 
 from ...products import FlatFit
 from .cells import Cells
-from .learning import spread_of_wavelengths
 from .nuisances import NuisanceFit
 from .pixels import PixelFit
 from .templates import FringeTemplates
+from .wavelengths import spread_of_wavelengths
 
 __all__ = ["CERTAIN", "MISFIT", "contrast_map", "flat_fit", "model_error", "remarks", "says_misfit"]
 
 CERTAIN = 25.0
-"""Chi-square difference to the next order of the whole sensor below which the order is not decided."""
+"""Chi-square difference to the next order of the whole sensor below which a person is told."""
 MISFIT = 1.2
 """Mean square of what is left of small blocks of pixels, over their variance, from which on the model is
 said not to fit."""
@@ -51,20 +51,29 @@ def model_error(pixels: PixelFit, scale_sigma: float) -> PixelFit:
     expected = float(chi2_distribution.median(most - 1)) / (most - 1)
     # A median has the scatter of a mean of about half as many numbers.
     scatter = _SIGNIFICANT * 1.5 * np.sqrt(2.0 / (most - 1))
-    ny, nx = pixels.chi2.shape
-    for top in range(0, ny, _BLOCK_PX):
-        for left in range(0, nx, _BLOCK_PX):
-            part = (slice(top, top + _BLOCK_PX), slice(left, left + _BLOCK_PX))
-            chi2 = pixels.chi2[part]
-            chi2 = chi2[np.isfinite(chi2)]
-            if chi2.size == 0:
-                continue
-            excess = float(np.median(chi2)) / expected
-            if excess > 1.0 + scatter / np.sqrt(chi2.size):
-                pixels.sigma[part] *= np.float32(np.sqrt(excess))
+    middle, count = _block_medians(pixels.chi2)
+    excess = middle / expected
+    for row, column in zip(*np.nonzero(excess > 1.0 + scatter / np.sqrt(count)), strict=True):
+        part = tuple(slice(_BLOCK_PX * k, _BLOCK_PX * (k + 1)) for k in (row, column))
+        pixels.sigma[part] *= np.float32(np.sqrt(excess[row, column]))
     if scale_sigma > 0.0:
         np.hypot(pixels.sigma, np.float32(scale_sigma) * pixels.value, out=pixels.sigma)
     return pixels
+
+
+def _block_medians(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Median of every block, of every second row and column of it, and how many numbers it is of, at least one."""
+    side = _BLOCK_PX // 2
+    some = values[::2, ::2]
+    down, across = (-(-length // side) for length in some.shape)
+    padded = np.full((down * side, across * side), np.nan, np.float32)
+    padded[: some.shape[0], : some.shape[1]] = some
+    blocks = padded.reshape(down, side, across, side).swapaxes(1, 2).reshape(down, across, -1)
+    blocks = np.sort(np.where(np.isfinite(blocks), blocks, np.float32(np.inf)), axis=-1)
+    count = np.maximum(np.isfinite(blocks).sum(axis=-1), 1)
+    pair = np.stack([(count - 1) // 2, count // 2], axis=-1)
+    middle = np.take_along_axis(blocks, pair, axis=-1).mean(axis=-1)
+    return np.where(np.isfinite(middle), middle, np.float32(0)), count
 
 
 def contrast_map(
@@ -122,14 +131,15 @@ def worst_flat(flats: FlatFit) -> tuple[int, float] | None:
     return (worst, float(away[worst])) if away[worst] > _OUTLIER else None
 
 
-def cards(flats: FlatFit, margin: float) -> dict[str, Any]:
-    """Header keywords: contrast, misfit of cells, certainty of the order, the flat that does not fit."""
+def cards(flats: FlatFit, margin: float, scale_sigma: float) -> dict[str, Any]:
+    """Header keywords: contrast, misfit of cells, certainty of order and scale, the flat that does not fit."""
     weight = 1.0 / np.maximum(flats.contrast_sigma, 1e-9) ** 2
     found: dict[str, Any] = {
         "CONTRAST": round(float(flats.contrast.mean()), 6),
         "CONTRSIG": round(float(1.0 / np.sqrt(weight.sum())) if np.any(flats.contrast_sigma) else 0.0, 6),
         "CELLMISF": round(float(flats.misfit.mean()), 3),
         "ORDMARG": round(min(margin, 1e6), 1),
+        "SCALESIG": float(f"{scale_sigma:.3g}"),
     }
     worst = worst_flat(flats)
     if worst is not None:
@@ -164,6 +174,11 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
         f"contrast {metadata['CONTRAST']:.3g} ± {metadata['CONTRSIG']:.1g} of the model's "
         f"({flats.contrast.min():.3g} to {flats.contrast.max():.3g} over the wavelengths)"
     ]
+    if float(metadata["SCALESIG"]) > 0.0:
+        said.append(
+            f"all thicknesses share an uncertainty of {metadata['SCALESIG']:.1g} of themselves, because the "
+            f"wavelengths are off by {np.sqrt(np.mean(flats.offset_nm**2)):.2g} nm rms; σ contains it"
+        )
     misfit = float(metadata["CELLMISF"])
     if misfit > MISFIT:
         worst = int(np.argmax(flats.misfit))
@@ -177,10 +192,12 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
             f"{label:g} nm does not fit: {metadata['WORSTSIG']:.0f} sigma; its wavelength would have to be "
             f"{label + offset:.1f} nm"
         )
-    if float(metadata["ORDMARG"]) < CERTAIN:
+    margin = max(float(metadata["ORDMARG"]), 0.0)
+    if margin < CERTAIN:
+        odds = np.exp(-0.5 * margin)
         said.append(
-            f"the order of the sensor is not decided: another one is worse by a chi-square of only "
-            f"{max(metadata['ORDMARG'], 0.0):.1f}; all pixels are flagged SLIP. Flats over a wider range of "
-            "wavelengths, or better known wavelengths, would decide"
+            f"the order of the sensor is not sure: another one is worse by a chi-square of only {margin:.1f}, which "
+            f"leaves it a probability of {odds / (1.0 + odds):.1g}; pixels are flagged SLIP where that is too much. "
+            "Flats over a wider range of wavelengths, or better known wavelengths, would decide"
         )
     return said

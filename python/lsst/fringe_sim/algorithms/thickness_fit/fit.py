@@ -19,11 +19,12 @@ from ..flat_conditions import model_of_flats
 from ..thickness_fit_options import CONTRASTS, FIT_METHODS
 from .amplitudes import Amplitudes
 from .cells import sample_pixels
-from .conclusion import CERTAIN, cards, flat_fit
-from .global_fit import global_fit, normalise_to_cells, spans_orders
+from .conclusion import cards, flat_fit
+from .global_fit import global_fit
 from .guo2022 import walk_fit
 from .islands import fit_islands
 from .joint import joint_fit
+from .mean_response import normalise_to_cells, spans_orders
 from .nuisances import Nuisances
 from .pixels import PixelFit
 from .rescue import chi2_limits, typical_misfit
@@ -152,7 +153,7 @@ def fit_thickness(
         if joint.found.nuisance.misfit.size:
             flats = flat_fit(joint.found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
             coarse = joint.found.contrast_map
-            notes |= cards(flats, joint.found.margin)
+            notes |= cards(flats, joint.found.margin, joint.found.nuisance.scale_sigma)
         pixels, slip = joint.pixels, joint.slip
         notes |= {"ORDERUM": round(joint.found.order_um, 6), **joint.silicon.cards()}
     else:
@@ -170,9 +171,8 @@ def fit_thickness(
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
         flats = flat_fit(found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
         coarse = found.contrast_map
-        notes |= cards(flats, found.margin)
-    limit = slip_limit if float(notes.get("ORDMARG", CERTAIN)) >= CERTAIN else -1.0
-    everywhere = _assemble(pixels, slip, limit, cube, model.base_system.varying, notes, workers)
+        notes |= cards(flats, found.margin, found.nuisance.scale_sigma)
+    everywhere = _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes, workers)
     everywhere = replace(everywhere, flats=flats, contrast_map=coarse)
     return fit_islands(everywhere, cube, model if observable is None else with_observable(model, observable))
 

@@ -27,16 +27,23 @@ __all__ = [
     "Nuisances",
     "add_offset",
     "light_patterns",
+    "light_widths",
     "patterns_of_cells",
     "subtract_offset",
 ]
 
 FloatArray = NDArray[np.float64]
 
+_ROWS = 16
+"""Rows of cells whose light is made at a time."""
 OVERTONES = 4
 """Numbers that describe the overtones at one wavelength."""
 GAIN_ACCURACY = 0.005
 """How well gains of amplifiers are known: a few 1e-3 from iron-55, or from the variance of pairs of flats."""
+_GAIN_BY_WAVELENGTH = 0.2
+"""Standard deviation of the level of a zone at one wavelength, over that of its mean: levels are mostly gains."""
+_LIGHT, _LIGHT_BY_WAVELENGTH = 0.1, 0.02
+"""Standard deviations of each term of a slow illumination: what wavelengths share, and what each has of its own."""
 
 
 @dataclass(frozen=True)
@@ -182,12 +189,14 @@ class NuisanceFit:
         if not np.any(self.coefficients):
             return np.zeros((0, *cells.shape), np.float32)
         out = np.empty((len(self.coefficients), *cells.shape), np.float32)
-        columns = np.arange(cells.shape[1])
-        for row in range(
-            cells.shape[0]
-        ):  # patterns of all cells at once would need more memory than the cells
-            pattern, _ = patterns_of_cells(cells, free, np.full_like(columns, row), columns)
-            out[:, row] = np.expm1(self.coefficients @ pattern.T)
+        lines, columns = cells.shape
+        # Patterns of all cells at once would need more memory than the cells.
+        for first in range(0, lines, _ROWS):
+            rows, place = (part.ravel() for part in np.mgrid[first : min(first + _ROWS, lines), 0:columns])
+            pattern, _ = patterns_of_cells(cells, free, rows, place)
+            out[:, first : first + _ROWS] = np.expm1(self.coefficients @ pattern.T).reshape(
+                len(out), -1, columns
+            )
         return out
 
     def applied_to(self, base: FringeTemplates) -> FringeTemplates:
@@ -252,3 +261,13 @@ def light_patterns(
         terms = [(k, total - k) for total in range(1, degree + 1) for k in range(total + 1)]
         parts.append(np.stack([along[:, a] * beside[:, b] for a, b in terms], axis=1))
     return np.concatenate(parts, axis=1), zones
+
+
+def light_widths(free: Nuisances, zones: int, count: int, shared: bool) -> FloatArray:
+    """Standard deviations of the coefficients of the light: what wavelengths share, or what each has besides."""
+    known = np.isfinite(free.gain_accuracy)
+    width = np.full(count, (_LIGHT if shared else _LIGHT_BY_WAVELENGTH) if known else 1.0)
+    width[0] = 1.0
+    gain = free.gain_accuracy * (1.0 if shared else _GAIN_BY_WAVELENGTH) if known else 1.0
+    width[1 : 1 + zones] = gain
+    return width

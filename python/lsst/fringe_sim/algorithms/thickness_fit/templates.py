@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -184,7 +185,7 @@ class FringeTemplates:
         response = self.response
         if np.any(overtones):
             response = response + np.einsum(
-                "wq,nwq->nw", overtones, self.overtones() if waves is None else waves
+                "wq,nwq->nw", overtones, self.overtones if waves is None else waves
             )
         if np.any(shift_nm):
             grid = self.thickness_um
@@ -210,6 +211,7 @@ class FringeTemplates:
         thickness = np.asarray(thickness_um, dtype=float)
         return np.asarray(-(thickness * self.group + self.beside_um) / self.wavelength_nm)
 
+    @cached_property
     def overtones(self) -> FloatArray:
         """Second and third overtone of the response, each followed by its quadrature, along a last axis of length 4.
 
@@ -242,12 +244,12 @@ class FringeTemplates:
         InputError
             The grid is too short to hold two orders, or the response does not oscillate.
         """
-        curve = self.amplitude()
+        weights = np.ones(self.n_wavelengths) if weight is None else np.asarray(weight, dtype=float)
+        curve = self.amplitude()[:, weights > 0.0]
         curve = curve - curve.mean(axis=0)
-        weights = np.ones(curve.shape[1]) if weight is None else np.asarray(weight, dtype=float)
         count = len(curve)
         size = 1 << (2 * count - 1).bit_length()
-        power = (np.abs(np.fft.rfft(curve, size, axis=0)) ** 2) @ weights
+        power = (np.abs(np.fft.rfft(curve, size, axis=0)) ** 2) @ weights[weights > 0.0]
         correlation = np.fft.irfft(power, size)[:count] / np.arange(count, 0, -1)
         falling = np.flatnonzero(correlation < 0.0)
         if falling.size == 0:

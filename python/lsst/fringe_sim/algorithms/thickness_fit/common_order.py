@@ -1,0 +1,123 @@
+"""Order of a whole sensor where light, contrast and wavelengths are free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .learning import learn
+from .learning_cells import LearningCells
+from .nuisances import NuisanceFit, Nuisances
+from .templates import FringeTemplates
+
+__all__ = ["CommonOrder", "rank_orders"]
+
+_MOST_ORDERS = 8
+_CLEAR = 100.0
+"""Chi-square difference beyond which the orders behind one need not be asked."""
+_ALIKE = 50
+"""Parts of a sensor in which model error differs: it repeats with the phase and changes slowly with the thickness."""
+_ROUNDS_ELSEWHERE = 6
+_INSIDE = 0.99
+"""Share of a sensor that must lie in the range of thicknesses."""
+
+
+@dataclass(frozen=True, eq=False)
+class CommonOrder:
+    """Order of a whole sensor, all nuisances being free.
+
+    Attributes
+    ----------
+    shift : `float`
+        Orders by which the thickness is to be moved.
+    fit : `NuisanceFit`
+        Nuisances there.
+    margin : `float`
+        Chi-square by which the next best order is worse, model error allowed for.
+    slip : `float`
+        Probability that the order is another.
+    """
+
+    shift: float
+    fit: NuisanceFit
+    margin: float
+    slip: float
+
+
+def rank_orders(
+    cells: LearningCells,
+    base: FringeTemplates,
+    free: Nuisances,
+    start: NuisanceFit,
+    order_um: float,
+    range_um: tuple[float, float],
+) -> CommonOrder:
+    """Compare the orders of a whole sensor: each with the light, contrast and wavelengths that it needs.
+
+    Parameters
+    ----------
+    cells : `LearningCells`
+        Cells with their thickness.
+    base : `FringeTemplates`
+        The model.
+    free : `Nuisances`
+        What is free.
+    start : `NuisanceFit`
+        Nuisances at the present order.
+    order_um : `float`
+        Thickness of one order [µm].
+    range_um : `tuple` [`float`, `float`]
+        Thicknesses that are possible [µm].
+    """
+    thickness, here = learn(cells, base, free, start)
+    tried, places = {0.0: here}, {0.0: thickness}
+
+    def ask(shift: float, side: float) -> None:
+        """Begin at the order beside this one: from far away, too few steps would reach the best."""
+        near = replace(cells, thickness_um=places[shift - side])
+        moved, guess = _guess_at_order(near, base, free, tried[shift - side], side * order_um)
+        inside = (moved.thickness_um > range_um[0]) & (moved.thickness_um < range_um[1])
+        if inside.mean() < _INSIDE:
+            tried[shift] = replace(here, chi2=np.inf)
+        else:
+            places[shift], tried[shift] = learn(moved, base, free, guess, _ROUNDS_ELSEWHERE)
+
+    def costs() -> dict[float, float]:
+        """Chi-square of all, each where the model error of the best is counted as noise."""
+        noise = _noise_with_model_error(min(tried.values(), key=lambda fit: fit.chi2 + fit.prior))
+        return {shift: fit.chi2 / noise + fit.prior for shift, fit in tried.items()}
+
+    def clear(shift: float) -> bool:
+        cost = costs()
+        return cost[shift] > min(cost.values()) + _CLEAR
+
+    for side in (-1.0, 1.0):
+        shift = side
+        ask(shift, side)
+        while abs(shift) < _MOST_ORDERS and not clear(shift):
+            shift += side
+            ask(shift, side)
+    cost = costs()
+    best = min(cost, key=lambda shift: cost[shift])
+    excess = np.array([cost[shift] - cost[best] for shift in tried if shift != best])
+    odds = float(np.exp(-0.5 * excess).sum())
+    return CommonOrder(best, tried[best], float(excess.min()), odds / (1.0 + odds))
+
+
+def _noise_with_model_error(fit: NuisanceFit) -> float:
+    """Variance of cells with model error over that of their noise: it does not average out over cells."""
+    return 1.0 + fit.excess * (1.0 + fit.cells / _ALIKE)
+
+
+def _guess_at_order(
+    cells: LearningCells, base: FringeTemplates, free: Nuisances, start: NuisanceFit, move_um: float
+) -> tuple[LearningCells, NuisanceFit]:
+    """Cells moved by some orders, and the wavelengths at which their fringes look the same there."""
+    moved = replace(cells, thickness_um=cells.thickness_um + np.float32(move_um))
+    if free.wavelength_accuracy_nm == 0.0:
+        return moved, start
+    wavelength = base.wavelength_nm
+    away = move_um * (1.0 - wavelength / wavelength.mean())
+    shift = start.shift_nm - away / base.turn_um(float(np.median(moved.thickness_um)))
+    return moved, replace(start, shift_nm=shift)
