@@ -158,7 +158,7 @@ class Scene:
             north,
             np.concatenate([stars, galaxies]),
             np.concatenate([np.zeros(stars.size), np.clip(size, 0.1, 5.0)]),
-            shear / np.maximum(1.0, np.abs(shear) / 0.6),
+            np.asarray(shear / np.maximum(1.0, np.abs(shear) / 0.6), dtype=np.complex128),
         )
 
     def pointing(self, rng: np.random.Generator) -> Pointing:
