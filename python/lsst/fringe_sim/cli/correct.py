@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,7 @@ from .progress import progress
 if TYPE_CHECKING:
     from ..algorithms.fringe_correction import CorrectionOptions
     from ..algorithms.observed_frames import CorrectedFrame, FrameRecord
+    from ..products import ObservedFrame
     from ..products.observed_files import ObservedImage
 
 __all__ = ["correct"]
@@ -43,10 +46,15 @@ OWN_CARD = re.compile(r"FRING(COR|TID|PRB|VER|S[CE]\d+)")
     show_default=True,
     help="Size of a pixel [arcsec]: fringes are judged on scales up to 20 arcsec.",
 )
+@click.option(
+    "--inject",
+    is_flag=True,
+    help="Draw stars and galaxies into a copy of each frame, and tell their fluxes before and after.",
+)
 @click.option("--undo", is_flag=True, help="Put the fringes back that an earlier run has subtracted.")
 @output_folder(
     "Folder for frames, table and report.",
-    *("*_corrected.fits", "*_restored.fits", "frames.ecsv", "report.html"),
+    *("*_corrected.fits", "*_restored.fits", "frames.ecsv", "injected.ecsv", "report.html"),
 )
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def correct(
@@ -56,6 +64,7 @@ def correct(
     background_px: float,
     amplifiers: tuple[int, int] | None,
     pixel_scale: float,
+    inject: bool,
     undo: bool,
     out: OutputFolder,
     dry_run: bool,
@@ -82,7 +91,8 @@ def correct(
         _restore(images, known, target)
         return
     options = CorrectionOptions(background_px, grid_of(amplifiers))
-    done, refused = _corrected(images, known, options, background, pixel_scale, target)
+    make = partial(_correct_one, known, options, pixel_scale, inject)
+    done, refused = _corrected(images, make, background, target)
     _write_report(target, done, refused)
     for line in [*map(_describe, done), *refused]:
         click.echo(line)
@@ -106,14 +116,11 @@ def _check_headers(images: list[ObservedImage], undo: bool) -> None:
 
 def _corrected(
     images: list[ObservedImage],
-    known: TemplateFolder,
-    options: CorrectionOptions,
+    make: Callable[[ObservedFrame, str], tuple[CorrectedFrame, FrameRecord]],
     background: Path | None,
-    pixel_scale: float,
     target: Path,
 ) -> tuple[list[FrameRecord], list[str]]:
     """Frames that could be fitted, of which those that passed are written; and why others could not."""
-    from ..algorithms.observed_frames import correct_frame
     from ..products.observed_files import write_images
 
     done: list[FrameRecord] = []
@@ -125,11 +132,11 @@ def _corrected(
                 name = stem_of(path) if len(parts) == 1 else f"{stem_of(path)}[{image.name}]"
                 frame = image.read(background_path(background, image))
                 try:
-                    each = correct_frame(frame, known.of(frame.detector), options, pixel_arcsec=pixel_scale)
+                    each, record = make(frame, name)
                 except UndeterminedError as error:
                     refused.append(f"{name}: not corrected: {error}")
                 else:
-                    done.append(each.record(name))
+                    done.append(record)
                     if each.proof.passed:
                         made[image.index] = each
                 advance()
@@ -140,6 +147,25 @@ def _corrected(
                 first = {"FRINGTID": next(iter(made.values())).correction.template_id, "FRINGUND": None}
                 write_images(path, target / f"{stem_of(path)}_corrected.fits", pixels, cards, flags, first)
     return done, refused
+
+
+def _correct_one(
+    known: TemplateFolder,
+    options: CorrectionOptions,
+    pixel_scale: float,
+    inject: bool,
+    frame: ObservedFrame,
+    name: str,
+) -> tuple[CorrectedFrame, FrameRecord]:
+    from ..algorithms.observed_frames import correct_frame, recover_sources
+
+    templates = known.prepared(frame.detector)
+    made = correct_frame(frame, templates, options, pixel_arcsec=pixel_scale)
+    sources = None
+    if inject and made.proof.passed:
+        sources = recover_sources(frame, made, templates, options, pixel_arcsec=pixel_scale)
+        sources["name"] = name
+    return made, made.record(name, sources)
 
 
 def _by_file(images: list[ObservedImage]) -> dict[Path, list[ObservedImage]]:
@@ -163,7 +189,7 @@ def _restore(images: list[ObservedImage], known: TemplateFolder, target: Path) -
         pixels, cards, flags = {}, {}, {}
         for image in parts:
             header, frame = image.header(), image.read()
-            pixels[image.index] = undo_correction(frame.image, known.of(frame.detector), header)
+            pixels[image.index] = undo_correction(frame.image, known.prepared(frame.detector), header)
             cards[image.index] = dict.fromkeys(key for key in header if OWN_CARD.fullmatch(key))
             flags[image.index] = frame.mask < 0
         name = f"{stem_of(path).removesuffix('_corrected')}_restored.fits"
@@ -172,11 +198,14 @@ def _restore(images: list[ObservedImage], known: TemplateFolder, target: Path) -
 
 
 def _write_report(target: Path, done: list[FrameRecord], refused: list[str]) -> None:
-    from ..algorithms.observed_frames import summary_table
+    from ..algorithms.observed_frames import injected_table, summary_table
     from ..files import table_text, write_whole
     from ..report.correction_page import write_correction_report
 
     write_whole(target / "frames.ecsv", table_text(summary_table(done)))
+    sources = injected_table(done)
+    if sources is not None:
+        write_whole(target / "injected.ecsv", table_text(sources))
     write_correction_report(target / "report.html", done, refused)
 
 
