@@ -113,6 +113,11 @@ def angular_response(
     error = spectral_error(model, sky, band, fineness, samples)
     for components, made in ((merged, of_lines), (continua, of_continua)):
         error += _angular_error(model, components, [sampled for _, sampled in made], limits, samples)
+    if sky.flat is None:
+        white = white_light(band, fineness.continuum_step_nm)
+        flat = refine @ _single_angles(model, white, limits, few, grid)[0]
+    else:
+        flat = _single_angles(model, sky.flat.component(band), limits, angles, grid)[0]
     return AngularResponse(
         tuple(item.name for item in [*merged, *continua]),
         photons,
@@ -121,7 +126,7 @@ def angular_response(
         table.start_um,
         table.step_um,
         np.stack([*(values for values, _ in of_lines), *(refine @ values for values, _ in of_continua)]),
-        refine @ _single_angles(model, white_light(band, fineness.continuum_step_nm), limits, few, grid)[0],
+        flat,
         table.interpolation_error,
         error / level,
         sky.airmass,
