@@ -261,6 +261,7 @@ def recover_sources(
     *,
     pixel_arcsec: float = 0.2,
     sources: InjectionOptions | None = None,
+    name: str = "",
 ) -> Table:
     """Draw sources into a copy of a frame, and find their fluxes before and after its correction.
 
@@ -278,6 +279,8 @@ def recover_sources(
         Size of a pixel on the sky [arcsec].
     sources : `InjectionOptions`, optional
         Kinds and fluxes of the sources.
+    name : `str`, optional
+        Name of the frame in the table.
 
     Returns
     -------
@@ -300,7 +303,7 @@ def recover_sources(
     noise = math.sqrt(fitted.fit.chi2_per_pixel / float(np.median(used[used > 0])))
     free = fitted.sums.usable & ~fitted.objects
     measured = inject_sources(frame.image, free, noise, pixel_arcsec, both, sources)
-    return injection_table("", measured)
+    return injection_table(name, measured)
 
 
 def summary_table(records: Sequence[FrameRecord]) -> Table:

@@ -163,8 +163,7 @@ def _correct_one(
     made = correct_frame(frame, templates, options, pixel_arcsec=pixel_scale)
     sources = None
     if inject and made.proof.passed:
-        sources = recover_sources(frame, made, templates, options, pixel_arcsec=pixel_scale)
-        sources["name"] = name
+        sources = recover_sources(frame, made, templates, options, pixel_arcsec=pixel_scale, name=name)
     return made, made.record(name, sources)
 
 

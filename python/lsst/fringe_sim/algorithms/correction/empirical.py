@@ -32,14 +32,19 @@ STEPS, SETTLED = 6, 1e-4
 """Most alternations between scores and patterns, each a weighted least-squares solution given the other, and the
 change of the projection on the scores below which they end."""
 
+LEARNING_STEPS = 2
+"""Alternations in all learning rounds but the last."""
+
 MOST_VARIANCE = 20.0
 """Variance of a pixel of a pattern over the usual one beyond which the frames that see it do not decide it."""
 
 ROWS = 64
 """Rows that are converted to float64 at a time."""
 
-JUDGED_ROWS = 256
-"""Rows of a strip of the sensor; strips tell the number of templates where not all rows are needed for that."""
+JUDGED_ROWS, STRIPS = 256, 2
+"""Rows of a strip of the sensor, and the number of strips that tell the number of templates where the frames do not
+fit into memory: a template that a frame holds with a hundredth of the noise of a pixel has a scale of ten
+standard deviations in a million pixels."""
 
 FOLDS = 4
 """Groups of frames, each of which is left out in turn."""
@@ -155,7 +160,10 @@ def fit_templates(
                         "gain of a template in frames that it was not made of", float(gain[1]),
                         "above 0: more frames, or stronger fringes",
                     )  # fmt: skip
-            found = _decompose(stack, number, prior, scores=None if found is None else found.scores)
+            # Only the last patterns are wanted to the end; the others tell fringes from objects.
+            steps = STEPS if turn == LEARNING_ROUNDS - 1 else LEARNING_STEPS
+            start = None if found is None else found.scores
+            found = _decompose(stack, number, prior, scores=start, steps=steps)
             patterns = list(found.patterns)
         coverage = stack.coverage()
     unit = _per_sky(found.scores, level)
@@ -218,10 +226,9 @@ class _Stack:
 
     def strips(self, prior: Sequence[NDArray[np.float32]]) -> tuple[_Stack, list[NDArray[np.float32]]]:
         """Some strips of all frames, and of the patterns that are expected, which memory holds."""
-        most = IN_MEMORY // (8 * self.frames * self.shape[1] * JUDGED_ROWS)
-        if self._file is None or most * JUDGED_ROWS >= self.shape[0]:
+        if self._file is None or self.shape[0] <= STRIPS * JUDGED_ROWS:
             return self, list(prior)
-        first = np.linspace(0, self.shape[0] - JUDGED_ROWS, max(1, most) + 2)[1:-1].astype(int)
+        first = np.linspace(0, self.shape[0] - JUDGED_ROWS, STRIPS + 2)[1:-1].astype(int)
         rows = np.unique(first[:, None] + np.arange(JUDGED_ROWS))
         part = _Stack(self.frames, (rows.size, self.shape[1]), in_memory=True)
         for frame in range(self.frames):
@@ -248,13 +255,14 @@ def _decompose(
     prior: Sequence[NDArray[np.float32]],
     frames: NDArray[Any] | None = None,
     scores: FloatArray | None = None,
+    steps: int = STEPS,
 ) -> _Decomposition:
     """Patterns and scores of some frames, of all by default, beginning with scores if they are given."""
     chosen = np.arange(stack.frames) if frames is None else frames
     if scores is None or scores.shape[1] != number:
         scores = _first_scores(stack, number, prior, chosen)
     before = np.zeros((chosen.size, number))
-    for _ in range(STEPS):
+    for _ in range(steps):
         orthonormal, _ = np.linalg.qr(scores)
         if np.abs(orthonormal @ orthonormal.T - before @ before.T).max() < SETTLED:
             break

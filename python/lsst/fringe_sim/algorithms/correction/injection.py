@@ -101,9 +101,9 @@ def inject_sources(
 
     Notes
     -----
-    Fluxes are sums over a circle whose radius is the width of a star, less the median of a ring around it, over the
-    part of the flux that the same measurement finds of the source without noise. Noise of the sources themselves is not
-    added: what scatters is the sky and its fringes.
+    Fluxes are sums over a circle whose radius is the width of a star, less the mean of a ring around it, over the
+    part of the flux that the same measurement finds of the source without noise. Noise of the sources themselves is
+    not added: what scatters is the sky and its fringes.
     """
     chosen = options or InjectionOptions()
     stars = {kind: _stamp(kind, chosen, pixel_arcsec) for kind in (POINT, EXTENDED)}
@@ -190,7 +190,7 @@ class _Aperture:
         return slice(y - half, y + half + 1), slice(x - half, x + half + 1)
 
     def flux(self, stamp: NDArray[Any]) -> float:
-        sky = float(np.median(stamp[self.ring]))
+        sky = float(np.mean(stamp[self.ring], dtype=np.float64))
         return float(stamp[self.circle].sum(dtype=np.float64)) - self.pixels * sky
 
 
