@@ -361,7 +361,7 @@ def _pattern(template: FringeFrame | ArrayLike) -> tuple[NDArray[np.float32], ND
     return image, ~np.isfinite(image)
 
 
-def _of_shape(name: str, values: ArrayLike, shape: tuple[int, int]) -> NDArray[Any]:
+def _of_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
     array = np.asarray(values)
     if array.shape != shape:
         raise InputError(f"shape of the {name}", array.shape, f"{shape}")

@@ -166,6 +166,7 @@ def fit_templates(
             found = _decompose(stack, number, prior, scores=start, steps=steps)
             patterns = list(found.patterns)
         coverage = stack.coverage()
+    assert found is not None
     unit = _per_sky(found.scores, level)
     return ObservedTemplates(
         (found.patterns * unit[:, None, None]).astype(np.float32),

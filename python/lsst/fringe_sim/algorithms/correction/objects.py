@@ -102,6 +102,7 @@ def fit_frame(
         objects = found
         if changed <= UNCHANGED * objects.size:
             break
+    assert residual is not None
     fit = scale_fit(sums, solution)
     return FrameFit(fit, objects, background.surface(fit.coefficient), residual, sums, solution)
 

@@ -150,7 +150,8 @@ def _plain_weight(
 def _largest_structure(residual: NDArray[np.float32], good: NDArray[np.bool_], largest: int) -> float:
     """Structure in the aperture in which it is largest, from 2 px up."""
     noise = _pixel_variance(residual, good)
-    share, total = good, np.where(good, residual, np.float32(0.0))
+    share: NDArray[Any] = good
+    total = np.where(good, residual, np.float32(0.0))
     found, half = [], 1
     while 2 * half <= largest:
         found.append(_excess(*_overlapping(share, total, half), 2 * half, noise))

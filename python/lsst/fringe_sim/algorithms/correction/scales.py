@@ -150,17 +150,18 @@ def settle(
             _roughly_good(sums, allowed) if residual is None else _kept(sums, allowed, residual, clip_sigma)
         )
     rounding = rounding_of(sums.level) * math.sqrt(float(sums.weight.max(initial=0.0)))
-    for _ in range(ROUNDS):
+    for left in reversed(range(ROUNDS)):
         sums.use(used)
         _refuse_few(sums)
         solution = sums.solve()
         residual = sums.residual(solution)
-        if not math.isfinite(clip_sigma) or _spread(sums, residual) <= rounding:
+        if left == 0 or not math.isfinite(clip_sigma) or _spread(sums, residual) <= rounding:
             break
         kept = _kept(sums, allowed, residual, clip_sigma)
         if np.count_nonzero(kept != used) <= UNCHANGED * sums.pixels.sum():
             break
         used = kept
+    assert residual is not None
     return solution, residual
 
 

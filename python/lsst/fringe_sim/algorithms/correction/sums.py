@@ -186,7 +186,8 @@ class FrameSums:
     def _scattered(self, blocks: FloatArray) -> FloatArray:
         size = len(self.background)
         flat = (self._term[..., :, None] * size + self._term[..., None, :]).ravel()
-        return np.bincount(flat, weights=blocks.ravel(), minlength=size * size).reshape(size, size)
+        sums = np.bincount(flat, weights=blocks.ravel(), minlength=size * size)
+        return np.asarray(sums, dtype=np.float64).reshape(size, size)
 
     def _use_row(self, row: int, used: BoolArray) -> None:
         edges = self.background.rows.edges, self.background.columns.edges
