@@ -39,6 +39,29 @@ def corrected(night: Path, made: Path, tmp_path_factory: pytest.TempPathFactory)
     return out
 
 
+def test_sources_are_drawn_into_copies(night: Path, made: Path, corrected: Path, tmp_path: Path) -> None:
+    """The table tells their fluxes; the products are those of a run without them."""
+    words = [
+        "correct",
+        str(night),
+        "--templates",
+        str(made),
+        "--amplifiers",
+        "2x1",
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    assert run([*words, "--inject", "--pixel-scale", "0.8"]) == 0
+    table = Table.read(tmp_path / "o" / "injected.ecsv")
+    assert set(table["kind"]) == {"point", "extended"}
+    assert set(table["name"]) == {f"visit_{number}" for number in range(4)}
+    bright = table[table["magnitude"] == np.min(table["magnitude"])]
+    assert np.abs(bright["bias_after"]).max() < 0.2
+    for number in range(4):
+        name = f"visit_{number}_corrected.fits"
+        np.testing.assert_array_equal(fits.getdata(tmp_path / "o" / name), fits.getdata(corrected / name))
+
+
 def test_templates_and_report_are_written(made: Path) -> None:
     assert {file.name for file in made.iterdir()} == {"templates_S11.fits", "report.html"}
     header = fits.getheader(made / "templates_S11.fits")

@@ -19,6 +19,8 @@ from lsst.fringe_sim.effects import (
     apply_to_sky,
 )
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
+from lsst.fringe_sim.instrument.bandpass import Bandpass
+from lsst.fringe_sim.instrument.flat_spectrum import FlatSpectrum
 from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.mock import HIDDEN_EFFECTS, setup_optics, validate_effects
 from lsst.fringe_sim.mock.hidden_effects import AmplifierState, with_hidden_optics
@@ -54,8 +56,10 @@ def observe(model: FringeModel, thickness: np.ndarray, wavelengths: np.ndarray =
     flats = model.response(thickness, wavelengths), model.flat_image(thickness, geometry)
     sky = apply_to_sky(model.effects, model.base_system, SKY)
     lines = sky.lines.photon_radiance * sky.lines.transmission
+    lamp = (sky.flat or FlatSpectrum()).component(Bandpass.from_name("lsst_y"))
+    flat, _ = np.histogram(lamp.wavelength_nm, 100, (900.0, 1100.0), weights=lamp.photons)
     return np.concatenate(
-        [*(part.ravel() for part in flats), lines, *(c.photon_radiance for c in sky.continua)]
+        [*(part.ravel() for part in flats), lines, *(c.photon_radiance for c in sky.continua), flat]
     )
 
 

@@ -113,6 +113,8 @@ def angular_response(
     error = spectral_error(model, sky, band, fineness, samples)
     for components, made in ((merged, of_lines), (continua, of_continua)):
         error += _angular_error(model, components, [sampled for _, sampled in made], limits, samples)
+    light = white_light(band, fineness.continuum_step_nm) if sky.flat is None else sky.flat.component(band)
+    flat = _single_angles(model, light, limits, angles if sky.flat else few, grid)[0]
     return AngularResponse(
         tuple(item.name for item in [*merged, *continua]),
         photons,
@@ -121,7 +123,7 @@ def angular_response(
         table.start_um,
         table.step_um,
         np.stack([*(values for values, _ in of_lines), *(refine @ values for values, _ in of_continua)]),
-        refine @ _single_angles(model, white_light(band, fineness.continuum_step_nm), limits, few, grid)[0],
+        flat if sky.flat else refine @ flat,
         table.interpolation_error,
         error / level,
         sky.airmass,
@@ -143,15 +145,15 @@ def of_other_silicon(
     band = bandpass_of(model) if bandpass is None else bandpass
     angles, points = known.flat.shape
     grid = (known.start_um, known.step_um, points)
-    merged, continua = _components(sky_with_effects(model, sky), band, fineness)
+    sky = sky_with_effects(model, sky)
+    merged, continua = _components(sky, band, fineness)
     few = math.ceil(angles * CONTINUUM_ANGLES / ANGLES)
     refine = _legendre_interpolation(few, angles)
     of_lines = [_single_angles(model, item, known.limits, angles, grid)[0] for item in merged]
-    white = white_light(band, fineness.continuum_step_nm)
-    *smooth, flat = (
-        refine @ _single_angles(model, item, known.limits, few, grid)[0] for item in [*continua, white]
-    )
-    return replace(known, values=np.stack([*of_lines, *smooth]), flat=flat)
+    smooth = [refine @ _single_angles(model, item, known.limits, few, grid)[0] for item in continua]
+    light = white_light(band, fineness.continuum_step_nm) if sky.flat is None else sky.flat.component(band)
+    flat = _single_angles(model, light, known.limits, angles if sky.flat else few, grid)[0]
+    return replace(known, values=np.stack([*of_lines, *smooth]), flat=flat if sky.flat else refine @ flat)
 
 
 def _components(

@@ -10,7 +10,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,14 +27,16 @@ __all__ = [
     "CorrectionOptions",
     "FringeCorrection",
     "ResidualFringe",
+    "TemplateSet",
     "component_patterns",
     "correct_fringes",
     "residual_fringe",
-    "template_identity",
     "undo_correction",
 ]
 
 FloatArray = NDArray[np.float64]
+
+Templates: TypeAlias = "TemplateSet | Sequence[FringeFrame] | ArrayLike"
 
 TEMPLATE_ID = "FRINGTID"
 """Keyword of a corrected exposure: which templates were subtracted."""
@@ -60,6 +62,55 @@ class CorrectionOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class TemplateSet:
+    """Templates as the fit wants them; made once for all frames of a sensor.
+
+    Attributes
+    ----------
+    patterns : `list` of `numpy.ndarray`, float32, shape ``(ny, nx)``
+        Templates of mean 0; 0 where they have no value.
+    variances : `list` of `numpy.ndarray`, float32
+        Variance of the noise of each, 0 where nobody knows it.
+    unknown : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
+        Pixels in which one of them has no value.
+    identity : `str`
+        Beginning of the SHA-256 of all their pixels that have a value.
+    """
+
+    patterns: list[NDArray[np.float32]]
+    variances: list[NDArray[np.float32]]
+    unknown: NDArray[np.bool_]
+    identity: str
+
+    @classmethod
+    def of(cls, templates: Templates) -> TemplateSet:
+        """Take templates in.
+
+        Raises
+        ------
+        InputError
+            No template, or templates of several shapes.
+        """
+        if isinstance(templates, TemplateSet):
+            return templates
+        pairs = [_pattern(template) for template in templates]  # type: ignore[union-attr]
+        if not pairs:
+            raise InputError("templates", 0, "one or more")
+        digest = hashlib.sha256()
+        unknown = np.zeros(pairs[0][0].shape, dtype=bool)
+        patterns, variances = [], []
+        for (image, missing), template in zip(pairs, templates, strict=True):  # type: ignore[arg-type]
+            unknown |= _of_shape("template", missing, unknown.shape)
+            digest.update(np.where(missing, np.float32(np.nan), image).astype("<f4").tobytes())
+            # A pedestal is no fringe, and would take sky along.
+            pedestal = image.mean(where=~missing, dtype=np.float64) if not missing.all() else 0.0
+            patterns.append(np.where(missing, np.float32(0.0), image - np.float32(pedestal)))
+            if isinstance(template, FringeFrame):
+                variances.append(np.where(missing, np.float32(0.0), template.variance.astype(np.float32)))
+        return cls(patterns, variances, unknown, digest.hexdigest()[:16])
+
+
+@dataclass(frozen=True, eq=False)
 class FringeCorrection:
     """A corrected exposure and what was subtracted.
 
@@ -75,7 +126,7 @@ class FringeCorrection:
     covariance : `numpy.ndarray`, shape ``(K, K)``
         Their covariance.
     template_id : `str`
-        Which templates they are (`template_identity`).
+        Which templates they are (`TemplateSet.identity`).
     frame : `FrameFit`
         Background, objects and residual.
     """
@@ -126,7 +177,7 @@ class ResidualFringe:
 
 def correct_fringes(
     image: ArrayLike,
-    templates: Sequence[FringeFrame] | ArrayLike,
+    templates: Templates,
     *,
     variance: ArrayLike | None = None,
     mask: ArrayLike | None = None,
@@ -139,7 +190,7 @@ def correct_fringes(
     ----------
     image : array_like, shape ``(ny, nx)``
         Exposure; its sky may be subtracted already, as long as the fringes are not.
-    templates : sequence of `FringeFrame`, or array_like of shape ``(K, ny, nx)``
+    templates : `TemplateSet`, sequence of `FringeFrame`, or array_like of shape ``(K, ny, nx)``
         Fringe templates; NaN, or masked, where they have no value.
     variance : array_like, shape ``(ny, nx)``, optional
         Variance of the exposure; by default one for all pixels, from the differences of neighbours. The errors of the
@@ -169,7 +220,8 @@ def correct_fringes(
     if exposure.ndim != 2:
         raise InputError("shape of the exposure", exposure.shape, "two axes (y, x)")
     shape = (exposure.shape[0], exposure.shape[1])
-    patterns, unknown = _templates(templates, shape)
+    known = TemplateSet.of(templates)
+    unknown = _of_shape("template", known.unknown, shape)
     good = np.isfinite(exposure) & ~unknown
     if mask is not None:
         good &= _of_shape("mask", mask, shape) == 0
@@ -178,23 +230,19 @@ def correct_fringes(
     )
     background = BackgroundTerms(shape, chosen.spacing_px, chosen.amplifiers)
     rounds = ROUNDS if chosen.find_objects else 1
-    frame = fit_frame(exposure, weight, patterns, background, rounds=rounds)
-    corrected = exposure - _fringes(patterns, frame.fit.scale, unknown, exposure)
-    return FringeCorrection(
-        corrected, unknown, frame.fit.scale, frame.fit.covariance, template_identity(templates), frame
-    )
+    frame = fit_frame(exposure, weight, known.patterns, background, rounds=rounds)
+    corrected = exposure - _fringes(known, frame.fit.scale, exposure)
+    return FringeCorrection(corrected, unknown, frame.fit.scale, frame.fit.covariance, known.identity, frame)
 
 
-def undo_correction(
-    image: ArrayLike, templates: Sequence[FringeFrame] | ArrayLike, header: Mapping[str, Any]
-) -> NDArray[Any]:
+def undo_correction(image: ArrayLike, templates: Templates, header: Mapping[str, Any]) -> NDArray[Any]:
     """Add the fringes again that `correct_fringes` subtracted; the exposure is what it was, to rounding.
 
     Parameters
     ----------
     image : array_like, shape ``(ny, nx)``
         Corrected exposure.
-    templates : sequence of `FringeFrame`, or array_like of shape ``(K, ny, nx)``
+    templates : `TemplateSet`, sequence of `FringeFrame`, or array_like of shape ``(K, ny, nx)``
         The templates of the correction.
     header : mapping
         Header of the corrected exposure.
@@ -207,12 +255,13 @@ def undo_correction(
     number = header.get(CORRECTED)
     if not number:
         raise InputError(CORRECTED, number, "an exposure that was corrected by this package")
-    own = template_identity(templates)
-    if header.get(TEMPLATE_ID) != own:
-        raise InputError(TEMPLATE_ID, header.get(TEMPLATE_ID), f"{own}, which the templates given have")
+    known = TemplateSet.of(templates)
+    if header.get(TEMPLATE_ID) != known.identity:
+        allowed = f"{known.identity}, which the templates given have"
+        raise InputError(TEMPLATE_ID, header.get(TEMPLATE_ID), allowed)
     corrected = np.asarray(image)
-    patterns, unknown = _templates(templates, (corrected.shape[0], corrected.shape[1]))
-    return np.asarray(corrected + _fringes(patterns, _stated_scales(header, patterns), unknown, corrected))
+    _of_shape("template", known.unknown, (corrected.shape[0], corrected.shape[1]))
+    return np.asarray(corrected + _fringes(known, _stated_scales(header, known.patterns), corrected))
 
 
 def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
@@ -231,15 +280,6 @@ def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) 
         if not abs(value) < np.finfo(np.float32).max:
             raise OutOfRangeError(name, float(value), "a finite number of electrons")
     return scale
-
-
-def template_identity(templates: Sequence[FringeFrame] | ArrayLike) -> str:
-    """Beginning of the SHA-256 of all pixels of templates, where they have a value."""
-    digest = hashlib.sha256()
-    for template in templates:  # type: ignore[union-attr]
-        image, unknown = _pattern(template)
-        digest.update(np.where(unknown, np.float32(np.nan), image).astype("<f4").tobytes())
-    return digest.hexdigest()[:16]
 
 
 def residual_fringe(
@@ -330,23 +370,6 @@ def component_patterns(thickness_um: ArrayLike, response: SkyResponse) -> NDArra
     return patterns
 
 
-def _templates(
-    templates: Sequence[FringeFrame] | ArrayLike, shape: tuple[int, int]
-) -> tuple[list[NDArray[np.float32]], NDArray[np.bool_]]:
-    """Patterns of mean 0 with numbers everywhere, and the pixels in which one of them has no value."""
-    unknown = np.zeros(shape, dtype=bool)
-    patterns: list[NDArray[np.float32]] = []
-    for template in templates:  # type: ignore[union-attr]
-        pattern, missing = _pattern(template)
-        unknown |= _of_shape("template", missing, shape)
-        # A pedestal is no fringe, and would take sky along.
-        pedestal = pattern.mean(where=~missing, dtype=np.float64) if not missing.all() else 0.0
-        patterns.append(np.where(missing, np.float32(0.0), pattern - np.float32(pedestal)))
-    if not patterns:
-        raise InputError("templates", 0, "one or more")
-    return patterns, unknown
-
-
 def _pattern(template: FringeFrame | ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """A template, and where it has no value."""
     if isinstance(template, FringeFrame):
@@ -355,23 +378,18 @@ def _pattern(template: FringeFrame | ArrayLike) -> tuple[NDArray[np.float32], ND
     return image, ~np.isfinite(image)
 
 
-def _of_shape(name: str, values: ArrayLike, shape: tuple[int, int]) -> NDArray[Any]:
+def _of_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
     array = np.asarray(values)
     if array.shape != shape:
         raise InputError(f"shape of the {name}", array.shape, f"{shape}")
     return array
 
 
-def _fringes(
-    patterns: Sequence[NDArray[np.float32]],
-    scale: FloatArray,
-    unknown: NDArray[np.bool_],
-    exposure: NDArray[Any],
-) -> NDArray[Any]:
+def _fringes(known: TemplateSet, scale: FloatArray, exposure: NDArray[Any]) -> NDArray[Any]:
     """What is subtracted, in the floating type of the exposure."""
     kind = exposure.dtype.newbyteorder("=") if exposure.dtype.kind == "f" else np.dtype(np.float32)
     total = np.zeros(exposure.shape, dtype=kind)
-    for factor, pattern in zip(scale, patterns, strict=True):
-        total += (factor * pattern).astype(kind)
-    total[unknown] = 0.0
+    for factor, pattern in zip(scale, known.patterns, strict=True):
+        total += kind.type(factor) * pattern
+    total[known.unknown] = 0.0
     return total

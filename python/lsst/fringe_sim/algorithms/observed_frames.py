@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
-from astropy.table import Table
+from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 from ..errors import InputError, named_units
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
 from ..products.same_light import refuse_equal_pixels
-from .correction.background import BackgroundTerms
 from .correction.empirical import TemplateOptions, fit_templates
+from .correction.injection import InjectionOptions, inject_sources, injection_table
+from .correction.objects import square_sums
 from .correction.quality import FrameProof, prove
 from .correction.scales import steady_weight
-from .fringe_correction import CorrectionOptions, FringeCorrection, correct_fringes
+from .fringe_correction import CorrectionOptions, FringeCorrection, TemplateSet, correct_fringes
+from .image_correlation import LogBins, correlation_function
 
-__all__ = ["CorrectedFrame", "FrameRecord", "correct_frame", "make_templates", "summary_table"]
+__all__ = [
+    "CorrectedFrame",
+    "FrameRecord",
+    "correct_frame",
+    "injected_table",
+    "make_templates",
+    "recover_sources",
+    "summary_table",
+]
 
 LEAST_FRAMES = 3
 """Two frames cannot tell what they share from what either has alone."""
@@ -31,6 +42,9 @@ APERTURE_ARCSEC = 20.0
 
 PICTURE_PX = 128
 """Pictures are averaged down to about this many pixels a side, over which noise is smoothed as well."""
+
+SQUARES_IN_APERTURE = 12
+"""Squares over which pixels are averaged for the correlation function, in its largest separation."""
 
 LARGEST_PART = 8
 """The largest aperture is at most this part of a side: there must be several of them."""
@@ -58,16 +72,47 @@ class CorrectedFrame:
     proof: FrameProof
     fringes: NDArray[np.float32]
 
-    def record(self, name: str) -> FrameRecord:
+    def record(self, name: str, injected: Table | None = None) -> FrameRecord:
         """What is kept of a frame when its pixels are written."""
         fitted = self.correction.frame
         good = fitted.fit.weight > 0
-        after = np.where(good, fitted.residual, np.nan)
-        before = after + np.where(good, self.fringes - self.fringes[good].mean(), np.nan)
         step = max(1, min(self.frame.shape) // PICTURE_PX)
-        pictures = tuple(_block_means(each, step) for each in (before, self.fringes, after))
+        after, fringes = (_block_means(each, good, step) for each in (fitted.residual, self.fringes))
+        before = after + fringes - self.fringes[good].mean(dtype=np.float64)
+        correlation = self._correlation(good)
+        pictures = (before, _block_means(self.fringes, np.isfinite(self.fringes), step), after)
         found = self.correction
-        return FrameRecord(name, self.frame.detector, found.scale, found.sigma, self.proof, pictures, step)
+        return FrameRecord(
+            name,
+            self.frame.detector,
+            found.scale,
+            found.sigma,
+            self.proof,
+            pictures,
+            step,
+            correlation,
+            injected,
+        )
+
+    def _correlation(self, good: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Separation [px] and correlation before and after, over the variance of a pixel, shape ``(3, B)``.
+
+        Of means over squares, at separations beyond one square, where white noise has none.
+        """
+        aperture = max(2, min(2 * PICTURE_PX, min(self.frame.shape) // LARGEST_PART))
+        side = max(1, aperture // SQUARES_IN_APERTURE)
+        fitted = self.correction.frame
+        number = square_sums(good, side)
+        after, fringes = (_block_means(each, good, side) for each in (fitted.residual, self.fringes))
+        before = after + fringes
+        bins = LogBins(1.5, max(3.0, aperture / side), 8)
+        found = [
+            correlation_function(np.nan_to_num(each - np.nanmean(each)), number, bins)
+            for each in (before, after)
+        ]
+        weight = fitted.fit.weight
+        variance = fitted.fit.chi2_per_pixel / float(np.median(weight[good]))
+        return np.stack([side * found[0].separation_px, *(each.xi / variance for each in found)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +131,10 @@ class FrameRecord:
         Frame before, fringes, frame after, averaged over squares.
     step_px : `int`
         Side of the squares [px].
+    correlation : `numpy.ndarray`, shape ``(3, B)``
+        Separation [px], and the correlation function before and after the correction, over the variance of a pixel.
+    injected : `~astropy.table.Table` or `None`
+        Bias and scatter of the fluxes of sources in a copy of the frame (`injection_table`).
     """
 
     name: str
@@ -93,8 +142,10 @@ class FrameRecord:
     scale: NDArray[np.float64]
     sigma: NDArray[np.float64]
     proof: FrameProof
-    pictures: tuple[NDArray[np.float64], ...]
+    pictures: tuple[NDArray[np.float32], ...]
     step_px: int = 1
+    correlation: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
+    injected: Table | None = None
 
 
 def make_templates(
@@ -155,7 +206,7 @@ def make_templates(
 @named_units
 def correct_frame(
     frame: ObservedFrame,
-    templates: Sequence[FringeFrame],
+    templates: TemplateSet | Sequence[FringeFrame],
     options: CorrectionOptions | None = None,
     *,
     pixel_arcsec: float = 0.2,
@@ -167,7 +218,7 @@ def correct_frame(
     ----------
     frame : `ObservedFrame`
         A frame with its fringes.
-    templates : sequence of `FringeFrame`
+    templates : `TemplateSet`, or sequence of `FringeFrame`
         Templates of its sensor.
     options : `CorrectionOptions`, optional
         Background, amplifiers, detection of objects.
@@ -184,20 +235,17 @@ def correct_frame(
         Its pixels do not decide the scales.
     """
     chosen = options or CorrectionOptions()
+    known = TemplateSet.of(templates)
     done = correct_fringes(
         frame.image,
-        templates,
+        known,
         variance=frame.variance,
         mask=frame.mask,
         options=chosen,
         header={**frame.metadata, **(header or {})},
     )
-    background = BackgroundTerms(frame.shape, chosen.spacing_px, chosen.amplifiers)
-    weight = np.where(done.uncorrected, 0, _weight(frame)).astype(np.float32)
     aperture = max(1, min(round(APERTURE_ARCSEC / pixel_arcsec), min(frame.shape) // LARGEST_PART))
-    patterns = [np.where(each.mask == 0, each.image, 0) for each in templates]
-    variances = [np.where(each.mask == 0, each.variance, 0) for each in templates]
-    proof = prove(frame.image, weight, done.frame.fit, patterns, background, aperture, variances)
+    proof = prove(done.frame, done.frame.sums.weight, aperture, known.variances)
     corrected = dataclasses.replace(
         frame,
         image=done.image,
@@ -208,30 +256,94 @@ def correct_frame(
     return CorrectedFrame(corrected, done, proof, fringes)
 
 
+def recover_sources(
+    frame: ObservedFrame,
+    corrected: CorrectedFrame,
+    templates: TemplateSet,
+    options: CorrectionOptions | None = None,
+    *,
+    pixel_arcsec: float = 0.2,
+    sources: InjectionOptions | None = None,
+    name: str = "",
+) -> Table:
+    """Draw sources into a copy of a frame, and find their fluxes before and after its correction.
+
+    Parameters
+    ----------
+    frame : `ObservedFrame`
+        A frame with its fringes; it stays as it is.
+    corrected : `CorrectedFrame`
+        Its correction, which tells where there are no objects.
+    templates : `TemplateSet`
+        Templates of its sensor.
+    options : `CorrectionOptions`, optional
+        Those of the correction.
+    pixel_arcsec : `float`, optional
+        Size of a pixel on the sky [arcsec].
+    sources : `InjectionOptions`, optional
+        Kinds and fluxes of the sources.
+    name : `str`, optional
+        Name of the frame in the table.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        One row for each kind and magnitude, see `injection_table`.
+
+    Raises
+    ------
+    InputError
+        No place where a source would be alone.
+    """
+
+    def both(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        done = correct_fringes(image, templates, variance=frame.variance, mask=frame.mask, options=options)
+        background = done.frame.background
+        return image - background, np.asarray(done.image, dtype=np.float32) - background
+
+    fitted = corrected.correction.frame
+    used = fitted.fit.weight
+    noise = math.sqrt(fitted.fit.chi2_per_pixel / float(np.median(used[used > 0])))
+    free = fitted.sums.usable & ~fitted.objects
+    measured = inject_sources(frame.image, free, noise, pixel_arcsec, both, sources)
+    return injection_table(name, measured)
+
+
 def summary_table(records: Sequence[FrameRecord]) -> Table:
     """One row per frame: scales, structure before and after, and whether the templates may be trusted."""
     table = Table({name: [getattr(each, name) for each in records] for name in ("name", "detector")})
     for number in range(max((each.scale.size for each in records), default=0)):
         table[f"scale {number}"] = [_at(each.scale, number) for each in records]
         table[f"sigma {number}"] = [_at(each.sigma, number) for each in records]
-    for name in (field.name for field in dataclasses.fields(FrameProof)):
+    for name in (each.name for each in dataclasses.fields(FrameProof)):
         table[name] = [getattr(each.proof, name) for each in records]
+    for row, name in ((1, "correlation_before"), (2, "correlation_after")):
+        table[name] = [_largest(each.correlation[row]) for each in records]
     table["passed"] = [each.proof.passed for each in records]
     return table
+
+
+def injected_table(records: Sequence[FrameRecord]) -> Table | None:
+    """Bias and scatter of the fluxes of sources in copies of all frames; `None` if none were drawn."""
+    tables = [each.injected for each in records if each.injected is not None]
+    return vstack(tables) if tables else None
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    """The value that is farthest from 0; NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
 
 
 def _at(values: NDArray[np.float64], number: int) -> float:
     return float(values[number]) if number < values.size else 0.0
 
 
-def _block_means(image: NDArray[Any], side: int) -> NDArray[np.float64]:
-    """Means over squares of the pixels that are numbers."""
-    ny, nx = (size // side for size in image.shape)
-    blocks = image[: ny * side, : nx * side].reshape(ny, side, nx, side).astype(np.float64)
-    known = np.isfinite(blocks)
-    number = known.sum(axis=(1, 3))
-    total = np.where(known, blocks, 0.0).sum(axis=(1, 3))
-    return np.divide(total, number, out=np.full((ny, nx), np.nan), where=number > 0)
+def _block_means(image: NDArray[Any], good: NDArray[np.bool_], side: int) -> NDArray[np.float32]:
+    """Means over squares of the good pixels; NaN without any."""
+    number = square_sums(good, side)
+    total = square_sums(np.where(good, image, np.float32(0.0)), side)
+    return np.divide(total, number, out=np.full(number.shape, np.nan, np.float32), where=number > 0)
 
 
 def _first_of_alike(frames: Sequence[Callable[[], ObservedFrame]], names: Sequence[str]) -> ObservedFrame:

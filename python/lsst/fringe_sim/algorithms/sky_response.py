@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -256,17 +256,19 @@ def tabulate_components(
     if not lights:
         raise InputError("sky", "no light behind the bandpass", "lines or a continuum inside it")
     sums = [_SpectralSum.of(model, light) for light in lights]
+    flat = _flat_field(model, sky, band, lights[-1].beam, error_samples((low, high)))
     level = float(sum(each.electrons(*error_samples((low, high))).mean() for each in sums))
 
     def contributions(start_um: float, step_um: float, count: int) -> FloatArray:
-        return np.stack([each.electrons(start_um, step_um, count) for each in sums]) / level
+        electrons = np.stack([each.electrons(start_um, step_um, count) for each in sums])
+        return electrons / (level * flat(start_um, step_um, count))
 
-    late = any(item.effect.acts_on == "response" for item in model.effects)
+    late = sky.flat is not None or any(item.effect.acts_on == "response" for item in model.effects)
     table = tabulate(
         contributions,
         (low, high),
         [each.light.mean_wavelength_nm for each in sums],
-        # An effect on the response may change its derivatives; then they are measured.
+        # An effect on the response or a flat field may change its derivatives; then they are measured.
         fourth_derivative=None if late else max(each.derivative_bound(4, low) for each in sums) / level,
         tolerance=fineness.table_tolerance,
     )
@@ -278,14 +280,25 @@ def electrons_on_grid(
 ) -> dict[str, FloatArray]:
     """Electrons s⁻¹ m⁻² arcsec⁻² from each component of a sky on a uniform grid of thickness, by name.
 
+    No flat field has divided them.
     Summed as finely as for a table, but smooth from point to point as derivatives want it.
     """
-    sky = sky_with_effects(model, sky)
-    lights = _lights(sky, band, SkyQuadrature(), model.system.beam)
+    lights = _lights(sky_with_effects(model, sky), band, SkyQuadrature(), model.system.beam)
     return {
         light.component.name: _SpectralSum.of(model, light).electrons(start_um, step_um, count)
         for light in lights
     }
+
+
+def _flat_field(
+    model: FringeModel, sky: SkySpectrum, band: Bandpass, beam: Beam, samples: tuple[float, float, int]
+) -> Callable[[float, float, int], FloatArray | float]:
+    """What the flat field of a sky sees on a uniform grid of thickness, relative to its mean; 1 without one."""
+    if sky.flat is None:
+        return lambda *_: 1.0
+    seen = _SpectralSum.of(model, _Light.of([sky.flat.component(band)], beam))
+    mean = float(seen.electrons(*samples).mean())
+    return lambda *grid: seen.electrons(*grid) / mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -432,7 +445,7 @@ def is_band(name: str) -> bool:
 
 
 def white_light(band: Bandpass, step_nm: float) -> SpectralComponent:
-    """Light of a flat field: as many photons at every wavelength, behind the filter."""
+    """Light of a white flat field: as many photons at every wavelength, behind the filter."""
     low, high = band.support()
     count = math.ceil((high - low) / step_nm)
     wave = low + (np.arange(count) + 0.5) * (high - low) / count

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from .progress import progress
 if TYPE_CHECKING:
     from ..algorithms.fringe_correction import CorrectionOptions
     from ..algorithms.observed_frames import CorrectedFrame, FrameRecord
+    from ..products import ObservedFrame
     from ..products.observed_files import ObservedImage
 
 __all__ = ["correct"]
@@ -53,10 +55,15 @@ OWN_CARD = re.compile(r"FRING(COR|TID|PRB|VER|S[CE]\d+)")
     show_default=True,
     help="Size of a pixel [arcsec]: fringes are judged on scales up to 20 arcsec.",
 )
+@click.option(
+    "--inject",
+    is_flag=True,
+    help="Draw stars and galaxies into a copy of each frame, and tell their fluxes before and after.",
+)
 @click.option("--undo", is_flag=True, help="Put the fringes back that an earlier run has subtracted.")
 @output_folder(
     "Folder for frames, table and report.",
-    *("*_corrected.fits", "*_restored.fits", "frames.ecsv", "report.html"),
+    *("*_corrected.fits", "*_restored.fits", "frames.ecsv", "injected.ecsv", "report.html"),
 )
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def correct(
@@ -66,6 +73,7 @@ def correct(
     background_px: float,
     amplifiers: tuple[int, int] | None,
     pixel_scale: float,
+    inject: bool,
     undo: bool,
     out: OutputFolder,
     dry_run: bool,
@@ -97,7 +105,8 @@ def correct(
         passed = True
     else:
         options = CorrectionOptions(background_px, grid_of(amplifiers))
-        done, refused = _corrected(images, known, options, background, pixel_scale, target, names)
+        make = partial(_correct_one, known, options, pixel_scale, inject)
+        done, refused = _corrected(images, make, background, target, names)
         _write_report(target, done, [*unusable, *refused])
         passed = all(each.proof.passed for each in done)
         for record in done:
@@ -119,15 +128,12 @@ def _refuse_uncorrected(header: Mapping[str, Any], source: str) -> None:
 
 def _corrected(
     images: list[ObservedImage],
-    known: TemplateFolder,
-    options: CorrectionOptions,
+    make: Callable[[ObservedFrame, str], tuple[CorrectedFrame, FrameRecord]],
     background: Path | None,
-    pixel_scale: float,
     target: Path,
     names: Mapping[Path, str],
 ) -> tuple[list[FrameRecord], list[str]]:
     """Frames that could be fitted, of which those that passed are written; and why others could not."""
-    from ..algorithms.observed_frames import correct_frame
     from ..products.observed_files import write_images
 
     done: list[FrameRecord] = []
@@ -138,13 +144,11 @@ def _corrected(
             for image in parts:
                 name = stem_of(path) if len(parts) == 1 else f"{stem_of(path)}[{image.name}]"
                 try:
-                    frame = image.read(background_path(background, image))
-                    found = known.of(frame.detector, frame.physical_filter)
-                    each = correct_frame(frame, found, options, pixel_arcsec=pixel_scale)
+                    each, record = make(image.read(background_path(background, image)), name)
                 except InputError as error:
                     refused.append(f"{name}: not corrected: {error}")
                 else:
-                    done.append(each.record(name))
+                    done.append(record)
                     if each.proof.passed:
                         made[image.index] = each
                 advance()
@@ -155,6 +159,24 @@ def _corrected(
                 first = {"FRINGTID": next(iter(made.values())).correction.template_id, "FRINGUND": None}
                 write_images(path, target / names[path], pixels, cards, flags, first)
     return done, refused
+
+
+def _correct_one(
+    known: TemplateFolder,
+    options: CorrectionOptions,
+    pixel_scale: float,
+    inject: bool,
+    frame: ObservedFrame,
+    name: str,
+) -> tuple[CorrectedFrame, FrameRecord]:
+    from ..algorithms.observed_frames import correct_frame, recover_sources
+
+    templates = known.prepared(frame.detector, frame.physical_filter)
+    made = correct_frame(frame, templates, options, pixel_arcsec=pixel_scale)
+    sources = None
+    if inject and made.proof.passed:
+        sources = recover_sources(frame, made, templates, options, pixel_arcsec=pixel_scale, name=name)
+    return made, made.record(name, sources)
 
 
 def _by_file(images: list[ObservedImage]) -> dict[Path, list[ObservedImage]]:
@@ -183,7 +205,8 @@ def _restore(
         try:
             for image in parts:
                 header, frame = image.header(), image.read()
-                pixels[image.index] = undo_correction(frame.image, known.of(frame.detector), header)
+                templates = known.prepared(frame.detector)
+                pixels[image.index] = undo_correction(frame.image, templates, header)
                 cards[image.index] = dict.fromkeys(key for key in header if OWN_CARD.fullmatch(key))
                 flags[image.index] = frame.mask < 0
         except InputError as error:
@@ -196,11 +219,14 @@ def _restore(
 
 
 def _write_report(target: Path, done: list[FrameRecord], refused: list[str]) -> None:
-    from ..algorithms.observed_frames import summary_table
+    from ..algorithms.observed_frames import injected_table, summary_table
     from ..files import table_text, write_whole
     from ..report.correction_page import write_correction_report
 
     write_whole(target / "frames.ecsv", table_text(summary_table(done)))
+    sources = injected_table(done)
+    if sources is not None:
+        write_whole(target / "injected.ecsv", table_text(sources))
     write_correction_report(target / "report.html", done, refused)
 
 

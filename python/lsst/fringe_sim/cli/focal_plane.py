@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from ..errors import InputError
 from ..files import table_text, write_together
 from ..instrument.camera import Camera
 from ..instrument.detector import Detector
+from ..instrument.flat_spectrum import FlatSpectrum
 from ..instrument.night import NightHistory, random_nights
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel, Setup
@@ -81,6 +82,12 @@ class _SensorMapType(click.ParamType):
 )
 @click.option("--airmass", type=click.FloatRange(1.0, 5.0), default=1.2, show_default=True, help="Airmass.")
 @click.option(
+    "--flat-spectrum",
+    default="white",
+    show_default=True,
+    help="Light of the flat field: white, gaussian:MEAN:FWHM in nm, or a table.",
+)
+@click.option(
     "--nights", type=click.IntRange(1, 1000), default=5, show_default=True, help="Random nights to correct."
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of stand-ins and nights.")
@@ -97,6 +104,7 @@ def focal_plane(
     sensors: tuple[str, ...],
     maps: tuple[SensorMap, ...],
     airmass: float,
+    flat_spectrum: str,
     nights: int,
     seed: int,
     effects_file: Path | None,
@@ -116,6 +124,7 @@ def focal_plane(
     chosen = _chosen(sensors)
     measured = {Camera.from_name("lsstCam").detector(item.name).name: item.path for item in maps}
     settings = sky_settings(read_settings(effects_file) if effects_file else {})
+    flat = None if flat_spectrum == "white" else FlatSpectrum.from_name(flat_spectrum)
     for path in measured.values():
         if not path.is_file():
             raise InputError("--thickness", str(path), "an existing FITS file")
@@ -129,7 +138,7 @@ def focal_plane(
         for name, path in measured.items()
     }
     observed = random_nights(nights, seed)
-    sky = SkySpectrum.dark(airmass=airmass)
+    sky = replace(SkySpectrum.dark(airmass=airmass), flat=flat)
     tables = []
     with progress("forecasting sensors", len(chosen)) as advance:
         for setup_name in SETUPS.values():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -16,6 +15,7 @@ from .parameters import SIZE
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..algorithms.correction import AmplifierGrid
+    from ..algorithms.fringe_correction import TemplateSet
     from ..products import FringeFrame
     from ..products.observed_files import ObservedImage
 
@@ -171,6 +171,7 @@ class TemplateFolder:
     """Templates by sensor, from ``fringe-sim templates`` or of a model."""
 
     def __init__(self, path: Path) -> None:
+        self._last: tuple[tuple[str, str], TemplateSet] | None = None
         self._files: dict[str, list[Path]] = defaultdict(list)
         found = [path] if path.is_file() else sorted(path.glob("templates_*.fits"))
         for file in found or sorted(path.glob("fringe_*.fits")):
@@ -213,10 +214,18 @@ class TemplateFolder:
             raise InputError("filter of a frame", physical_filter, allowed)
         return found
 
+    def prepared(self, detector: str, physical_filter: str = "") -> TemplateSet:
+        """The same as a fit wants them; those of the last sensor are kept, for its next frame."""
+        from ..algorithms.fringe_correction import TemplateSet
 
-@functools.lru_cache(maxsize=1)
+        wanted = detector, physical_filter
+        if self._last is None or self._last[0] != wanted:
+            self._last = (wanted, TemplateSet.of(self.of(*wanted)))
+        return self._last[1]
+
+
 def _read_templates(files: tuple[Path, ...]) -> list[FringeFrame]:
-    """Templates of one sensor: those of the last one are kept, for its next frame."""
+    """Templates of one sensor."""
     from ..products import FringeFrame, FringeTemplates
     from ..products.same_light import refuse_equal_pixels
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
 
     from ..algorithms.sky_response import Response
     from ..instrument.detector import Detector
+    from ..instrument.flat_spectrum import FlatSpectrum
     from ..instrument.night import NightHistory
     from ..instrument.setup import Setup
     from ..model import FringeModel
@@ -58,6 +59,12 @@ NO_DATE = "1970-01-01T00:00:00"  # of templates of a model: two runs agree to th
 @click.option("--detector", default=None, help="Place in the focal plane; decides the beam.")
 @click.option("--exptime", type=Quantity("s"), default=None, help="Exposure time; by default the set-up's.")
 @click.option("--airmass", type=click.FloatRange(1.0, 5.0), default=None, help="By default the set-up's.")
+@click.option(
+    "--flat-spectrum",
+    default=None,
+    help="Light of the flat field: white, gaussian:MEAN:FWHM in nm (an LED or a laser), or a table; by default "
+    "white where every pixel has its own beam, and none otherwise.",
+)
 @click.option("--night/--one-frame", default=False, help="Eleven hourly frames of the published night.")
 @click.option(
     "--level",
@@ -90,6 +97,7 @@ def sky(
     detector: str | None,
     exptime: float | None,
     airmass: float | None,
+    flat_spectrum: str | None,
     night: bool,
     level: str,
     templates: bool,
@@ -111,6 +119,7 @@ def sky(
       fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky_with_effects
     """
     from ..instrument.camera import Camera
+    from ..instrument.flat_spectrum import FlatSpectrum
     from ..instrument.night import NightHistory
     from ..report.figures import sky_figure
     from ..report.sky_page import write_sky_report
@@ -123,6 +132,7 @@ def sky(
     silicon = None if silicon_thickness is None else _silicon(silicon_thickness, layer)
     settings = sky_settings(effects.settings)
     history = NightHistory.guo2022() if night else None
+    flat = None if flat_spectrum is None else FlatSpectrum.from_name(flat_spectrum)
     count = 1 if history is None else len(history)
     if dry_run:
         click.echo(
@@ -134,6 +144,8 @@ def sky(
     maps = [name for name in (thickness, silicon_thickness) if name not in (BUILT_IN, None)]
     given: list[str | Path] = [*maps, *effects.files]
     cards = _cards(model, given, contrast, section)
+    if flat is not None:
+        cards["FLATSPEC"] = flat.name
     folder = out.prepare()
     common: dict[str, Any] = {
         "read_noise_e": 0.0 if noiseless else sensor.read_noise,
@@ -141,7 +153,7 @@ def sky(
         "detector": sensor.name,
         "physical_filter": setup.bandpass,
     }
-    exposure = Exposure(exptime, airmass or setup.airmass, history, level == "measured")
+    exposure = Exposure(exptime, airmass or setup.airmass, history, level == "measured", flat)
     layers = Layers(layer, silicon, section, phase_sigma)
     response = _response(layers, model, sensor, exposure)
     series, scales = _frames(layers, model, response, exposure, common)
@@ -178,6 +190,7 @@ class Exposure:
     airmass: float
     night: NightHistory | None  # a frame for each of its times; one frame of the dark sky without
     measured: bool  # whether the level is that of the measured quantum efficiency
+    flat: FlatSpectrum | None  # light of the flat field
 
 
 def _model(setup: Setup, settings: Mapping[str, Any], sensor: Detector) -> FringeModel:
@@ -220,10 +233,11 @@ def _response(layers: Layers, model: FringeModel, sensor: Detector, exposure: Ex
     from ..instrument.sky import SkySpectrum
     from ..products.thickness_map import thickness_span_um
 
+    dark = replace(SkySpectrum.dark(airmass=exposure.airmass), flat=exposure.flat)
     click.echo("tabulating the response to the sky", err=True)
     made = sky_of_maps(
         model,
-        SkySpectrum.dark(airmass=exposure.airmass),
+        dark,
         SensorPlacement.of(sensor, model.setup.pixel_scale_arcsec, layers.section),
         thickness_span_um(layers.thickness_um, MARGIN_UM),
         None if layers.silicon_um is None else silicon_nodes_um(model, layers.silicon_um),

@@ -37,7 +37,7 @@ from .sensor import (
     NonLinearity,
 )
 from .silicon_gradient import SiliconGradient
-from .sky import HotRotation, OHBands, RotationalTemperature, SkyContinuum, WaterVapour
+from .sky import FlatFringes, HotRotation, OHBands, RotationalTemperature, SkyContinuum, WaterVapour
 from .stack import (
     AirGap,
     ArCoating,
@@ -138,5 +138,6 @@ EFFECTS: tuple[Effect, ...] = (
     OHBands(),
     SkyContinuum(),
     WaterVapour(),
+    FlatFringes(),
 )
 """Every effect of this package, in the order in which they are applied; `known_effects` has those of others, too."""

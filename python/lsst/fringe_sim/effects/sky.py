@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ..instrument.flat_spectrum import FlatSpectrum
 from ..instrument.sky import SkySpectrum
 from .base import Parameter, PlainNullEffect, SearchHints, Values
 
-__all__ = ["HotRotation", "OHBands", "RotationalTemperature", "SkyContinuum", "WaterVapour"]
+__all__ = ["FlatFringes", "HotRotation", "OHBands", "RotationalTemperature", "SkyContinuum", "WaterVapour"]
 
 HOT_K = 1000.0
 """Temperature of a hot population that is added to that of the line list [K]."""
@@ -132,3 +133,27 @@ class WaterVapour(PlainNullEffect):
     def change_sky(self, sky: SkySpectrum, values: Values) -> SkySpectrum:
         """Raise the transmission of every line to a power."""
         return replace(sky, lines=replace(sky.lines, transmission=sky.lines.transmission ** values["scale"]))
+
+
+class FlatFringes(PlainNullEffect):
+    """The flat field by which the frames are divided was lit by a lamp of one colour, and prints its fringes.
+
+    The rest of its light is white.
+    """
+
+    name = "flat_fringes"
+    title = "fringes of the flat field"
+    acts_on = "spectrum"
+    reference = "Howell 2012, PASP 124, 263 (fringes of flats with lamps of lines, and of the sky)"
+    parameters = (
+        Parameter(
+            "share", "", 0.0, (0.0, 1.0), 0.3, "part of the light of the flat field that is the lamp's"
+        ),
+        Parameter("mean", "nm", 970.0, (700.0, 1100.0), 20.0, "mean wavelength of the lamp"),
+        Parameter("fwhm", "nm", 40.0, (0.5, 120.0), 15.0, "full width of its line at half of its height"),
+    )
+    search = SearchHints(places=("mean", "fwhm"), natural_bounds=(0.0, 1.0))
+
+    def change_sky(self, sky: SkySpectrum, values: Values) -> SkySpectrum:
+        """Divide by another flat field."""
+        return replace(sky, flat=FlatSpectrum.gaussian(values["mean"], values["fwhm"], values["share"]))

@@ -24,6 +24,7 @@ from .oh_levels import SECOND_RADIATION_CM_K, RotationalLevels, boltzmann
 
 if TYPE_CHECKING:  # filters take time to import, and effects do without
     from .bandpass import Bandpass
+    from .flat_spectrum import FlatSpectrum
 
 __all__ = [
     "ContinuumTerm",
@@ -307,11 +308,15 @@ class SkySpectrum:
         Everything else, term by term.
     airmass : `float`
         Airmass of the pointing.
+    flat : `~lsst.fringe_sim.instrument.flat_spectrum.FlatSpectrum` or `None`
+        Light of the flat field by which the frames are divided, which prints its own fringes into them. By default
+        frames with the beam of every pixel are divided by one of white light, and others by none.
     """
 
     lines: EmissionLines
     continua: tuple[ContinuumTerm, ...] = ()
     airmass: float = 1.0
+    flat: FlatSpectrum | None = None
 
     @classmethod
     @named_units

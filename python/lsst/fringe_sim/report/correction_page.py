@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import Table
 from matplotlib.figure import Figure
 
-from ..algorithms.observed_frames import FrameRecord, summary_table
+from ..algorithms.observed_frames import FrameRecord, injected_table, summary_table
 from ..products import FringeTemplates
 from .page import Report
 from .style import figure, finite_range, show_image
@@ -61,6 +61,7 @@ def write_correction_report(path: Path, records: Sequence[FrameRecord], refused:
                 column.info.format = ".3g"
         marks = ["good" if each.proof.passed else "bad" for each in records]
         report.table(shown, "frames", download=table, marks=marks)
+    _proofs(report, records)
     report.remarks([(line.partition(": ")[0], line.partition(": ")[2]) for line in refused])
     order = sorted(range(len(records)), key=lambda item: records[item].proof.probability)
     bad = [item for item in order if not records[item].proof.passed]
@@ -72,6 +73,38 @@ def write_correction_report(path: Path, records: Sequence[FrameRecord], refused:
         verdict = "corrected" if each.proof.passed else f"refused: {each.proof.worst}"
         report.figure(frame_figure(each), f"{each.name}: {verdict}.")
     return report.write(path)
+
+
+def _proofs(report: Report, records: Sequence[FrameRecord]) -> None:
+    """What remains of the fringes in correlations, and in the fluxes of sources that were drawn into copies."""
+    if any(np.isfinite(each.correlation[1:]).any() for each in records):
+        report.section("Correlation", "Of what is left beside background and objects, frame by frame.")
+        report.figure(_correlation_figure(records), "Correlation function over the variance of a pixel.")
+    sources = injected_table(records)
+    if sources is not None:
+        report.section(
+            "Injected sources",
+            "Stars and exponential discs in copies of the frames: bias and scatter of their fluxes as fractions of "
+            "them, with the fringes and without. Magnitudes are those of counts, without a zero point.",
+        )
+        shown = sources.copy()
+        for column in shown.itercols():
+            if column.dtype.kind == "f":
+                column.info.format = ".3g"
+        report.table(shown, "injected", download=sources)
+
+
+def _correlation_figure(records: Sequence[FrameRecord]) -> Figure:
+    with figure(6.5, 3.9) as made:
+        axes = made.subplots()
+        for row, name, colour in ((1, "before", "C1"), (2, "after", "C0")):
+            for number, each in enumerate(records):
+                label = name if number == 0 else None
+                axes.plot(each.correlation[0], each.correlation[row], color=colour, lw=1.0, label=label)
+        axes.set(xscale="log", xlabel="separation (px)", ylabel="correlation / variance of a pixel")
+        axes.axhline(0.0, color="0.7", lw=0.8)
+        axes.legend()
+    return made
 
 
 def frame_figure(record: FrameRecord) -> Figure:

@@ -24,6 +24,7 @@ from ..effects import activate_effects, known_effects
 from ..effects.active import settings_of
 from ..errors import InputError, to_number
 from ..instrument.detector import Detector
+from ..instrument.flat_spectrum import FlatSpectrum
 from ..instrument.sky import EmissionLines, SkySpectrum
 from ..model import LABORATORY_TEMPERATURE, FringeModel, Setup
 from ..model.provenance import effects_of_header
@@ -60,6 +61,7 @@ class SkyModel:
     laboratory_temperature_k: float | None = None  # at which it was measured, if it states that
     phase_sigma: float = 0.0  # of the adhesive between laboratory and sky [rad per 10 K]
     silicon_nodes_um: tuple[float, ...] | None = None  # thicknesses of the silicon; that of the stack without
+    flat_spectrum: str = ""  # light of the flat field, see `FlatSpectrum.from_name`
 
     def fringe_model(self) -> FringeModel:
         """Sensor behind the telescope."""
@@ -73,7 +75,9 @@ class SkyModel:
     def spectrum(self) -> SkySpectrum:
         """Dark sky with all OH bands at their reference intensity."""
         lines = EmissionLines.oh(self.rotational_temperature_k, self.vibrational_temperature_k)
-        return SkySpectrum.dark(lines, self.airmass, solar_flux_sfu=self.solar_flux_sfu)
+        dark = SkySpectrum.dark(lines, self.airmass, solar_flux_sfu=self.solar_flux_sfu)
+        flat = FlatSpectrum.from_name(self.flat_spectrum) if self.flat_spectrum else None
+        return dataclasses.replace(dark, flat=flat)
 
     def response(
         self, silicon_um: NDArray[np.float64] | None = None
@@ -146,6 +150,13 @@ class SkyModelConfig(FringeModelConfig):
         dtype=float, default=129.0, doc="Solar radio flux, sfu, which scales the airglow continuum."
     )
 
+    flat_spectrum: Field[str] = Field(
+        dtype=str,
+        optional=True,
+        doc="Light of the flat field: white, gaussian:MEAN:FWHM in nm, or a table with columns wavelength and "
+        "photons; by default white where every pixel has its own beam, and none otherwise.",
+    )
+
     def setDefaults(self) -> None:
         """Look at the sky."""
         super().setDefaults()
@@ -203,6 +214,7 @@ class SkyModelConfig(FringeModelConfig):
             vibrational_temperature_k=self.vibrational_temperature_k,
             thickness_range_um=thickness_span_um(thickness_um),
             laboratory_temperature_k=None if stated is None else to_number(LABORATORY_TEMPERATURE, stated),
+            flat_spectrum=self.flat_spectrum or "",
         )
 
 

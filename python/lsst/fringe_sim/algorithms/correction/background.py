@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,23 @@ from ...errors import OutOfRangeError
 __all__ = ["AmplifierGrid", "BackgroundTerms"]
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 SPACING_PX = 256.0
 """Distance between the knots of the surface [px]: what is smaller than it is left to the fringes."""
 
-_DEGREE = 3
+CUBIC = 4
+"""Coefficients of a cubic."""
+
+PRODUCT = 7
+"""Coefficients of the product of two cubics."""
+
+MOST_BLOCKS_A_SIDE, SMALLEST_BLOCK_PX = 16, 4
+"""Blocks are as large as correlated noise reaches, and enough of them to know a scatter to 5 %: 16 a side
+where the image is large enough, 4 pixels a side where it is not."""
+
 _ROWS = 256
-"""Rows that are converted to float64 at a time."""
+"""Rows of a surface that are made at a time."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +58,9 @@ ONE_AMPLIFIER = AmplifierGrid()
 class BackgroundTerms:
     """Linear terms of a background, each a function of the row times a function of the column.
 
-    The surface is a tensor product of cubic B-splines; the level of an amplifier is 1 on it and 0 elsewhere.
-    Sums over the pixels of the image are therefore products of small matrices, however large the image is.
+    The surface is a tensor product of cubic B-splines; the level of an amplifier is 1 on it and 0 elsewhere. The
+    image is cut into cells, in each of which every term is a cubic of row and column. Sums over pixels are
+    therefore a few numbers per cell, from which all others follow.
 
     Parameters
     ----------
@@ -71,82 +82,153 @@ class BackgroundTerms:
             raise OutOfRangeError("spacing of the background [px]", spacing_px, "positive")
         grid = amplifiers or ONE_AMPLIFIER
         self.shape = shape
-        self._parts = [(_splines(shape[0], spacing_px), _splines(shape[1], spacing_px))]
-        if grid.rows * grid.columns > 1:
-            self._parts.append((_steps(shape[0], grid.rows), _steps(shape[1], grid.columns)))
-        self._sizes = [rows.shape[1] * columns.shape[1] for rows, columns in self._parts]
+        self.rows = Side.of(shape[0], spacing_px, grid.rows)
+        self.columns = Side.of(shape[1], spacing_px, grid.columns)
+        self._grid = (self.rows.splines.shape[1], self.columns.splines.shape[1])
+        self._levels = (grid.rows, grid.columns) if grid.rows * grid.columns > 1 else (0, 0)
 
     def __len__(self) -> int:
         """Number of terms."""
-        return sum(self._sizes)
+        return int(np.prod(self._grid)) + int(np.prod(self._levels))
 
-    def normal_matrix(self, weight: NDArray[Any]) -> FloatArray:
-        """Sums of products of two terms with a weight per pixel, shape ``(P, P)``."""
-        blocks = [
-            [self._cross(weight, one, two) if i <= j else None for j, two in enumerate(self._parts)]
-            for i, one in enumerate(self._parts)
-        ]
-        full = [
-            [block if block is not None else blocks[j][i].T for j, block in enumerate(line)]  # type: ignore[union-attr]
-            for i, line in enumerate(blocks)
-        ]
-        return np.block(full)
+    def local(self) -> tuple[FloatArray, IntArray]:
+        """What each cell has of the terms.
 
-    def moments(self, image: NDArray[Any]) -> FloatArray:
-        """Sum of an image times every term, shape ``(P,)``."""
-        sums = [np.zeros((rows.shape[1], columns.shape[1])) for rows, columns in self._parts]
-        for band in _bands(self.shape):
-            values = image[band].astype(np.float64)
-            for total, (rows, columns) in zip(sums, self._parts, strict=True):
-                total += rows[band].T @ (values @ columns)
-        return np.concatenate([total.ravel() for total in sums])
+        Returns
+        -------
+        coefficient : `numpy.ndarray`, shape ``(ny, nx, 16, T)``
+            Coefficients of the T terms of a cell in products of the four `Side.basis` of its rows and columns.
+        term : `numpy.ndarray` of `int`, shape ``(ny, nx, T)``
+            Which terms they are.
+        """
+        rows, columns = self.rows, self.columns
+        size = (len(rows), len(columns), CUBIC * CUBIC, -1)
+        coefficient = np.einsum("ypa,xqb->yxpqab", rows.cubic, columns.cubic).reshape(size)
+        span = rows.span[:, None] + np.arange(CUBIC), columns.span[:, None] + np.arange(CUBIC)
+        term = (span[0][:, None, :, None] * self._grid[1] + span[1][:, None, :]).reshape(*size[:2], -1)
+        if self._levels[0]:
+            one = np.einsum("yp,xq->yxpq", rows.one, columns.one).reshape(*size[:3], 1)
+            level = rows.part[:, None] * self._levels[1] + columns.part + int(np.prod(self._grid))
+            coefficient = np.concatenate([coefficient, one], axis=3)
+            term = np.concatenate([term, level[..., None]], axis=2)
+        return coefficient, term
 
     def surface(self, coefficient: FloatArray) -> NDArray[np.float32]:
         """The background with these coefficients, shape ``shape``."""
-        made = np.zeros(self.shape, dtype=np.float32)
-        parts = np.split(coefficient, np.cumsum(self._sizes)[:-1])
-        for (rows, columns), values in zip(self._parts, parts, strict=True):
-            grid = values.reshape(rows.shape[1], columns.shape[1])
-            made += (rows @ (grid @ columns.T)).astype(np.float32)
+        made = np.empty(self.shape, dtype=np.float32)
+        for rows, values in self.bands(coefficient):
+            made[rows] = values
         return made
+
+    def bands(self, coefficient: FloatArray) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+        """The background with these coefficients, some rows at a time."""
+        splines = coefficient[: int(np.prod(self._grid))].reshape(self._grid)
+        across = (splines @ self.columns.splines.T).astype(np.float32)
+        down = self.rows.splines.astype(np.float32)
+        levels = None
+        if self._levels[0]:
+            level = coefficient[int(np.prod(self._grid)) :].reshape(self._levels)
+            levels = level[:, self.columns.pixel_part].astype(np.float32)
+        for start in range(0, self.shape[0], _ROWS):
+            rows = slice(start, min(start + _ROWS, self.shape[0]))
+            values = down[rows] @ across
+            if levels is not None:
+                values += levels[self.rows.pixel_part[rows]]
+            yield rows, values
 
     def unity(self) -> FloatArray:
         """Coefficients of the constant 1: the splines of a side sum to it."""
-        return np.concatenate([np.ones(self._sizes[0]), np.zeros(len(self) - self._sizes[0])])
-
-    def _cross(
-        self, weight: NDArray[Any], one: tuple[FloatArray, FloatArray], two: tuple[FloatArray, FloatArray]
-    ) -> FloatArray:
-        row_pairs, row_one, row_two = _overlapping(one[0], two[0])
-        column_pairs, column_one, column_two = _overlapping(one[1], two[1])
-        sums = np.zeros((row_pairs.shape[1], column_pairs.shape[1]))
-        for band in _bands(self.shape):
-            sums += row_pairs[band].T @ (weight[band].astype(np.float64) @ column_pairs)
-        matrix = np.zeros((one[0].shape[1], one[1].shape[1], two[0].shape[1], two[1].shape[1]))
-        matrix[row_one[:, None], column_one, row_two[:, None], column_two] = sums
-        return matrix.reshape(one[0].shape[1] * one[1].shape[1], -1)
+        number = int(np.prod(self._grid))
+        return np.concatenate([np.ones(number), np.zeros(len(self) - number)])
 
 
-def _bands(shape: tuple[int, int]) -> Iterator[slice]:
-    for start in range(0, shape[0], _ROWS):
-        yield slice(start, start + _ROWS)
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One side of an image, cut where a span of the splines, an amplifier or a block ends.
+
+    Attributes
+    ----------
+    splines : `numpy.ndarray`, shape ``(side, spans + 3)``
+        Cubic B-splines at the centres of the pixels.
+    pixel_part : `numpy.ndarray` of `int`, shape ``(side,)``
+        Amplifier of each pixel.
+    edges : `numpy.ndarray` of `int`, shape ``(N + 1,)``
+        First pixels of the N pieces, and the length of the side.
+    basis : `list` of `numpy.ndarray`, shape ``(pixels, 7)``
+        Orthonormal polynomials of rising degree over the pixels of each piece; 0 for those beyond its pixels.
+    product : `numpy.ndarray`, shape ``(N, 4, 4, 7)``
+        Products of two of the first four polynomials, as sums of all.
+    cubic : `numpy.ndarray`, shape ``(N, 4, 4)``
+        Coefficients of the four splines of a piece.
+    one : `numpy.ndarray`, shape ``(N, 4)``
+        Coefficients of the constant 1.
+    span, part, block : `numpy.ndarray` of `int`, shape ``(N,)``
+        First spline, amplifier and block of each piece.
+    """
+
+    splines: FloatArray
+    pixel_part: IntArray
+    edges: IntArray
+    basis: list[FloatArray]
+    product: FloatArray
+    cubic: FloatArray
+    one: FloatArray
+    span: IntArray
+    part: IntArray
+    block: IntArray
+
+    def __len__(self) -> int:
+        """Number of pieces."""
+        return len(self.basis)
+
+    @classmethod
+    def of(cls, side: int, spacing_px: float, amplifiers: int) -> Side:
+        """Cut a side."""
+        spans = max(1, round(side / spacing_px))
+        blocks = max(1, min(MOST_BLOCKS_A_SIDE, side // SMALLEST_BLOCK_PX))
+        span, part, block = (_parts(side, number) for number in (spans, amplifiers, blocks))
+        cuts = np.flatnonzero(np.diff(span) + np.diff(part) + np.diff(block)) + 1
+        edges = np.concatenate([[0], cuts, [side]])
+        splines = _splines(side, spans)
+        pieces = [slice(start, stop) for start, stop in itertools.pairwise(edges)]
+        basis = [_polynomials(piece.stop - piece.start) for piece in pieces]
+        cubics = [each[:, :CUBIC] for each in basis]
+        first = edges[:-1]
+        return cls(
+            splines=splines,
+            pixel_part=part,
+            edges=edges,
+            basis=basis,
+            product=np.stack(
+                [np.einsum("np,nr,nk->prk", c, c, b) for c, b in zip(cubics, basis, strict=True)]
+            ),
+            cubic=np.stack(
+                [
+                    each.T @ splines[piece, span[piece.start] : span[piece.start] + CUBIC]
+                    for each, piece in zip(cubics, pieces, strict=True)
+                ]
+            ),
+            one=np.stack([each.sum(axis=0) for each in cubics]),
+            span=span[first],
+            part=part[first],
+            block=block[first],
+        )
 
 
-def _splines(side: int, spacing_px: float) -> FloatArray:
-    """Cubic B-splines at the centres of the pixels, shape ``(side, spans + 3)``."""
-    spans = max(1, round(side / spacing_px))
+def _parts(side: int, number: int) -> IntArray:
+    """Which of equal parts of a side each pixel is in, by its centre."""
+    return np.asarray((2 * np.arange(side) + 1) * number // (2 * side))
+
+
+def _splines(side: int, spans: int) -> FloatArray:
     step = side / spans
-    knots = step * np.arange(-_DEGREE, spans + _DEGREE + 1)
-    return np.asarray(BSpline.design_matrix(np.arange(side) + 0.5, knots, _DEGREE).toarray())
+    knots = step * np.arange(1 - CUBIC, spans + CUBIC)
+    return np.asarray(BSpline.design_matrix(np.arange(side) + 0.5, knots, CUBIC - 1).toarray())
 
 
-def _steps(side: int, parts: int) -> FloatArray:
-    """1 on each of equal parts of a side, shape ``(side, parts)``."""
-    part = np.arange(side) * parts // side
-    return (part[:, None] == np.arange(parts)).astype(float)
-
-
-def _overlapping(one: FloatArray, two: FloatArray) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-    """Products of a function of each kind that are not 0 everywhere, and of which functions they are."""
-    first, second = np.nonzero(np.abs(one).T @ np.abs(two))
-    return one[:, first] * two[:, second], first, second
+def _polynomials(pixels: int) -> FloatArray:
+    place = (np.arange(pixels) + 0.5) * 2.0 / pixels - 1.0
+    powers = np.polynomial.legendre.legvander(place, min(PRODUCT, pixels) - 1)
+    made = np.zeros((pixels, PRODUCT))
+    made[:, : powers.shape[1]] = np.linalg.qr(powers)[0]
+    return made

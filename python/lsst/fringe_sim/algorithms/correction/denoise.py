@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,6 @@ from scipy.fft import irfft2, rfft2
 from scipy.ndimage import uniform_filter
 
 __all__ = ["shrink_noise"]
-
-FloatArray = NDArray[np.float64]
 
 WINDOW_PX = 128
 """Side of the windows in which fringes are sought as waves; within one they change little in direction and length."""
@@ -25,8 +23,8 @@ FILLINGS = 4
 
 
 def shrink_noise(
-    pattern: FloatArray, variance: FloatArray, known: NDArray[np.bool_]
-) -> tuple[FloatArray, float]:
+    pattern: NDArray[Any], variance: NDArray[Any], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], float]:
     """What is expected of a pattern of fringes, given a noisy measurement of it.
 
     Parameters
@@ -40,7 +38,7 @@ def shrink_noise(
 
     Returns
     -------
-    pattern : `numpy.ndarray`, shape ``(ny, nx)``
+    pattern : `numpy.ndarray`, float32, shape ``(ny, nx)``
         The pattern without most of its noise.
     kept : `float`
         Part of the variance of the noise that is left in it.
@@ -52,36 +50,63 @@ def shrink_noise(
     that Cai (1999, Annals of Statistics 27, 898) puts into it.
     """
     if not known.any():
-        return np.zeros(pattern.shape), 0.0
-    noise = float(variance[known].mean())
-    filled = np.where(known, pattern, 0.0)
-    for _ in range(1 if known.all() else FILLINGS):
-        expected, kept = _shrunk(filled, noise)
-        filled = np.where(known, pattern, expected)
-    return expected, kept
+        return np.zeros(pattern.shape, dtype=np.float32), 0.0
+    noise = float(variance[known].mean(dtype=np.float64))
+    windows = _Windows(known, noise)
+    filled = np.where(known, pattern, np.float32(0.0)).astype(np.float32)
+    expected = windows.shrink(filled)
+    if not known.all():
+        for _ in range(FILLINGS - 1):
+            expected = windows.shrink(np.where(known, filled, expected), again=True)
+    return expected, windows.kept
 
 
-def _shrunk(image: FloatArray, noise: float) -> tuple[FloatArray, float]:
-    size = min(WINDOW_PX, 2 * (min(image.shape) // 2))
-    bell = np.sin(np.pi * (np.arange(size) + 0.5) / size)
-    window = np.outer(bell, bell)
-    # Reflected at the edges, so that every pixel lies in four windows, whose squares sum to 1.
-    padding = [(size // 2, size + (-side) % (size // 2)) for side in image.shape]
-    padded = np.pad(image, padding, mode="symmetric")
-    total = np.zeros(padded.shape)
-    floor = float((window**2).sum()) * noise
-    gains = []
-    for place in _windows(padded.shape, size):
-        wave = rfft2(padded[place] * window)
-        power = uniform_filter(np.abs(wave) ** 2, 3, mode=("wrap", "nearest"))
-        gain = np.maximum(0.0, 1.0 - THRESHOLD * floor / np.maximum(power, 1e-300))
-        gains.append(float(np.mean(gain**2)))
-        total[place] += irfft2(gain * wave, s=(size, size)) * window
-    inside = tuple(slice(size // 2, size // 2 + side) for side in image.shape)
-    return total[inside], float(np.mean(gains))
+class _Windows:
+    """Windows over an image that is reflected at its edges, so that every pixel lies in four, whose squares sum to 1.
 
+    When the pixels without a value are filled once more, only windows in which there are such are worked out again.
+    """
 
-def _windows(shape: tuple[int, ...], size: int) -> Iterator[tuple[slice, slice]]:
-    for y in range(0, shape[0] - size + 1, size // 2):
-        for x in range(0, shape[1] - size + 1, size // 2):
-            yield slice(y, y + size), slice(x, x + size)
+    def __init__(self, known: NDArray[np.bool_], noise: float) -> None:
+        self.size = min(WINDOW_PX, 2 * (min(known.shape) // 2))
+        bell = np.sin(np.pi * (np.arange(self.size) + 0.5) / self.size)
+        self.window = np.outer(bell, bell).astype(np.float32)
+        self.floor = np.float32(THRESHOLD * float((bell**2).sum() ** 2) * noise)
+        self.inside = tuple(slice(self.size // 2, self.size // 2 + side) for side in known.shape)
+        half = self.size // 2
+        self.padding = [(half, self.size + (-side) % half) for side in known.shape]
+        gaps = np.pad(~known, self.padding, mode="symmetric")
+        self.places = [range(0, side - self.size + 1, half) for side in gaps.shape]
+        self.gaps = [
+            [x for x in self.places[1] if gaps[y : y + self.size, x : x + self.size].any()]
+            for y in self.places[0]
+        ]
+        self.total = np.zeros(gaps.shape, dtype=np.float32)
+        self.last: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self.gains: list[float] = []
+
+    @property
+    def kept(self) -> float:
+        """Part of the variance of the noise that is left."""
+        return float(np.mean(self.gains))
+
+    def shrink(self, image: NDArray[np.float32], *, again: bool = False) -> NDArray[np.float32]:
+        """The image without most of its noise."""
+        padded = np.pad(image, self.padding, mode="symmetric")
+        for y, gaps in zip(self.places[0], self.gaps, strict=True):
+            columns = gaps if again else list(self.places[1])
+            if columns:
+                for x, made in zip(columns, self._row(padded, y, columns), strict=True):
+                    place = np.s_[y : y + self.size, x : x + self.size]
+                    self.total[place] += made - self.last.get((y, x), np.float32(0.0))
+                    if x in gaps:
+                        self.last[y, x] = made
+        return self.total[self.inside]
+
+    def _row(self, padded: NDArray[np.float32], y: int, columns: list[int]) -> NDArray[np.float32]:
+        pieces = np.stack([padded[y : y + self.size, x : x + self.size] for x in columns])
+        wave = rfft2(pieces * self.window)
+        power = uniform_filter(wave.real**2 + wave.imag**2, (1, 3, 3), mode=("nearest", "wrap", "nearest"))
+        gain = np.maximum(np.float32(0.0), 1.0 - self.floor / np.maximum(power, np.float32(1e-30)))
+        self.gains.append(float(np.mean(np.square(gain), dtype=np.float64)))
+        return np.asarray(irfft2(gain * wave, s=(self.size, self.size)) * self.window)

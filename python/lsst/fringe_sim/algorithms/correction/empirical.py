@@ -28,8 +28,23 @@ BAND_BYTES = 64 * 2**20
 LEARNING_ROUNDS = 3
 """Times that background and objects are found anew with the fringes known so far."""
 
-STEPS = 6
-"""Alternations between scores and patterns; each is a weighted least-squares solution given the other."""
+STEPS, SETTLED = 6, 1e-4
+"""Most alternations between scores and patterns, each a weighted least-squares solution given the other, and the
+change of the projection on the scores below which they end."""
+
+LEARNING_STEPS = 2
+"""Alternations in all learning rounds but the last."""
+
+MOST_VARIANCE = 20.0
+"""Variance of a pixel of a pattern over the usual one beyond which the frames that see it do not decide it."""
+
+ROWS = 64
+"""Rows that are converted to float64 at a time."""
+
+JUDGED_ROWS, STRIPS = 256, 2
+"""Rows of a strip of the sensor, and the number of strips that tell the number of templates where the frames do not
+fit into memory: a template that a frame holds with a hundredth of the noise of a pixel has a scale of ten
+standard deviations in a million pixels."""
 
 FOLDS = 4
 """Groups of frames, each of which is left out in turn."""
@@ -130,6 +145,7 @@ def fit_templates(
     with _Stack(len(frames), shape) as stack:
         patterns: list[NDArray[np.float32]] = list(prior)
         level = np.ones(len(frames))
+        found: _Decomposition | None = None
         gain = np.zeros(0)
         number = chosen.components or 1
         for turn in range(LEARNING_ROUNDS):
@@ -137,16 +153,20 @@ def fit_templates(
                 level[place] = stack.fill(place, frame, patterns, background)
                 advance()
             if turn == LEARNING_ROUNDS - 1 and chosen.components is None:
-                gain = _held_out_gain(stack, min(chosen.most, len(frames) // 3), prior)
+                gain = _held_out_gain(*stack.strips(prior), min(chosen.most, len(frames) // 3))
                 number = int(np.argmax(gain))
                 if number == 0:
                     raise UndeterminedError(
                         "gain of a template in frames that it was not made of", float(gain[1]),
                         "above 0: more frames, or stronger fringes",
                     )  # fmt: skip
-            found = _decompose(stack, number, prior)
-            patterns = [each.astype(np.float32) for each in found.patterns]
+            # Only the last patterns are wanted to the end; the others tell fringes from objects.
+            steps = STEPS if turn == LEARNING_ROUNDS - 1 else LEARNING_STEPS
+            start = None if found is None else found.scores
+            found = _decompose(stack, number, prior, scores=start, steps=steps)
+            patterns = list(found.patterns)
         coverage = stack.coverage()
+    assert found is not None
     unit = _per_sky(found.scores, level)
     return ObservedTemplates(
         (found.patterns * unit[:, None, None]).astype(np.float32),
@@ -166,10 +186,10 @@ def _per_sky(scores: FloatArray, level: FloatArray) -> FloatArray:
 class _Stack:
     """Frames less their backgrounds, and the weights of their pixels, in memory or in a file."""
 
-    def __init__(self, frames: int, shape: tuple[int, int]) -> None:
+    def __init__(self, frames: int, shape: tuple[int, int], *, in_memory: bool = False) -> None:
         size = (frames, *shape)
         self._file: Any = None
-        if 8 * int(np.prod(size)) > IN_MEMORY:
+        if 8 * int(np.prod(size)) > IN_MEMORY and not in_memory:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by __exit__
             both: NDArray[np.float32] = np.memmap(self._file, dtype=np.float32, shape=(2, *size), mode="w+")
         else:
@@ -205,6 +225,17 @@ class _Stack:
         rows = max(1, BAND_BYTES // (4 * self.frames * self.shape[1]))
         return [slice(start, start + rows) for start in range(0, self.shape[0], rows)]
 
+    def strips(self, prior: Sequence[NDArray[np.float32]]) -> tuple[_Stack, list[NDArray[np.float32]]]:
+        """Some strips of all frames, and of the patterns that are expected, which memory holds."""
+        if self._file is None or self.shape[0] <= STRIPS * JUDGED_ROWS:
+            return self, list(prior)
+        first = np.linspace(0, self.shape[0] - JUDGED_ROWS, STRIPS + 2)[1:-1].astype(int)
+        rows = np.unique(first[:, None] + np.arange(JUDGED_ROWS))
+        part = _Stack(self.frames, (rows.size, self.shape[1]), in_memory=True)
+        for frame in range(self.frames):
+            part.values[frame], part.weight[frame] = self.values[frame, rows], self.weight[frame, rows]
+        return part, [each[rows] for each in prior]
+
     def coverage(self) -> NDArray[np.int32]:
         seen = np.zeros(self.shape, dtype=np.int32)
         for weight in self.weight:
@@ -214,42 +245,61 @@ class _Stack:
 
 @dataclass(frozen=True, eq=False)
 class _Decomposition:
-    patterns: FloatArray
-    variance: FloatArray
+    patterns: NDArray[np.float32]
+    variance: NDArray[np.float32]
     scores: FloatArray
 
 
 def _decompose(
-    stack: _Stack, number: int, prior: Sequence[NDArray[np.float32]], frames: NDArray[Any] | None = None
+    stack: _Stack,
+    number: int,
+    prior: Sequence[NDArray[np.float32]],
+    frames: NDArray[Any] | None = None,
+    scores: FloatArray | None = None,
+    steps: int = STEPS,
 ) -> _Decomposition:
-    """Patterns and scores of some frames, of all by default."""
+    """Patterns and scores of some frames, of all by default, beginning with scores if they are given."""
     chosen = np.arange(stack.frames) if frames is None else frames
-    scores = _first_scores(stack, number, prior, chosen)
-    for _ in range(STEPS):
+    if scores is None or scores.shape[1] != number:
+        scores = _first_scores(stack, number, prior, chosen)
+    before = np.zeros((chosen.size, number))
+    for _ in range(steps):
         orthonormal, _ = np.linalg.qr(scores)
+        if np.abs(orthonormal @ orthonormal.T - before @ before.T).max() < SETTLED:
+            break
+        before = orthonormal
         patterns, variance, known = _patterns_of(stack, orthonormal, chosen)
         # Orthonormal scores give all patterns the same noise; among these the principal ones are orthogonal.
-        gram = np.tensordot(patterns, patterns, axes=([1, 2], [1, 2]))
-        _, turn = np.linalg.eigh(gram)
-        patterns = np.tensordot(turn.T[::-1], patterns, axes=1)
+        _, turn = np.linalg.eigh(_gram(patterns))
+        patterns = np.tensordot(turn.T[::-1].astype(np.float32), patterns, axes=1)
         patterns, variance = _shrunk(patterns, variance, known, prior)
         scores = _scores_of(stack, patterns, chosen)
     return _Decomposition(patterns, variance, scores)
 
 
+def _gram(patterns: NDArray[np.float32]) -> FloatArray:
+    """Sums of products of patterns, single precision within a row only."""
+    return np.asarray(
+        np.einsum("kyx,lyx->kly", patterns, patterns, optimize=True).sum(axis=2, dtype=np.float64)
+    )
+
+
 def _shrunk(
-    patterns: FloatArray, variance: FloatArray, known: NDArray[np.bool_], prior: Sequence[NDArray[np.float32]]
-) -> tuple[FloatArray, FloatArray]:
+    patterns: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    prior: Sequence[NDArray[np.float32]],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     made, left = np.empty_like(patterns), np.empty_like(patterns)
     basis = np.stack([each[known] for each in prior], axis=1) if prior else None
     for number, pattern in enumerate(patterns):
-        expected: Any = 0.0
+        expected: Any = np.float32(0.0)
         if basis is not None:
             factor = np.linalg.lstsq(basis, pattern[known], rcond=None)[0]
-            expected = np.tensordot(factor, np.stack(list(prior)), axes=1)
+            expected = np.tensordot(factor, np.stack(list(prior)), axes=1).astype(np.float32)
         departure, kept = shrink_noise(pattern - expected, variance, known)
         made[number] = expected + departure
-        left[number] = kept * variance
+        left[number] = np.float32(kept) * variance
     return made, left
 
 
@@ -260,7 +310,7 @@ def _first_scores(
     gram = np.zeros((chosen.size, chosen.size))
     for band in stack.bands():
         whole = stack.values[chosen, band] * np.sqrt(stack.weight[chosen, band])
-        flat = whole.reshape(chosen.size, -1).astype(np.float64)
+        flat = whole.reshape(chosen.size, -1)
         gram += flat @ flat.T
     # The noise of a frame stands in its own element only; what the others share is put there instead.
     np.fill_diagonal(gram, 0.0)
@@ -271,57 +321,92 @@ def _first_scores(
     noise = np.array([1.0 / np.sqrt(max(float(stack.weight[j].max()), 1e-30)) for j in chosen])
     scores = lead[:, ::-1] * noise[:, None]
     if prior:
-        expected = _scores_of(stack, np.stack([np.asarray(each, dtype=float) for each in prior]), chosen)
+        expected = _scores_of(stack, np.stack([np.asarray(each, dtype=np.float32) for each in prior]), chosen)
         scores[:, : min(number, len(prior))] = expected[:, :number]
     return scores
 
 
 def _patterns_of(
     stack: _Stack, scores: FloatArray, chosen: NDArray[Any]
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Every pixel of the patterns from the frames that see it, its variance, and whether enough of them do."""
     number = scores.shape[1]
-    patterns = np.zeros((number, *stack.shape))
-    variance = np.zeros(stack.shape)
+    patterns = np.zeros((number, *stack.shape), dtype=np.float32)
+    variance = np.zeros(stack.shape, dtype=np.float32)
     known = np.zeros(stack.shape, dtype=bool)
-    products = np.einsum("jk,jl->jkl", scores, scores).reshape(chosen.size, -1)
+    pairs = [(k, m) for k in range(number) for m in range(k + 1)]
+    products = np.stack([scores[:, k] * scores[:, m] for k, m in pairs], axis=1).astype(np.float32)
+    factors = scores.astype(np.float32)
     for band in stack.bands():
-        weight = stack.weight[chosen, band].astype(np.float64)
-        normal = np.tensordot(weight, products, axes=([0], [0])).reshape(*weight.shape[1:], number, number)
-        moment = np.tensordot(weight * stack.values[chosen, band], scores, axes=([0], [0]))
+        weight = stack.weight[chosen, band]
         # A frame alone decides no pixel that K frames are needed for.
-        seen = (weight > 0).sum(axis=0) > number
-        least = np.linalg.eigvalsh(normal)[..., 0]
-        seen &= least > 0.05 * np.median(least)
-        solution = np.linalg.solve(normal[seen], moment[seen][..., None])[..., 0]
-        for k in range(number):
-            patterns[k, band][seen] = solution[:, k]
-        variance[band][seen] = np.trace(np.linalg.inv(normal[seen]), axis1=-2, axis2=-1) / number
+        seen = np.count_nonzero(weight, axis=0) > number
+        flat = weight.reshape(chosen.size, -1)
+        normal = (products.T @ flat).astype(np.float64)
+        flat *= stack.values[chosen, band].reshape(flat.shape)
+        solution, trace = _solved(dict(zip(pairs, normal, strict=True)), factors.T @ flat, number)
+        trace = trace.reshape(seen.shape)
+        if seen.any():
+            seen &= trace < MOST_VARIANCE * np.median(trace[seen])
+        patterns[:, band] = np.where(seen, solution.reshape(number, *seen.shape), 0.0)
+        variance[band] = np.where(seen, trace / number, 0.0)
         known[band] = seen
     return patterns, variance, known
 
 
+def _solved(
+    normal: dict[tuple[int, int], FloatArray], moment: NDArray[Any], number: int
+) -> tuple[FloatArray, FloatArray]:
+    """Solutions of small systems, one for each pixel, and the traces of their inverses, by Cholesky's factors."""
+    lower: dict[tuple[int, int], FloatArray] = {}
+    for k in range(number):
+        for m in range(k + 1):
+            rest = normal[k, m] - sum(lower[k, i] * lower[m, i] for i in range(m))
+            lower[k, m] = np.sqrt(np.maximum(rest, 1e-300)) if k == m else rest / lower[m, m]
+    forward: list[FloatArray] = []
+    for k in range(number):
+        forward.append((moment[k] - sum(lower[k, i] * forward[i] for i in range(k))) / lower[k, k])
+    solution = np.empty((number, forward[0].size))
+    for k in reversed(range(number)):
+        rest = forward[k] - sum(lower[i, k] * solution[i] for i in range(k + 1, number))
+        solution[k] = rest / lower[k, k]
+    # Squares of the elements of the inverse of the factor.
+    trace = np.zeros(forward[0].size)
+    for column in range(number):
+        inverse: dict[int, FloatArray] = {}
+        for k in range(column, number):
+            one = float(k == column) - sum(lower[k, i] * inverse[i] for i in range(column, k))
+            inverse[k] = one / lower[k, k]
+            trace += inverse[k] ** 2
+    return solution, trace
+
+
 def _scores_of(
-    stack: _Stack, patterns: FloatArray, chosen: NDArray[Any], part: NDArray[Any] | None = None
+    stack: _Stack, patterns: NDArray[np.float32], chosen: NDArray[Any], part: NDArray[Any] | None = None
 ) -> FloatArray:
     """Scores of frames by weighted least squares over their pixels, or over a part of them."""
-    flat = patterns.reshape(len(patterns), -1)
-    scores = np.zeros((chosen.size, len(patterns)))
+    number = len(patterns)
+    scores = np.zeros((chosen.size, number))
     for place, frame in enumerate(chosen):
-        weight = stack.weight[frame].ravel().astype(np.float64)
-        if part is not None:
-            weight *= part.ravel()
-        weighted = flat * weight
-        normal = weighted @ flat.T
+        normal, moment = np.zeros((number, number)), np.zeros(number)
+        for start in range(0, stack.shape[0], ROWS):
+            rows = slice(start, start + ROWS)
+            weight = stack.weight[frame, rows]
+            if part is not None:
+                weight = weight * part[rows]
+            flat = patterns[:, rows].reshape(number, -1).astype(np.float64)
+            weighted = flat * weight.ravel()
+            normal += weighted @ flat.T
+            moment += weighted @ stack.values[frame, rows].ravel().astype(np.float64)
         normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal) + 1e-300
-        scores[place] = np.linalg.solve(normal, weighted @ stack.values[frame].ravel())
+        scores[place] = np.linalg.solve(normal, moment)
     return scores
 
 
-def _held_out_gain(stack: _Stack, most: int, prior: Sequence[NDArray[np.float32]]) -> FloatArray:
+def _held_out_gain(stack: _Stack, prior: Sequence[NDArray[np.float32]], most: int) -> FloatArray:
     """What 0, 1, 2, … patterns take of the squared pulls of frames that they were not made of, until it falls."""
     rows, columns = (np.arange(side) // CHECK_PX for side in stack.shape)
-    white = (np.add.outer(rows, columns) % 2).astype(float)
+    white = (np.add.outer(rows, columns) % 2).astype(np.float32)
     gain = [0.0]
     for number in range(1, most + 1):
         gain.append(sum(_fold_gain(stack, number, prior, fold, white) for fold in range(FOLDS)))
@@ -331,7 +416,7 @@ def _held_out_gain(stack: _Stack, most: int, prior: Sequence[NDArray[np.float32]
 
 
 def _fold_gain(
-    stack: _Stack, number: int, prior: Sequence[NDArray[np.float32]], fold: int, white: FloatArray
+    stack: _Stack, number: int, prior: Sequence[NDArray[np.float32]], fold: int, white: NDArray[np.float32]
 ) -> float:
     left = np.arange(fold, stack.frames, FOLDS)
     others = np.setdiff1d(np.arange(stack.frames), left)
@@ -342,7 +427,7 @@ def _fold_gain(
     for part in (white, 1.0 - white):
         scores = _scores_of(stack, patterns, left, 1.0 - part)
         for score, frame in zip(scores, left, strict=True):
-            fringes = np.tensordot(score, patterns, axes=1)
-            both = 2.0 * stack.values[frame] * fringes - fringes**2
-            gain += float((part * stack.weight[frame] * both).sum())
+            fringes = np.tensordot(score.astype(np.float32), patterns, axes=1)
+            both = (2.0 * stack.values[frame] - fringes) * fringes
+            gain += float((part * stack.weight[frame] * both).sum(dtype=np.float64))
     return gain

@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter, label
+from scipy.ndimage import gaussian_filter, label
 
 from .background import BackgroundTerms
-from .scales import ScaleFit, fit_scales, rounding_of
+from .scales import ScaleFit, rounding_of, scale_fit, settle
+from .sums import FrameSums, Solution
 
-__all__ = ["FrameFit", "find_objects", "fit_frame"]
+__all__ = ["FrameFit", "find_objects", "fit_frame", "square_sums"]
 
 BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
 
 SCALES_PX = (0.0, 1.5, 5.0)
 """Widths of the kernels with which objects are looked for [px]: single pixels, stars, halos and galaxies."""
@@ -30,11 +32,11 @@ LEAST_GROWTH_PX, GROWTH = 3.0, 0.5
 UNCHANGED = 1e-3
 """Part of the pixels of which no fit takes notice, below which objects count as the same."""
 
-SAMPLE = 200_000
-"""Pixels that tell a scatter to 0.2 %."""
+SAMPLE, LEAST_SAMPLE = 200_000, 1000
+"""Pixels that tell a scatter to 0.2 %, and those below which all are asked."""
 
-BINNED_PX = 4
-"""Pixels on a side that are averaged before the widest kernel."""
+BINNED_PX = (2, 2, 4)
+"""Side of the squares of pixels in which objects of each width are sought."""
 
 ROUNDS = 4
 """Rounds of fit and detection; fringes and background are those of pixels without the objects found so far."""
@@ -54,12 +56,18 @@ class FrameFit:
         Background.
     residual : `numpy.ndarray`, float32, shape ``(ny, nx)``
         Frame less background and fringes; 0 where the frame has no number.
+    sums : `FrameSums`
+        Sums over the pixels that were used.
+    solution : `Solution`
+        Their least-squares solution.
     """
 
     fit: ScaleFit
     objects: BoolArray
     background: NDArray[np.float32]
     residual: NDArray[np.float32]
+    sums: FrameSums
+    solution: Solution
 
 
 def fit_frame(
@@ -68,7 +76,6 @@ def fit_frame(
     patterns: Sequence[NDArray[np.float32]],
     background: BackgroundTerms,
     *,
-    known: BoolArray | None = None,
     rounds: int = ROUNDS,
 ) -> FrameFit:
     """Fit background and fringes, find the objects in what is left, and repeat without them.
@@ -77,8 +84,6 @@ def fit_frame(
     ----------
     image, weight, patterns, background
         See `fit_scales`.
-    known : `numpy.ndarray` of `bool`, optional
-        Pixels of objects that are known before.
     rounds : `int`, optional
         Most rounds; ends when the objects stay the same.
 
@@ -87,87 +92,127 @@ def fit_frame(
     UndeterminedError
         Too few pixels are left, or the templates are not independent.
     """
-    objects = np.zeros(weight.shape, dtype=bool) if known is None else known
+    sums = FrameSums(image, weight, patterns, background)
+    objects = np.zeros(weight.shape, dtype=bool)
+    residual = None
     for _ in range(rounds):
-        fit = fit_scales(image, np.where(objects, 0, weight), patterns, background)
-        surface = background.surface(fit.coefficient)
-        residual = np.where(weight > 0, image - surface, 0).astype(np.float32)
-        for scale, pattern in zip(fit.scale, patterns, strict=True):
-            residual -= np.float32(scale) * np.where(weight > 0, pattern, 0)
-        found = find_objects(residual, weight, rounding_of(surface))
-        if known is not None:
-            found |= known
+        solution, residual = settle(sums, sums.usable & ~objects, residual)
+        found = find_objects(residual, sums.usable, rounding_of(sums.level))
         changed = np.count_nonzero(found != objects)
         objects = found
         if changed <= UNCHANGED * objects.size:
             break
-    return FrameFit(fit, objects, surface, residual)
+    assert residual is not None
+    fit = scale_fit(sums, solution)
+    return FrameFit(fit, objects, background.surface(fit.coefficient), residual, sums, solution)
 
 
-def find_objects(
-    residual: NDArray[np.float32], weight: NDArray[np.float32], rounding: float = 0.0
-) -> BoolArray:
+def find_objects(residual: NDArray[np.float32], good: BoolArray, rounding: float = 0.0) -> BoolArray:
     """Pixels of objects, with what surrounds them.
 
     Parameters
     ----------
     residual : `numpy.ndarray`, shape ``(ny, nx)``
-        Frame less background and fringes.
-    weight : `numpy.ndarray`
-        0 where a pixel says nothing.
+        Frame less background and fringes; 0 where a pixel is not good.
+    good : `numpy.ndarray` of `bool`
+        Pixels that say something.
     rounding : `float`, optional
         Scatter that is rounding: a frame without noise has no objects that could be told from it.
     """
-    good = weight > 0
     objects = np.zeros(good.shape, dtype=bool)
-    if not good.any() or _scatter(residual[good]) <= rounding:
+    noise = _scatter(residual, good)
+    if noise <= rounding:
         return objects
-    for width, threshold in zip(SCALES_PX, THRESHOLDS, strict=True):
+    for width, threshold, binned in zip(SCALES_PX, THRESHOLDS, BINNED_PX, strict=True):
         # What is found already does not reach into the wider kernels.
-        objects |= _grown(_above(residual, good & ~objects, width, threshold))
+        left = good & ~objects
+        if width == 0.0:
+            single = np.abs(residual) > np.float32(threshold * noise)
+            above = square_sums(single & left, binned) > 0
+        else:
+            above = _above(residual, left, width, threshold, binned, noise)
+        _grow_into(objects, above, binned)
     return objects
 
 
-def _above(residual: NDArray[np.float32], good: BoolArray, width: float, threshold: float) -> BoolArray:
-    """Pixels in which the smoothed residual stands above its own scatter; below it where width is 0 as well."""
-    values = np.where(good, residual, 0).astype(np.float32)
-    if width == 0.0:
-        return good & (np.abs(values) > threshold * _scatter(values[good]))
-    binned = BINNED_PX if width > BINNED_PX else 1
-    share, smooth = (_smooth(each, width, binned) for each in (good.astype(np.float32), values))
+def _above(
+    residual: NDArray[np.float32], good: BoolArray, width: float, threshold: float, binned: int, noise: float
+) -> BoolArray:
+    """Squares of pixels in which the smoothed residual stands above its own scatter."""
+    values = np.where(good, residual, np.float32(0.0))
+    share = square_sums(good, binned)
+    smooth = gaussian_filter(square_sums(values, binned), width / binned, truncate=3.0)
+    share = gaussian_filter(share, width / binned, truncate=3.0) / np.float32(binned**2)
     seen = share > 0.25
-    smooth /= np.maximum(share, 0.25)
+    smooth /= np.maximum(share, 0.25) * np.float32(binned**2)
     # White noise is the least there is: few independent places do not tell less.
-    least = _scatter(values[good]) / (2.0 * math.sqrt(math.pi) * width)
-    scatter = max(_scatter(smooth[seen]), least) / np.sqrt(np.maximum(share, 0.25))
-    above = seen & (smooth > threshold * scatter)
-    if binned > 1:
-        above = above.repeat(binned, axis=0).repeat(binned, axis=1)
-        above = above[: good.shape[0], : good.shape[1]]
-    return above
+    effective = math.sqrt(width**2 + (binned**2 - 1) / 12.0)
+    least = noise / (2.0 * math.sqrt(math.pi) * effective)
+    scatter = max(_scatter(smooth, seen), least) / np.sqrt(np.maximum(share, 0.25))
+    return np.asarray(seen & (smooth > threshold * scatter))
 
 
-def _smooth(image: NDArray[np.float32], width: float, binned: int) -> NDArray[np.float32]:
-    """Gaussian average, of means over squares if ``binned`` is more than 1."""
-    if binned > 1:
-        padded = np.pad(image, [(0, -side % binned) for side in image.shape], mode="edge")
-        blocks = padded.reshape(padded.shape[0] // binned, binned, -1, binned)
-        image = blocks.mean(axis=(1, 3), dtype=np.float32)
-    return np.asarray(gaussian_filter(image, width / binned, truncate=3.0))
+def square_sums(image: NDArray[Any], side: int) -> NDArray[np.float32]:
+    """Sums over squares; those at the far edges have fewer pixels."""
+    if side == 1:
+        return np.asarray(image, dtype=np.float32)
+    if image.dtype == bool and side < 256:
+        image = image.view(np.uint8)
+    ny, nx = (size - size % side for size in image.shape)
+    kind = image.dtype if image.dtype.kind == "u" else np.dtype(np.float32)
+    rows = image[:ny].reshape(-1, side, image.shape[1]).sum(axis=1, dtype=kind)
+    if ny < image.shape[0]:
+        rows = np.concatenate([rows, image[ny:].sum(axis=0, dtype=kind)[None]])
+    total = rows[:, :nx:side].astype(np.float32)
+    for offset in range(1, side):
+        total += rows[:, offset:nx:side]
+    if nx < image.shape[1]:
+        total = np.concatenate([total, rows[:, nx:].sum(axis=1, dtype=np.float32)[:, None]], axis=1)
+    return total
 
 
-def _scatter(values: NDArray[Any]) -> float:
+def _scatter(values: NDArray[Any], good: BoolArray) -> float:
     """Standard deviation from the quartile below the median: objects only add light."""
-    sample = values[:: max(1, values.size // SAMPLE)]
+    step = (values.size // SAMPLE) | 1
+    sample = values.ravel()[::step][good.ravel()[::step]]
+    if sample.size < LEAST_SAMPLE:
+        sample = values[good]
     low, middle = np.percentile(sample, [25.0, 50.0]) if sample.size else (0.0, 0.0)
     return float(middle - low) / 0.6745
 
 
-def _grown(above: BoolArray) -> BoolArray:
-    """The same with what surrounds each object, further around large ones."""
-    if not above.any():
-        return above
+def _grow_into(objects: BoolArray, above: BoolArray, binned: int) -> None:
+    """Add squares of pixels near those that are above a threshold, further around large objects."""
     number, count = label(above, structure=np.ones((3, 3)))
-    reach = LEAST_GROWTH_PX + GROWTH * np.sqrt(np.bincount(number.ravel(), minlength=count + 1))
-    distance, nearest = distance_transform_edt(~above, return_indices=True)
-    return np.asarray(distance <= reach[number[tuple(nearest)]])
+    area = np.bincount(number.ravel(), minlength=count + 1) * binned**2
+    reach = LEAST_GROWTH_PX + GROWTH * np.sqrt(area)
+    rim = above.copy()
+    rim[1:-1, 1:-1] &= ~(above[:-2, 1:-1] & above[2:, 1:-1] & above[1:-1, :-2] & above[1:-1, 2:])
+    y, x = np.nonzero(rim)
+    # Squares reach from their corners: half their side further than from their centres.
+    near = _near(above.shape, y, x, (reach[number[y, x]] + (binned - 1) / 2.0) / binned)
+    near |= above
+    wide = near.repeat(binned, axis=1)[:, : objects.shape[1]]
+    for offset in range(binned):
+        rows = objects[offset::binned]
+        rows |= wide[: len(rows)]
+
+
+def _near(
+    shape: tuple[int, ...], y: NDArray[np.int64], x: NDArray[np.int64], radius: FloatArray
+) -> BoolArray:
+    """Pixels within a radius of places, from the beginnings and ends of the rows of their circles."""
+    ny, nx = shape
+    edges = np.zeros((ny, nx + 1), dtype=np.int32)
+    order = np.argsort(-radius)
+    y, x, radius = y[order], x[order], radius[order]
+    for offset in range(-int(radius[0]) if radius.size else 0, int(radius[0]) + 1 if radius.size else 0):
+        some = int(np.searchsorted(-radius, -abs(offset), side="right"))
+        row = y[:some] + offset
+        there = (row >= 0) & (row < ny)
+        half = np.sqrt(radius[:some][there] ** 2 - offset**2).astype(np.int64)
+        first, last = np.maximum(x[:some][there] - half, 0), np.minimum(x[:some][there] + half + 1, nx)
+        np.add.at(edges, (row[there], first), 1)
+        np.add.at(edges, (row[there], last), -1)
+    # Where more circles have begun than ended.
+    return np.asarray(np.cumsum(edges, axis=1, out=edges)[:, :-1] > 0)

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve, uniform_filter
 from scipy.stats import norm as normal
 from scipy.stats import t as student
 
 from ...errors import InputError
-from .background import BackgroundTerms
-from .objects import fit_frame
-from .scales import ScaleFit, fit_scales
+from .objects import FrameFit, find_objects, square_sums
+from .scales import CLIP_SIGMA, rounding_of
+from .sums import FrameSums
 
 __all__ = ["FrameProof", "excess_structure", "prove", "uniform_background_indicator"]
 
@@ -25,14 +24,24 @@ FloatArray = NDArray[np.float64]
 LEAST_PROBABILITY = 1e-3
 """Probability of a good template's statistic below which it is refused: one of a thousand good frames."""
 
-BLOCKS = 8
-"""Blocks a side, between which the scatter of every part of the statistic is taken."""
+JUDGED_TOGETHER = 2
+"""Blocks a side over which products are added before their scatter is taken."""
 
 LEAST_SHARE = 0.5
 """Part of an aperture that must be good."""
 
-UBI_RADIUS_PX, UBI_BOX_PX, UBI_REACH = 2.0, 10, 3
-"""Radius of the apertures, side of the boxes of the local noise, radii around an aperture without masked pixels."""
+LEAST_OVERLAPPING = 4
+"""Half the side of the smallest apertures that overlap [px]."""
+
+UBI_RADIUS_PX, UBI_BOX_PX, UBI_STEP_PX = 2.0, 10, 4
+"""Radius of the apertures, side of the boxes of the local noise, distance of the apertures from each other, which
+hardly overlap."""
+
+NOISE_ROWS = 512
+"""Rows whose differences of neighbours tell the noise of a pixel to 0.1 % where a row has a thousand pixels."""
+
+NOISE_SAMPLE = 200_000
+"""Pixels that tell a scatter to 0.2 %."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +80,8 @@ class FrameProof:
 
 
 def prove(
-    image: NDArray[Any],
+    frame: FrameFit,
     weight: NDArray[np.float32],
-    fit: ScaleFit,
-    patterns: Sequence[NDArray[np.float32]],
-    background: BackgroundTerms,
     aperture_px: int,
     variances: Sequence[NDArray[Any]] = (),
 ) -> FrameProof:
@@ -83,16 +89,10 @@ def prove(
 
     Parameters
     ----------
-    image : `numpy.ndarray`, shape ``(ny, nx)``
-        The frame before it.
+    frame : `FrameFit`
+        The frame, taken apart by the templates.
     weight : `numpy.ndarray`, shape ``(ny, nx)``
         Inverse variance of all good pixels, with those of objects.
-    fit : `ScaleFit`
-        Fit of the templates, of which the weight leaves out objects.
-    patterns : sequence of `numpy.ndarray`
-        The templates.
-    background : `BackgroundTerms`
-        Terms beside them.
     aperture_px : `int`
         Side of the largest aperture [px]; 20 arcsec are 100 px of the LSST Camera.
     variances : sequence of `numpy.ndarray`, optional
@@ -100,43 +100,64 @@ def prove(
 
     Notes
     -----
-    The statistic is the largest of several. For bands of scales of 1, 2, 4, … pixels: by how much the part of the
-    fringes in the band raises the squares of the frame when it is subtracted, less what the noise of the templates
-    lets expect. For every template: its product with what is left on the black squares of a chequerboard by scales
-    from the white ones, and the other way round. The former have the errors of white noise, the latter those of the
-    scatter between blocks; the probability of the largest is corrected for their number (Šidák 1967, JASA 62, 626).
+    The statistic is the largest of several. For bands of scales of 1, 2, 4, … pixels (differences of means over
+    squares of so many pixels and over squares of twice as many): by how much the part of the fringes in the band
+    raises the squares of the frame when it is subtracted, less what the noise of the templates lets expect. For
+    every template: its product with what is left on the black squares of a chequerboard by scales from the white
+    ones, and the other way round. The former have the errors of white noise, the latter those of the scatter between
+    blocks; the probability of the largest is corrected for their number (Šidák 1967, JASA 62, 626).
     """
-    # Objects without regard to the template: what it prints into the frame is not left out.
-    plain = fit_frame(image, weight, [], background, rounds=1)
-    untouched = np.where(plain.objects, 0, plain.fit.weight)
-    used = fit.weight
-    alone = fit_scales(image, used, [], background, clip_sigma=math.inf)
-    before = _residual(image, used, alone, [], background)
-    after = _residual(image, used, fit, patterns, background)
-    apertures = [2**power for power in range(int(math.log2(max(aperture_px, 1))) + 1)]
+    sums, fit = frame.sums, frame.fit
+    used = sums.used
+    before = sums.residual(sums.solve(templates=False))
     largest = max(aperture_px, 1)
-    fringes = sum(scale * pattern for scale, pattern in zip(fit.scale, patterns, strict=True))
-    allowed = sum((scale**2 * each for scale, each in zip(fit.scale, variances, strict=False)), np.zeros(()))
-    looks = _rises(
-        plain.residual,
-        np.asarray(fringes, dtype=float),
-        untouched,
-        largest,
-        np.asarray(allowed),
-        fit.chi2_per_pixel,
-    )
-    looks |= _products(image, used, patterns, background)
+    fringes = np.zeros(used.shape, dtype=np.float32)
+    for scale, pattern in zip(fit.scale, sums.patterns, strict=True):
+        fringes += np.float32(scale) * pattern
+    allowed = [scale**2 * each for scale, each in zip(fit.scale, variances, strict=False)]
+    # Objects without regard to the template: what it prints into the frame is not left out.
+    untouched = _plain_weight(before, weight, sums)
+    looks = _rises(before, fringes, untouched, largest, allowed, fit.chi2_per_pixel) | _products(sums)
     probability, worst = _corrected(looks)
+    rms = float(fringes[used].std(dtype=np.float64))
+    structure = [_largest_structure(each, used, largest) for each in (before, frame.residual)]
     return FrameProof(
-        fringe_rms=float((before - after)[used > 0].std()),
-        structure_before=max(excess_structure(before, used, side) for side in [*apertures[1:], largest]),
-        structure_after=max(excess_structure(after, used, side) for side in [*apertures[1:], largest]),
-        fringes_left=_from_scales(fit, patterns, used, largest),
-        ubi_before=uniform_background_indicator(before, used > 0),
-        ubi_after=uniform_background_indicator(after, used > 0),
+        fringe_rms=rms,
+        structure_before=structure[0],
+        structure_after=structure[1],
+        fringes_left=_from_scales(frame, largest),
+        ubi_before=uniform_background_indicator(before, used),
+        ubi_after=uniform_background_indicator(frame.residual, used),
         probability=probability,
         worst=worst,
     )
+
+
+def _plain_weight(
+    residual: NDArray[np.float32], weight: NDArray[np.float32], sums: FrameSums
+) -> NDArray[np.float32]:
+    """Weight without objects and outliers of a frame whose fringes nobody knows."""
+    good = weight > 0
+    objects = find_objects(residual, good, rounding_of(sums.level))
+    pull2 = np.square(residual)
+    pull2 *= weight
+    step = (pull2.size // NOISE_SAMPLE) | 1
+    some = pull2.ravel()[::step][sums.used.ravel()[::step]]
+    limit = CLIP_SIGMA**2 * 1.4826**2 * float(np.median(some)) if some.size else math.inf
+    return np.where(objects | (pull2 > limit), np.float32(0.0), weight)
+
+
+def _largest_structure(residual: NDArray[np.float32], good: NDArray[np.bool_], largest: int) -> float:
+    """Structure in the aperture in which it is largest, from 2 px up."""
+    noise = _pixel_variance(residual, good)
+    share: NDArray[Any] = good
+    total = np.where(good, residual, np.float32(0.0))
+    found, half = [], 1
+    while 2 * half <= largest:
+        found.append(_excess(*_overlapping(share, total, half), 2 * half, noise))
+        share, total = square_sums(share, 2), square_sums(total, 2)
+        half *= 2
+    return max([*found, excess_structure(residual, good, largest)])
 
 
 def excess_structure(residual: NDArray[Any], weight: NDArray[Any], aperture_px: int) -> float:
@@ -147,20 +168,24 @@ def excess_structure(residual: NDArray[Any], weight: NDArray[Any], aperture_px: 
     residual : `numpy.ndarray`, shape ``(ny, nx)``
         Frame less its background.
     weight : `numpy.ndarray`
-        Inverse variance, which counts up to a factor; 0 where a pixel is not good.
+        0 where a pixel is not good.
     aperture_px : `int`
-        Side of the apertures [px].
+        Side of the apertures [px], which overlap by half where it is even.
     """
-    mean, share = _means(residual, weight > 0, aperture_px)
-    seen = share > LEAST_SHARE
-    if not seen.any():
-        return math.nan
     good = weight > 0
-    # The noise of a pixel is that of differences of neighbours, which no smooth structure enters.
-    noise = _pixel_variance(residual, good) / (aperture_px**2 * share[seen])
-    if not np.mean(noise) > 0.0:
+    return _excess(*_apertures(residual, good, aperture_px), aperture_px, _pixel_variance(residual, good))
+
+
+def _excess(share: NDArray[Any], total: NDArray[Any], side: int, noise: float) -> float:
+    """Structure from the numbers of good pixels in apertures and the sums over them."""
+    seen = share > LEAST_SHARE * side**2
+    if not seen.any() or not noise > 0.0:
         return math.nan
-    excess = float(np.mean(mean[seen] ** 2) / np.mean(noise) - 1.0)
+    number = share[seen]
+    mean = total[seen] / number
+    # The noise of a pixel is that of differences of neighbours, which no smooth structure enters.
+    white = noise * float(np.mean(1.0 / number, dtype=np.float64))
+    excess = float(np.mean(np.square(mean), dtype=np.float64)) / white - 1.0
     return math.sqrt(max(excess, 0.0))
 
 
@@ -184,95 +209,112 @@ def uniform_background_indicator(residual: NDArray[Any], good: NDArray[np.bool_]
     Notes
     -----
     ``(std(flux) + median(error) / area) / median(error)``, as the program fringez of the authors computes it
-    (doi 10.1088/1538-3873/abf77a), with apertures of radius 2 px; here they stand on every pixel that has six
-    good ones on either side, and not on random ones.
+    (doi 10.1088/1538-3873/abf77a), with apertures of radius 2 px; here they stand on every fourth pixel of every
+    fourth row that has six good ones on either side, and not on random ones.
     """
-    values = np.where(good, residual, 0.0).astype(np.float64)
-    disc = _disc(UBI_RADIUS_PX)
-    reach = int(UBI_REACH * UBI_RADIUS_PX)
-    free = uniform_filter(good.astype(np.float32), 2 * reach + 1, mode="constant") > 1.0 - 1e-4
-    if not free.any():
+    step, disc = UBI_STEP_PX, _disc(UBI_RADIUS_PX)
+    bad = square_sums(~good, step)
+    # Around a pixel of a square lie this one, the one before and the two after.
+    full = [slice(1 + offset, size - 2 + offset) for size in bad.shape[:1] for offset in (-1, 0, 1, 2)]
+    wide = [slice(1 + offset, size - 2 + offset) for size in bad.shape[1:] for offset in (-1, 0, 1, 2)]
+    free = sum(bad[rows, columns] for rows in full for columns in wide) == 0
+    if not np.any(free):
         return math.nan
-    flux = convolve(values, disc, mode="constant")[free]
-    error = np.sqrt(convolve(_box_variance(values, good), disc, mode="nearest")[free])
+    places = np.argwhere(free)
+    y, x = (places[:: len(places) // NOISE_SAMPLE | 1] * step + step + step // 2).T
+    reach = len(disc) // 2
+    flux = sum(
+        part * residual[y + dy - reach, x + dx - reach]
+        for dy, line in enumerate(disc)
+        for dx, part in enumerate(line)
+    )
+    error = np.sqrt(_box_variance(residual, good)[y // UBI_BOX_PX, x // UBI_BOX_PX] * disc.sum())
     middle = float(np.median(error))
-    return (float(flux.std()) + middle / float(disc.sum())) / middle if middle > 0.0 else math.nan
+    return (float(np.std(flux)) + middle / float(disc.sum())) / middle if middle > 0.0 else math.nan
 
 
-def _residual(
-    image: NDArray[Any],
-    weight: NDArray[Any],
-    fit: ScaleFit,
-    patterns: Sequence[NDArray[np.float32]],
-    background: BackgroundTerms,
-) -> FloatArray:
-    """Frame less background and fringes; 0 where it has no weight."""
-    left = np.where(weight > 0, image - background.surface(fit.coefficient), 0.0)
-    for scale, pattern in zip(fit.scale, patterns, strict=True):
-        left -= np.where(weight > 0, scale * pattern, 0.0)
-    return left
+def _apertures(
+    values: NDArray[Any], good: NDArray[np.bool_], side: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Number of good pixels in each aperture, and sum over them."""
+    half = side // 2 if side % 2 == 0 else side
+    share, total = (square_sums(each, half) for each in (good, np.where(good, values, np.float32(0.0))))
+    # Squares that the edge has cut are no part of apertures.
+    ny, nx = (size // half for size in good.shape)
+    share, total = share[:ny, :nx], total[:ny, :nx]
+    return (share, total) if half == side else _overlapping(share, total, half)
 
 
-def _means(residual: NDArray[Any], good: NDArray[np.bool_], side: int) -> tuple[FloatArray, FloatArray]:
-    """Mean over the good pixels of apertures, and their share of each."""
-    share = uniform_filter(good.astype(np.float64), side, mode="constant")
-    total = uniform_filter(np.where(good, residual, 0.0), side, mode="constant")
-    return total / np.maximum(share, 1e-9), share
+def _overlapping(
+    share: NDArray[Any], total: NDArray[Any], half: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Apertures of two by two squares; where there are so many that it matters not, without overlap."""
+    if half < LEAST_OVERLAPPING:
+        return square_sums(share, 2), square_sums(total, 2)
+    made = [
+        each[1:, 1:] + each[1:, :-1] + each[:-1, 1:] + each[:-1, :-1]
+        for each in (np.asarray(share, dtype=np.float32), total)
+    ]
+    return made[0], made[1]
 
 
 def _pixel_variance(residual: NDArray[Any], good: NDArray[np.bool_]) -> float:
-    both = good[:, 1:] & good[:, :-1]
+    step = max(1, len(good) // NOISE_ROWS)
+    both = good[::step, 1:] & good[::step, :-1]
     if not both.any():
         raise InputError("pairs of good pixels", 0, "some")
-    return 0.5 * float(np.mean(np.square(residual[:, 1:] - residual[:, :-1])[both]))
+    difference = (residual[::step, 1:] - residual[::step, :-1])[both]
+    return 0.5 * float(np.mean(np.square(difference, dtype=np.float64)))
 
 
 def _rises(
-    before: NDArray[Any],
-    fringes: FloatArray,
-    weight: NDArray[Any],
+    before: NDArray[np.float32],
+    fringes: NDArray[np.float32],
+    weight: NDArray[np.float32],
     largest: int,
-    allowed: FloatArray,
+    allowed: Sequence[NDArray[Any]],
     chi2: float,
 ) -> dict[str, float]:
     """Probability, for each band of scales, that what is subtracted there adds so much to the squares by chance."""
-    looks = {}
-    finer, width = fringes, 1
-    while width <= max(largest, 2):
-        coarser = uniform_filter(fringes, 2 * width + 1)
-        band = finer - coarser
-        rise = float(np.sum(weight * (band**2 - 2.0 * band * before - allowed)))
-        error = 2.0 * math.sqrt(chi2 * float(np.sum(weight * band**2)))
+    noise = sum(_dot(weight, each) for each in allowed)
+    looks, moment, width = {}, weight * before, 1
+    while width <= max(largest, 2) and min(fringes.shape) >= 2:
+        ny, nx = (2 * (size // 2) for size in fringes.shape)
+        fringes, weight, moment = (each[:ny, :nx] for each in (fringes, weight, moment))
+        coarser = square_sums(fringes, 2) / np.float32(4.0)
+        power = rise = 0.0
+        for corner in (np.s_[::2, ::2], np.s_[::2, 1::2], np.s_[1::2, ::2], np.s_[1::2, 1::2]):
+            band = fringes[corner] - coarser
+            power += _dot(band, band * weight[corner])
+            rise -= 2.0 * _dot(band, moment[corner])
+        error = 2.0 * math.sqrt(chi2 * power)
+        rise += power - noise
         looks[f"structure of {width} px"] = float(normal.sf(rise / error)) if error > 0.0 else 1.0
-        finer, width = coarser, 2 * width
+        fringes, weight, moment = coarser, square_sums(weight, 2), square_sums(moment, 2)
+        width *= 2
     return looks
 
 
-def _products(
-    image: NDArray[Any],
-    weight: NDArray[Any],
-    patterns: Sequence[NDArray[np.float32]],
-    background: BackgroundTerms,
-) -> dict[str, float]:
+def _dot(one: NDArray[Any], two: NDArray[Any]) -> float:
+    """Sum of products of pixels: single precision within a row only."""
+    return float(np.einsum("yx,yx->y", one, two).sum(dtype=np.float64))
+
+
+def _products(sums: FrameSums) -> dict[str, float]:
     """Probability, for each template, of its product with what scales from other pixels leave."""
-    squares = np.add.outer(*(np.arange(side) * 2 * BLOCKS // side for side in weight.shape)) % 2 == 0
-    sums: list[FloatArray] = [np.zeros((BLOCKS, BLOCKS)) for _ in patterns]
-    for used, judged in ((squares, ~squares), (~squares, squares)):
-        fit = fit_scales(image, np.where(used, weight, 0), patterns, background, clip_sigma=math.inf)
-        left = _residual(image, np.where(judged, weight, 0), fit, patterns, background)
-        for number, pattern in enumerate(patterns):
-            beside = np.where(weight > 0, pattern, 0.0)
-            beside = np.where(weight > 0, beside - beside[weight > 0].mean(), 0.0)
-            sums[number] += _block_sums(left * beside * weight)
-    return {f"template {number}": _chance(each, sided=2) for number, each in enumerate(sums)}
+    blocks = sums.background.rows.block[:, None] + sums.background.columns.block
+    white = blocks % 2 == 0
+    means = sums.mean_patterns()
+    total = np.zeros((len(sums.patterns), *white.shape))
+    for used in (white, ~white):
+        total += sums.products(sums.solve(used), means) * ~used
+    return {
+        f"template {number}": _chance(square_sums(sums.by_block(each), JUDGED_TOGETHER), sided=2)
+        for number, each in enumerate(total)
+    }
 
 
-def _block_sums(values: FloatArray) -> FloatArray:
-    edges = [np.arange(BLOCKS) * side // BLOCKS for side in values.shape]
-    return np.asarray(np.add.reduceat(np.add.reduceat(values, edges[0], axis=0), edges[1], axis=1))
-
-
-def _chance(blocks: FloatArray, sided: int) -> float:
+def _chance(blocks: NDArray[Any], sided: int) -> float:
     """Probability of a mean over blocks that is so large by chance."""
     values = blocks[blocks != 0.0]
     if values.size < 3:
@@ -287,14 +329,20 @@ def _corrected(looks: dict[str, float]) -> tuple[float, str]:
     return float(-math.expm1(len(looks) * math.log1p(-min(looks[worst], 1.0 - 1e-12)))), worst
 
 
-def _from_scales(
-    fit: ScaleFit, patterns: Sequence[NDArray[np.float32]], weight: NDArray[Any], side: int
-) -> float:
+def _from_scales(frame: FrameFit, side: int) -> float:
     """What the errors of the scales leave in an aperture, as a fraction of its noise."""
-    good = weight > 0
-    smooth = np.stack([_means(each - each[good].mean(), good, side)[0][good] for each in patterns])
+    fit, good = frame.fit, frame.sums.used
+    centred = [
+        pattern - np.float32(mean)
+        for pattern, mean in zip(frame.sums.patterns, frame.sums.mean_patterns(), strict=True)
+    ]
+    both = [_apertures(each, good, side) for each in centred]
+    seen = both[0][0] > LEAST_SHARE * side**2
+    smooth = np.stack([(total / np.maximum(share, 1.0))[seen] for share, total in both]).astype(np.float64)
+    if not smooth.size:
+        return math.nan
     power = float(np.trace(fit.covariance @ (smooth @ smooth.T))) / smooth.shape[1]
-    noise = fit.chi2_per_pixel / float(np.mean(weight[good])) / side**2
+    noise = fit.chi2_per_pixel / float(fit.weight[good].mean(dtype=np.float64)) / side**2
     return math.sqrt(power / noise) if noise > 0.0 else math.nan
 
 
@@ -307,17 +355,14 @@ def _disc(radius: float) -> FloatArray:
     return np.asarray(inside.reshape(side, 10, side, 10).mean(axis=(1, 3)))
 
 
-def _box_variance(values: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
-    """Variance of the good pixels in boxes, on every pixel of a box; that of all in boxes without any."""
-    padding = [(0, -side % UBI_BOX_PX) for side in values.shape]
-    shape = [(side + extra) // UBI_BOX_PX for side, (_, extra) in zip(values.shape, padding, strict=True)]
-    sums = [
-        np.pad(each, padding).reshape(shape[0], UBI_BOX_PX, shape[1], UBI_BOX_PX).sum(axis=(1, 3))
-        for each in (good.astype(np.float64), values, values**2)
-    ]
-    number = np.maximum(sums[0], 1.0)
-    variance = sums[2] / number - (sums[1] / number) ** 2
-    full = sums[0] > 0.5 * UBI_BOX_PX**2
-    variance[~full] = np.median(variance[full]) if full.any() else values[good].var()
-    spread = variance.repeat(UBI_BOX_PX, axis=0).repeat(UBI_BOX_PX, axis=1)
-    return np.asarray(spread[: values.shape[0], : values.shape[1]])
+def _box_variance(values: NDArray[Any], good: NDArray[np.bool_]) -> FloatArray:
+    """Variance of the good pixels in boxes; that of all in boxes without many."""
+    kept = np.where(good, values, 0.0)
+    number, total, squares = (
+        square_sums(each, UBI_BOX_PX).astype(np.float64) for each in (good, kept, np.square(kept))
+    )
+    number = np.maximum(number, 1.0)
+    variance = np.asarray(squares / number - (total / number) ** 2)
+    full = number > 0.5 * UBI_BOX_PX**2
+    variance[~full] = np.median(variance[full]) if full.any() else kept[good].var()
+    return variance

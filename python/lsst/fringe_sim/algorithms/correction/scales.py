@@ -8,34 +8,31 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import OutOfRangeError, UndeterminedError
-from .background import BackgroundTerms
+from .background import SMALLEST_BLOCK_PX, BackgroundTerms
+from .sums import FrameSums, Solution
 
-__all__ = ["ScaleFit", "fit_scales", "steady_weight"]
+__all__ = ["ScaleFit", "fit_scales", "scale_fit", "settle", "steady_weight"]
 
 FloatArray = NDArray[np.float64]
-
-RIDGE = 1e-9
-"""Part of its mean that is added to the diagonal of the background's normal matrix: rounding of sums in float64 is
-1e-13 of it, and terms without pixels become 0."""
-
-LEAST_INDEPENDENT = 1e-6
-"""Least eigenvalue of the correlation matrix of templates, below which float32 patterns are one pattern."""
+BoolArray = NDArray[np.bool_]
 
 LEAST_BLOCKS = 25
 """Blocks with pixels below which the errors of the scales, which come from their scatter, mean nothing: with 25 an
 error is itself known to 14 %."""
 
-MOST_BLOCKS_A_SIDE, SMALLEST_BLOCK_PX = 16, 4
-"""Blocks are as large as correlated noise reaches, and enough of them to know a scatter to 5 %: 16 a side
-where the image is large enough, 4 pixels a side where it is not."""
-
 ROUNDS, UNCHANGED = 6, 2e-4
 """Most rounds of clipping, and the part of the pixels below which it ends: Gaussian noise has 6e-5 beyond
 four standard deviations."""
+
+CLIP_SIGMA = 4.0
+"""Standard deviations beyond which a pixel is left out."""
+
+ROUGH_SIGMA = 5.0
+"""Standard deviations from the median of its cell beyond which a pixel is left out of the first fit, which
+stars would spoil."""
 
 LARGEST_NOISE = 1e15
 """Noise of a pixel, and one over it, whose square and its products with pixels are numbers in single precision."""
@@ -43,8 +40,12 @@ LARGEST_NOISE = 1e15
 SAMPLE = 200_000
 """Pixels that tell a scatter to 0.2 %."""
 
-CELL_PX = 64
-"""Side of the cells in which the variance is averaged: no pixel is weighed by its own noise."""
+CELL_PX, CELL_STEP = 64, 4
+"""Side of the cells in which the variance is averaged, so that no pixel is weighed by its own noise, and the
+distance of the pixels that tell it."""
+
+_ROWS = 256
+"""Rows that are worked on at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,23 +79,13 @@ class ScaleFit:
         return int(np.count_nonzero(self.weight))
 
 
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    scale: FloatArray
-    coefficient: FloatArray
-    schur: FloatArray
-    """Normal matrix of the scales with the background eliminated."""
-    leakage: FloatArray
-    """Background that each template resembles, shape ``(P, K)``."""
-
-
 def fit_scales(
     image: NDArray[Any],
     weight: NDArray[Any],
     patterns: Sequence[NDArray[np.float32]],
     background: BackgroundTerms,
     *,
-    clip_sigma: float = 4.0,
+    clip_sigma: float = CLIP_SIGMA,
 ) -> ScaleFit:
     """Weighted least squares of all templates and the background at once.
 
@@ -122,30 +113,75 @@ def fit_scales(
     background takes of them, and the score ``g_b`` of a block of pixels (Liang & Zeger 1986, Biometrika 73,
     13).
     """
-    level = np.float32(np.median(image[weight > 0])) if (weight > 0).any() else np.float32(0.0)
-    centred = np.where(weight > 0, image - level, 0).astype(np.float32)
-    used = weight.astype(np.float32)
-    blocks = _Blocks.of(background.shape)
-    for _ in range(ROUNDS):
-        _refuse_few(used, blocks, len(background) + len(patterns))
-        solution = _solve(centred, used, patterns, background)
-        residual = centred - background.surface(solution.coefficient)
-        for scale, pattern in zip(solution.scale, patterns, strict=True):
-            residual -= np.float32(scale) * np.where(used > 0, pattern, 0)
-        pull = residual[used > 0] * np.sqrt(used[used > 0])
-        # A variance that is wrong by a factor clips as one that is right.
-        spread = 1.4826 * float(np.median(np.abs(pull[:: max(1, pull.size // SAMPLE)])))
-        off = np.abs(residual) * np.sqrt(used) > clip_sigma * spread
-        if np.count_nonzero(off) <= UNCHANGED * pull.size or spread <= rounding_of(level) * math.sqrt(
-            used.max()
-        ):
+    sums = FrameSums(image, weight.astype(np.float32), patterns, background)
+    solution, _ = settle(sums, sums.usable, clip_sigma=clip_sigma)
+    return scale_fit(sums, solution)
+
+
+def settle(
+    sums: FrameSums,
+    allowed: BoolArray,
+    residual: NDArray[np.float32] | None = None,
+    *,
+    clip_sigma: float = CLIP_SIGMA,
+) -> tuple[Solution, NDArray[np.float32]]:
+    """Fit, leave out pixels that lie off, and repeat until they stay the same.
+
+    Parameters
+    ----------
+    sums : `FrameSums`
+        Sums over the frame, which are left with the pixels of the last fit.
+    allowed : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
+        Pixels that may be used.
+    residual : `numpy.ndarray`, optional
+        What an earlier fit left, which tells the pixels to begin with.
+    clip_sigma : `float`, optional
+        Pixels that lie off by more standard deviations are left out.
+
+    Returns
+    -------
+    solution : `Solution`
+    residual : `numpy.ndarray`, float32, shape ``(ny, nx)``
+        What it leaves in all pixels with a weight.
+    """
+    used = allowed
+    if math.isfinite(clip_sigma):
+        used = (
+            _roughly_good(sums, allowed) if residual is None else _kept(sums, allowed, residual, clip_sigma)
+        )
+    rounding = rounding_of(sums.level) * math.sqrt(float(sums.weight.max(initial=0.0)))
+    for left in reversed(range(ROUNDS)):
+        sums.use(used)
+        _refuse_few(sums)
+        solution = sums.solve()
+        residual = sums.residual(solution)
+        if left == 0 or not math.isfinite(clip_sigma) or _spread(sums, residual) <= rounding:
             break
-        used = np.where(off, 0, used).astype(np.float32)
-    free = pull.size - len(background) - len(patterns)
-    covariance = _covariance(residual, used, patterns, background, solution, blocks) * pull.size / free
-    coefficient = solution.coefficient + float(level) * background.unity()
-    chi2 = float(np.sum(np.square(pull, dtype=np.float64)) / free)
-    return ScaleFit(solution.scale, covariance, coefficient, used, chi2)
+        kept = _kept(sums, allowed, residual, clip_sigma)
+        if np.count_nonzero(kept != used) <= UNCHANGED * sums.pixels.sum():
+            break
+        used = kept
+    assert residual is not None
+    return solution, residual
+
+
+def scale_fit(sums: FrameSums, solution: Solution) -> ScaleFit:
+    """Scales with their errors."""
+    pixels = int(sums.pixels.sum())
+    free = pixels - len(sums.background) - solution.scale.size
+    blocks = sums.by_block(sums.pixels)
+    filled = np.count_nonzero(blocks)
+    score = np.array([sums.by_block(each).ravel() for each in sums.products(solution)])
+    score = score.reshape(solution.scale.size, blocks.size)
+    meat = score @ score.T * (filled / (filled - 1) * pixels / free)
+    half = np.linalg.solve(solution.schur, meat)
+    return ScaleFit(
+        scale=solution.scale,
+        covariance=np.asarray(np.linalg.solve(solution.schur, half.T)),
+        coefficient=solution.coefficient + sums.level * sums.background.unity(),
+        weight=np.where(sums.used, sums.weight, np.float32(0.0)),
+        chi2_per_pixel=sums.chi2(solution) / free,
+    )
 
 
 def steady_weight(
@@ -170,21 +206,35 @@ def steady_weight(
         A noise below 1e-15 or above 1e15.
     """
     if variance is None:
-        both = good[:, 1:] & good[:, :-1]
-        difference = image[:, 1:][both].astype(np.float64) - image[:, :-1][both]
+        step = max(1, image.size // (4 * SAMPLE))
+        both = good[::step, 1:] & good[::step, :-1]
+        difference = image[::step, 1:][both].astype(np.float64) - image[::step, :-1][both]
         spread = 1.4826 * float(np.median(np.abs(difference))) / math.sqrt(2.0) if difference.size else 0.0
         _refuse_unit(spread)
         return np.where(good, 1.0 / spread**2 if spread > 0.0 else 1.0, 0.0).astype(np.float32)
     known = good & np.isfinite(variance) & (variance > 0)
-    _refuse_unit(math.sqrt(float(np.median(variance[known]))) if known.any() else 0.0)
+    some = np.where(known[::CELL_STEP, ::CELL_STEP], variance[::CELL_STEP, ::CELL_STEP], np.nan)
+    middle = _cell_medians(some)
+    finite = middle[np.isfinite(middle)]
+    _refuse_unit(math.sqrt(float(np.median(finite))) if finite.size else 0.0)
     weight = np.zeros(good.shape, dtype=np.float32)
-    for y in range(0, good.shape[0], CELL_PX):
-        for x in range(0, good.shape[1], CELL_PX):
-            cell = np.s_[y : y + CELL_PX, x : x + CELL_PX]
-            values = variance[cell][known[cell]]
-            if values.size:
-                weight[cell] = np.where(known[cell], 1.0 / np.median(values), 0.0)
+    for row, across in enumerate(middle):
+        rows = slice(row * CELL_PX, (row + 1) * CELL_PX)
+        steady = np.broadcast_to(np.repeat(across, CELL_PX)[: good.shape[1]], known[rows].shape)
+        # In a cell of which hardly anything is known, each pixel counts as it is.
+        steady = np.where(np.isfinite(steady), steady, variance[rows])
+        np.divide(1.0, steady, out=weight[rows], where=known[rows], casting="same_kind")
     return weight
+
+
+def _cell_medians(some: NDArray[Any]) -> NDArray[Any]:
+    """Median of each cell over what is no NaN of every so many pixels of every so many rows."""
+    side = CELL_PX // CELL_STEP
+    padded = np.pad(some, [(0, -size % side) for size in some.shape], constant_values=np.nan)
+    cells = padded.reshape(padded.shape[0] // side, side, -1, side).swapaxes(1, 2)
+    ordered = np.sort(cells.reshape(*cells.shape[:2], -1), axis=-1)
+    place = np.maximum(np.isfinite(ordered).sum(axis=-1, keepdims=True) - 1, 0) // 2
+    return np.asarray(np.take_along_axis(ordered, place, axis=-1)[..., 0])
 
 
 def _refuse_unit(noise: float) -> None:
@@ -199,30 +249,48 @@ def rounding_of(level: ArrayLike) -> float:
     return 8.0 * float(np.finfo(np.float32).eps) * float(np.max(np.abs(level)))
 
 
-@dataclass(frozen=True)
-class _Blocks:
-    """Equal blocks of pixels: large enough for correlated noise, and enough of them for a scatter."""
-
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, shape: tuple[int, int]) -> _Blocks:
-        return cls(*(np.arange(0, side, _block_side(side)) for side in shape))
-
-    def sums(self, image: NDArray[Any]) -> FloatArray:
-        """Sum over each block."""
-        by_row = np.add.reduceat(image, self.rows, axis=0, dtype=np.float64)
-        return np.add.reduceat(by_row, self.columns, axis=1)
-
-
-def _block_side(side: int) -> int:
-    return max(SMALLEST_BLOCK_PX, -(-side // MOST_BLOCKS_A_SIDE))
+def _roughly_good(sums: FrameSums, allowed: BoolArray) -> BoolArray:
+    """Pixels that are near the median of their cell."""
+    few = allowed[::CELL_STEP, ::CELL_STEP]
+    some = np.where(few, sums.image[::CELL_STEP, ::CELL_STEP], np.float32(np.nan))
+    middle = _cell_medians(some)
+    side = CELL_PX // CELL_STEP
+    wide = middle.repeat(side, axis=0).repeat(side, axis=1)[: some.shape[0], : some.shape[1]]
+    reach = ROUGH_SIGMA * 1.4826 * _cell_medians(np.abs(some - wide))
+    good = allowed.copy()
+    for row, across in enumerate(zip(middle, reach, strict=True)):
+        rows = slice(row * CELL_PX, (row + 1) * CELL_PX)
+        centre, most = (np.repeat(each, CELL_PX)[: allowed.shape[1]] for each in across)
+        # A cell without a number has no limit.
+        good[rows] &= ~(np.abs(sums.image[rows] - centre) > most)
+    return good
 
 
-def _refuse_few(weight: NDArray[Any], blocks: _Blocks, parameters: int) -> None:
-    pixels = int(np.count_nonzero(weight))
-    filled = int(np.count_nonzero(blocks.sums(weight > 0)))
+def _kept(sums: FrameSums, allowed: BoolArray, residual: NDArray[np.float32], clip_sigma: float) -> BoolArray:
+    """Pixels that do not lie off; a variance that is wrong by a factor clips as one that is right."""
+    most = np.float32((clip_sigma * _spread(sums, residual)) ** 2)
+    kept = np.empty(allowed.shape, dtype=bool)
+    for start in range(0, len(kept), _ROWS):
+        rows = slice(start, start + _ROWS)
+        pull2 = np.square(residual[rows])
+        pull2 *= sums.weight[rows]
+        np.less_equal(pull2, most, out=kept[rows])
+    kept &= allowed
+    return kept
+
+
+def _spread(sums: FrameSums, residual: NDArray[np.float32]) -> float:
+    """Scatter of the pulls of a sample of the pixels in use."""
+    step = (residual.size // SAMPLE) | 1
+    used = sums.used.ravel()[::step]
+    pull = np.abs(residual.ravel()[::step][used]) * np.sqrt(sums.weight.ravel()[::step][used])
+    return 1.4826 * float(np.median(pull)) if pull.size else 0.0
+
+
+def _refuse_few(sums: FrameSums) -> None:
+    parameters = len(sums.background) + len(sums.patterns)
+    pixels = int(sums.pixels.sum())
+    filled = int(np.count_nonzero(sums.by_block(sums.pixels)))
     if filled < LEAST_BLOCKS or pixels <= 4 * parameters:
         block = SMALLEST_BLOCK_PX
         allowed = (
@@ -230,77 +298,3 @@ def _refuse_few(weight: NDArray[Any], blocks: _Blocks, parameters: int) -> None:
             f"more; there are {filled}"
         )
         raise UndeterminedError("pixels for the scales of the templates", pixels, allowed)
-
-
-def _solve(
-    image: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    patterns: Sequence[NDArray[np.float32]],
-    background: BackgroundTerms,
-) -> _Solution:
-    weighted = [np.where(weight > 0, weight * pattern, 0) for pattern in patterns]
-    normal = background.normal_matrix(weight)
-    normal[np.diag_indices_from(normal)] += RIDGE * np.trace(normal) / len(normal)
-    factor = scipy.linalg.cho_factor(normal)
-    mixed = np.zeros((len(background), len(patterns)))
-    for number, each in enumerate(weighted):
-        mixed[:, number] = background.moments(each)
-    leakage = scipy.linalg.cho_solve(factor, mixed)
-    gram = np.array([[_dot(one, two) for two in patterns] for one in weighted]).reshape(
-        len(patterns), len(patterns)
-    )
-    schur = gram - mixed.T @ leakage
-    schur = 0.5 * (schur + schur.T)
-    _refuse_degenerate(schur, np.diag(gram))
-    along = background.moments(weight * image)
-    moment = np.array([_dot(each, image) for each in weighted]) - leakage.T @ along
-    scale = np.linalg.solve(schur, moment)
-    coefficient = scipy.linalg.cho_solve(factor, along - mixed @ scale)
-    return _Solution(scale, coefficient, schur, leakage)
-
-
-def _dot(one: NDArray[Any], two: NDArray[Any]) -> float:
-    """Sum of products of pixels; a pixel without weight counts nowhere, whatever the template has there."""
-    total = 0.0
-    for start in range(0, len(one), 256):
-        left = one[start : start + 256].astype(np.float64)
-        right = np.where(left != 0.0, two[start : start + 256], 0.0)
-        total += float(np.vdot(left, right))
-    return total
-
-
-def _refuse_degenerate(schur: FloatArray, power: FloatArray) -> None:
-    """Templates of which the background, or each other, leave nothing."""
-    if not power.size:
-        return
-    left = np.diag(schur) / np.where(power > 0.0, power, 1.0)
-    if not (left > LEAST_INDEPENDENT).all():
-        number = int(np.argmin(left))
-        allowed = "a template that varies more quickly than the background"
-        raise UndeterminedError(
-            f"part of template {number} beside the background", float(left[number]), allowed
-        )
-    root = np.sqrt(np.diag(schur))
-    least = float(np.linalg.eigvalsh(schur / np.outer(root, root))[0])
-    if least < LEAST_INDEPENDENT:
-        raise UndeterminedError("independence of the templates", least, f"above {LEAST_INDEPENDENT:g}")
-
-
-def _covariance(
-    residual: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    patterns: Sequence[NDArray[np.float32]],
-    background: BackgroundTerms,
-    solution: _Solution,
-    blocks: _Blocks,
-) -> FloatArray:
-    scores = []
-    weighted = weight * residual
-    for pattern, leakage in zip(patterns, solution.leakage.T, strict=True):
-        beside = np.where(weight > 0, pattern, 0) - background.surface(leakage)
-        scores.append(blocks.sums(weighted * beside).ravel())
-    filled = np.count_nonzero(blocks.sums(weight > 0))
-    score = np.array(scores).reshape(len(patterns), blocks.rows.size * blocks.columns.size)
-    meat = score @ score.T * filled / (filled - 1)
-    half = np.linalg.solve(solution.schur, meat)
-    return np.asarray(np.linalg.solve(solution.schur, half.T))

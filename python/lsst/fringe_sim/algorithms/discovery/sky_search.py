@@ -119,8 +119,10 @@ class SkyExposures:
         if grid not in self._missing:
             self._missing.clear()
             self._missing[grid] = self._summed_in_full(grid) - self._short(self.base, grid)
-            self._flat = self._flat_field(grid)
-        return (self._short(model, grid) + self._missing[grid]) / self._flat
+            self._flat = self._white_flat(grid)
+        light = sky_with_effects(model, self.sky).flat
+        flat = self._flat if light is None else self._flat_field(model, light.component(self.band), grid)
+        return (self._short(model, grid) + self._missing[grid]) / flat
 
     def place_weight(self, geometry: ImageGeometry) -> FloatArray:
         """See `Exposures`."""
@@ -169,15 +171,19 @@ class SkyExposures:
             rows.append(self._factors(parts) @ np.stack([electrons[part.name] for part in parts]))
         return np.concatenate(rows)
 
-    def _flat_field(self, grid: Grid) -> FloatArray:
+    def _white_flat(self, grid: Grid) -> FloatArray:
         """What flat fields of white light have taken out of the frames, ``(K * F, count)``."""
         if self.field is None:
             return np.ones((1, 1))
-        white = white_light(self.band, FLAT_STEP_NM)
+        return self._flat_field(self.base, white_light(self.band, FLAT_STEP_NM), grid)
+
+    def _flat_field(self, model: FringeModel, part: SpectralComponent, grid: Grid) -> FloatArray:
+        """The same for flat fields of any light."""
+        beams = [model.base_system.beam] if self.field is None else self.field.beams
         rows = []
-        for beam in self.field.beams:
-            light = Illumination.spectrum(white.wavelength_nm, white.photons, reduce_beam(beam, LINE_ANGLES))
-            reduced = self.base.system.reduce(light)
+        for beam in beams:
+            light = Illumination.spectrum(part.wavelength_nm, part.photons, reduce_beam(beam, LINE_ANGLES))
+            reduced = _behind(model, beam).system.reduce(light)
             rows.append(reduced.averaged_on_grid(light.weight, *grid)[0])
         return np.repeat(rows, len(self.scales), axis=0)
 
