@@ -19,7 +19,8 @@ from .wavelengths import spread_of_wavelengths
 __all__ = ["CERTAIN", "MISFIT", "contrast_map", "flat_fit", "model_error", "remarks", "says_misfit"]
 
 CERTAIN = 25.0
-"""Chi-square difference to the next order of the whole sensor below which a person is told."""
+"""Chi-square difference to the next order of the whole sensor below which the order is not decided: flats that the
+model does not describe have shown 19 for an order that was wrong."""
 MISFIT = 1.2
 """Mean square of what is left of small blocks of pixels, over their variance, from which on the model is
 said not to fit."""
@@ -194,10 +195,9 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
         )
     margin = max(float(metadata["ORDMARG"]), 0.0)
     if margin < CERTAIN:
-        odds = np.exp(-0.5 * margin)
         said.append(
-            f"the order of the sensor is not sure: another one is worse by a chi-square of only {margin:.1f}, which "
-            f"leaves it a probability of {odds / (1.0 + odds):.1g}; pixels are flagged SLIP where that is too much. "
+            f"the order of the sensor is not decided: another one is worse by a chi-square of only {margin:.1f}; all "
+            "pixels are flagged SLIP. "
             "Flats over a wider range of wavelengths, or better known wavelengths, would decide"
         )
     return said

@@ -19,7 +19,7 @@ from ..flat_conditions import model_of_flats
 from ..thickness_fit_options import CONTRASTS, FIT_METHODS
 from .amplitudes import Amplitudes
 from .cells import sample_pixels
-from .conclusion import cards, flat_fit
+from .conclusion import CERTAIN, cards, flat_fit
 from .global_fit import global_fit
 from .guo2022 import walk_fit
 from .islands import fit_islands
@@ -172,7 +172,9 @@ def fit_thickness(
         flats = flat_fit(found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
         coarse = found.contrast_map
         notes |= cards(flats, found.margin, found.nuisance.scale_sigma)
-    everywhere = _assemble(pixels, slip, slip_limit, cube, model.base_system.varying, notes, workers)
+    # The probability of another order trusts the model; where the model is wrong, a small margin is all that tells.
+    limit = slip_limit if float(notes.get("ORDMARG", CERTAIN)) >= CERTAIN else -1.0
+    everywhere = _assemble(pixels, slip, limit, cube, model.base_system.varying, notes, workers)
     everywhere = replace(everywhere, flats=flats, contrast_map=coarse)
     return fit_islands(everywhere, cube, model if observable is None else with_observable(model, observable))
 
