@@ -256,6 +256,7 @@ def correct_frame(
     return CorrectedFrame(corrected, done, proof, fringes)
 
 
+@named_units
 def recover_sources(
     frame: ObservedFrame,
     corrected: CorrectedFrame,
