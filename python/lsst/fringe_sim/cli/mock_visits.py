@@ -8,7 +8,7 @@ import click
 
 from .mock_flats import thickness_map
 from .output import OutputFolder, output_folder
-from .parameters import BUILT_IN, SIZE, ChosenEffects, model_effects
+from .parameters import BUILT_IN, SIZE, SKY, ChosenEffects, model_effects
 from .progress import progress
 
 __all__ = ["mock_visits"]
@@ -16,7 +16,7 @@ __all__ = ["mock_visits"]
 
 @click.command("mock-visits")
 @output_folder("Folder for the visits.", "visit_*.fits", argument=True)
-@click.option("--setup", default="lsst_e2v", show_default=True, help="Set-up behind a telescope.")
+@SKY.name_option("lsst_e2v", "Set-up behind a telescope: name or file.")
 @click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
 @click.option(
     "--thickness",
@@ -69,11 +69,10 @@ def mock_visits(
     import numpy as np
 
     from ..instrument.camera import Camera
-    from ..instrument.setup import Setup
     from ..mock.hidden_effects import validate_effects
     from ..mock.visits import VisitConditions, write_mock_visits
 
-    chosen = Setup.from_file(setup) if setup.endswith((".yaml", ".yml")) else Setup.from_name(setup)
+    chosen = SKY.convert(setup, None, None)
     sensor = Camera.from_name(chosen.camera).detector(detector or chosen.detector)
     shape = (size[1], size[0]) if size else sensor.shape
     rng = np.random.default_rng(seed)

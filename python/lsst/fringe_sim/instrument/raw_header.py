@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from astropy.io import fits
@@ -40,9 +40,14 @@ def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[st
     return value.strip() if isinstance(value, str) else value
 
 
+def _differ(values: Sequence[Any]) -> bool:
+    """Whether values are not all the same; one that is no number is like itself."""
+    return any(value != values[0] and not (value != value and values[0] != values[0]) for value in values)
+
+
 def _refuse_different(header: fits.Header, keyword: str) -> None:
     values = [header[keyword, number] for number in range(header.count(keyword))]
-    if any(value != values[0] for value in values):
+    if _differ(values):
         raise FrameFormatError(keyword, " and ".join(map(str, values)), "one value, not several that differ")
 
 
@@ -74,7 +79,7 @@ class DeclaredHeader:
         except FrameFormatError as error:
             raise error.in_source(self.source) from None
         values = [value for value in stated if value is not None]
-        if any(value != values[0] for value in values):
+        if _differ(values):
             raise self.refuse(keyword, " and ".join(map(str, values)), "one value, not several that differ")
         return values[0] if values else None
 
