@@ -154,6 +154,7 @@ def test_tilted_silicon(rng) -> None:
     assert pull.std() == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.rng("broad flats cannot tell and say so")
 def test_broad_flats_cannot_tell_and_say_so(rng, tmp_path, capsys) -> None:
     """The adhesive is found all the same, with the fringes of the silicon as noise."""

@@ -93,6 +93,7 @@ def test_dry_runs_write_nothing(raws, tmp_path, capsys) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_missing_wavelength_is_said(copy, tmp_path, capsys) -> None:
     flat_at(copy, 950).unlink()
     assert run(["fit", str(copy), "--out", str(tmp_path / "fit")]) == 0

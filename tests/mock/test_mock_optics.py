@@ -81,6 +81,7 @@ def test_materials_follow_the_curve_of_the_fitting_side(medium: str) -> None:
         np.testing.assert_allclose(ours, get_medium(medium).index(wavelength, temperature), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_flat_field_is_the_average_over_the_line(e2v: FlatFieldOptics) -> None:
     """Against a plain sum over two thousand wavelengths of tmm."""
     sigma = e2v.bandwidth_fwhm_nm / math.sqrt(8.0 * math.log(2.0))
