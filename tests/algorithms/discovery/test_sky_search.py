@@ -153,7 +153,9 @@ def test_cells_of_many_pixels_see_the_mean_of_their_beams() -> None:
 )
 def test_a_hidden_effect_is_found_on_the_sky(setup: str, name: str, settings: dict[str, float]) -> None:
     seed = int(np.random.SeedSequence().generate_state(1)[0] >> 8)
-    level = 4e6 if setup == "lsst_e2v" else 1e5
+    # Fringes of cold silicon at 14 um have 2e-4 of the LSST's sky: at 4e6 electrons, a quarter of them stands out by
+    # a chi-square of 50, of which the data held out see a third.
+    level = 4e7 if setup == "lsst_e2v" else 1e5
     frames, known = sky_frames_of(setup, settings, seed, level)
     catalogue = [effect for effect in EFFECTS if effect.name in CATALOGUE]
     verdict = discover_sky(frames, known, 0.002, setup, catalogue, rng=np.random.default_rng(seed))
