@@ -11,6 +11,7 @@ from astropy.table import Table
 from observed_night import observed_night
 
 from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.cli.observed import _other_light
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +162,17 @@ def test_dry_run_writes_nothing(night: Path, made: Path, tmp_path: Path) -> None
     assert run(["templates", str(night), "--out", str(out), "--dry-run"]) == 0
     assert run(["correct", str(night), "--templates", str(made), "--out", str(out), "--dry-run"]) == 0
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("template", "frame", "refused"),
+    [
+        ("lsst_y", "g", True),
+        ("lsst_y", "y_10", False),
+        ("hsc_y", "HSC-Y", False),
+        ("lsst_y", "Y DECam c0005", False),
+    ],
+)
+def test_bands_of_a_model_and_of_a_frame_must_agree(template, frame, refused) -> None:
+    assert _other_light(template, frame, True) is refused
+    assert _other_light(template, frame, False)

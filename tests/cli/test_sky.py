@@ -201,3 +201,20 @@ def test_a_section_outside_the_sensor_is_refused_before_the_work(thickness, tmp_
     assert "window.fits" in message
     assert "of the section" in message
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("cards", "factor", "words"),
+    [
+        ({"CONTRAST": "x", "CONTRSIG": 0.1}, 1.0, "CONTRAST"),
+        ({"CONTRAST": -3.0, "CONTRSIG": 0.1}, 1.0, "not negative"),
+        ({}, 60.0, "thickness"),
+    ],
+)
+def test_a_map_that_no_fit_has_written_is_refused(cards, factor, words, tmp_path, capsys) -> None:
+    hdu = fits.PrimaryHDU((factor * e2v_321((20, 24))).astype(np.float32))
+    hdu.header.update(cards)
+    hdu.writeto(tmp_path / "map.fits")
+    given = ["sky", "--thickness", str(tmp_path / "map.fits"), "--detector", "R22_S11"]
+    assert run([*given, "--out", str(tmp_path / "sky")]) == 1
+    assert words in capsys.readouterr().err

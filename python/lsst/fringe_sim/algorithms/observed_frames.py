@@ -252,7 +252,8 @@ def correct_frame(
         mask=frame.mask | np.where(done.uncorrected, mask_bits("SUSPECT"), 0).astype(np.int32),
         metadata={**frame.metadata, **done.cards},
     )
-    fringes = np.where(np.isfinite(frame.image), frame.image - done.image, 0).astype(np.float32)
+    fringes = np.zeros(frame.shape, dtype=np.float32)
+    np.subtract(frame.image, done.image, out=fringes, where=np.isfinite(frame.image))
     return CorrectedFrame(corrected, done, proof, fringes)
 
 

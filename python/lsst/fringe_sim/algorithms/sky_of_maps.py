@@ -121,6 +121,7 @@ def sky_of_maps(
     ``phase_sigma``: that of `simulate_sky_frame`. ``respond``: ``(model, range, like) -> response`` of a sensor, by
     default that of `sensor_response`; ``like`` is one of the same sensor with other silicon, or `None`.
     """
+    model.checked_thickness_um(thickness_range_um)
     span = widened_um(model, thickness_range_um, phase_sigma)
 
     def in_every_beam(own: FringeModel, range_um: tuple[float, float], like: Response | None) -> Response:

@@ -240,7 +240,9 @@ def _describe(record: FrameRecord) -> str:
     scales = ", ".join(
         f"{scale:.4g} ± {sigma:.2g}" for scale, sigma in zip(record.scale, record.sigma, strict=True)
     )
+    clearest = max(abs(scale / sigma) for scale, sigma in zip(record.scale, record.sigma, strict=True))
     return (
-        f"{record.name}: scales {scales}; structure beyond the noise {proof.structure_before:.2f} before, "
+        f"{record.name}: scales {scales} (fringes at {clearest:.1f} σ); "
+        f"structure beyond the noise {proof.structure_before:.2f} before, "
         f"{proof.structure_after:.2f} after"
     )

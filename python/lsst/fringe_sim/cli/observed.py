@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -167,6 +168,10 @@ def stem_of(path: Path) -> str:
     return name
 
 
+BAND = re.compile(r"(?:[a-z]+[_-])?([ugrizy])(?:_\d+)?")
+"""Names of filters that tell the band: y, y_10, HSC-Y, lsst_y."""
+
+
 class TemplateFolder:
     """Templates by sensor, from ``fringe-sim templates`` or of a model."""
 
@@ -207,11 +212,9 @@ class TemplateFolder:
             raise UnknownNameError("sensor of a frame", detector, names)
         files = tuple(self._files[detector if detector in self._files else names[0]])
         found = _read_templates(files)
-        # A model names its filter as its telescope does, which a file need not.
-        observed = [each.physical_filter for each in found if _keyword(files[0], "PRODUCT") != "FringeFrame"]
-        if physical_filter and any(name not in ("", physical_filter) for name in observed):
-            allowed = f"{observed[0]}, that of the templates"
-            raise InputError("filter of a frame", physical_filter, allowed)
+        for name in {each.physical_filter for each in found}:
+            if _other_light(name, physical_filter, _keyword(files[0], "PRODUCT") == "FringeFrame"):
+                raise InputError("filter of a frame", physical_filter, f"{name}, that of the templates")
         return found
 
     def prepared(self, detector: str, physical_filter: str = "") -> TemplateSet:
@@ -222,6 +225,19 @@ class TemplateFolder:
         if self._last is None or self._last[0] != wanted:
             self._last = (wanted, TemplateSet.of(self.of(*wanted)))
         return self._last[1]
+
+
+def _other_light(template: str, frame: str, is_model: bool) -> bool:
+    """Whether the names of two filters are of different ones.
+
+    A model names its filter as its telescope does, which a file need not: only the bands of both can differ.
+    """
+    if not template or not frame:
+        return False
+    if not is_model:
+        return template != frame
+    bands = [BAND.fullmatch(name.strip().lower()) for name in (template, frame)]
+    return bands[0] is not None and bands[1] is not None and bands[0][1] != bands[1][1]
 
 
 def _read_templates(files: tuple[Path, ...]) -> list[FringeFrame]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, to_number
 from .output import OutputFolder, output_folder
 from .parameters import BUILT_IN, SKY, ChosenEffects, Quantity, model_effects
 from .progress import progress
@@ -128,6 +128,7 @@ def sky(
 
     _check_exposure(exptime, night)
     sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
+    contrast = laboratory_contrast(thickness)
     layer, section = _layer(thickness, sensor, setup.varying)
     silicon = None if silicon_thickness is None else _silicon(silicon_thickness, layer)
     settings = sky_settings(effects.settings)
@@ -140,7 +141,6 @@ def sky(
         )
         return
     model = _model(setup, settings, sensor).at_laboratory_temperature(map_header(thickness))
-    contrast = laboratory_contrast(thickness)
     maps = [name for name in (thickness, silicon_thickness) if name not in (BUILT_IN, None)]
     given: list[str | Path] = [*maps, *effects.files]
     cards = _cards(model, given, contrast, section)
@@ -325,7 +325,11 @@ def laboratory_contrast(thickness: str) -> tuple[float, float] | None:
     header = map_header(thickness)
     if "CONTRAST" not in header or "CONTRSIG" not in header:
         return None
-    return float(header["CONTRAST"]), float(header["CONTRSIG"])
+    contrast, sigma = (to_number(name, header[name]) for name in ("CONTRAST", "CONTRSIG"))
+    if not (0.0 <= contrast < math.inf and 0.0 <= sigma < math.inf):
+        found = (contrast, sigma)
+        raise InputError("CONTRAST, CONTRSIG", found, "finite and not negative", source=thickness)
+    return contrast, sigma
 
 
 def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:

@@ -199,7 +199,7 @@ class FringeModel:
             A quantity that is no length.
         """
         wavelength = self._wavelength(wavelength_nm)
-        thickness = self._thickness(thickness_um)
+        thickness = self.checked_thickness_um(thickness_um)
         return self.respond(self.system.flat_fields(wavelength), thickness, wavelength)
 
     @named_units
@@ -222,7 +222,7 @@ class FringeModel:
         InputError
             The map does not fit the geometry, or an effect in electrons meets a level that is not known.
         """
-        thickness = self._thickness(thickness_um)
+        thickness = self.checked_thickness_um(thickness_um)
         if thickness.shape != geometry.sample_shape:
             raise InputError("shape of the thickness map", thickness.shape, f"{geometry.sample_shape}")
         image = self.with_islands(lambda model: model.response(thickness, geometry.wavelength_nm), geometry)
@@ -288,7 +288,7 @@ class FringeModel:
             Largest interpolation error.
         """
         wavelength = self._wavelength(wavelength_nm)
-        low, high = self._thickness(thickness_range_um).tolist()
+        low, high = self.checked_thickness_um(thickness_range_um).tolist()
         illumination = self.system.flat_fields(wavelength)
         return self.table_of(illumination, (low, high), wavelength_nm=wavelength, tolerance=tolerance)
 
@@ -332,7 +332,7 @@ class FringeModel:
         if late:
             raise InputError("effects", late, "effects of the stack or of the illumination")
         illumination = self.system.flat_fields(self._wavelength(wavelength_nm))
-        thickness = self._thickness(thickness_um)
+        thickness = self.checked_thickness_um(thickness_um)
         return self.system.reduce(illumination).averaged_derivative(illumination.weight, thickness)
 
     @named_units
@@ -348,7 +348,7 @@ class FringeModel:
     @named_units
     def quadrature_error(self, wavelength_nm: ArrayLike, thickness_um: ArrayLike) -> float:
         """Largest change of the response when the wavelength nodes are twice as dense."""
-        wavelength, thickness = self._wavelength(wavelength_nm), self._thickness(thickness_um)
+        wavelength, thickness = self._wavelength(wavelength_nm), self.checked_thickness_um(thickness_um)
         coarse = self.system.flat_fields(wavelength)
         fine = self.system.flat_fields(wavelength, DEFAULT_STEP_NM / 2.0)
         difference = self.respond(coarse, thickness) - self.respond(fine, thickness)
@@ -382,8 +382,14 @@ class FringeModel:
         )
         return wavelength
 
-    def _thickness(self, thickness_um: ArrayLike) -> FloatArray:
-        """Thicknesses that the varying layer can have; those in nm or mm are a thousandfold."""
+    def checked_thickness_um(self, thickness_um: ArrayLike) -> FloatArray:
+        """Thicknesses [µm], refused if the varying layer cannot have them; those in nm or mm are a thousandfold.
+
+        Raises
+        ------
+        OutOfRangeError
+            One is far outside the range of the set-up.
+        """
         thickness = np.asarray(without_unit("thickness", thickness_um, "um"), dtype=float)
         low, high = self.setup.thickness_range_um
         check_range(
