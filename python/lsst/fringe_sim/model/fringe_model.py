@@ -390,7 +390,7 @@ class FringeModel:
         OutOfRangeError
             One is far outside the range of the set-up.
         """
-        thickness = np.asarray(without_unit("thickness", thickness_um, "um"), dtype=float)
+        thickness = np.asarray(without_unit("thickness_um", thickness_um, "um"), dtype=float)
         low, high = self.setup.thickness_range_um
         check_range(
             f"thickness of {self.setup.varying} [um]",
