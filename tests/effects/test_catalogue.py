@@ -99,3 +99,10 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert run(["effects", "delamination"]) == 1
     assert run(["effects", "--effects-from", str(tmp_path / "none.py")]) == 1
     assert "none.py" in capsys.readouterr().err
+
+
+def test_what_acts_on_the_spectrum_is_of_the_sky_alone() -> None:
+    """A map of the thickness does not have to know of it."""
+    of_spectrum = [effect for effect in EFFECTS if effect.acts_on == "spectrum"]
+    assert "flat_fringes" in {effect.name for effect in of_spectrum}
+    assert all(effect.sky_only for effect in of_spectrum)

@@ -188,10 +188,15 @@ class Effect(Described, ABC):
     laboratory_only: ClassVar[bool] = False
     """Whether it belongs to lamp, bench or cryostat, which a sensor does not take along to the telescope."""
     sky_only: ClassVar[bool] = False
-    """Whether it belongs to the sensor at the telescope alone: neither flats nor maps made from them know of it."""
+    """Whether it belongs to the sensor at the telescope, or to its sky: neither flats nor maps made from them know of
+    it. So is all that acts on the spectrum."""
     reference: ClassVar[str]
     search: ClassVar[SearchHints] = SearchHints()
     """What a search must know of it."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.sky_only = cls.sky_only or getattr(cls, "acts_on", "") == "spectrum"
 
     def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
         """Return the optical system with the effect in it."""

@@ -28,7 +28,6 @@ class RotationalTemperature(PlainNullEffect):
     name = "rotational_temperature"
     title = "rotational temperature of OH"
     acts_on = "spectrum"
-    sky_only = True
     reference = f"{_TWO_POPULATIONS}; Noll et al. 2025, doi 10.5194/gmd-18-4353-2025 (+-20 K in a night)"
     parameters = (
         Parameter(
@@ -53,7 +52,6 @@ class HotRotation(PlainNullEffect):
     name = "hot_rotation"
     title = "hot rotational population of OH"
     acts_on = "spectrum"
-    sky_only = True
     reference = f"{_TWO_POPULATIONS}; Oliva et al. 2015, doi 10.1051/0004-6361/201526291 (hot OH)"
     parameters = (
         Parameter(
@@ -79,7 +77,6 @@ class OHBands(PlainNullEffect):
     name = "oh_bands"
     title = "strengths of the OH bands"
     acts_on = "spectrum"
-    sky_only = True
     reference = "Guo, Walter, Lage & Lupton 2022, section 4.1 (bands change through a night)"
     parameters = tuple(
         Parameter(f"band_{band.replace('-', '_')}", "", 1.0, (0.0, 10.0), 0.2, f"factor on the band {band}")
@@ -104,7 +101,6 @@ class SkyContinuum(PlainNullEffect):
     name = "sky_continuum"
     title = "level of the sky continuum"
     acts_on = "spectrum"
-    sky_only = True
     reference = (
         "Noll et al. 2025, Geosci. Model Dev. 18, 4353: the airglow continuum varies by tens of per cent"
     )
@@ -125,7 +121,6 @@ class WaterVapour(PlainNullEffect):
     name = "water_vapour"
     title = "absorption of the lines by water vapour"
     acts_on = "spectrum"
-    sky_only = True
     reference = "Noll et al. 2012, doi 10.1051/0004-6361/201219040 (sky model of Paranal, 2.5 mm of water)"
     parameters = (Parameter("scale", "", 1.0, (0.0, 8.0), 0.5, "column over that of the line list"),)
     search = SearchHints(natural_bounds=(0.0,))

@@ -111,11 +111,7 @@ def discover(
     check_setup(cube, model)
     known = {item.effect.name for item in model.effects}
     # Flats do not see the spectrum of the night sky, nor the sensor at the telescope.
-    own = [
-        effect
-        for effect in known_effects(effects)
-        if not (effect.sky_only or effect.acts_on == "spectrum") or effect.name in known
-    ]
+    own = [effect for effect in known_effects(effects) if not effect.sky_only or effect.name in known]
     return search_exposures(cube, model, own, rng, options, report)
 
 
