@@ -15,7 +15,7 @@ from lsst.fringe_sim import products as p
 from lsst.fringe_sim.algorithms.pca import fit_pca
 from lsst.fringe_sim.cli.inputs import read_section
 from lsst.fringe_sim.cli.observed import latest_date
-from lsst.fringe_sim.cli.sky import laboratory_contrast
+from lsst.fringe_sim.cli.sky import laboratory_contrast, map_header
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.products.file_keywords import FILE_KEYWORDS, FILTER_NAMES, SENSOR_NAMES
@@ -39,7 +39,12 @@ def with_card(path: Path, keyword: str, value: Any, hdu: int = 0) -> Path:
 def read_map(path: Path) -> Any:
     found = p.ThicknessMap.read_any(path, "epoxy")
     section = read_section(path, SENSOR, found.shape)
-    return found.value.tobytes(), found.mask.tobytes(), str(section), laboratory_contrast(str(path))
+    return (
+        found.value.tobytes(),
+        found.mask.tobytes(),
+        str(section),
+        laboratory_contrast(map_header(str(path)), str(path)),
+    )
 
 
 def read_cube(path: Path) -> Any:

@@ -128,7 +128,8 @@ def sky(
 
     _check_exposure(exptime, night)
     sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
-    contrast = laboratory_contrast(thickness)
+    header = map_header(thickness)
+    contrast = laboratory_contrast(header, thickness)
     layer, section = _layer(thickness, sensor, setup.varying)
     silicon = None if silicon_thickness is None else _silicon(silicon_thickness, layer)
     settings = sky_settings(effects.settings)
@@ -140,7 +141,7 @@ def sky(
             f"would simulate {count} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
         )
         return
-    model = _model(setup, settings, sensor).at_laboratory_temperature(map_header(thickness))
+    model = _model(setup, settings, sensor).at_laboratory_temperature(header)
     maps = [name for name in (thickness, silicon_thickness) if name not in (BUILT_IN, None)]
     given: list[str | Path] = [*maps, *effects.files]
     cards = _cards(model, given, contrast, section)
@@ -320,15 +321,14 @@ def map_header(thickness: str) -> Mapping[str, Any]:
         return dict(hdus[0].header)
 
 
-def laboratory_contrast(thickness: str) -> tuple[float, float] | None:
-    """Contrast of the laboratory flats over that of the model, and its uncertainty, if the map states them."""
-    header = map_header(thickness)
+def laboratory_contrast(header: Mapping[str, Any], source: str) -> tuple[float, float] | None:
+    """Contrast of the laboratory flats over that of the model, and its uncertainty, if the header of a map tells."""
     if "CONTRAST" not in header or "CONTRSIG" not in header:
         return None
     contrast, sigma = (to_number(name, header[name]) for name in ("CONTRAST", "CONTRSIG"))
     if not (0.0 <= contrast < math.inf and 0.0 <= sigma < math.inf):
         found = (contrast, sigma)
-        raise InputError("CONTRAST, CONTRSIG", found, "finite and not negative", source=thickness)
+        raise InputError("CONTRAST, CONTRSIG", found, "finite and not negative", source=source)
     return contrast, sigma
 
 

@@ -139,13 +139,14 @@ def quantiles(values: FloatArray, groups: int) -> FloatArray:
     return np.diff(integral) / np.diff(edges)
 
 
-def lagrange_weights(nodes: FloatArray, place: float) -> FloatArray:
-    """Weights of the values at the nodes in the polynomial through all of them."""
-    difference = nodes[:, None] - nodes[None, :]
-    np.fill_diagonal(difference, 1.0)
-    above = np.broadcast_to(place - nodes, difference.shape).copy()
-    np.fill_diagonal(above, 1.0)
-    return np.prod(above / difference, axis=1)
+def lagrange_weights(nodes: FloatArray, place: ArrayLike) -> FloatArray:
+    """Weights of the values at the nodes in the polynomial through all of them, ``(nodes, *place)``."""
+    where = np.asarray(place, dtype=float)
+    weights = np.ones((nodes.size, *where.shape))
+    for number, node in enumerate(nodes):
+        for other in np.delete(nodes, number):
+            weights[number] *= (where - other) / (node - other)
+    return weights
 
 
 def beam_of_quantiles(quantile: FloatArray, nodes: int) -> Beam:

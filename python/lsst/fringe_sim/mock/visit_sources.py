@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
+from ..instrument.readout import zero_point
 
 __all__ = ["MASK_PLANES", "Pointing", "Scene", "VisitConditions", "VisitImage"]
 
@@ -31,9 +31,6 @@ BRIGHTEST, COUNTED, FAINTEST = 13.0, 22.0, 24.0
 
 STAR_SLOPE, GALAXY_SLOPE = 0.2, 0.4
 """Slopes of log counts with magnitude: stars near the galactic pole, galaxies brighter than their turnover."""
-
-PLANCK_J_S = 6.62607015e-34
-AB_ZERO_W_M2_HZ = 3631e-26
 
 BLUR_OF_A_RAY_PX = 0.4
 """Diffusion of the charge of a cosmic ray [px rms]."""
@@ -141,6 +138,7 @@ class Scene:
     ) -> Scene:
         """Sources on a patch that is large enough for all pointings."""
         scale = float(light["pixel_scale_arcsec"])
+        bandpass, area_m2 = Bandpass.from_name(str(light["bandpass"])), float(light["effective_area_m2"])
         half = 0.5 * scale * math.hypot(*shape) + 4.0 * conditions.dither_arcsec + 10.0
         area = (2.0 * half / 60.0) ** 2
         stars = _magnitudes(conditions.stars_per_arcmin2 * area, STAR_SLOPE, rng)
@@ -153,7 +151,7 @@ class Scene:
         return cls(
             conditions,
             scale,
-            _electrons_per_s_at_zero(str(light["bandpass"]), float(light["effective_area_m2"])),
+            10.0 ** (0.4 * zero_point(bandpass, area_m2, airmass=1.0)),
             east,
             north,
             np.concatenate([stars, galaxies]),
@@ -195,14 +193,13 @@ class VisitImage:
         sources = _draw_sources(light, scene, pointing, seconds, rng)
         charge = rng.poisson(light).astype(np.float32)
         _add_cosmic_rays(charge, sensor, night.cosmic_rays_per_s_cm2 * seconds, rng)
-        variance = charge.copy()
+        variance = charge + np.float32(night.read_noise_e**2)
         saturated = np.zeros(charge.shape, dtype=bool)
         for amp in sensor.amplifiers:
             part = slice(amp.y0, amp.y0 + amp.height), slice(amp.x0, amp.x0 + amp.width)
             saturated[part] = _bleed(charge[part], amp.gain * amp.saturation)
             charge[part] *= np.float32(1.0 + night.amplifier_rms * rng.standard_normal())
         charge += np.float32(night.read_noise_e) * rng.standard_normal(charge.shape, dtype=np.float32)
-        variance = np.maximum(variance, 0.0) + np.float32(night.read_noise_e**2)
         mask = np.where(saturated, np.int32(1 << MASK_PLANES["SAT"]), np.int32(0))
         return cls(charge, mask, variance, pointing, sources)
 
@@ -212,16 +209,6 @@ def _magnitudes(bright: float, slope: float, rng: np.random.Generator) -> FloatA
     low, high = (10.0 ** (slope * (limit - COUNTED)) for limit in (BRIGHTEST, FAINTEST))
     number = rng.poisson(bright * (high - low))
     return np.asarray(COUNTED + np.log10(rng.uniform(low, high, number)) / slope)
-
-
-@functools.lru_cache(maxsize=8)
-def _electrons_per_s_at_zero(bandpass: str, area_m2: float) -> float:
-    """Electrons per second from a source of AB magnitude 0."""
-    curve = Bandpass.from_name(bandpass)
-    low, high = curve.support()
-    wave = np.linspace(low, high, 500)
-    seen = curve.transmission(wave) * curve.air.total(wave) * curve.quantum_efficiency(wave)
-    return area_m2 * AB_ZERO_W_M2_HZ / PLANCK_J_S * float(np.trapezoid(seen / wave, wave))
 
 
 def _slope(shape: tuple[int, ...], rms: float, rng: np.random.Generator) -> NDArray[np.float32]:

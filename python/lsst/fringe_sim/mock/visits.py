@@ -23,6 +23,7 @@ from ..files import all_or_nothing
 from ..instrument.bandpass import Bandpass
 from ..instrument.camera import Camera, Detector
 from ..instrument.night import StochasticNight
+from ..instrument.ray_bundle import lagrange_weights
 from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
 from ..instrument.telescope import telescope_beam
 from .film_fields import add_mode, add_periodic_mode, light_in
@@ -135,7 +136,7 @@ def detected_sky(
     radius = _field_radius_deg(sensor, thickness_um.shape, float(light["pixel_scale_arcsec"]))
     nodes = np.sqrt(np.linspace(radius.min() ** 2, radius.max() ** 2, FIELD_NODES))
     grid = _grid(thickness_um)
-    shares = _lagrange(nodes**2, radius**2)
+    shares = lagrange_weights(nodes**2, radius**2).astype(np.float32)
     total = np.zeros((len(parts), *thickness_um.shape), dtype=np.float32)
     for node, share in zip(nodes, shares, strict=True):
         many, few = (_angles(light["beam"], float(node), number) for number in (BEAM_NODES, CONTINUUM_NODES))
@@ -189,15 +190,6 @@ def _grid(thickness_um: NDArray[np.floating]) -> FloatArray:
     low, high = float(np.min(thickness_um)), float(np.max(thickness_um))
     points = math.ceil((high - low) / STEP_UM) + 9
     return np.asarray(max(low - 4.0 * STEP_UM, 0.0) + STEP_UM * np.arange(points, dtype=float))
-
-
-def _lagrange(nodes: FloatArray, place: FloatArray) -> list[NDArray[np.float32]]:
-    """Weights of the nodes at every place."""
-    weights = []
-    for number, node in enumerate(nodes):
-        others = np.delete(nodes, number)
-        weights.append(np.prod([(place - other) / (node - other) for other in others], axis=0))
-    return [weight.astype(np.float32) for weight in weights]
 
 
 def _summed(
