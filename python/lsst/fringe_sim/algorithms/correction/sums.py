@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +10,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from ...compiled import run_threaded
 from ...errors import UndeterminedError
 from .background import CUBIC, BackgroundTerms
 
@@ -94,8 +93,7 @@ class FrameSums:
 
     def use(self, used: BoolArray) -> None:
         """Take these pixels into the sums, and all others out of them."""
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            list(pool.map(lambda row: self._use_row(row, used), range(len(self.background.rows))))
+        run_threaded(lambda row: self._use_row(row, used), len(self.background.rows))
         self.used = used
 
     def solve(self, cells: BoolArray | None = None, *, templates: bool = True) -> Solution:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compiled import kernel, run_threaded
+from ...compiled import kernel, processors, run_threaded
 from ...errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ...model import FringeModel
 from ...optics.system import OBSERVABLES
@@ -99,7 +98,7 @@ def fit_thickness(
         nuisances. If the flats cannot tell, the fringes of the silicon count as noise and the
         keyword ``SIFIT`` of the map is false; ``SIWHY`` says why.
     threads : `int`, optional
-        Number of threads; as many as there are processors if not given. Has no influence on the result.
+        Number of threads; that of `compiled.processors` if not given. Has no influence on the result.
 
     Returns
     -------
@@ -126,7 +125,7 @@ def fit_thickness(
     if not 0.0 < slip_limit <= 1.0:
         raise OutOfRangeError("slip limit", slip_limit, "above 0, at most 1")
     refuse_noiseless(cube.metadata, cube.detector or None)
-    workers = threads if threads is not None else len(os.sched_getaffinity(0))
+    workers = processors() if threads is None else threads
     if not any((plane == 0).any() for plane in cube.mask):
         raise InputError("good pixels of the cube", 0, "one or more", source=cube.detector or None)
     model = model_of_flats(model, cube.exposures)
