@@ -47,6 +47,11 @@ TITLES = {
 }
 
 
+def counted(path: str) -> bool:
+    """Whether a file is code to read; spoilt input that the faults are made of is not."""
+    return path.endswith(".py") and "corpus" not in PurePosixPath(path).parts
+
+
 def sources(revision: str | None) -> dict[PurePosixPath, str]:
     """Python files of package and tests, by path, of a revision or of the work tree."""
     command = ["git", "-C", str(TOP)]
@@ -54,7 +59,7 @@ def sources(revision: str | None) -> dict[PurePosixPath, str]:
         listed = subprocess.run(
             [*command, "ls-files", "python", "tests"], check=True, capture_output=True, text=True
         )
-        paths = [path for path in listed.stdout.split("\n") if path.endswith(".py") and (TOP / path).exists()]
+        paths = [path for path in listed.stdout.split("\n") if counted(path) and (TOP / path).exists()]
         return {PurePosixPath(path): (TOP / path).read_text() for path in paths}
     packed = subprocess.run(
         [*command, "archive", revision, "python", "tests"], check=True, capture_output=True
@@ -62,7 +67,7 @@ def sources(revision: str | None) -> dict[PurePosixPath, str]:
     found = {}
     with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
         for member in archive:
-            if member.isfile() and member.name.endswith(".py"):
+            if member.isfile() and counted(member.name):
                 found[PurePosixPath(member.name)] = archive.extractfile(member).read().decode()
     return found
 
