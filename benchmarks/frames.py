@@ -1,11 +1,10 @@
-"""Frames of 16.4 Mpix from tables, beside numpy and scipy."""
+"""Frames of 16.4 Mpix from tables, beside numpy."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import map_coordinates, spline_filter
 
-from lsst.fringe_sim.model import ResponseTable, TwoLayerTable, response_table, two_layer_table
+from lsst.fringe_sim.model import ResponseTable, response_table
 from lsst.fringe_sim.optics import Beam, Illumination, LayerStack
 from lsst.fringe_sim.optics.illumination import MonochromaticProfile
 from lsst.fringe_sim.optics.system import OpticalSystem
@@ -15,14 +14,13 @@ from ._table import Row, median_time
 SHAPE = (4096, 4004)
 
 
-def thickness_maps() -> tuple[np.ndarray, np.ndarray]:
-    """Smooth maps with the grain of a measurement."""
+def thickness_map() -> np.ndarray:
+    """A smooth map with the grain of a measurement."""
     y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
     rng = np.random.default_rng(3)
     adhesive = 18.0 + 3.0 * np.sin(x / 900.0) * np.cos(y / 1100.0)
     adhesive += 0.01 * rng.standard_normal(SHAPE, dtype=np.float32)
-    silicon = 100.0 + 0.2 * np.cos(x / 1500.0 + y / 800.0)
-    return adhesive.astype(np.float32), silicon.astype(np.float32)
+    return adhesive.astype(np.float32)
 
 
 def run() -> list[Row]:
@@ -30,15 +28,13 @@ def run() -> list[Row]:
     system = OpticalSystem(LayerStack.from_resource("e2v_ccd250"), 173.0, MonochromaticProfile(), beam)
     light = Illumination.spectrum(np.linspace(930.0, 1050.0, 20), np.ones(20), beam)
     table = response_table(system, light, (14.0, 22.0))
-    both = two_layer_table(system, light, (14.5, 21.5), (99.7, 100.3), tolerance=1e-6)
-    adhesive, silicon = thickness_maps()
+    adhesive = thickness_map()
     out = np.empty(SHAPE, dtype=np.float32)
     copy_s = median_time(lambda: np.copyto(out, adhesive), 7)
     pixels = float(out.size)
     return [
         Row("16.4 Mpix, memory", "copy of a float32 image", copy_s, pixels),
         *one_layer(table, adhesive, out, pixels, copy_s),
-        *two_layers(both, adhesive, silicon, out, pixels, copy_s),
     ]
 
 
@@ -59,41 +55,5 @@ def one_layer(
             pixels,
             numpy_s / pixels,
             f"{ours_s / copy_s:.1f} copies; float32 rounding {error:.0e}",
-        ),
-    ]
-
-
-def two_layers(
-    table: TwoLayerTable,
-    adhesive: np.ndarray,
-    silicon: np.ndarray,
-    out: np.ndarray,
-    pixels: float,
-    copy_s: float,
-) -> list[Row]:
-    filtered = spline_filter(table.values[0], 3)
-
-    def scipy_way() -> np.ndarray:
-        place = np.stack(
-            [
-                (adhesive - table.start_um[0]) / table.step_um[0],
-                (silicon - table.start_um[1]) / table.step_um[1],
-            ]
-        )
-        return map_coordinates(filtered, place, order=3, prefilter=False, output=np.float32)
-
-    scipy_s = median_time(scipy_way, 1)
-    ours_s = median_time(lambda: table.frame(adhesive, silicon, 0, out), 5)
-    error = np.abs(out - scipy_way()).max()
-    work = f"16.4 Mpix from a table of {table.values.shape[1]} × {table.values.shape[2]} thicknesses"
-    return [
-        Row(work, "scipy map_coordinates (order 3)", scipy_s, pixels),
-        Row(
-            work,
-            "TwoLayerTable.frame (cubic)",
-            ours_s,
-            pixels,
-            scipy_s / pixels,
-            f"{ours_s / (1.5 * copy_s):.1f} times the memory traffic; largest difference {error:.0e}",
         ),
     ]

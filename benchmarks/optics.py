@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import tmm
 
-from lsst.fringe_sim.optics import Beam, Illumination, LayerStack, ThicknessGrid, layer_absorption
+from lsst.fringe_sim.optics import Beam, Illumination, LayerStack, layer_absorption
 from lsst.fringe_sim.optics.closed_form import on_grid
 from lsst.fringe_sim.optics.illumination import GaussianProfile, MonochromaticProfile
 from lsst.fringe_sim.optics.system import OpticalSystem
@@ -162,9 +162,6 @@ def sky_table() -> list[Row]:
     error = np.abs(ours() - exact).max() / np.ptp(exact)
     direct_s, ours_s = median_time(direct, 5), median_time(ours, 7)
     cpu_s = median_time(ours, 7, cpu=True)
-    both = system.reduce_two_layers(light)
-    lower, upper = ThicknessGrid(14.0, 0.02, 64), ThicknessGrid(99.5, 0.005, 200)
-    two_s = median_time(lambda: both.averaged_on_grid(light.weight, lower, upper), 1)
     return [
         Row(work, "direct sum of the closed form", direct_s, evaluations),
         Row(
@@ -174,12 +171,6 @@ def sky_table() -> list[Row]:
             evaluations,
             direct_s / evaluations,
             f"{cpu_s:.2f} s of processor time; {error:.0e} of peak-to-peak from the direct sum",
-        ),
-        Row(
-            "the same over adhesive and silicon: 64 × 200 thicknesses",
-            "closed form of two phases",
-            two_s,
-            float(light.weight.size * 2 * 64 * 200),
         ),
     ]
 

@@ -54,21 +54,6 @@ def test_order_of_wavelengths_does_not_matter(model) -> None:
     np.testing.assert_array_equal(model.response(thickness, WAVELENGTHS[::-1])[::-1], forward)
 
 
-def test_derivative_matches_differences(model) -> None:
-    thickness = np.linspace(14.0, 14.6, 31)
-    step = 1e-4
-    points = [model.response(thickness + k * step, WAVELENGTHS) for k in (-2, -1, 1, 2)]
-    numeric = (points[0] - 8.0 * points[1] + 8.0 * points[2] - points[3]) / (12.0 * step)
-    np.testing.assert_allclose(
-        model.thickness_derivative(thickness, WAVELENGTHS), numeric, rtol=0.0, atol=1e-9
-    )
-
-
-def test_derivative_refuses_effects_it_does_not_know(model) -> None:
-    with pytest.raises(InputError, match="contrast_loss"):
-        model.with_effects({"contrast_loss.factor": 0.5}).thickness_derivative([14.0], [960.0])
-
-
 def test_quadrature_is_converged(model) -> None:
     assert model.quadrature_error(WAVELENGTHS, np.linspace(5.0, 30.0, 101)) < 1e-7
 
@@ -114,8 +99,6 @@ def test_quantities_are_converted_or_refused(model) -> None:
     plain = model.response([16.0, 16.1], [960.0])
     given = model.response([16000.0, 16100.0] * units.nm, [0.96] * units.um)
     np.testing.assert_allclose(given, plain, rtol=1e-12)
-    slope = model.thickness_derivative(0.016 * units.mm, 9600 * units.AA)
-    np.testing.assert_allclose(slope, model.thickness_derivative(16.0, 960.0), rtol=1e-9)
     for thickness, wavelength in ((16.0 * units.s, 960.0), (16.0, 960.0 * units.K)):
         with pytest.raises(InputError, match="quantity"):
             model.response(thickness, wavelength)

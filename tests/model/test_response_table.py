@@ -63,15 +63,6 @@ def test_bound_of_the_fourth_derivative_holds(rng: np.random.Generator) -> None:
         assert sharpness * bound < seen < bound
 
 
-@pytest.mark.rng("derivative is that of the response")
-def test_derivative_is_that_of_the_response(table: ResponseTable, rng: np.random.Generator) -> None:
-    optics = system()
-    light = optics.flat_fields(WAVELENGTHS)
-    thickness = rng.uniform(14.0, 16.0, 500)
-    exact = optics.reduce(light).averaged_derivative(light.weight, thickness)
-    assert np.abs(table.thickness_derivative(thickness) - exact).max() < 1e-4 * np.abs(exact).max()
-
-
 @pytest.mark.rng("frame is lookup in single precision")
 def test_frame_is_lookup_in_single_precision(table: ResponseTable, rng: np.random.Generator) -> None:
     thickness = rng.uniform(14.0, 16.0, (37, 53))

@@ -27,13 +27,3 @@ def test_errors_of_single_exposures_are_interpolated_and_add_up(system: OpticalS
     np.testing.assert_allclose(
         twice.true_wavelength(nominal) - nominal, [1.8, 1.8, 1.2, 0.6, 1.0], atol=1e-12
     )
-
-
-def test_nominal_wavelength_is_the_inverse(system: OpticalSystem) -> None:
-    rng = np.random.default_rng()
-    errors = tuple((float(node), float(rng.normal(0.0, 0.5))) for node in range(800, 1051, 10))
-    moved = dataclasses.replace(
-        system, wavelength_errors_nm=(errors,), wavelength_offset_nm=2.0, wavelength_stretch=0.02
-    )
-    nominal = np.linspace(850.0, 1000.0, 37)
-    np.testing.assert_allclose(moved.nominal_wavelength(moved.true_wavelength(nominal)), nominal, atol=1e-6)

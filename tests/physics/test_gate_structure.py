@@ -35,7 +35,7 @@ def test_a_pixel_is_the_mean_of_its_parts() -> None:
             )
             reduced = model.system.reduce(light)
             assert reduced.averaged(light.weight, [adhesive])[0, 0] == pytest.approx(own, rel=1e-9)
-            derivative = reduced.averaged_derivative(light.weight, [adhesive])[0, 0]
+            derivative = reduced.averaged_derivative_on_grid(light.weight, adhesive, 0.01, 1)[0, 0]
             ahead, behind = (
                 0.7 * absorbed(model, wave, adhesive + step, gates)
                 + 0.3 * absorbed(model, wave, adhesive + step, 2.0 * gates)

@@ -3,16 +3,13 @@
 from ..instrument.setup import Setup, setup_names
 from .fringe_model import LABORATORY_TEMPERATURE, FringeModel
 from .response_table import ResponseTable, response_table, tabulate
-from .two_layer_table import TwoLayerTable, two_layer_table
 
 __all__ = [
     "LABORATORY_TEMPERATURE",
     "FringeModel",
     "ResponseTable",
     "Setup",
-    "TwoLayerTable",
     "response_table",
     "setup_names",
     "tabulate",
-    "two_layer_table",
 ]

@@ -320,22 +320,6 @@ class FringeModel:
         return tabulate(sample, thickness_range_um, labels, tolerance=tolerance)
 
     @named_units
-    def thickness_derivative(self, thickness_um: ArrayLike, wavelength_nm: ArrayLike) -> FloatArray:
-        """Exact derivative of `response` with respect to thickness [1/µm].
-
-        Raises
-        ------
-        InputError
-            An effect acts on the response after the optics; its derivative is not known here.
-        """
-        late = [item.effect.name for item in self.effects if item.effect.acts_on == "response"]
-        if late:
-            raise InputError("effects", late, "effects of the stack or of the illumination")
-        illumination = self.system.flat_fields(self._wavelength(wavelength_nm))
-        thickness = self.checked_thickness_um(thickness_um)
-        return self.system.reduce(illumination).averaged_derivative(illumination.weight, thickness)
-
-    @named_units
     def fringe_order_um(self, wavelength_nm: ArrayLike) -> FloatArray:
         """Thickness of one fringe order at normal incidence, λ / 2n of the varying layer [µm].
 

@@ -114,17 +114,8 @@ class ResponseTable:
         thickness = np.asarray(thickness_um, dtype=float)
         flat = np.ascontiguousarray(thickness).ravel()
         self._demand_inside(flat)
-        out = self._interpolated(flat, 0)
+        out = self._interpolated(flat)
         return out.reshape(len(out), *thickness.shape)
-
-    @named_units
-    def thickness_derivative(self, thickness_um: ArrayLike) -> FloatArray:
-        """Derivative of `lookup` [1/µm]; same shape and errors."""
-        thickness = np.asarray(thickness_um, dtype=float)
-        flat = np.ascontiguousarray(thickness).ravel()
-        self._demand_inside(flat)
-        out = self._interpolated(flat, 1)
-        return (out / self.step_um).reshape(len(out), *thickness.shape)
 
     @named_units
     def frame(
@@ -179,13 +170,13 @@ class ResponseTable:
             self._demand_inside(np.asarray(image[int(np.argmax(outside))], dtype=float))
         return out
 
-    def _interpolated(self, thickness: FloatArray, order: int) -> FloatArray:
+    def _interpolated(self, thickness: FloatArray) -> FloatArray:
         out = np.empty((len(self.values), thickness.size))
         polynomials = contiguous(self.polynomials)
         thickness = contiguous(thickness)
 
         def work(first: int, last: int) -> None:
-            _lookup_kernel(polynomials, self.start_um, 1.0 / self.step_um, thickness, order, first, last, out)
+            _lookup_kernel(polynomials, self.start_um, 1.0 / self.step_um, thickness, first, last, out)
 
         run_shares(work, thickness.size, _LEAST_PIXELS)
         return out
@@ -341,7 +332,6 @@ def _lookup_kernel(
     start: float,
     per_step: float,
     thickness: NDArray,
-    order: int,
     first: int,
     last: int,
     out: NDArray,
@@ -357,10 +347,7 @@ def _lookup_kernel(
         t = position - cell
         for row in range(rows):
             c = polynomials[row, cell]
-            if order == 0:
-                out[row, i] = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
-            else:
-                out[row, i] = c[1] + t * (2.0 * c[2] + t * 3.0 * c[3])
+            out[row, i] = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
 
 
 @kernel(relaxed=True)

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from .stack import Layer as Layer
     from .stack import LayerStack as LayerStack
     from .transfer_matrix import layer_absorption as layer_absorption
-    from .two_phase_response import ThicknessGrid as ThicknessGrid
-    from .two_phase_response import TwoPhaseResponse as TwoPhaseResponse
-    from .two_phase_response import reduce_to_two_phases as reduce_to_two_phases
 
 _LAZY = {
     "Beam": ".illumination",
@@ -36,14 +33,11 @@ _LAZY = {
     "Medium": ".media",
     "PhaseResponse": ".phase_response",
     "SpectralProfile": ".illumination",
-    "ThicknessGrid": ".two_phase_response",
-    "TwoPhaseResponse": ".two_phase_response",
     "constant_medium": ".media",
     "get_medium": ".media",
     "layer_absorption": ".transfer_matrix",
     "medium_names": ".media",
     "reduce_to_phase": ".phase_response",
-    "reduce_to_two_phases": ".two_phase_response",
 }
 
 __all__ = sorted(_LAZY)  # pyright: ignore[reportUnsupportedDunderAll]

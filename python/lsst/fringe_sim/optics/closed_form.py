@@ -23,14 +23,12 @@ _ANCHOR = 64
 """Steps of the phase recurrence between two exact evaluations; keeps its rounding error below 1e-14."""
 
 
-def at_thicknesses(
-    arrays: tuple[np.ndarray, ...], weights: FloatArray, thickness: FloatArray, order: int
-) -> FloatArray:
-    """The closed form or its derivative at all thicknesses, in threads; ``(W, N)``."""
+def at_thicknesses(arrays: tuple[np.ndarray, ...], weights: FloatArray, thickness: FloatArray) -> FloatArray:
+    """The closed form at all thicknesses, in threads; ``(W, N)``."""
     out = np.empty((len(weights), thickness.size))
 
     def work(first: int, last: int) -> None:
-        _point_kernel((*arrays, weights), thickness, np.int64(order), first, last, out)
+        _point_kernel((*arrays, weights), thickness, first, last, out)
 
     run_shares(work, thickness.size, _LEAST_WORK // weights.size)
     return out
@@ -54,7 +52,6 @@ def on_grid(
 def _point_kernel(
     nodes: Nodes,
     d: NDArray,
-    order: int,
     first: int,
     last: int,
     out: NDArray,
@@ -69,17 +66,9 @@ def _point_kernel(
                 angle = kappa[m, q].real * d[i]
                 z = complex(size * math.cos(angle), size * math.sin(angle))
                 top = a[m, q] + (b[m, q] * size + e[m, q]) * size + 2.0 * (c[m, q] * z).real
-                if order == 0:
-                    u = 1.0 + g[m, q].real * z.real - g[m, q].imag * z.imag
-                    v = g[m, q].real * z.imag + g[m, q].imag * z.real
-                    total += w[m, q] * top / (u * u + v * v)
-                    continue
-                field = 1.0 + g[m, q] * z
-                bottom = field.real * field.real + field.imag * field.imag
-                dz, dsize = 1j * kappa[m, q] * z, -kappa[m, q].imag * size
-                dtop = (2.0 * b[m, q] * size + e[m, q]) * dsize + 2.0 * (c[m, q] * dz).real
-                dbottom = 2.0 * (field.conjugate() * g[m, q] * dz).real
-                total += w[m, q] * (dtop * bottom - top * dbottom) / (bottom * bottom)
+                u = 1.0 + g[m, q].real * z.real - g[m, q].imag * z.imag
+                v = g[m, q].real * z.imag + g[m, q].imag * z.real
+                total += w[m, q] * top / (u * u + v * v)
             out[m, i] = total
 
 

@@ -391,21 +391,20 @@ def _add_harmonic(value, low, window, grid):  # type: ignore[no-untyped-def]  # 
 
 @subkernel
 def _transparent_sum(
-    s: float, c: complex, h: complex, kr: float, spread: float, where: float, order: int
+    s: float, c: complex, h: complex, kr: float, spread: float, where: float
 ) -> float:  # pragma: no cover - compiled
     """Sum of all harmonics of one node in a transparent layer, by multiplication."""
     norm = 1.0 / (1.0 - abs(h) ** 2)
     turn = h * np.exp(1j * kr * where)
     value = norm * (s * h + c + c.conjugate() * h * h) * np.exp(1j * kr * where)
-    total = norm * (s + 2.0 * (c.conjugate() * h).real) if order == 0 else 0.0
+    total = norm * (s + 2.0 * (c.conjugate() * h).real)
     # exp(-(m sigma)²/2) from one m to the next
     damping = math.exp(-0.5 * (kr * spread) ** 2)
     further, square = damping**3, damping**2
     for m in range(1, _MOST_TERMS):
-        rate = complex(0.0, m * kr) ** order if order > 0 else complex(1.0, 0.0)
-        term = value * (damping * rate)
+        term = value * damping
         total += 2.0 * term.real
-        if m >= 2 and abs(term) < _SMALLEST * (m * kr) ** order:
+        if m >= 2 and abs(term) < _SMALLEST:
             break
         value *= turn
         damping *= further
@@ -413,13 +412,13 @@ def _transparent_sum(
     return total
 
 
-def series_at(nodes: tuple[NDArray, ...], spread: float, thickness: NDArray, order: int) -> NDArray:
-    """Weighted mean, or a derivative, at any thickness; shapes ``(W, Q)``, ``(N,)`` -> ``(W, N)``."""
+def series_at(nodes: tuple[NDArray, ...], spread: float, thickness: NDArray) -> NDArray:
+    """Weighted mean at any thickness; shapes ``(W, Q)``, ``(N,)`` -> ``(W, N)``."""
     nodes = tuple(contiguous(each) for each in nodes)
     out = np.zeros((len(nodes[-1]), thickness.size))
 
     def work(first: int, last: int) -> None:
-        _series_kernel(nodes, spread, thickness, order, first, last, out)
+        _series_kernel(nodes, spread, thickness, first, last, out)
 
     run_shares(work, thickness.size, _LEAST_SUMS // nodes[-1].size)
     return out
@@ -427,7 +426,7 @@ def series_at(nodes: tuple[NDArray, ...], spread: float, thickness: NDArray, ord
 
 @kernel
 def _series_kernel(  # type: ignore[no-untyped-def]
-    nodes, spread, thickness, order, first, last, out
+    nodes, spread, thickness, first, last, out
 ):  # pragma: no cover - compiled
     a, b, e, c, g, kappa, w = nodes
     groups, many = w.shape
@@ -436,19 +435,18 @@ def _series_kernel(  # type: ignore[no-untyped-def]
         for group in range(groups):
             total = 0.0
             for q in range(many):
-                scale = abs(kappa[group, q])
                 if kappa[group, q].imag == 0.0:
                     total += w[group, q] * _transparent_sum(
-                        a[group, q] + b[group, q] + e[group, q], c[group, q], -g[group, q], scale, spread,
-                        thickness[i], order,
+                        a[group, q] + b[group, q] + e[group, q], c[group, q], -g[group, q],
+                        abs(kappa[group, q]), spread, thickness[i],
                     )  # fmt: skip
                     continue
                 for m in range(_MOST_TERMS):
                     amount = _harmonic(
                         m, a[group, q], b[group, q], e[group, q], c[group, q], -g[group, q], kappa[group, q],
-                        spread, thickness[i], order, harmonic,
+                        spread, thickness[i], 0, harmonic,
                     )  # fmt: skip
                     total += (1.0 if m == 0 else 2.0) * w[group, q] * harmonic[0].real
-                    if m >= 2 and amount < _SMALLEST * (m * scale) ** order:
+                    if m >= 2 and amount < _SMALLEST:
                         break
             out[group, i] = total

@@ -117,30 +117,12 @@ class PhaseResponse:
         """
         thickness = _checked_thickness(thickness_um)
         if self.spread_um > 0.0:
-            return self._spread_at_nodes(thickness, 0)
+            return self._spread_at_nodes(thickness)
         a, b, e, c, g, kappa, share = self._aligned(thickness.ndim)
         z = np.exp(1j * kappa * thickness)
         size = np.abs(z)
         top = a + b * size**2 + e * size + 2.0 * (c * z).real
         return (share * top / np.abs(1.0 + g * z) ** 2).sum(axis=0)
-
-    @named_units
-    def thickness_derivative(self, thickness_um: ArrayLike) -> FloatArray:
-        """Exact derivative of `evaluate` with respect to thickness [1/µm]; same shape."""
-        thickness = _checked_thickness(thickness_um)
-        if self.spread_um > 0.0:
-            return self._spread_at_nodes(thickness, 1)
-        a, b, e, c, g, kappa, share = self._aligned(thickness.ndim)
-        z = np.exp(1j * kappa * thickness)
-        dz = 1j * kappa * z
-        size = np.abs(z)
-        dsize = -kappa.imag * size
-        top = a + b * size**2 + e * size + 2.0 * (c * z).real
-        dtop = 2.0 * b * size * dsize + e * dsize + 2.0 * (c * dz).real
-        bottom_field = 1.0 + g * z
-        bottom = np.abs(bottom_field) ** 2
-        dbottom = 2.0 * (np.conj(bottom_field) * g * dz).real
-        return (share * (dtop * bottom - top * dbottom) / bottom**2).sum(axis=0)
 
     def _aligned(self, axes: int) -> list[np.ndarray]:
         """Coefficients and shares, the state axis in front of all axes that broadcast."""
@@ -148,7 +130,7 @@ class PhaseResponse:
         names = (*_COEFFICIENTS, "share")
         return [getattr(self, name).reshape(len(self.a), *pad, *self.node_shape) for name in names]
 
-    def _spread_at_nodes(self, thickness: FloatArray, order: int) -> FloatArray:
+    def _spread_at_nodes(self, thickness: FloatArray) -> FloatArray:
         shape = np.broadcast_shapes(self.node_shape, thickness.shape)
         states = (len(self.a), *shape)
 
@@ -159,9 +141,7 @@ class PhaseResponse:
         place = np.broadcast_to(thickness, shape).ravel()
         out = np.array(
             [
-                series_at(tuple(part[i : i + 1] for part in spread), self.spread_um, place[i : i + 1], order)[
-                    0, 0
-                ]
+                series_at(tuple(part[i : i + 1] for part in spread), self.spread_um, place[i : i + 1])[0, 0]
                 for i in range(place.size)
             ]
         )
@@ -182,7 +162,14 @@ class PhaseResponse:
         -------
         response : `numpy.ndarray`, shape ``(W, *thickness.shape)`` (or ``thickness.shape``)
         """
-        return self._averaged(weight, thickness_um, 0)
+        thickness = _checked_thickness(thickness_um)
+        arrays, weights, squeeze = self._grouped(weight)
+        flat = np.ascontiguousarray(thickness).ravel()
+        if self.spread_um > 0.0:
+            out = series_at((*arrays, weights), self.spread_um, flat)
+        else:
+            out = at_thicknesses(arrays, weights, flat)
+        return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
 
     @named_units
     def averaged_on_grid(
@@ -219,21 +206,6 @@ class PhaseResponse:
 
     def _series_pays(self) -> bool:
         return bool(np.abs(self.g).max() < _LARGEST_RATIO and not np.any(self.kappa.imag))
-
-    @named_units
-    def averaged_derivative(self, weight: ArrayLike, thickness_um: ArrayLike) -> FloatArray:
-        """Thickness derivative of `averaged` [1/µm]; same shape."""
-        return self._averaged(weight, thickness_um, 1)
-
-    def _averaged(self, weight: ArrayLike, thickness_um: ArrayLike, order: int) -> FloatArray:
-        thickness = _checked_thickness(thickness_um)
-        arrays, weights, squeeze = self._grouped(weight)
-        flat = np.ascontiguousarray(thickness).ravel()
-        if self.spread_um > 0.0:
-            out = series_at((*arrays, weights), self.spread_um, flat, order)
-        else:
-            out = at_thicknesses(arrays, weights, flat, order)
-        return out[0].reshape(thickness.shape) if squeeze else out.reshape(len(out), *thickness.shape)
 
     @named_units
     def derivative_bound(self, weight: ArrayLike, order: int, from_um: float = 0.0) -> FloatArray:

@@ -13,12 +13,8 @@ from .diffuse import DiffuseReturn
 from .illumination import DEFAULT_STEP_NM, Beam, Illumination, LampSpectrum, SpectralProfile
 from .phase_response import PhaseResponse, reduce_to_phase
 from .stack import LayerStack
-from .two_phase_response import TwoPhaseResponse, reduce_to_two_phases
 
 __all__ = ["OBSERVABLES", "OpticalSystem", "Structure"]
-
-INVERSIONS = 40
-"""Fixed-point steps from a true wavelength to the nominal one; each leaves a part of the slope of the errors."""
 
 OBSERVABLES = ("detection", "total")
 """``detection``: absorbed in the detection layer. ``total``: 1 - R - T of the stack, as the paper's fit used."""
@@ -108,16 +104,6 @@ class OpticalSystem:
         stretched = self.wavelength_stretch * (nominal - self.stretch_pivot_nm)
         return nominal + self.wavelength_offset_nm + stretched + self._single_errors(nominal)
 
-    @named_units
-    def nominal_wavelength(self, true_nm: ArrayLike) -> np.ndarray:
-        """Wavelength to which the monochromator is set where it delivers ``true_nm`` [nm]."""
-        true = np.asarray(true_nm, dtype=float)
-        without = true - self.wavelength_offset_nm + self.wavelength_stretch * self.stretch_pivot_nm
-        nominal = without / (1.0 + self.wavelength_stretch)
-        for _ in range(INVERSIONS if self.wavelength_errors_nm else 0):
-            nominal = (without - self._single_errors(nominal)) / (1.0 + self.wavelength_stretch)
-        return nominal
-
     def _single_errors(self, nominal_nm: np.ndarray) -> np.ndarray:
         total = np.zeros(nominal_nm.shape)
         for errors in self.wavelength_errors_nm:
@@ -169,35 +155,3 @@ class OpticalSystem:
                 reduced(layers=[self.stack.position(name)], attenuation=taken), factor * seen
             )
         return response
-
-    def reduce_two_layers(self, illumination: Illumination) -> TwoPhaseResponse:
-        """Closed form in the thickness of the detection layer and of the varying layer below it.
-
-        Raises
-        ------
-        InputError
-            The observable is not the detection layer, the varying layer does not lie below it, or a layer is not
-            fully coherent.
-        """
-        if self.observable != "detection":
-            raise InputError("observable", self.observable, "detection (with two varying layers)")
-        if self.diffuse is not None:
-            raise InputError("diffuse return", self.diffuse.reflectance, "none (with two varying layers)")
-        if self.structure is not None:
-            raise InputError("structure", self.structure.layer, "none (with two varying layers)")
-        if np.any(self.stack.thickness_spread_um):
-            raise InputError(
-                "thickness spread", self.stack.thickness_spread_um.tolist(), "zero in all layers"
-            )
-        index = self.stack.indices(illumination.wavelength_nm, self.temperature_k)
-        thickness = np.where(np.isinf(self.stack.thickness_um), 0.0, self.stack.thickness_um)
-        return reduce_to_two_phases(
-            index,
-            thickness,
-            1e-3 * illumination.wavelength_nm,
-            illumination.theta,
-            self.polarization,
-            upper=self.stack.position(self.detection),
-            lower=self.stack.position(self.varying),
-            roughness=1e-3 * self.stack.roughness_nm,
-        )
