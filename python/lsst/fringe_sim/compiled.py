@@ -35,15 +35,10 @@ def kernel(
 ) -> Any:
     """Compile a function that Python calls.
 
-    Parameters
-    ----------
-    function : callable, optional
-        Numpy arrays and numbers in, and out.
-    relaxed : `bool` or `set` [`str`], optional
-        Whether sums and products may be reordered and contracted, as vector instructions need; or which of the
-        freedoms of rounding of LLVM.
-    parallel : `bool`, optional
-        Whether its loops over ``prange`` run in threads of numba.
+    ``function``: numpy arrays and numbers in, and out.
+    ``relaxed``: whether sums and products may be reordered and contracted, as vector instructions need; or
+        which of the freedoms of rounding of LLVM.
+    ``parallel``: whether its loops over ``prange`` run in threads of numba.
     """
     return _compiled(function, fastmath=_RELAXED if relaxed is True else relaxed, parallel=parallel)
 
@@ -53,15 +48,10 @@ def subkernel(
 ) -> Any:
     """Compile a function that only compiled functions call.
 
-    Parameters
-    ----------
-    function : callable, optional
-        As for `kernel`.
-    relaxed : `bool`, optional
-        As for `kernel`; the function is then always put into what calls it.
-    expand : `bool`, optional
-        Put the source, not the machine code, into what calls it: dearer to compile, for innermost loops that are
-        faster so.
+    ``function``: as for `kernel`.
+    ``relaxed``: as for `kernel`; the function is then always put into what calls it.
+    ``expand``: put the source, not the machine code, into what calls it: dearer to compile, for innermost
+        loops that are faster so.
     """
     inside = {"inline": "always"} if expand else {"forceinline": True} if relaxed else {}
     return _compiled(
@@ -155,14 +145,9 @@ _limit: list[int | None] = [None]
 def run_threaded(work: Callable[[int], object], count: int, threads: int | None = None) -> None:
     """Call ``work(i)`` for every ``i < count``; each call writes to its own place, so order does not matter.
 
-    Parameters
-    ----------
-    work : callable
-        Releases the interpreter lock most of the time.
-    count : `int`
-        Number of calls.
-    threads : `int`, optional
-        Number of threads; that of `processors` if not given.
+    ``work``: releases the interpreter lock most of the time.
+    ``count``: number of calls.
+    ``threads``: number of threads; that of `processors` if not given.
     """
     threads = min(processors() if threads is None else threads, count)
     if threads <= 1:
@@ -183,14 +168,9 @@ def _share(work: Callable[[int], object], first: int, count: int, threads: int) 
 def run_shares(work: Callable[[int, int], object], count: int, least: int) -> None:
     """Call ``work(first, last)`` on shares of ``range(count)`` in threads.
 
-    Parameters
-    ----------
-    work : callable
-        As for `run_threaded`; what it does for one item must not depend on the share.
-    count : `int`
-        Number of items.
-    least : `int`
-        Items of a share that are worth a thread.
+    ``work``: as for `run_threaded`; what it does for one item must not depend on the share.
+    ``count``: number of items.
+    ``least``: items of a share that are worth a thread.
     """
     shares = max(1, min(_SHARES * processors(), count // max(least, 1))) if processors() > 1 else 1
     edges = [share * count // shares for share in range(shares + 1)]

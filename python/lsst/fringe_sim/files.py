@@ -26,16 +26,9 @@ def all_or_nothing(target: Path) -> Iterator[Path]:
     It becomes that file if the block ends well, and vanishes if not. The content is on the disk before it gets the
     name, so that not even a crash of the machine leaves half of it there.
 
-    Parameters
-    ----------
-    target : `pathlib.Path`
-        The file; an existing one is replaced. Where it is a link, the link is replaced and not what it points to.
-        What a writer of this file has left that was killed is cleared.
-
-    Raises
-    ------
-    OSError
-        The folder does not exist or cannot be written, or the disk is full.
+    ``target``: the file; an existing one is replaced. Where it is a link, the link is replaced and not what
+        it points to. What a writer of this file has left that was killed is cleared.
+    `OSError`: the folder does not exist or cannot be written, or the disk is full.
     """
     with _temporary(target) as temporary:
         yield temporary
@@ -58,21 +51,10 @@ def write_together(folder: Path, contents: Mapping[str, str]) -> Path:
 
     All of them are complete under temporary names before the first gets its own.
 
-    Parameters
-    ----------
-    folder : `pathlib.Path`
-        An existing folder.
-    contents : mapping of `str` to `str`
-        Text of each file by its name. The last one is the index, by which readers find the others.
-
-    Returns
-    -------
-    index : `pathlib.Path`
-
-    Raises
-    ------
-    OSError
-        The folder does not exist or cannot be written, or the disk is full: the files of before are then untouched.
+    ``folder``: an existing folder.
+    ``contents``: text of each file by its name. The last one is the index, by which readers find the others.
+    `OSError`: the folder does not exist or cannot be written, or the disk is full: the files of before are
+        then untouched.
     """
     *_, index = contents
     with ExitStack() as stack:

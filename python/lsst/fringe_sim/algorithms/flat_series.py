@@ -24,25 +24,16 @@ LEVEL_E = 20_000.0
 @named_units
 @dataclass(frozen=True)
 class FlatSeries:
-    """Flats that are taken under the same conditions.
+    """Flats that are taken under the same conditions."""
 
-    Attributes
-    ----------
-    wavelength_nm : `tuple` [`float`, ...]
-        Nominal wavelengths [nm].
-    level_e : `float`
-        Mean level [electrons].
-    bandwidth_fwhm_nm, temperature_k, f_number : `float` or `None`
-        Nominal width of the line [nm], temperature [K] and focal ratio; as in the set-up where not given.
-    dark_time_s : `tuple` [`float`, ...]
-        Time in which each flat gathers charge [s]; empty, the default, if not known.
-    """
-
-    wavelength_nm: tuple[float, ...]
-    level_e: float = LEVEL_E
+    wavelength_nm: tuple[float, ...]  # nominal wavelengths [nm]
+    level_e: float = LEVEL_E  # mean level [electrons]
+    # bandwidth_fwhm_nm, temperature_k, f_number: nominal width of the line [nm], temperature [K] and focal
+    # ratio; as in the set-up where not given
     bandwidth_fwhm_nm: float | None = None
     temperature_k: float | None = None
     f_number: float | None = None
+    # time in which each flat gathers charge [s]; empty, the default, if not known
     dark_time_s: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:

@@ -35,27 +35,15 @@ def smooth_masked(
     ``Σ G² w V / (Σ G w)²``. Pixels that are not good, or not finite, count nowhere; they receive the average of
     their good neighbours.
 
-    Parameters
-    ----------
-    image, variance : `numpy.ndarray` [y, x]
-        Values with independent noise, and their variance.
-    good : `numpy.ndarray` [y, x], bool
-        Pixels to use.
-    sigma_px : `float`
-        Standard deviation of the kernel [px], cut off at four of them; 0 leaves good pixels as they are.
-
-    Returns
-    -------
-    smoothed, variance : `numpy.ndarray` [y, x], float32
-        NaN in pixels that are not good and have less than 2 % of the kernel on good ones. Neighbouring values are
-        correlated: the noise of the result has a Gaussian correlation of standard deviation ``sqrt(2) sigma_px``.
-
-    Raises
-    ------
-    InputError
-        The arrays have different shapes, or are not two-dimensional.
-    OutOfRangeError
-        ``sigma_px`` is negative.
+    ``image``, ``variance``: values with independent noise, and their variance.
+    ``good``: pixels to use.
+    ``sigma_px``: standard deviation of the kernel [px], cut off at four of them; 0 leaves good pixels as they
+        are.
+    Returns NaN in pixels that are not good and have less than 2 % of the kernel on good ones. Neighbouring
+        values are correlated: the noise of the result has a Gaussian correlation of standard deviation
+        ``sqrt(2) sigma_px``.
+    `InputError`: the arrays have different shapes, or are not two-dimensional.
+    `OutOfRangeError`: ``sigma_px`` is negative.
     """
     if image.ndim != 2 or not image.shape == variance.shape == good.shape:
         shapes = (image.shape, variance.shape, good.shape)

@@ -53,10 +53,7 @@ BESIDE = "silicon_gradient"
 def known_silicon_um(silicon: ThicknessMap, shape: tuple[int, int]) -> FloatArray:
     """Thickness of the silicon [µm] on the pixels of the map of another layer; NaN where there is none.
 
-    Raises
-    ------
-    InputError
-        It is of another layer, or of other pixels.
+    `InputError`: it is of another layer, or of other pixels.
     """
     found = silicon.of_layer(DETECTION).known_um().astype(float)
     if found.shape != shape:
@@ -67,12 +64,8 @@ def known_silicon_um(silicon: ThicknessMap, shape: tuple[int, int]) -> FloatArra
 def silicon_nodes_um(model: FringeModel, silicon_um: FloatArray) -> tuple[float, ...]:
     """Thicknesses of the silicon that are tabulated for a map [µm]; one if it is the same everywhere.
 
-    Raises
-    ------
-    InputError
-        The set-up varies the silicon alone, or an effect says something else of it.
-    OutOfRangeError
-        No known thickness, or a range that is no silicon of one sensor.
+    `InputError`: the set-up varies the silicon alone, or an effect says something else of it.
+    `OutOfRangeError`: no known thickness, or a range that is no silicon of one sensor.
     """
     system = model.base_system
     if system.varying == system.detection:

@@ -49,24 +49,13 @@ _BOUND_ANGLES = 6
 @named_units
 @dataclass(frozen=True)
 class SkyQuadrature:
-    """How finely a sky is summed.
+    """How finely a sky is summed."""
 
-    Attributes
-    ----------
-    line_shift_nm : `float`
-        Rms shift allowed when close lines are merged [nm].
-    continuum_step_nm : `float`
-        Spacing of the wavelengths that stand for a continuum [nm].
-    continuum_angles : `int`
-        Angles used for a continuum, whose fringes average out over wavelength; lines use all of the beam.
-    table_tolerance : `float`
-        Interpolation error of a row of the table, relative to the mean sky.
-    """
-
-    line_shift_nm: float = 0.003
-    continuum_step_nm: float = 0.2
+    line_shift_nm: float = 0.003  # rms shift allowed when close lines are merged [nm]
+    continuum_step_nm: float = 0.2  # spacing of the wavelengths that stand for a continuum [nm]
+    # angles used for a continuum, whose fringes average out over wavelength; lines use all of the beam
     continuum_angles: int = 32
-    table_tolerance: float = 3e-7
+    table_tolerance: float = 3e-7  # interpolation error of a row of the table, relative to the mean sky
 
 
 class FrameTable(Protocol):
@@ -109,30 +98,15 @@ class Response(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SkyResponse:
-    """Electrons from the components of a sky, over thickness.
+    """Electrons from the components of a sky, over thickness."""
 
-    Attributes
-    ----------
-    component : `tuple` [`str`, ...]
-        Names of the components, C of them.
-    photons : `numpy.ndarray`, shape ``(C,)``
-        Photons behind air and optics [s⁻¹ m⁻² arcsec⁻²].
-    level : `float`
-        Electrons [s⁻¹ m⁻² arcsec⁻²] of all components together, averaged over the tabulated thicknesses.
-    table : `ResponseTable`
-        Electrons from each component as a fraction of `level`, one row per component.
-    quadrature_error : `float`
-        Estimated error of the sums over lines and angles, relative to the mean sky.
-    airmass : `float`
-        Airmass of the sky.
-    """
-
-    component: tuple[str, ...]
-    photons: FloatArray
+    component: tuple[str, ...]  # names of the components, C of them
+    photons: FloatArray  # (C,): photons behind air and optics [s⁻¹ m⁻² arcsec⁻²]
+    # electrons [s⁻¹ m⁻² arcsec⁻²] of all components together, averaged over the tabulated thicknesses
     level: float
-    table: ResponseTable
-    quadrature_error: float
-    airmass: float
+    table: ResponseTable  # electrons from each component as a fraction of `level`, one row per component
+    quadrature_error: float  # estimated error of the sums over lines and angles, relative to the mean sky
+    airmass: float  # airmass of the sky
 
     @property
     def bands(self) -> tuple[str, ...]:
@@ -154,10 +128,7 @@ class SkyResponse:
     def sky(self, scale: Mapping[str, float] | None = None) -> ResponseTable:
         """Electrons s⁻¹ m⁻² arcsec⁻² as a table of one row.
 
-        Parameters
-        ----------
-        scale : mapping, optional
-            Factors on components, by name; those not named stay as they are.
+        ``scale``: factors on components, by name; those not named stay as they are.
         """
         factors = self.factors(scale)
         rates = factors * self.photons

@@ -40,10 +40,8 @@ def read_section(
 ) -> SensorSection | None:
     """Pixels of a sensor that a map shows, by what its headers say or by its size; `None` if neither tells.
 
-    Raises
-    ------
-    FrameFormatError, OutOfRangeError
-        A header with a malformed section, or with pixels that the sensor does not have.
+    `FrameFormatError`, `OutOfRangeError`: a header with a malformed section, or with pixels that the sensor
+        does not have.
     """
     with complete_fits(path) as hdus:
         headers = [hdus[0].header, *(hdu.header for hdu in hdus[1:2])]
@@ -57,11 +55,8 @@ def read_section(
 def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Mapping from a YAML file, read with the safe loader, or effects from an override that a search has left.
 
-    Raises
-    ------
-    InputError
-        The file is empty, not YAML, not a mapping, or an override that is not whole or has anything in it but effects
-        and their numbers.
+    `InputError`: the file is empty, not YAML, not a mapping, or an override that is not whole or has anything
+        in it but effects and their numbers.
     """
     if Path(path).suffix == ".py":
         text = read_user_text(path, "override file", LONGEST_USER_FILE)
@@ -76,10 +71,8 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
 def sky_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Effects that a sensor takes along to the telescope; those of the laboratory are named and left out.
 
-    Raises
-    ------
-    UnknownNameError, OutOfRangeError, InputError
-        An effect that there is not, or a value that it cannot have.
+    `UnknownNameError`, `OutOfRangeError`, `InputError`: an effect that there is not, or a value that it cannot
+        have.
     """
     active = activate_effects(settings, known_effects())
     applied = {

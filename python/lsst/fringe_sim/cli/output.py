@@ -28,16 +28,10 @@ HEADER_BYTES = 57_600  # of a FITS file, in which its ORIGIN is looked for
 class OutputFolder(os.PathLike[str]):
     """Where a command writes.
 
-    Parameters
-    ----------
-    path : `pathlib.Path`
-        The folder; it need not exist.
-    products : `tuple` [`str`, ...]
-        Names of what the command writes there; ``*`` and ``[0-9]`` as in the shell.
-    overwrite : `bool`
-        Whether products of an earlier run are cleared. Nothing else ever is.
-    resumes : `bool`
-        Whether the command goes on with what an earlier run has left.
+    ``path``: the folder; it need not exist.
+    ``products``: names of what the command writes there; ``*`` and ``[0-9]`` as in the shell.
+    ``overwrite``: whether products of an earlier run are cleared. Nothing else ever is.
+    ``resumes``: whether the command goes on with what an earlier run has left.
     """
 
     path: Path
@@ -58,10 +52,8 @@ class OutputFolder(os.PathLike[str]):
     def refuse_used(self) -> None:
         """Refuse a folder with products of an earlier run, before long work.
 
-        Raises
-        ------
-        InputError
-            There are some, and neither are they to be cleared nor to be gone on with; or the path is a file.
+        `InputError`: there are some, and neither are they to be cleared nor to be gone on with; or the path
+            is a file.
         """
         if self.path.exists() and not self.path.is_dir():
             raise InputError("output folder", str(self), "a folder, not a file")
@@ -171,10 +163,7 @@ def _is_ours(path: Path) -> bool:
 def refuse_used_file(option: str, file: Path, overwrite: bool) -> None:
     """Refuse a file that is there already, or cannot be written, before long work.
 
-    Raises
-    ------
-    InputError
-        It is there and is not to be replaced, is no regular file, or its folder is not there.
+    `InputError`: it is there and is not to be replaced, is no regular file, or its folder is not there.
     """
     if file.exists() and not (overwrite and file.is_file()):
         allowed = "a file, not something else" if overwrite else "a new file; --overwrite replaces it"
@@ -193,18 +182,11 @@ def output_folder(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """``--out`` and ``--overwrite`` of a command, which gets them as one `OutputFolder` named ``out``.
 
-    Parameters
-    ----------
-    help_text : `str`
-        What ``--out`` says under ``--help``.
-    *products : `str`
-        What the command writes there; see `OutputFolder`.
-    argument : `bool`, optional
-        The folder is the argument OUTDIR, not an option.
-    default, required : `pathlib.Path`, `bool`, optional
-        Folder without the option, and whether there must be one.
-    resumes : `bool`, optional
-        The command goes on with what an earlier run has left.
+    ``help_text``: what ``--out`` says under ``--help``.
+    ``*products``: what the command writes there; see `OutputFolder`.
+    ``argument``: the folder is the argument OUTDIR, not an option.
+    ``default``, ``required``: folder without the option, and whether there must be one.
+    ``resumes``: the command goes on with what an earlier run has left.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:

@@ -49,10 +49,7 @@ BUILT_IN = "e2v_321"
 class Quantity(click.ParamType):
     """A number, with or without a unit: ``960``, ``960nm``, ``0.96um``, ``-90degC``.
 
-    Parameters
-    ----------
-    unit : `str`
-        Unit of a bare number and of the result, in astropy's spelling.
+    ``unit``: unit of a bare number and of the result, in astropy's spelling.
     """
 
     def __init__(self, unit: str) -> None:
@@ -136,12 +133,8 @@ class _Size(click.ParamType):
 class SetupType(click.ParamType):
     """A set-up by its name, or a YAML file laid out like the shipped ones.
 
-    Parameters
-    ----------
-    kind : {"monochromator", "sky", ""}
-        Light that the command is for; any if empty.
-    wanted : `str`
-        The same in words.
+    ``kind`` {"monochromator", "sky", ""}: light that the command is for; any if empty.
+    ``wanted``: the same in words.
     """
 
     name = "NAME|FILE.yaml"

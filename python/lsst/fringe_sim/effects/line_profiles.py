@@ -24,15 +24,9 @@ _PANEL_NODES = 8
 
 @dataclass(frozen=True)
 class LorentzianProfile(SpectralProfile):
-    """Lorentzian line, cut off at ten times its width: 3 % of an endless one lie beyond.
+    """Lorentzian line, cut off at ten times its width: 3 % of an endless one lie beyond."""
 
-    Attributes
-    ----------
-    fwhm_nm : `float`
-        Full width at half maximum [nm].
-    """
-
-    fwhm_nm: float
+    fwhm_nm: float  # full width at half maximum [nm]
 
     def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
         """Composite Gauss-Legendre nodes; see `SpectralProfile.nodes`."""
@@ -50,19 +44,12 @@ class LorentzianProfile(SpectralProfile):
 
 @dataclass(frozen=True)
 class MixedProfile(SpectralProfile):
-    """Light of two shapes about the same wavelength.
+    """Light of two shapes about the same wavelength."""
 
-    Attributes
-    ----------
-    first, second : `SpectralProfile`
-        The shapes.
-    share : `float`
-        Part of the light in the second, 0 to 1.
-    """
-
+    # first, second: the shapes
     first: SpectralProfile
     second: SpectralProfile
-    share: float
+    share: float  # part of the light in the second, 0 to 1
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.share <= 1.0:
@@ -80,10 +67,7 @@ class MixedProfile(SpectralProfile):
 def line_width(profile: SpectralProfile, effect: str) -> float:
     """Full width at half maximum of a line, or of the first of the shapes that it is mixed from [nm].
 
-    Raises
-    ------
-    InputError
-        The profile has no width.
+    `InputError`: the profile has no width.
     """
     while isinstance(profile, MixedProfile):
         profile = profile.first

@@ -96,16 +96,10 @@ def find_rings(
     Large maps are searched twice, averaged over larger cells and in a part of full resolution; where rings are found
     in a part, they are followed outwards.
 
-    Parameters
-    ----------
-    image : `numpy.ndarray`, shape ``(ny, nx)``
-        The map.
-    used : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
-        Where it has data.
-    y_px, x_px : `numpy.ndarray`, shapes ``(ny,)`` and ``(nx,)``
-        Rows and columns [px].
-    middle : `numpy.ndarray`, shape ``(2,)``
-        Row and column of the middle of the sensor.
+    ``image`` ``(ny, nx)``: the map.
+    ``used`` ``(ny, nx)``: where it has data.
+    ``y_px``, ``x_px`` ``(ny,)``: rows and columns [px].
+    ``middle`` ``(2,)``: row and column of the middle of the sensor.
     """
     if used.sum() < FEWEST_CELLS:
         return None

@@ -273,20 +273,11 @@ def _filtered(
 ) -> FloatArray:
     """Multiply the cosine series of an image along one axis by a function of its frequency.
 
-    Parameters
-    ----------
-    image : `numpy.ndarray`, shape ``(..., ny, nx)``
-        The image.
-    geometry : `ImageGeometry`
-        Where its samples lie.
-    axis : `int`
-        -2 or -1.
-    response : callable
-        Factor at angular frequencies [rad/px].
-
-    Returns
-    -------
-    image : `numpy.ndarray`, shape ``(..., ny, nx)``
+    ``image`` ``(..., ny, nx)``: the image.
+    ``geometry``: where its samples lie.
+    ``axis``: -2 or -1.
+    ``response``: factor at angular frequencies [rad/px].
+    Returns ``(..., ny, nx)``.
     """
     size = image.shape[axis]
     factor = response(np.arange(size) * np.pi / size / geometry.cell_px[axis])

@@ -36,23 +36,14 @@ SIGMA_PER_FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
 @named_units
 @dataclass(frozen=True, eq=False)
 class FlatSpectrum:
-    """Light of the flat field by which frames are divided; the fringes that it has are printed into them.
+    """Light of the flat field by which frames are divided; the fringes that it has are printed into them."""
 
-    Attributes
-    ----------
-    name : `str`
-        What it is, as for `from_name`.
-    wavelength_nm, photons : `numpy.ndarray`, shape ``(K,)``
-        Photons per nm of a lamp in front of the filter, up to a factor, linear between these wavelengths [nm] and 0
-        beyond; empty for white light.
-    share : `float`
-        Part of the light behind the filter that is the lamp's; the rest is white.
-    """
-
-    name: str = "white"
+    name: str = "white"  # what it is, as for `from_name`
+    # wavelength_nm, photons: (K,): photons per nm of a lamp in front of the filter, up to a factor, linear
+    # between these wavelengths [nm] and 0 beyond; empty for white light
     wavelength_nm: FloatArray = field(default_factory=lambda: np.zeros(0))
     photons: FloatArray = field(default_factory=lambda: np.zeros(0))
-    share: float = 0.0
+    share: float = 0.0  # part of the light behind the filter that is the lamp's; the rest is white
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.share <= 1.0:

@@ -33,29 +33,18 @@ GROUND_CM = 1.0
 
 @dataclass(frozen=True, eq=False)
 class RotationalLevels:
-    """Populations of the upper levels of lines.
+    """Populations of the upper levels of lines."""
 
-    Attributes
-    ----------
-    vibration : `numpy.ndarray`, shape ``(K,)``
-        Vibrational level.
-    energy_cm, weight : `numpy.ndarray`, shape ``(K,)``
-        Energy above the lowest level of the same vibration [1/cm], and statistical weight.
-    cold, hot : `numpy.ndarray`, shape ``(K,)``
-        Populations per sublevel [rayleigh seconds].
-    cold_k : `float`
-        Temperature of the cold population [K].
-    line_level : `numpy.ndarray` of `int`, shape ``(N,)``
-        Upper level of every line.
-    """
-
-    vibration: NDArray[np.int64]
+    vibration: NDArray[np.int64]  # (K,): vibrational level
+    # energy_cm, weight: (K,): energy above the lowest level of the same vibration [1/cm], and statistical
+    # weight
     energy_cm: FloatArray
     weight: FloatArray
+    # cold, hot: (K,): populations per sublevel [rayleigh seconds]
     cold: FloatArray
     hot: FloatArray
-    cold_k: float
-    line_level: NDArray[np.int64]
+    cold_k: float  # temperature of the cold population [K]
+    line_level: NDArray[np.int64]  # (N,): upper level of every line
 
     @classmethod
     def of_reference(cls) -> RotationalLevels:
@@ -142,13 +131,7 @@ class RotationalLevels:
 
 
 def boltzmann(energy_cm: FloatArray, kelvin: float | FloatArray) -> FloatArray:
-    """Boltzmann factors of energies [1/cm].
-
-    Raises
-    ------
-    OutOfRangeError
-        A temperature that is not positive.
-    """
+    """Boltzmann factors of energies [1/cm]. `OutOfRangeError`: a temperature that is not positive."""
     if not np.all((np.asarray(kelvin) > 0.0) & np.isfinite(kelvin)):
         raise OutOfRangeError("temperature [K]", kelvin, "positive")
     return np.asarray(np.exp(-SECOND_RADIATION_CM_K * energy_cm / kelvin))

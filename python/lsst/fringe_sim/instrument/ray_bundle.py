@@ -40,19 +40,12 @@ QUANTILES = 4096
 
 @dataclass(frozen=True, eq=False)
 class RayBundle:
-    """Rays that reach one place of the focal plane; every ray carries the same light.
+    """Rays that reach one place of the focal plane; every ray carries the same light."""
 
-    Attributes
-    ----------
-    slope_x, slope_y : `numpy.ndarray`, shape ``(N,)``
-        Slopes dx/dz and dy/dz against the normal of the sensor, z pointing into it.
-    kept_fraction : `float`
-        Share of the rays launched over the entrance pupil that was not vignetted.
-    """
-
+    # slope_x, slope_y: (N,): slopes dx/dz and dy/dz against the normal of the sensor, z pointing into it
     slope_x: FloatArray
     slope_y: FloatArray
-    kept_fraction: float
+    kept_fraction: float  # share of the rays launched over the entrance pupil that was not vignetted
 
     @property
     def sin_squared(self) -> FloatArray:
@@ -81,18 +74,10 @@ def gauss_rule(value: ArrayLike, weight: ArrayLike, nodes: int) -> tuple[FloatAr
     reorthogonalisation, Golub & Welsch 1969). Where the measure has no more points than that, it is returned as is;
     where many are in the same places, the rule has a node in each of these.
 
-    Parameters
-    ----------
-    value, weight : array_like, shape ``(N,)``
-        Points of the measure and their weights.
-    nodes : `int`
-        Number of nodes wanted.
-
-    Returns
-    -------
-    node, node_weight : `numpy.ndarray`
-        At most ``nodes`` ascending nodes inside the range of ``value``, and weights that sum to the sum of
-        ``weight``.
+    ``value``, ``weight`` ``(N,)``: points of the measure and their weights.
+    ``nodes``: number of nodes wanted.
+    Returns at most ``nodes`` ascending nodes inside the range of ``value``, and weights that sum to the sum
+        of ``weight``.
     """
     if nodes < 1:
         raise OutOfRangeError("number of beam angles", nodes, "1 or more")

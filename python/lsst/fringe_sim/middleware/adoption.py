@@ -28,19 +28,13 @@ __all__ = ["AdoptionReport", "adopt_datasets"]
 
 @dataclasses.dataclass(frozen=True)
 class AdoptionReport:
-    """What became of the datasets.
+    """What became of the datasets."""
 
-    Attributes
-    ----------
-    adopted, present : `tuple` [`DatasetRef`, ...]
-        Datasets that are new under the instrument (or would be), and those that the run had before.
-    homeless : `tuple` [`str`, ...]
-        Names of sensors that the instrument does not have.
-    """
-
+    # adopted, present: datasets that are new under the instrument (or would be), and those that the run had
+    # before
     adopted: tuple[DatasetRef, ...]
     present: tuple[DatasetRef, ...]
-    homeless: tuple[str, ...]
+    homeless: tuple[str, ...]  # names of sensors that the instrument does not have
 
 
 def adopt_datasets(
@@ -56,31 +50,16 @@ def adopt_datasets(
 ) -> AdoptionReport:
     """Give datasets of sensors the data ids that the same sensors have in another instrument.
 
-    Parameters
-    ----------
-    butler : `lsst.daf.butler.Butler`
-        The repository, writeable unless ``dry_run``.
-    dataset_type : `str`
-        Dataset type with the dimensions instrument and detector, as ``epoxyThickness``.
-    collections : sequence of `str`
-        Where the datasets are; the first that has one wins.
-    instrument : `str`
-        Name of the instrument that adopts them.
-    run : `str`
-        Run into which they go; what it has already stays as it is.
-    where : `str`, optional
-        Condition on the data ids, as ``instrument='LSST-TS8' AND detector.raft='RTM-020'``.
-    transfer : `str`, optional
-        How the files come along: ``hardlink``, ``copy``, ``direct``, ….
-    dry_run : `bool`, optional
-        Say what would be adopted, but store nothing.
-
-    Raises
-    ------
-    UnknownNameError
-        The repository does not know the instrument or the dataset type.
-    InputError
-        The dataset type has other dimensions, or there is nothing to adopt.
+    ``butler``: the repository, writeable unless ``dry_run``.
+    ``dataset_type``: dataset type with the dimensions instrument and detector, as ``epoxyThickness``.
+    ``collections``: where the datasets are; the first that has one wins.
+    ``instrument``: name of the instrument that adopts them.
+    ``run``: run into which they go; what it has already stays as it is.
+    ``where``: condition on the data ids, as ``instrument='LSST-TS8' AND detector.raft='RTM-020'``.
+    ``transfer``: how the files come along: ``hardlink``, ``copy``, ``direct``, ….
+    ``dry_run``: say what would be adopted, but store nothing.
+    `UnknownNameError`: the repository does not know the instrument or the dataset type.
+    `InputError`: the dataset type has other dimensions, or there is nothing to adopt.
     """
     known = [record.name for record in butler.query_dimension_records("instrument", explain=False)]
     by_name = {cls.getName(): cls for cls in INSTRUMENTS.values() if cls.getName() in known}

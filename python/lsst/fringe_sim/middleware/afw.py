@@ -13,13 +13,7 @@ __all__ = ["frame_from_exposure", "observed_from_exposure", "read_exposure"]
 
 
 def read_exposure(path: str) -> Any:
-    """Read the file of a fringe frame as an ``ExposureF``.
-
-    Raises
-    ------
-    InputError
-        afw is not installed.
-    """
+    """Read the file of a fringe frame as an ``ExposureF``. `InputError`: afw is not installed."""
     try:
         from lsst.afw.image import ExposureF
     except ImportError:
@@ -35,16 +29,9 @@ def read_exposure(path: str) -> Any:
 def frame_from_exposure(exposure: Any) -> FringeFrame:
     """Return the fringe frame that an ``ExposureF`` holds.
 
-    Parameters
-    ----------
-    exposure : ``lsst.afw.image.ExposureF``
-        A fringe calibration: zero-mean fractions of the sky, with the time of its making in
+    ``exposure``: a fringe calibration: zero-mean fractions of the sky, with the time of its making in
         ``CALIB_CREATION_DATETIME``.
-
-    Raises
-    ------
-    InputError
-        The exposure does not say when it was made, or is no fringe frame.
+    `InputError`: the exposure does not say when it was made, or is no fringe frame.
     """
     header = exposure.getMetadata()
     if "CALIB_CREATION_DATETIME" not in header:
@@ -65,10 +52,7 @@ def frame_from_exposure(exposure: Any) -> FringeFrame:
 def observed_from_exposure(exposure: Any) -> ObservedFrame:
     """Return the frame that an exposure of Rubin's pipelines holds.
 
-    Parameters
-    ----------
-    exposure : ``lsst.afw.image.ExposureF``
-        A science exposure after the removal of its instrument's signature.
+    ``exposure``: a science exposure after the removal of its instrument's signature.
     """
     detector, header = exposure.getDetector(), exposure.getMetadata()
     label = exposure.getFilter()

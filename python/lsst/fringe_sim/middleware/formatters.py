@@ -134,10 +134,7 @@ class StrictJsonFormatter(FormatterV2):
     def to_bytes(self, in_memory_dataset: Any) -> bytes:
         """Serialise the mapping.
 
-        Raises
-        ------
-        InputError
-            It holds a number that is not finite, or something that JSON does not know.
+        `InputError`: it holds a number that is not finite, or something that JSON does not know.
         """
         try:
             text = json.dumps(in_memory_dataset, allow_nan=False, ensure_ascii=False, indent=2)

@@ -43,28 +43,13 @@ def write_handoff(
 ) -> list[DatasetRef]:
     """Write the fringe frames of a collection for another repository.
 
-    Parameters
-    ----------
-    butler : `lsst.daf.butler.Butler`
-        The repository that has the frames.
-    collection : `str`
-        Calibration collection, whose validity ranges go along, or a run.
-    directory : `str` or `pathlib.Path`
-        Directory for the files; new or empty.
-    where : `str`, optional
-        Condition on the data ids, as ``instrument='LSSTCam' AND detector.raft='R11'``.
-    dry_run : `bool`, optional
-        Say what would be written, but write nothing.
-
-    Returns
-    -------
-    refs : `list` [`lsst.daf.butler.DatasetRef`]
-        The frames.
-
-    Raises
-    ------
-    InputError
-        There is no such collection, it has no fringe frames, or the directory is not empty.
+    ``butler``: the repository that has the frames.
+    ``collection``: calibration collection, whose validity ranges go along, or a run.
+    ``directory``: directory for the files; new or empty.
+    ``where``: condition on the data ids, as ``instrument='LSSTCam' AND detector.raft='R11'``.
+    ``dry_run``: say what would be written, but write nothing.
+    Returns the frames.
+    `InputError`: there is no such collection, it has no fringe frames, or the directory is not empty.
     """
     target = Path(directory)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -112,10 +97,7 @@ def _export(butler: Butler, collection: str, refs: list[DatasetRef], target: Pat
 def isr_override(filters: Sequence[str]) -> str:
     """Configuration with which ``IsrTask`` of ip_isr subtracts templates without noise: ``-C isr:isr_fringe.py``.
 
-    Parameters
-    ----------
-    filters : sequence of `str`
-        Physical filters to be corrected; ip_isr corrects none unless it is told.
+    ``filters``: physical filters to be corrected; ip_isr corrects none unless it is told.
 
     Notes
     -----

@@ -229,15 +229,8 @@ def sensor_of(data_id: DataCoordinate | Mapping[str, Any]) -> Detector:
 
     By the name of the instrument, not by its class: a repository may have it from Rubin's own package.
 
-    Parameters
-    ----------
-    data_id : `lsst.daf.butler.DataCoordinate` or `Mapping`
-        With ``instrument`` and ``detector``.
-
-    Raises
-    ------
-    UnknownNameError
-        An instrument that this package does not know.
+    ``data_id``: with ``instrument`` and ``detector``.
+    `UnknownNameError`: an instrument that this package does not know.
     """
     by_name = {cls.getName(): cls for cls in INSTRUMENTS.values()}
     name = str(data_id["instrument"])

@@ -31,27 +31,13 @@ OBSERVATION_REASON = "night sky"
 
 @dataclasses.dataclass(frozen=True)
 class NightPlan:
-    """The sky exposures of one night.
+    """The sky exposures of one night."""
 
-    Attributes
-    ----------
-    date : `datetime.date`
-        Evening on which the night begins.
-    hours : `tuple` [`float`, ...]
-        Local time of each exposure, hours; after midnight it goes on beyond 24.
-    exposure_time_s : `float`
-        Exposure time, seconds.
-    airmass : `float`
-        Airmass of all exposures.
-    physical_filter : `str` or `None`
-        Filter; `None` for the instrument's y filter.
-    """
-
-    date: datetime.date
-    hours: tuple[float, ...]
-    exposure_time_s: float = 30.0
-    airmass: float = 1.2
-    physical_filter: str | None = None
+    date: datetime.date  # evening on which the night begins
+    hours: tuple[float, ...]  # local time of each exposure, hours; after midnight it goes on beyond 24
+    exposure_time_s: float = 30.0  # exposure time, seconds
+    airmass: float = 1.2  # airmass of all exposures
+    physical_filter: str | None = None  # filter; `None` for the instrument's y filter
 
     def __post_init__(self) -> None:
         if not self.hours or not all(12 <= hour < 36 for hour in self.hours):
@@ -67,10 +53,7 @@ class NightPlan:
 def parse_hours(text: str) -> tuple[float, ...]:
     """Read ``19:29`` or ``19:29:0.5``: first, last and step in local hours, the last one included.
 
-    Raises
-    ------
-    InputError
-        The text is something else, or the step does not lead from the first to the last.
+    `InputError`: the text is something else, or the step does not lead from the first to the last.
     """
     allowed = "FIRST:LAST or FIRST:LAST:STEP in local hours, as 19:29 or 19:29:0.5"
     try:
@@ -124,29 +107,14 @@ def define_night(
 ) -> list[dict[str, Any]]:
     """Register the exposures of one or more nights, and the run of raw images, which may stay empty.
 
-    Parameters
-    ----------
-    butler : `lsst.daf.butler.Butler`
-        The repository, writeable unless ``dry_run``.
-    instrument : `str`
-        Name of an instrument that the repository knows.
-    plans : iterable of `NightPlan`
-        The nights.
-    dry_run : `bool`, optional
-        Return the records, but store nothing.
-
-    Returns
-    -------
-    records : `list` [`dict`]
-        The exposure records.
-
-    Raises
-    ------
-    UnknownNameError
-        The repository does not know the instrument.
-    InputError
-        The instrument has no night, the filter is not one of its sky filters, or the repository has one of the
-        exposures with other properties.
+    ``butler``: the repository, writeable unless ``dry_run``.
+    ``instrument``: name of an instrument that the repository knows.
+    ``plans``: the nights.
+    ``dry_run``: return the records, but store nothing.
+    Returns the exposure records.
+    `UnknownNameError`: the repository does not know the instrument.
+    `InputError`: the instrument has no night, the filter is not one of its sky filters, or the repository has
+        one of the exposures with other properties.
     """
     known = [record.name for record in butler.query_dimension_records("instrument", explain=False)]
     if instrument not in known:

@@ -83,22 +83,13 @@ class RawExposure:
 
 @dataclasses.dataclass(frozen=True)
 class IngestReport:
-    """What became of the files.
+    """What became of the files."""
 
-    Attributes
-    ----------
-    ingested, present : `tuple` [`RawExposure`, ...]
-        Files that are new in the repository (or would be), and files that were there before.
-    refused : `tuple` [`str`, ...]
-        One message for each file that could not be used.
-    run : `dict` [`str`, `str`]
-        Run into which the files of each instrument went.
-    """
-
+    # ingested, present: files that are new in the repository (or would be), and files that were there before
     ingested: tuple[RawExposure, ...]
     present: tuple[RawExposure, ...]
-    refused: tuple[str, ...]
-    run: Mapping[str, str]
+    refused: tuple[str, ...]  # one message for each file that could not be used
+    run: Mapping[str, str]  # run into which the files of each instrument went
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -132,28 +123,15 @@ def ingest_raws(
 ) -> IngestReport:
     """Ingest raw frames.
 
-    Parameters
-    ----------
-    butler : `lsst.daf.butler.Butler`
-        The repository, writeable unless ``dry_run``.
-    paths : iterable of `str`
-        Files, directories and patterns.
-    transfer : `str` or `None`, optional
-        How the files come into the repository (``copy``, ``link``, ``direct`` to leave them where they are, …).
-    run : `str`, optional
-        Run for the files; by default ``<instrument>/raw/all``.
-    dry_run : `bool`, optional
-        Look at the files and report, but store nothing.
-
-    Returns
-    -------
-    report : `IngestReport`
-        What became of each file.
-
-    Raises
-    ------
-    InputError
-        The repository holds raw frames of another kind, or other processes ingest the same frames over and over.
+    ``butler``: the repository, writeable unless ``dry_run``.
+    ``paths``: files, directories and patterns.
+    ``transfer``: how the files come into the repository (``copy``, ``link``, ``direct`` to leave them where
+        they are, …).
+    ``run``: run for the files; by default ``<instrument>/raw/all``.
+    ``dry_run``: look at the files and report, but store nothing.
+    Returns what became of each file.
+    `InputError`: the repository holds raw frames of another kind, or other processes ingest the same frames
+        over and over.
     """
     files, refused = find_raw_files(paths)
     registered = _registered_instruments(butler)
@@ -201,10 +179,7 @@ def _registered_instruments(butler: Butler) -> dict[str, type[FringeInstrument]]
 def examine(path: str, registered: Mapping[str, type[FringeInstrument]]) -> RawExposure:
     """Read the header of one file.
 
-    Raises
-    ------
-    InputError
-        The file is no raw frame, or the repository does not know its instrument or its filter.
+    `InputError`: the file is no raw frame, or the repository does not know its instrument or its filter.
     """
     header = read_raw_header(path)
     metadata = RawMetadata.from_header(header, source=path)

@@ -29,17 +29,9 @@ SECTIONS = (("storageClasses",), ("datastore", "formatters"))
 def open_repository(repo: str, *, writeable: bool = False) -> Iterator[Butler]:
     """Open a repository, and close it afterwards.
 
-    Parameters
-    ----------
-    repo : `str`
-        The repository.
-    writeable : `bool`, optional
-        Whether anything will be stored.
-
-    Raises
-    ------
-    InputError
-        There is no such repository, or its registry cannot be opened.
+    ``repo``: the repository.
+    ``writeable``: whether anything will be stored.
+    `InputError`: there is no such repository, or its registry cannot be opened.
     """
     with _open(repo, writeable) as butler:
         yield butler
@@ -50,10 +42,7 @@ def recover_repository(repo: str) -> None:
 
     A repository on which all is well stays as it is; processes that are at work on it are waited for.
 
-    Raises
-    ------
-    InputError
-        There is no such repository, or its registry cannot be opened for writing.
+    `InputError`: there is no such repository, or its registry cannot be opened for writing.
     """
     try:
         with Butler.from_config(repo, writeable=True) as butler:
@@ -67,10 +56,7 @@ def recover_repository(repo: str) -> None:
 def require_prepared(repo: str) -> None:
     """Refuse a repository in which datasets of this package cannot be stored.
 
-    Raises
-    ------
-    InputError
-        There is no such repository, or it lacks storage classes or formatters.
+    `InputError`: there is no such repository, or it lacks storage classes or formatters.
     """
     found = unprepared(_config(repo), repo)
     if found is not None:
@@ -92,15 +78,8 @@ def prepare_repository(repo: str) -> list[str]:
 
     What it has of the same names stays as it is. Doing it twice changes nothing.
 
-    Returns
-    -------
-    added : `list` [`str`]
-        Names of storage classes and formatters.
-
-    Raises
-    ------
-    InputError
-        There is no such repository, or its datastore or configuration has to be changed by hand.
+    Returns names of storage classes and formatters.
+    `InputError`: there is no such repository, or its datastore or configuration has to be changed by hand.
     """
     config = _config(repo)
     missing, file = _missing(config), config.configFile

@@ -225,12 +225,8 @@ def setup_optics(setup: str, silicon: str | None = None) -> tuple[FlatFieldOptic
 def films_of(content: Mapping[str, Any], setup: str, silicon: str | None = None) -> tuple[Film, ...]:
     """Films of a set-up's stack; ``silicon`` as for `setup_optics`.
 
-    Raises
-    ------
-    UnknownNameError
-        There is no such stack.
-    InputError
-        No table of silicon.
+    `UnknownNameError`: there is no such stack.
+    `InputError`: no table of silicon.
     """
     own = silicon or str(content.get("silicon", "Si"))
     if own.partition("_")[0] != "Si":

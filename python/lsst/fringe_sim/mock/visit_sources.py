@@ -46,41 +46,22 @@ DTYPE = [("x", float), ("y", float), ("magnitude", float), ("electrons", float),
 
 @dataclass(frozen=True)
 class VisitConditions:
-    """What the visits of a night look like.
+    """What the visits of a night look like."""
 
-    Attributes
-    ----------
-    stars_per_arcmin2, galaxies_per_arcmin2 : `float`
-        Sources brighter than magnitude 22.
-    seeing_arcsec : `tuple` [`float`, `float`]
-        Least and largest full width at half maximum of a star.
-    slope : `float`
-        Rms of the relative slope of scattered light over the sensor, along either side.
-    amplifier_rms : `float`
-        Rms relative error of the gains that is left.
-    cosmic_rays_per_s_cm2 : `float`
-        Tracks in each second and square centimetre.
-    dither_arcsec, rotation_deg : `float`
-        Rms of the pointing along either axis, and half the range of the angle of the camera.
-    hours : `float`
-        Length of the night.
-    read_noise_e : `float`
-        Read noise [e⁻ rms].
-    moon : `float`
-        Largest level of moonlight, relative to the dark sky.
-    """
-
+    # stars_per_arcmin2, galaxies_per_arcmin2: sources brighter than magnitude 22
     stars_per_arcmin2: float = 3.0
     galaxies_per_arcmin2: float = 5.0
-    seeing_arcsec: tuple[float, float] = (0.6, 1.1)
-    slope: float = 0.02
-    amplifier_rms: float = 0.001
-    cosmic_rays_per_s_cm2: float = 0.03
+    seeing_arcsec: tuple[float, float] = (0.6, 1.1)  # least and largest full width at half maximum of a star
+    slope: float = 0.02  # rms of the relative slope of scattered light over the sensor, along either side
+    amplifier_rms: float = 0.001  # rms relative error of the gains that is left
+    cosmic_rays_per_s_cm2: float = 0.03  # tracks in each second and square centimetre
+    # dither_arcsec, rotation_deg: rms of the pointing along either axis, and half the range of the angle of
+    # the camera
     dither_arcsec: float = 15.0
     rotation_deg: float = 90.0
-    hours: float = 8.0
-    read_noise_e: float = 6.0
-    moon: float = 0.5
+    hours: float = 8.0  # length of the night
+    read_noise_e: float = 6.0  # read noise [e⁻ rms]
+    moon: float = 0.5  # largest level of moonlight, relative to the dark sky
 
 
 @dataclass(frozen=True)

@@ -61,43 +61,22 @@ FIRST_VISIT = datetime.datetime(2026, 1, 15, 1, 0, tzinfo=datetime.UTC)
 
 @dataclass(frozen=True, eq=False)
 class MockVisit:
-    """A visit and what is true of it.
+    """A visit and what is true of it."""
 
-    Attributes
-    ----------
-    path : `pathlib.Path`
-        Its file.
-    fringes : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Light of the sky less its mean over the sensor [e⁻].
-    level_e : `float`
-        Mean light of the sky [e⁻].
-    sources : `numpy.ndarray`
-        Sources on the sensor: ``x``, ``y`` [px], ``magnitude``, ``electrons``, ``galaxy``.
-    """
-
-    path: Path
-    fringes: NDArray[np.float32]
-    level_e: float
+    path: Path  # its file
+    fringes: NDArray[np.float32]  # (ny, nx): light of the sky less its mean over the sensor [e⁻]
+    level_e: float  # mean light of the sky [e⁻]
+    # sources on the sensor: ``x``, ``y`` [px], ``magnitude``, ``electrons``, ``galaxy``
     sources: NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
 class DetectedSky:
-    """Light of the components of a dark sky that a sensor detects, pixel by pixel.
+    """Light of the components of a dark sky that a sensor detects, pixel by pixel."""
 
-    Attributes
-    ----------
-    names : `tuple` [`str`, ...]
-        OH bands, then continua.
-    n_bands : `int`
-        How many of them are bands.
-    light : `numpy.ndarray`, float32, shape ``(len(names), ny, nx)``
-        Electrons per second and pixel.
-    """
-
-    names: tuple[str, ...]
-    n_bands: int
-    light: NDArray[np.float32]
+    names: tuple[str, ...]  # OH bands, then continua
+    n_bands: int  # how many of them are bands
+    light: NDArray[np.float32]  # (len(names), ny, nx): electrons per second and pixel
 
 
 def detected_sky(
@@ -105,21 +84,12 @@ def detected_sky(
 ) -> DetectedSky:
     """Sum the light of the night sky over lines, angles and polarisations, for every pixel of a sensor.
 
-    Parameters
-    ----------
-    setup : `str`
-        Name of a set-up behind a telescope, or its YAML file.
-    sensor : `Detector`
-        Where in the field the sensor lies. A map of any size covers all of it.
-    thickness_um : `numpy.ndarray` [y, x]
-        Thickness of the layer that varies [µm].
-    effects : mapping, optional
-        Hidden effects of the sensor, as for `validate_effects`.
-
-    Raises
-    ------
-    InputError
-        A set-up without a telescope and a filter, or an effect that does not act on the layers of a whole sensor.
+    ``setup``: name of a set-up behind a telescope, or its YAML file.
+    ``sensor``: where in the field the sensor lies. A map of any size covers all of it.
+    ``thickness_um``: thickness of the layer that varies [µm].
+    ``effects``: hidden effects of the sensor, as for `validate_effects`.
+    `InputError`: a set-up without a telescope and a filter, or an effect that does not act on the layers of a
+        whole sensor.
     """
     content = read_setup_file(setup)
     light = content["illumination"]
@@ -246,41 +216,21 @@ def write_mock_visits(
 ) -> tuple[MockVisit, ...]:
     """Write visits of one night, after the removal of the instrument's signature.
 
-    Parameters
-    ----------
-    out_dir : path-like
-        Folder for the files; made if it does not exist.
-    setup : `str`
-        Name of a set-up behind a telescope, or its YAML file.
-    detector : `int` or `str`
-        Number or name of the sensor in the set-up's camera.
-    thickness_um : `numpy.ndarray` [y, x]
-        Thickness of the layer that varies [µm], of the size of the sensor.
-    visits : `int`
-        Number of visits.
-    rng : `numpy.random.Generator`
-        Source of all randomness.
-    effects : mapping, optional
-        Hidden effects of the sensor, as for `validate_effects`.
-    size : `str`, optional
-        ``"NXxNY"`` for a cut-down sensor, whose pixels are spread over the same part of the field for the beam, and
-        have their usual size for sources.
-    conditions : `VisitConditions`, optional
-        Sources, seeing, light, and what disturbs.
-    first_visit : `datetime.datetime`, optional
-        Time of the first visit (UTC).
-    progress : callable, optional
-        Called with the path of each file once it is written.
-
-    Returns
-    -------
-    visits : `tuple` [`MockVisit`, ...]
-        The files, and the truth, which stands nowhere in them.
-
-    Raises
-    ------
-    InputError, OutOfRangeError, UnknownNameError
-        An argument cannot be used; nothing has been written then.
+    ``out_dir``: folder for the files; made if it does not exist.
+    ``setup``: name of a set-up behind a telescope, or its YAML file.
+    ``detector``: number or name of the sensor in the set-up's camera.
+    ``thickness_um``: thickness of the layer that varies [µm], of the size of the sensor.
+    ``visits``: number of visits.
+    ``rng``: source of all randomness.
+    ``effects``: hidden effects of the sensor, as for `validate_effects`.
+    ``size``: ``"NXxNY"`` for a cut-down sensor, whose pixels are spread over the same part of the field for
+        the beam, and have their usual size for sources.
+    ``conditions``: sources, seeing, light, and what disturbs.
+    ``first_visit``: time of the first visit (UTC).
+    ``progress``: called with the path of each file once it is written.
+    Returns the files, and the truth, which stands nowhere in them.
+    `InputError`, `OutOfRangeError`, `UnknownNameError`: an argument cannot be used; nothing has been written
+        then.
     """
     if visits < 1:
         raise OutOfRangeError("visits", visits, "1 or more")

@@ -31,16 +31,10 @@ def effects_override(
     compares with what it got; its last line the hash of all others. A file that was cut short is not taken for a
     shorter one.
 
-    Parameters
-    ----------
-    settings : mapping
-        Values by ``effect.parameter``.
-    setup, verdict : `str`
-        Set-up of the data in which they were found, and the verdict on them.
-    known : mapping, optional
-        Effects that were in the model before the search.
-    detector : `str`, optional
-        Name of the sensor.
+    ``settings``: values by ``effect.parameter``.
+    ``setup``, ``verdict``: set-up of the data in which they were found, and the verdict on them.
+    ``known``: effects that were in the model before the search.
+    ``detector``: name of the sensor.
     """
     lines = [f"{_WRITTEN}{written_effects({**(known or {}), **settings})!r}"]
     lines.append(f"{_BEGINNING}{_quoted(setup)}; verdict: {_quoted(verdict)}.")
@@ -67,17 +61,9 @@ def written_effects(settings: Mapping[str, float]) -> str:
 def refuse_other_effects(written: str, settings: Mapping[str, float]) -> None:
     """Refuse effects that are not those that an override says it was written with; others may stand beside them.
 
-    Parameters
-    ----------
-    written : `str`
-        What `written_effects` returned; empty without such an override.
-    settings : mapping
-        Values by ``effect.parameter``.
-
-    Raises
-    ------
-    InputError
-        An effect is missing or has another value.
+    ``written``: what `written_effects` returned; empty without such an override.
+    ``settings``: values by ``effect.parameter``.
+    `InputError`: an effect is missing or has another value.
     """
     *names, _ = written.split() or [""]
     if written and written_effects({name: settings[name] for name in names if name in settings}) != written:

@@ -91,10 +91,7 @@ def _fit_as_published(
 ) -> tuple[float, FloatArray, NDArray[np.floating], FloatArray]:
     """Best thickness in the range of the published map, with 1 − R − T less its mean, not divided by it.
 
-    Returns
-    -------
-    thickness_um, predicted, searched_um, searched_rms
-        Best thickness [µm], the model there, all thicknesses that were tried [µm] and the misfit of each.
+    Returns best thickness [µm], the model there, all thicknesses that were tried [µm] and the misfit of each.
     """
     low, high = SEARCH_UM
     searched = low + SEARCH_STEP_UM * np.arange(int((high - low) / SEARCH_STEP_UM) + 1)
@@ -271,12 +268,8 @@ def raft(context: Context) -> Section:
 def row_jumps(thickness_um: FloatArray, order_um: float) -> int:
     """Number of successive rows between which a map jumps by whole fringe orders.
 
-    Parameters
-    ----------
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness [µm].
-    order_um : `float`
-        Thickness of one fringe order [µm].
+    ``thickness_um`` ``(ny, nx)``: thickness [µm].
+    ``order_um``: thickness of one fringe order [µm].
     """
     steps = np.median(np.diff(thickness_um, axis=0), axis=1)
     # A sensor changes slowly: a jump is a step unlike the steps around it.

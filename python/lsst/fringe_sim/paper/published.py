@@ -16,38 +16,20 @@ __all__ = ["Finding", "PublishedNumber", "published_numbers"]
 
 @dataclass(frozen=True)
 class PublishedNumber:
-    """One number of the paper.
+    """One number of the paper."""
 
-    Attributes
-    ----------
-    item : `str`
-        Key.
-    place : `str`
-        Section, equation, table or figure.
-    quantity, unit : `str`
-        What the number is, and its unit.
-    low, high : `float`
-        What the paper states, both alike unless it gives a range; NaN where it gives no number.
-    tolerance : `float`
-        Allowed on either side.
-    corrected : `float`
-        What is right where the paper errs, else NaN.
-    note : `str`
-        Reason.
-    from_figure : `bool`
-        Measured in a figure rather than printed.
-    """
-
-    item: str
-    place: str
+    item: str  # key
+    place: str  # section, equation, table or figure
+    # quantity, unit: what the number is, and its unit
     quantity: str
     unit: str
+    # low, high: what the paper states, both alike unless it gives a range; NaN where it gives no number
     low: float
     high: float
-    tolerance: float
-    corrected: float = math.nan
-    note: str = ""
-    from_figure: bool = False
+    tolerance: float  # allowed on either side
+    corrected: float = math.nan  # what is right where the paper errs, else NaN
+    note: str = ""  # reason
+    from_figure: bool = False  # measured in a figure rather than printed
 
     @classmethod
     def from_mapping(cls, content: Mapping[str, Any]) -> PublishedNumber:
@@ -99,27 +81,16 @@ class PublishedNumber:
 
 @dataclass(frozen=True)
 class Finding:
-    """A recomputed number beside the published one.
+    """A recomputed number beside the published one."""
 
-    Attributes
-    ----------
-    number : `PublishedNumber`
-        The published number.
-    value : `float`
-        The recomputed one; NaN if it could not be computed.
-    status : {"agrees", "erratum", "differs", "skipped"}
-        Within the tolerance of the paper; of the corrected number, where the paper errs; of neither; not computed.
-    reason : `str`
-        Why it was skipped.
-    cold : `float`
-        The same recomputed with silicon as measured in the cold, NaN if it was not; `value` has the paper's
-        constants.
-    """
-
-    number: PublishedNumber
-    value: float
+    number: PublishedNumber  # the published number
+    value: float  # the recomputed one; NaN if it could not be computed
+    # {"agrees", "erratum", "differs", "skipped"}: within the tolerance of the paper; of the corrected number,
+    # where the paper errs; of neither; not computed
     status: str
-    reason: str = ""
+    reason: str = ""  # why it was skipped
+    # the same recomputed with silicon as measured in the cold, NaN if it was not; `value` has the paper's
+    # constants
     cold: float = math.nan
 
 
@@ -127,10 +98,7 @@ class Finding:
 def published_numbers() -> dict[str, PublishedNumber]:
     """All numbers by item, in the order of the paper.
 
-    Raises
-    ------
-    ResourceError
-        The table has an entry twice, or one that is not a number.
+    `ResourceError`: the table has an entry twice, or one that is not a number.
     """
     numbers: dict[str, PublishedNumber] = {}
     for content in read_yaml("paper", "published.yaml")["numbers"]:
@@ -142,13 +110,7 @@ def published_numbers() -> dict[str, PublishedNumber]:
 
 
 def published_number(item: str) -> PublishedNumber:
-    """One number.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such item.
-    """
+    """One number. `UnknownNameError`: there is no such item."""
     numbers = published_numbers()
     if item not in numbers:
         raise UnknownNameError("number of the paper", item, tuple(numbers))

@@ -59,18 +59,10 @@ STATUSES = ("agrees", "erratum", "differs", "skipped")
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """Sections with their findings.
+    """Sections with their findings."""
 
-    Attributes
-    ----------
-    sections : `tuple` [`Section`, ...]
-        What was computed.
-    findings : `tuple` [`tuple` [`Finding`, ...], ...]
-        Findings of each section.
-    """
-
-    sections: tuple[Section, ...]
-    findings: tuple[tuple[Finding, ...], ...]
+    sections: tuple[Section, ...]  # what was computed
+    findings: tuple[tuple[Finding, ...], ...]  # findings of each section
 
     @property
     def all_findings(self) -> tuple[Finding, ...]:

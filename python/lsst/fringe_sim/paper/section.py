@@ -59,52 +59,29 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A section of the paper, recomputed.
+    """A section of the paper, recomputed."""
 
-    Attributes
-    ----------
-    title, text : `str`
-        Heading, and what was done.
-    values : mapping
-        Recomputed numbers by item of the table of published numbers; NaN where one could not be computed.
-    panels : `tuple` [`Graph` or `Picture`, ...]
-        What is drawn, side by side.
-    caption : `str`
-        Caption of the panels.
-    """
-
+    # title, text: heading, and what was done
     title: str
     text: str
+    # recomputed numbers by item of the table of published numbers; NaN where one could not be computed
     values: Mapping[str, float]
-    panels: tuple[Graph | Picture, ...] = ()
-    caption: str = ""
+    panels: tuple[Graph | Picture, ...] = ()  # what is drawn, side by side
+    caption: str = ""  # caption of the panels
 
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What a recomputation starts from.
+    """What a recomputation starts from."""
 
-    Attributes
-    ----------
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Adhesive of E2V-CCD250-321 over the whole sensor [µm], on any number of pixels.
-    detail_um : `numpy.ndarray`, shape ``(ny, nx)``
-        A part of it pixel by pixel [µm].
-    coadds : `int`
-        Largest number of exposures in a coadd.
-    seed : `int`
-        Seed of noise, random fields and rotations.
-    shared : `pathlib.Path` or `None`
-        Folder with ``measured/`` and ``data/``: curves and maps read off the published figures.
-    silicon : `str`
-        Table of silicon; by default the constants of the paper, whatever the set-ups have today.
-    """
-
+    # (ny, nx): adhesive of E2V-CCD250-321 over the whole sensor [µm], on any number of pixels
     thickness_um: FloatArray
-    detail_um: FloatArray
-    coadds: int = 800
-    seed: int = 1
+    detail_um: FloatArray  # (ny, nx): a part of it pixel by pixel [µm]
+    coadds: int = 800  # largest number of exposures in a coadd
+    seed: int = 1  # seed of noise, random fields and rotations
+    # folder with ``measured/`` and ``data/``: curves and maps read off the published figures
     shared: Path | None = None
+    # table of silicon; by default the constants of the paper, whatever the set-ups have today
     silicon: str = PAPER_SILICON
 
     def __post_init__(self) -> None:

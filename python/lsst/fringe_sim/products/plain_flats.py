@@ -36,38 +36,20 @@ BIASES = ("bias", "zero")
 
 @dataclass(frozen=True)
 class PlainImage:
-    """What the header of one image says; the pixels are read when they are wanted.
+    """What the header of one image says; the pixels are read when they are wanted."""
 
-    Attributes
-    ----------
-    source : `str`
-        The file.
-    kind : `str`
-        ``flat``, ``bias``, or else ``IMGTYPE`` in lower case; ``flat`` where it is absent. Of another kind than these
-        two nothing else is asked for.
-    shape : `tuple` [`int`, `int`]
-        Rows and columns.
-    detector : `str`
-        Name of the sensor; empty if it is not stated.
-    wavelength_nm, temperature_k : `float` or `None`
-        Of a flat; `None` where the temperature is not stated.
-    gain : `float`
-        Electrons for each count.
-    read_noise_e : `float`
-        Read noise in electrons; 0 where it is not stated.
-    full : `float`
-        Counts at which a pixel is saturated.
-    """
-
-    source: str
+    source: str  # the file
+    # ``flat``, ``bias``, or else ``IMGTYPE`` in lower case; ``flat`` where it is absent. Of another kind than
+    # these two nothing else is asked for.
     kind: str
-    shape: tuple[int, int]
-    detector: str = ""
+    shape: tuple[int, int]  # rows and columns
+    detector: str = ""  # name of the sensor; empty if it is not stated
+    # wavelength_nm, temperature_k: of a flat; `None` where the temperature is not stated
     wavelength_nm: float | None = None
     temperature_k: float | None = None
-    gain: float = 1.0
-    read_noise_e: float = 0.0
-    full: float = math.inf
+    gain: float = 1.0  # electrons for each count
+    read_noise_e: float = 0.0  # read noise in electrons; 0 where it is not stated
+    full: float = math.inf  # counts at which a pixel is saturated
 
     @classmethod
     def read(cls, path: str | Path) -> PlainImage | None:

@@ -71,17 +71,9 @@ class Axis:
 def parse_set(names: Sequence[str], catalogue: Sequence[Effect] | None = None) -> tuple[Axis, ...]:
     """Parameters of a set of effects.
 
-    Parameters
-    ----------
-    names : sequence of `str`
-        ``effect`` for all of its parameters, or ``effect.parameter`` for one.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such effect or parameter.
-    InputError
-        More than three parameters, or one twice.
+    ``names``: ``effect`` for all of its parameters, or ``effect.parameter`` for one.
+    `UnknownNameError`: there is no such effect or parameter.
+    `InputError`: more than three parameters, or one twice.
     """
     known = {effect.name: effect for effect in (known_effects() if catalogue is None else catalogue)}
     system = FringeModel.from_setup(LAB).base_system
@@ -132,18 +124,10 @@ class _Table:
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """A set of effects given all data.
+    """A set of effects given all data."""
 
-    Attributes
-    ----------
-    axes : `tuple` [`Axis`, ...]
-        Its parameters.
-    predictor : `Predictor`
-        Data and predictions.
-    """
-
-    axes: tuple[Axis, ...]
-    predictor: Predictor
+    axes: tuple[Axis, ...]  # its parameters
+    predictor: Predictor  # data and predictions
 
     @property
     def name(self) -> str:

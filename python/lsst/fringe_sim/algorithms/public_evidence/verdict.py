@@ -59,47 +59,28 @@ RIVALS: tuple[tuple[str, ...], ...] = (
 
 @dataclass(frozen=True)
 class Measurement:
-    """One that would tell members of a class apart.
+    """One that would tell members of a class apart."""
 
-    Attributes
-    ----------
-    name, unit : `str`
-        What is measured.
-    accuracy : `float`
-        Relative accuracy that is taken for granted.
-    expect : callable
-        ``(settings) -> value`` with effects at given values.
-    """
-
+    # name, unit: what is measured
     name: str
     unit: str
-    accuracy: float
-    expect: Callable[[Mapping[str, float]], float]
+    accuracy: float  # relative accuracy that is taken for granted
+    expect: Callable[[Mapping[str, float]], float]  # ``(settings) -> value`` with effects at given values
 
 
 @dataclass(frozen=True)
 class KindRow:
-    """One kind of data, foretold from all others.
+    """One kind of data, foretold from all others."""
 
-    Attributes
-    ----------
-    name : `str`
-        Kind.
-    paper, plane, foretold : `float`
-        Rms misfit of the model of the paper, of plane layers without any effect, and of what the best set says
-        after the other kinds; of logarithms for contrasts, efficiencies and amplitudes.
-    log_probability : `float`
-        Logarithm of the probability of these data given the others, less that of plane layers.
-    paper_fitted : `bool`
-        Whether the paper has fitted its map to these data, so that it foretells nothing.
-    """
-
-    name: str
+    name: str  # kind
+    # paper, plane, foretold: rms misfit of the model of the paper, of plane layers without any effect, and of
+    # what the best set says after the other kinds; of logarithms for contrasts, efficiencies and amplitudes
     paper: float
     plane: float
     foretold: float
+    # logarithm of the probability of these data given the others, less that of plane layers
     log_probability: float
-    paper_fitted: bool
+    paper_fitted: bool  # whether the paper has fitted its map to these data, so that it foretells nothing
 
     @property
     def factor(self) -> float:
@@ -109,15 +90,9 @@ class KindRow:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Sets of effects, compared.
+    """Sets of effects, compared."""
 
-    Attributes
-    ----------
-    fits : `tuple` [`JointFit`, ...]
-        Best first; one of them is the empty set.
-    """
-
-    fits: tuple[JointFit, ...]
+    fits: tuple[JointFit, ...]  # best first; one of them is the empty set
 
     @property
     def best(self) -> JointFit:
