@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -11,9 +12,6 @@ import numpy as np
 
 from lsst.pex.config import Config, Field, FieldValidationError
 from lsst.pipe.base import (
-    InputQuantizedConnection,
-    NoWorkFound,
-    OutputQuantizedConnection,
     PipelineTask,
     PipelineTaskConfig,
     PipelineTaskConnections,
@@ -66,14 +64,6 @@ class EffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrumen
         dimensions=("instrument", "detector"),
     )
 
-    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
-        """A sensor without flats is no work."""
-        connection, refs = inputs["flats"]
-        if not refs:
-            raise NoWorkFound(label, "flats", connection)
-        super().adjustQuantum(inputs, outputs, label, data_id)
-        return {}, {}
-
 
 class SearchConfig(Config):
     """How hard a search looks."""
@@ -121,12 +111,7 @@ class EffectDiscoveryTask(PipelineTask):
     config: EffectDiscoveryConfig
     _DefaultName = "effectDiscovery"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the flats one by one into a cube, search, store."""
         detector = sensor_of(data_id_of(butlerQC))
         flats = (butlerQC.get(ref).get() for ref in inputRefs.flats)
@@ -164,13 +149,10 @@ class EffectDiscoveryTask(PipelineTask):
             choice.model(),
             rng=self.config.rng(detector),
             options=self.config.options(SearchOptions()),
-            report=self._say,
+            report=functools.partial(self.log.verbose, "%s"),
         )
         self.log.info("%s: %s", detector.name, verdict.summary())
         return _stored(self.config, choice, verdict, detector)
-
-    def _say(self, line: str) -> None:
-        self.log.verbose("%s", line)
 
 
 class SkyEffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
@@ -221,12 +203,7 @@ class SkyEffectDiscoveryTask(PipelineTask):
     config: SkyEffectDiscoveryConfig
     _DefaultName = "skyEffectDiscovery"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read frames and map, search, store."""
         detector = sensor_of(data_id_of(butlerQC))
         frames = [butlerQC.get(ref).get() for ref in inputRefs.frames]
@@ -273,13 +250,10 @@ class SkyEffectDiscoveryTask(PipelineTask):
             sky=sky_model.spectrum(),
             placement=placement_in_frames(frames, detector, model.setup.pixel_scale_arcsec),
             options=self.config.options(SKY_SEARCH),
-            report=self._say,
+            report=functools.partial(self.log.verbose, "%s"),
         )
         self.log.info("%s: %s", detector.name, verdict.summary())
         return _stored(self.config, choice, verdict, detector)
-
-    def _say(self, line: str) -> None:
-        self.log.verbose("%s", line)
 
 
 def _stored(

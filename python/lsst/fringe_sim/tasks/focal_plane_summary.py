@@ -9,9 +9,6 @@ import numpy as np
 from astropy.table import Table
 
 from lsst.pipe.base import (
-    InputQuantizedConnection,
-    NoWorkFound,
-    OutputQuantizedConnection,
     PipelineTask,
     PipelineTaskConfig,
     PipelineTaskConnections,
@@ -21,7 +18,7 @@ from lsst.pipe.base import (
 from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.focal_plane import summary_table
-from .quantum import common_header, unusable
+from .quantum import common_header, put_in_order, unusable
 
 __all__ = ["FocalPlaneSummaryConfig", "FocalPlaneSummaryConnections", "FocalPlaneSummaryTask"]
 
@@ -45,13 +42,9 @@ class FocalPlaneSummaryConnections(PipelineTaskConnections, dimensions=("instrum
 
     def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
         """Put the sensors in the order of their numbers."""
-        connection, refs = inputs["forecasts"]
-        if not refs:
-            raise NoWorkFound(label, "forecasts", connection)
-        ordered = sorted(refs, key=lambda ref: ref.dataId["detector"])
-        inputs["forecasts"] = (connection, ordered)
+        ordered = put_in_order(inputs, "forecasts", lambda ref: ref.dataId["detector"])
         super().adjustQuantum(inputs, outputs, label, data_id)
-        return {"forecasts": (connection, ordered)}, {}
+        return ordered, {}
 
 
 class FocalPlaneSummaryConfig(PipelineTaskConfig, pipelineConnections=FocalPlaneSummaryConnections):
@@ -65,12 +58,7 @@ class FocalPlaneSummaryTask(PipelineTask):
     config: FocalPlaneSummaryConfig
     _DefaultName = "focalPlaneSummary"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read, gather, store."""
         with unusable("focal plane"):
             result = self.run(butlerQC.get(inputRefs.forecasts))

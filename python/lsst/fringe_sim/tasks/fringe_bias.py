@@ -7,9 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from lsst.pipe.base import (
-    InputQuantizedConnection,
     NoWorkFound,
-    OutputQuantizedConnection,
     PipelineTask,
     PipelineTaskConfig,
     PipelineTaskConnections,
@@ -77,12 +75,7 @@ class FringeBiasTask(PipelineTask):
     config: FringeBiasConfig
     _DefaultName = "fringeBias"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the frames one by one while they are combined."""
         detector = sensor_of(data_id_of(butlerQC))
         with unusable(detector.name):

@@ -6,8 +6,6 @@ from typing import Any, ClassVar
 
 from lsst.pex.config import Field, FieldValidationError, ListField
 from lsst.pipe.base import (
-    InputQuantizedConnection,
-    OutputQuantizedConnection,
     PipelineTask,
     PipelineTaskConfig,
     PipelineTaskConnections,
@@ -122,12 +120,7 @@ class FringeForecastTask(PipelineTask):
     config: FringeForecastConfig
     _DefaultName = "fringeForecast"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the map if there is one, forecast, store."""
         detector = sensor_of(data_id_of(butlerQC))
         with unusable(detector.name):

@@ -11,9 +11,6 @@ import numpy as np
 
 from lsst.pex.config import ChoiceField, Field
 from lsst.pipe.base import (
-    InputQuantizedConnection,
-    NoWorkFound,
-    OutputQuantizedConnection,
     PipelineTask,
     PipelineTaskConfig,
     PipelineTaskConnections,
@@ -25,7 +22,7 @@ from lsst.pipe.base.connectionTypes import Input, Output
 from ..algorithms.pca import fit_pca, fringe_templates
 from ..products import FringeComponents, SkyFringe
 from ..products.same_light import refuse_equal_pixels, refuse_mixed_models
-from .quantum import common_header, data_id_of, run_datetime, sensor_of, unusable
+from .quantum import common_header, data_id_of, put_in_order, run_datetime, sensor_of, unusable
 
 __all__ = ["FringePcaConfig", "FringePcaConnections", "FringePcaTask"]
 
@@ -39,6 +36,7 @@ class FringePcaConnections(PipelineTaskConnections, dimensions=("instrument", "p
         storageClass="SkyFringe",
         dimensions=("instrument", "exposure", "detector"),
         multiple=True,
+        minimum=2,
     )
     fringe = Output(
         doc="Zero-mean fractional fringe frame, which instrument signature removal subtracts.",
@@ -60,13 +58,9 @@ class FringePcaConnections(PipelineTaskConnections, dimensions=("instrument", "p
 
     def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
         """Put the frames in the order of time; one alone has no components."""
-        connection, refs = inputs["frames"]
-        if len(refs) < 2:
-            raise NoWorkFound(label, "frames", connection)
-        ordered = sorted(refs, key=lambda ref: ref.dataId["exposure"])
-        inputs["frames"] = (connection, ordered)
+        ordered = put_in_order(inputs, "frames", lambda ref: ref.dataId["exposure"])
         super().adjustQuantum(inputs, outputs, label, data_id)
-        return {"frames": (connection, ordered)}, {}
+        return ordered, {}
 
 
 class FringePcaConfig(PipelineTaskConfig, pipelineConnections=FringePcaConnections):
@@ -102,12 +96,7 @@ class FringePcaTask(PipelineTask):
     config: FringePcaConfig
     _DefaultName = "fringePca"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the frames, decompose, store."""
         data_id = data_id_of(butlerQC)
         detector = sensor_of(data_id)

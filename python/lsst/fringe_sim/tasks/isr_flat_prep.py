@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 
 from lsst.pex.config import DictField, Field, FieldValidationError
 from lsst.pipe.base import (
-    InputQuantizedConnection,
-    OutputQuantizedConnection,
     PipelineTask,
     PipelineTaskConfig,
     PipelineTaskConnections,
@@ -134,12 +132,7 @@ class IsrFlatPrepTask(PipelineTask):
     config: IsrFlatPrepConfig
     _DefaultName = "isrFlatPrep"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read, prepare, store."""
         data_id = data_id_of(butlerQC)
         detector = sensor_of(data_id)

@@ -8,9 +8,6 @@ from typing import Any
 
 from lsst.pex.config import Config, Field
 from lsst.pipe.base import (
-    InputQuantizedConnection,
-    NoWorkFound,
-    OutputQuantizedConnection,
     PipelineTask,
     PipelineTaskConfig,
     PipelineTaskConnections,
@@ -23,7 +20,7 @@ from ..algorithms.correction import AmplifierGrid
 from ..algorithms.correction.empirical import TemplateOptions
 from ..algorithms.observed_frames import make_templates
 from ..products import ObservedFrame
-from .quantum import common_header, data_id_of, run_datetime, sensor_of, unusable
+from .quantum import common_header, data_id_of, put_in_order, run_datetime, sensor_of, unusable
 
 __all__ = ["BackgroundConfig", "ObservedFringeConfig", "ObservedFringeConnections", "ObservedFringeTask"]
 
@@ -41,6 +38,7 @@ class ObservedFringeConnections(
         storageClass="ObservedFrame",
         dimensions=("instrument", "exposure", "detector"),
         multiple=True,
+        minimum=LEAST_FRAMES,
         deferLoad=True,
     )
     templates = Output(
@@ -53,13 +51,9 @@ class ObservedFringeConnections(
 
     def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
         """Put the frames in the order of time; two have no template."""
-        connection, refs = inputs["frames"]
-        if len(refs) < LEAST_FRAMES:
-            raise NoWorkFound(label, "frames", connection)
-        ordered = sorted(refs, key=lambda ref: ref.dataId["exposure"])
-        inputs["frames"] = (connection, ordered)
+        ordered = put_in_order(inputs, "frames", lambda ref: ref.dataId["exposure"])
         super().adjustQuantum(inputs, outputs, label, data_id)
-        return {"frames": (connection, ordered)}, {}
+        return ordered, {}
 
 
 class BackgroundConfig(Config):
@@ -102,12 +96,7 @@ class ObservedFringeTask(PipelineTask):
     config: ObservedFringeConfig
     _DefaultName = "observedFringe"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the frames one by one, decompose, store."""
         data_id = data_id_of(butlerQC)
         detector = sensor_of(data_id)

@@ -7,7 +7,7 @@ import datetime
 import hashlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from lsst.daf.butler import DataCoordinate
@@ -23,6 +23,7 @@ __all__ = [
     "common_header",
     "config_digest",
     "data_id_of",
+    "put_in_order",
     "run_datetime",
     "sensor_of",
     "unusable",
@@ -79,6 +80,13 @@ def data_id_of(butlerQC: QuantumContext) -> DataCoordinate:
     if data_id is None:
         raise AssertionError("a quantum that runs has a data id")
     return data_id
+
+
+def put_in_order(inputs: Any, name: str, key: Callable[[Any], Any]) -> dict[str, Any]:
+    """Sort the references of an input for `adjustQuantum`, which returns what this returns."""
+    connection, refs = inputs[name]
+    inputs[name] = (connection, sorted(refs, key=key))
+    return {name: inputs[name]}
 
 
 def common_header(config: Config) -> dict[str, Any]:

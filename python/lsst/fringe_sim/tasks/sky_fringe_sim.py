@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField, RangeField
 from lsst.pipe.base import (
-    InputQuantizedConnection,
-    OutputQuantizedConnection,
     PipelineTask,
     PipelineTaskConfig,
     PipelineTaskConnections,
@@ -187,12 +185,7 @@ class SkyFringeSimTask(PipelineTask):
     config: SkyFringeSimConfig
     _DefaultName = "skyFringeSim"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the map, simulate, store."""
         data_id = data_id_of(butlerQC)
         detector = sensor_of(data_id)
