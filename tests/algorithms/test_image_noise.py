@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from lsst.fringe_sim.algorithms.image_noise import add_exposure_noise
+from lsst.fringe_sim.compiled import limit_threads
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 
 SHAPE = (700, 900)
@@ -73,8 +74,10 @@ def test_seed_decides_and_threads_do_not():
     np.testing.assert_array_equal(made[0], made[1])
     assert not np.array_equal(made[0], made[2])
     for threads in (1, 3):
-        alone = add_exposure_noise(image, np.random.default_rng(1), 4.0, threads=threads)
+        limit_threads(threads)
+        alone = add_exposure_noise(image, np.random.default_rng(1), 4.0)
         np.testing.assert_array_equal(alone, made[0])
+    limit_threads(None)
 
 
 def test_no_electrons_no_photons():

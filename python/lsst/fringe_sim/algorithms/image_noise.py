@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError
 
 __all__ = ["add_exposure_noise"]
@@ -18,7 +17,7 @@ _BAND_ROWS = 64
 
 
 def add_exposure_noise(
-    electrons: ArrayLike, rng: np.random.Generator, read_noise_e: float = 0.0, *, threads: int | None = None
+    electrons: ArrayLike, rng: np.random.Generator, read_noise_e: float = 0.0
 ) -> NDArray[np.float32]:
     """Poisson noise of the photoelectrons and Gaussian read noise.
 
@@ -30,8 +29,6 @@ def add_exposure_noise(
         Source of randomness, from which one stream is spawned for every 64 rows.
     read_noise_e : `float`, optional
         Read noise [e⁻ rms].
-    threads : `int`, optional
-        Number of threads; as many as there are processors if not given. Has no influence on the result.
 
     Returns
     -------
@@ -54,15 +51,15 @@ def add_exposure_noise(
     if not lowest >= 0.0 or not math.isfinite(float(image.max())):
         raise InputError("expected electrons", lowest, "finite and not negative in every pixel")
     noisy = np.empty(image.shape, dtype=np.float32)
-    bands = [slice(start, start + _BAND_ROWS) for start in range(0, len(image), _BAND_ROWS)]
+    streams = rng.spawn(-(-len(image) // _BAND_ROWS))
 
-    def expose(band: slice, stream: np.random.Generator) -> None:
+    def expose(number: int) -> None:
+        band, stream = slice(number * _BAND_ROWS, (number + 1) * _BAND_ROWS), streams[number]
         noisy[band] = stream.poisson(image[band])
         if read_noise_e > 0.0:
             read = stream.standard_normal(noisy[band].shape, dtype=np.float32)
             noisy[band] += np.float32(read_noise_e) * read
 
     # Random numbers are drawn outside of Python's lock.
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(expose, bands, rng.spawn(len(bands))))
+    run_threaded(expose, len(streams))
     return noisy

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
+from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError
 
 __all__ = ["smooth_masked"]
@@ -61,8 +60,9 @@ def smooth_masked(
     reach = len(kernel) // 2
     value, noise = np.empty(image.shape, np.float32), np.empty(image.shape, np.float32)
 
-    def smooth(start: int) -> None:
+    def smooth(band: int) -> None:
         """Rows of one band, from those that reach into it."""
+        start = band * _BAND_ROWS
         stop = min(start + _BAND_ROWS, len(image))
         first = max(start - reach, 0)
         rows, inner = slice(first, stop + reach), slice(start - first, stop - first)
@@ -79,8 +79,7 @@ def smooth_masked(
         value[start:stop] = spread(image[rows], kernel) / weight
         noise[start:stop] = spread(variance[rows], kernel**2) / weight**2
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(smooth, range(0, len(image), _BAND_ROWS)))
+    run_threaded(smooth, -(-len(image) // _BAND_ROWS))
     return value, noise
 
 

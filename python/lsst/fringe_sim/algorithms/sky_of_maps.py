@@ -212,22 +212,34 @@ class SiliconTable:
         place = (self.silicon_um - self.node_um[0]) / step
         known = np.isfinite(place) & np.isfinite(thickness)
         place = np.where(known, place, 0.0)
-        first = np.clip(np.floor(place).astype(np.int32) - STENCIL // 2 + 1, 0, len(self.tables) - STENCIL)
-        image = np.where(known, np.float32(0.0), np.float32(np.nan))
+        nodes = len(self.tables)
+        first = np.clip(np.floor(place).astype(np.int16) - (STENCIL // 2 - 1), 0, nodes - STENCIL)
+        first[~known] = nodes
+        # Pixels in the order of their first node: those that a table is asked for stand together.
+        order = np.argsort(first, axis=None, kind="stable")
+        edges = np.searchsorted(first.ravel()[order], np.arange(nodes + 1))
+        beyond = (place - first).ravel()[order]
+        image = np.where(known, np.float32(0.0), np.float32(np.nan)).ravel()
+        given, asked = thickness.ravel(), np.full(thickness.size, np.nan, thickness.dtype)
         for number, table in enumerate(self.tables):
-            node = number - first
-            asked = known & (node >= 0) & (node < STENCIL)
-            if asked.any():
-                seen = table.frame(np.where(asked, thickness, np.nan))
-                weight = _lagrange(place[asked] - first[asked], node[asked])
-                image[asked] += weight.astype(np.float32) * seen[asked]
-        return image
+            lowest = max(number - STENCIL + 1, 0)
+            inside = order[edges[lowest] : edges[number + 1]]
+            if not inside.size:
+                continue
+            asked[inside] = given[inside]
+            seen = table.frame(asked.reshape(thickness.shape)).ravel()
+            asked[inside] = np.nan
+            for start in range(lowest, number + 1):
+                group = slice(edges[start], edges[start + 1])
+                weight = _lagrange(beyond[group], number - start).astype(np.float32)
+                image[order[group]] += weight * seen[order[group]]
+        return image.reshape(thickness.shape)
 
 
-def _lagrange(place: FloatArray, node: NDArray[np.int32]) -> FloatArray:
-    """Weight of one of the nodes 0, 1, ... of a stencil at a place among them."""
+def _lagrange(place: FloatArray, node: int) -> FloatArray:
+    """Weight of one of the nodes 0, 1, ... of a stencil at places among them."""
     weight = np.ones(place.shape)
     for other in range(STENCIL):
-        factor = (place - other) / np.where(node == other, 1, node - other)
-        weight *= np.where(node == other, 1.0, factor)
+        if other != node:
+            weight *= (place - other) / (node - other)
     return weight

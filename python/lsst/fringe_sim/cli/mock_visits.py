@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -10,6 +11,10 @@ from .mock_flats import thickness_map
 from .output import OutputFolder, output_folder
 from .parameters import BUILT_IN, SIZE, SKY, ChosenEffects, model_effects
 from .progress import progress
+
+if TYPE_CHECKING:  # imported by the functions, so that --help is quick
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = ["mock_visits"]
 
@@ -93,21 +98,21 @@ def mock_visits(
             effects=effects.settings,
             size=f"{shape[1]}x{shape[0]}" if size else None,
             conditions=VisitConditions(stars_per_arcmin2=stars, moon=moon),
-            progress=lambda path: advance(),
         )
-    if truth is not None:
-        _write_truth(truth, {visit.path.name: visit.fringes for visit in written})
-    click.echo(f"{len(written)} visits in {folder}")
+        for visit in written:
+            if truth is not None:
+                _write_truth(truth / visit.path.name, visit.fringes)
+            advance()
+    click.echo(f"{visits} visits in {folder}")
 
 
-def _write_truth(folder: Path, fringes: dict[str, object]) -> None:
+def _write_truth(path: Path, fringes: NDArray[np.float32]) -> None:
     from astropy.io import fits
 
     from ..files import all_or_nothing
 
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, image in fringes.items():
-        hdu = fits.PrimaryHDU(image)
-        hdu.header["BUNIT"] = ("electron", "light of the sky less its mean")
-        with all_or_nothing(folder / name) as temporary:
-            hdu.writeto(temporary)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hdu = fits.PrimaryHDU(fringes)
+    hdu.header["BUNIT"] = ("electron", "light of the sky less its mean")
+    with all_or_nothing(path) as temporary:
+        hdu.writeto(temporary)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,8 +66,6 @@ class MockVisit:
     path: Path  # its file
     fringes: NDArray[np.float32]  # (ny, nx): light of the sky less its mean over the sensor [e⁻]
     level_e: float  # mean light of the sky [e⁻]
-    # sources on the sensor: ``x``, ``y`` [px], ``magnitude``, ``electrons``, ``galaxy``
-    sources: NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,9 +209,7 @@ def write_mock_visits(
     effects: Mapping[str, Any] | None = None,
     size: str | None = None,
     conditions: VisitConditions | None = None,
-    first_visit: datetime.datetime = FIRST_VISIT,
-    progress: Callable[[Path], None] | None = None,
-) -> tuple[MockVisit, ...]:
+) -> Iterator[MockVisit]:
     """Write visits of one night, after the removal of the instrument's signature.
 
     ``out_dir``: folder for the files; made if it does not exist.
@@ -226,9 +222,7 @@ def write_mock_visits(
     ``size``: ``"NXxNY"`` for a cut-down sensor, whose pixels are spread over the same part of the field for
         the beam, and have their usual size for sources.
     ``conditions``: sources, seeing, light, and what disturbs.
-    ``first_visit``: time of the first visit (UTC).
-    ``progress``: called with the path of each file once it is written.
-    Returns the files, and the truth, which stands nowhere in them.
+    Returns the files, each written when it is asked for, and the truth, which stands nowhere in them.
     `InputError`, `OutOfRangeError`, `UnknownNameError`: an argument cannot be used; nothing has been written
         then.
     """
@@ -247,17 +241,16 @@ def write_mock_visits(
     scales = _band_scales(sky, night.hours, visits, seconds, band_rng)
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for number, (scale, visit_rng) in enumerate(zip(scales, visit_rngs, strict=True)):
-        start = first_visit + datetime.timedelta(hours=night.hours * number / visits)
-        sky_e = seconds * np.tensordot(scale, sky.light, axes=1).astype(np.float32)
-        image = VisitImage.expose(scene, sky_e, sensor, seconds, visit_rng)
+
+    def write(number: int) -> MockVisit:
+        start = FIRST_VISIT + datetime.timedelta(hours=night.hours * number / visits)
+        sky_e = seconds * np.tensordot(scales[number], sky.light, axes=1).astype(np.float32)
+        image = VisitImage.expose(scene, sky_e, sensor, seconds, visit_rngs[number])
         path = folder / f"visit_{number + 1:03d}_{sensor.name}.fits"
         _write(path, image, _header(sensor, light, image.pointing, start, seconds))
-        written.append(MockVisit(path, sky_e - np.float32(sky_e.mean()), float(sky_e.mean()), image.sources))
-        if progress is not None:
-            progress(path)
-    return tuple(written)
+        return MockVisit(path, sky_e - np.float32(sky_e.mean()), float(sky_e.mean()))
+
+    return map(write, range(visits))
 
 
 def _band_scales(
