@@ -30,7 +30,7 @@ def test_response_is_the_brute_force_average_over_the_line(model, rng) -> None:
     thickness = rng.uniform(6.0, 28.0)
     offset = np.linspace(-4.5, 4.5, 2001)
     weight = np.exp(-4.0 * np.log(2.0) * (offset / 2.0) ** 2)
-    stack = model.setup.stack.with_thickness("adhesive", thickness)
+    stack = model.setup.stack.replace_layer("adhesive", thickness_um=thickness)
     for wavelength in (885.0, 960.0):
         wave = wavelength + offset
         fraction = layer_absorption(

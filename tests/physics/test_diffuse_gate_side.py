@@ -87,7 +87,7 @@ def test_energy_is_conserved() -> None:
     """Where all that is not scattered is reflected totally and silicon is deep, nothing but the two ends is left."""
     stack = Setup.from_name("ts8_e2v").stack
     medium = stack.layers[stack.position("detection")].medium
-    deep = stack.with_thickness("detection", 1e5)
+    deep = stack.replace_layer("detection", thickness_um=1e5)
     for name in ("upper", "lower"):
         deep = deep.with_inserted(Layer(name, medium, 0.0), before="gate_oxide")
     taken, left = DiffuseReturn("upper", "lower", 0.5).fate(deep, "detection", WAVES, 183.15)
@@ -95,7 +95,7 @@ def test_energy_is_conserved() -> None:
     assert np.all((left >= 0.0) & (taken + left <= 1.0 + 1e-12))
     # All is scattered again and again: what is not absorbed can only leave through the front.
     taken, left = DiffuseReturn("upper", "lower", 1.0 - 1e-12).fate(
-        deep.with_thickness("detection", 100.0), "detection", WAVES, 183.15
+        deep.replace_layer("detection", thickness_um=100.0), "detection", WAVES, 183.15
     )
     np.testing.assert_allclose(taken + left, 1.0, atol=1e-9)
 

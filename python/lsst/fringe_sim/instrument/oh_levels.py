@@ -84,11 +84,6 @@ class RotationalLevels:
         """Population of the upper level of every line, both parts together."""
         return (self.cold + self.hot)[self.line_level]
 
-    @property
-    def line_energy_cm(self) -> FloatArray:
-        """Energy of the upper level of every line [1/cm]."""
-        return self.energy_cm[self.line_level]
-
     def of_lines(self, chosen: NDArray[Any]) -> RotationalLevels:
         """The same levels for lines in another order, or for some of them."""
         return replace(self, line_level=self.line_level[chosen])

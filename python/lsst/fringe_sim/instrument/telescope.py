@@ -229,11 +229,6 @@ class Telescope:
         except (KeyError, TypeError) as error:
             raise ResourceError(f"telescope {name}: wrong or missing entry {error}") from error
 
-    @property
-    def pixel_solid_angle_arcsec2(self) -> float:
-        """Sky area of a pixel [arcsec²]."""
-        return self.pixel_scale_arcsec**2
-
     @named_units
     def trace(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0) -> RayBundle:
         """Rays that arrive at one field position.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -19,9 +18,7 @@ __all__ = [
     "LampSpectrum",
     "MonochromaticProfile",
     "SpectralProfile",
-    "TabulatedProfile",
     "TriangularProfile",
-    "WingedGaussianProfile",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -120,79 +117,6 @@ class TriangularProfile(SpectralProfile):
 
 
 @named_units
-@dataclass(frozen=True)
-class WingedGaussianProfile(SpectralProfile):
-    """Gaussian line on a weak, wide Lorentzian: scattered light of the grating.
-
-    Attributes
-    ----------
-    fwhm_nm : `float`
-        Full width at half maximum of the core [nm].
-    wing_fraction : `float`
-        Part of the light in the wing, 0 to below 1.
-    wing_fwhm_nm : `float`
-        Full width at half maximum of the wing [nm].
-    wing_reach_nm : `float`
-        Distance at which the wing is cut off [nm].
-    """
-
-    fwhm_nm: float
-    wing_fraction: float
-    wing_fwhm_nm: float
-    wing_reach_nm: float = 20.0
-
-    def __post_init__(self) -> None:
-        _check_width(self.fwhm_nm)
-        _check_width(self.wing_fwhm_nm)
-        if not 0.0 <= self.wing_fraction < 1.0:
-            raise OutOfRangeError("fraction of light in the wing", self.wing_fraction, "0 to below 1")
-        if not 0.0 < self.wing_reach_nm <= 100.0:
-            raise OutOfRangeError("reach of the wing [nm]", self.wing_reach_nm, "above 0 and up to 100")
-
-    @named_units
-    def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
-        """Nodes of the core and, unless it is empty, of the wing; see `SpectralProfile.nodes`."""
-        offset, weight = GaussianProfile(self.fwhm_nm).nodes(step_nm)
-        if self.wing_fraction == 0.0:
-            return offset, weight
-        # The wing varies over its own width near the middle and is sampled like the fringes elsewhere.
-        finest = min(8.0 * step_nm, 0.5 * self.wing_fwhm_nm)
-        place, share = _gauss_panels(np.array([-self.wing_reach_nm, 0.0, self.wing_reach_nm]), finest, 8)
-        share = share / (1.0 + (2.0 * place / self.wing_fwhm_nm) ** 2)
-        joint = [(1.0 - self.wing_fraction) * weight, self.wing_fraction * share / share.sum()]
-        return np.concatenate([offset, place]), np.concatenate(joint)
-
-
-@named_units
-@dataclass(frozen=True, eq=False)
-class TabulatedProfile(SpectralProfile):
-    """Measured line: straight lines between tabulated points.
-
-    Attributes
-    ----------
-    offset_nm : `numpy.ndarray`, shape ``(K,)``
-        Wavelength relative to the nominal one [nm], increasing.
-    light : `numpy.ndarray`, shape ``(K,)``
-        Relative number of photons per wavelength, not negative.
-    """
-
-    offset_nm: FloatArray
-    light: FloatArray
-
-    def __post_init__(self) -> None:
-        offset, light = _checked_table("line profile", self.offset_nm, self.light)
-        object.__setattr__(self, "offset_nm", offset)
-        object.__setattr__(self, "light", light)
-
-    @named_units
-    def nodes(self, step_nm: float = DEFAULT_STEP_NM) -> tuple[FloatArray, FloatArray]:
-        """Gauss–Legendre nodes between the points; see `SpectralProfile.nodes`."""
-        place, share = _gauss_panels(self.offset_nm, 4.0 * step_nm, 4)
-        share = share * np.interp(place, self.offset_nm, self.light)
-        return place, share / share.sum()
-
-
-@named_units
 @dataclass(frozen=True, eq=False)
 class LampSpectrum:
     """Spectrum of the lamp in front of the monochromator, e.g. the arc lines of xenon.
@@ -209,7 +133,18 @@ class LampSpectrum:
     light: FloatArray
 
     def __post_init__(self) -> None:
-        wavelength, light = _checked_table("lamp spectrum", self.wavelength_nm, self.light)
+        wavelength, light = np.asarray(self.wavelength_nm, dtype=float), np.asarray(self.light, dtype=float)
+        if wavelength.ndim != 1 or wavelength.shape != light.shape or wavelength.size < 2:
+            shapes = (wavelength.shape, light.shape)
+            raise InputError("shapes of the lamp spectrum", shapes, "equally long, two points or more")
+        if not (np.all(np.isfinite(wavelength)) and np.all(np.diff(wavelength) > 0.0)):
+            raise InputError(
+                "wavelengths of the lamp spectrum", wavelength.tolist()[:4], "finite and increasing"
+            )
+        if not (np.all(np.isfinite(light)) and np.all(light >= 0.0) and light.sum() > 0.0):
+            raise InputError(
+                "light in the lamp spectrum", float(light.min()), "finite, not negative, not all zero"
+            )
         object.__setattr__(self, "wavelength_nm", wavelength)
         object.__setattr__(self, "light", light)
 
@@ -395,30 +330,6 @@ class Illumination:
             np.tile(beam.theta, wave.size)[None, :],
             joint[None, :],
         )
-
-
-def _gauss_panels(edges: FloatArray, longest: float, order: int) -> tuple[FloatArray, FloatArray]:
-    """Composite Gauss–Legendre nodes and weights on panels that end at ``edges``."""
-    x, w = np.polynomial.legendre.leggauss(order)
-    places, weights = [], []
-    for low, high in itertools.pairwise(edges):
-        panels = max(1, math.ceil((high - low) / longest))
-        half = 0.5 * (high - low) / panels
-        middle = low + half * (2.0 * np.arange(panels) + 1.0)
-        places.append((middle[:, None] + half * x).ravel())
-        weights.append(np.tile(half * w, panels))
-    return np.concatenate(places), np.concatenate(weights)
-
-
-def _checked_table(what: str, place: ArrayLike, light: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    x, y = np.asarray(place, dtype=float), np.asarray(light, dtype=float)
-    if x.ndim != 1 or x.shape != y.shape or x.size < 2:
-        raise InputError(f"shapes of the {what}", (x.shape, y.shape), "equally long, two points or more")
-    if not (np.all(np.isfinite(x)) and np.all(np.diff(x) > 0.0)):
-        raise InputError(f"wavelengths of the {what}", x.tolist()[:4], "finite and increasing")
-    if not (np.all(np.isfinite(y)) and np.all(y >= 0.0) and y.sum() > 0.0):
-        raise InputError(f"light in the {what}", float(y.min()), "finite, not negative, not all zero")
-    return x, y
 
 
 def _check_width(fwhm_nm: float) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -174,11 +173,6 @@ class LayerStack:
         layers[position] = replace(layers[position], **changes)  # type: ignore[arg-type]
         return replace(self, layers=tuple(layers))
 
-    @named_units
-    def with_thickness(self, name: str, thickness_um: float) -> LayerStack:
-        """Stack in which the layer ``name`` has another thickness [µm]."""
-        return self.replace_layer(name, thickness_um=float(thickness_um))
-
     def with_medium(self, name: str, medium: Medium) -> LayerStack:
         """Stack in which the layer ``name`` is made of something else."""
         return self.replace_layer(name, medium=medium)
@@ -210,9 +204,3 @@ class LayerStack:
         if position == 0:
             raise InputError("layer to insert before", before, "any layer but the ambient", source=self.name)
         return replace(self, layers=(*self.layers[:position], layer, *self.layers[position:]))
-
-
-def ensure_layers(stack: LayerStack, names: Sequence[str]) -> None:
-    """Raise `UnknownNameError` unless every name is a layer of the stack."""
-    for name in names:
-        stack.position(name)
