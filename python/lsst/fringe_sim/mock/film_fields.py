@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +20,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
+class Light(NamedTuple):
     """All that one angle and polarisation need apart from the thickness; Q wavelengths.
 
     Fields ``(E, H)`` stand at the lower face of the varying film as ``bottom`` and are carried by the film's own
@@ -168,20 +166,7 @@ def _rough_face(admittance: ComplexArray, phase: ComplexArray) -> ComplexArray:
 
 def add_mode(total: FloatArray, light: Light, thickness_um: FloatArray) -> None:
     """Add the weighted absorbed fraction of one angle and polarisation to ``total``."""
-    _add_absorption(
-        total,
-        thickness_um + light.extra_um,
-        light.weight,
-        light.phase,
-        light.admittance,
-        light.ambient,
-        light.bottom,
-        light.incident,
-        light.top_above,
-        light.top_below,
-        light.low_above,
-        light.low_below,
-    )
+    _add_absorption(total, thickness_um + light.extra_um, light, 0, light.weight.size)
 
 
 PHASES = 32
@@ -193,50 +178,27 @@ def add_periodic_mode(total: FloatArray, light: Light, thickness_um: FloatArray)
     number = np.arange(PHASES // 2)
     to_harmonics = np.exp(-2j * np.pi * number[:, np.newaxis] * np.arange(PHASES) / PHASES) / PHASES
     to_harmonics[1:] *= 2.0
-    _add_harmonics(
-        total,
-        thickness_um + light.extra_um,
-        to_harmonics,
-        light.weight,
-        light.phase,
-        light.admittance,
-        light.ambient,
-        light.bottom,
-        light.incident,
-        light.top_above,
-        light.top_below,
-        light.low_above,
-        light.low_below,
-    )
+    _add_harmonics(total, thickness_um + light.extra_um, to_harmonics, light)
 
 
 @kernel
 def _add_absorption(
-    total: FloatArray,
-    thickness: FloatArray,
-    weight: FloatArray,
-    phase: ComplexArray,
-    admittance: ComplexArray,
-    ambient: FloatArray,
-    bottom: ComplexArray,
-    incident: ComplexArray,
-    top_above: ComplexArray,
-    top_below: ComplexArray,
-    low_above: ComplexArray,
-    low_below: ComplexArray,
+    total: FloatArray, thickness: FloatArray, light: Light, first: int, last: int
 ) -> None:  # pragma: no cover - compiled
-    for q in range(weight.size):
-        y, e_bottom, h_bottom = admittance[q], bottom[q, 0], bottom[q, 1]
-        c, t, low = incident[q], top_above[q], low_above[q]
+    """Add what is absorbed of the wavelengths from the first to before the last."""
+    for q in range(first, last):
+        y, e_bottom, h_bottom = light.admittance[q], light.bottom[q, 0], light.bottom[q, 1]
+        c, t, low = light.incident[q], light.top_above[q], light.low_above[q]
+        t_below, low_below, ambient = light.top_below[q], light.low_below[q], light.ambient[q]
         for i in range(thickness.size):
-            once = np.exp(1j * phase[q] * thickness[i])
+            once = np.exp(1j * light.phase[q] * thickness[i])
             even, odd = 0.5 * (1.0 + once * once), 0.5 * (1.0 - once * once)
             e = even * e_bottom + odd * h_bottom / y
             h = odd * y * e_bottom + even * h_bottom
-            e_top = t[0, 0] * e + t[0, 1] * h + once * top_below[q, 0]
-            h_top = t[1, 0] * e + t[1, 1] * h + once * top_below[q, 1]
-            e_low = low[0, 0] * e + low[0, 1] * h + once * low_below[q, 0]
-            h_low = low[1, 0] * e + low[1, 1] * h + once * low_below[q, 1]
+            e_top = t[0, 0] * e + t[0, 1] * h + once * t_below[0]
+            h_top = t[1, 0] * e + t[1, 1] * h + once * t_below[1]
+            e_low = low[0, 0] * e + low[0, 1] * h + once * low_below[0]
+            h_low = low[1, 0] * e + low[1, 1] * h + once * low_below[1]
             flux = (
                 e_top.real * h_top.real
                 + e_top.imag * h_top.imag
@@ -245,52 +207,26 @@ def _add_absorption(
             )
             e_front = c[0, 0] * e + c[0, 1] * h
             h_front = c[1, 0] * e + c[1, 1] * h
-            forward = 0.5 * (e_front + h_front / ambient[q])
-            total[i] += weight[q] * flux / (ambient[q] * (forward.real**2 + forward.imag**2))
+            forward = 0.5 * (e_front + h_front / ambient)
+            total[i] += light.weight[q] * flux / (ambient * (forward.real**2 + forward.imag**2))
 
 
 @kernel
 def _add_harmonics(
-    total: FloatArray,
-    thickness: FloatArray,
-    to_harmonics: ComplexArray,
-    weight: FloatArray,
-    phase: ComplexArray,
-    admittance: ComplexArray,
-    ambient: FloatArray,
-    bottom: ComplexArray,
-    incident: ComplexArray,
-    top_above: ComplexArray,
-    top_below: ComplexArray,
-    low_above: ComplexArray,
-    low_below: ComplexArray,
+    total: FloatArray, thickness: FloatArray, to_harmonics: ComplexArray, light: Light
 ) -> None:  # pragma: no cover - compiled
     samples = np.empty(to_harmonics.shape[1])
     places = np.arange(samples.size) / samples.size
     harmonic = np.empty(to_harmonics.shape[0], np.complex128)
-    for q in range(weight.size):
-        one = slice(q, q + 1)
+    for q in range(light.weight.size):
         samples[:] = 0.0
-        _add_absorption(
-            samples,
-            np.pi / phase[q].real * places,
-            weight[one],
-            phase[one],
-            admittance[one],
-            ambient[one],
-            bottom[one],
-            incident[one],
-            top_above[one],
-            top_below[one],
-            low_above[one],
-            low_below[one],
-        )
+        _add_absorption(samples, np.pi / light.phase[q].real * places, light, q, q + 1)
         for h in range(harmonic.size):
             harmonic[h] = 0.0
             for i in range(samples.size):
                 harmonic[h] += to_harmonics[h, i] * samples[i]
         for i in range(thickness.size):
-            turn = np.exp(2j * phase[q].real * thickness[i])
+            turn = np.exp(2j * light.phase[q].real * thickness[i])
             wave = 0.0j
             for h in range(harmonic.size - 1, 0, -1):
                 wave = (wave + harmonic[h]) * turn
