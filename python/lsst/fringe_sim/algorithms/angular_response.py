@@ -84,9 +84,7 @@ def angular_response(
     model: FringeModel,
     sky: SkySpectrum,
     limits: tuple[float, float],
-    bandpass: Bandpass | None = None,
     thickness_range_um: tuple[float, float] | None = None,
-    quadrature: SkyQuadrature | None = None,
     angles: int = ANGLES,
 ) -> AngularResponse:
     """Tabulate the response of a sensor to a sky under single angles.
@@ -98,8 +96,7 @@ def angular_response(
         raise OutOfRangeError("limits of sin² of the angle", limits, "two increasing numbers within 0 to 1")
     if model.system.beam is not model.base_system.beam:
         raise InputError("effects", sorted(model.effect_settings), "none that changes the beam")
-    fineness = SkyQuadrature() if quadrature is None else quadrature
-    band = bandpass_of(model) if bandpass is None else bandpass
+    fineness, band = SkyQuadrature(), bandpass_of(model)
     sky = sky_with_effects(model, sky)
     few_rays = reduce_beam(model.system.beam, fineness.continuum_angles)
     table, photons, level = tabulate_components(model, sky, band, thickness_range_um, fineness, few_rays)
@@ -130,19 +127,12 @@ def angular_response(
     )
 
 
-def of_other_silicon(
-    known: AngularResponse,
-    model: FringeModel,
-    sky: SkySpectrum,
-    bandpass: Bandpass | None = None,
-    quadrature: SkyQuadrature | None = None,
-) -> AngularResponse:
+def of_other_silicon(known: AngularResponse, model: FringeModel, sky: SkySpectrum) -> AngularResponse:
     """Another response on the grids of one that is known, with its errors, for silicon of another thickness.
 
     Errors are found once: they do not depend on a part in a thousand of the silicon.
     """
-    fineness = SkyQuadrature() if quadrature is None else quadrature
-    band = bandpass_of(model) if bandpass is None else bandpass
+    fineness, band = SkyQuadrature(), bandpass_of(model)
     angles, points = known.flat.shape
     grid = (known.start_um, known.step_um, points)
     sky = sky_with_effects(model, sky)

@@ -26,7 +26,7 @@ from ..model import FringeModel, ResponseTable
 from .angular_response import ANGLES, AngularResponse, angular_response, of_other_silicon
 from .island_response import parts_of, response_with_islands
 from .sensor_placement import SensorPlacement
-from .sky_frame import SkyQuadrature, is_band, sky_response
+from .sky_frame import is_band, sky_response
 from .sky_response import (
     Response,
     component_factors,
@@ -133,11 +133,9 @@ class SensorResponse:
         """Factor on every component, 1 unless named; errors as of `SkyResponse.factors`."""
         return component_factors(self.component, self.field.angular.photons, scale)
 
-    def of_other_silicon(
-        self, model: FringeModel, sky: SkySpectrum, quadrature: SkyQuadrature | None = None
-    ) -> SensorResponse:
+    def of_other_silicon(self, model: FringeModel, sky: SkySpectrum) -> SensorResponse:
         """The same for silicon of another thickness. Frames are divided by one flat field of the whole sensor."""
-        angular = of_other_silicon(self.field.angular, model, sky, None, quadrature)
+        angular = of_other_silicon(self.field.angular, model, sky)
         flats = [float((self.field.weights @ each.flat).mean()) for each in (self.field.angular, angular)]
         values = angular.values * (flats[0] / flats[1])
         return replace(self, field=replace(self.field, angular=replace(angular, values=values)))
@@ -226,7 +224,6 @@ def field_response(
     angular: AngularResponse,
     beams: BeamField,
     radius_range_deg: tuple[float, float],
-    step_deg: float = RADIUS_STEP_DEG,
 ) -> FieldResponse:
     """Give an angular response the beams of a range of field radii.
 
@@ -238,16 +235,16 @@ def field_response(
     if not 0.0 <= low <= high or low > edge:
         raise OutOfRangeError("field radii [deg]", radius_range_deg, f"ascending, from 0 to {edge:g}")
     high = min(high, edge)
-    first = max(0.0, low - step_deg)
-    cells = max(_STENCIL - 1, math.ceil((min(high + step_deg, edge) - first) / step_deg - 1e-9))
-    first = max(0.0, min(first, edge - cells * step_deg))
+    first = max(0.0, low - RADIUS_STEP_DEG)
+    cells = max(_STENCIL - 1, math.ceil((min(high + RADIUS_STEP_DEG, edge) - first) / RADIUS_STEP_DEG - 1e-9))
+    first = max(0.0, min(first, edge - cells * RADIUS_STEP_DEG))
     weights, kept = [], []
-    on_axis = beams.kept_fraction(0.0)
+    _, on_axis = beams.sin_squared_at(0.0)
     for number in range(cells + 1):
-        rays, share = beams.sin_squared_at(min(first + number * step_deg, edge))
+        rays, share = beams.sin_squared_at(min(first + number * RADIUS_STEP_DEG, edge))
         weights.append(angular.weights(rays))
         kept.append(share / on_axis)
-    return FieldResponse(angular, first, step_deg, np.stack(weights), np.array(kept))
+    return FieldResponse(angular, first, RADIUS_STEP_DEG, np.stack(weights), np.array(kept))
 
 
 def sensor_response(
@@ -255,7 +252,6 @@ def sensor_response(
     sky: SkySpectrum,
     placement: SensorPlacement,
     thickness_range_um: tuple[float, float] | None = None,
-    quadrature: SkyQuadrature | None = None,
     like: Response | None = None,
 ) -> Response:
     """Response of one sensor with the beam of every pixel and with its local effects.
@@ -271,15 +267,15 @@ def sensor_response(
     def respond(own: FringeModel) -> Response:
         earlier = next(known, None)
         if isinstance(earlier, SensorResponse):
-            return earlier.of_other_silicon(own, sky, quadrature)
+            return earlier.of_other_silicon(own, sky)
         beams = beam_field(own.setup.telescope)
         if beams is None:
-            return sky_response(own, sky, None, thickness_range_um, quadrature)
+            return sky_response(own, sky, None, thickness_range_um)
         radii = placement.radius_range_deg
         limits = beam_limits(beams, radii)
         share = (limits[1] - limits[0]) / float(np.subtract(*beam_limits(beams)[::-1]))
         angles = math.ceil(ANGLES * share) + _MORE_ANGLES
-        angular = angular_response(own, sky, limits, None, thickness_range_um, quadrature, angles)
+        angular = angular_response(own, sky, limits, thickness_range_um, angles)
         return field_response(angular, beams, radii).on(placement)
 
     return response_with_islands(model, respond)

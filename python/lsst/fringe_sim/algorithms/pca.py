@@ -41,6 +41,8 @@ _ROUNDING = 1e-13
 """Share of the variance below which an eigenvalue is rounding of float32 frames."""
 
 _HISTOGRAM_BINS = 32_768
+"""Of thickness, over the range of the response; the error falls with their square."""
+
 _BLOCK = 65_536
 """Pixels that are counted at a time."""
 
@@ -214,7 +216,6 @@ def decompose_thickness(
     scales: Sequence[Mapping[str, float]],
     *,
     n_components: int | None = None,
-    bins: int = _HISTOGRAM_BINS,
 ) -> ThicknessComponents:
     """Principal components of noiseless model frames, from the histogram of thickness alone.
 
@@ -231,8 +232,6 @@ def decompose_thickness(
         Factors on the components of the sky, one mapping per frame.
     n_components : `int`, optional
         Components to keep; by default all that are not rounding.
-    bins : `int`, optional
-        Bins of the histogram over the range of the response; the error falls with their square.
 
     Raises
     ------
@@ -244,7 +243,7 @@ def decompose_thickness(
     thickness = np.asarray(thickness_um)
     if len(scales) < 2:
         raise InputError("number of frames", len(scales), "two or more frames")
-    count, centre = _thickness_histogram(thickness, response.table, bins)
+    count, centre = _thickness_histogram(thickness, response.table)
     factors = np.stack([response.factors(scale) for scale in scales])
     levels = factors @ (response.level * response.table.lookup(centre))
     background = levels @ count / count.sum()
@@ -493,29 +492,19 @@ def _signs(components: FloatArray) -> FloatArray:
     return np.where(extreme < 0.0, -1.0, 1.0)
 
 
-def _thickness_histogram(
-    thickness: NDArray[Any], table: ResponseTable, bins: int
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels per bin between the ends of a table, and centres of the bins; empty ones are left out.
-
-    Raises
-    ------
-    InputError
-        No pixel has a thickness.
-    OutOfRangeError
-        A thickness outside the table.
-    """
+def _thickness_histogram(thickness: NDArray[Any], table: ResponseTable) -> tuple[FloatArray, FloatArray]:
+    """Pixels per bin between the ends of a table, and centres of the bins; empty ones are left out."""
     values = np.ravel(thickness)
-    low, width = table.start_um, (table.stop_um - table.start_um) / bins
-    count = np.zeros(bins, dtype=np.int64)
+    low, width = table.start_um, (table.stop_um - table.start_um) / _HISTOGRAM_BINS
+    count = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)
     for start in range(0, values.size, _BLOCK):
         known = values[start : start + _BLOCK].astype(np.float64)
         known = known[~np.isnan(known)]
         if known.size:
             # The table says what is wrong with an end outside; rounding at its own ends is not.
             table.lookup([known.min(), known.max()])
-            place = np.clip((known - low) / width, 0, bins - 1).astype(np.int64)
-            count += np.bincount(place, minlength=bins)
+            place = np.clip((known - low) / width, 0, _HISTOGRAM_BINS - 1).astype(np.int64)
+            count += np.bincount(place, minlength=_HISTOGRAM_BINS)
     filled = np.flatnonzero(count)
     if filled.size == 0:
         raise InputError("pixels with a thickness", 0, "some pixels")

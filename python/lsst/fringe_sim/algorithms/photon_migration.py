@@ -85,7 +85,6 @@ def photon_migration(
     light: Sequence[SpectralComponent],
     stack: LayerStack,
     temperature_k: float,
-    layer: str = "detection",
 ) -> PhotonMigration:
     """Walk of the photons of a sky in the detection layer.
 
@@ -95,7 +94,7 @@ def photon_migration(
         raise InputError("light", "none", "components with photons")
     wavelength = np.concatenate([item.wavelength_nm for item in light])
     photons = np.concatenate([item.photons for item in light])
-    medium = stack.layers[stack.position(layer)]
+    medium = stack.layers[stack.position("detection")]
     index = medium.medium.index(wavelength, temperature_k)
     total = rays.slope_x.size
     golden = 0.5 * (math.sqrt(5.0) - 1.0)

@@ -148,11 +148,6 @@ class BeamField:
         sine, _ = self.sin_squared_at(field_x_deg, field_y_deg)
         return beam_of_quantiles(quantiles(sine, QUANTILES), nodes)
 
-    @named_units
-    def kept_fraction(self, field_x_deg: float, field_y_deg: float = 0.0) -> float:
-        """Unvignetted share of the pupil at one field position."""
-        return self.sin_squared_at(field_x_deg, field_y_deg)[1]
-
 
 def _edge_rays(
     squared: FloatArray, inner: float, outer: float

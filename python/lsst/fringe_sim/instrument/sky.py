@@ -385,15 +385,13 @@ class SkySpectrum:
         return SpectralComponent(term.name, wave, photons)
 
 
-def van_rhijn_factor(airmass: float, height_km: float = AIRGLOW_HEIGHT_KM) -> float:
+def van_rhijn_factor(airmass: float) -> float:
     """Path through an emitting shell relative to the zenith.
 
     Parameters
     ----------
     airmass : `float`
         Secant of the zenith distance.
-    height_km : `float`, optional
-        Height of the shell [km].
 
     References
     ----------
@@ -402,7 +400,9 @@ def van_rhijn_factor(airmass: float, height_km: float = AIRGLOW_HEIGHT_KM) -> fl
     if not airmass >= 1.0:
         raise OutOfRangeError("airmass", airmass, "1 or more")
     sine_squared = 1.0 - airmass**-2
-    return float((1.0 - (EARTH_RADIUS_KM / (EARTH_RADIUS_KM + height_km)) ** 2 * sine_squared) ** -0.5)
+    return float(
+        (1.0 - (EARTH_RADIUS_KM / (EARTH_RADIUS_KM + AIRGLOW_HEIGHT_KM)) ** 2 * sine_squared) ** -0.5
+    )
 
 
 def airglow_continuum(solar_flux_sfu: float = 129.0) -> ContinuumTerm:

@@ -255,15 +255,7 @@ class Telescope:
             return Beam.cone(self.optics.f_number, self.optics.obscuration, nodes)
         if self.optics.axisymmetric:
             field_x_deg, field_y_deg = math.hypot(field_x_deg, field_y_deg), 0.0
-        return beam_of_quantiles(_traced_quantiles(self.optics, field_x_deg, field_y_deg)[0], nodes)
-
-    @named_units
-    def kept_fraction(self, field_x_deg: float = 0.0, field_y_deg: float = 0.0) -> float:
-        """Share of the pupil that light from one field position passes; vignetting is its fall off axis."""
-        self._check_field(field_x_deg, field_y_deg)
-        if isinstance(self.optics, ConeOptics):
-            return 1.0
-        return _traced_quantiles(self.optics, field_x_deg, field_y_deg)[1]
+        return beam_of_quantiles(_traced_quantiles(self.optics, field_x_deg, field_y_deg), nodes)
 
     def _check_field(self, field_x_deg: float, field_y_deg: float) -> None:
         if not math.hypot(field_x_deg, field_y_deg) <= self.field_radius_deg:
@@ -315,10 +307,7 @@ def batoid_optic(prescription: str) -> batoid.Optic:
 
 
 @functools.lru_cache(maxsize=64)
-def _traced_quantiles(
-    optics: TracedOptics, field_x_deg: float, field_y_deg: float
-) -> tuple[FloatArray, float]:
-    bundle = optics.trace(field_x_deg, field_y_deg)
-    quantile = bundle.quantiles()
+def _traced_quantiles(optics: TracedOptics, field_x_deg: float, field_y_deg: float) -> FloatArray:
+    quantile = optics.trace(field_x_deg, field_y_deg).quantiles()
     quantile.flags.writeable = False
-    return quantile, bundle.kept_fraction
+    return quantile

@@ -69,15 +69,13 @@ def parse_hours(text: str) -> tuple[float, ...]:
     return tuple(float(hour) for hour in first + step * np.arange(count))
 
 
-def hour_of_night(record: Any, utc_offset_h: float | None = None) -> float:
+def hour_of_night(record: Any) -> float:
     """Local time at the middle of an exposure, hours; after midnight it goes on beyond 24.
 
     Parameters
     ----------
     record : `lsst.daf.butler.DimensionRecord`
         Record of an exposure.
-    utc_offset_h : `float`, optional
-        Local time minus UTC; by default that of the instrument.
 
     Raises
     ------
@@ -86,8 +84,7 @@ def hour_of_night(record: Any, utc_offset_h: float | None = None) -> float:
     """
     if record.timespan is None or record.timespan.begin is None or record.timespan.end is None:
         raise InputError("timespan", record.timespan, "a begin and an end", source=f"exposure {record.id}")
-    if utc_offset_h is None:
-        utc_offset_h = _utc_offset(_instrument(record.instrument))
+    utc_offset_h = _utc_offset(_instrument(record.instrument))
     begin, end = record.timespan.begin, record.timespan.end
     middle = begin + (end - begin) / 2
     midnight = Time(_day(record.day_obs).isoformat(), scale="utc")

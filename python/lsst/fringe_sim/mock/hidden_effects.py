@@ -53,7 +53,7 @@ XENON_REFERENCE_NM, XENON_FWHM_NM = 992.592, 2.0
 
 
 def validate_effects(
-    settings: Mapping[str, Any] | None, catalogue: tuple[HiddenEffect, ...] | None = None
+    settings: Mapping[str, Any] | None,
 ) -> tuple[tuple[HiddenEffect, dict[str, float]], ...]:
     """Check settings and return the effects with their values, in the order of the catalogue.
 
@@ -61,8 +61,6 @@ def validate_effects(
     ----------
     settings : mapping or `None`
         ``{"bandwidth.fwhm": 2.4}`` or ``{"bandwidth": {"fwhm": 2.4}}``, or both mixed.
-    catalogue : `tuple` [`HiddenEffect`, ...], optional
-        Effects to choose from; `HIDDEN_EFFECTS` by default.
 
     Raises
     ------
@@ -73,7 +71,7 @@ def validate_effects(
     InputError
         A value that is not a finite number, or a setting without a parameter.
     """
-    return check_settings(settings or {}, HIDDEN_EFFECTS if catalogue is None else catalogue)
+    return check_settings(settings or {}, HIDDEN_EFFECTS)
 
 
 def with_hidden_optics(optics: FlatFieldOptics, active: Iterable[ActiveHiddenEffect]) -> FlatFieldOptics:

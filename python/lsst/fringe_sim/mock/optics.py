@@ -345,9 +345,9 @@ class FlatFieldOptics:
         table = SignalTable(grid, signal, tuple(float(value) for value in wavelengths_nm))
         return replace(table, relative_error=self._measure_error(table))
 
-    def _measure_error(self, table: SignalTable, samples: int = 24) -> float:
+    def _measure_error(self, table: SignalTable) -> float:
         rng = np.random.default_rng(len(table.grid_um))
-        between = np.sort(rng.uniform(table.grid_um[1], table.grid_um[-2], samples))
+        between = np.sort(rng.uniform(table.grid_um[1], table.grid_um[-2], 24))
         finer = replace(self, line_step_nm=0.5 * self.line_step_nm, height_step_nm=0.5 * self.height_step_nm)
         worst = 0.0
         for row, wavelength in enumerate(table.wavelengths_nm):

@@ -256,7 +256,6 @@ def write_mock_flats(
     level_e: float = DEFAULT_LEVEL_E,
     defects: Defects | None = None,
     silicon: str | None = None,
-    first_exposure: datetime.datetime = FIRST_EXPOSURE,
     progress: Callable[[Path], None] | None = None,
 ) -> MockRun:
     """Write bias frames and monochromatic flats of one sensor.
@@ -289,8 +288,6 @@ def write_mock_flats(
         Blemishes; none by default.
     silicon : `str`, optional
         Table of the optical constants of silicon, as ``Si_franta2017``; by default that of the set-up.
-    first_exposure : `datetime.datetime`, optional
-        Time of the first frame.
     progress : callable, optional
         Called with the path of each file once it is written.
 
@@ -323,7 +320,7 @@ def write_mock_flats(
 
     plan: list[float | None] = [None] * n_bias
     plan += [wavelength for wavelength in wavelengths for _ in range(repeats)]
-    clock = Clock(first_exposure)
+    clock = Clock(FIRST_EXPOSURE)
     written: list[MockExposure] = []
     for number, (wavelength, frame_rng) in enumerate(zip(plan, frames_rng.spawn(len(plan)), strict=True)):
         level = 0.0 if wavelength is None else level_e * (1.0 + LEVEL_SCATTER * level_rng.standard_normal())

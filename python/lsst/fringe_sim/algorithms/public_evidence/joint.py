@@ -68,14 +68,14 @@ class Axis:
         return np.asarray(np.log(np.gradient(values)) - np.log1p(place**2) - math.log(whole))
 
 
-def parse_set(names: Sequence[str], catalogue: Sequence[Effect] | None = None) -> tuple[Axis, ...]:
+def parse_set(names: Sequence[str]) -> tuple[Axis, ...]:
     """Parameters of a set of effects.
 
     ``names``: ``effect`` for all of its parameters, or ``effect.parameter`` for one.
     `UnknownNameError`: there is no such effect or parameter.
     `InputError`: more than three parameters, or one twice.
     """
-    known = {effect.name: effect for effect in (known_effects() if catalogue is None else catalogue)}
+    known = {effect.name: effect for effect in known_effects()}
     system = FringeModel.from_setup(LAB).base_system
     axes = []
     for given in names:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ...effects import Effect, known_effects
 from ..discovery.options import SearchOptions
 from .joint import JointFit, Predictor, parse_set
 from .kinds import (
@@ -196,7 +195,6 @@ class Comparison:
 def compare(
     sets: Sequence[Sequence[str]] = RIVALS,
     kinds: Sequence[Kind] | None = None,
-    catalogue: Sequence[Effect] | None = None,
     advance: Callable[[], None] = lambda: None,
 ) -> Comparison:
     """Compare sets of effects, and none at all, on all public data.
@@ -207,13 +205,10 @@ def compare(
         Effects, or single parameters as ``effect.parameter``.
     kinds : sequence of `Kind`, optional
         Data; `public_kinds` by default.
-    catalogue : sequence of `Effect`, optional
-        Effects that may be named.
     advance : callable, optional
         Called after each set.
     """
-    known = known_effects() if catalogue is None else catalogue
-    wanted = [parse_set(names, known) for names in ((), *sets)]
+    wanted = [parse_set(names) for names in ((), *sets)]
     predictor = Predictor(public_kinds() if kinds is None else kinds)
     fits = []
     for axes in wanted:
