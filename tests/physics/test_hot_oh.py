@@ -84,7 +84,7 @@ def test_a_hot_population_is_added_to_the_cold_one(table) -> None:
     """It used to multiply the hot populations that are listed: 86 % of the light came from above 1500 cm⁻¹ then."""
     before = part_above(EmissionLines.oh(), table, 1500.0)
     assert before == pytest.approx(0.020, abs=0.001)
-    direct = EmissionLines.oh(190.0, hot_temperature_k=1000.0, hot_ratio=0.01)
+    direct = EmissionLines.oh().with_rotation(lambda levels: levels.thermal(190.0, 1000.0, 0.01))
     assert part_above(direct, table, 1500.0) == pytest.approx(0.0042, abs=0.0003)
     effect = with_effects(EmissionLines.oh(190.0), {"hot_rotation.ratio": 0.01})
     np.testing.assert_allclose(effect.photon_radiance, direct.photon_radiance, rtol=1e-9)

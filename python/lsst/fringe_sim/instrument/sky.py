@@ -120,10 +120,6 @@ class EmissionLines:
         cls,
         rotational_temperature_k: float | None = None,
         vibrational_temperature_k: float | None = None,
-        band_scale: Mapping[str, float] | None = None,
-        *,
-        hot_temperature_k: float | None = None,
-        hot_ratio: float = 0.0,
     ) -> EmissionLines:
         """OH lines between 880 and 1110 nm, recomputed from Einstein coefficients and populations.
 
@@ -135,20 +131,11 @@ class EmissionLines:
         vibrational_temperature_k : `float`, optional
             Vibrational temperature [K] between the lowest rotational levels; by default the PALACE populations,
             which correspond to 10 970 K.
-        band_scale : mapping, optional
-            Factors on the radiance of bands, by name (``{"8-4": 1.3}``).
-        hot_temperature_k, hot_ratio : `float`, optional
-            A second, hot rotational population: its temperature [K] and its size relative to the cold one at zero
-            rotational energy. Needs ``rotational_temperature_k``.
 
         Raises
         ------
         OutOfRangeError
-            A temperature that is not positive, or a negative ratio.
-        UnknownNameError
-            A band that is not in the list.
-        InputError
-            A hot population without a cold temperature.
+            A temperature that is not positive.
 
         Notes
         -----
@@ -157,10 +144,8 @@ class EmissionLines:
         """
         table = read_table("sky", "oh_lines_palace_yband.ecsv")
         levels = RotationalLevels.of_reference()
-        if hot_temperature_k is not None and rotational_temperature_k is None:
-            raise InputError("rotational_temperature_k", None, "a temperature of the cold population")
         if rotational_temperature_k is not None:
-            levels = levels.thermal(rotational_temperature_k, hot_temperature_k, hot_ratio)
+            levels = levels.thermal(rotational_temperature_k)
         rate = np.asarray(table["A"], dtype=float) * np.asarray(table["g_up"], dtype=float)
         radiance = rate * levels.line_population * _photons_per_rayleigh()
         if vibrational_temperature_k is not None:
@@ -168,14 +153,13 @@ class EmissionLines:
             radiance *= _vibrational_factor(np.asarray(table["v_up"]), vibrational_temperature_k)
             radiance *= total / radiance.sum()
         order = np.argsort(np.asarray(table["wavelength"]), kind="stable")
-        lines = cls(
+        return cls(
             np.asarray(table["wavelength"], dtype=float)[order],
             radiance[order],
             np.asarray(table["transmission"], dtype=float)[order],
             np.asarray(table["band"], dtype=str)[order],
             levels.of_lines(order),
         )
-        return lines.scaled(band_scale or {})
 
     @functools.cached_property
     def bands(self) -> tuple[str, ...]:
@@ -183,7 +167,7 @@ class EmissionLines:
         return tuple(dict.fromkeys(str(name) for name in self.band))
 
     def scaled(self, band_scale: Mapping[str, float]) -> EmissionLines:
-        """Lines whose bands are multiplied by factors.
+        """Lines whose bands are multiplied by factors, by name (``{"8-4": 1.3}``).
 
         Raises
         ------

@@ -148,6 +148,14 @@ class FringeInstrument(Instrument):
         record = {"instrument": self.getName(), "name": name, "band": band}
         registry.syncDimensionData("physical_filter", record, update=update)
 
+    def sync_exposure(self, registry: Any, record: Mapping[str, Any]) -> None:
+        """Make the record of an exposure, with those of its filter, night and group."""
+        name, instrument = str(record["physical_filter"]), record["instrument"]
+        self.register_filter(registry, name, self.band_of(name))
+        registry.syncDimensionData("day_obs", {"instrument": instrument, "id": record["day_obs"]})
+        registry.syncDimensionData("group", {"instrument": instrument, "name": record["group"]})
+        registry.syncDimensionData("exposure", record)
+
     @classmethod
     def band_of(cls, physical_filter: str) -> str:
         """Return the band of a physical filter, also of one that is named like the registered ones (``y_04``).

@@ -201,14 +201,8 @@ def _record(
 
 
 def _store(butler: Butler, cls: type[FringeInstrument], record: dict[str, Any]) -> None:
-    registry = butler.registry
-    instrument = record["instrument"]
-    name = record["physical_filter"]
     try:
-        cls().register_filter(registry, name, cls.band_of(name))
-        registry.syncDimensionData("day_obs", {"instrument": instrument, "id": record["day_obs"]})
-        registry.syncDimensionData("group", {"instrument": instrument, "name": record["group"]})
-        registry.syncDimensionData("exposure", record)
+        cls().sync_exposure(butler.registry, record)
     except ConflictingDefinitionError as error:
         raise InputError(
             "exposure",

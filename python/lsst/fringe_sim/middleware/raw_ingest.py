@@ -408,24 +408,10 @@ def _sync_exposures(
     for key, info in {_exposure_key(exposure): exposure.info for exposure in exposures}.items():
         try:
             with butler.transaction():
-                _sync_exposure(butler, info, registered[key[0]])
+                registered[key[0]]().sync_exposure(butler.registry, _exposure_record(info))
         except ConflictingDefinitionError as error:
             refused[key] = (
                 f"exposure {key[1]} of {key[0]} is in the repository with other properties "
                 f"({_one_line(error)}); allowed: a DATE-OBS or SEQNUM of its own"
             )
     return refused
-
-
-def _sync_exposure(butler: Butler, info: ObservationInfo, instrument: type[FringeInstrument]) -> None:
-    record = _exposure_record(info)
-    name = str(record["physical_filter"])
-    instrument().register_filter(butler.registry, name, instrument.band_of(name))
-    registry = butler.registry
-    registry.syncDimensionData("day_obs", _day_obs_record(info))
-    registry.syncDimensionData("group", {"instrument": info.instrument, "name": info.exposure_group})
-    registry.syncDimensionData("exposure", record)
-
-
-def _day_obs_record(info: ObservationInfo) -> dict[str, Any]:
-    return {"instrument": info.instrument, "id": info.observing_day}
