@@ -54,7 +54,7 @@ QUANTUM_COSTS: Mapping[str, QuantumCost] = MappingProxyType(
         "focalPlaneSummary": QuantumCost(0.1, 339 * MIB),
     }
 )
-"""By task, as ``python tests/bps/measure_quanta.py`` has measured them: twelve flats, three biases, eleven hours.
+"""By task, as ``python scripts/measure_quanta.py`` has measured them: twelve flats, three biases, eleven hours.
 
 The search for effects found none; with effects it takes longer. That on the sky has not been measured on a full
 sensor: its time is that of a small one with an effect, its memory that of eleven frames, counted. Neither have the

@@ -1,6 +1,6 @@
 """What one quantum of each task costs on a full sensor: processor time, memory, disk.
 
-    python tests/bps/measure_quanta.py --folder /tmp/quanta
+    python scripts/measure_quanta.py --folder /tmp/quanta
 
 runs every task on one e2v sensor of 4096 x 4004 pixels, one process for each task, and
 prints what the middleware has recorded of the quanta. The numbers are those of `algorithms.cost_model`; the requests
