@@ -218,7 +218,7 @@ class SiliconTable:
         # Pixels in the order of their first node: those that a table is asked for stand together.
         order = np.argsort(first, axis=None, kind="stable")
         edges = np.searchsorted(first.ravel()[order], np.arange(nodes + 1))
-        beyond = (place - first).ravel()[order]
+        beyond = np.asarray(place - first, dtype=float).ravel()[order]
         image = np.where(known, np.float32(0.0), np.float32(np.nan)).ravel()
         given, asked = thickness.ravel(), np.full(thickness.size, np.nan, thickness.dtype)
         for number, table in enumerate(self.tables):
