@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.ndimage import median_filter
 
 from ..algorithms.single_pixel import fit_single_pixel, published_pixel
 from ..algorithms.thickness_fit import fit_thickness
+from ..mock.raw_frames import setup_optics
 from ..mock.thickness import E2V_SHAPE
 from ..model import FringeModel
 from ..products import FlatExposures, FringeCube
@@ -34,6 +36,12 @@ FIT_CONTRAST = 0.15
 """Brings the simulated flats to the measured contrast of about 2 %."""
 
 FIT_SHAPE = (200, 204)
+
+FOREIGN_SILICON = "Si_schinke2015"
+FOREIGN_ERROR_NM = 0.5
+"""Accuracy of the wavelengths of the stand [nm]."""
+
+FOREIGN_GRADIENT = 0.02
 ROW = 3015
 """Row 3000 of the frame trimmed by 15 rows."""
 
@@ -214,29 +222,50 @@ def _fitted_fringe(trend: FloatArray, phase: FloatArray, values: FloatArray) -> 
 
 
 def thickness_fit(context: Context) -> Section:
-    """Section 3.3, on flats whose thickness is known."""
+    """Section 3.3, on flats whose thickness is known: of the model that is fitted, and of another one."""
     model = FringeModel.from_setup(context.setup(LAB), {"contrast_loss.factor": FIT_CONTRAST})
     detail = context.detail_um[: FIT_SHAPE[0], : FIT_SHAPE[1]]
-    cube = _flats(model, detail, context.rng("thickness fit"))
     order = float(model.fringe_order_um(WAVELENGTH_NM))
+    wavelength = np.array(model.setup.wavelengths_nm)
+    own = model.response(detail, wavelength)
+    other = _foreign_light(detail, wavelength)
     values, pictures = {}, []
-    for method, item in (("guo2022", "walk_slips"), ("global", "global_slips")):
-        fitted = fit_thickness(cube, model, method, threads=2)
-        wrong = np.asarray(fitted.value, dtype=float) - detail
-        # Pixels that the fit itself flags as doubtful count too: the paper flags none.
-        good = np.isfinite(wrong)
-        values[item] = PERCENT * float((np.abs(wrong[good]) > 0.5 * order).mean())
-        name = {"guo2022": "walk from pixel to pixel", "global": "all pixels at once"}[method]
-        pictures.append(Picture(name, "fitted − true [nm]", 1e3 * np.where(good, wrong, np.nan), True))
+    for kind, light, suffix in (("own model", own, ""), ("other model", other, "_foreign")):
+        cube = _flats(model, light, context.rng("thickness fit"))
+        for method, item in (("guo2022", "walk_slips"), ("global", "global_slips")):
+            fitted = fit_thickness(cube, model, method, threads=2)
+            wrong = np.asarray(fitted.value, dtype=float) - detail
+            # Pixels that the fit itself flags as doubtful count too: the paper flags none.
+            good = np.isfinite(wrong)
+            values[item + suffix] = PERCENT * float((np.abs(wrong[good]) > 0.5 * order).mean())
+            name = {"guo2022": "walk from pixel to pixel", "global": "all pixels at once"}[method]
+            picture = 1e3 * np.where(good, wrong, np.nan)
+            pictures.append(Picture(f"{name}, {kind}", "fitted − true [nm]", picture, True))
     return Section(
         "Thickness fit: section 3.3",
-        f"{len(cube.wavelength_nm)} simulated flats of {detail.shape[1]} × {detail.shape[0]} px with "
+        f"{len(wavelength)} simulated flats of {detail.shape[1]} × {detail.shape[0]} px with "
         f"{PERCENT * FIT_NOISE:g} % of noise and the measured contrast of 2 %, fitted with the algorithm of the "
-        "paper and with the one that is the default here. Both use the detection layer.",
+        "paper and with the one that is the default here. Both use the detection layer. The flats are first of the "
+        "model that is fitted, then of another simulator: its own sum over films and line, another table of "
+        f"silicon, wavelengths off by {FOREIGN_ERROR_NM:g} nm in turn and light that falls by "
+        f"{PERCENT * FOREIGN_GRADIENT:g} % over the part.",
         values,
         tuple(pictures),
         "Error of the fitted thickness.",
     )
+
+
+def _foreign_light(layer: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+    """Flats of the independent simulator, with what the fitted model does not have."""
+    errors = FOREIGN_ERROR_NM * (-1.0) ** np.arange(len(wavelength_nm))
+    optics = replace(
+        setup_optics(LAB, FOREIGN_SILICON)[0],
+        coherent_part=FIT_CONTRAST,
+        wavelength_errors_nm=tuple(zip(wavelength_nm.tolist(), errors.tolist(), strict=True)),
+    )
+    table = optics.table((float(layer.min()), float(layer.max())), wavelength_nm.tolist())
+    slope = 1.0 + FOREIGN_GRADIENT * np.linspace(-0.5, 0.5, layer.shape[1])
+    return np.stack([slope * table.evaluate(row, layer) for row in range(len(wavelength_nm))])
 
 
 def raft(context: Context) -> Section:
@@ -282,12 +311,11 @@ def _fundamental(profile: FloatArray) -> float:
     return float(2.0 * np.abs(np.fft.rfft(profile)[1]) / len(profile))
 
 
-def _flats(model: FringeModel, layer: FloatArray, rng: np.random.Generator) -> FringeCube:
-    """Flats of the model over their means, with white noise."""
+def _flats(model: FringeModel, light: FloatArray, rng: np.random.Generator) -> FringeCube:
+    """Flats over their means, with white noise, at the wavelengths of the model's set-up."""
     setup = model.setup
     wavelength = np.array(setup.wavelengths_nm)
-    clean = model.response(layer, wavelength)
-    clean /= clean.mean(axis=(1, 2), keepdims=True)
+    clean = light / light.mean(axis=(1, 2), keepdims=True)
     image = (clean + FIT_NOISE * rng.standard_normal(clean.shape)).astype(np.float32)
     exposures = FlatExposures(
         wavelength, np.array(setup.bandwidth_fwhm_nm), np.array(setup.temperature_k), np.array(np.inf)
