@@ -64,6 +64,7 @@ def test_the_sky_has_fringes_and_the_objects_have_none(thickness: Path) -> None:
     np.testing.assert_array_equal(faint[0, :3], 0.0)  # the thickness is not known
 
 
+@pytest.mark.slow
 def test_bands_and_effects_change_the_fringes(thickness: Path) -> None:
     fringes: dict[str, Any] = {"detector": "R00_S00", "setup": "monocam", "thickness": str(thickness)}
     plain = np.std(drawn("FringedSky", fringes=fringes) - drawn("Scattered"))

@@ -1,8 +1,8 @@
 """Fringes on the sky of images that GalSim draws from a configuration.
 
 ``modules: [lsst.fringe_sim.algorithms.galsim_config]`` adds the image type ``FringedSky``: a ``Scattered`` image
-whose sky, whatever it is made of, is multiplied by the fringes of one sensor before noise is drawn. See the page on other
-programs in the guide.
+whose sky, whatever it is made of, is multiplied by the fringes of one sensor before noise is drawn. The
+page of the guide on other programs has an example.
 """
 
 from __future__ import annotations
