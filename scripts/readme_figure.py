@@ -7,7 +7,7 @@ from pathlib import Path
 from lsst.fringe_sim.algorithms.sky_frame import simulate_sky_frame
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.report.style import figure, save_figure, show_image
+from lsst.fringe_sim.style import figure, save_figure, show_image
 
 TARGET = Path(__file__).resolve().parents[1] / "doc" / "_static" / "readme.png"
 

@@ -15,6 +15,8 @@ ORDER = (
     "errors",
     "lazy",
     "files",
+    "style",
+    "notebook",
     "compiled",
     "resources",
     "optics",
@@ -32,6 +34,7 @@ ALLOWED["paper"] = set(ORDER) | {"mock", "paper"}
 ALLOWED["report"] = {
     "errors",
     "files",
+    "style",
     "compiled",
     "resources",
     "optics",

@@ -42,7 +42,7 @@ def test_two_sensors_of_a_focal_plane(two_sensors) -> None:
     sensors = Table.read(out / "focal_plane.ecsv")
     assert list(sensors["detector"]) == ["R22_S11", "R22_S12"]
     assert list(sensors["stand_in"]) == [False, True]
-    # OH lines alone have 0.099 % with this map (physics.md); continua, which hardly fringe, dilute them to four fifths.
+    # OH lines alone have 0.099 % with this map (physics.md), of which continua leave four fifths.
     assert sensors["rms"][0] == pytest.approx(0.08, abs=0.01)
     assert np.all(sensors["residual_2"] < 0.1)
     assert len(Table.read(out / "cells.ecsv")) == 128

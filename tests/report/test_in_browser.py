@@ -11,7 +11,7 @@ from astropy.table import Table
 from browser import check_page, open_page
 
 from lsst.fringe_sim.report import Report
-from lsst.fringe_sim.report.style import figure, show_image
+from lsst.fringe_sim.style import figure, show_image
 
 WIDE, PHONE = 1280, 390
 

@@ -11,7 +11,7 @@ from astropy import units
 from astropy.table import Table
 
 from lsst.fringe_sim.report import Report
-from lsst.fringe_sim.report.style import figure, show_image
+from lsst.fringe_sim.style import figure, show_image
 
 
 class Checker(HTMLParser):

@@ -11,7 +11,7 @@ from lsst.fringe_sim.algorithms.image_correlation import coadds_of_frames
 from lsst.fringe_sim.products import SkyFringe
 from lsst.fringe_sim.report.figures import residuals_figure
 from lsst.fringe_sim.report.sky_page import sky_amplitudes, write_sky_report
-from lsst.fringe_sim.report.style import block_mean
+from lsst.fringe_sim.style import block_mean
 
 
 def night(shape: tuple[int, int] = (150, 160), hours: int = 3) -> list[SkyFringe]:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..report.page import Report
-from ..report.style import LINES, SEQUENTIAL, figure
+from ..style import LINES, SEQUENTIAL, figure
 from .result import VISIBLE, ChallengeResult
 
 __all__ = [

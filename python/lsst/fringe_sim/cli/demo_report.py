@@ -32,8 +32,8 @@ from ..report.figures import (
 )
 from ..report.page import Report
 from ..report.sky_page import sky_amplitudes
-from ..report.style import save_figure
 from ..report.thickness_page import phase_folded, residual_of_fit, residual_table
+from ..style import save_figure
 
 __all__ = ["DemoDatasets", "write_demo_report"]
 

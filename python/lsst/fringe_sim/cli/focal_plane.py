@@ -34,7 +34,7 @@ from ..model import FringeModel, Setup
 from ..products.thickness_map import thickness_span_um
 from ..report.figures import focal_plane_figure
 from ..report.focal_plane_page import write_focal_plane_page
-from ..report.style import save_figure
+from ..style import save_figure
 from .inputs import read_settings, read_thickness, sky_settings
 from .output import OutputFolder, output_folder
 from .parameters import effects_file_option

@@ -123,7 +123,7 @@ def sky(
     from ..instrument.night import NightHistory
     from ..report.figures import sky_figure
     from ..report.sky_page import write_sky_report
-    from ..report.style import save_figure
+    from ..style import save_figure
     from .inputs import sky_settings
 
     _check_exposure(exptime, night)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, UnknownNameError, named_units, printable_name, to_number
+from ..notebook import InNotebook
 from ..optics.illumination import (
     Beam,
     GaussianProfile,
@@ -41,7 +42,7 @@ WAVELENGTH_ACCURACY_NM = 0.5
 
 @named_units
 @dataclass(frozen=True)
-class Setup:
+class Setup(InNotebook):
     """Sensor, temperature and light of one instrument or test stand.
 
     Attributes
@@ -103,6 +104,21 @@ class Setup:
     airmass: float
     wavelength_accuracy_nm: float = WAVELENGTH_ACCURACY_NM
     laboratory_temperature_k: float | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """Sensor, temperature and light, with units."""
+        low, high = self.thickness_range_um
+        laboratory = self.kind == "monochromator"
+        light = f"monochromator, {self.bandwidth_fwhm_nm:g} nm" if laboratory else f"sky in {self.bandpass}"
+        return {
+            "name": self.name,
+            "title": self.title,
+            "camera": self.camera,
+            "stack": " / ".join(self.stack.names),
+            "varying layer": f"{self.varying}, {low:g} to {high:g} µm",
+            "temperature": f"{self.temperature_k:g} K",
+            "light": f"{light}, {self.telescope or self.beam_kind}",
+        }
 
     @classmethod
     def from_name(cls, name: str) -> Setup:

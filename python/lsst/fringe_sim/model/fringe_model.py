@@ -23,12 +23,14 @@ from ..effects import (
 from ..effects.active import settings_of
 from ..errors import InputError, named_units, to_number, without_unit
 from ..instrument.setup import Setup
+from ..notebook import InNotebook
 from ..optics.harmonics import ROUNDING
 from ..optics.illumination import DEFAULT_STEP_NM, Illumination
 from ..optics.media import TEMPERATURE_RANGE_K, check_range
 from ..optics.phase_response import PhaseResponse
 from ..optics.system import OpticalSystem
 from .response_table import DEFAULT_TOLERANCE, ResponseTable, response_table, tabulate
+from .spectrum import StackSpectrum, spectrum_of
 
 __all__ = ["LABORATORY_TEMPERATURE", "FringeModel"]
 
@@ -45,7 +47,7 @@ PHASE_MEAN_SAMPLES = 256
 
 
 @dataclass(frozen=True)
-class FringeModel:
+class FringeModel(InNotebook):
     """Response of a sensor, with effects.
 
     Attributes
@@ -130,6 +132,41 @@ class FringeModel:
         return replace(
             self, setup=setup, base_system=replace(self.base_system, laboratory_temperature_k=kelvin)
         )
+
+    def facts(self) -> dict[str, Any]:
+        """Those of the set-up, and the effects."""
+        effects = ", ".join(f"{name} = {value:g}" for name, value in self.effect_settings.items())
+        return {**self.setup.facts(), "effects": effects or "none"}
+
+    @named_units
+    def spectrum(self, wavelength_nm: ArrayLike, thickness_um: float | None = None) -> StackSpectrum:
+        """Where light of each wavelength ends: reflected, absorbed layer by layer, transmitted.
+
+        For plane layers and strictly monochromatic light, averaged over the angles of the beam; the width of a line
+        and effects that act on the response are not in it.
+
+        Parameters
+        ----------
+        wavelength_nm : array_like, shape ``(W,)``
+            Wavelengths in vacuum [nm].
+        thickness_um : `float`, optional
+            Thickness of the varying layer [µm]; by default the middle of the range of the set-up.
+
+        Raises
+        ------
+        OutOfRangeError
+            As for `response`.
+        InputError
+            An effect makes the stack more than plane layers, or acts on the response.
+        """
+        late = [item.effect.name for item in self.effects if item.effect.acts_on == "response"]
+        if late:
+            raise InputError("effects", late, "effects of the stack or of the illumination")
+        middle = sum(self.setup.thickness_range_um) / 2.0
+        thickness = self.checked_thickness_um(middle if thickness_um is None else thickness_um)
+        if thickness.ndim:
+            raise InputError("thickness_um", thickness_um, "one number")
+        return spectrum_of(self.system, self._wavelength(wavelength_nm), float(thickness))
 
     @property
     def effect_settings(self) -> dict[str, float]:

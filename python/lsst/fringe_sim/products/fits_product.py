@@ -7,16 +7,20 @@ import os
 from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError
+from ..notebook import InNotebook, axes_or_new
 from . import _check as check
 from . import _fits as io
 from .sensor_section import SensorSection
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["DETECTOR", "FILTER", "MASK", "Card", "Extension", "FitsProduct", "Image", "SensorProduct"]
 
@@ -180,7 +184,7 @@ NARROW_MASK = _Mask("mask", "MASK", np.int16)
 """Of a cube, in which the mask is as large as the image; all planes fit into it."""
 
 
-class FitsProduct(ABC):
+class FitsProduct(InNotebook, ABC):
     """A product that a FITS file can hold: a frozen dataclass with ``metadata``, which says what is where."""
 
     CARDS: ClassVar[tuple[Card, ...]]  # its numbers and names, in the order of the header
@@ -205,7 +209,7 @@ class FitsProduct(ABC):
             object.__setattr__(self, name, value)
         self._check()
 
-    def _check(self) -> None:  # noqa: B027 - few products have anything to add
+    def _check(self) -> None:
         """What no single field can tell."""
 
     def __repr__(self) -> str:
@@ -214,6 +218,34 @@ class FitsProduct(ABC):
         values = ((card, getattr(self, card.field)) for card in self.CARDS)
         told = (f", {card.field}={value!r}" for card, value in values if value not in ("", card.default))
         return f"{type(self).__name__}({shape}{''.join(told)})"
+
+    def facts(self) -> dict[str, Any]:
+        """Shape of its images, its numbers and names, and the share of the pixels that is masked."""
+        shown: dict[str, Any] = {"shape": " × ".join(map(str, getattr(self, self.EXTENSIONS[0].field).shape))}
+        for card in self.CARDS:
+            value = getattr(self, card.field)
+            if value not in ("", card.default):
+                shown[card.what or card.field] = f"{value:g} {card.unit}" if card.unit else value
+        mask: NDArray[Any] = getattr(self, "mask")  # noqa: B009
+        return {**shown, "masked": f"{100.0 * np.mean(mask != 0):.3g} %"}
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw its image, of several the middle one, with masked pixels grey; on new axes by default."""
+        from ..style import show_image
+
+        image, label, diverging = self._picture()
+        mask: NDArray[Any] = getattr(self, "mask")  # noqa: B009
+        drawn = axes_or_new(axes)
+        title = str(getattr(self, "detector", ""))
+        mask = mask[len(mask) // 2] if mask.ndim > image.ndim else mask
+        show_image(drawn, image, mask=mask, label=label, title=title, diverging=diverging)
+        return drawn
+
+    def _picture(self) -> tuple[NDArray[Any], str, bool]:
+        """What is drawn, its label, and whether its zero is the middle of the colours."""
+        first = self.EXTENSIONS[0]
+        image = getattr(self, first.field)
+        return image[len(image) // 2] if image.ndim > 2 else image, first.name.lower(), False
 
     @classmethod
     def _keywords(cls) -> tuple[str, ...]:

@@ -102,6 +102,9 @@ class FringeComponents(FitsProduct):
         Image("scores", "SCORES", dtype=np.float64, everywhere=True, on_sensor=False),
     )
 
+    def _picture(self) -> tuple[NDArray[Any], str, bool]:
+        return 100.0 * self.mean, "mean frame, sky / mean − 1 [%]", True
+
     def _check(self) -> None:
         if self.scores.shape[1] != self.n_components:
             raise FrameFormatError("SCORES", f"shape {self.scores.shape}", f"(n_frames, {self.n_components})")

@@ -207,6 +207,16 @@ class FringeCube(FitsProduct):
             **fields,
         )
 
+    def facts(self) -> dict[str, Any]:
+        """What every product states, and the wavelengths."""
+        return {**super().facts(), "wavelengths [nm]": ", ".join(f"{one:g}" for one in self.wavelength_nm)}
+
+    def _picture(self) -> tuple[NDArray[Any], str, bool]:
+        middle = len(self.image) // 2
+        image = np.where(self.mask[middle] == 0, self.image[middle], np.nan)
+        label = f"{self.wavelength_nm[middle]:g} nm, counts / mean − 1 [%]"
+        return 100.0 * (image / np.nanmean(image) - 1.0), label, True
+
     def __repr__(self) -> str:
         low, high = self.wavelength_nm.min(), self.wavelength_nm.max()
         return f"{super().__repr__()[:-1]}, {low:g} to {high:g} nm, {self.unit})"

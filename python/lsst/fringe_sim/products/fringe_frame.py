@@ -65,6 +65,9 @@ class FringeFrame(SensorProduct):
     detector: str = ""
     xy0: tuple[int, int] = (0, 0)
 
+    def _picture(self) -> tuple[NDArray[Any], str, bool]:
+        return 100.0 * self.image, "sky / mean − 1 [%]", True
+
     CARDS = (
         Card("physical_filter", "FILTER", "physical filter", kind=str, empty=False),
         DETECTOR,

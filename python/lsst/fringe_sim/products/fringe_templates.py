@@ -58,6 +58,9 @@ class FringeTemplates(FitsProduct):
     detector: str = ""
     physical_filter: str = ""
 
+    def _picture(self) -> tuple[NDArray[Any], str, bool]:
+        return 100.0 * self.patterns[0], "first template [% of the sky]", True
+
     CARDS = (
         DETECTOR,
         FILTER,

@@ -127,6 +127,9 @@ class SkyFringe(SensorProduct):
             raise UnknownNameError("unit", self.unit, SKY_UNITS)
         super().__post_init__()
 
+    def _picture(self) -> tuple[NDArray[Any], str, bool]:
+        return 100.0 * self.fraction(), "sky / mean − 1 [%]", True
+
     def fraction(self) -> NDArray[np.float32]:
         """Fringe pattern (sky - mean) / mean, whatever the unit."""
         if self.unit == "fraction":

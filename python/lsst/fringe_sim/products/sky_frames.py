@@ -4,23 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FrameFormatError, InputError, named_units, without_unit
+from ..notebook import InNotebook
 from . import _check as check
 from .mask import mask_bits
 from .same_light import refuse_equal_pixels, refuse_mixed_models
 from .sky_frame import SkyFringe
 from .thickness_map import UNKNOWN_SIGMA_UM, ThicknessMap
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 __all__ = ["SkyFrames"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SkyFrames:
+class SkyFrames(InNotebook):
     """Frames of one sensor, and its thickness.
 
     Parameters
@@ -122,6 +126,20 @@ class SkyFrames:
     def thickness_sigma_um(self) -> NDArray[np.float64]:
         """Uncertainty of the thickness [µm]."""
         return self.thickness.sigma.astype(float)
+
+    def facts(self) -> dict[str, Any]:
+        """How many frames, when, and of what."""
+        hours = [frame.hour for frame in self.frames]
+        return {
+            "frames": len(self.frames),
+            "local time": f"{min(hours):g} to {max(hours):g} h",
+            "layer": self.thickness.layer,
+            **self.frames[0].facts(),
+        }
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the first frame."""
+        return self.frames[0].plot(axes)
 
     def __repr__(self) -> str:
         rows, columns = self.shape

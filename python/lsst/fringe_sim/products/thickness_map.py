@@ -108,6 +108,17 @@ class ThicknessMap(SensorProduct):
         Image("contrast_map", "CONTRAST_MAP", gaps=True, optional=True, on_sensor=False),
     )
 
+    def facts(self) -> dict[str, Any]:
+        """What every product states; range and median uncertainty of the thickness, which a mask may hide."""
+        known, sigma = self.known_um(), self.sigma[self.mask == 0]
+        if not sigma.size:
+            return {**super().facts(), "thickness": "none is known"}
+        span = f"{np.nanmin(known):.3f} to {np.nanmax(known):.3f} µm"
+        return {**super().facts(), "thickness": span, "median σ": f"{1e3 * np.median(sigma):.2g} nm"}
+
+    def _picture(self) -> tuple[NDArray[Any], str, bool]:
+        return self.value, f"{self.layer} [µm]", False
+
     @property
     def contrast(self) -> NDArray[np.float64] | None:
         """Fringe amplitude over that of the model at each wavelength; `None` if the fit did not learn it."""

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from ..algorithms.observed_frames import FrameRecord, injected_table, summary_table
 from ..products import FringeTemplates
+from ..style import figure, finite_range, show_image
 from .page import Report
-from .style import figure, finite_range, show_image
 
 __all__ = ["frame_figure", "write_correction_report", "write_templates_report"]
 

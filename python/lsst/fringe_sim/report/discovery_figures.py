@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..algorithms.discovery import Verdict
-from .style import DIVERGING, LINES, figure
+from ..style import DIVERGING, LINES, figure
 
 __all__ = ["candidates_figure", "gap_figure", "leftover_figure", "where_figure"]
 

@@ -11,10 +11,10 @@ from astropy.table import Table
 
 from ..algorithms.discovery import Verdict, probability_text
 from ..algorithms.flat_residual import ResidualPair
+from ..style import finite_range
 from .discovery_figures import candidates_figure, gap_figure, leftover_figure, where_figure
 from .figures import flats_figure, thickness_figure
 from .page import Report
-from .style import finite_range
 
 __all__ = ["discovery_page", "headline"]
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
-from .style import (
+from ..style import (
     DIVERGING,
     LINES,
     SEQUENTIAL,

@@ -13,7 +13,7 @@ from astropy.table import Table
 from matplotlib.figure import Figure
 
 from ..files import table_text, write_whole
-from .style import to_png
+from ..style import to_png
 
 __all__ = ["Report"]
 

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from ..paper.published import Finding
 from ..paper.reproduce import Reproduction, findings_table
 from ..paper.section import Graph, Picture, Section
+from ..style import figure, show_image
 from .page import Report
-from .style import figure, show_image
 
 __all__ = ["section_figures", "write_paper_page"]
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
-from ..files import write_whole
+from .files import write_whole
 
 __all__ = [
     "DIVERGING",
