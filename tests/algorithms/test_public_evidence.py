@@ -31,8 +31,9 @@ class Thermometer:
         self.values, self.name = np.array(readings), name
 
     def predict(self, models) -> np.ndarray:
-        factor = models(self.setup).effect_settings.get("contrast_loss.factor", 1.0)
-        return np.full((3, 1), factor)
+        settings = models(self.setup).effect_settings
+        factor = settings.get("contrast_loss.factor", 1.0) - 1e-4 * settings.get("bandwidth.fwhm", 2.0)
+        return np.full((3, 1), factor + 2e-4)
 
     def chi2(self, prediction: np.ndarray) -> np.ndarray:
         return (((self.values[:, None] - prediction) / self.sigma) ** 2).sum(axis=-2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from lsst.fringe_sim.mock.hidden_effects import AmplifierState
 from lsst.fringe_sim.mock.raw_files import Clock, primary_header, write_frame
 from lsst.fringe_sim.mock.raw_frames import FIRST_EXPOSURE
 from lsst.fringe_sim.mock.readout import Readout
-from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.model import FringeModel, Setup
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
 
 WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
@@ -80,7 +81,8 @@ def test_what_another_simulator_hides_is_named(
     sensor: ForeignSensor, stated_nm: float, key: str, value: float
 ) -> None:
     cube = exposed(sensor, np.random.default_rng(41), bandwidth_nm=stated_nm)
-    verdict = discover(cube, "ts8_e2v", rng=np.random.default_rng(0))
+    setup = replace(Setup.from_name("ts8_e2v"), bandwidth_fwhm_nm=stated_nm)
+    verdict = discover(cube, setup, rng=np.random.default_rng(0))
     assert verdict.verdict == "named", verdict.summary()
     (effect,) = verdict.effects
     name, _, parameter = key.partition(".")

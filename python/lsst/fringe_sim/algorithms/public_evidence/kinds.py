@@ -23,7 +23,8 @@ from ...instrument.setup import Setup
 from ...instrument.sky import SkySpectrum, blend_components
 from ...instrument.telescope import reduce_beam
 from ...model import FringeModel
-from ...optics import Illumination
+from ...optics import Beam, Illumination
+from ...optics.illumination import GaussianProfile
 from ...resources import read_table
 from ..single_pixel import published_pixel
 from ..sky_response import is_band
@@ -93,6 +94,8 @@ LINE_SHIFT_NM, LEAST_SHARE = 0.02, 0.97
 SKY_NODES = {"monocam": 12, "hsc": 24, "lsst_e2v": 64}
 SKY_UM = {"monocam": (14.0, 22.0), "hsc": (199.0, 201.0), "lsst_e2v": (14.0, 22.0)}
 SKY_SAMPLES = 801
+TREND = 3
+"""Degree of the run of the level with thickness, which is no fringe: an adhesive that absorbs has one."""
 
 
 class Models(Protocol):
@@ -359,12 +362,17 @@ class SeenOnSky(_Gaussian):
 
 
 def sky_amplitude(models: Models, setup: str, amplitude: str) -> float:
-    """Fringes of a dark sky [%], over all thicknesses of the sensor: ``rms`` or ``half_peak_to_peak``."""
+    """Fringes of a dark sky [%] about the smooth run of the level over all thicknesses of the sensor.
+
+    ``amplitude`` is ``rms`` or ``half_peak_to_peak``.
+    """
     light, share = _sky_light(setup)
     low, high = SKY_UM[setup]
     step = (high - low) / (SKY_SAMPLES - 1)
     response = models(setup).respond_on_grid(light, low, step, SKY_SAMPLES, tolerance=1e-5)[0]
-    fringe = 100.0 * share * (response / response.mean() - 1.0)
+    place = np.linspace(-1.0, 1.0, SKY_SAMPLES)
+    run = np.polynomial.Polynomial.fit(place, response, TREND)(place)
+    fringe = 100.0 * share * (response - run) / response.mean()
     return float(fringe.std() if amplitude == "rms" else 0.5 * np.ptp(fringe))
 
 
@@ -397,19 +405,34 @@ def harmonics(
 
 @functools.cache
 def _sky_light(setup: str) -> tuple[Illumination, float]:
-    """The stronger lines of a dark sky in the beam of a telescope, and the share of all lines in its light."""
+    """The stronger lines of a dark sky in the beam of a telescope, and the share of all lines in what is detected."""
     model = FringeModel.from_setup(setup)
     parts = SkySpectrum.dark(airmass=model.setup.airmass).components(Bandpass.from_name(model.setup.bandpass))
     lines = [item for item in parts if is_band(item.name)]
-    total = sum(float(item.photons.sum()) for item in parts)
-    share = sum(float(item.photons.sum()) for item in lines) / total
+    beam = reduce_beam(model.system.beam, SKY_NODES[setup])
+    efficiency = _efficiency(model, beam, setup)
+    total, of_lines = (
+        sum(float(item.photons @ np.interp(item.wavelength_nm, *efficiency)) for item in some)
+        for some in (parts, lines)
+    )
+    share = of_lines / total
     blended = blend_components(lines, LINE_SHIFT_NM)
     wavelength = np.concatenate([item.wavelength_nm for item in blended])
     photons = np.concatenate([item.photons for item in blended])
     order = np.argsort(-photons)
     count = int(np.searchsorted(np.cumsum(photons[order]), LEAST_SHARE * photons.sum())) + 1
-    beam = reduce_beam(model.system.beam, SKY_NODES[setup])
     return Illumination.spectrum(wavelength[order[:count]], photons[order[:count]], beam), share
+
+
+def _efficiency(model: FringeModel, beam: Beam, setup: str) -> tuple[FloatArray, FloatArray]:
+    """Wavelengths of the band [nm], and what the sensor detects there, averaged over the fringes of all layers."""
+    low, high = Bandpass.from_name(model.setup.bandpass).support()
+    wavelength = np.arange(low, high, 10.0)
+    light = Illumination.flat_fields(wavelength, GaussianProfile(QE_LINE_NM), beam)
+    first, last = SKY_UM[setup]
+    step = (last - first) / (SKY_SAMPLES - 1)
+    response = model.respond_on_grid(light, first, step, SKY_SAMPLES, tolerance=1e-5)
+    return wavelength, np.asarray(response.mean(axis=1))
 
 
 def without_bench(settings: Mapping[str, float]) -> dict[str, float]:

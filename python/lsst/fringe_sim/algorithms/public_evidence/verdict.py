@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from ...errors import InputError
 from ..discovery.options import SearchOptions
-from .joint import JointFit, Predictor, parse_set
+from .joint import Axis, JointFit, Predictor, parse_set
 from .kinds import (
     LAB,
     SHIFT_UM,
@@ -210,12 +211,27 @@ def compare(
     """
     wanted = [parse_set(names) for names in ((), *sets)]
     predictor = Predictor(public_kinds() if kinds is None else kinds)
+    _refuse_unfelt({axis.key: axis for axes in wanted for axis in axes}, predictor)
     fits = []
     for axes in wanted:
         fit = JointFit(axes, predictor)
         fits.append((fit.log_evidence, fit))
         advance()
     return Comparison(tuple(fit for _, fit in sorted(fits, key=lambda item: -item[0])))
+
+
+def _refuse_unfelt(axes: Mapping[str, Axis], predictor: Predictor) -> None:
+    """Refuse parameters of which no prediction of any kind depends."""
+    for axis in axes.values():
+        nodes = axis.nodes(3)
+        felt = any(
+            not np.array_equal(*(predictor.predict(kind, {axis.key: float(one)}) for one in nodes[[0, -1]]))
+            for kind in predictor.kinds
+        )
+        if not felt:
+            raise InputError(
+                "effect", axis.key, "one on which the public data depend: optics, sensor or bench"
+            )
 
 
 def _at_published_map(kind: Kind, prediction: FloatArray) -> float:
