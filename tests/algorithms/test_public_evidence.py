@@ -15,7 +15,9 @@ from lsst.fringe_sim.algorithms.public_evidence.kinds import (
     FlatShape,
     PixelFlats,
     PublishedMap,
+    SeenOnSky,
     models_with,
+    sky_amplitude,
 )
 from lsst.fringe_sim.algorithms.public_evidence.verdict import compare
 from lsst.fringe_sim.errors import InputError, UnknownNameError
@@ -151,3 +153,20 @@ def test_shape_of_the_real_fringe_is_that_of_the_detection_layer() -> None:
     total = kind.predict(models_with({}, of_flats="total"))[0, 0]
     assert kind.values[0] < -5.0 * 0.0042, "standard error of the mean of the blocks"
     assert detection < 0.0 < total
+
+
+def test_a_parameter_that_no_data_feel_is_refused() -> None:
+    """Lines of the sky are the same for every set; its parameter would come back as its prior, judged as equal to none."""
+    with pytest.raises(InputError, match=r"rotational_temperature\.offset"):
+        compare([("rotational_temperature",)], kinds=(PixelFlats.published(), SeenOnSky.published("hsc")))
+    with pytest.raises(InputError, match="dark_current"):
+        compare([("dark_current",)], kinds=(PixelFlats.published(),))
+
+
+def test_the_run_of_the_level_with_thickness_is_no_fringe() -> None:
+    """An adhesive that absorbs takes light from thick places; its fringes on the sky of the LSST are weaker by it."""
+    plain, absorbing = (
+        sky_amplitude(models_with(settings), "lsst_e2v", "rms") for settings in ({}, {"epoxy_absorption.k": 0.0044})
+    )
+    assert plain == pytest.approx(0.086, abs=0.005)
+    assert absorbing < 0.5 * plain
