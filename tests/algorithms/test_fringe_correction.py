@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.correction import AmplifierGrid
+from lsst.fringe_sim.algorithms.correction.detection import log_evidence
 from lsst.fringe_sim.algorithms.fringe_correction import (
     CorrectionOptions,
     component_patterns,
@@ -108,6 +109,50 @@ def test_stars_do_not_move_the_scales(patterns, rng):
         pulls.append((found.scale - truth) / found.sigma)
     assert np.sqrt(np.mean(np.square(pulls))) < 1.6
     assert np.abs(pulls).max() < 4.0
+
+
+@pytest.mark.rng("a pattern that the exposure does not have is not subtracted")
+def test_a_pattern_that_the_exposure_does_not_have_is_not_subtracted(patterns, rng):
+    """Fringes of another pattern, on which the scales are noise."""
+    y, x = np.mgrid[:400, :500]
+    clean = LEVEL * (1.0 + 0.01 * patterns[0])
+    foreign = [0.01 * np.sin((x + y) / 8.0), 0.01 * np.sin((x - 2.0 * y) / 14.0)]
+    seen = 0
+    for _ in range(4):
+        image = noisy(with_sources(clean, rng), rng)
+        found = correct_fringes(image, foreign)
+        assert correct_fringes(image, patterns).seen
+        if found.seen:
+            seen += 1
+            continue
+        np.testing.assert_array_equal(found.image, image)
+        assert found.cards["FRINGCOR"] == 0
+        np.testing.assert_array_equal(undo_correction(found.image, foreign, found.cards), image)
+        correct_fringes(found.image, patterns, header=found.cards)
+    assert seen <= 1
+
+
+@pytest.mark.parametrize("number", [1, 4])
+@pytest.mark.rng("noise is not seen and scales of five sigma are")
+def test_noise_is_not_seen_and_scales_of_five_sigma_are(rng, number):
+    """At even odds the rate of scales of noise that are seen falls with the root of the number of blocks."""
+    root = rng.standard_normal((number, number + 2))
+    covariance = root @ root.T
+    draws = rng.multivariate_normal(np.zeros(number), covariance, 4000)
+    seen = np.mean([log_evidence(scale, covariance, 256) > 0.0 for scale in draws])
+    assert 0.001 < seen < 0.03
+    first = np.zeros(number)
+    first[0] = 5.0 / np.sqrt(np.linalg.inv(covariance)[0, 0])
+    assert log_evidence(first, covariance, 256) > 4.0
+    assert log_evidence(first, covariance, 256) > log_evidence(first, covariance, 25)
+
+
+@pytest.mark.rng("an exposure that was negated is refused")
+def test_an_exposure_that_was_negated_is_refused(patterns, rng):
+    image = noisy(LEVEL * (1.0 + 0.01 * patterns[0]), rng)
+    with pytest.raises(OutOfRangeError, match="sky of the frame"):
+        correct_fringes(-image, patterns)
+    assert correct_fringes(image - np.float32(LEVEL), patterns).seen
 
 
 @pytest.mark.rng("fringes are not taken for objects")
@@ -346,7 +391,7 @@ def test_bad_input_is_named(patterns):
     image = np.ones((400, 500))
     with pytest.raises(InputError, match="templates"):
         correct_fringes(image, [])
-    with pytest.raises(InputError, match="shape of the template"):
+    with pytest.raises(InputError, match="shape of the frame"):
         correct_fringes(image, [np.ones((3, 3))])
     with pytest.raises(InputError, match="shape of the mask"):
         correct_fringes(image, [patterns[0]], mask=np.ones((2, 2)))
