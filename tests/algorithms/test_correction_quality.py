@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from scipy.ndimage import gaussian_filter
 
 from lsst.fringe_sim.algorithms.correction.quality import excess_structure, uniform_background_indicator
@@ -42,7 +41,7 @@ def test_the_uniform_background_indicator(white):
 
 
 def frame_with_fringes(rng, amplitude, phase_error):
-    """A frame whose fringes are elsewhere than those of the template, faint stars, and the part that no scale takes."""
+    """A frame with faint stars whose fringes are elsewhere than those of the template, the fringes, the template."""
     y, x = np.mgrid[:SIDE, :SIDE]
     phase = 0.22 * x + 0.15 * y + 2e-4 * (x - 180) ** 2
     wrong = gaussian_filter(rng.standard_normal(x.shape), 40)
@@ -66,6 +65,8 @@ def test_what_is_left_of_the_fringes_is_told(rng, phase_error):
     left = np.std(fringes - done.fringes) / np.std(done.fringes)
     proof = done.proof
     assert proof.part_left_sigma < 0.15
-    assert proof.part_left**2 == pytest.approx(left**2, abs=3.0 * ((left + proof.part_left_sigma) ** 2 - left**2))
+    assert proof.part_left**2 == pytest.approx(
+        left**2, abs=3.0 * ((left + proof.part_left_sigma) ** 2 - left**2)
+    )
     ratio = proof.fringes_left / proof.part_left if proof.part_left else 0.0
     assert ratio == pytest.approx(proof.structure_before, rel=0.3) or ratio == 0.0

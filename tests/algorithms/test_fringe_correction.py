@@ -84,6 +84,26 @@ def test_the_errors_of_the_scales_hold(rng, side, draws, stated):
 
 
 @pytest.mark.slow
+@pytest.mark.rng("errors hold for templates that change slowly")
+def test_errors_hold_for_templates_that_change_slowly(rng):
+    """Background and levels of amplifiers take a part of the noise of each block, which such templates see."""
+    y, x = np.mgrid[:256, :256]
+    angles, lengths = rng.uniform(0.0, np.pi, 4), (60.0, 75.0, 90.0, 110.0)
+    waves = [
+        np.sin(2.0 * np.pi * (x * np.cos(a) + y * np.sin(a)) / length + 1e-4 * x**2).astype(np.float32)
+        for a, length in zip(angles, lengths, strict=True)
+    ]
+    options = CorrectionOptions(amplifiers=AmplifierGrid(2, 8), find_objects=False)
+    pulls = []
+    for _ in range(80):
+        image = (1000.0 + 5.0 * sum(waves) + 30.0 * rng.standard_normal(x.shape)).astype(np.float32)
+        found = correct_fringes(image, waves, variance=np.full(x.shape, 900.0), options=options)
+        pulls.append((found.scale - 5.0) / found.sigma)
+    # Known to 0.04.
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.slow
 @pytest.mark.rng("errors hold for noise that is correlated")
 def test_errors_hold_for_noise_that_is_correlated(rng):
     """As in an image that was resampled: the variance of a pixel does not tell its correlation with neighbours."""

@@ -157,7 +157,9 @@ def test_a_frame_without_the_fringes_of_the_templates_is_left_as_it_is(
     assert row["structure_after"] == row["structure_before"]
     words = ["correct", str(after), "--templates", str(other), "--undo", "--out", str(tmp_path / "restored")]
     assert run(words) == 0
-    np.testing.assert_array_equal(fits.getdata(tmp_path / "restored" / "visit_0_restored.fits"), fits.getdata(path))
+    np.testing.assert_array_equal(
+        fits.getdata(tmp_path / "restored" / "visit_0_restored.fits"), fits.getdata(path)
+    )
 
 
 def test_two_runs_write_the_same_bytes_and_digits_of_the_file_are_kept(

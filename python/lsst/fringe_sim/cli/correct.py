@@ -245,9 +245,7 @@ def _describe(record: FrameRecord) -> str:
     scales = f"scales {scales} {record.unit or 'counts'}"
     clearest = max(abs(scale / sigma) for scale, sigma in zip(record.scale, record.sigma, strict=True))
     if not proof.seen:
-        return (
-            f"{record.name}: left as it is: the fringes of the templates are not seen ({clearest:.1f} σ, {scales})"
-        )
+        return f"{record.name}: left as it is: the fringes of the templates are not seen ({clearest:.1f} σ, {scales})"
     return (
         f"{record.name}: {scales} (fringes at {clearest:.1f} σ); of the fringes "
         f"{100.0 * proof.part_left:.0f} ± {100.0 * proof.part_left_sigma:.0f} % left; structure beyond the noise "

@@ -53,8 +53,9 @@ def write_correction_report(path: Path, records: Sequence[FrameRecord], refused:
     report.section(
         "Frames",
         "Evidence of the fringes (natural logarithm; below 0 they are not seen, and the frame is left as it is); "
-        "structure beyond the noise in apertures up to 20 arcsec, as a fraction of it; the fringes that are left, as a "
-        "fraction of the same noise and as a part of those that were subtracted; the uniform background indicator, 0.98 for white noise; and the probability "
+        "structure beyond the noise in apertures up to 20 arcsec, as a fraction of it; the fringes that are left, as "
+        "a fraction of the same noise and as a part of those that were subtracted; the uniform background "
+        "indicator, 0.98 for white noise; and the probability "
         "that a good template does so badly.",
     )
     if len(table):

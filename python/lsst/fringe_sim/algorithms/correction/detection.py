@@ -27,7 +27,7 @@ def log_evidence(scale: FloatArray, covariance: FloatArray, blocks: int) -> floa
 
     Notes
     -----
-    Against the frame without fringes stand K + 1 equally probable ones: each template alone, and all of them together.
+    Against the frame without fringes stand K + 1 equally probable ones: each template alone, and all of them.
     The prior of scales has the width that one block would give them (Zellner's g-prior with unit information;
     equation 6 of Liang et al. 2008, JASA 103, 410, doi 10.1198/016214507000001337), so that a scale has to be further
     from 0 the more ways there are to find one by chance, and the more pixels tell it.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fft2
 
+from .objects import square_sums
 from .scales import ScaleFit
 
 __all__ = ["PartLeft", "part_left"]
@@ -19,6 +20,10 @@ Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
 WINDOW_PX, WINDOWS_A_SIDE = 128, 6
 """Side of the windows in which fringes are waves of few directions and lengths; in small frames it is a sixth of the
 shorter side, so that the scatter between windows tells the error."""
+
+
+BINNED_PX = 2
+"""Side of the squares that are added first where windows are as large as that: fringes are longer than 4 px."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +94,19 @@ def part_left(
 def _oriented_power(residual: Window, fringes: Window, used: NDArray[np.bool_]) -> Sums:
     """Power of residual and of fringes, in each window, at the waves of the fringes less that across them."""
     side = 2 * (min(WINDOW_PX, min(used.shape) // WINDOWS_A_SIDE) // 2)
+    residual, fringes = (np.where(used, each, np.float32(0.0)) for each in (residual, fringes))
+    if side == WINDOW_PX:
+        residual, fringes = (square_sums(each, BINNED_PX) for each in (residual, fringes))
+        side //= BINNED_PX
     bell = np.sin(np.pi * (np.arange(side) + 0.5) / side).astype(np.float32)
     window = np.outer(bell, bell)
     found: list[tuple[float, float]] = []
-    for y in range(0, used.shape[0] - side + 1, side):
-        for x in range(0, used.shape[1] - side + 1, side):
+    for y in range(0, residual.shape[0] - side + 1, side):
+        for x in range(0, residual.shape[1] - side + 1, side):
             place = np.s_[y : y + side, x : x + side]
             both = np.empty((side, side), dtype=np.complex64)
             both.real, both.imag = residual[place], fringes[place]
-            both *= window * used[place]
+            both *= window
             found.append(_of_window(both))
     of_residual, of_fringes = np.array(found).T
     return of_residual, of_fringes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm as normal
 from scipy.stats import t as student
 
+from ...compiled import run_threaded
 from ...errors import InputError
 from .objects import FrameFit, find_objects, square_sums
 from .part_left import part_left
@@ -52,14 +53,14 @@ class FrameProof:
     Attributes
     ----------
     evidence : `float`
-        Logarithm of the evidence of the templates (`log_evidence`); below 0 their fringes are not seen, and nothing was
+        Logarithm of the evidence of the templates (`log_evidence`); below 0 no fringes are seen, and nothing was
         subtracted.
     fringe_rms : `float`
         Standard deviation of what was subtracted, in the unit of the frame.
     structure_before, structure_after : `float`
         Structure beyond the noise, of the apertures up to the largest; background and objects are left out.
     fringes_left, fringes_left_sigma : `float`
-        The fringes that are left, in the aperture in which fringes are the largest part of the noise, and the error of
+        The fringes that are left, in the aperture in which fringes are most of the noise, and the error of
         this number; NaN where none are seen.
     part_left, part_left_sigma : `float`
         The same as a part of the fringes that were subtracted (`part_left`).
@@ -132,28 +133,47 @@ def prove(
     for scale, pattern in zip(fit.scale, sums.patterns, strict=True):
         fringes += np.float32(scale) * pattern
     allowed = [scale**2 * each for scale, each in zip(fit.scale, variances, strict=False)]
-    # Objects without regard to the template: what it prints into the frame is not left out.
-    untouched = _plain_weight(before, weight, sums)
-    looks = _rises(before, fringes, untouched, largest, allowed, fit.chi2_per_pixel) | _products(sums)
-    probability, worst = _corrected(looks)
     mean = float(fit.scale @ sums.mean_patterns())
     apertures, noise = _Apertures(used, largest), _pixel_variance(frame.residual, used)
-    whole = math.sqrt(apertures.power(fringes - np.float32(mean)) / noise) if noise > 0.0 else math.nan
-    left = part_left(frame.residual, fringes, used, fit, frame.solution.schur)
+
+    def looks() -> dict[str, float]:
+        # Objects without regard to the template: what it prints into the frame is not left out.
+        untouched = _plain_weight(before, weight, sums)
+        return _rises(before, fringes, untouched, largest, allowed, fit.chi2_per_pixel) | _products(sums)
+
+    found, whole, structure, ubi, left = _together(
+        looks,
+        lambda: math.sqrt(apertures.power(fringes - np.float32(mean)) / noise) if noise > 0.0 else math.nan,
+        lambda: [apertures.structure(each, noise) for each in (before, frame.residual)],
+        lambda: [uniform_background_indicator(each, used) for each in (before, frame.residual)],
+        lambda: part_left(frame.residual, fringes, used, fit, frame.solution.schur),
+    )
+    probability, worst = _corrected(found)
     return FrameProof(
         evidence=fit.evidence,
         fringe_rms=float(fringes[used].std(dtype=np.float64)),
-        structure_before=apertures.structure(before, noise),
-        structure_after=apertures.structure(frame.residual, noise),
+        structure_before=structure[0],
+        structure_after=structure[1],
         fringes_left=whole * left.value,
         fringes_left_sigma=whole * left.sigma,
         part_left=left.value,
         part_left_sigma=left.sigma,
-        ubi_before=uniform_background_indicator(before, used),
-        ubi_after=uniform_background_indicator(frame.residual, used),
+        ubi_before=ubi[0],
+        ubi_after=ubi[1],
         probability=probability,
         worst=worst,
     )
+
+
+def _together(*works: Callable[[], Any]) -> list[Any]:
+    """What each of several works returns, done in threads."""
+    results: list[Any] = [None] * len(works)
+
+    def one(item: int) -> None:
+        results[item] = works[item]()
+
+    run_threaded(one, len(works))
+    return results
 
 
 def _untouched(frame: FrameFit, largest: int) -> FrameProof:

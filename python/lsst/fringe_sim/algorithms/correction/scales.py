@@ -13,10 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 from ...errors import OutOfRangeError, UndeterminedError
 from .background import SMALLEST_BLOCK_PX, BackgroundTerms
 from .detection import log_evidence
-from .scatter import score_covariance
+from .scatter import scale_covariance
 from .sums import FrameSums, Solution, four_digits
 
-__all__ = ["ScaleFit", "coefficient_of", "fit_scales", "refuse_negative_sky", "scale_fit", "settle", "steady_weight"]
+__all__ = [
+    "ScaleFit",
+    "coefficient_of",
+    "fit_scales",
+    "refuse_negative_sky",
+    "scale_fit",
+    "settle",
+    "steady_weight",
+]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -59,8 +67,8 @@ class ScaleFit:
     scale : `numpy.ndarray`, shape ``(K,)``
         Scales, in the unit of the image over that of the templates.
     covariance : `numpy.ndarray`, shape ``(K, K)``
-        Their covariance, from the scatter between blocks of pixels: it holds for noise that is correlated within a
-        block, and for a variance that is not known.
+        Their covariance, from the scatter between blocks of pixels (`scale_covariance`): it holds for noise that is
+        correlated, and for a variance that is not known.
     coefficient : `numpy.ndarray`, shape ``(P,)``
         Coefficients of the background.
     weight : `numpy.ndarray`, float32, shape ``(ny, nx)``
@@ -116,12 +124,6 @@ def fit_scales(
     ------
     UndeterminedError
         Too few pixels, or templates that the background or other templates can stand for.
-
-    Notes
-    -----
-    The covariance is ``S⁻¹ (Σ_b g_b g_bᵀ) S⁻¹`` with the normal matrix ``S`` of the templates less what the
-    background takes of them, and the score ``g_b`` of a block of pixels, and what blocks have in common
-    (`score_covariance`).
     """
     sums = FrameSums(image, weight.astype(np.float32), patterns, background)
     solution, _ = settle(sums, sums.usable, clip_sigma=clip_sigma)
@@ -180,8 +182,7 @@ def scale_fit(sums: FrameSums, solution: Solution) -> ScaleFit:
     pixels = int(sums.pixels.sum())
     free = pixels - len(sums.background) - solution.scale.size
     blocks = np.count_nonzero(sums.by_block(sums.pixels))
-    half = np.linalg.solve(solution.schur, score_covariance(sums, solution))
-    covariance = np.asarray(np.linalg.solve(solution.schur, half.T))
+    covariance = scale_covariance(sums, solution)
     return ScaleFit(
         scale=solution.scale,
         covariance=covariance,

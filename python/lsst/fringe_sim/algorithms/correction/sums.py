@@ -142,6 +142,21 @@ class FrameSums:
             made[k] = np.einsum("yxm,yxmn,yxn->yx", left, self.matrix, other)
         return made
 
+    def by_cell(self, solution: Solution) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+        """Normal matrix of background and templates in each cell, what a solution leaves times each term, the terms.
+
+        Shapes ``(ny, nx, T, T)``, ``(ny, nx, T)``, ``(ny, nx, T)``; the templates are the terms after the background.
+        """
+        number, terms = len(self.patterns), self._term.shape[2]
+        design = np.zeros((*self.pixels.shape, TERMS + number, terms + number))
+        design[..., :TERMS, :terms] = self._local
+        design[..., TERMS:, terms:] = np.eye(number)
+        turned = design.swapaxes(2, 3)
+        rows = self.matrix[..., :-1, :]
+        score = (turned @ (rows @ self._left(solution)[..., None]))[..., 0]
+        places = np.broadcast_to(len(self.background) + np.arange(number), (*self.pixels.shape, number))
+        return turned @ rows[..., :-1] @ design, score, np.concatenate([self._term, places], axis=2)
+
     def totals(self, solution: Solution) -> list[FloatArray]:
         """Sums in each cell of 1, of what a solution leaves, and of each template beside the background."""
         one = np.concatenate(
@@ -178,11 +193,14 @@ class FrameSums:
     def residual(self, solution: Solution) -> NDArray[np.float32]:
         """Frame less background and templates; 0 where a pixel is never used."""
         left = np.empty(self.image.shape, dtype=np.float32)
-        for rows, surface in self.background.bands(solution.coefficient):
-            np.subtract(self.image[rows], surface, out=left[rows])
+
+        def take(rows: slice, surface: NDArray[np.float32]) -> None:
+            part = np.subtract(self.image[rows], surface, out=left[rows])
             for scale, pattern in zip(solution.scale, self.patterns, strict=False):
-                left[rows] -= np.float32(scale) * pattern[rows]
-            left[rows][~self.usable[rows]] = 0.0
+                part -= np.multiply(pattern[rows], np.float32(scale), out=surface)
+            part *= self.usable[rows]
+
+        self.background.for_bands(solution.coefficient, take)
         return left
 
     def _left(self, solution: Solution) -> FloatArray:
@@ -284,4 +302,6 @@ def _refuse_degenerate(schur: FloatArray, power: FloatArray) -> None:
     root = np.sqrt(np.diag(schur))
     least = float(np.linalg.eigvalsh(schur / np.outer(root, root))[0])
     if least < LEAST_INDEPENDENT:
-        raise UndeterminedError("independence of the templates", four_digits(least), f"above {LEAST_INDEPENDENT:g}")
+        raise UndeterminedError(
+            "independence of the templates", four_digits(least), f"above {LEAST_INDEPENDENT:g}"
+        )
