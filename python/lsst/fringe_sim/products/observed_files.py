@@ -137,8 +137,10 @@ class ObservedImage:
         """
         with complete_fits(self.path) as hdus:
             stored = hdus[self.index].data
-            kind = np.float64 if stored.dtype.kind == "f" and stored.dtype.itemsize > 4 else np.float32
-            image = np.array(stored, dtype=kind)
+            kind: type[np.floating] = np.float32
+            if stored.dtype.kind == "f" and stored.dtype.itemsize > np.dtype(kind).itemsize:
+                kind = np.float64
+            image: NDArray[np.floating] = np.array(stored, dtype=kind)
         if background is not None:
             image += _companion(background, self, image.shape)
         return image

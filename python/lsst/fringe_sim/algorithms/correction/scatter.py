@@ -33,12 +33,13 @@ def scale_covariance(sums: FrameSums, solution: Solution) -> FloatArray:
     if not solution.scale.size:
         return np.zeros((0, 0))
     changes = _changes(sums, solution)
-    within = changes.T @ changes
+    within: FloatArray = np.asarray(changes.T @ changes, dtype=np.float64)
     weight, residual, *patterns = (sums.by_block(each) for each in sums.totals(solution))
     along = _correlated(residual, weight)
     pairs = np.array([[float((along * _lagged(a, b)).sum()) for b in patterns] for a in patterns])
     half = np.linalg.solve(solution.schur, 0.5 * (pairs + pairs.T))
-    return np.asarray(within + _widening(np.linalg.solve(solution.schur, half.T), within))
+    between = np.asarray(np.linalg.solve(solution.schur, half.T), dtype=np.float64)
+    return np.asarray(within + _widening(between, within))
 
 
 def _changes(sums: FrameSums, solution: Solution) -> FloatArray:
