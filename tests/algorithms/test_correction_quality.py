@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from lsst.fringe_sim.algorithms.correction.quality import excess_structure, uniform_background_indicator
+from lsst.fringe_sim.algorithms.fringe_correction import TemplateSet
+from lsst.fringe_sim.algorithms.observed_frames import correct_frame
+from lsst.fringe_sim.products import ObservedFrame
 
 SIDE, NOISE, APERTURE = 400, 3.0, 20
 
@@ -34,3 +38,35 @@ def test_the_uniform_background_indicator(white):
     waves = white + NOISE * np.sin(np.arange(SIDE) / 20.0)
     assert uniform_background_indicator(waves, good) > 2.0
     assert np.isnan(uniform_background_indicator(white, ~good))
+
+
+def frame_with_fringes(rng, amplitude, phase_error):
+    """A frame with faint stars whose fringes are elsewhere than those of the template, the fringes, the template."""
+    y, x = np.mgrid[:SIDE, :SIDE]
+    phase = 0.22 * x + 0.15 * y + 2e-4 * (x - 180) ** 2
+    wrong = gaussian_filter(rng.standard_normal(x.shape), 40)
+    fringes = amplitude * np.sin(phase + wrong * phase_error / wrong.std())
+    offset = np.arange(-6, 7)
+    star = np.exp(-0.5 * (offset[:, None] ** 2 + offset**2) / 2.5)
+    sky = 2000.0 + fringes
+    for cy, cx in rng.integers(6, SIDE - 6, (300, 2)):
+        sky[cy - 6 : cy + 7, cx - 6 : cx + 7] += rng.pareto(1.0) * 10.0 * star
+    image = rng.poisson(sky).astype(np.float32)
+    frame = ObservedFrame(image, np.zeros(image.shape, dtype=np.int32), unit="electron")
+    return frame, fringes, np.sin(phase).astype(np.float32)
+
+
+@pytest.mark.parametrize("phase_error", [0.0, 0.4, 0.8])
+@pytest.mark.rng("what is left of the fringes is told")
+def test_what_is_left_of_the_fringes_is_told(rng, phase_error):
+    """From a map that is wrong by much less than the residual shows to the eye, with stars below detection."""
+    frame, fringes, pattern = frame_with_fringes(rng, 12.0, phase_error)
+    done = correct_frame(frame, TemplateSet.of([pattern]))
+    left = np.std(fringes - done.fringes) / np.std(done.fringes)
+    proof = done.proof
+    assert proof.part_left_sigma < 0.15
+    assert proof.part_left**2 == pytest.approx(
+        left**2, abs=3.0 * ((left + proof.part_left_sigma) ** 2 - left**2)
+    )
+    ratio = proof.fringes_left / proof.part_left if proof.part_left else 0.0
+    assert ratio == pytest.approx(proof.structure_before, rel=0.3) or ratio == 0.0

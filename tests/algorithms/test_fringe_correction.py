@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.correction import AmplifierGrid
+from lsst.fringe_sim.algorithms.correction.detection import log_evidence
 from lsst.fringe_sim.algorithms.fringe_correction import (
     CorrectionOptions,
     component_patterns,
@@ -83,6 +84,26 @@ def test_the_errors_of_the_scales_hold(rng, side, draws, stated):
 
 
 @pytest.mark.slow
+@pytest.mark.rng("errors hold for templates that change slowly")
+def test_errors_hold_for_templates_that_change_slowly(rng):
+    """Background and levels of amplifiers take a part of the noise of each block, which such templates see."""
+    y, x = np.mgrid[:256, :256]
+    angles, lengths = rng.uniform(0.0, np.pi, 4), (60.0, 75.0, 90.0, 110.0)
+    waves = [
+        np.sin(2.0 * np.pi * (x * np.cos(a) + y * np.sin(a)) / length + 1e-4 * x**2).astype(np.float32)
+        for a, length in zip(angles, lengths, strict=True)
+    ]
+    options = CorrectionOptions(amplifiers=AmplifierGrid(2, 8), find_objects=False)
+    pulls = []
+    for _ in range(80):
+        image = (1000.0 + 5.0 * sum(waves) + 30.0 * rng.standard_normal(x.shape)).astype(np.float32)
+        found = correct_fringes(image, waves, variance=np.full(x.shape, 900.0), options=options)
+        pulls.append((found.scale - 5.0) / found.sigma)
+    # Known to 0.04.
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.slow
 @pytest.mark.rng("errors hold for noise that is correlated")
 def test_errors_hold_for_noise_that_is_correlated(rng):
     """As in an image that was resampled: the variance of a pixel does not tell its correlation with neighbours."""
@@ -108,6 +129,50 @@ def test_stars_do_not_move_the_scales(patterns, rng):
         pulls.append((found.scale - truth) / found.sigma)
     assert np.sqrt(np.mean(np.square(pulls))) < 1.6
     assert np.abs(pulls).max() < 4.0
+
+
+@pytest.mark.rng("a pattern that the exposure does not have is not subtracted")
+def test_a_pattern_that_the_exposure_does_not_have_is_not_subtracted(patterns, rng):
+    """Fringes of another pattern, on which the scales are noise."""
+    y, x = np.mgrid[:400, :500]
+    clean = LEVEL * (1.0 + 0.01 * patterns[0])
+    foreign = [0.01 * np.sin((x + y) / 8.0), 0.01 * np.sin((x - 2.0 * y) / 14.0)]
+    seen = 0
+    for _ in range(4):
+        image = noisy(with_sources(clean, rng), rng)
+        found = correct_fringes(image, foreign)
+        assert correct_fringes(image, patterns).seen
+        if found.seen:
+            seen += 1
+            continue
+        np.testing.assert_array_equal(found.image, image)
+        assert found.cards["FRINGCOR"] == 0
+        np.testing.assert_array_equal(undo_correction(found.image, foreign, found.cards), image)
+        correct_fringes(found.image, patterns, header=found.cards)
+    assert seen <= 1
+
+
+@pytest.mark.parametrize("number", [1, 4])
+@pytest.mark.rng("noise is not seen and scales of five sigma are")
+def test_noise_is_not_seen_and_scales_of_five_sigma_are(rng, number):
+    """At even odds the rate of scales of noise that are seen falls with the root of the number of blocks."""
+    root = rng.standard_normal((number, number + 2))
+    covariance = root @ root.T
+    draws = rng.multivariate_normal(np.zeros(number), covariance, 4000)
+    seen = np.mean([log_evidence(scale, covariance, 256) > 0.0 for scale in draws])
+    assert 0.001 < seen < 0.03
+    first = np.zeros(number)
+    first[0] = 5.0 / np.sqrt(np.linalg.inv(covariance)[0, 0])
+    assert log_evidence(first, covariance, 256) > 4.0
+    assert log_evidence(first, covariance, 256) > log_evidence(first, covariance, 25)
+
+
+@pytest.mark.rng("an exposure that was negated is refused")
+def test_an_exposure_that_was_negated_is_refused(patterns, rng):
+    image = noisy(LEVEL * (1.0 + 0.01 * patterns[0]), rng)
+    with pytest.raises(OutOfRangeError, match="sky of the frame"):
+        correct_fringes(-image, patterns)
+    assert correct_fringes(image - np.float32(LEVEL), patterns).seen
 
 
 @pytest.mark.rng("fringes are not taken for objects")
@@ -346,7 +411,7 @@ def test_bad_input_is_named(patterns):
     image = np.ones((400, 500))
     with pytest.raises(InputError, match="templates"):
         correct_fringes(image, [])
-    with pytest.raises(InputError, match="shape of the template"):
+    with pytest.raises(InputError, match="shape of the frame"):
         correct_fringes(image, [np.ones((3, 3))])
     with pytest.raises(InputError, match="shape of the mask"):
         correct_fringes(image, [patterns[0]], mask=np.ones((2, 2)))

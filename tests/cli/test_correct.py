@@ -12,6 +12,7 @@ from observed_night import observed_night
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.cli.observed import _other_light
+from lsst.fringe_sim.products import FringeFrame
 
 
 @pytest.fixture(scope="module")
@@ -126,32 +127,95 @@ def test_a_template_of_another_sensor_is_refused(
     assert "did you mean S11" in capsys.readouterr().out
 
 
+def template_file(folder: Path, pattern: np.ndarray) -> Path:
+    """A folder with one template of sensor S11."""
+    flat = np.zeros(pattern.shape)
+    image = pattern - pattern.mean()
+    frame = FringeFrame(image, flat.astype(int), flat, "y", "2026-01-01T00:00:00", detector="S11")
+    folder.mkdir()
+    frame.write_fits(folder / "fringe_0.fits")
+    return folder
+
+
+def correct(templates: Path, out: Path, *frames: Path) -> int:
+    return run(["correct", *map(str, frames), "--templates", str(templates), "--out", str(out)])
+
+
+def test_a_frame_without_the_fringes_of_the_templates_is_left_as_it_is(
+    night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    y, x = np.mgrid[:72, :72]
+    other = template_file(tmp_path / "other", 0.01 * np.sin(y / 2.2 + x / 7.0))
+    path, out = night / "visit_0.fits", tmp_path / "out"
+    assert correct(other, out, path) == 0
+    assert "not seen" in capsys.readouterr().out
+    after = out / "visit_0_corrected.fits"
+    np.testing.assert_array_equal(fits.getdata(after), fits.getdata(path))
+    assert fits.getheader(after)["FRINGCOR"] == 0
+    row = Table.read(out / "frames.ecsv")[0]
+    assert not row["seen"]
+    assert row["structure_after"] == row["structure_before"]
+    words = ["correct", str(after), "--templates", str(other), "--undo", "--out", str(tmp_path / "restored")]
+    assert run(words) == 0
+    np.testing.assert_array_equal(
+        fits.getdata(tmp_path / "restored" / "visit_0_restored.fits"), fits.getdata(path)
+    )
+
+
+def test_two_runs_write_the_same_bytes_and_digits_of_the_file_are_kept(
+    night: Path, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pixels of 64 bits stay so, and the unit of the frame is that of the scales."""
+    image, header = fits.getdata(night / "visit_0.fits"), fits.getheader(night / "visit_0.fits")
+    header["BUNIT"] = "adu"
+    source = tmp_path / "long.fits"
+    finer = image + np.random.default_rng(5).uniform(0.0, 1e-6, image.shape)
+    fits.PrimaryHDU(finer, header).writeto(source)
+    for name in ("first", "second"):
+        assert correct(made, tmp_path / name, source) == 0
+    assert " adu (" in capsys.readouterr().out
+    first, second = (tmp_path / name / "long_corrected.fits" for name in ("first", "second"))
+    assert first.read_bytes() == second.read_bytes()
+    pixels, cards = fits.getdata(first, header=True)
+    assert pixels.dtype.itemsize == 8
+    assert cards.comments["FRINGSC0"].startswith("[adu]")
+    subtracted = (finer - pixels) / cards["FRINGSC0"]
+    with fits.open(made / "templates_S11.fits") as hdus:
+        pattern = hdus["PATTERNS"].data[0]
+    # Where few frames see the sky nothing is subtracted.
+    assert np.ptp((subtracted - pattern)[subtracted != 0.0]) < 1e-5 * np.ptp(pattern)
+    with fits.open(first, checksum=True) as hdus:
+        assert all(hdu.verify_checksum() == 1 for hdu in hdus)
+
+
+def test_a_frame_that_names_no_sensor_is_refused(
+    night: Path, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Templates of a sensor are not those of any."""
+    fits.PrimaryHDU(fits.getdata(night / "visit_0.fits")).writeto(tmp_path / "plain.fits")
+    assert correct(made, tmp_path / "out", tmp_path / "plain.fits") == 1
+    assert "S11" in capsys.readouterr().out
+
+
+def test_a_frame_that_was_negated_is_refused(
+    night: Path, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image, header = fits.getdata(night / "visit_0.fits"), fits.getheader(night / "visit_0.fits")
+    fits.PrimaryHDU(-image, header).writeto(tmp_path / "negative.fits")
+    assert correct(made, tmp_path / "out", tmp_path / "negative.fits") == 1
+    assert "sky of the frame" in capsys.readouterr().out
+
+
 def test_a_frame_to_which_templates_add_structure_is_not_written(
     night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from lsst.fringe_sim.products import FringeFrame
-
     rng = np.random.default_rng(7)
     image = fits.getdata(night / "visit_0.fits").astype(float)
     pattern = (image - image.mean()) / image.mean() + 0.02 * rng.standard_normal(image.shape)
     pattern = np.clip(pattern, -0.05, 0.05)
-    flat = np.zeros(image.shape)
     rolled = np.roll(pattern, 1, axis=0) * (rng.random(image.shape) < 0.5)
-    frame = FringeFrame(
-        rolled - rolled.mean(), flat.astype(int), flat, "y", "2026-01-01T00:00:00", detector="S11"
-    )
-    (tmp_path / "model").mkdir()
-    frame.write_fits(tmp_path / "model" / "fringe_0.fits")
     out = tmp_path / "out"
-    words = [
-        "correct",
-        str(night / "visit_0.fits"),
-        "--templates",
-        str(tmp_path / "model"),
-        "--out",
-        str(out),
-    ]
-    assert run(words) == 1
+    assert correct(template_file(tmp_path / "model", rolled), out, night / "visit_0.fits") == 1
     assert "add structure" in capsys.readouterr().out
     assert not list(out.glob("*.fits"))
     assert "refused" in (out / "report.html").read_text(encoding="utf-8")

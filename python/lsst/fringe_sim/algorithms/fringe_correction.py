@@ -20,7 +20,7 @@ from ..errors import InputError, OutOfRangeError, named_units, to_number
 from ..products import CORRECTED, FringeFrame, refuse_corrected
 from .correction.background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .correction.objects import ROUNDS, FrameFit, fit_frame
-from .correction.scales import steady_weight
+from .correction.scales import ScaleFit, refuse_negative_sky, steady_weight
 from .sky_frame import SkyResponse
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "TemplateSet",
     "component_patterns",
     "correct_fringes",
+    "refuse_uncorrected",
     "residual_fringe",
     "undo_correction",
 ]
@@ -109,6 +110,17 @@ class TemplateSet:
                 variances.append(np.where(missing, np.float32(0.0), template.variance.astype(np.float32)))
         return cls(patterns, variances, unknown, digest.hexdigest()[:16])
 
+    def refuse_other_shape(self, shape: tuple[int, ...]) -> None:
+        """Refuse an exposure of another size.
+
+        Raises
+        ------
+        InputError
+            It is not as large as the templates.
+        """
+        if shape != self.unknown.shape:
+            raise InputError("shape of the frame", shape, f"{self.unknown.shape}, that of the templates")
+
 
 @dataclass(frozen=True, eq=False)
 class FringeCorrection:
@@ -117,26 +129,31 @@ class FringeCorrection:
     Attributes
     ----------
     image : `numpy.ndarray`, shape ``(ny, nx)``
-        Exposure less the scaled templates, in the floating type of the exposure; where a template has no value, the
-        exposure itself.
+        Exposure less the scaled templates, in the floating type of the exposure; where a template has no value, or if
+        their fringes are not seen, the exposure itself.
     uncorrected : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
         Pixels in which a template has no value.
     scale : `numpy.ndarray`, shape ``(K,)``
-        Scales of the templates, in the unit of the exposure over that of the templates.
+        Measured scales of the templates, in the unit of the exposure over that of the templates.
     covariance : `numpy.ndarray`, shape ``(K, K)``
         Their covariance.
-    template_id : `str`
-        Which templates they are (`TemplateSet.identity`).
     frame : `FrameFit`
         Background, objects and residual.
+    templates : `TemplateSet`
+        The templates.
     """
 
     image: NDArray[Any]
     uncorrected: NDArray[np.bool_]
     scale: FloatArray
     covariance: FloatArray
-    template_id: str
     frame: FrameFit
+    templates: TemplateSet
+
+    @property
+    def template_id(self) -> str:
+        """Which templates they are (`TemplateSet.identity`)."""
+        return self.templates.identity
 
     @property
     def sigma(self) -> FloatArray:
@@ -144,11 +161,21 @@ class FringeCorrection:
         return np.sqrt(np.diag(self.covariance))
 
     @property
+    def seen(self) -> bool:
+        """Whether the exposure has the fringes of the templates; otherwise nothing was subtracted."""
+        return self.frame.fit.seen
+
+    def applied(self, image: NDArray[Any]) -> NDArray[Any]:
+        """The same exposure in another floating type, corrected; whole numbers become single precision."""
+        return _subtracted(image, self.templates, self.frame.fit)
+
+    @property
     def cards(self) -> dict[str, Any]:
         """Header keywords of the corrected exposure: by them it is refused a second time, and restored."""
-        scales = {f"FRINGSC{number}": float(scale) for number, scale in enumerate(self.scale)}
+        subtracted = self.scale if self.seen else np.zeros(0)
+        scales = {f"FRINGSC{number}": float(scale) for number, scale in enumerate(subtracted)}
         sigmas = {f"FRINGSE{number}": float(sigma) for number, sigma in enumerate(self.sigma)}
-        return {CORRECTED: len(self.scale), TEMPLATE_ID: self.template_id, **scales, **sigmas}
+        return {CORRECTED: subtracted.size, TEMPLATE_ID: self.template_id, **scales, **sigmas}
 
 
 @dataclass(frozen=True)
@@ -184,7 +211,7 @@ def correct_fringes(
     options: CorrectionOptions | None = None,
     header: Mapping[str, Any] | None = None,
 ) -> FringeCorrection:
-    """Subtract scaled templates from an exposure.
+    """Subtract scaled templates from an exposure, unless their fringes are not seen in it.
 
     Parameters
     ----------
@@ -210,7 +237,8 @@ def correct_fringes(
     Raises
     ------
     InputError
-        An exposure that was corrected already, no template, or shapes that do not belong together.
+        An exposure that was corrected already or has a negative sky, no template, or shapes that do not belong
+        together.
     UndeterminedError
         Too few good pixels, or templates that the background or each other can stand for.
     """
@@ -221,18 +249,20 @@ def correct_fringes(
         raise InputError("shape of the exposure", exposure.shape, "two axes (y, x)")
     shape = (exposure.shape[0], exposure.shape[1])
     known = TemplateSet.of(templates)
-    unknown = _of_shape("template", known.unknown, shape)
+    known.refuse_other_shape(shape)
+    unknown = known.unknown
     good = np.isfinite(exposure) & ~unknown
     if mask is not None:
         good &= _of_shape("mask", mask, shape) == 0
     weight = steady_weight(
         good, None if variance is None else _of_shape("variance", variance, shape), exposure
     )
+    refuse_negative_sky(exposure, weight)
     background = BackgroundTerms(shape, chosen.spacing_px, chosen.amplifiers)
     rounds = ROUNDS if chosen.find_objects else 1
     frame = fit_frame(exposure, weight, known.patterns, background, rounds=rounds)
-    corrected = exposure - _fringes(known, frame.fit.scale, exposure)
-    return FringeCorrection(corrected, unknown, frame.fit.scale, frame.fit.covariance, known.identity, frame)
+    corrected = _subtracted(exposure, known, frame.fit)
+    return FringeCorrection(corrected, unknown, frame.fit.scale, frame.fit.covariance, frame, known)
 
 
 def undo_correction(image: ArrayLike, templates: Templates, header: Mapping[str, Any]) -> NDArray[Any]:
@@ -252,26 +282,38 @@ def undo_correction(image: ArrayLike, templates: Templates, header: Mapping[str,
     InputError
         The header states no correction of ours, or other templates.
     """
-    number = header.get(CORRECTED)
-    if not number:
-        raise InputError(CORRECTED, number, "an exposure that was corrected by this package")
+    refuse_uncorrected(header)
     known = TemplateSet.of(templates)
     if header.get(TEMPLATE_ID) != known.identity:
         allowed = f"{known.identity}, which the templates given have"
         raise InputError(TEMPLATE_ID, header.get(TEMPLATE_ID), allowed)
     corrected = np.asarray(image)
-    _of_shape("template", known.unknown, (corrected.shape[0], corrected.shape[1]))
+    known.refuse_other_shape(corrected.shape)
     return np.asarray(corrected + _fringes(known, _stated_scales(header, known.patterns), corrected))
 
 
+def refuse_uncorrected(header: Mapping[str, Any], source: str | None = None) -> None:
+    """Refuse an exposure of which the header does not say that this package has corrected it.
+
+    Raises
+    ------
+    InputError
+        It does not.
+    """
+    if header.get(CORRECTED) is None:
+        raise InputError(CORRECTED, None, "an exposure that was corrected by this package", source=source)
+
+
 def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
-    """Scales of all templates by a header of ours.
+    """Scales of all templates by a header of ours; 0 if they were not seen, and nothing was subtracted.
 
     Raises
     ------
     InputError
         It states none, or of another number of templates.
     """
+    if header[CORRECTED] == 0:
+        return np.zeros(len(patterns))
     if header[CORRECTED] != len(patterns):
         raise InputError(CORRECTED, header[CORRECTED], f"{len(patterns)}, the number of the templates")
     names = [f"FRINGSC{item}" for item in range(len(patterns))]
@@ -387,9 +429,22 @@ def _of_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[A
 
 def _fringes(known: TemplateSet, scale: FloatArray, exposure: NDArray[Any]) -> NDArray[Any]:
     """What is subtracted, in the floating type of the exposure."""
-    kind = exposure.dtype.newbyteorder("=") if exposure.dtype.kind == "f" else np.dtype(np.float32)
+    kind = _floating(exposure)
     total = np.zeros(exposure.shape, dtype=kind)
     for factor, pattern in zip(scale, known.patterns, strict=True):
         total += kind.type(factor) * pattern
     total[known.unknown] = 0.0
     return total
+
+
+def _subtracted(exposure: NDArray[Any], known: TemplateSet, fit: ScaleFit) -> NDArray[Any]:
+    """An exposure without its fringes, if they are seen."""
+    corrected = exposure.astype(_floating(exposure))
+    if fit.seen:
+        corrected -= _fringes(known, fit.scale, exposure)
+    return corrected
+
+
+def _floating(exposure: NDArray[Any]) -> np.dtype[Any]:
+    """Type in which an exposure is corrected: its own, or single precision for whole numbers."""
+    return exposure.dtype.newbyteorder("=") if exposure.dtype.kind == "f" else np.dtype(np.float32)

@@ -20,7 +20,7 @@ from .correction.empirical import TemplateOptions, fit_templates
 from .correction.injection import InjectionOptions, inject_sources, injection_table
 from .correction.objects import square_sums
 from .correction.quality import FrameProof, prove
-from .correction.scales import steady_weight
+from .correction.scales import refuse_negative_sky, steady_weight
 from .fringe_correction import CorrectionOptions, FringeCorrection, TemplateSet, correct_fringes
 from .image_correlation import LogBins, correlation_function
 
@@ -92,6 +92,7 @@ class CorrectedFrame:
             step,
             correlation,
             injected,
+            self.frame.unit,
         )
 
     def _correlation(self, good: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -135,6 +136,8 @@ class FrameRecord:
         Separation [px], and the correlation function before and after the correction, over the variance of a pixel.
     injected : `~astropy.table.Table` or `None`
         Bias and scatter of the fluxes of sources in a copy of the frame (`injection_table`).
+    unit : `str`
+        Unit of the frame and of the scales; may be empty.
     """
 
     name: str
@@ -146,6 +149,7 @@ class FrameRecord:
     step_px: int = 1
     correlation: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
     injected: Table | None = None
+    unit: str = ""
 
 
 def make_templates(
@@ -313,7 +317,7 @@ def recover_sources(
 
 def summary_table(records: Sequence[FrameRecord]) -> Table:
     """One row per frame: scales, structure before and after, and whether the templates may be trusted."""
-    table = Table({name: [getattr(each, name) for each in records] for name in ("name", "detector")})
+    table = Table({name: [getattr(each, name) for each in records] for name in ("name", "detector", "unit")})
     for number in range(max((each.scale.size for each in records), default=0)):
         table[f"scale {number}"] = [_at(each.scale, number) for each in records]
         table[f"sigma {number}"] = [_at(each.sigma, number) for each in records]
@@ -321,6 +325,7 @@ def summary_table(records: Sequence[FrameRecord]) -> Table:
         table[name] = [getattr(each.proof, name) for each in records]
     for row, name in ((1, "correlation_before"), (2, "correlation_after")):
         table[name] = [_largest(each.correlation[row]) for each in records]
+    table["seen"] = [each.proof.seen for each in records]
     table["passed"] = [each.proof.passed for each in records]
     return table
 
@@ -371,7 +376,9 @@ def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[NDArray[np.float32], ND
 
 def _weight(frame: ObservedFrame) -> NDArray[np.float32]:
     good = (frame.mask == 0) & np.isfinite(frame.image)
-    return steady_weight(good, frame.variance, frame.image)
+    weight = steady_weight(good, frame.variance, frame.image)
+    refuse_negative_sky(frame.image, weight)
+    return weight
 
 
 def _refuse_other(frame: ObservedFrame, first: ObservedFrame) -> None:

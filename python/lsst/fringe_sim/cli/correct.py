@@ -80,18 +80,19 @@ def correct(
 ) -> None:
     """Subtract fringe templates from observed frames, and prove frame by frame that it helped.
 
-    Files keep their layout: pixels change, and the header says by how much. A frame to which the templates add
-    structure is not written; the report shows it, and the exit status is 1.
+    Files keep their layout: pixels change, and the header says by how much. A frame in which the fringes of the
+    templates are not seen is written with its pixels as they are. A frame to which the templates add structure is not
+    written; the report shows it, and the exit status is 1.
 
     \b
     Examples:
       fringe-sim correct night/*.fits --templates templates --out corrected
       fringe-sim correct corrected/*_corrected.fits --templates templates --out restored --undo
     """
-    from ..algorithms.fringe_correction import CorrectionOptions
+    from ..algorithms.fringe_correction import CorrectionOptions, refuse_uncorrected
     from ..products import refuse_corrected
 
-    images, unusable = images_of(frames, _refuse_uncorrected if undo else refuse_corrected)
+    images, unusable = images_of(frames, refuse_uncorrected if undo else refuse_corrected)
     known = TemplateFolder(folder)
     known.check(images)
     names = target_names(images, *(("_restored", "_corrected") if undo else ("_corrected",)))
@@ -119,13 +120,6 @@ def correct(
         raise click.exceptions.Exit(EXIT_REFUSED)
 
 
-def _refuse_uncorrected(header: Mapping[str, Any], source: str) -> None:
-    from ..products import CORRECTED
-
-    if not header.get(CORRECTED):
-        raise InputError(CORRECTED, None, "a frame that was corrected by this program", source=source)
-
-
 def _corrected(
     images: list[ObservedImage],
     make: Callable[[ObservedFrame, str], tuple[CorrectedFrame, FrameRecord]],
@@ -141,20 +135,22 @@ def _corrected(
     with progress("correcting frames", len(images)) as advance:
         for path, parts in _by_file(images).items():
             made: dict[int, CorrectedFrame] = {}
+            pixels: dict[int, Any] = {}
             for image in parts:
                 name = stem_of(path) if len(parts) == 1 else f"{stem_of(path)}[{image.name}]"
+                added = background_path(background, image)
                 try:
-                    each, record = make(image.read(background_path(background, image)), name)
+                    each, record = make(image.read(added), name)
                 except InputError as error:
                     refused.append(f"{name}: not corrected: {error}")
                 else:
                     done.append(record)
                     if each.proof.passed:
                         made[image.index] = each
+                        pixels[image.index] = each.correction.applied(image.pixels(added))
                 advance()
             if made:
                 cards = {index: _cards(each) for index, each in made.items()}
-                pixels = {index: each.frame.image for index, each in made.items()}
                 flags = {index: each.correction.uncorrected for index, each in made.items()}
                 first = {"FRINGTID": next(iter(made.values())).correction.template_id, "FRINGUND": None}
                 write_images(path, target / names[path], pixels, cards, flags, first)
@@ -189,7 +185,13 @@ def _by_file(images: list[ObservedImage]) -> dict[Path, list[ObservedImage]]:
 def _cards(each: CorrectedFrame) -> dict[str, Any]:
     from .. import __version__
 
-    return {**each.correction.cards, "FRINGPRB": each.proof.probability, "FRINGVER": __version__}
+    made: dict[str, Any] = {**each.correction.cards, "FRINGPRB": each.proof.probability}
+    for keyword, value in made.items():
+        scale = re.fullmatch(r"FRINGS([CE])(\d+)", keyword)
+        if scale:
+            what = "scale" if scale[1] == "C" else "error of the scale"
+            made[keyword] = (value, f"[{each.frame.unit or 'counts'}] {what} of template {scale[2]}")
+    return {**made, "FRINGVER": __version__}
 
 
 def _restore(
@@ -206,7 +208,7 @@ def _restore(
             for image in parts:
                 header, frame = image.header(), image.read()
                 templates = known.prepared(frame.detector)
-                pixels[image.index] = undo_correction(frame.image, templates, header)
+                pixels[image.index] = undo_correction(image.pixels(), templates, header)
                 cards[image.index] = dict.fromkeys(key for key in header if OWN_CARD.fullmatch(key))
                 flags[image.index] = frame.mask < 0
         except InputError as error:
@@ -240,9 +242,12 @@ def _describe(record: FrameRecord) -> str:
     scales = ", ".join(
         f"{scale:.4g} ± {sigma:.2g}" for scale, sigma in zip(record.scale, record.sigma, strict=True)
     )
+    scales = f"scales {scales} {record.unit or 'counts'}"
     clearest = max(abs(scale / sigma) for scale, sigma in zip(record.scale, record.sigma, strict=True))
+    if not proof.seen:
+        return f"{record.name}: left as it is: the fringes of the templates are not seen ({clearest:.1f} σ, {scales})"
     return (
-        f"{record.name}: scales {scales} (fringes at {clearest:.1f} σ); "
-        f"structure beyond the noise {proof.structure_before:.2f} before, "
-        f"{proof.structure_after:.2f} after"
+        f"{record.name}: {scales} (fringes at {clearest:.1f} σ); of the fringes "
+        f"{100.0 * proof.part_left:.0f} ± {100.0 * proof.part_left_sigma:.0f} % left; structure beyond the noise "
+        f"{proof.structure_before:.2f} before, {proof.structure_after:.2f} after"
     )

@@ -200,7 +200,7 @@ class TemplateFolder:
                 self.of(sensor)
 
     def of(self, detector: str, physical_filter: str = "") -> list[FringeFrame]:
-        """Templates of a sensor; the only ones there are for a sensor or templates without a name.
+        """Templates of a sensor; templates without a name are those of any sensor.
 
         Raises
         ------
@@ -208,8 +208,8 @@ class TemplateFolder:
             There are none of it, or those of another filter, or a file is damaged or there twice.
         """
         names = sorted(self._files)
-        if detector not in self._files and (len(names) > 1 or (names[0] and detector)):
-            raise UnknownNameError("sensor of a frame", detector, names)
+        if detector not in self._files and names != [""]:
+            raise UnknownNameError("sensor that a frame names", detector, names)
         files = tuple(self._files[detector if detector in self._files else names[0]])
         found = _read_templates(files)
         for name in {each.physical_filter for each in found}:

@@ -42,6 +42,7 @@ __all__ = [
     "read_metadata",
     "refuse_other_unit",
     "write_hdus",
+    "write_summed",
 ]
 
 Scalar = bool | int | float | str | None
@@ -218,11 +219,19 @@ def write_hdus(
     hdus[0].header[EXTENSIONS_KEY] = (len(hdus) - 1, "number of extensions")
     if section is not None:
         _add_world_coordinates(hdus, section)
-    for hdu in hdus:
+    write_summed(target, hdus, verify="exception")
+
+
+def write_summed(target: Path, hdus: Sequence[Any], verify: str = "fix") -> None:
+    """Write HDUs with their checksums, in which nothing is of the clock; ``verify`` as of astropy."""
+    whole = fits.HDUList(list(hdus))
+    whole.update_extend()
+    for hdu in whole:
+        hdu.verify(verify)
         hdu.add_datasum(when="data unit checksum")
         hdu.add_checksum(when="HDU checksum", override_datasum=True)
     with all_or_nothing(target) as temporary, open(temporary, "wb") as stream:
-        fits.HDUList(list(hdus)).writeto(stream, output_verify="exception")
+        whole.writeto(stream, output_verify=verify)
 
 
 def existing_folder(path: str | os.PathLike[str]) -> Path:

@@ -6,7 +6,8 @@ What pipelines do not agree on is said once in `_Layout`: where masks and varian
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError, printable_name, to_number
-from ..files import all_or_nothing
 from ..instrument.raw_header import header_value
-from ..resources import complete_fits
+from ..resources import complete_fits, open_user_fits, refuse_damage
+from ._fits import write_summed
 from .file_keywords import FILTER_NAMES, SENSOR_NAMES, declared_names
 from .mask import MASK_PLANES, mask_bits
 from .observed_frame import ObservedFrame
@@ -97,14 +98,12 @@ class ObservedImage:
         InputError
             A damaged file, or companions of another size.
         """
+        image = self.pixels(background).astype(np.float32, copy=False)
         with complete_fits(self.path) as hdus:
             header = _merged(hdus, self.index)
-            image = np.array(hdus[self.index].data, dtype=np.float32)
             layout = _layout_of(self)
             mask = layout.mask(self, hdus, header)
             variance = layout.variance(self, hdus, header)
-        if background is not None:
-            image += _companion(background, self, image.shape)
         if mask is None:
             mask = np.zeros(image.shape, dtype=np.int32)
         for what, array in (("mask", mask), ("variance", variance)):
@@ -125,6 +124,26 @@ class ObservedImage:
             detector=detector_of(header),
             physical_filter=_first_of(header, FILTER_NAMES),
         )
+
+    def pixels(self, background: Path | None = None) -> NDArray[np.floating]:
+        """The image in the floating type of the file, whole numbers in single precision.
+
+        ``background``: see `read`.
+
+        Raises
+        ------
+        InputError
+            A damaged file, or a background of another size.
+        """
+        with complete_fits(self.path) as hdus:
+            stored = hdus[self.index].data
+            kind: type[np.floating] = np.float32
+            if stored.dtype.kind == "f" and stored.dtype.itemsize > np.dtype(kind).itemsize:
+                kind = np.float64
+            image: NDArray[np.floating] = np.array(stored, dtype=kind)
+        if background is not None:
+            image += _companion(background, self, image.shape)
+        return image
 
     def header(self) -> dict[str, Any]:
         """Keywords of the image, and those of the primary header that it does not have itself."""
@@ -182,7 +201,7 @@ def write_images(
     images : mapping of `int` to `numpy.ndarray`
         New pixels by number of the HDU.
     cards : mapping of `int` to mapping
-        Keywords of each of these HDUs; those with the value `None` are removed.
+        Keywords of each of these HDUs, values alone or with comments; those with the value `None` are removed.
     uncorrected : mapping of `int` to `numpy.ndarray` of `bool`
         Pixels that are as they were; named in an extension of their own, which is absent where there are none.
     primary : mapping
@@ -193,13 +212,13 @@ def write_images(
     OSError
         The folder does not exist or cannot be written, or the disk is full.
     """
-    with complete_fits(source) as hdus:
+    with complete_fits(source) as hdus, _as_stored(source) as stored:
         made, flags = [], []
         for number, hdu in enumerate(hdus):
             if hdu.name.endswith(UNCORRECTED):
                 continue
             if number not in images:
-                made.append(hdu.copy())
+                made.append(stored[number])
                 continue
             header = hdu.header.copy()
             _set_cards(header, cards[number])
@@ -209,8 +228,17 @@ def write_images(
                 name = f"{hdu.name}_{UNCORRECTED}" if number and hdu.name else UNCORRECTED
                 flags.append(fits.ImageHDU(uncorrected[number].astype(np.uint8), name=name))
         _set_cards(made[0].header, primary)
-        with all_or_nothing(target) as temporary, open(temporary, "wb") as stream:
-            fits.HDUList(made + flags).writeto(stream, output_verify="fix", checksum=True)
+        write_summed(target, made + flags)
+
+
+@contextmanager
+def _as_stored(source: Path) -> Iterator[fits.HDUList]:
+    """The file, with compressed images as the tables that they are stored as."""
+    with (
+        refuse_damage("file", "a complete FITS file", str(source)),
+        open_user_fits(source, warning="truncated", memmap=False, disable_image_compression=True) as hdus,
+    ):
+        yield hdus
 
 
 def _set_cards(header: fits.Header, cards: Mapping[str, Any]) -> None:

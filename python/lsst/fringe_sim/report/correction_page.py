@@ -43,15 +43,19 @@ def write_templates_report(path: Path, made: Iterable[tuple[str, FringeTemplates
 def write_correction_report(path: Path, records: Sequence[FrameRecord], refused: Sequence[str]) -> Path:
     """Write the page of a night: one row per frame, pictures of the worst and of all that were refused."""
     table = summary_table(records)
-    passed = sum(each.proof.passed for each in records)
+    passed = sum(each.proof.passed and each.proof.seen for each in records)
+    unseen = sum(not each.proof.seen for each in records)
+    left = f" {unseen} left as they are: the fringes of the templates are not seen." if unseen else ""
     report = Report(
         "Fringe correction",
-        f"{passed} of {len(table) + len(refused)} images corrected.",
+        f"{passed} of {len(table) + len(refused)} images corrected.{left}",
     )
     report.section(
         "Frames",
-        "Structure beyond the noise in apertures up to 20 arcsec, as a fraction of it; fringes that the errors of "
-        "the scales leave; the uniform background indicator, 0.98 for white noise; and the probability "
+        "Evidence of the fringes (natural logarithm; below 0 they are not seen, and the frame is left as it is); "
+        "structure beyond the noise in apertures up to 20 arcsec, as a fraction of it; the fringes that are left, as "
+        "a fraction of the same noise and as a part of those that were subtracted; the uniform background "
+        "indicator, 0.98 for white noise; and the probability "
         "that a good template does so badly.",
     )
     if len(table):
@@ -71,6 +75,7 @@ def write_correction_report(path: Path, records: Sequence[FrameRecord], refused:
     for item in chosen:
         each = records[item]
         verdict = "corrected" if each.proof.passed else f"refused: {each.proof.worst}"
+        verdict = verdict if each.proof.seen else "left as it is"
         report.figure(frame_figure(each), f"{each.name}: {verdict}.")
     return report.write(path)
 

@@ -84,7 +84,7 @@ class FringeCorrectionConfig(
 
 
 class FringeCorrectionTask(PipelineTask):
-    """Subtract fringe templates from a frame; refuse those that add structure."""
+    """Subtract fringe templates from a frame, if their fringes are seen; refuse those that add structure."""
 
     ConfigClass = FringeCorrectionConfig
     config: FringeCorrectionConfig
@@ -131,7 +131,9 @@ class FringeCorrectionTask(PipelineTask):
         made = correct_frame(frame, templates.frames(), options, pixel_arcsec=self.config.pixel_arcsec)
         if not made.proof.passed:
             allowed = f"what a good template gives (worst: {made.proof.worst})"
-            raise InputError("probability of the correction", made.proof.probability, allowed)
+            raise InputError("probability of the correction", float(f"{made.proof.probability:.4g}"), allowed)
+        if not made.proof.seen:
+            self.log.warning("%s: left as it is: the fringes of the templates are not seen", name)
         self.log.info(
             "%s: structure beyond the noise %.2f before, %.2f after",
             *(name, made.proof.structure_before, made.proof.structure_after),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from ...compiled import run_threaded
 from ...errors import OutOfRangeError
 
 __all__ = ["AmplifierGrid", "BackgroundTerms"]
@@ -30,8 +31,8 @@ MOST_BLOCKS_A_SIDE, SMALLEST_BLOCK_PX = 16, 4
 """Blocks are as large as correlated noise reaches, and enough of them to know a scatter to 5 %: 16 a side
 where the image is large enough, 4 pixels a side where it is not."""
 
-_ROWS = 256
-"""Rows of a surface that are made at a time."""
+_ROWS = 32
+"""Rows of a surface that are made at a time: few enough that a processor's own memory holds them."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +117,13 @@ class BackgroundTerms:
     def surface(self, coefficient: FloatArray) -> NDArray[np.float32]:
         """The background with these coefficients, shape ``shape``."""
         made = np.empty(self.shape, dtype=np.float32)
-        for rows, values in self.bands(coefficient):
-            made[rows] = values
+        self.for_bands(coefficient, made.__setitem__)
         return made
 
-    def bands(self, coefficient: FloatArray) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-        """The background with these coefficients, some rows at a time."""
+    def for_bands(
+        self, coefficient: FloatArray, work: Callable[[slice, NDArray[np.float32]], object]
+    ) -> None:
+        """Call ``work`` with some rows at a time and the background there, in threads."""
         splines = coefficient[: int(np.prod(self._grid))].reshape(self._grid)
         across = (splines @ self.columns.splines.T).astype(np.float32)
         down = self.rows.splines.astype(np.float32)
@@ -129,12 +131,15 @@ class BackgroundTerms:
         if self._levels[0]:
             level = coefficient[int(np.prod(self._grid)) :].reshape(self._levels)
             levels = level[:, self.columns.pixel_part].astype(np.float32)
-        for start in range(0, self.shape[0], _ROWS):
-            rows = slice(start, min(start + _ROWS, self.shape[0]))
+
+        def one(band: int) -> None:
+            rows = slice(band * _ROWS, min((band + 1) * _ROWS, self.shape[0]))
             values = down[rows] @ across
             if levels is not None:
                 values += levels[self.rows.pixel_part[rows]]
-            yield rows, values
+            work(rows, values)
+
+        run_threaded(one, -(-self.shape[0] // _ROWS))
 
     def unity(self) -> FloatArray:
         """Coefficients of the constant 1: the splines of a side sum to it."""

@@ -14,6 +14,7 @@ from ...errors import InputError, UndeterminedError
 from .background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .denoise import shrink_noise
 from .objects import fit_frame
+from .sums import four_digits
 
 __all__ = ["ObservedTemplates", "TemplateOptions", "fit_templates"]
 
@@ -157,7 +158,7 @@ def fit_templates(
                 number = int(np.argmax(gain))
                 if number == 0:
                     raise UndeterminedError(
-                        "gain of a template in frames that it was not made of", float(gain[1]),
+                        "gain of a template in frames that it was not made of", four_digits(gain[1]),
                         "above 0: more frames, or stronger fringes",
                     )  # fmt: skip
             # Only the last patterns are wanted to the end; the others tell fringes from objects.

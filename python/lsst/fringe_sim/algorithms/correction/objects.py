@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
 
 from .background import BackgroundTerms
-from .scales import ScaleFit, rounding_of, scale_fit, settle
+from .scales import ScaleFit, coefficient_of, rounding_of, scale_fit, settle
 from .sums import FrameSums, Solution
 
 __all__ = ["FrameFit", "find_objects", "fit_frame", "square_sums"]
@@ -55,7 +56,7 @@ class FrameFit:
     background : `numpy.ndarray`, float32, shape ``(ny, nx)``
         Background.
     residual : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Frame less background and fringes; 0 where the frame has no number.
+        Frame less background and fringes, if any are seen; 0 where the frame has no number.
     sums : `FrameSums`
         Sums over the pixels that were used.
     solution : `Solution`
@@ -104,6 +105,11 @@ def fit_frame(
             break
     assert residual is not None
     fit = scale_fit(sums, solution)
+    if patterns and not fit.seen:
+        # Their scales are noise, and the frame is one without them.
+        solution = sums.solve(templates=False)
+        residual = sums.residual(solution)
+        fit = dataclasses.replace(fit, coefficient=coefficient_of(sums, solution))
     return FrameFit(fit, objects, background.surface(fit.coefficient), residual, sums, solution)
 
 

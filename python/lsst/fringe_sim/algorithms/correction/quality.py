@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from scipy.stats import norm as normal
 from scipy.stats import t as student
 
+from ...compiled import run_threaded
 from ...errors import InputError
 from .objects import FrameFit, find_objects, square_sums
+from .part_left import part_left
 from .scales import CLIP_SIGMA, rounding_of
 from .sums import FrameSums
 
@@ -50,12 +52,18 @@ class FrameProof:
 
     Attributes
     ----------
+    evidence : `float`
+        Logarithm of the evidence of the templates (`log_evidence`); below 0 no fringes are seen, and nothing was
+        subtracted.
     fringe_rms : `float`
         Standard deviation of what was subtracted, in the unit of the frame.
     structure_before, structure_after : `float`
         Structure beyond the noise, of the apertures up to the largest; background and objects are left out.
-    fringes_left : `float`
-        Fringes that the errors of the scales leave, in the largest aperture.
+    fringes_left, fringes_left_sigma : `float`
+        The fringes that are left, in the aperture in which fringes are most of the noise, and the error of
+        this number; NaN where none are seen.
+    part_left, part_left_sigma : `float`
+        The same as a part of the fringes that were subtracted (`part_left`).
     ubi_before, ubi_after : `float`
         Uniform background indicator.
     probability : `float`
@@ -64,14 +72,23 @@ class FrameProof:
         Which part of the statistic is the worst one.
     """
 
+    evidence: float
     fringe_rms: float
     structure_before: float
     structure_after: float
     fringes_left: float
+    fringes_left_sigma: float
+    part_left: float
+    part_left_sigma: float
     ubi_before: float
     ubi_after: float
     probability: float
     worst: str
+
+    @property
+    def seen(self) -> bool:
+        """Whether the frame has the fringes of the templates."""
+        return self.evidence > 0.0
 
     @property
     def passed(self) -> bool:
@@ -108,29 +125,68 @@ def prove(
     blocks; the probability of the largest is corrected for their number (Šidák 1967, JASA 62, 626).
     """
     sums, fit = frame.sums, frame.fit
-    used = sums.used
+    used, largest = sums.used, max(aperture_px, 1)
+    if not fit.seen:
+        return _untouched(frame, largest)
     before = sums.residual(sums.solve(templates=False))
-    largest = max(aperture_px, 1)
     fringes = np.zeros(used.shape, dtype=np.float32)
     for scale, pattern in zip(fit.scale, sums.patterns, strict=True):
         fringes += np.float32(scale) * pattern
     allowed = [scale**2 * each for scale, each in zip(fit.scale, variances, strict=False)]
-    # Objects without regard to the template: what it prints into the frame is not left out.
-    untouched = _plain_weight(before, weight, sums)
-    looks = _rises(before, fringes, untouched, largest, allowed, fit.chi2_per_pixel) | _products(sums)
-    probability, worst = _corrected(looks)
-    rms = float(fringes[used].std(dtype=np.float64))
-    structure = [_largest_structure(each, used, largest) for each in (before, frame.residual)]
+    mean = float(fit.scale @ sums.mean_patterns())
+    apertures, noise = _Apertures(used, largest), _pixel_variance(frame.residual, used)
+
+    def looks() -> dict[str, float]:
+        # Objects without regard to the template: what it prints into the frame is not left out.
+        untouched = _plain_weight(before, weight, sums)
+        return _rises(before, fringes, untouched, largest, allowed, fit.chi2_per_pixel) | _products(sums)
+
+    found, whole, structure, ubi, left = _together(
+        looks,
+        lambda: math.sqrt(apertures.power(fringes - np.float32(mean)) / noise) if noise > 0.0 else math.nan,
+        lambda: [apertures.structure(each, noise) for each in (before, frame.residual)],
+        lambda: [uniform_background_indicator(each, used) for each in (before, frame.residual)],
+        lambda: part_left(frame.residual, fringes, used, fit, frame.solution.schur),
+    )
+    probability, worst = _corrected(found)
     return FrameProof(
-        fringe_rms=rms,
+        evidence=fit.evidence,
+        fringe_rms=float(fringes[used].std(dtype=np.float64)),
         structure_before=structure[0],
         structure_after=structure[1],
-        fringes_left=_from_scales(frame, largest),
-        ubi_before=uniform_background_indicator(before, used),
-        ubi_after=uniform_background_indicator(frame.residual, used),
+        fringes_left=whole * left.value,
+        fringes_left_sigma=whole * left.sigma,
+        part_left=left.value,
+        part_left_sigma=left.sigma,
+        ubi_before=ubi[0],
+        ubi_after=ubi[1],
         probability=probability,
         worst=worst,
     )
+
+
+def _together(*works: Callable[[], Any]) -> list[Any]:
+    """What each of several works returns, done in threads."""
+    results: list[Any] = [None] * len(works)
+
+    def one(item: int) -> None:
+        results[item] = works[item]()
+
+    run_threaded(one, len(works))
+    return results
+
+
+def _untouched(frame: FrameFit, largest: int) -> FrameProof:
+    """Of a frame from which nothing was subtracted: what is left of fringes that are not seen nobody knows."""
+    used = frame.sums.used
+    noise = _pixel_variance(frame.residual, used)
+    structure = _Apertures(used, largest).structure(frame.residual, noise)
+    ubi = uniform_background_indicator(frame.residual, used)
+    unknown = dict.fromkeys(("fringes_left", "fringes_left_sigma", "part_left", "part_left_sigma"), math.nan)
+    return FrameProof(
+        frame.fit.evidence, 0.0, structure, structure, **unknown,
+        ubi_before=ubi, ubi_after=ubi, probability=1.0, worst="",
+    )  # fmt: skip
 
 
 def _plain_weight(
@@ -147,17 +203,30 @@ def _plain_weight(
     return np.where(objects | (pull2 > limit), np.float32(0.0), weight)
 
 
-def _largest_structure(residual: NDArray[np.float32], good: NDArray[np.bool_], largest: int) -> float:
-    """Structure in the aperture in which it is largest, from 2 px up."""
-    noise = _pixel_variance(residual, good)
-    share: NDArray[Any] = good
-    total = np.where(good, residual, np.float32(0.0))
-    found, half = [], 1
-    while 2 * half <= largest:
-        found.append(_excess(*_overlapping(share, total, half), 2 * half, noise))
-        share, total = square_sums(share, 2), square_sums(total, 2)
-        half *= 2
-    return max([*found, excess_structure(residual, good, largest)])
+class _Apertures:
+    """Square apertures of 2, 4, 8, … px and the largest ones, over the good pixels of a frame."""
+
+    def __init__(self, good: NDArray[np.bool_], largest: int) -> None:
+        self.good, self.largest = good, largest
+        self.shares: list[NDArray[np.float32]] = []
+        share: NDArray[Any] = good
+        while 2 << len(self.shares) <= largest:
+            self.shares.append(_overlapping(share, 1 << len(self.shares)))
+            share = square_sums(share, 2)
+        self.last = _of_apertures(good, largest)
+
+    def structure(self, values: NDArray[np.float32], noise: float) -> float:
+        """Structure beyond the noise [variance of a pixel] in the apertures in which it is largest."""
+        return math.sqrt(max(self.power(values) / noise - 1.0, 0.0)) if noise > 0.0 else math.nan
+
+    def power(self, values: NDArray[np.float32]) -> float:
+        """Largest mean square of means over apertures, as the variance of a pixel of white noise that had it."""
+        total = np.where(self.good, values, np.float32(0.0))
+        found = [_power(self.last, _of_apertures(total, self.largest), self.largest)]
+        for level, share in enumerate(self.shares):
+            found.append(_power(share, _overlapping(total, 1 << level), 2 << level))
+            total = square_sums(total, 2)
+        return max(found)
 
 
 def excess_structure(residual: NDArray[Any], weight: NDArray[Any], aperture_px: int) -> float:
@@ -173,20 +242,21 @@ def excess_structure(residual: NDArray[Any], weight: NDArray[Any], aperture_px: 
         Side of the apertures [px], which overlap by half where it is even.
     """
     good = weight > 0
-    return _excess(*_apertures(residual, good, aperture_px), aperture_px, _pixel_variance(residual, good))
+    share = _of_apertures(good, aperture_px)
+    total = _of_apertures(np.where(good, residual, np.float32(0.0)), aperture_px)
+    noise = _pixel_variance(residual, good)
+    # NaN if no aperture has enough pixels.
+    return math.sqrt(max(_power(share, total, aperture_px) / noise - 1.0, 0.0)) if noise > 0.0 else math.nan
 
 
-def _excess(share: NDArray[Any], total: NDArray[Any], side: int, noise: float) -> float:
-    """Structure from the numbers of good pixels in apertures and the sums over them."""
+def _power(share: NDArray[Any], total: NDArray[Any], side: int) -> float:
+    """Mean square of means over apertures relative to that of white noise of variance 1; NaN without apertures."""
     seen = share > LEAST_SHARE * side**2
-    if not seen.any() or not noise > 0.0:
+    if not seen.any():
         return math.nan
     number = share[seen]
-    mean = total[seen] / number
-    # The noise of a pixel is that of differences of neighbours, which no smooth structure enters.
-    white = noise * float(np.mean(1.0 / number, dtype=np.float64))
-    excess = float(np.mean(np.square(mean), dtype=np.float64)) / white - 1.0
-    return math.sqrt(max(excess, 0.0))
+    squares = float(np.mean(np.square(total[seen] / number), dtype=np.float64))
+    return squares / float(np.mean(1.0 / number, dtype=np.float64))
 
 
 def uniform_background_indicator(residual: NDArray[Any], good: NDArray[np.bool_]) -> float:
@@ -233,29 +303,21 @@ def uniform_background_indicator(residual: NDArray[Any], good: NDArray[np.bool_]
     return (float(np.std(flux)) + middle / float(disc.sum())) / middle if middle > 0.0 else math.nan
 
 
-def _apertures(
-    values: NDArray[Any], good: NDArray[np.bool_], side: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Number of good pixels in each aperture, and sum over them."""
+def _of_apertures(values: NDArray[Any], side: int) -> NDArray[np.float32]:
+    """Sums over apertures, which overlap by half where their side is even."""
     half = side // 2 if side % 2 == 0 else side
-    share, total = (square_sums(each, half) for each in (good, np.where(good, values, np.float32(0.0))))
     # Squares that the edge has cut are no part of apertures.
-    ny, nx = (size // half for size in good.shape)
-    share, total = share[:ny, :nx], total[:ny, :nx]
-    return (share, total) if half == side else _overlapping(share, total, half)
+    ny, nx = (size // half for size in values.shape)
+    total = square_sums(values, half)[:ny, :nx]
+    return total if half == side else _overlapping(total, half)
 
 
-def _overlapping(
-    share: NDArray[Any], total: NDArray[Any], half: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _overlapping(total: NDArray[Any], half: int) -> NDArray[np.float32]:
     """Apertures of two by two squares; where there are so many that it matters not, without overlap."""
     if half < LEAST_OVERLAPPING:
-        return square_sums(share, 2), square_sums(total, 2)
-    made = [
-        each[1:, 1:] + each[1:, :-1] + each[:-1, 1:] + each[:-1, :-1]
-        for each in (np.asarray(share, dtype=np.float32), total)
-    ]
-    return made[0], made[1]
+        return square_sums(total, 2)
+    whole = np.asarray(total, dtype=np.float32)
+    return np.asarray(whole[1:, 1:] + whole[1:, :-1] + whole[:-1, 1:] + whole[:-1, :-1])
 
 
 def _pixel_variance(residual: NDArray[Any], good: NDArray[np.bool_]) -> float:
@@ -327,23 +389,6 @@ def _corrected(looks: dict[str, float]) -> tuple[float, str]:
     """Probability of the smallest of several, and which it is."""
     worst = min(looks, key=lambda name: looks[name])
     return float(-math.expm1(len(looks) * math.log1p(-min(looks[worst], 1.0 - 1e-12)))), worst
-
-
-def _from_scales(frame: FrameFit, side: int) -> float:
-    """What the errors of the scales leave in an aperture, as a fraction of its noise."""
-    fit, good = frame.fit, frame.sums.used
-    centred = [
-        pattern - np.float32(mean)
-        for pattern, mean in zip(frame.sums.patterns, frame.sums.mean_patterns(), strict=True)
-    ]
-    both = [_apertures(each, good, side) for each in centred]
-    seen = both[0][0] > LEAST_SHARE * side**2
-    smooth = np.stack([(total / np.maximum(share, 1.0))[seen] for share, total in both]).astype(np.float64)
-    if not smooth.size:
-        return math.nan
-    power = float(np.trace(fit.covariance @ (smooth @ smooth.T))) / smooth.shape[1]
-    noise = fit.chi2_per_pixel / float(fit.weight[good].mean(dtype=np.float64)) / side**2
-    return math.sqrt(power / noise) if noise > 0.0 else math.nan
 
 
 def _disc(radius: float) -> FloatArray:

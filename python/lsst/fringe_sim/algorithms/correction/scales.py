@@ -12,9 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...errors import OutOfRangeError, UndeterminedError
 from .background import SMALLEST_BLOCK_PX, BackgroundTerms
-from .sums import FrameSums, Solution
+from .detection import log_evidence
+from .scatter import scale_covariance
+from .sums import FrameSums, Solution, four_digits
 
-__all__ = ["ScaleFit", "fit_scales", "scale_fit", "settle", "steady_weight"]
+__all__ = [
+    "ScaleFit",
+    "coefficient_of",
+    "fit_scales",
+    "refuse_negative_sky",
+    "scale_fit",
+    "settle",
+    "steady_weight",
+]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -57,14 +67,16 @@ class ScaleFit:
     scale : `numpy.ndarray`, shape ``(K,)``
         Scales, in the unit of the image over that of the templates.
     covariance : `numpy.ndarray`, shape ``(K, K)``
-        Their covariance, from the scatter between blocks of pixels: it holds for noise that is correlated within a
-        block, and for a variance that is not known.
+        Their covariance, from the scatter between blocks of pixels (`scale_covariance`): it holds for noise that is
+        correlated, and for a variance that is not known.
     coefficient : `numpy.ndarray`, shape ``(P,)``
         Coefficients of the background.
     weight : `numpy.ndarray`, float32, shape ``(ny, nx)``
         Inverse variance of the pixels that were used; 0 for others and for clipped ones.
     chi2_per_pixel : `float`
         Mean squared residual over the variance.
+    evidence : `float`
+        Logarithm of the evidence of the templates (`log_evidence`).
     """
 
     scale: FloatArray
@@ -72,6 +84,12 @@ class ScaleFit:
     coefficient: FloatArray
     weight: NDArray[np.float32]
     chi2_per_pixel: float
+    evidence: float
+
+    @property
+    def seen(self) -> bool:
+        """Whether the frame is more probable with the fringes of the templates than without."""
+        return self.evidence > 0.0
 
     @property
     def pixels(self) -> int:
@@ -106,12 +124,6 @@ def fit_scales(
     ------
     UndeterminedError
         Too few pixels, or templates that the background or other templates can stand for.
-
-    Notes
-    -----
-    The covariance is ``S⁻¹ (Σ_b g_b g_bᵀ) S⁻¹`` with the normal matrix ``S`` of the templates less what the
-    background takes of them, and the score ``g_b`` of a block of pixels (Liang & Zeger 1986, Biometrika 73,
-    13).
     """
     sums = FrameSums(image, weight.astype(np.float32), patterns, background)
     solution, _ = settle(sums, sums.usable, clip_sigma=clip_sigma)
@@ -169,19 +181,21 @@ def scale_fit(sums: FrameSums, solution: Solution) -> ScaleFit:
     """Scales with their errors."""
     pixels = int(sums.pixels.sum())
     free = pixels - len(sums.background) - solution.scale.size
-    blocks = sums.by_block(sums.pixels)
-    filled = np.count_nonzero(blocks)
-    score = np.array([sums.by_block(each).ravel() for each in sums.products(solution)])
-    score = score.reshape(solution.scale.size, blocks.size)
-    meat = score @ score.T * (filled / (filled - 1) * pixels / free)
-    half = np.linalg.solve(solution.schur, meat)
+    blocks = np.count_nonzero(sums.by_block(sums.pixels))
+    covariance = scale_covariance(sums, solution)
     return ScaleFit(
         scale=solution.scale,
-        covariance=np.asarray(np.linalg.solve(solution.schur, half.T)),
-        coefficient=solution.coefficient + sums.level * sums.background.unity(),
+        covariance=covariance,
+        coefficient=coefficient_of(sums, solution),
         weight=np.where(sums.used, sums.weight, np.float32(0.0)),
         chi2_per_pixel=sums.chi2(solution) / free,
+        evidence=log_evidence(solution.scale, covariance, int(blocks)),
     )
+
+
+def coefficient_of(sums: FrameSums, solution: Solution) -> FloatArray:
+    """Coefficients of the whole background: the sums are of frames less a level."""
+    return np.asarray(solution.coefficient + sums.level * sums.background.unity())
 
 
 def steady_weight(
@@ -227,6 +241,26 @@ def steady_weight(
     return weight
 
 
+def refuse_negative_sky(image: NDArray[Any], weight: NDArray[np.float32]) -> None:
+    """Refuse a frame that has been negated: a sky that was subtracted lies within the noise of a pixel of 0.
+
+    Raises
+    ------
+    OutOfRangeError
+        It is lower.
+    """
+    step = max(1, image.size // SAMPLE)
+    used = weight.ravel()[::step]
+    known = used > 0
+    if not known.any():
+        return
+    level = float(np.median(image.ravel()[::step][known]))
+    noise = 1.0 / math.sqrt(float(np.median(used[known])))
+    if level < -noise:
+        allowed = f"positive, or subtracted: within the noise of a pixel ({noise:.3g}) of 0"
+        raise OutOfRangeError("sky of the frame", four_digits(level), allowed)
+
+
 def _cell_medians(some: NDArray[Any]) -> NDArray[Any]:
     """Median of each cell over what is no NaN of every so many pixels of every so many rows."""
     side = CELL_PX // CELL_STEP
@@ -241,7 +275,7 @@ def _refuse_unit(noise: float) -> None:
     """Refuse numbers whose squares single precision does not hold."""
     if noise > 0.0 and not 1.0 / LARGEST_NOISE < noise < LARGEST_NOISE:
         allowed = f"{1.0 / LARGEST_NOISE:.0e} to {LARGEST_NOISE:.0e}, in another unit"
-        raise OutOfRangeError("noise of a pixel", noise, allowed)
+        raise OutOfRangeError("noise of a pixel", four_digits(noise), allowed)
 
 
 def rounding_of(level: ArrayLike) -> float:

@@ -14,7 +14,7 @@ from ...compiled import run_threaded
 from ...errors import UndeterminedError
 from .background import CUBIC, BackgroundTerms
 
-__all__ = ["FrameSums", "Solution"]
+__all__ = ["FrameSums", "Solution", "four_digits"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -142,6 +142,35 @@ class FrameSums:
             made[k] = np.einsum("yxm,yxmn,yxn->yx", left, self.matrix, other)
         return made
 
+    def by_cell(self, solution: Solution) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+        """Normal matrix of background and templates in each cell, what a solution leaves times each term, the terms.
+
+        Shapes ``(ny, nx, T, T)``, ``(ny, nx, T)``, ``(ny, nx, T)``; the templates are the terms after the background.
+        """
+        number, terms = len(self.patterns), self._term.shape[2]
+        design = np.zeros((*self.pixels.shape, TERMS + number, terms + number))
+        design[..., :TERMS, :terms] = self._local
+        design[..., TERMS:, terms:] = np.eye(number)
+        turned = design.swapaxes(2, 3)
+        rows = self.matrix[..., :-1, :]
+        score = (turned @ (rows @ self._left(solution)[..., None]))[..., 0]
+        places = np.broadcast_to(len(self.background) + np.arange(number), (*self.pixels.shape, number))
+        return turned @ rows[..., :-1] @ design, score, np.concatenate([self._term, places], axis=2)
+
+    def totals(self, solution: Solution) -> list[FloatArray]:
+        """Sums in each cell of 1, of what a solution leaves, and of each template beside the background."""
+        one = np.concatenate(
+            [self._on_cells(self.background.unity()), np.zeros((*self.pixels.shape, len(self.patterns) + 1))],
+            axis=2,
+        )
+        others = [one, self._left(solution)]
+        for k, leakage in enumerate(solution.leakage.T):
+            beside = np.zeros_like(one)
+            beside[..., :TERMS] = -self._on_cells(leakage)
+            beside[..., TERMS + k] = 1.0
+            others.append(beside)
+        return [np.einsum("yxm,yxmn,yxn->yx", one, self.matrix, other) for other in others]
+
     def chi2(self, solution: Solution) -> float:
         """Sum of the squared pulls of the pixels in use."""
         left = self._left(solution)
@@ -164,11 +193,14 @@ class FrameSums:
     def residual(self, solution: Solution) -> NDArray[np.float32]:
         """Frame less background and templates; 0 where a pixel is never used."""
         left = np.empty(self.image.shape, dtype=np.float32)
-        for rows, surface in self.background.bands(solution.coefficient):
-            np.subtract(self.image[rows], surface, out=left[rows])
+
+        def take(rows: slice, surface: NDArray[np.float32]) -> None:
+            part = np.subtract(self.image[rows], surface, out=left[rows])
             for scale, pattern in zip(solution.scale, self.patterns, strict=False):
-                left[rows] -= np.float32(scale) * pattern[rows]
-            left[rows][~self.usable[rows]] = 0.0
+                part -= np.multiply(pattern[rows], np.float32(scale), out=surface)
+            part *= self.usable[rows]
+
+        self.background.for_bands(solution.coefficient, take)
         return left
 
     def _left(self, solution: Solution) -> FloatArray:
@@ -251,6 +283,11 @@ def _middle(image: NDArray[Any], usable: BoolArray) -> float:
     return float(np.float32(np.median(values))) if values.size else 0.0
 
 
+def four_digits(value: float) -> float:
+    """A measured number as a message states it."""
+    return float(f"{value:.4g}")
+
+
 def _refuse_degenerate(schur: FloatArray, power: FloatArray) -> None:
     """Templates of which the background, or each other, leave nothing."""
     if not power.size:
@@ -260,9 +297,11 @@ def _refuse_degenerate(schur: FloatArray, power: FloatArray) -> None:
         number = int(np.argmin(left))
         allowed = "a template that varies more quickly than the background"
         raise UndeterminedError(
-            f"part of template {number} beside the background", float(left[number]), allowed
+            f"part of template {number} beside the background", four_digits(left[number]), allowed
         )
     root = np.sqrt(np.diag(schur))
     least = float(np.linalg.eigvalsh(schur / np.outer(root, root))[0])
     if least < LEAST_INDEPENDENT:
-        raise UndeterminedError("independence of the templates", least, f"above {LEAST_INDEPENDENT:g}")
+        raise UndeterminedError(
+            "independence of the templates", four_digits(least), f"above {LEAST_INDEPENDENT:g}"
+        )
