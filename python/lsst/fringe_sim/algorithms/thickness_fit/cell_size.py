@@ -24,6 +24,8 @@ _NINTH_DECILE = 1.28
 """Of a normal distribution, in standard deviations."""
 _CLEAREST = 4
 """Wavelengths from which the size of the cells is chosen."""
+_SAMPLE = 1000
+"""Squares from which their median is taken."""
 _CUT_NOISE = 0.902
 """Mean of the squares of normal deviates that are cut at eight times their median."""
 
@@ -105,7 +107,7 @@ def _structure(
                 count = np.isfinite(square).sum(axis=1)
                 if square.size and count.min() >= 16:
                     # Spikes are cut: neither a fringe nor noise has squares so far above the median.
-                    square = np.minimum(square, 8.0 * np.nanmedian(square, axis=1)[:, None])
+                    square = np.minimum(square, 8.0 * np.nanmedian(square[:, :: 1 + square.shape[1] // _SAMPLE], axis=1)[:, None])
                     excess = np.nanmean(square, axis=1) - 2.0 * _CUT_NOISE * noise
                     # Where noise rules, the ninth decile would be that of the noise of these means.
                     scatter = _NINTH_DECILE * np.sqrt(np.sum((share * 2.0 * noise) ** 2 * 2.0 / count))

@@ -19,7 +19,7 @@ from .mean_response import SENSOR_ORDERS, normalise_to_cells, normalise_to_pixel
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, subtract_offset
 from .orders import SURE, solve_orders
-from .pixels import CellSurface, calm_surface
+from .pixels import CellSurface
 from .shared_misfit import leaves_only_noise
 from .templates import FringeTemplates
 
@@ -138,7 +138,7 @@ class Solver:
         """Whether a solution leaves over nothing that neighbouring pixels share."""
         if not np.isfinite(state.thickness_um).any():
             return False
-        surface = calm_surface(surface_of(state, self.order_um), self.threads)
+        surface = surface_of(state, self.order_um)
         fitted = normalise_to_pixels(self.data, state.templates, surface, self.threads)
         return leaves_only_noise(self.data, fitted, surface)
 
@@ -167,8 +167,11 @@ class Solver:
         """Whether a sensor holds orders enough to tell light and contrast from the fringes."""
         if not np.isfinite(state.thickness_um).any():
             return False
+        orders = self._open_orders(state.templates)
+        if spans_orders(state.thickness_um, self.order_um, _SURELY_MORE * orders):
+            return True
         joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
-        return spans_orders(joined, self.order_um, self._open_orders(state.templates))
+        return spans_orders(joined, self.order_um, orders)
 
     @staticmethod
     def _open_orders(templates: FringeTemplates) -> float:
@@ -264,8 +267,10 @@ class Solver:
 
     def adjust(self, state: State) -> State:
         """Fit mean response and nuisances to the cells, the orders being as they are, but for a common one."""
+        if state.described:  # what is free is learned from the pixels
+            return state
         if state.free.any:
-            return self._learn(state, ranked=not state.described)
+            return self._learn(state, ranked=True)
         if state.normalisation == "range":
             return state
         if state.normalisation == "narrow":  # refitting and renormalising in turn would crawl
