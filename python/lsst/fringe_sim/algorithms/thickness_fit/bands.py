@@ -57,7 +57,7 @@ def load_band(
 
 
 def _to_read(array: NDArray[Any]) -> NDArray[Any]:
-    """Contiguous array that is not to be written, whatever it was: the kernel is compiled once, and nothing copied."""
+    """Contiguous array that is not to be written, whatever it was: one version of the kernel, and no copies."""
     part = np.ascontiguousarray(array).view()
     part.flags.writeable = False
     return part

@@ -125,9 +125,7 @@ def global_fit(
     if state.normalisation == "sensor" and not state.free.any:
         state = replace(state, templates=normalise_to_pixels(data, state.templates, calmed, threads))
     typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
-    pixels = fit_pixels(
-        fringes, state.templates, calmed, order, typical_weight=typical, threads=threads
-    )
+    pixels = fit_pixels(fringes, state.templates, calmed, order, typical_weight=typical, threads=threads)
     rough = spread_to_pixels(cells, ~surface.smooth)
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
     pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)

@@ -28,8 +28,6 @@ __all__ = ["Solver", "State", "surface_of"]
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
-_MISFIT = 1.5
-"""Reduced chi-square of cells from which on a model is known to be wrong; what it leaves over is shared by many."""
 _FEWEST_TO_SETTLE = 4
 """Wavelengths from which on the mean response of a narrow sensor is sought together with its order."""
 _OPEN_ORDERS = 0.5
@@ -75,13 +73,6 @@ class State:
     margin: float = np.inf
     described: bool = False
     """Whether the model as it is describes the flats, so that the orders are those that it gives."""
-
-    @property
-    def misfit(self) -> float:
-        """Median reduced chi-square of the cells, each by itself."""
-        freedom = np.maximum(self.cells.n_wavelengths - 1, 1)
-        reduced = (self.found.chi2 / freedom)[np.isfinite(self.found.chi2)]
-        return float(np.median(reduced)) if reduced.size else 1.0
 
 
 @dataclass(frozen=True)
@@ -212,8 +203,8 @@ class Solver:
             compensated, slope_y, slope_x, found.best_um, templates, nuisance, normalisation, found, range_um,
             free=self.free,
         )  # fmt: skip
-        # Evidence of a model that does not fit is not believed, however many cells agree: they err alike.
-        sure = np.inf if self.free.any and state.misfit > _MISFIT else SURE
+        # Evidence of a model that does not describe the flats is not believed, however many agree: they err alike.
+        sure = np.inf if self.free.any else SURE
         return replace(state, thickness_um=solve_orders(cells, found, sure).thickness_um)
 
     def _narrow(self, cells: Cells, first: State) -> State:
@@ -282,7 +273,7 @@ class Solver:
     def _learn(self, state: State, ranked: bool) -> State:
         """Learn light, contrast and wavelengths; if ``ranked``, the order of the whole sensor with them."""
         whole = add_offset(state.cells, state.nuisance.light(state.cells, state.free))
-        sample = LearningCells.of(whole, state.thickness_um, state.free, self.temper)
+        sample = LearningCells.of(whole, state.thickness_um, state.free, self.temper, self.order_um)
         if sample.thickness_um.size == 0:
             return state
         base = self.base or state.templates
