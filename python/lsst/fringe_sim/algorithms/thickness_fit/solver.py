@@ -14,8 +14,9 @@ from .common_order import rank_orders
 from .evidence import OrderEvidence, order_evidence, refine_cells
 from .first_nuisances import first_nuisances
 from .learning import learn
-from .learning_cells import LearningCells, sample_blocks
+from .learning_cells import LearningCells, sample_blocks, some_of
 from .mean_response import SENSOR_ORDERS, normalise_to_cells, normalise_to_pixels, spans_orders
+from .misfit import Misfit, shared_variance
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, subtract_offset
 from .orders import SURE, solve_orders
@@ -28,6 +29,8 @@ __all__ = ["Solver", "State", "surface_of"]
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
+_MOST_COMPARED = 20_000
+"""Cells that show how far cells err alike."""
 _FEWEST_TO_SETTLE = 4
 """Wavelengths from which on the mean response of a narrow sensor is sought together with its order."""
 _OPEN_ORDERS = 0.5
@@ -71,6 +74,8 @@ class State:
     """Whether mean response and orders were found together, by a search that may have missed the true ones."""
     free: Nuisances = field(default_factory=Nuisances)
     margin: float = np.inf
+    alike: float = 1.0
+    """Variance of sums over cells relative to cells that err by themselves, the largest that was met on the way."""
     described: bool = False
     """Whether the model as it is describes the flats, so that the orders are those that it gives."""
 
@@ -96,14 +101,14 @@ class Solver:
             if described is not None:
                 return described
         nuisance = first_nuisances(cells, templates, self.free)
-        fitted = nuisance.applied_to(templates)
+        fitted, alike = nuisance.applied_to(templates), 1.0
         for turn in range(_MOST_SOLUTIONS):
             even = subtract_offset(cells, nuisance.light(cells, self.free))
-            state = self._state(even, fitted, nuisance, "sensor", self.range_um)
+            state = self._state(even, fitted, nuisance, "sensor", self.range_um, alike)
             before, state = state, self._learn(state, ranked=turn == 0)
             if _agree(before, state):
                 break
-            fitted, nuisance = state.templates, state.nuisance
+            fitted, nuisance, alike = state.templates, state.nuisance, state.alike
         return state
 
     def _described(self, cells: Cells, templates: FringeTemplates) -> State | None:
@@ -193,8 +198,9 @@ class Solver:
         nuisance: NuisanceFit,
         normalisation: str,
         range_um: tuple[float, float],
+        alike: float = 1.0,
     ) -> State:
-        """Orders of all cells, the model being as it is."""
+        """Orders of all cells, the model being as it is; ``alike`` is how far cells erred alike before it was so."""
         found = order_evidence(
             cells, templates, self.order_um, range_um=range_um, temper=self.temper, threads=self.threads
         )
@@ -203,9 +209,26 @@ class Solver:
             compensated, slope_y, slope_x, found.best_um, templates, nuisance, normalisation, found, range_um,
             free=self.free,
         )  # fmt: skip
-        # Evidence of a model that does not describe the flats is not believed, however many agree: they err alike.
-        sure = np.inf if self.free.any else SURE
-        return replace(state, thickness_um=solve_orders(cells, found, sure).thickness_um)
+        # Evidence of a model that does not describe the flats is worth less, however many agree: they err alike.
+        alike = max(alike, self._erring_alike(state)) if self.free.any else 1.0
+        thickness = solve_orders(cells, found, SURE * alike).thickness_um
+        return replace(state, thickness_um=thickness, alike=alike)
+
+    def _erring_alike(self, state: State) -> float:
+        """Variance of sums over cells, each at its own best thickness, relative to cells that err by themselves."""
+        thickness = state.found.best_um.ravel()
+        every = np.flatnonzero(np.isfinite(thickness))
+        known = some_of(every, _MOST_COMPARED)
+        wavelengths, thickness = state.templates.n_wavelengths, thickness[known]
+        value, weight = (
+            part.reshape(-1, part.shape[-1])[known, :wavelengths]
+            for part in (state.cells.value, state.cells.weight)
+        )
+        rest = np.sqrt(weight) * (value - state.templates.amplitude_at(thickness).T)
+        chi2 = (rest**2).sum(axis=1)
+        rest *= np.sqrt(Misfit.of(chi2, max(wavelengths - 1.0, 1.0)).trust(chi2))[:, None]
+        orders = (np.arange(len(rest)), np.argsort(thickness % self.order_um))
+        return 1.0 + (shared_variance(rest, orders) - 1.0) * every.size / max(known.size, 1)
 
     def _narrow(self, cells: Cells, first: State) -> State:
         """Orders of a sensor of few orders, whose mean response depends on them, and they on it.
