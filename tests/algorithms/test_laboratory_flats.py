@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flat_cubes import relative_flats
+from hard_maps import HARD_MAPS
 from laboratory_flats import ROWS, judge, make_flats
 
 from lsst.fringe_sim.algorithms import fit_thickness
@@ -69,6 +71,15 @@ def test_right_by_default(name, model, rng) -> None:
 def test_contrast_that_falls_with_the_thickness(name, model, rng) -> None:
     truth, cube = case(name, rng)
     check(fit_thickness(cube, model), truth, widest=1.3)
+
+
+@pytest.mark.slow
+@pytest.mark.rng("laboratory a step under an unknown contrast")
+def test_a_step_in_the_layer_under_an_unknown_contrast(model, rng) -> None:
+    """Two halves, neither of which can borrow its order from the other."""
+    truth = HARD_MAPS["two_halves"](SHAPE)
+    weak = model.with_effects({"contrast_loss.factor": 0.4})
+    check(fit_thickness(relative_flats(truth, weak, rng), model), truth)
 
 
 @pytest.mark.slow

@@ -130,17 +130,15 @@ class Amplitudes:
 
 
 def core(array: NDArray[Any]) -> NDArray[Any]:
-    """Contiguous array with broadcast axes shrunk to length 1, which is how kernels know them."""
-    part = array[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in array.strides)]
-    return np.ascontiguousarray(part)
+    """Array with broadcast axes shrunk to length 1, which is how kernels know them."""
+    return array[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in array.strides)]
 
 
 def _flags(bad: NDArray[Any]) -> NDArray[np.int16]:
     """Mask as int16, non-zero where it was; other types are only asked whether they are zero."""
     if bad.dtype == np.int16:
         return native(bad, np.int16)
-    core = bad[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in bad.strides)]
-    return np.broadcast_to((core != 0).astype(np.int16), bad.shape)
+    return np.broadcast_to((core(bad) != 0).astype(np.int16), bad.shape)
 
 
 def native(array: NDArray[Any], dtype: Any) -> NDArray[Any]:
@@ -148,5 +146,4 @@ def native(array: NDArray[Any], dtype: Any) -> NDArray[Any]:
     kind = np.dtype(dtype)
     if array.dtype == kind and array.dtype.isnative:
         return np.asarray(array)
-    core = array[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in array.strides)]
-    return np.broadcast_to(core.astype(kind), array.shape)
+    return np.broadcast_to(core(array).astype(kind), array.shape)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compiled import contiguous, kernel
+from ...compiled import kernel
 from .amplitudes import Amplitudes, core
 
 __all__ = ["BAND_ROWS", "load_band"]
@@ -47,12 +49,18 @@ def load_band(
     cell_of_row = data.cell_of_row()[low:high]
     for band in range(bands):
         _load(
-            contiguous(image[band]), contiguous(variance[min(band, len(variance) - 1)]),
-            contiguous(bad[min(band, len(bad) - 1)]), scale[band], contiguous(light[band]), cell_of_row,
-            data.x_edges,
+            _to_read(image[band]), _to_read(variance[min(band, len(variance) - 1)]),
+            _to_read(bad[min(band, len(bad) - 1)]), scale[band], _to_read(light[band]), cell_of_row, data.x_edges,
             amplitude[band], weight[band],
         )  # fmt: skip
     return amplitude, weight
+
+
+def _to_read(array: NDArray[Any]) -> NDArray[Any]:
+    """Contiguous array that is not to be written, whatever it was: one version of the kernel, and no copies."""
+    part = np.ascontiguousarray(array).view()
+    part.flags.writeable = False
+    return part
 
 
 @kernel(relaxed=True)
@@ -60,6 +68,7 @@ def _load(image, variance, bad, factor, light, cell_of_row, x_edges, amplitude, 
     """One wavelength; axes of ``variance`` and ``bad`` have one element where all along them is the same."""
     rows, columns = image.shape
     same_variance, same_bad = np.empty(columns, np.float32), np.empty(columns, np.int16)
+    same_light = np.empty(columns, np.float32)
     square = factor * factor
     for row in range(rows):
         own = variance[min(row, variance.shape[0] - 1)]
@@ -80,8 +89,10 @@ def _load(image, variance, bad, factor, light, cell_of_row, x_edges, amplitude, 
             inverse[x] = np.float32(1.0) / spread if good else np.float32(0.0)
         if light.shape[0] > 0:
             # Amplitudes are flats less one, and so is the light.
-            own_light = light[cell_of_row[row]]
-            for cell in range(own_light.shape[0]):
-                per_light = np.float32(1.0) / (np.float32(1.0) + own_light[cell])
-                for x in range(x_edges[cell], x_edges[cell + 1]):
-                    value[x] = (value[x] - own_light[cell]) * per_light
+            if row == 0 or cell_of_row[row] != cell_of_row[row - 1]:
+                own_light = light[cell_of_row[row]]
+                for cell in range(own_light.shape[0]):
+                    for x in range(x_edges[cell], x_edges[cell + 1]):
+                        same_light[x] = np.float32(1.0) / (np.float32(1.0) + own_light[cell])
+            for x in range(columns):
+                value[x] = (value[x] + np.float32(1.0)) * same_light[x] - np.float32(1.0)

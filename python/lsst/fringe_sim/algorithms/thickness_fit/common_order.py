@@ -16,8 +16,6 @@ __all__ = ["CommonOrder", "rank_orders"]
 _MOST_ORDERS = 8
 _CLEAR = 100.0
 """Chi-square difference beyond which the orders behind one need not be asked."""
-_ALIKE = 50
-"""Parts of a sensor in which model error differs: it repeats with the phase and changes slowly with the thickness."""
 _ROUNDS_ELSEWHERE = 6
 _INSIDE = 0.99
 """Share of a sensor that must lie in the range of thicknesses."""
@@ -84,9 +82,9 @@ def rank_orders(
             places[shift], tried[shift] = learn(moved, base, free, guess, _ROUNDS_ELSEWHERE)
 
     def costs() -> dict[float, float]:
-        """Chi-square of all, each where the model error of the best is counted as noise."""
-        noise = _noise_with_model_error(min(tried.values(), key=lambda fit: fit.chi2 + fit.prior))
-        return {shift: fit.chi2 / noise + fit.prior for shift, fit in tried.items()}
+        """Improbability of all, each where cells err alike as far as those of the best do."""
+        shared = min(tried.values(), key=lambda fit: fit.chi2 + fit.prior).shared
+        return {shift: fit.chi2 / shared + fit.prior for shift, fit in tried.items()}
 
     def clear(shift: float) -> bool:
         cost = costs()
@@ -103,11 +101,6 @@ def rank_orders(
     excess = np.array([cost[shift] - cost[best] for shift in tried if shift != best])
     odds = float(np.exp(-0.5 * excess).sum())
     return CommonOrder(best, tried[best], float(excess.min()), odds / (1.0 + odds))
-
-
-def _noise_with_model_error(fit: NuisanceFit) -> float:
-    """Variance of cells with model error over that of their noise: it does not average out over cells."""
-    return 1.0 + fit.excess * (1.0 + fit.cells / _ALIKE)
 
 
 def _guess_at_order(

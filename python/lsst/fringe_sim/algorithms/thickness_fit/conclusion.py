@@ -21,9 +21,9 @@ __all__ = ["CERTAIN", "MISFIT", "contrast_map", "flat_fit", "model_error", "rema
 CERTAIN = 25.0
 """Chi-square difference to the next order of the whole sensor below which the order is not decided: flats that the
 model does not describe have shown 19 for an order that was wrong."""
-MISFIT = 1.2
-"""Mean square of what is left of small blocks of pixels, over their variance, from which on the model is
-said not to fit."""
+MISFIT = 1.1**2
+"""Mean square of what is left of small blocks of pixels, over their variance, from which on the model is said not to
+fit: it makes uncertainties larger by more than the tenth to which they are stated."""
 _OUTLIER = 5.0
 """Standard deviations beyond which a wavelength does not belong to its label."""
 _BLOCKS = 16

@@ -16,7 +16,6 @@ from .conclusion import contrast_map, model_error
 from .mean_response import normalise_to_pixels
 from .nuisances import NuisanceFit, Nuisances
 from .pixels import PixelFit, calm_surface, fit_pixels
-from .posterior import widen_uncertainties
 from .relaxation import SettledCells, settle_orders
 from .rescue import rescue_pixels
 from .shared_misfit import doubt_from_shared_misfit
@@ -125,15 +124,14 @@ def global_fit(
     fringes = replace(data, offset=light, y_edges=cells.y_edges, x_edges=cells.x_edges)
     if state.normalisation == "sensor" and not state.free.any:
         state = replace(state, templates=normalise_to_pixels(data, state.templates, calmed, threads))
-    pixels = fit_pixels(fringes, state.templates, calmed, order, threads=threads)
+    typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
+    pixels = fit_pixels(fringes, state.templates, calmed, order, typical_weight=typical, threads=threads)
     rough = spread_to_pixels(cells, ~surface.smooth)
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
     pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)
     pixels = rescue_pixels(
         fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
-    typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
-    widen_uncertainties(fringes, state.templates, pixels, order, typical, threads)
     pixels = model_error(pixels, state.nuisance.scale_sigma)
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))

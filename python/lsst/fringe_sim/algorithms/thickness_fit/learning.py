@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from .evidence import refine_row
 from .learning_cells import LearningCells
+from .misfit import Misfit, shared_variance
 from .nuisances import OVERTONES, NuisanceFit, Nuisances, light_widths
 from .templates import FringeTemplates
 from .wavelengths import CommonError, common_error, shift_precision
@@ -28,10 +28,6 @@ FloatArray = NDArray[np.float64]
 
 _ROUNDS = 8
 _TOLERANCE = 3e-5
-_SIGNIFICANT = 3.0
-"""Standard deviations from which on a misfit counts."""
-_UNSOUND = 1e-4
-"""Probability of a chi-square, where the typical one is that of most cells, below which a cell has no say."""
 _CONTRAST_BY_WAVELENGTH = 0.3
 """Standard deviation of the logarithm of the contrast of one wavelength about the mean of all."""
 _FADING = 0.1
@@ -189,8 +185,8 @@ class _Problem:
     ) -> tuple[FloatArray, FloatArray]:
         """Normal matrix and right-hand side, the prior included."""
         wavelengths, own, shared = self.base.n_wavelengths, self.own, self.shared
-        weight = self.cells.temper * self.cells.weight[:, :wavelengths].astype(float)
-        weight = weight * _sound(rest, weight)[:, None]
+        weight = self.cells.weight[:, :wavelengths].astype(float)
+        weight = self.cells.temper * self._trust(rest, weight)[2][:, None] * weight
         weight = weight / np.maximum(
             (weight * rest**2).sum(axis=0) / np.maximum((weight > 0).sum(axis=0), 1), 1.0
         )
@@ -325,21 +321,26 @@ class _Problem:
             turn = float(np.abs(self.base.turn_um(fit.middle_um)).mean())
             scale = self._common(fit).sigma_nm * turn / fit.middle_um
         weight = self.cells.weight[:, :wavelengths].astype(float)
-        sound = _sound(rest, weight)
-        seen = (weight[sound] > 0).sum(axis=0)
+        misfit, each, trust = self._trust(rest, weight)
         # The thickness of each cell takes one degree of freedom, and each nuisance as much as it is not held.
         held = np.diag(variance @ precision)[: wavelengths * own].reshape(wavelengths, own).sum(axis=1)
+        seen = (weight > 0).sum(axis=0)
         freedom = np.maximum(seen * (1.0 - 1.0 / wavelengths) - (own - held), 1.0)
-        squares = (weight * rest**2)[sound].sum(axis=0)
-        excess = squares.sum() / freedom.sum() - 1.0 - _SIGNIFICANT * np.sqrt(2.0 / freedom.sum())
-        each_cell = (weight * rest**2).sum(axis=1)
-        capped = np.minimum(each_cell, _worst(each_cell, wavelengths))
+        squares = (trust[:, None] * weight * rest**2).sum(axis=0) / freedom
+        standard = np.sqrt(trust[:, None] * weight / np.maximum(squares, 1.0)) * rest
+        by_phase = np.argsort(thickness % self.cells.order_um)
         return thickness, replace(
             fit,
-            contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale, misfit=squares / freedom,
-            chi2=self.cells.temper * float(capped.sum()), prior=self._prior_chi2(fit),
-            excess=max(float(excess), 0.0), cells=len(capped),
+            contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale,
+            misfit=misfit.scale * squares, chi2=self.cells.temper * misfit.cost(each), prior=self._prior_chi2(fit),
+            shared=shared_variance(standard, (np.arange(len(rest)), by_phase)),
         )  # fmt: skip
+
+    def _trust(self, rest: FloatArray, weight: FloatArray) -> tuple[Misfit, FloatArray, FloatArray]:
+        """How far cells can be off, the chi-square of each, and how far it is to be trusted."""
+        chi2 = (weight * rest**2).sum(axis=1)
+        misfit = Misfit.of(chi2, max(self.base.n_wavelengths - 1.0, 1.0))
+        return misfit, chi2, misfit.trust(chi2)
 
     def _prior_chi2(self, fit: NuisanceFit) -> float:
         """Twice the negative logarithm of the prior, but for a constant."""
@@ -357,15 +358,3 @@ def _change(before: NuisanceFit, after: NuisanceFit) -> float:
         0.1 * float(np.abs(np.log(after.contrast / before.contrast)).max()),
         0.01 * float(np.abs(after.shift_nm - before.shift_nm).max()),
     )
-
-
-def _sound(rest: FloatArray, weight: FloatArray) -> NDArray[np.bool_]:
-    """Cells that fit no worse than most: others sit on a false minimum."""
-    misfit = (weight * rest**2).sum(axis=1)
-    return np.asarray(misfit <= _worst(misfit, rest.shape[1]))
-
-
-def _worst(misfit: FloatArray, wavelengths: int) -> float:
-    """Largest chi-square of a cell that is still believed."""
-    degrees = max(wavelengths - 1, 1)
-    return float(np.median(misfit) * chdtri(degrees, _UNSOUND) / chdtri(degrees, 0.5))

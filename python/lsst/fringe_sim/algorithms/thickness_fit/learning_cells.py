@@ -36,10 +36,11 @@ class LearningCells:
     pattern: FloatArray
     zones: int
     temper: float
+    order_um: float
 
     @classmethod
     def of(
-        cls, cells: Cells, thickness_um: NDArray[np.float32], free: Nuisances, temper: float = 1.0
+        cls, cells: Cells, thickness_um: NDArray[np.float32], free: Nuisances, temper: float, order_um: float
     ) -> LearningCells:
         """Some thousand cells with a thickness, drawn at random but always the same."""
         good = some_of(np.flatnonzero(np.isfinite(thickness_um)), _MOST_CELLS)
@@ -52,6 +53,7 @@ class LearningCells:
             pattern,
             zones,
             temper,
+            order_um,
         )
 
 
@@ -115,6 +117,7 @@ def sample_blocks(
         pattern[good],
         zones,
         1.0,
+        order_um,
     )
 
 

@@ -148,15 +148,13 @@ class NuisanceFit:
     scale_sigma : `float`
         Standard uncertainty of the scale of the thickness, which all pixels share.
     misfit : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Mean squared residual of the cells over their variance, at each wavelength.
+        Typical squared residual of the cells over their variance, at each wavelength.
     mean_response : `numpy.ndarray`, shape ``(n_wavelengths,)``
         Mean response over the sensor to which level and contrast belong; empty if it is not known.
     chi2, prior : `float`
-        Chi-square of the cells looked at, and of what the prior says of the nuisances.
-    excess : `float`
-        Part of the chi-square per degree of freedom that is significantly more than noise.
-    cells : `int`
-        Number of cells looked at.
+        Twice the negative logarithm of the probability of the cells looked at, and of the prior of the nuisances.
+    shared : `float`
+        Variance of sums over cells relative to that of cells which err each by itself.
     """
 
     coefficients: FloatArray
@@ -172,8 +170,7 @@ class NuisanceFit:
     mean_response: FloatArray = field(default_factory=lambda: np.empty(0))
     chi2: float = np.inf
     prior: float = 0.0
-    excess: float = 0.0
-    cells: int = 0
+    shared: float = 1.0
 
     @classmethod
     def none(cls, wavelengths: int, patterns: int = 0) -> NuisanceFit:

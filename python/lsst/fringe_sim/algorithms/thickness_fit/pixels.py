@@ -18,6 +18,7 @@ from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, load_band
 from .medians import middle_of
 from .newton import gauss_newton, newton_block
+from .posterior import widen_band, widest_parabola
 from .templates import FringeTemplates
 
 __all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels"]
@@ -168,6 +169,7 @@ def fit_pixels(
     surface: CellSurface,
     order_um: float,
     *,
+    typical_weight: NDArray[np.floating],
     threads: int = 2,
 ) -> PixelFit:
     """Refine every pixel.
@@ -182,10 +184,13 @@ def fit_pixels(
         Where to begin.
     order_um : `float`
         Thickness of one fringe order [µm].
+    typical_weight : `numpy.ndarray`, shape ``(n_wavelengths,)``
+        Typical inverse variance of each wavelength.
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
     _, ny, nx = data.shape
+    limit = widest_parabola(templates, typical_weight, order_um)
     value, sigma, chi2 = (np.empty((ny, nx), np.float32) for _ in range(3))
     used = np.zeros((ny, nx), np.int32)
     table = templates.table()
@@ -194,12 +199,15 @@ def fit_pixels(
 
     def work(band: int) -> None:
         low, high = band * BAND_ROWS, min((band + 1) * BAND_ROWS, ny)
+        amplitude, weight = load_band(data, low, high)
+        grid = (table, templates.start_um, templates.step_um, order_um)
         _fit_band(
-            *load_band(data, low, high), table, templates.start_um, templates.step_um, order_um,
+            amplitude, weight, *grid,
             surface.thickness_um, surface.slope_y, surface.slope_x, surface.y_centre, surface.x_centre,
             surface.smooth, surface.known, low, below_y, share_y, below_x, share_x,
             value[low:high], sigma[low:high], chi2[low:high], used[low:high],
         )  # fmt: skip
+        widen_band(amplitude, weight, *grid, limit, value[low:high], sigma[low:high])
 
     run_threaded(work, -(-ny // BAND_ROWS), threads)
     return PixelFit(value, sigma, chi2, used)

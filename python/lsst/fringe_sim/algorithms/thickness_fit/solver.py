@@ -14,12 +14,13 @@ from .common_order import rank_orders
 from .evidence import OrderEvidence, order_evidence, refine_cells
 from .first_nuisances import first_nuisances
 from .learning import learn
-from .learning_cells import LearningCells, sample_blocks
+from .learning_cells import LearningCells, sample_blocks, some_of
 from .mean_response import SENSOR_ORDERS, normalise_to_cells, normalise_to_pixels, spans_orders
+from .misfit import Misfit, shared_variance
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, subtract_offset
 from .orders import SURE, solve_orders
-from .pixels import CellSurface, calm_surface
+from .pixels import CellSurface
 from .shared_misfit import leaves_only_noise
 from .templates import FringeTemplates
 
@@ -28,8 +29,8 @@ __all__ = ["Solver", "State", "surface_of"]
 _MODEL_CHANGE = 0.15
 """Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
 _MOST_SOLUTIONS = 3
-_MISFIT = 1.5
-"""Reduced chi-square of cells from which on a model is known to be wrong; what it leaves over is shared by many."""
+_MOST_COMPARED = 20_000
+"""Cells that show how far cells err alike."""
 _FEWEST_TO_SETTLE = 4
 """Wavelengths from which on the mean response of a narrow sensor is sought together with its order."""
 _OPEN_ORDERS = 0.5
@@ -73,15 +74,10 @@ class State:
     """Whether mean response and orders were found together, by a search that may have missed the true ones."""
     free: Nuisances = field(default_factory=Nuisances)
     margin: float = np.inf
+    alike: float = 1.0
+    """Variance of sums over cells relative to cells that err by themselves, the largest that was met on the way."""
     described: bool = False
     """Whether the model as it is describes the flats, so that the orders are those that it gives."""
-
-    @property
-    def misfit(self) -> float:
-        """Median reduced chi-square of the cells, each by itself."""
-        freedom = np.maximum(self.cells.n_wavelengths - 1, 1)
-        reduced = (self.found.chi2 / freedom)[np.isfinite(self.found.chi2)]
-        return float(np.median(reduced)) if reduced.size else 1.0
 
 
 @dataclass(frozen=True)
@@ -105,14 +101,14 @@ class Solver:
             if described is not None:
                 return described
         nuisance = first_nuisances(cells, templates, self.free)
-        fitted = nuisance.applied_to(templates)
+        fitted, alike = nuisance.applied_to(templates), 1.0
         for turn in range(_MOST_SOLUTIONS):
             even = subtract_offset(cells, nuisance.light(cells, self.free))
-            state = self._state(even, fitted, nuisance, "sensor", self.range_um)
+            state = self._state(even, fitted, nuisance, "sensor", self.range_um, alike)
             before, state = state, self._learn(state, ranked=turn == 0)
             if _agree(before, state):
                 break
-            fitted, nuisance = state.templates, state.nuisance
+            fitted, nuisance, alike = state.templates, state.nuisance, state.alike
         return state
 
     def _described(self, cells: Cells, templates: FringeTemplates) -> State | None:
@@ -138,7 +134,7 @@ class Solver:
         """Whether a solution leaves over nothing that neighbouring pixels share."""
         if not np.isfinite(state.thickness_um).any():
             return False
-        surface = calm_surface(surface_of(state, self.order_um), self.threads)
+        surface = surface_of(state, self.order_um)
         fitted = normalise_to_pixels(self.data, state.templates, surface, self.threads)
         return leaves_only_noise(self.data, fitted, surface)
 
@@ -167,8 +163,11 @@ class Solver:
         """Whether a sensor holds orders enough to tell light and contrast from the fringes."""
         if not np.isfinite(state.thickness_um).any():
             return False
+        orders = self._open_orders(state.templates)
+        if spans_orders(state.thickness_um, self.order_um, _SURELY_MORE * orders):
+            return True
         joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
-        return spans_orders(joined, self.order_um, self._open_orders(state.templates))
+        return spans_orders(joined, self.order_um, orders)
 
     @staticmethod
     def _open_orders(templates: FringeTemplates) -> float:
@@ -199,8 +198,9 @@ class Solver:
         nuisance: NuisanceFit,
         normalisation: str,
         range_um: tuple[float, float],
+        alike: float = 1.0,
     ) -> State:
-        """Orders of all cells, the model being as it is."""
+        """Orders of all cells, the model being as it is; ``alike`` is how far cells erred alike before it was so."""
         found = order_evidence(
             cells, templates, self.order_um, range_um=range_um, temper=self.temper, threads=self.threads
         )
@@ -209,9 +209,26 @@ class Solver:
             compensated, slope_y, slope_x, found.best_um, templates, nuisance, normalisation, found, range_um,
             free=self.free,
         )  # fmt: skip
-        # Evidence of a model that does not fit is not believed, however many cells agree: they err alike.
-        sure = np.inf if self.free.any and state.misfit > _MISFIT else SURE
-        return replace(state, thickness_um=solve_orders(cells, found, sure).thickness_um)
+        # Evidence of a model that does not describe the flats is worth less, however many agree: they err alike.
+        alike = max(alike, self._erring_alike(state)) if self.free.any else 1.0
+        thickness = solve_orders(cells, found, SURE * alike).thickness_um
+        return replace(state, thickness_um=thickness, alike=alike)
+
+    def _erring_alike(self, state: State) -> float:
+        """Variance of sums over cells, each at its own best thickness, relative to cells that err by themselves."""
+        thickness = state.found.best_um.ravel()
+        every = np.flatnonzero(np.isfinite(thickness))
+        known = some_of(every, _MOST_COMPARED)
+        wavelengths, thickness = state.templates.n_wavelengths, thickness[known]
+        value, weight = (
+            part.reshape(-1, part.shape[-1])[known, :wavelengths]
+            for part in (state.cells.value, state.cells.weight)
+        )
+        rest = np.sqrt(weight) * (value - state.templates.amplitude_at(thickness).T)
+        chi2 = (rest**2).sum(axis=1)
+        rest *= np.sqrt(Misfit.of(chi2, max(wavelengths - 1.0, 1.0)).trust(chi2))[:, None]
+        orders = (np.arange(len(rest)), np.argsort(thickness % self.order_um))
+        return 1.0 + (shared_variance(rest, orders) - 1.0) * every.size / max(known.size, 1)
 
     def _narrow(self, cells: Cells, first: State) -> State:
         """Orders of a sensor of few orders, whose mean response depends on them, and they on it.
@@ -264,8 +281,10 @@ class Solver:
 
     def adjust(self, state: State) -> State:
         """Fit mean response and nuisances to the cells, the orders being as they are, but for a common one."""
+        if state.described:  # what is free is learned from the pixels
+            return state
         if state.free.any:
-            return self._learn(state, ranked=not state.described)
+            return self._learn(state, ranked=True)
         if state.normalisation == "range":
             return state
         if state.normalisation == "narrow":  # refitting and renormalising in turn would crawl
@@ -277,7 +296,7 @@ class Solver:
     def _learn(self, state: State, ranked: bool) -> State:
         """Learn light, contrast and wavelengths; if ``ranked``, the order of the whole sensor with them."""
         whole = add_offset(state.cells, state.nuisance.light(state.cells, state.free))
-        sample = LearningCells.of(whole, state.thickness_um, state.free, self.temper)
+        sample = LearningCells.of(whole, state.thickness_um, state.free, self.temper, self.order_um)
         if sample.thickness_um.size == 0:
             return state
         base = self.base or state.templates
