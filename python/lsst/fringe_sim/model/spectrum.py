@@ -101,7 +101,7 @@ def spectrum_of(system: OpticalSystem, wavelength_nm: FloatArray, thickness_um: 
     if any(beyond.values()):
         found = ", ".join(name for name, there in beyond.items() if there)
         raise InputError("effects", found, "plane layers alone (the response has the others)")
-    stack = system.stack.with_thickness(system.varying, thickness_um)
+    stack = system.stack.replace_layer(system.varying, thickness_um=thickness_um)
     index = stack.indices(wavelength_nm, system.temperature_k)
     total = np.zeros(index.shape)
     for theta, weight in zip(system.beam.theta.tolist(), system.beam.weight.tolist(), strict=True):
