@@ -134,7 +134,7 @@ MUTATIONS: list[tuple[str, str, str, dict[str, Any], tuple[Any, ...]]] = [
     ("primary", "LSST_NUM", "ts8", {}, ("E2V-CCD250-200",)),
     ("primary", "CCD_MANU", "ts8", {}, ("ITL",)),
     ("primary", "CCD_TYPE", "ts8", {}, ("3800C",)),
-    ("primary", "FILTER", "lsstCam", {}, ("z_20",)),
+    ("primary", "FILTER", "lsstCam", {}, ("y_04", "z_20")),
     ("primary", "FILTER1", "lsstCam", {}, ("ND",)),
     ("primary", "FILTER2", "lsstCam", {}, ("ND",)),
     ("primary", "RUNNUM", "ts8", {}, ("6007D",)),

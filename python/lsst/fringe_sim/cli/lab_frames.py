@@ -210,11 +210,23 @@ def _raw_series(frames: Sequence[RawMetadata], paths: Sequence[str]) -> LabSerie
     serials = sorted({frame.serial or f"{frame.raft}_{frame.slot}" for frame in flats})
     if len(serials) > 1:
         raise InputError("sensors", ", ".join(serials), "frames of one sensor", source=" ".join(paths))
+    _refuse_other_cameras(flats, paths)
     flats.sort(key=lambda frame: (frame.require_wavelength_nm(), frame.exposure_id))
     biases = [
         frame for frame in frames if frame.observation_type == "bias" and frame.serial == flats[0].serial
     ]
     return LabSeries(flats[0].serial, tuple(biases), tuple(flats))
+
+
+def _refuse_other_cameras(flats: Sequence[RawMetadata], paths: Sequence[str]) -> None:
+    """One sensor has a number in each camera, and its exposures are numbered by the camera."""
+    places = {
+        (frame.camera, Camera.from_name(frame.camera).detector(frame.detector).name): frame for frame in flats
+    }
+    if len(places) > 1:
+        told = "; ".join(f"{name} of {camera} in {frame.source}" for (camera, name), frame in places.items())
+        allowed = "one camera and place for the frames of a sensor (INSTRUME, TSTAND, RAFTBAY, SLOTNAME)"
+        raise InputError("sensors", told, allowed, source=" ".join(paths))
 
 
 def _say_masked(flat: FringeFlat) -> FringeFlat:

@@ -6,10 +6,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from collections.abc import Mapping
 
-__all__ = ["NOT_READ", "RAW_KEYWORDS", "READERS", "HeaderKeyword", "reason_not_read"]
+__all__ = ["NOT_READ", "RAW_KEYWORDS", "READERS", "HeaderKeyword", "is_unknown", "reason_not_read"]
 
 USED, CHECKED, REFUSED = "used", "checked", "refused"
 """It decides something of the result; another value than the one allowed is refused; its presence is refused."""
@@ -58,23 +59,35 @@ _PRIMARY = (
     ("CREATOR", "ccc", "not another simulator"),
     ("CONTRLLR", "uuu", "number of the exposure; H, which PhoSim writes, is refused"),
     ("IMGTYPE", "uuu", "bias, flat or another type; one that is not known is refused"),
-    ("TESTTYPE", "uuu", "type where IMGTYPE is absent; reason of the exposure; not PHOSIM"),
+    (
+        "TESTTYPE",
+        "uuu",
+        "type where IMGTYPE is absent; reason of the exposure; of a monochromatic flat a test that has some",
+    ),
     ("MONOWL", "uuu", "wavelength in nm, 200 to 1300; two values are refused"),
     ("MONOCH-BANDPASS", "u-u", "width of the line in nm, in place of the set-up's where it is not 0"),
-    ("EXPTIME", "uuu", "exposure time in s; dark time where DARKTIME is absent"),
+    (
+        "EXPTIME",
+        "uuu",
+        "exposure time in s, more than 0 of a monochromatic flat; dark time where DARKTIME is absent",
+    ),
     ("SHUTTIME", "uuu", "exposure time in s in place of EXPTIME where it is more than 0"),
-    ("DARKTIME", "uuu", "time of the dark current in s"),
+    ("DARKTIME", "uuu", "time of the dark current in s, not less than the exposure time"),
     ("CCDTEMP", "uuu", "temperature in °C, -200 to 60"),
     ("SENSTEMP", "uuu", "temperature where CCDTEMP is absent"),
-    ("TEMP_SET", "uuu", "temperature where neither is there"),
+    ("TEMP_SET", "uuu", "temperature where neither is there; else within 5 °C of them"),
     ("RAFTBAY", "uuu", "place of the raft in the LSST Camera"),
     ("RAFTNAME", "uuu", "place or module of the raft"),
     ("SLOTNAME", "uuu", "slot of the sensor"),
     ("CCDSLOT", "uuu", "slot of the sensor where SLOTNAME is absent"),
-    ("LSST_NUM", "uuu", "serial number of the sensor"),
+    ("LSST_NUM", "uuu", "serial number of the sensor; in the LSST Camera none that is at another place"),
     ("CCD_MANU", "ccc", "the vendor that the table of the camera has there"),
     ("CCD_TYPE", "ccc", "the model of that vendor"),
-    ("FILTER", "-u-", "physical filter of the LSST Camera"),
+    (
+        "FILTER",
+        "cuc",
+        "physical filter of the LSST Camera; of a monochromatic flat one that passes its light",
+    ),
     ("FILTER1", "-u-", "second part of the physical filter"),
     ("FILTER2", "-u-", "third part of the physical filter"),
     ("RUNNUM", "uuu", "run, in the header of products; science program"),
@@ -140,7 +153,11 @@ NOT_READ: tuple[tuple[str, str], ...] = (
     ),
     (r"CHECKSUM|DATASUM", "of the acquisition; a frame whose pixels were cut down keeps the former ones"),
     (r"DATE|DATE-END|MJD-END|MJD-TRG|(DATE|MJD)P(BEG|END)|SHUT_DEL|TSTART", "other moments than the begin"),
-    (r"IMAGETAG|FILENAME|GROUPID|PROGRAM|REASON|(CUR|MAX)INDEX|OBJECT|TELESCOP|OBSANNOT|COMMENT", "names"),
+    (
+        r"IMAGETAG|FILENAME|GROUPID|PROGRAM|REASON|(CUR|MAX)INDEX|OBJECT|TELESCOP|OBSANNOT|COMMENT|HISTORY|CONTINUE|ORIGIN"
+        r"|DAQANNOT|",
+        "names",
+    ),
     (r"CONTNUM|REBNAME|SEQ(FILE|NAME|CKSUM)|CCD_SERN", "parts of the instrument; LSST_NUM names the sensor"),
     (r"(FP|IH)VERS|FIRMWARE|PLATFORM|DAQ(VERS|PART|FOLD)", "software of the instrument"),
     (r"CCDGAIN|CCDNOISE", "rough guesses of the acquisition; gain and noise are measured or tabulated"),
@@ -161,10 +178,14 @@ NOT_READ: tuple[tuple[str, str], ...] = (
         "coordinates of pixels; DETSEC states the place",
     ),
     (
-        r"OBS-(LONG|LAT|ELEV)|OBSGEO-[XYZ]|(RA|DEC|HA|EL|AZ)(START|END)?|AMEND|ROT(PA|COORD)|TRACKSYS|RADESYS|FOCUSZ",
+        r"OBS-(LONG|LAT|ELEV)|OBSGEO-[XYZ]|(RA|DEC|HA|EL|AZ)(START|END)?|AMEND|ROT(PA|COORD)|TRACKSYS|RADESYS|FOCUSZ"
+        r"|BOT[XY](CAM)?|TELCODE|TSEQNUM",
         "pointing; AMSTART states the airmass",
     ),
-    (r"VIGNETTE|VIGN_MIN|AIRTEMP|PRESSURE|HUMIDITY|WIND(SPD|DIR)|SEEING", "dome and weather"),
+    (
+        r"VIGNETTE|VIGN_MIN|AIRTEMP|PRESSURE|HUMIDITY|WIND(SPD|DIR)|SEEING|TEMP(LED\d|SPH|BRD)",
+        "dome and weather",
+    ),
 )
 """Keywords of real headers that nothing depends on, as regular expressions, and why."""
 
@@ -172,3 +193,12 @@ NOT_READ: tuple[tuple[str, str], ...] = (
 def reason_not_read(keyword: str) -> str | None:
     """Why nothing depends on a keyword; `None` of one that should be declared."""
     return next((reason for pattern, reason in NOT_READ if re.fullmatch(pattern, keyword)), None)
+
+
+@functools.cache
+def is_unknown(keyword: str) -> bool:
+    """Whether a keyword is neither declared nor known to be of no use: a reader says that it does not use it."""
+    return keyword not in _NAMES and reason_not_read(keyword) is None
+
+
+_NAMES = frozenset(item.name for item in RAW_KEYWORDS)

@@ -7,13 +7,16 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from ..errors import FrameFormatError
+from ..errors import FrameFormatError, UnknownNameError
+from .camera import Camera
 from .detector import Detector
 
 __all__ = [
     "refuse_binning",
+    "refuse_no_flat",
     "refuse_other_day",
     "refuse_other_instrument",
+    "refuse_other_sensor",
     "refuse_other_unit",
     "refuse_other_vendor",
     "refuse_stutter",
@@ -29,6 +32,9 @@ MODELS = {"CCD250": "e2v", "3800C": "itl"}
 
 COUNTS = frozenset({"", "adu", "dn", "count", "counts"})
 """What ``BUNIT`` may say of numbers of the converter, without regard to case."""
+
+WITHOUT_FLATS = frozenset({"BIAS", "ZERO", "DARK", "FE55", "PPUMP", "TRAP"})
+"""Values of ``TESTTYPE`` of tests whose frames are no flats: no light, X-rays, or charge that was moved."""
 
 FULL_SHAPE = {"e2v": (4004, 4096), "itl": (4000, 4072)}
 """Rows and columns of a whole sensor, by vendor."""
@@ -119,6 +125,40 @@ def refuse_stutter(rows: Any, observation_type: str, source: str) -> None:
     """
     if rows not in (None, 0) and observation_type != "stuttered":
         raise FrameFormatError("STUTTER ROWS", rows, f"0 in a {observation_type} frame", source=source)
+
+
+def refuse_no_flat(test_type: str, exposure_time_s: float, source: str) -> None:
+    """Refuse a monochromatic flat of a test that takes none, and one without light.
+
+    Raises
+    ------
+    FrameFormatError
+        ``TESTTYPE`` is one of `WITHOUT_FLATS`, or the shutter was never open.
+    """
+    if test_type.upper() in WITHOUT_FLATS:
+        allowed = f"a test with flats in it, as IMGTYPE says that this is one; {test_type} takes none"
+        raise FrameFormatError("TESTTYPE", test_type, allowed, source=source)
+    if exposure_time_s == 0.0:
+        raise FrameFormatError("EXPTIME", exposure_time_s, "more than 0 s for a flat", source=source)
+
+
+def refuse_other_sensor(table: Camera, place: str, serial: str, source: str) -> None:
+    """Refuse a serial number that the table of the camera has at another place.
+
+    One that it does not have is no contradiction: early frames of the LSST Camera are of other sensors.
+
+    Raises
+    ------
+    FrameFormatError
+        Place and serial number are two sensors of the camera.
+    """
+    try:
+        at_place, of_serial = table.detector(place), table.detector(serial)
+    except UnknownNameError:
+        return
+    if at_place.id != of_serial.id:
+        allowed = f"{at_place.serial}, which is at {place}; {serial} is at {of_serial.name}"
+        raise FrameFormatError("LSST_NUM", serial, allowed, source=source)
 
 
 def refuse_other_vendor(

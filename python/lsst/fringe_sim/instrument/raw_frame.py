@@ -21,10 +21,12 @@ from astropy.io import fits
 from ..errors import FrameFormatError, InputError, UnknownNameError
 from ..resources import DAMAGE, first_line, open_user_fits
 from .camera import Camera
+from .header_keywords import is_unknown
 from .raw_checks import refuse_binning, refuse_other_unit, refuse_other_vendor
 from .raw_header import header_value
 from .raw_layout import N_AMPLIFIERS, Section, amplifier_layouts, image_shape
 from .raw_metadata import OBSERVATION_TYPES, RawMetadata
+from .stated_facts import refuse_contradictions
 
 __all__ = [
     "N_AMPLIFIERS",
@@ -37,8 +39,8 @@ __all__ = [
     "read_raw_metadata",
 ]
 
-SETTING_NM = 1.0
-"""What two readings of one setting of the monochromator may differ by; steps between flats are 5 nm or more."""
+MOST_SHOWN = 12
+"""Keywords that a note names."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -131,8 +133,8 @@ class RawFrame:
         """
         source = str(path)
         with _open_fits(source) as hdus:
-            header = _merged_header(hdus)
-            metadata = RawMetadata.from_header(header, source=source)
+            header = _merged_header(hdus, source)
+            metadata = _with_unused(RawMetadata.from_header(header, source=source), hdus)
             layouts, shape = amplifier_layouts(hdus, source)
             _refuse_other_pixels(header, metadata, shape)
             amplifiers = tuple(
@@ -194,8 +196,8 @@ def _read_without_pixels(path: str | Path) -> tuple[fits.Header, RawMetadata]:
     source = str(path)
     with _open_fits(source) as hdus:
         _, shape = amplifier_layouts(hdus, source)
-        header = _merged_header(hdus)
-    metadata = RawMetadata.from_header(header, source=source)
+        header = _merged_header(hdus, source)
+        metadata = _with_unused(RawMetadata.from_header(header, source=source), hdus)
     _refuse_other_pixels(header, metadata, shape)
     return header, metadata
 
@@ -232,26 +234,34 @@ _CONDITION_HDUS = ("TEST_COND", "REB_COND")
 _CONDITIONS = ("MONOWL", "CCDTEMP", "SENSTEMP", "TEMP_SET")
 
 
-def _merged_header(hdus: Sequence[Any]) -> fits.Header:
+def _merged_header(hdus: Sequence[Any], source: str) -> fits.Header:
     """Primary header, and from the test conditions what it lacks."""
     header = hdus[0].header.copy()
+    named = [
+        ("", header),
+        *((hdu.name or f"HDU {number}", hdu.header) for number, hdu in enumerate(hdus[1:], 1)),
+    ]
+    refuse_contradictions(named, header_value, source)
     for hdu in hdus[1:]:
         if hdu.name in _CONDITION_HDUS:
             for keyword in _CONDITIONS:
                 value = header_value(hdu.header, keyword)
                 if value is not None and header_value(header, keyword) is None:
                     header[keyword] = (value, f"from {hdu.name}")
-                elif keyword == "MONOWL" and value is not None:
-                    _refuse_other_wavelength(header, hdu)
     return header
 
 
-def _refuse_other_wavelength(header: fits.Header, hdu: Any) -> None:
-    """The monochromator is set once: what two HDUs say of it may differ by its reading, not by another setting."""
-    here, there = header_value(header, "MONOWL"), header_value(hdu.header, "MONOWL")
-    numbers = all(isinstance(value, int | float) and value > 0 for value in (here, there))
-    if numbers and abs(here - there) > SETTING_NM:
-        raise FrameFormatError("MONOWL", f"{here} and {there} in {hdu.name}", "one wavelength")
+def _with_unused(metadata: RawMetadata, hdus: Sequence[Any]) -> RawMetadata:
+    """Keywords that nothing depends on and that are not known to be of no use are said."""
+    images = [hdu for hdu in hdus if hdu.is_image]  # all of the tables is of the electronics
+    unknown = dict.fromkeys(keyword for hdu in images for keyword in hdu.header if is_unknown(keyword))
+    if not unknown:
+        return metadata
+    shown = ", ".join([*unknown][:MOST_SHOWN]) + (" and more" if len(unknown) > MOST_SHOWN else "")
+    note = (
+        f"keywords that are not used: {shown}; gains and noise are measured, or those of the camera's table"
+    )
+    return dataclasses.replace(metadata, notes=(*metadata.notes, note))
 
 
 def _integer_pixels(hdu: Any, source: str) -> npt.NDArray[np.integer[Any]]:

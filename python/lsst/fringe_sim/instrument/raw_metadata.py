@@ -14,9 +14,10 @@ from typing import Any
 
 from ..errors import FrameFormatError, UnknownNameError, named_units
 from .camera import Camera, Detector
-from .raw_checks import refuse_other_instrument, refuse_stutter
+from .raw_checks import refuse_no_flat, refuse_other_instrument, refuse_other_sensor, refuse_stutter
 from .raw_header import DeclaredHeader, header_value
 from .raw_times import DAY_ROLLOVER_H, begin_of_exposure, day_and_sequence, exposure_id, time_scale
+from .stated_facts import SAME_SECONDS, refuse_contradictions, refuse_other_filter
 
 __all__ = ["DAY_ROLLOVER_H", "OBSERVATION_TYPES", "RawMetadata", "header_value"]
 
@@ -190,9 +191,14 @@ def _interpret(header: DeclaredHeader) -> RawMetadata:
         camera,
         header.source,
     )
+    refuse_contradictions([("", header.cards)], lambda _, keyword: header.value(keyword), header.source)
     observation_type = _observation_type(header)
     refuse_stutter(header.value("STUTTER ROWS"), observation_type, header.source)
+    wavelength, filter_name = _wavelength(header, observation_type), _filter_name(header)
     exposure_time, dark_time = _times(header, observation_type)
+    if observation_type == "flat" and wavelength is not None:
+        refuse_no_flat(header.text("TESTTYPE"), exposure_time, header.source)
+        refuse_other_filter(header.text("FILTER"), wavelength, header.source)
     temperature, temperature_source = _temperature(header)
     detector = _detector(header, camera)
     start, scale = begin_of_exposure(header, camera), time_scale(header, camera)
@@ -202,7 +208,7 @@ def _interpret(header: DeclaredHeader) -> RawMetadata:
         camera=camera,
         observation_type=observation_type,
         test_type=header.text("TESTTYPE").lower(),
-        wavelength_nm=_wavelength(header, observation_type),
+        wavelength_nm=wavelength,
         bandpass_nm=_bandpass(header),
         exposure_time_s=exposure_time,
         dark_time_s=dark_time,
@@ -212,7 +218,7 @@ def _interpret(header: DeclaredHeader) -> RawMetadata:
         slot=detector.slot,
         serial=header.text("LSST_NUM").removesuffix("-Dev"),
         detector=detector.id,
-        filter_name=_filter_name(header),
+        filter_name=filter_name,
         airmass=_airmass(header),
         run=header.text("RUNNUM"),
         date_obs=start,
@@ -220,7 +226,7 @@ def _interpret(header: DeclaredHeader) -> RawMetadata:
         day_obs=day_obs,
         seq_num=seq_num,
         exposure_id=exposure_id(header, camera, start, day_obs, seq_num),
-        notes=_notes(header, camera),
+        notes=_notes(header, camera, detector),
     )
 
 
@@ -253,12 +259,24 @@ def _camera(header: DeclaredHeader) -> str:
     )
 
 
-def _notes(header: DeclaredHeader, camera: str) -> tuple[str, ...]:
-    """The instrument decides about sensor and exposure number: say so where the header does not name it."""
-    if header.value("INSTRUME") is not None or "TS8" in header.text("TSTAND").upper():
-        return ()
-    told = "RAFTBAY or RAFTNAME" if camera == "lsstCam" else "RAFTNAME or LSST_NUM"
-    return (f"neither INSTRUME nor TSTAND = TS8 in the header: taken as a frame of {camera}, for its {told}",)
+def _notes(header: DeclaredHeader, camera: str, detector: Detector) -> tuple[str, ...]:
+    """The instrument decides about sensor and exposure number: say so where the header does not name it.
+
+    So does the serial number on the test stand, whose rafts were rebuilt, against the place.
+    """
+    notes = []
+    if header.value("INSTRUME") is None and "TS8" not in header.text("TSTAND").upper():
+        told = "RAFTBAY or RAFTNAME" if camera == "lsstCam" else "RAFTNAME or LSST_NUM"
+        notes.append(
+            f"neither INSTRUME nor TSTAND = TS8 in the header: taken as a frame of {camera}, for its {told}"
+        )
+    place = _place(header, camera)
+    raft, _, slot = place.partition("_")
+    if camera == "ts8" and place and (slot != detector.slot or ("RTM" in raft and raft != detector.raft)):
+        notes.append(
+            f"the header has the sensor at {place}; LSST_NUM {header.text('LSST_NUM')} decides: {detector.name}"
+        )
+    return tuple(notes)
 
 
 def _bay(header: DeclaredHeader) -> str | None:
@@ -280,10 +298,9 @@ def _detector(header: DeclaredHeader, camera: str) -> Detector:
     table = Camera.from_name(camera)
     if len(table.detectors) == 1:
         return table.detectors[0]
-    slot = header.text("SLOTNAME") or header.text("CCDSLOT")
-    raft = _bay(header) if camera == "lsstCam" else _module(header) or _bay(header)
-    place = f"{raft}_{slot}" if raft and slot else ""
-    serial = header.text("LSST_NUM")
+    place, serial = _place(header, camera), header.text("LSST_NUM")
+    if camera == "lsstCam" and place and serial:
+        refuse_other_sensor(table, place, serial, header.source)
     keys = [key for key in ((place, serial) if camera == "lsstCam" else (serial, place)) if key]
     if not keys:
         raise header.refuse("LSST_NUM", None, "the serial number of the sensor, or RAFTBAY and CCDSLOT")
@@ -293,6 +310,13 @@ def _detector(header: DeclaredHeader, camera: str) -> Detector:
         except UnknownNameError as error:
             unknown = error
     raise unknown.in_source(header.source)
+
+
+def _place(header: DeclaredHeader, camera: str) -> str:
+    """Raft and slot, joined; empty where one of them is not stated."""
+    slot = header.text("SLOTNAME") or header.text("CCDSLOT")
+    raft = _bay(header) if camera == "lsstCam" else _module(header) or _bay(header)
+    return f"{raft}_{slot}" if raft and slot else ""
 
 
 def _observation_type(header: DeclaredHeader) -> str:
@@ -334,7 +358,7 @@ def _times(header: DeclaredHeader, observation_type: str) -> tuple[float, float]
     value = header.value("EXPTIME")
     if value is None and observation_type == "bias":
         value = 0.0
-    exposure = header.number("EXPTIME", value, "seconds, 0 or more", lambda s: s >= 0)
+    asked = exposure = header.number("EXPTIME", value, "seconds, 0 or more", lambda s: s >= 0)
     shutter = header.value("SHUTTIME")
     if shutter is not None:
         # 0 where the shutter stayed closed.
@@ -342,7 +366,9 @@ def _times(header: DeclaredHeader, observation_type: str) -> tuple[float, float]
     dark = header.value("DARKTIME")
     if dark is None:
         return exposure, exposure
-    return exposure, header.number("DARKTIME", dark, "seconds, 0 or more", lambda s: s >= 0)
+    least = min(exposure, asked) - SAME_SECONDS  # the shutter opens after the sensor was cleared
+    allowed = f"seconds, not less than the exposure time of {exposure:g} s"
+    return exposure, header.number("DARKTIME", dark, allowed, lambda s: s >= max(least, 0.0))
 
 
 def _temperature(header: DeclaredHeader) -> tuple[float | None, str]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError, named_units
-from ..instrument.raw_frame import SETTING_NM
+from ..instrument.stated_facts import SETTING_NM
 from ..instrument.raw_header import DeclaredHeader
 from ..instrument.raw_layout import Section
 from ..instrument.raw_metadata import TEMPERATURE_RANGE_C, WAVELENGTH_RANGE_NM, ZERO_CELSIUS_K
