@@ -85,6 +85,36 @@ def test_a_quantity_of_another_kind_is_refused(callee: Any, bound: bool, paramet
         callee(*([object()] if bound else []), **{parameter: 3.0 * u.kg})
 
 
+@pytest.mark.parametrize(
+    ("callee", "bound", "parameter"), [item[1:] for item in EDGE], ids=[i[0] for i in EDGE]
+)
+def test_what_is_no_number_is_refused(callee: Any, bound: bool, parameter: str) -> None:
+    """Truth values would be 0 and 1, masked entries good numbers, and numpy's own errors name no parameter."""
+    masked = np.ma.MaskedArray([3.0, 4.0], mask=[False, True])
+    wrong = (
+        True,
+        np.True_,
+        "a",
+        ["a"],
+        3j,
+        np.array([3 + 0j]),
+        masked,
+        [[1.0, 2.0], [3.0]],
+        {},
+        object(),
+        10**400,
+    )
+    for value in wrong:
+        with pytest.raises(InputError, match=parameter):
+            callee(*([object()] if bound else []), **{parameter: value})
+
+
+def test_an_array_without_masked_entries_is_one_of_numbers() -> None:
+    model = FringeModel.from_setup("ts8_e2v")
+    found = model.response(np.ma.MaskedArray([14.0, 14.1], mask=[False, False]), [950.0])
+    np.testing.assert_array_equal(found, model.response([14.0, 14.1], [950.0]))
+
+
 def test_layers_and_wavelength_have_one_unit() -> None:
     index, depth = [1.0, 1.5, 1.0], [np.inf, 1.0, np.inf]
     wanted = layer_absorption(index, depth, 0.9, theta=0.1)

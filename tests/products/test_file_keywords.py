@@ -120,7 +120,10 @@ FILES: dict[str, tuple[Callable[[], Any], Callable[[Path], Any]]] = {
     "sky frame": (lambda: make.sky(mask=GOOD, metadata=MODEL), read_sky),
     "plain flat": (Plain, read_plain),
     "observed frame": (Observed, read_observed),
-    "any product": (lambda: make.thickness(mask=GOOD | p.mask_bits("SLIP")), read_map),
+    "any product": (
+        lambda: make.thickness(mask=np.eye(3, 4, dtype=np.int32) * p.mask_bits("SLIP")),
+        read_map,
+    ),
 }
 
 VALUES: dict[tuple[str, str], tuple[int, tuple[Any, ...]]] = {
@@ -146,6 +149,8 @@ VALUES: dict[tuple[str, str], tuple[int, tuple[Any, ...]]] = {
     ("plain flat", "WAVELNTH"): (0, (940.0,)),
     ("plain flat", "TEMPK"): (0, (170.0,)),
     ("plain flat", "CCDTEMP"): (0, (-100.0,)),
+    ("plain flat", "EXPTIME"): (0, (0.0, -1.0)),
+    ("plain flat", "FILTER"): (0, ("r_57", "550nm")),
     ("plain flat", "BUNIT"): (0, ("electron", "jansky")),
     ("plain flat", "GAIN"): (0, (0.8, -1.0)),
     ("plain flat", "RDNOISE"): (0, (9.0, -9.0)),

@@ -11,7 +11,7 @@ import difflib
 import functools
 import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 __all__ = [
@@ -26,8 +26,10 @@ __all__ = [
     "UndeterminedError",
     "UnknownNameError",
     "has_unit",
+    "is_masked",
     "named_units",
     "printable_name",
+    "refuse_no_numbers",
     "shown",
     "to_number",
     "without_unit",
@@ -209,7 +211,7 @@ def to_number(field: str, value: Any, allowed: str = "a number", *, source: str 
     OutOfRangeError
         An integer beyond the largest float.
     """
-    if isinstance(value, bool):
+    if type(value).__name__ in TRUTHS or is_masked(value):
         raise InputError(field, value, allowed, source=source)
     try:
         return float(value)
@@ -218,6 +220,50 @@ def to_number(field: str, value: Any, allowed: str = "a number", *, source: str 
     except OverflowError:
         sign = -math.inf if value < 0 else math.inf
         raise OutOfRangeError(field, sign, f"{allowed} below 1.8e308", source=source) from None
+
+
+TRUTHS = ("bool", "bool_")
+"""Types of Python and numpy that are no numbers, though both count them as 0 and 1."""
+
+
+def is_masked(value: Any) -> bool:
+    """Whether an array has masked entries, whose numbers mean nothing and which numpy drops the mask of."""
+    mask = getattr(value, "mask", None)
+    return mask is not None and bool(getattr(mask, "any", lambda: mask)())
+
+
+def refuse_no_numbers(field: str, value: Any) -> None:
+    """Refuse what is no number, or array or sequence of numbers; `None` stands for no value.
+
+    Raises
+    ------
+    InputError
+        Truth values, text, complex numbers, objects, or masked entries.
+    """
+    if type(value) is float or value is None:
+        return
+    dtype = getattr(value, "dtype", None)
+    if dtype is not None:
+        if getattr(dtype, "kind", "f") not in "fiu":
+            raise InputError(field, f"of type {dtype}", "a number or an array of numbers")
+        if is_masked(value):
+            raise InputError(
+                field, "masked in part", "numbers without a mask; fill in what is masked, or NaN"
+            )
+    elif isinstance(value, tuple | list):
+        for item in value:
+            refuse_no_numbers(field, item)
+        if len(set(map(_length, value))) > 1:
+            raise InputError(field, value, "numbers in rows of one length")
+    elif isinstance(value, int) and not isinstance(value, bool):
+        to_number(field, value)
+    elif isinstance(value, bool | str | bytes | complex | Mapping) or not hasattr(value, "__iter__"):
+        raise InputError(field, value, "a number or an array of numbers")
+
+
+def _length(value: Any) -> tuple[int, ...]:
+    """Length of a row; nothing of a number."""
+    return (len(value),) if isinstance(value, tuple | list) else tuple(getattr(value, "shape", ()))[:1]
 
 
 def without_unit(field: str, value: Any, unit: str = "") -> Any:
@@ -259,8 +305,9 @@ Callee = TypeVar("Callee", bound=Callable[..., Any])
 def named_units(callee: Callee) -> Callee:
     """Convert quantities of astropy to the unit that the name of a parameter states, as ``nm`` of ``wavelength_nm``.
 
-    Numbers and arrays pass as they are. Of a class, the parameters of its construction are converted. Without this,
-    numpy takes the number out of a quantity and leaves its unit behind.
+    Numbers and arrays pass as they are; what is no number is refused. Of a class, the parameters of its construction
+    are converted. Without this, numpy takes the number out of a quantity and leaves its unit behind, takes numbers
+    under a mask for good ones, and true for 1.
 
     Parameters
     ----------
@@ -270,7 +317,8 @@ def named_units(callee: Callee) -> Callee:
     Raises
     ------
     InputError
-        From the callee: a quantity of another kind; the parameter is named.
+        From the callee: a quantity of another kind, truth values, text, complex numbers or masked entries; the
+        parameter is named.
     """
     if inspect.isclass(callee):
         callee.__init__ = named_units(callee.__init__)  # type: ignore[method-assign]
@@ -283,6 +331,8 @@ def named_units(callee: Callee) -> Callee:
 
     @functools.wraps(callee)
     def with_plain_numbers(*args: Any, **kwargs: Any) -> Any:
+        for place, name in places.items():
+            refuse_no_numbers(name, args[place] if place < len(args) else kwargs.get(name))
         stated = {places[place] for place in places if place < len(args) and has_unit(args[place])}
         stated |= {name for name in units.keys() & kwargs.keys() if has_unit(kwargs[name])}
         if not stated:

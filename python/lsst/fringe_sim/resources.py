@@ -298,6 +298,7 @@ def read_user_table(path: str | os.PathLike[str], what: str) -> Table:
 def parse_user_yaml(text: str, what: str, *, source: str | None = None) -> Any:
     """Parse YAML from a user with the safe loader, without references and not deeper than a description is.
 
+    A key that stands twice is refused, as nothing says which of its values is meant.
     References are refused because a text of a few lines can stand for more values than there is memory.
 
     Raises
@@ -308,12 +309,25 @@ def parse_user_yaml(text: str, what: str, *, source: str | None = None) -> Any:
     _check_length(text, what, source)
     try:
         _check_events(text, what, source)
-        return yaml.safe_load(text)
+        return yaml.load(text, Loader=_EachKeyOnce)  # noqa: S506 - a safe loader
     except (yaml.YAMLError, ValueError, ArithmeticError, TypeError, AttributeError, LookupError) as error:
         if isinstance(error, InputError):
-            raise
+            raise (error if error.source or source is None else error.in_source(source)) from None
         reason = first_line(error)
         raise InputError(what, reason, "YAML", source=source) from None
+
+
+class _EachKeyOnce(yaml.SafeLoader):
+    """Safe loader that refuses a mapping with a key twice, of which yaml takes the last."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for place, key in enumerate(keys):
+            if key in keys[:place]:
+                raise InputError(
+                    "key", key, f"a key once (again in line {node.value[place][0].start_mark.line + 1})"
+                )
+        return super().construct_mapping(node, deep=deep)
 
 
 def _check_length(text: str, what: str, source: str | None) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects import activate_effects, known_effects
+from ..effects.active import flat_settings
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel
@@ -55,8 +56,8 @@ def read_section(
 def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Mapping from a YAML file, read with the safe loader, or effects from an override that a search has left.
 
-    `InputError`: the file is empty, not YAML, not a mapping, or an override that is not whole or has anything
-        in it but effects and their numbers.
+    `InputError`: the file is empty, not YAML, not a mapping, states an effect twice, or is an override that is
+        not whole or has anything in it but effects and their numbers.
     """
     if Path(path).suffix == ".py":
         text = read_user_text(path, "override file", LONGEST_USER_FILE)
@@ -65,7 +66,7 @@ def read_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
     if not isinstance(content, dict):
         found = "empty" if content is None else type(content).__name__
         raise InputError("settings file", found, "a mapping, {} for no effects", source=str(path))
-    return content
+    return flat_settings(content, str(path))
 
 
 def sky_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from glob import has_magic, iglob
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import click
 
 from ..errors import InputError
 
-__all__ = ["OutputFolder", "output_folder", "refuse_used_file"]
+__all__ = ["OutputFolder", "output_folder", "refuse_among_inputs", "refuse_used_file"]
 
 LOCK = ".fringe-sim.lock"
 OURS = (b"ORIGIN  = 'lsst.fringe_sim'", b"FRINGTID=", b"FRINGUND=")
@@ -160,6 +161,50 @@ def _is_ours(path: Path) -> bool:
     return any(word in header for word in OURS)
 
 
+def refuse_among_inputs(folder: Path, inputs: Iterable[str]) -> None:
+    """Refuse to write into a folder that is read: the next run would take products for frames.
+
+    Parameters
+    ----------
+    folder : `pathlib.Path`
+        Where products go; it need not exist.
+    inputs : iterable of `str`
+        Files, folders, which are read with all below them, and patterns.
+
+    Raises
+    ------
+    InputError
+        The folder is one of the inputs, inside one, or where a pattern finds files.
+    """
+    target = folder.resolve()
+    for given in inputs:
+        read = Path(given).resolve()
+        inside = Path(given).is_dir() and target.is_relative_to(read)
+        if not inside and has_magic(given):
+            found = [Path(name) for name in iglob(given, recursive=True)]
+            inside = any(
+                target.is_relative_to(name.resolve()) if name.is_dir() else target == name.resolve().parent
+                for name in found
+            )
+        if inside:
+            allowed = (
+                f"a folder that is not in {given}, which is read: a next run would take products for frames"
+            )
+            raise InputError("output folder", str(folder), allowed)
+
+
+def _inputs_of(context: click.Context, values: dict[str, Any]) -> list[str]:
+    """What a command is given to read: its arguments, and options with a path."""
+    given = []
+    for parameter in context.command.params:
+        value = values.get(parameter.name or "")
+        if value is not None and (
+            isinstance(parameter, click.Argument) or isinstance(parameter.type, click.Path)
+        ):
+            given += [str(item) for item in (value if isinstance(value, tuple) else (value,))]
+    return given
+
+
 def refuse_used_file(option: str, file: Path, overwrite: bool) -> None:
     """Refuse a file that is there already, or cannot be written, before long work.
 
@@ -195,6 +240,7 @@ def output_folder(
             folder = None if out is None else OutputFolder(out, products, overwrite, resumes)
             if folder is not None:
                 folder.refuse_used()
+                refuse_among_inputs(folder.path, _inputs_of(click.get_current_context(), others))
             command(out=folder, **others)
 
         kind = click.Path(path_type=Path)

@@ -267,7 +267,7 @@ def model_effects(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """``--effect`` and ``--effects-file`` of a command, which gets them as `ChosenEffects` named ``effects``.
 
-    An option wins over the file, and the last of equal names over the others. ``own``: with ``--effects-from``.
+    An option wins over the file; an option with two values is refused. ``own``: with ``--effects-from``.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -315,5 +315,15 @@ def effects_file_option(help_text: str = "YAML.") -> Callable[[Callable[..., Non
 
 
 def effect_settings(settings: tuple[tuple[str, float], ...]) -> dict[str, float]:
-    """Mapping from repeated ``--effect`` options; the last of equal names wins."""
-    return dict(settings)
+    """Mapping from repeated ``--effect`` options, each of another name.
+
+    Raises
+    ------
+    InputError
+        One of them is given two values.
+    """
+    found: dict[str, float] = {}
+    for name, value in settings:
+        if found.setdefault(name, value) != value:
+            raise InputError("--effect", f"{name} = {found[name]:g} and {value:g}", "one value for each")
+    return found

@@ -129,6 +129,26 @@ def _check_bounds(effect: Described, name: str, value: float) -> None:
         )
 
 
+def flat_settings(settings: Mapping[str, Any], source: str | None = None) -> dict[str, Any]:
+    """Values by ``name.parameter`` of settings that may be nested.
+
+    Raises
+    ------
+    InputError
+        A setting without a parameter, or one that stands in both forms.
+    """
+    flat: dict[str, Any] = {}
+    try:
+        for effect, parameter, value in _flatten(settings):
+            name = f"{effect}.{parameter}"
+            if name in flat:
+                raise InputError("effect setting", name, "once, nested or with a point")
+            flat[name] = value
+    except InputError as error:
+        raise (error if source is None else error.in_source(source)) from None
+    return flat
+
+
 def _flatten(settings: Mapping[str, Any]) -> Iterable[tuple[str, str, Any]]:
     for key, value in settings.items():
         if isinstance(value, Mapping):

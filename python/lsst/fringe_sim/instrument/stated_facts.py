@@ -15,6 +15,7 @@ from ..errors import FrameFormatError, InputError, to_number
 __all__ = [
     "FILTER_RANGE_NM",
     "RAW_FACTS",
+    "SAME_CELSIUS",
     "SAME_SECONDS",
     "SETTING_NM",
     "Fact",
@@ -175,7 +176,7 @@ FILTER_RANGE_NM: Mapping[str, tuple[float, float]] = {
     "y": (879.0, 1100.0),
     "SDSSz": (770.0, 1114.0),
 }
-"""Where a filter passes 0.001 of its most [nm]: LSST throughputs 1.9 and SDSS 2010, in g, r, i the wider of the two."""
+"""Where a filter passes 0.001 of its most [nm]: LSST throughputs 1.9, SDSS 2010; of g, r, i the wider one."""
 
 _NARROW_NM, _EDGE_NM = 25.0, 10.0
 """Half of the distance of two narrow filters of the camera's test stand; slope of a long-pass filter."""

@@ -114,10 +114,13 @@ def read_effects_override(text: str, source: str | None = None) -> dict[str, flo
         try:
             if statement is None:
                 raise ValueError
-            found[statement[2]] = float(statement[3])
+            value = float(statement[3])
         except ValueError:
             allowed = 'lines of config.effects["effect.parameter"] = number'
             raise InputError("statement", line, allowed, source=source) from None
+        if statement[2] in found:
+            raise InputError("statement", line, f"{statement[2]} once", source=source)
+        found[statement[2]] = value
     if not found and not complete:
         raise InputError("override file", "without any effect", "one that sets at least one", source=source)
     return found

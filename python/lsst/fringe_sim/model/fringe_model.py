@@ -403,6 +403,7 @@ class FringeModel(InNotebook):
         )
         return wavelength
 
+    @named_units
     def checked_thickness_um(self, thickness_um: ArrayLike) -> FloatArray:
         """Thicknesses [µm], refused if the varying layer cannot have them; those in nm or mm are a thousandfold.
 
@@ -411,7 +412,7 @@ class FringeModel(InNotebook):
         OutOfRangeError
             One is far outside the range of the set-up.
         """
-        thickness = np.asarray(without_unit("thickness_um", thickness_um, "um"), dtype=float)
+        thickness = np.asarray(thickness_um, dtype=float)
         low, high = self.setup.thickness_range_um
         check_range(
             f"thickness of {self.setup.varying} [um]",

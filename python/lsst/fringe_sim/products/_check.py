@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FrameFormatError, InputError, OutOfRangeError, to_number, without_unit
+from ..errors import FrameFormatError, InputError, OutOfRangeError, is_masked, to_number, without_unit
 from .mask import ALL_BITS
 
 __all__ = [
@@ -48,6 +48,8 @@ def as_float_array(
         raise FrameFormatError(field, "ragged nested sequences", f"a real array of {ndim} axes") from None
     if array.dtype.kind not in "fiu":
         raise FrameFormatError(field, f"dtype {array.dtype}", "real numbers")
+    if is_masked(values):
+        raise FrameFormatError(field, "masked in part", "numbers; what is masked belongs into the mask")
     if array.ndim != ndim or array.size == 0:
         raise FrameFormatError(field, f"shape {array.shape}", f"{ndim} axes, none of them empty")
     if array.dtype.newbyteorder("=") != np.dtype(dtype):

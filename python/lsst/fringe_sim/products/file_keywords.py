@@ -80,7 +80,11 @@ FILE_KEYWORDS: tuple[FileKeyword, ...] = (
         for name in ("MONOWL", "WAVELEN", "WAVELNTH")
     ),
     FileKeyword(_PLAIN, "TEMPK", _FITS, USED, "temperature in K, in place of that of the set-up"),
-    FileKeyword(_PLAIN, "CCDTEMP", _FITS, USED, "temperature in °C where TEMPK is absent"),
+    FileKeyword(
+        _PLAIN, "CCDTEMP", _FITS, USED, "temperature in °C where TEMPK is absent; else the same within 5 °C"
+    ),
+    FileKeyword(_PLAIN, "EXPTIME", _FITS, CHECKED, "more than 0 s of a flat"),
+    FileKeyword(_PLAIN, "FILTER", _FITS, CHECKED, "of a flat a filter that passes its light"),
     FileKeyword(_PLAIN, "BUNIT", _FITS, USED, "electron, or adu, else refused"),
     FileKeyword(_PLAIN, "GAIN", _FITS, USED, "electrons for each adu"),
     FileKeyword(_PLAIN, "RDNOISE", _FITS, USED, "read noise in electrons; none where it is absent"),

@@ -22,7 +22,18 @@ from .sensor_section import SensorSection
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["DETECTOR", "FILTER", "MASK", "Card", "Extension", "FitsProduct", "Image", "SensorProduct"]
+__all__ = [
+    "DETECTOR",
+    "FILTER",
+    "MASK",
+    "NOTED",
+    "Card",
+    "Extension",
+    "FitsProduct",
+    "Image",
+    "SensorProduct",
+    "check_noted",
+]
 
 _NEEDED = object()
 """Stands for no default: a header must have the keyword."""
@@ -76,6 +87,40 @@ class Card:
 
 DETECTOR = Card("detector", "DETNAME", "sensor", kind=str, default="")
 FILTER = Card("physical_filter", "FILTER", "physical filter", kind=str, default="")
+
+
+def _noted(keyword: str, what: str, unit: str = "", low: float = 0.0, high: float = math.inf) -> Card:
+    return Card(keyword, keyword, what, unit, low=low, high=high)
+
+
+NOTED = (
+    _noted("LABTEMP", "temperature at which the thickness was measured", "K", 100.0, 400.0),
+    _noted("SCALESIG", "uncertainty that all thicknesses share, fraction of them"),
+    _noted("CONTRAST", "contrast of the flats over that of the model"),
+    _noted("CONTRSIG", "its uncertainty"),
+    _noted("ORDMARG", "margin of the order of the fringe", low=-math.inf),
+    _noted("MISFIT", "misfit of the flats"),
+    _noted("CELLMISF", "misfit of cells"),
+    _noted("SMOOTHPX", "smoothing of the flats", "px"),
+    _noted("RDNOISE", "read noise", "electron"),
+    _noted("FRINGRMS", "rms of the fringes, fraction of the sky"),
+    _noted("PHASERMS", "change of the fringes by an open phase, fraction of the sky"),
+    _noted("PHASESIG", "that phase", "rad / 10 K"),
+)
+"""Numbers among the metadata that readers go by; a product need not have them, but not other than they can be."""
+
+
+def check_noted(metadata: Mapping[str, Any]) -> None:
+    """Refuse metadata with a value that a number of `NOTED` cannot have.
+
+    Raises
+    ------
+    InputError
+        No number, or one outside its bounds; the keyword is named.
+    """
+    for card in NOTED:
+        if metadata.get(card.keyword) is not None:
+            card.check(metadata[card.keyword])
 
 
 @dataclass(frozen=True)
@@ -205,6 +250,7 @@ class FitsProduct(InNotebook, ABC):
         for card in self.CARDS:
             values[card.field] = card.check(getattr(self, card.field))
         values["metadata"] = io.normalise_metadata(getattr(self, "metadata"), self._keywords())  # noqa: B009
+        check_noted(values["metadata"])
         for name, value in values.items():
             object.__setattr__(self, name, value)
         self._check()
@@ -265,6 +311,7 @@ class FitsProduct(InNotebook, ABC):
         show; their world coordinates are written with them.
         """
         merged = io.merge_metadata(getattr(self, "metadata"), metadata, self._keywords())  # noqa: B009
+        check_noted(merged)
         hdus = [io.primary_hdu(type(self).__name__, self._primary_cards(merged), merged)]
         hdus += [hdu for item in self.EXTENSIONS if (hdu := item.hdu(self)) is not None]
         io.write_hdus(path, hdus, section)

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError, named_units
-from ..instrument.stated_facts import SETTING_NM
 from ..instrument.raw_header import DeclaredHeader
 from ..instrument.raw_layout import Section
 from ..instrument.raw_metadata import TEMPERATURE_RANGE_C, WAVELENGTH_RANGE_NM, ZERO_CELSIUS_K
+from ..instrument.stated_facts import SAME_CELSIUS, SETTING_NM, Fact, refuse_other_filter
 from ..resources import complete_fits
 from .file_keywords import SENSOR_NAMES, declared_names
 from .fringe_cube import FringeCube
@@ -76,6 +76,9 @@ class PlainImage:
         if kind not in ("bias", "flat"):
             return cls(header.source, kind, shape)
         _refuse_overscan(header, shape)
+        seconds = header.value("EXPTIME")
+        if kind == "flat" and seconds is not None:
+            header.number("EXPTIME", seconds, "more than 0 s for a flat", lambda s: s > 0)
         noise, full = header.value("RDNOISE"), header.value("SATURATE")
         return cls(
             source=header.source,
@@ -263,24 +266,28 @@ def _wavelength(header: DeclaredHeader) -> float:
     stated = {name: value for name in WAVELENGTHS if (value := header.value(name)) is not None}
     if not stated:
         raise header.refuse(WAVELENGTHS[0], "missing", allowed)
-    numbers = [
-        header.number(name, value, allowed, lambda nm: low <= nm <= high) for name, value in stated.items()
-    ]
-    if max(numbers) - min(numbers) > SETTING_NM:
-        raise header.refuse(" and ".join(stated), numbers, "one wavelength")
-    return numbers[0]
+    numbers = {
+        name: header.number(name, value, allowed, lambda nm: low <= nm <= high)
+        for name, value in stated.items()
+    }
+    Fact("wavelength", WAVELENGTHS, SETTING_NM, "nm").refuse_different(numbers.items(), header.source)
+    wavelength = next(iter(numbers.values()))
+    refuse_other_filter(header.text("FILTER"), wavelength, header.source)
+    return wavelength
 
 
 def _temperature(header: DeclaredHeader) -> float | None:
     """Temperature of the sensor [K] by ``TEMPK``, or ``CCDTEMP`` in °C; `None` where neither is there."""
     low, high = TEMPERATURE_RANGE_C
+    kelvin: dict[str, float] = {}
     for name, zero, unit in (("TEMPK", ZERO_CELSIUS_K, "K"), ("CCDTEMP", 0.0, "°C")):
         value = header.value(name)
         if value is not None:
             allowed = f"{unit} from {low + zero:g} to {high + zero:g}"
             number = header.number(name, value, allowed, lambda t, z=zero: low <= t - z <= high)  # type: ignore[misc]
-            return number - zero + ZERO_CELSIUS_K
-    return None
+            kelvin[name] = number - zero + ZERO_CELSIUS_K
+    Fact("temperature [K]", (), SAME_CELSIUS, "K").refuse_different(kelvin.items(), header.source)
+    return next(iter(kelvin.values()), None)
 
 
 def _gain(header: DeclaredHeader) -> float:

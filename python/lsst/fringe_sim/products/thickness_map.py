@@ -29,6 +29,10 @@ THICKNESS_LIMITS_UM = (0.5, 1000.0)
 """Layers that make fringes in a sensor: a map in nm or mm that does not say so lies outside."""
 
 
+ORDER_UM = 0.35
+"""An order of the fringes of glue, 1000 nm / (2 × 1.45), in which a map without any meaning is uncertain [µm]."""
+
+
 class _Counts(Image):
     """Image of whole numbers."""
 
@@ -166,7 +170,19 @@ class ThicknessMap(SensorProduct):
                 found = cls(**_from_elsewhere(hdus, layer, source))
             else:
                 raise FrameFormatError(io.PRODUCT_KEY, product, cls.__name__, source=source)
+        found._refuse_nothing_known(source)
         return found if layer is None else found.of_layer(layer, source)
+
+    def _refuse_nothing_known(self, source: str) -> None:
+        """Refuse a map without a good pixel, and one less certain than the order of its fringes."""
+        good = self.mask == 0
+        if not good.any():
+            allowed = "one or more: every pixel is masked"
+            raise FrameFormatError("good pixels of the thickness map", 0, allowed, source=source)
+        middle = float(np.median(self.sigma[good]))
+        if not middle < ORDER_UM:
+            allowed = f"less than {ORDER_UM:g} µm, an order of its fringes: state the unit of SIGMA in BUNIT"
+            raise FrameFormatError("median of SIGMA [µm]", middle, allowed, source=source)
 
     def of_layer(self, layer: str, source: str | None = None) -> Self:
         """The map itself, if it is of this layer.
@@ -218,11 +234,11 @@ def _from_elsewhere(hdus: fits.HDUList, layer: str | None, source: str) -> dict[
         raise FrameFormatError("thickness map", shape, "a two-dimensional image in µm", source=source)
     value = io.in_unit("thickness map", data.astype(float), _unit_of(hdus, number), "um", source=source)
     mask = hdus["MASK"].data if "MASK" in hdus else None
-    missing = (
-        ~np.isfinite(value)
-        if mask is None or mask.shape != value.shape
-        else ~np.isfinite(value) | (mask != 0)
-    )
+    for name in ("MASK", "SIGMA"):
+        if name in hdus and hdus[name].shape != value.shape:
+            allowed = f"that of the map, {value.shape}"
+            raise FrameFormatError(f"shape of {name}", hdus[name].shape, allowed, source=source)
+    missing = ~np.isfinite(value) if mask is None else ~np.isfinite(value) | (mask != 0)
     if missing.all():
         raise FrameFormatError("thickness map", "no finite pixel", "a thickness in µm", source=source)
     low, high = THICKNESS_LIMITS_UM
@@ -232,7 +248,7 @@ def _from_elsewhere(hdus: fits.HDUList, layer: str | None, source: str) -> dict[
         raise FrameFormatError("median of the thickness map [µm]", middle, allowed, source=source)
     missing |= ~(np.nan_to_num(value, nan=-1.0) > 0.0)
     sigma = np.full(value.shape, UNKNOWN_SIGMA_UM)
-    if "SIGMA" in hdus and hdus["SIGMA"].shape == value.shape:
+    if "SIGMA" in hdus:
         unit = hdus["SIGMA"].header.get("BUNIT")
         sigma = io.in_unit("SIGMA", hdus["SIGMA"].data.astype(float), unit, "um", source=source)
         missing |= ~(np.isfinite(sigma) & (sigma >= 0.0))
