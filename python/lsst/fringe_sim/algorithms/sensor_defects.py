@@ -180,24 +180,19 @@ def _rise(profile: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64]
 
 
 def _usual_rise(rise: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """What a group must exceed by the fringes around it, of which other defects are a small part.
+    """What a group must exceed by the fringes around it, of which a few defects are a small part.
 
-    The group itself is left out: of a narrow sensor it is no small part. A window as wide as the sensor is closed to a
-    ring, so that it holds every other group once.
+    Where the group and those that share columns with it are more than may exceed what is usual, as in a narrow
+    sensor, they are left out; the sensor is then closed to a ring, so that every other group counts once.
     """
-    size = min(2 * (NEARBY + 8 * width) + 1, len(rise) - 1 + len(rise) % 2)
+    size = min(2 * (NEARBY + 8 * width) + 1, len(rise))
+    own = 2 * (width + 1) + 1
     around = np.ones(size, dtype=np.bool_)
-    shared = (
-        width + BESIDE
-    )  # groups that have columns in common with this one, or with what it is compared to
-    around[max(size // 2 - shared, 0) : size // 2 + shared + 1] = False
-    if not around.any():
-        return np.full(len(rise), np.inf)
+    narrow = own > (1.0 - USUAL_PERCENT / 100.0) * size
+    if narrow and own < size:
+        around[size // 2 - width - 1 : size // 2 + width + 2] = False
     usual: NDArray[np.float64] = percentile_filter(
-        np.abs(rise),
-        USUAL_PERCENT,
-        footprint=around,
-        mode="reflect" if len(rise) > size + 1 else "wrap",
+        np.abs(rise), USUAL_PERCENT, footprint=around, mode="wrap" if narrow else "reflect"
     )
     return EXCEPTIONAL * usual
 
