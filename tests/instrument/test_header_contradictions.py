@@ -142,6 +142,84 @@ def test_contradictions_are_refused(changes: dict[str, Any], keyword: str) -> No
         interpret(LSSTCAM_HEADER, **changes)
 
 
+FLAT_OF_CAMERA = {**LSSTCAM_HEADER, "MONOWL": 960.03}
+
+
+@pytest.mark.parametrize(
+    ("base", "changes", "words"),
+    [
+        (
+            TS8_HEADER,
+            {"CCDTEMP": 20.0, "TEMP_SET": -90.0},
+            ("CCDTEMP and TEMP_SET", "20.0 and -90.0", "5 °C"),
+        ),
+        (TS8_HEADER, {"TEMP_SET": -80.0}, ("CCDTEMP and TEMP_SET",)),
+        (TS8_HEADER, {"TEMP_SET": "cold"}, ("TEMP_SET is 'cold'",)),
+        (TS8_HEADER, {"SENSTEMP": -70.0}, ("CCDTEMP and SENSTEMP",)),
+        (TS8_HEADER, {"SLOTNAME": "S01", "CCDSLOT": "S22"}, ("SLOTNAME and CCDSLOT", "S01 and S22")),
+        (LSSTCAM_HEADER, {"RAFTBAY": "R11", "RAFTNAME": "R12"}, ("RAFTBAY and RAFTNAME",)),
+        (LSSTCAM_HEADER, {"CCDSLOT": "S02"}, ("LSST_NUM", "R11_S02", "R11_S01")),
+        (LSSTCAM_HEADER, {"RAFTBAY": "R12"}, ("LSST_NUM", "R11_S01")),
+        (TS8_HEADER, {"TESTTYPE": "DARK"}, ("TESTTYPE", "takes none")),
+        (TS8_HEADER, {"TESTTYPE": "FE55"}, ("TESTTYPE", "takes none")),
+        (TS8_HEADER, {"EXPTIME": 0.0}, ("EXPTIME is 0.0", "more than 0")),
+        (TS8_HEADER, {"DARKTIME": 2.0}, ("DARKTIME is 2.0", "21.9")),
+        (FLAT_OF_CAMERA, {"FILTER": "r_57"}, ("FILTER is 'r_57'", "960.03 nm of MONOWL", "526 to 710")),
+        (FLAT_OF_CAMERA, {"FILTER": "SDSSi"}, ("FILTER",)),
+        (FLAT_OF_CAMERA, {"FILTER": "750nm"}, ("FILTER",)),
+        (TS8_HEADER, {"FILTER": "1000CutOn"}, ("FILTER",)),
+    ],
+)
+def test_two_statements_of_one_fact_do_not_differ(
+    base: dict[str, Any], changes: dict[str, Any], words: tuple[str, ...]
+) -> None:
+    with pytest.raises(FrameFormatError, match=r"^raw\.fits: ") as caught:
+        interpret(base, **changes)
+    assert all(word in str(caught.value) for word in words)
+
+
+@pytest.mark.parametrize(
+    ("base", "changes"),
+    [
+        # TEMP_SET and CCDTEMP of real flats of TS3 and TS8; sensors of one series lie up to 5 °C apart.
+        (TS8_HEADER, {"TEMP_SET": -95.0, "CCDTEMP": -95.12656}),
+        (TS8_HEADER, {"TEMP_SET": -100.0, "CCDTEMP": -100.52526152, "SENSTEMP": -100.52526152}),
+        (TS8_HEADER, {"FILTER": "550CutOn"}),
+        (TS8_HEADER, {"FILTER": "unspecified", "FILTER2": "unspecified"}),
+        (TS8_HEADER, {"IMGTYPE": "BIAS", "EXPTIME": 0.0, "TESTTYPE": "LAMBDA"}),
+        (TS8_HEADER, {"IMGTYPE": "FE55", "TESTTYPE": "FE55", "MONOWL": 549.997, "FILTPOS": 4}),
+        (TS8_HEADER, {"TESTTYPE": "SFLAT_HI", "MONOWL": None}),
+        (FLAT_OF_CAMERA, {"FILTER": "950nm"}),
+        (FLAT_OF_CAMERA, {"FILTER": "NONE"}),
+        (FLAT_OF_CAMERA, {"FILTER": "ph_05"}),
+        (FLAT_OF_CAMERA, {"FILTER": "r_57", "MONOWL": None}),
+        (FLAT_OF_CAMERA, {"EXPTIME": 15.0, "SHUTTIME": 15.000065088272095, "DARKTIME": 15.0}),
+        (
+            LSSTCAM_HEADER,
+            {"IMGTYPE": "DARK", "TESTTYPE": "DARK", "EXPTIME": 5.0, "SHUTTIME": 0.0, "DARKTIME": 5.01371},
+        ),
+        # The first sensors in the camera were not those of its table.
+        (
+            LSSTCAM_HEADER,
+            {
+                "RAFTBAY": "R10",
+                "CCDSLOT": "S02",
+                "LSST_NUM": "ITL-3800C-041",
+                "RAFTNAME": "LCA-11021_RTM-003_ETU2",
+            },
+        ),
+    ],
+)
+def test_what_real_headers_state_is_no_contradiction(base: dict[str, Any], changes: dict[str, Any]) -> None:
+    assert interpret(base, **changes).notes == ()
+
+
+def test_the_place_of_a_rebuilt_raft_is_said() -> None:
+    (note,) = interpret(TS8_HEADER, SLOTNAME="S22").notes
+    assert "RTM-020_S22" in note
+    assert "RTM-020_S01" in note
+
+
 def test_what_is_taken_for_granted_is_said() -> None:
     assert interpret(TS8_HEADER).notes == ()
     assert interpret(LSSTCAM_HEADER).notes == ()
@@ -180,6 +258,43 @@ def test_another_wavelength_in_the_test_conditions(raw: Path, second: float, ref
         both_refuse(raw, "TEST_COND")
     else:
         assert RawFrame.read(raw).metadata.wavelength_nm == 960.03
+
+
+@pytest.mark.parametrize(
+    ("place", "keyword", "value"),
+    [
+        (1, "MONOWL", 700.0),
+        (16, "MONOWL", 700.0),
+        (3, "LSST_NUM", "E2V-CCD250-200"),
+        (3, "CCDTEMP", 20.0),
+        (3, "EXPTIME", 3.0),
+        (3, "IMGTYPE", "BIAS"),
+        (3, "INSTRUME", "HSC"),
+        (3, "CCDSLOT", "S22"),
+    ],
+)
+def test_any_hdu_may_contradict_the_first(tmp_path: Path, place: int, keyword: str, value: Any) -> None:
+    write_raw(tmp_path / "raw.fits", {"INSTRUME": "LSST-TS8", "SLOTNAME": "S01"})
+    with fits.open(tmp_path / "raw.fits", mode="update") as hdus:
+        hdus[place].header[keyword] = value
+    both_refuse(tmp_path / "raw.fits", f"{keyword} of SEGMENT")
+
+
+def test_an_hdu_may_repeat_what_the_first_says(raw: Path) -> None:
+    with fits.open(raw, mode="update") as hdus:
+        for hdu in hdus[1:]:
+            hdu.header.update({"MONOWL": 960.0, "LSST_NUM": "E2V-CCD250-321-Dev", "CCDTEMP": -90.0})
+    assert RawFrame.read(raw).metadata.notes == ()
+
+
+def test_keywords_that_nobody_knows_are_named(raw: Path) -> None:
+    with fits.open(raw, mode="update") as hdus:
+        hdus[0].header["MONOWAVE"] = 700.0
+        for hdu in hdus[1:]:
+            hdu.header["GAIN"] = 3.0
+    for read in (read_raw_metadata, lambda path: RawFrame.read(path).metadata):
+        (note,) = read(raw).notes
+        assert "MONOWAVE, GAIN" in note
 
 
 @pytest.mark.parametrize(

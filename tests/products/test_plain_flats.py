@@ -143,6 +143,27 @@ def test_equal_pixels_at_another_wavelength_are_refused(flats: Path) -> None:
         read_plain_flats(flats.iterdir(), **LIGHT)
 
 
+@pytest.mark.parametrize(
+    ("cards", "words"),
+    [
+        ({"TEMPK": 173.0, "CCDTEMP": 20.0}, "TEMPK and CCDTEMP"),
+        ({"MONOWL": 950.0, "WAVELEN": 960.0}, "MONOWL and WAVELEN"),
+        ({"EXPTIME": 0.0}, "EXPTIME"),
+        ({"FILTER": "r_57"}, "FILTER"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(tmp_path: Path, cards: dict[str, Any], words: str) -> None:
+    path = write(tmp_path / "a.fits", np.ones((20, 30)), **{"MONOWL": 950.0, "BUNIT": "e", **cards})
+    with pytest.raises(InputError, match=rf"a\.fits: {words}"):
+        read_plain_flats([path], **LIGHT)
+
+
+def test_two_temperatures_that_agree_are_one(tmp_path: Path) -> None:
+    cards = {"TEMPK": 173.0, "CCDTEMP": -100.5, "EXPTIME": 3.0, "FILTER": "y_10"}
+    path = write(tmp_path / "a.fits", np.ones((20, 30)), MONOWL=950.0, BUNIT="e", **cards)
+    assert read_plain_flats([path], **LIGHT).exposures.temperature_k[0] == 173.0
+
+
 @pytest.mark.parametrize("damage", [b"", b"no FITS file", None])
 def test_a_damaged_one_is_named_and_can_be_skipped(flats: Path, damage: bytes | None, capsys) -> None:
     content = (flats / "4.fits").read_bytes()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from lsst.fringe_sim import products
 from lsst.fringe_sim.instrument.header_keywords import NOT_READ, RAW_KEYWORDS, READERS
+from lsst.fringe_sim.instrument.stated_facts import RAW_FACTS
 from lsst.fringe_sim.products.file_keywords import FILE_KEYWORDS
-from lsst.fringe_sim.products.fits_product import Card
+from lsst.fringe_sim.products.fits_product import NOTED, Card
 
 from .markdown import code, sections, table
 
@@ -26,6 +27,22 @@ def raw_keywords() -> str:
     ]
     parts = [
         table(("keyword", "HDU", *READERS, "decides, or must be"), rows),
+        "### Stated more than once",
+        "What the primary header and every other HDU say of one thing is compared, and refused where it differs by more "
+        "than this.",
+        table(
+            ("fact", "keywords", "may differ by", "because"),
+            [
+                (
+                    fact.name,
+                    ", ".join(map(code, fact.keywords)),
+                    "" if fact.apart is None else f"{fact.apart:g} {fact.unit}",
+                    fact.because,
+                )
+                for fact in RAW_FACTS
+            ],
+        ),
+        "A keyword that is neither above nor below is named by `fit`, `discover` and `ingest`, and not used.",
         "### On which nothing depends",
         table(("keywords (regular expression)", "because"), [(code(name), why) for name, why in NOT_READ]),
     ]
@@ -43,6 +60,9 @@ def file_keywords() -> str:
         (name, code(card.keyword), card.what, card.unit, _allowed(card))
         for name in READ_BACK
         for card in getattr(products, name).CARDS
+    ]
+    cards += [
+        ("any, where it is there", code(card.keyword), card.what, card.unit, _allowed(card)) for card in NOTED
     ]
     parts.append(table(("product", "keyword", "meaning", "unit", "allowed"), cards))
     return sections(parts)

@@ -99,6 +99,8 @@ NOTED = (
     _noted("CONTRAST", "contrast of the flats over that of the model"),
     _noted("CONTRSIG", "its uncertainty"),
     _noted("ORDMARG", "margin of the order of the fringe", low=-math.inf),
+    _noted("SLOPEORD", "orders of the fringes from one pixel to the next"),
+    _noted("SLOPECON", "contrast that is left within a pixel", high=1.0),
     _noted("MISFIT", "misfit of the flats"),
     _noted("CELLMISF", "misfit of cells"),
     _noted("SMOOTHPX", "smoothing of the flats", "px"),

@@ -16,7 +16,16 @@ from .pixels import PixelFit
 from .templates import FringeTemplates
 from .wavelengths import spread_of_wavelengths
 
-__all__ = ["CERTAIN", "MISFIT", "contrast_map", "flat_fit", "model_error", "remarks", "says_misfit"]
+__all__ = [
+    "CERTAIN",
+    "MISFIT",
+    "contrast_map",
+    "flat_fit",
+    "model_error",
+    "remarks",
+    "says_misfit",
+    "slope_cards",
+]
 
 CERTAIN = 25.0
 """Chi-square difference to the next order of the whole sensor below which the order is not decided: flats that the
@@ -31,6 +40,8 @@ _BLOCKS = 16
 _BLOCK_PX = 32
 """Side of the blocks over which model error is judged [px]."""
 _SIGNIFICANT = 3.0
+_SOME = 512
+"""Rows and columns of which slopes are taken."""
 
 
 def model_error(pixels: PixelFit, scale_sigma: float) -> PixelFit:
@@ -150,6 +161,41 @@ def cards(flats: FlatFit, margin: float, scale_sigma: float) -> dict[str, Any]:
     return found
 
 
+def slope_cards(thickness_um: NDArray[np.float32], order_um: float) -> dict[str, float]:
+    """Header keywords: orders from one pixel to the next, and the contrast that is left of fringes so dense.
+
+    A pixel averages the fringes over what the thickness changes within it, which the model does not: it has one
+    thickness. Where they turn by an order within a pixel, nothing is left.
+    """
+    some = [max(1, length // _SOME) for length in thickness_um.shape]
+    steps = [np.diff(thickness_um[:: some[0]], axis=1), np.diff(thickness_um[:, :: some[1]], axis=0)]
+    orders = [np.abs(step[np.isfinite(step)]) / order_um for step in steps]
+    if not all(part.size for part in orders):
+        return {}
+    left = np.prod([np.abs(np.sinc(part)).mean() for part in orders])
+    return {
+        "SLOPEORD": round(float(np.hypot(*(np.median(part) for part in orders))), 6),
+        "SLOPECON": round(float(left), 6),
+    }
+
+
+def _said_of_misfit(metadata: Mapping[str, Any], flats: FlatFit) -> str:
+    """Why small blocks of pixels do not fit, if the slopes tell; else where to look."""
+    off = np.sqrt(float(metadata["CELLMISF"]))
+    said = f"the model does not fit: small blocks of pixels are off by {off:.2f} times their noise"
+    left = float(metadata.get("SLOPECON", 1.0))
+    lost = 1.0 - left
+    if lost > _OUTLIER * float(metadata["CONTRSIG"]) and lost > 0.5 * (1.0 - float(metadata["CONTRAST"])):
+        return (
+            f"{said}. The fringes are too dense for these pixels: the thickness changes by "
+            f"{metadata['SLOPEORD']:.2f} orders from one to the next (median), so that a pixel averages over "
+            f"fringes and a contrast of {left:.2g} is left. Nothing need be hidden in the flats; more pixels "
+            "for the same slopes (of simulated flats a larger --size) would fit"
+        )
+    worst = flats.wavelength_nm[int(np.argmax(flats.misfit))]
+    return f"{said}, most at {worst:g} nm; run 'fringe-sim discover' to find out why"
+
+
 def says_misfit(metadata: Mapping[str, Any]) -> bool:
     """Whether a map says that model and flats do not go together, or that its order is not decided."""
     return (
@@ -180,13 +226,8 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
             f"all thicknesses share an uncertainty of {metadata['SCALESIG']:.1g} of themselves, because the "
             f"wavelengths are off by {np.sqrt(np.mean(flats.offset_nm**2)):.2g} nm rms; σ contains it"
         )
-    misfit = float(metadata["CELLMISF"])
-    if misfit > MISFIT:
-        worst = int(np.argmax(flats.misfit))
-        said.append(
-            f"the model does not fit: small blocks of pixels are off by {np.sqrt(misfit):.2f} times their noise, "
-            f"most at {flats.wavelength_nm[worst]:g} nm; run 'fringe-sim discover' to find out why"
-        )
+    if float(metadata["CELLMISF"]) > MISFIT:
+        said.append(_said_of_misfit(metadata, flats))
     if "WORSTFLT" in metadata:
         label, offset = metadata["WORSTFLT"], metadata["WORSTOFF"]
         said.append(

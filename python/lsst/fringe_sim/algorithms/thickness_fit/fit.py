@@ -18,7 +18,7 @@ from ..flat_conditions import model_of_flats
 from ..thickness_fit_options import CONTRASTS, FIT_METHODS
 from .amplitudes import Amplitudes
 from .cells import sample_pixels
-from .conclusion import CERTAIN, cards, flat_fit
+from .conclusion import CERTAIN, cards, flat_fit, slope_cards
 from .global_fit import global_fit
 from .guo2022 import walk_fit
 from .islands import fit_islands
@@ -167,6 +167,7 @@ def fit_thickness(
         pixels = found.pixels
         slip = slip_probability(found, out=found.border_slip)
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
+        notes |= slope_cards(pixels.value, found.order_um)
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
         flats = flat_fit(found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
         coarse = found.contrast_map
