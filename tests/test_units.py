@@ -91,6 +91,8 @@ def test_a_quantity_of_another_kind_is_refused(callee: Any, bound: bool, paramet
 def test_what_is_no_number_is_refused(callee: Any, bound: bool, parameter: str) -> None:
     """Truth values would be 0 and 1, masked entries good numbers, and numpy's own errors name no parameter."""
     masked = np.ma.MaskedArray([3.0, 4.0], mask=[False, True])
+    if "dict" in str(inspect.signature(callee).parameters[parameter].annotation):
+        return  # records, with a number for each wavelength among others
     wrong = (
         True,
         np.True_,

@@ -28,8 +28,8 @@ def raw_keywords() -> str:
     parts = [
         table(("keyword", "HDU", *READERS, "decides, or must be"), rows),
         "### Stated more than once",
-        "What the primary header and every other HDU say of one thing is compared, and refused where it differs by more "
-        "than this.",
+        "What the primary header and every other HDU say of one thing is compared, and refused where it differs by "
+        "more than this.",
         table(
             ("fact", "keywords", "may differ by", "because"),
             [

@@ -323,15 +323,18 @@ def named_units(callee: Callee) -> Callee:
     if inspect.isclass(callee):
         callee.__init__ = named_units(callee.__init__)  # type: ignore[method-assign]
         return callee
-    names = list(inspect.signature(callee).parameters)
+    parameters = inspect.signature(callee).parameters
+    names = list(parameters)
     units = {name: unit for name in names if (unit := _unit_of(name))}
     places = {names.index(name): name for name in units}
+    # Some hold records with a key for each wavelength.
+    numbers = {at: name for at, name in places.items() if "dict" not in str(parameters[name].annotation)}
 
     relative = {"d", "wavelength"} <= units.keys()
 
     @functools.wraps(callee)
     def with_plain_numbers(*args: Any, **kwargs: Any) -> Any:
-        for place, name in places.items():
+        for place, name in numbers.items():
             refuse_no_numbers(name, args[place] if place < len(args) else kwargs.get(name))
         stated = {places[place] for place in places if place < len(args) and has_unit(args[place])}
         stated |= {name for name in units.keys() & kwargs.keys() if has_unit(kwargs[name])}

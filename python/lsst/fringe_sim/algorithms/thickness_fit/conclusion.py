@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -174,7 +175,7 @@ def slope_cards(thickness_um: NDArray[np.float32], order_um: float) -> dict[str,
         return {}
     left = np.prod([np.abs(np.sinc(part)).mean() for part in orders])
     return {
-        "SLOPEORD": round(float(np.hypot(*(np.median(part) for part in orders))), 6),
+        "SLOPEORD": round(math.hypot(*(float(np.median(part)) for part in orders)), 6),
         "SLOPECON": round(float(left), 6),
     }
 
