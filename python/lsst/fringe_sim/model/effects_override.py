@@ -118,7 +118,7 @@ def read_effects_override(text: str, source: str | None = None) -> dict[str, flo
         except ValueError:
             allowed = 'lines of config.effects["effect.parameter"] = number'
             raise InputError("statement", line, allowed, source=source) from None
-        if statement[2] in found:
+        if statement[2] in found and not complete:  # a search may find another value than was known
             raise InputError("statement", line, f"{statement[2]} once", source=source)
         found[statement[2]] = value
     if not found and not complete:
