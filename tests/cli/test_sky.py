@@ -207,7 +207,7 @@ def test_a_section_outside_the_sensor_is_refused_before_the_work(thickness, tmp_
     ("cards", "factor", "words"),
     [
         ({"CONTRAST": "x", "CONTRSIG": 0.1}, 1.0, "CONTRAST"),
-        ({"CONTRAST": -3.0, "CONTRSIG": 0.1}, 1.0, "not negative"),
+        ({"CONTRAST": -3.0, "CONTRSIG": 0.1}, 1.0, "CONTRAST is -3.0"),
         ({}, 60.0, "thickness"),
     ],
 )
