@@ -218,6 +218,7 @@ class _Search:
             first_field=self.prepared.undistorted_field,
             shifts_um=self.prepared.shifts_um,
             guess=self.prepared.guess,
+            alike=self.reached and self.reached.whole,
         )
         self.where = self._where(whole)
         chance = self._chance(whole, whole.null)
@@ -366,6 +367,7 @@ class _Search:
             generic=self.prepared.rich,
             first_field=self.prepared.undistorted_field,
             guess=self.prepared.guess,
+            alike=whole,
         )
 
     def _refined(self, whole: Selector, best: Hypothesis) -> tuple[Prepared | None, int]:

@@ -132,6 +132,8 @@ class Selector:
         a few pixels is open.
     guess : mapping, optional
         Settings with which ``first_field`` was fitted: where to start with those effects, besides.
+    alike : `Selector`, optional
+        One of the same effects on as large cells, from which their coordinates are taken over.
     """
 
     def __init__(
@@ -145,26 +147,18 @@ class Selector:
         first_field: FloatArray | None = None,
         shifts_um: Sequence[float] = (),
         guess: Mapping[str, float] | None = None,
+        alike: Selector | None = None,
     ) -> None:
         self.problem, self.index, self.generic = problem, index, generic
         self.first_field = null.field if first_field is None else first_field
         self.shifts_um = tuple(shifts_um)
         self.guess = dict(guess or {})
         self.null = Hypothesis((), null, 0.0)
-        thickness = problem.basis.expand(null.field)
         self.effects = {effect.name: effect for effect in catalogue}
-        self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
-        self.left_out: dict[str, str] = {}
-        for effect in catalogue:
-            try:
-                effect.check_search(problem.forward.geometry)
-                found = coordinates_of(effect, problem.forward, thickness)
-                for item in found:
-                    problem.forward.predict({item.key: item.value(0.1 * item.unit_step)}, thickness)
-            except InputError as error:
-                self.left_out[effect.name] = str(error)
-            else:
-                self.coordinates[effect.name] = found
+        if alike is not None and alike.problem.cells.cell_px == problem.cells.cell_px:
+            self.coordinates, self.left_out = alike.coordinates, alike.left_out
+        else:
+            self._find_coordinates(catalogue, problem.basis.expand(null.field))
         state = self.state(null)
         fringes = state.value - state.value.mean(axis=(1, 2), keepdims=True)
         self._undescribed = PRECISION**2 * float((state.whiten(fringes) ** 2).sum())
@@ -174,6 +168,22 @@ class Selector:
         # Sets are enlarged, swapped and compared from the same fits.
         self._scores: dict[tuple[Fit, bool], dict[str, Candidate | None]] = {}
         self._island_starts: dict[tuple[Fit, str], list[IslandStart]] = {}
+
+    def _find_coordinates(self, catalogue: Sequence[Effect], thickness_um: FloatArray) -> None:
+        """Coordinates of every effect that the data can be searched for, and why the others are left out."""
+        forward = self.problem.forward
+        self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
+        self.left_out: dict[str, str] = {}
+        for effect in catalogue:
+            try:
+                effect.check_search(forward.geometry)
+                found = coordinates_of(effect, forward, thickness_um)
+                for item in found:
+                    forward.change({}, {item.key: item.value(0.1 * item.unit_step)}, thickness_um)
+            except InputError as error:
+                self.left_out[effect.name] = str(error)
+            else:
+                self.coordinates[effect.name] = found
 
     def state(self, fit: Fit) -> State:
         """Everything the tests need at a fit."""
