@@ -9,7 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .comparison import chi2_with_free_fringes, fringe_order_um, local_minima, sampled_part
+from .comparison import (
+    FEW_CELLS,
+    chi2_with_free_fringes,
+    fringe_order_um,
+    local_minima,
+    sampled_part,
+)
 from .fit import Coordinate, Fit, Problem, fit_model
 
 __all__ = ["fields_in_other_orders", "starts_in_other_orders"]
@@ -25,9 +31,6 @@ PARTS_BETWEEN = (0.5, 0.25)
 ORDERS_MOVED, STEPS_PER_ORDER = 6, 12
 PLACES_REFITTED, PLACES_KEPT = 8, 4
 """Fringe orders and fits with which a strong effect on the phase is looked for, and the steps to an order."""
-
-COMPARED_CELLS = 500
-"""Cells with which places are compared."""
 
 LEAST_THICKNESS_UM, MOST_SIGMAS = 0.5, 4.0
 """Thinnest layer, and how far a map that is known may be moved, over its uncertainty."""
@@ -143,7 +146,7 @@ class _Trial:
     @cached_property
     def sample(self) -> tuple[slice, slice, slice]:
         """Which cells are compared."""
-        return sampled_part(self.whole.size, COMPARED_CELLS)
+        return sampled_part(self.whole.size, FEW_CELLS)
 
     @cached_property
     def fields_um(self) -> FloatArray:

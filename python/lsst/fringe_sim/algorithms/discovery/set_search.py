@@ -33,6 +33,9 @@ HARDLY_LESS = 0.5
 MUCH_OF_THE_BEST = 0.3
 """Part of what the best single effect explains that one must which may take narrow fringes away."""
 
+SCANNED_PARENTS = 2
+"""Sets, best first, to which effects are added by their finite signatures, and not by their derivatives alone."""
+
 SHIFTING_EFFECTS = 3
 """Effects that are looked for in other fringe orders, each with the set with which it is likeliest."""
 
@@ -84,16 +87,25 @@ class SetSearch:
         return best, [self.step(self.selector.null, best)]
 
     def refits(self, base: Hypothesis, rival: Hypothesis | None = None) -> list[Hypothesis]:
-        """Refits of the best-scored additions to a set, likeliest first; none that cannot come near a rival."""
+        """Refits of the best-scored additions to a set, likeliest first; none that cannot come near a rival.
+
+        One that leaves about noise is a rival of those that promise less.
+        """
         scores = self.selector.score(base.fit, self.selector.others(base), scan=True)
-        worth = scores
-        if not self.order_open:  # a score in the wrong order says nothing
-            goal = rival.fit.chi2 if rival else math.inf
-            able = (c for c in scores if c.promise > WORTH_FITTING and _may_reach(goal, base, c))
-            worth = list(able)[: self.options.refits]
-        refitted = [self.selector.with_candidate(base, c) for c in worth]
-        for hypothesis in refitted:
-            self._say_refit(base, hypothesis)
+        goal, refitted = rival.fit.chi2 if rival else math.inf, []
+        for candidate in scores:
+            # A score in the wrong order says nothing.
+            if not self.order_open and (
+                candidate.promise <= WORTH_FITTING
+                or len(refitted) == self.options.refits
+                or not _may_reach(goal, base, candidate)
+            ):
+                continue
+            found = self.selector.with_candidate(base, candidate)
+            self._say_refit(base, found)
+            refitted.append(found)
+            if not self._leaves_much(found):
+                goal = min(goal, found.fit.chi2)
         return sorted(refitted, key=lambda item: -item.log_evidence)
 
     def first(self, singles: list[Hypothesis]) -> tuple[Hypothesis, list[Step]]:
@@ -319,7 +331,7 @@ class SetSearch:
         """
         promised: dict[frozenset[str], tuple[float, Hypothesis, Candidate]] = {}
         for place, parent in enumerate(self._nearly_as_good(current)):
-            scan = place < self.options.parents  # derivatives alone take a tenth of the time
+            scan = place < SCANNED_PARENTS  # derivatives alone take a tenth of the time
             for candidate in self.selector.score(parent.fit, self.selector.others(parent), scan=scan):
                 key = frozenset((*parent.names, candidate.name))
                 left = parent.fit.chi2 - candidate.promise
