@@ -26,7 +26,7 @@ SIZES_TRIED = (0.1, 0.15, 0.23, 0.35, *(0.5 * n for n in range(1, 21)))
 """Departures, in prior scales, at which one that shifts the phase is: its misfit has a minimum for every fringe."""
 
 PARTS_BETWEEN = (0.5, 0.25)
-"""Parts of the distance to the next size by which the best ones are changed, in turn."""
+"""Parts of the distance to the next size by which the best ones of all orders are changed, in turn."""
 
 ORDERS_MOVED, STEPS_PER_ORDER = 6, 12
 PLACES_REFITTED, PLACES_KEPT = 8, 4
@@ -113,7 +113,7 @@ def _moved(field: FloatArray, shift_um: float, even: bool, middle_um: float) -> 
 def _places(
     problem: Problem, fit: Fit, moved: Sequence[int], first_field: FloatArray, index: float
 ) -> list[_Place]:
-    """The best sizes of each coordinate in each order; sizes lie too far apart for the right one to win at once.
+    """The best sizes of each coordinate; sizes lie too far apart for the right one to win at once.
 
     A sample of cells is compared with the model, levels and contrasts free.
     """
@@ -126,11 +126,14 @@ def _places(
         for even in (False, True):
             problem.forward.cover(_moved(whole, edge, even, float(whole.mean())))
     found = []
-    for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
-        inside = shifts[np.abs(shifts - turn * order) <= 0.51 * order]
-        if inside.size:
-            trial = _Trial(problem, fit, whole, inside)
-            found += [place for number in moved for place in trial.places(number)]
+    for number in moved:
+        rough: list[_Rough] = []
+        for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
+            inside = shifts[np.abs(shifts - turn * order) <= 0.51 * order]
+            if inside.size:
+                rough += _Trial(problem, fit, whole, inside).minima(number)
+        rough.sort(key=lambda item: item.place.chi2)
+        found += [item.trial.refined(item) for item in rough[: 2 * PLACES_REFITTED]]
     return found
 
 
@@ -155,20 +158,23 @@ class _Trial:
         moves = [(shift, even) for even in (False, True) for shift in self.shifts_um]
         return np.stack([_moved(few, shift, even, middle) for shift, even in moves])
 
-    def places(self, number: int) -> list[_Place]:
+    def minima(self, number: int) -> list[_Rough]:
         """The sizes of one coordinate than which no size near it is better."""
         sizes = _sizes(self.fit.coordinates[number])
         own = [self.place(number, size) for size in sizes]
-        found = []
-        for low in local_minima(np.array([place.chi2 for place in own])):
-            best, size = own[low], sizes[low]
-            gap = np.diff(sizes)[max(low - 1, 0) : low + 1].min()
-            for part in PARTS_BETWEEN:
-                beside = [size - part * gap, size + part * gap]
-                tried = [(self.place(number, one), one) for one in beside]
-                best, size = min([(best, size), *tried], key=lambda item: item[0].chi2)
-            found.append(best)
-        return found
+        return [
+            _Rough(self, own[low], sizes[low], float(np.diff(sizes)[max(low - 1, 0) : low + 1].min()))
+            for low in local_minima(np.array([place.chi2 for place in own]))
+        ]
+
+    def refined(self, rough: _Rough) -> _Place:
+        """The best of some sizes between a minimum and its neighbours."""
+        best, size = rough.place, rough.size
+        for part in PARTS_BETWEEN:
+            beside = [size - part * rough.gap, size + part * rough.gap]
+            tried = [(self.place(best.moved, one), one) for one in beside]
+            best, size = min([(best, size), *tried], key=lambda item: item[0].chi2)
+        return best
 
     def place(self, number: int, size: float) -> _Place:
         """One coordinate at a size, with the field where it fits best."""
@@ -180,6 +186,16 @@ class _Trial:
         lowest = [_vertex(self.shifts_um, each) for each in chi2]
         even = lowest[1][1] < lowest[0][1]
         return _Place(number, position, lowest[even][0], even, lowest[even][1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Rough:
+    """A size of one coordinate than which no other is better, and how far the nearest one tried is."""
+
+    trial: _Trial
+    place: _Place
+    size: float
+    gap: float
 
 
 def _vertex(places: FloatArray, values: FloatArray) -> tuple[float, float]:
