@@ -41,7 +41,7 @@ FloatArray = NDArray[np.float64]
 
 SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
 FIRST_SCAN = (0.3, 3.0)
-FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
+FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 8))
 """Departures, in prior scales, at which the finite signature of an effect is tried; the fine ones where it may grow
 with the fourth power (a beam whose onset is taken for thickness). The first two tell whether it is worth while."""
 
@@ -169,11 +169,14 @@ class Selector:
         self.guess, self._singles = dict(guess or {}), dict(singles or {})
         self.null = Hypothesis((), null, 0.0)
         self.effects = {effect.name: effect for effect in catalogue}
+        self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
+        self.left_out: dict[str, str] = {}
+        # Effects whose finite signatures are their derivatives
+        self._straight: set[str] = set()
         if alike is not None and alike.problem.cells.cell_px == problem.cells.cell_px:
             self.coordinates, self.left_out = alike.coordinates, alike.left_out
             self._straight = alike._straight
         else:
-            self._straight: set[str] = set()
             self._find_coordinates(catalogue, problem.basis.expand(null.field))
         state = self.state(null)
         fringes = state.value - state.value.mean(axis=(1, 2), keepdims=True)
@@ -186,10 +189,8 @@ class Selector:
         self._island_starts: dict[tuple[Fit, str], list[IslandStart]] = {}
 
     def _find_coordinates(self, catalogue: Sequence[Effect], thickness_um: FloatArray) -> None:
-        """Coordinates of every effect that the data can be searched for, and why the others are left out."""
+        """Find the coordinates of every effect that can be looked for, and why the others are left out."""
         forward = self.problem.forward
-        self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
-        self.left_out: dict[str, str] = {}
         for effect in catalogue:
             try:
                 effect.check_search(forward.geometry)
@@ -288,9 +289,10 @@ class Selector:
     ) -> dict[str, Candidate | None]:
         """Score tests of effects; `None` for what is not seen or cannot be combined with what is in already."""
         if scan and self._singles and fit is self.null.fit:
-            found = self._candidates(state, fit, names, scan=False)
-            return {name: self._as_before(state, fit, name, candidate) for name, candidate in found.items()}
-        found, derivatives = {}, {}
+            plain = self._candidates(state, fit, names, scan=False)
+            return {name: self._as_before(state, fit, name, candidate) for name, candidate in plain.items()}
+        found: dict[str, Candidate | None] = {}
+        derivatives: dict[str, FloatArray] = {}
         for name in names:
             if self.problem.forward.is_island(name):
                 found[name] = (
@@ -654,7 +656,8 @@ class Selector:
     def _spread_starts(self, fit: Fit, *, both_sides: bool = False) -> list[FloatArray]:
         """The fit with its last effect moved to other sizes, from near the null to near the bound."""
         last = fit.coordinates[-1]
-        if len(fit.coordinates) > 1 and fit.coordinates[-2].effect == last.effect:
+        several = len(fit.coordinates) > 1 and fit.coordinates[-2].effect == last.effect
+        if several or last.effect in self._straight:
             return []
         value = last.value(fit.position[-1])
         bounds = (last.low, last.high) if both_sides else (last.high if value >= last.null else last.low,)
