@@ -468,7 +468,9 @@ class Selector:
         score, information = state.design.project(every, state.residual)
         score, strength, cross = score[own:], np.diag(information)[own:], information[:own, own:]
         along = (cross * solve_symmetric(information[:own, :own], cross)).sum(axis=0)
-        if np.all(along[strength > 1.0] > STRAIGHT * strength[strength > 1.0]):
+        seen = strength > 1.0
+        # Of a few pixels in the wrong fringe order neither says anything.
+        if self.generic and np.all(along[seen] > STRAIGHT * strength[seen]):
             self._straight.add(candidate.name)
         elif (score**2 / np.maximum(strength, 1e-300)).max() > least:
             others, columns = self._at_sizes(
