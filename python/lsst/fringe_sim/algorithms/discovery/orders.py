@@ -29,8 +29,11 @@ PARTS_BETWEEN = (0.5, 0.25)
 """Parts of the distance to the next size by which the best ones of all orders are changed, in turn."""
 
 ORDERS_MOVED, STEPS_PER_ORDER = 6, 12
-PLACES_REFITTED, PLACES_KEPT = 8, 4
-"""Fringe orders and fits with which a strong effect on the phase is looked for, and the steps to an order."""
+"""How far the field is moved [fringe orders], and the steps to an order."""
+
+PLACES_REFITTED, STEPS_ALONE, PLACES_KEPT = 8, 8, 2
+"""Places from which the size of an effect is fitted alone, the steps of such a fit (a fifth of an order at most, from
+less than half an order away), and the best ones, from which all effects are fitted."""
 
 LEAST_THICKNESS_UM, MOST_SIGMAS = 0.5, 4.0
 """Thinnest layer, and how far a map that is known may be moved, over its uncertainty."""
@@ -68,7 +71,10 @@ def starts_in_other_orders(
         others = [n for n in range(len(place.position)) if n != place.moved]
         held = {fit.coordinates[n].key: fit.coordinates[n].value(place.position[n]) for n in others}
         own = (fit.coordinates[place.moved],)
-        alone = fit_model(problem, own, place.position[[place.moved]], field, fit.levels, held, rival=least)
+        alone = fit_model(
+            problem, own, place.position[[place.moved]], field, fit.levels, held,
+            iterations=STEPS_ALONE, rival=least,
+        )  # fmt: skip
         settled = place.position.copy()
         settled[place.moved] = alone.position[0]
         found.append((settled, alone.field, alone.chi2))

@@ -129,7 +129,7 @@ class SetSearch:
         Where all leave much, those that shift the phase are looked for in other fringe orders first: what is likely
         in the wrong one would tear the thickness to where it suits.
         """
-        if not self._leaves_much(singles[0]):
+        if not self._may_be_in_another_order(singles[0]):
             return singles[0]
         elsewhere = (
             self.selector.improved(single.names, self.selector.null.fit, scan=True)
@@ -155,6 +155,15 @@ class SetSearch:
             if blur.names != best.names
             and self.selector.null.fit.chi2 - blur.fit.chi2 > MUCH_OF_THE_BEST * explained
         ]
+
+    def _may_be_in_another_order(self, hypothesis: Hypothesis) -> bool:
+        """Whether much is left that another fringe order may explain: most of it is no effect on the image."""
+        if not self._leaves_much(hypothesis):
+            return False
+        excess = hypothesis.fit.chi2 - self.selector.problem.cells.n_values
+        images = filter(self.selector.problem.forward.is_image_effect, self.selector.others(hypothesis))
+        scores = self.selector.score(hypothesis.fit, list(images))
+        return all(candidate.gain < HARDLY_LESS * excess for candidate in scores)
 
     def _leaves_much(self, hypothesis: Hypothesis) -> bool:
         noise = self.selector.problem.cells.n_values
@@ -234,7 +243,9 @@ class SetSearch:
         if not larger:
             return None
         best = self._most_credible(larger)
-        if not self.options.is_noise(best):
+        if not self.options.is_noise(best) and (
+            not self._leaves_much(best) or self._may_be_in_another_order(best)
+        ):
             best = self._most_credible(self._in_other_orders(larger))
         if best.log_evidence < current.log_evidence + self.options.least_evidence:
             return None
@@ -388,6 +399,8 @@ class SetSearch:
 
     def _searched_harder(self, singles: list[Hypothesis]) -> list[Hypothesis]:
         """The nearly best single effects, and those that shift the phase, tried at other sizes too."""
+        if self._leaves_much(singles[0]) and not self._may_be_in_another_order(singles[0]):
+            return singles
         near = [h for h in singles if h.log_evidence > 0.7 * singles[0].log_evidence][:4]
         near += [h for h in singles if h not in near and self.selector.shifts_phase(h)]
         return [self.selector.improved(h.names, self.selector.null.fit, scan=True) for h in near]
