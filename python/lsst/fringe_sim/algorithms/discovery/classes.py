@@ -25,8 +25,8 @@ off 500 to 5000, for seven ghost images and stains of other seeds than the recor
 
 RIVALS_REFITTED = 3
 MUCH_OF_IT = 0.9
-"""Best replacements of an effect that are fitted again, and the part of the log evidence from which on as many of those
-that shift the phase are looked for at other sizes and in other orders."""
+"""Best replacements of an effect that are fitted again, and the part of the log evidence from which on as many that
+shift the phase are looked for at other sizes and in other orders."""
 
 LEAST_PROMISE = 4.0
 ALIKE = 0.8
