@@ -141,7 +141,7 @@ class SetSearch:
     def that_may_hide_fringes(self, singles: list[Hypothesis]) -> list[Hypothesis]:
         """Single effects that blur, and explain much though not most, where all leave much."""
         best = singles[0]
-        if self.order_open or not self._leaves_much(best):
+        if self.order_open or not self._may_be_in_another_order(best):
             return []
         blurs = [
             self.selector.hypothesis((name,))
@@ -157,12 +157,17 @@ class SetSearch:
         ]
 
     def _may_be_in_another_order(self, hypothesis: Hypothesis) -> bool:
-        """Whether much is left that another fringe order may explain: most of it is no effect on the image."""
+        """Whether much is left that another thickness may explain, and not what pixels do by themselves."""
         if not self._leaves_much(hypothesis):
             return False
+        forward = self.selector.problem.forward
         excess = hypothesis.fit.chi2 - self.selector.problem.cells.n_values
-        images = filter(self.selector.problem.forward.is_image_effect, self.selector.others(hypothesis))
-        scores = self.selector.score(hypothesis.fit, list(images))
+        of_pixels = [
+            name
+            for name in self.selector.others(hypothesis)
+            if forward.is_image_effect(name) and not forward.couples_pixels(name)
+        ]
+        scores = self.selector.score(hypothesis.fit, of_pixels)
         return all(candidate.gain < HARDLY_LESS * excess for candidate in scores)
 
     def _leaves_much(self, hypothesis: Hypothesis) -> bool:
