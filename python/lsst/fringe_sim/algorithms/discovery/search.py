@@ -219,7 +219,7 @@ class _Search:
             first_field=self.prepared.undistorted_field,
             shifts_um=self.prepared.shifts_um,
             guess=self.prepared.guess,
-            alike=self.reached and self.reached.whole,
+            alike=None if self.reached is None else self.reached.whole,
         )
         self.where = self._where(whole)
         chance = self._chance(whole, whole.null)

@@ -92,7 +92,8 @@ class SetSearch:
         One that leaves about noise is a rival of those that promise less.
         """
         scores = self.selector.score(base.fit, self.selector.others(base), scan=True)
-        goal, refitted = rival.fit.chi2 if rival else math.inf, []
+        goal = rival.fit.chi2 if rival else math.inf
+        refitted: list[Hypothesis] = []
         for candidate in scores:
             # A score in the wrong order says nothing.
             if not self.order_open and (
