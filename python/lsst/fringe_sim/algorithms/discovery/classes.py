@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 
 from .fit import Fit
 from .selection import MOST_OF_PROMISE, Hypothesis, Selector, similarity
@@ -24,8 +25,8 @@ off 500 to 5000, for seven ghost images and stains of other seeds than the recor
 
 RIVALS_REFITTED = 3
 MUCH_OF_IT = 0.9
-"""Best replacements of an effect that are fitted again, and the part of the log evidence from which on others are, at
-other sizes and in other orders: those that shift the phase."""
+"""Best replacements of an effect that are fitted again, and the part of the log evidence from which on as many that
+shift the phase are looked for at other sizes and in other orders."""
 
 LEAST_PROMISE = 4.0
 ALIKE = 0.8
@@ -122,12 +123,10 @@ def _refit_rivals(selector: Selector, chosen: Hypothesis, found: dict[str, Hypot
         n: h for n, h in found.items() if h is not chosen and h.log_evidence < chosen.log_evidence - width
     }
     ranked = sorted(behind, key=lambda n: -behind[n].log_evidence)
-    for number, name in enumerate(ranked):
-        scan = behind[name].log_evidence > MUCH_OF_IT * chosen.log_evidence and selector.shifts_phase(
-            behind[name]
-        )
-        if scan or number < RIVALS_REFITTED:
-            found[name] = selector.improved(behind[name].names, chosen.fit, scan=scan)
+    much = (n for n in ranked if behind[n].log_evidence > MUCH_OF_IT * chosen.log_evidence)
+    shifting = list(islice((n for n in much if selector.shifts_phase(behind[n])), RIVALS_REFITTED))
+    for name in dict.fromkeys((*ranked[:RIVALS_REFITTED], *shifting)):
+        found[name] = selector.improved(behind[name].names, chosen.fit, scan=name in shifting)
 
 
 def _replacements(

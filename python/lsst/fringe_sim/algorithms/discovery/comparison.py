@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "FEW_CELLS",
     "SAMPLED_CELLS",
     "chi2_with_free_fringes",
     "chi2_with_free_levels",
@@ -18,8 +19,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
-SAMPLED_CELLS = 1500
-"""Cells that tell models apart."""
+SAMPLED_CELLS, FEW_CELLS = 400, 150
+"""Cells on which a start is followed, and on which many starts are compared; the best are fitted to all cells."""
 
 
 def sampled_part(cells: int, wanted: int = SAMPLED_CELLS) -> tuple[slice, slice, slice]:

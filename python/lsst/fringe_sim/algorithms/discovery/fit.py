@@ -167,15 +167,9 @@ def _starts_quadratically(
     effect: str, parameter: Parameter, null: float, forward: Forward, thickness: FloatArray
 ) -> bool:
     sign = 1.0 if null < parameter.bounds[1] else -1.0
-    base = forward.predict({}, thickness).value
     small, large = (
-        np.abs(
-            forward.predict(
-                {f"{effect}.{parameter.name}": null + sign * size * parameter.prior_scale}, thickness
-            ).value
-            - base
-        ).max()
-        for size in (0.05, 0.1)
+        np.abs(forward.change({}, {f"{effect}.{parameter.name}": value}, thickness)).max()
+        for value in (null + sign * size * parameter.prior_scale for size in (0.05, 0.1))
     )
     return bool(large > 3.0 * small)
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from .comparison import chi2_with_free_fringes, fringe_order_um, sampled_part
+from .comparison import FEW_CELLS, chi2_with_free_fringes, fringe_order_um, sampled_part
 from .fit import Problem
 
 __all__ = ["ThicknessFollower"]
@@ -15,8 +15,7 @@ __all__ = ["ThicknessFollower"]
 FloatArray = NDArray[np.float64]
 
 SHIFTS_PER_ORDER, ORDERS_TRIED = 10, 1.5
-COMPARED_CELLS = 500
-"""Shifts that are compared before the first step, up to some fringe orders on either side, and the cells for it.
+"""Shifts that are compared before the first step, up to some fringe orders on either side.
 
 Steps find no more than the nearest fringe, and the thickness that suits a model without the effect may lie an order
 from the right one.
@@ -54,7 +53,7 @@ class ThicknessFollower:
         problem.forward.cover(thickness_um + self._shifts[0])
         problem.forward.cover(thickness_um + self._shifts[-1])
         cells = problem.cells
-        part, few = sampled_part(thickness_um.size), sampled_part(thickness_um.size, COMPARED_CELLS)
+        part, few = sampled_part(thickness_um.size), sampled_part(thickness_um.size, FEW_CELLS)
         self._sample, self._few = thickness_um[part[1:]], thickness_um[few[1:]]
         self._value, self._root = cells.value[part], np.sqrt(cells.weight[part])
         self._compared = cells.value[few], cells.weight[few]

@@ -521,15 +521,35 @@ class Forward:
         ``field_um`` (ny, nx). ``cells`` (n,): numbers of the cells; all by default. ``places_um`` (S, n):
         thicknesses of the cells; those of the field by default. Returns (W, S, n).
         """
+        outside = self._within_cells(self.table(settings), field_um, cells, places_um)
+        return self.on_island(name, settings, field_um, cells, places_um), outside
+
+    def on_island(
+        self,
+        name: str,
+        settings: Settings,
+        field_um: FloatArray,
+        cells: NDArray[np.intp] | None = None,
+        places_um: FloatArray | None = None,
+    ) -> FloatArray:
+        """The first of `on_and_off_island`."""
+        return self._within_cells(self._island_table(name, settings), field_um, cells, places_um)
+
+    def _within_cells(
+        self,
+        table: FloatArray,
+        field_um: FloatArray,
+        cells: NDArray[np.intp] | None,
+        places_um: FloatArray | None,
+    ) -> FloatArray:
+        """Light of a table in some cells as wide as the slopes of a field make them, ``(W, S, n)``."""
         own = np.arange(field_um.size) if cells is None else cells
         places = field_um.ravel()[own][np.newaxis] if places_um is None else places_um
         spread = [
             np.broadcast_to(moment.ravel()[own], places.shape)
             for moment in self._spread_in_cell(self.gradient(field_um))
         ]
-        tables = self._island_table(name, settings), self.table(settings)
-        on, off = (self._sampled(table, places, *spread).value for table in tables)
-        return on, off
+        return self._sampled(table, places, *spread).value
 
     def _island_table(self, name: str, settings: Settings) -> FloatArray:
         (table,) = (table for item, table in self._island_tables(settings) if item.effect.name == name)

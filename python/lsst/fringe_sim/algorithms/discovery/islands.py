@@ -84,12 +84,13 @@ def island_starts(
     """
     (size,) = (item for item in coordinates if not item.place)
     sizes = _sizes(size)
-    discs, about = [], Discs.of(problem.cells.seen)
+    discs, about, none = [], Discs.of(problem.cells.seen), _active(settings, coordinates, size, sizes[0])
+    _, off = problem.forward.on_and_off_island(size.effect, none, state.thickness_um)
     for value in sizes:
         if value > size.neighbour:  # it looks like a smaller one
             break
         active = _active(settings, coordinates, size, value)
-        changed = _change(problem, state, size.effect, settings, active)
+        changed = _change(problem, state, size.effect, active, off)
         signature = beside_thickness(state, state.whiten(level * changed))
         score = (signature * state.residual).sum(axis=0)
         discs.append(about.best(score, (signature**2).sum(axis=0)))
@@ -375,17 +376,15 @@ def _sizes(size: Coordinate) -> list[float]:
 
 
 def _change(
-    problem: Problem,
-    state: State,
-    name: str,
-    settings: Mapping[str, float],
-    active: Mapping[str, float],
+    problem: Problem, state: State, name: str, active: Mapping[str, float], off: FloatArray
 ) -> FloatArray:
-    """What a local effect would do to every cell, were it there; the thickness follows."""
+    """What a local effect would do to every cell, were it there; the thickness follows.
+
+    ``off`` (W, 1, n): light of the cells without it.
+    """
     forward, thickness = problem.forward, state.thickness_um
     shift = _suited_shift(problem, state, name, active)
-    on, _ = forward.on_and_off_island(name, active, thickness, None, (thickness + shift).reshape(1, -1))
-    _, off = forward.on_and_off_island(name, active, thickness)
+    on = forward.on_island(name, active, thickness, None, (thickness + shift).reshape(1, -1))
     return (on - off).reshape(-1, *thickness.shape)
 
 

@@ -9,7 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .comparison import chi2_with_free_fringes, fringe_order_um, local_minima, sampled_part
+from .comparison import (
+    FEW_CELLS,
+    chi2_with_free_fringes,
+    fringe_order_um,
+    local_minima,
+    sampled_part,
+)
 from .fit import Coordinate, Fit, Problem, fit_model
 
 __all__ = ["fields_in_other_orders", "starts_in_other_orders"]
@@ -20,14 +26,14 @@ SIZES_TRIED = (0.1, 0.15, 0.23, 0.35, *(0.5 * n for n in range(1, 21)))
 """Departures, in prior scales, at which one that shifts the phase is: its misfit has a minimum for every fringe."""
 
 PARTS_BETWEEN = (0.5, 0.25)
-"""Parts of the distance to the next size by which the best ones are changed, in turn."""
+"""Parts of the distance to the next size by which the best ones of all orders are changed, in turn."""
 
 ORDERS_MOVED, STEPS_PER_ORDER = 6, 12
-PLACES_REFITTED, PLACES_KEPT = 8, 4
-"""Fringe orders and fits with which a strong effect on the phase is looked for, and the steps to an order."""
+"""How far the field is moved [fringe orders], and the steps to an order."""
 
-COMPARED_CELLS = 500
-"""Cells with which places are compared."""
+PLACES_REFITTED, STEPS_ALONE, PLACES_KEPT = 8, 8, 2
+"""Places from which the size of an effect is fitted alone, the steps of such a fit (a fifth of an order at most, from
+less than half an order away), and the best ones, from which all effects are fitted."""
 
 LEAST_THICKNESS_UM, MOST_SIGMAS = 0.5, 4.0
 """Thinnest layer, and how far a map that is known may be moved, over its uncertainty."""
@@ -65,7 +71,10 @@ def starts_in_other_orders(
         others = [n for n in range(len(place.position)) if n != place.moved]
         held = {fit.coordinates[n].key: fit.coordinates[n].value(place.position[n]) for n in others}
         own = (fit.coordinates[place.moved],)
-        alone = fit_model(problem, own, place.position[[place.moved]], field, fit.levels, held, rival=least)
+        alone = fit_model(
+            problem, own, place.position[[place.moved]], field, fit.levels, held,
+            iterations=STEPS_ALONE, rival=least,
+        )  # fmt: skip
         settled = place.position.copy()
         settled[place.moved] = alone.position[0]
         found.append((settled, alone.field, alone.chi2))
@@ -110,7 +119,7 @@ def _moved(field: FloatArray, shift_um: float, even: bool, middle_um: float) -> 
 def _places(
     problem: Problem, fit: Fit, moved: Sequence[int], first_field: FloatArray, index: float
 ) -> list[_Place]:
-    """The best sizes of each coordinate in each order; sizes lie too far apart for the right one to win at once.
+    """The best sizes of each coordinate; sizes lie too far apart for the right one to win at once.
 
     A sample of cells is compared with the model, levels and contrasts free.
     """
@@ -123,11 +132,14 @@ def _places(
         for even in (False, True):
             problem.forward.cover(_moved(whole, edge, even, float(whole.mean())))
     found = []
-    for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
-        inside = shifts[np.abs(shifts - turn * order) <= 0.51 * order]
-        if inside.size:
-            trial = _Trial(problem, fit, whole, inside)
-            found += [place for number in moved for place in trial.places(number)]
+    for number in moved:
+        rough: list[_Rough] = []
+        for turn in range(-ORDERS_MOVED, ORDERS_MOVED + 1):
+            inside = shifts[np.abs(shifts - turn * order) <= 0.51 * order]
+            if inside.size:
+                rough += _Trial(problem, fit, whole, inside).minima(number)
+        rough.sort(key=lambda item: item.place.chi2)
+        found += [item.trial.refined(item) for item in rough[: 2 * PLACES_REFITTED]]
     return found
 
 
@@ -143,7 +155,7 @@ class _Trial:
     @cached_property
     def sample(self) -> tuple[slice, slice, slice]:
         """Which cells are compared."""
-        return sampled_part(self.whole.size, COMPARED_CELLS)
+        return sampled_part(self.whole.size, FEW_CELLS)
 
     @cached_property
     def fields_um(self) -> FloatArray:
@@ -152,20 +164,23 @@ class _Trial:
         moves = [(shift, even) for even in (False, True) for shift in self.shifts_um]
         return np.stack([_moved(few, shift, even, middle) for shift, even in moves])
 
-    def places(self, number: int) -> list[_Place]:
+    def minima(self, number: int) -> list[_Rough]:
         """The sizes of one coordinate than which no size near it is better."""
         sizes = _sizes(self.fit.coordinates[number])
         own = [self.place(number, size) for size in sizes]
-        found = []
-        for low in local_minima(np.array([place.chi2 for place in own])):
-            best, size = own[low], sizes[low]
-            gap = np.diff(sizes)[max(low - 1, 0) : low + 1].min()
-            for part in PARTS_BETWEEN:
-                beside = [size - part * gap, size + part * gap]
-                tried = [(self.place(number, one), one) for one in beside]
-                best, size = min([(best, size), *tried], key=lambda item: item[0].chi2)
-            found.append(best)
-        return found
+        return [
+            _Rough(self, own[low], sizes[low], float(np.diff(sizes)[max(low - 1, 0) : low + 1].min()))
+            for low in local_minima(np.array([place.chi2 for place in own]))
+        ]
+
+    def refined(self, rough: _Rough) -> _Place:
+        """The best of some sizes between a minimum and its neighbours."""
+        best, size = rough.place, rough.size
+        for part in PARTS_BETWEEN:
+            beside = [size - part * rough.gap, size + part * rough.gap]
+            tried = [(self.place(best.moved, one), one) for one in beside]
+            best, size = min([(best, size), *tried], key=lambda item: item[0].chi2)
+        return best
 
     def place(self, number: int, size: float) -> _Place:
         """One coordinate at a size, with the field where it fits best."""
@@ -177,6 +192,16 @@ class _Trial:
         lowest = [_vertex(self.shifts_um, each) for each in chi2]
         even = lowest[1][1] < lowest[0][1]
         return _Place(number, position, lowest[even][0], even, lowest[even][1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Rough:
+    """A size of one coordinate than which no other is better, and how far the nearest one tried is."""
+
+    trial: _Trial
+    place: _Place
+    size: float
+    gap: float
 
 
 def _vertex(places: FloatArray, values: FloatArray) -> tuple[float, float]:

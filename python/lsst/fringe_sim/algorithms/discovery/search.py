@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -195,8 +195,9 @@ class _Search:
         self.heldout = held_out_blocks(shape, self.options.heldout_fraction, self.rng)
         self._take(prepared)
 
-    def _take(self, prepared: Prepared) -> None:
-        self.prepared, self.cells = prepared, prepared.problem.cells
+    def _take(self, prepared: Prepared, singles: Mapping[str, FloatArray] | None = None) -> None:
+        """Go on with other field and noise; ``singles``: where effects alone are known to be."""
+        self.prepared, self.cells, self._singles = prepared, prepared.problem.cells, singles
         self.notes = [*self.headers, *prepared.told]
 
     @property
@@ -218,6 +219,7 @@ class _Search:
             first_field=self.prepared.undistorted_field,
             shifts_um=self.prepared.shifts_um,
             guess=self.prepared.guess,
+            alike=None if self.reached is None else self.reached.whole,
         )
         self.where = self._where(whole)
         chance = self._chance(whole, whole.null)
@@ -235,10 +237,10 @@ class _Search:
             return self._conclude(whole, sets, sets.finished(chosen, steps), steps, chance)
         singles = sets.refits(sets.selector.null)
         if singles and singles[0].log_evidence > self.options.least_evidence and refinements > 0:
-            refined = self._judged_again(whole, sets, singles)
+            refined, known_singles = self._judged_again(whole, sets, singles)
             if refined is not None:
                 self.say("field and noise are judged again with the best effect in the model")
-                self._take(refined)
+                self._take(refined, known_singles)
                 return self.run(refinements - 1)
         if singles and self._is_too_coarse(sets.selector, singles[0]):
             return self._run_finer(singles[0].fit, self._thickness(whole, singles[0].fit))
@@ -366,6 +368,8 @@ class _Search:
             generic=self.prepared.rich,
             first_field=self.prepared.undistorted_field,
             guess=self.prepared.guess,
+            alike=whole,
+            singles=self._singles,
         )
 
     def _refined(self, whole: Selector, best: Hypothesis) -> tuple[Prepared | None, int]:
@@ -375,18 +379,23 @@ class _Search:
             self.say(f"{mended} cells change their fringe order with {', '.join(best.names)}")
         return refined, mended
 
-    def _judged_again(self, whole: Selector, sets: SetSearch, singles: list[Hypothesis]) -> Prepared | None:
+    def _judged_again(
+        self, whole: Selector, sets: SetSearch, singles: list[Hypothesis]
+    ) -> tuple[Prepared | None, dict[str, FloatArray]]:
         """Field and noise as judged with the best single effect, or with one that takes fringes away.
 
         Where these are not seen the thickness is any, and a fit to it explains less than effects that weaken all of
         them. Once it is continued from where they are, it explains more.
+
+        Also where the effects alone are, if all cells are in the fringe order in which they were fitted.
         """
-        best, _ = self._refined(whole, sets.to_judge_with(singles))
+        best, mended = self._refined(whole, sets.to_judge_with(singles))
+        places = {} if mended else {one.names[0]: one.fit.position for one in singles}
         for blur in sets.that_may_hide_fringes(singles):
             other, _ = self._refined(whole, blur)
             if other is not None and is_judged_better(other, best or self.prepared):
-                best = other
-        return best
+                best, places = other, {}
+        return best, places
 
     def _is_too_coarse(self, selector: Selector, found: Hypothesis) -> bool:
         """Whether a blur explains much, but not all, in cells that were chosen for the image that it left."""

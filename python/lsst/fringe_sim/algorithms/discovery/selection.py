@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,6 +26,7 @@ from .fit import (
     coordinates_of,
     fit_model,
     linearise_at,
+    solve_symmetric,
 )
 from .following import ThicknessFollower
 from .islands import IslandStart, followed_on_island, island_starts, placed_on_island, start_at_step
@@ -39,9 +40,18 @@ FloatArray = NDArray[np.float64]
 
 
 SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
-FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 12))
+FIRST_SCAN = (0.3, 3.0)
+FINE_SCAN = tuple(float(size) for size in np.geomspace(0.1, 10.0, 8))
 """Departures, in prior scales, at which the finite signature of an effect is tried; the fine ones where it may grow
-with the fourth power (a beam whose onset is taken for thickness)."""
+with the fourth power (a beam whose onset is taken for thickness). The first two tell whether it is worth while."""
+
+WORTH_SCANNING = 0.1
+"""Part of the most that derivatives promise which the form of a finite signature, of any strength, must explain for
+other sizes of the effect to be tried."""
+
+STRAIGHT = 0.8
+"""Part of all finite signatures of an effect along its derivatives, beside all nuisances, from which on these promise
+what it would bring, and its finite signatures are not asked again."""
 
 IMPRECISION = 0.01
 """Part of what an effect does to the fringes in which our description of it may be wrong, and not the effect."""
@@ -132,6 +142,11 @@ class Selector:
         a few pixels is open.
     guess : mapping, optional
         Settings with which ``first_field`` was fitted: where to start with those effects, besides.
+    alike : `Selector`, optional
+        One of the same effects on as large cells, from which their coordinates are taken over.
+    singles : mapping, optional
+        Coordinates of effects that were fitted alone to the same data before: beside the unchanged model no other
+        sizes and places are looked for.
     """
 
     def __init__(
@@ -145,26 +160,24 @@ class Selector:
         first_field: FloatArray | None = None,
         shifts_um: Sequence[float] = (),
         guess: Mapping[str, float] | None = None,
+        alike: Selector | None = None,
+        singles: Mapping[str, FloatArray] | None = None,
     ) -> None:
         self.problem, self.index, self.generic = problem, index, generic
         self.first_field = null.field if first_field is None else first_field
         self.shifts_um = tuple(shifts_um)
-        self.guess = dict(guess or {})
+        self.guess, self._singles = dict(guess or {}), dict(singles or {})
         self.null = Hypothesis((), null, 0.0)
-        thickness = problem.basis.expand(null.field)
         self.effects = {effect.name: effect for effect in catalogue}
         self.coordinates: dict[str, tuple[Coordinate, ...]] = {}
         self.left_out: dict[str, str] = {}
-        for effect in catalogue:
-            try:
-                effect.check_search(problem.forward.geometry)
-                found = coordinates_of(effect, problem.forward, thickness)
-                for item in found:
-                    problem.forward.predict({item.key: item.value(0.1 * item.unit_step)}, thickness)
-            except InputError as error:
-                self.left_out[effect.name] = str(error)
-            else:
-                self.coordinates[effect.name] = found
+        # Effects whose finite signatures are their derivatives
+        self._straight: set[str] = set()
+        if alike is not None and alike.problem.cells.cell_px == problem.cells.cell_px:
+            self.coordinates, self.left_out = alike.coordinates, alike.left_out
+            self._straight = alike._straight
+        else:
+            self._find_coordinates(catalogue, problem.basis.expand(null.field))
         state = self.state(null)
         fringes = state.value - state.value.mean(axis=(1, 2), keepdims=True)
         self._undescribed = PRECISION**2 * float((state.whiten(fringes) ** 2).sum())
@@ -174,6 +187,20 @@ class Selector:
         # Sets are enlarged, swapped and compared from the same fits.
         self._scores: dict[tuple[Fit, bool], dict[str, Candidate | None]] = {}
         self._island_starts: dict[tuple[Fit, str], list[IslandStart]] = {}
+
+    def _find_coordinates(self, catalogue: Sequence[Effect], thickness_um: FloatArray) -> None:
+        """Find the coordinates of every effect that can be looked for, and why the others are left out."""
+        forward = self.problem.forward
+        for effect in catalogue:
+            try:
+                effect.check_search(forward.geometry)
+                found = coordinates_of(effect, forward, thickness_um)
+                for item in found:
+                    forward.change({}, {item.key: item.value(0.1 * item.unit_step)}, thickness_um)
+            except InputError as error:
+                self.left_out[effect.name] = str(error)
+            else:
+                self.coordinates[effect.name] = found
 
     def state(self, fit: Fit) -> State:
         """Everything the tests need at a fit."""
@@ -253,30 +280,53 @@ class Selector:
         known = self._scores.setdefault((fit, scan), {})
         missing = [name for name in names if name not in known]
         if missing:
-            state = self.state(fit)
-            known |= {name: self._candidate(state, fit, name, scan) for name in missing}
+            known |= self._candidates(self.state(fit), fit, missing, scan)
         found = [candidate for name in names if (candidate := known[name]) is not None]
         return sorted(found, key=lambda item: -item.promise)
 
-    def _candidate(self, state: State, fit: Fit, name: str, scan: bool) -> Candidate | None:
-        """Score test of an effect; `None` if it is not seen or cannot be combined with those that are in already."""
-        if self.problem.forward.is_island(name):
-            return self._on_some_island(state, fit, name) if scan else self._found_island(fit, name)
-        if self.is_sought(name):  # at null its place is anywhere, and its derivative says nothing
-            return self._sought(state, fit, name) if scan else None
+    def _candidates(
+        self, state: State, fit: Fit, names: Sequence[str], scan: bool
+    ) -> dict[str, Candidate | None]:
+        """Score tests of effects; `None` for what is not seen or cannot be combined with what is in already."""
+        if scan and self._singles and fit is self.null.fit:
+            plain = self._candidates(state, fit, names, scan=False)
+            return {name: self._as_before(state, fit, name, candidate) for name, candidate in plain.items()}
+        found: dict[str, Candidate | None] = {}
+        derivatives: dict[str, FloatArray] = {}
+        for name in names:
+            if self.problem.forward.is_island(name):
+                found[name] = (
+                    self._on_some_island(state, fit, name) if scan else self._found_island(fit, name)
+                )
+            elif self.is_sought(name):  # at null its place is anywhere, and its derivative says nothing
+                found[name] = self._sought(state, fit, name) if scan else None
+            else:
+                found[name], features = self._by_derivative(state, fit, name)
+                if scan and found[name] is not None and self._may_be_bent(name):
+                    derivatives[name] = features
+        least = WORTH_SCANNING * max((one.gain for one in found.values() if one is not None), default=0.0)
+        for name, features in derivatives.items():
+            candidate = found[name]
+            assert candidate is not None
+            found[name] = self._scanned(state, fit, candidate, features, least)
+        return found
+
+    def _by_derivative(self, state: State, fit: Fit, name: str) -> tuple[Candidate | None, FloatArray]:
+        """Score test of an effect by its derivatives, and these."""
         coordinates = self.coordinates[name]
         try:
             features = self.features(state, fit, name)
         except InputError:
-            return None
+            return None, np.zeros(0)
         score, information = state.design.project(FullColumns(features), state.residual)
         start, gain, degrees = bounded_minimum(score, information, coordinates)
-        candidate = Candidate(name, gain, degrees, start, gain)
+        return Candidate(name, gain, degrees, start, gain), features
+
+    def _may_be_bent(self, name: str) -> bool:
+        """Whether the finite signature of an effect may be another than its derivatives."""
         of_the_image = self.problem.forward.is_image_effect(name)
         far_from_linear = not of_the_image or self.problem.forward.couples_pixels(name)
-        if scan and far_from_linear and not self.has_many(name):
-            candidate = self._scanned(state, fit, candidate)
-        return candidate
+        return far_from_linear and not self.has_many(name) and name not in self._straight
 
     def is_sought(self, name: str) -> bool:
         """Whether an effect has to be looked for in what the model leaves, its place not being known."""
@@ -285,8 +335,19 @@ class Selector:
     def _sought(self, state: State, fit: Fit, name: str) -> Candidate | None:
         """The effect where it is seen, if it is."""
         start = self._seen(state, name)
-        if start is None:
-            return None
+        return None if start is None else self._beginning_at(state, fit, name, start)
+
+    def _as_before(self, state: State, fit: Fit, name: str, candidate: Candidate | None) -> Candidate | None:
+        """The candidate, or the effect as it was fitted before where that promises more."""
+        if name not in self._singles:
+            return candidate
+        before = self._beginning_at(state, fit, name, self._singles[name])
+        if before is None or (candidate is not None and candidate.promise > before.promise):
+            return candidate
+        return before if candidate is None else replace(candidate, start=before.start, promise=before.promise)
+
+    def _beginning_at(self, state: State, fit: Fit, name: str, start: FloatArray) -> Candidate | None:
+        """The effect at some size; `None` if it promises nothing there."""
         coordinates = self.coordinates[name]
         settings = {item.key: item.value(x) for item, x in zip(coordinates, start, strict=True)}
         level, _ = self.problem.amplitudes(fit.levels)
@@ -395,26 +456,29 @@ class Selector:
             return None
         return np.array([item.coordinate(seen[0][item.parameter]) for item in self.coordinates[name]])
 
-    def _scanned(self, state: State, fit: Fit, candidate: Candidate) -> Candidate:
+    def _scanned(
+        self, state: State, fit: Fit, candidate: Candidate, derivatives: FloatArray, least: float
+    ) -> Candidate:
         """Candidate with the best of its finite signatures, where that promises more than the derivative."""
-        coordinates = self.coordinates[candidate.name]
-        places, columns = [], []
-        held = self.problem.field_prior > 0.0 or self.problem.forward.is_image_effect(candidate.name)
-        follower = None if held else self._follower(state.thickness_um)
-        for number, item in enumerate(coordinates):
-            for size in FINE_SCAN if item.quadratic else SCAN:
-                for sign in (1.0,) if item.quadratic else (1.0, -1.0):
-                    departure = (size * item.scale) ** 2 if item.quadratic else sign * size * item.scale
-                    if not item.is_inside(departure):
-                        continue
-                    settings = {**fit.settings, item.key: item.value(departure)}
-                    for thickness in follower.places(settings) if follower else [state.thickness_um]:
-                        places.append((number, departure))
-                        columns.append(self._signature(state, fit, settings, thickness))
+        coordinates, own = self.coordinates[candidate.name], len(derivatives)
+        places, columns = self._at_sizes(state, fit, candidate.name, lambda item: FIRST_SCAN)
         if not columns:
             return candidate
-        score, information = state.design.project(FullColumns(np.stack(columns)), state.residual)
-        strength = np.diag(information)
+        every = FullColumns(np.concatenate([derivatives, columns]))
+        score, information = state.design.project(every, state.residual)
+        score, strength, cross = score[own:], np.diag(information)[own:], information[:own, own:]
+        along = (cross * solve_symmetric(information[:own, :own], cross)).sum(axis=0)
+        seen = strength > 1.0
+        # Of a few pixels in the wrong fringe order neither says anything.
+        if self.generic and np.all(along[seen] > STRAIGHT * strength[seen]):
+            self._straight.add(candidate.name)
+        elif (score**2 / np.maximum(strength, 1e-300)).max() > least:
+            others, columns = self._at_sizes(
+                state, fit, candidate.name, lambda item: FINE_SCAN if item.quadratic else SCAN[::2]
+            )
+            further, information = state.design.project(FullColumns(np.stack(columns)), state.residual)
+            places += others
+            score, strength = np.append(score, further), np.append(strength, np.diag(information))
         amplitude = np.divide(score, strength, out=np.zeros_like(score), where=strength > 1e-6)
         # A finite signature may be scaled only a little: its shape changes with its size. Of one that grows with the
         # square, no size between two of the scan may be lost.
@@ -426,6 +490,25 @@ class Selector:
         start = np.zeros(len(coordinates))
         start[number] = coordinates[number].clip(departure * min(amplitude[best], 1.5))
         return replace(candidate, start=start, promise=float(gain[best]))
+
+    def _at_sizes(
+        self, state: State, fit: Fit, name: str, sizes: Callable[[Coordinate], Sequence[float]]
+    ) -> tuple[list[tuple[int, float]], list[FloatArray]]:
+        """Finite signatures of an effect, and the number and the departure of the coordinate that has each."""
+        places, columns = [], []
+        held = self.problem.field_prior > 0.0 or self.problem.forward.is_image_effect(name)
+        follower = None if held else self._follower(state.thickness_um)
+        for number, item in enumerate(self.coordinates[name]):
+            for size in sizes(item):
+                for sign in (1.0,) if item.quadratic else (1.0, -1.0):
+                    departure = (size * item.scale) ** 2 if item.quadratic else sign * size * item.scale
+                    if not item.is_inside(departure):
+                        continue
+                    settings = {**fit.settings, item.key: item.value(departure)}
+                    for thickness in follower.places(settings) if follower else [state.thickness_um]:
+                        places.append((number, departure))
+                        columns.append(self._signature(state, fit, settings, thickness))
+        return places, columns
 
     def _follower(self, thickness_um: FloatArray) -> ThicknessFollower:
         return ThicknessFollower(self.problem, thickness_um, float(self.index.mean()))
@@ -575,7 +658,8 @@ class Selector:
     def _spread_starts(self, fit: Fit, *, both_sides: bool = False) -> list[FloatArray]:
         """The fit with its last effect moved to other sizes, from near the null to near the bound."""
         last = fit.coordinates[-1]
-        if len(fit.coordinates) > 1 and fit.coordinates[-2].effect == last.effect:
+        several = len(fit.coordinates) > 1 and fit.coordinates[-2].effect == last.effect
+        if several or last.effect in self._straight:
             return []
         value = last.value(fit.position[-1])
         bounds = (last.low, last.high) if both_sides else (last.high if value >= last.null else last.low,)

@@ -33,6 +33,9 @@ HARDLY_LESS = 0.5
 MUCH_OF_THE_BEST = 0.3
 """Part of what the best single effect explains that one must which may take narrow fringes away."""
 
+SCANNED_PARENTS = 2
+"""Sets, best first, to which effects are added by their finite signatures, and not by their derivatives alone."""
+
 SHIFTING_EFFECTS = 3
 """Effects that are looked for in other fringe orders, each with the set with which it is likeliest."""
 
@@ -84,16 +87,26 @@ class SetSearch:
         return best, [self.step(self.selector.null, best)]
 
     def refits(self, base: Hypothesis, rival: Hypothesis | None = None) -> list[Hypothesis]:
-        """Refits of the best-scored additions to a set, likeliest first; none that cannot come near a rival."""
+        """Refits of the best-scored additions to a set, likeliest first; none that cannot come near a rival.
+
+        One that leaves about noise is a rival of those that promise less.
+        """
         scores = self.selector.score(base.fit, self.selector.others(base), scan=True)
-        worth = scores
-        if not self.order_open:  # a score in the wrong order says nothing
-            goal = rival.fit.chi2 if rival else math.inf
-            able = (c for c in scores if c.promise > WORTH_FITTING and _may_reach(goal, base, c))
-            worth = list(able)[: self.options.refits]
-        refitted = [self.selector.with_candidate(base, c) for c in worth]
-        for hypothesis in refitted:
-            self._say_refit(base, hypothesis)
+        goal = rival.fit.chi2 if rival else math.inf
+        refitted: list[Hypothesis] = []
+        for candidate in scores:
+            # A score in the wrong order says nothing.
+            if not self.order_open and (
+                candidate.promise <= WORTH_FITTING
+                or len(refitted) == self.options.refits
+                or not _may_reach(goal, base, candidate)
+            ):
+                continue
+            found = self.selector.with_candidate(base, candidate)
+            self._say_refit(base, found)
+            refitted.append(found)
+            if not self._leaves_much(found):
+                goal = min(goal, found.fit.chi2)
         return sorted(refitted, key=lambda item: -item.log_evidence)
 
     def first(self, singles: list[Hypothesis]) -> tuple[Hypothesis, list[Step]]:
@@ -117,7 +130,7 @@ class SetSearch:
         Where all leave much, those that shift the phase are looked for in other fringe orders first: what is likely
         in the wrong one would tear the thickness to where it suits.
         """
-        if not self._leaves_much(singles[0]):
+        if not self._may_be_in_another_order(singles[0]):
             return singles[0]
         elsewhere = (
             self.selector.improved(single.names, self.selector.null.fit, scan=True)
@@ -129,7 +142,7 @@ class SetSearch:
     def that_may_hide_fringes(self, singles: list[Hypothesis]) -> list[Hypothesis]:
         """Single effects that blur, and explain much though not most, where all leave much."""
         best = singles[0]
-        if self.order_open or not self._leaves_much(best):
+        if self.order_open or not self._may_be_in_another_order(best):
             return []
         blurs = [
             self.selector.hypothesis((name,))
@@ -143,6 +156,20 @@ class SetSearch:
             if blur.names != best.names
             and self.selector.null.fit.chi2 - blur.fit.chi2 > MUCH_OF_THE_BEST * explained
         ]
+
+    def _may_be_in_another_order(self, hypothesis: Hypothesis) -> bool:
+        """Whether much is left that another thickness may explain, and not what pixels do by themselves."""
+        if not self._leaves_much(hypothesis):
+            return False
+        forward = self.selector.problem.forward
+        excess = hypothesis.fit.chi2 - self.selector.problem.cells.n_values
+        of_pixels = [
+            name
+            for name in self.selector.others(hypothesis)
+            if forward.is_image_effect(name) and not forward.couples_pixels(name)
+        ]
+        scores = self.selector.score(hypothesis.fit, of_pixels)
+        return all(candidate.gain < HARDLY_LESS * excess for candidate in scores)
 
     def _leaves_much(self, hypothesis: Hypothesis) -> bool:
         noise = self.selector.problem.cells.n_values
@@ -222,7 +249,9 @@ class SetSearch:
         if not larger:
             return None
         best = self._most_credible(larger)
-        if not self.options.is_noise(best):
+        if not self.options.is_noise(best) and (
+            not self._leaves_much(best) or self._may_be_in_another_order(best)
+        ):
             best = self._most_credible(self._in_other_orders(larger))
         if best.log_evidence < current.log_evidence + self.options.least_evidence:
             return None
@@ -319,7 +348,7 @@ class SetSearch:
         """
         promised: dict[frozenset[str], tuple[float, Hypothesis, Candidate]] = {}
         for place, parent in enumerate(self._nearly_as_good(current)):
-            scan = place < self.options.parents  # derivatives alone take a tenth of the time
+            scan = place < SCANNED_PARENTS  # derivatives alone take a tenth of the time
             for candidate in self.selector.score(parent.fit, self.selector.others(parent), scan=scan):
                 key = frozenset((*parent.names, candidate.name))
                 left = parent.fit.chi2 - candidate.promise
@@ -376,6 +405,8 @@ class SetSearch:
 
     def _searched_harder(self, singles: list[Hypothesis]) -> list[Hypothesis]:
         """The nearly best single effects, and those that shift the phase, tried at other sizes too."""
+        if self._leaves_much(singles[0]) and not self._may_be_in_another_order(singles[0]):
+            return singles
         near = [h for h in singles if h.log_evidence > 0.7 * singles[0].log_evidence][:4]
         near += [h for h in singles if h not in near and self.selector.shifts_phase(h)]
         return [self.selector.improved(h.names, self.selector.null.fit, scan=True) for h in near]

@@ -52,7 +52,7 @@ MEDIAN_SIDE = 15
 """Knots of the smooth surface [cells], rounds in which it forgets what lies far from it, the clarity that all cells
 together may lose by it, and the side of the area in which it begins with the median [cells]."""
 
-LEVEL_ROUNDS, LEVEL_CELLS = 2, 1500
+LEVEL_ROUNDS, LEVEL_CELLS = 2, 1000
 """How often levels and thickness follow from each other, and about how many cells are followed for them."""
 
 WINDOW_ORDERS = (0.15, 0.3, 0.5, 0.75, 1.0, 1.5)
@@ -330,15 +330,24 @@ def _correlations(
 
 def _common_shift(score: NDArray[np.float32], best: NDArray[np.int64], order: float, count: int) -> int:
     """Number of steps by which all cells are moved, a whole number of orders give or take a quarter."""
-    shifts = np.arange(-int(12 * order), int(12 * order) + 1)
-    cells = np.arange(len(best))
-    totals = np.full(shifts.size, -np.inf)
-    for number, shift in enumerate(shifts):
-        moved = best + shift
-        inside = (moved >= 0) & (moved < count)
-        if inside.mean() > 0.98:
-            totals[number] = float((score[cells[inside], moved[inside]].astype(float) ** 2).sum())
-    return int(shifts[int(np.argmax(totals))])
+    reach = int(12 * order)
+    totals, inside = _powers_of_shifts(score, np.ascontiguousarray(best), reach)
+    totals[inside <= 0.98 * len(best)] = -np.inf
+    return int(np.argmax(totals)) - reach
+
+
+@kernel
+def _powers_of_shifts(
+    score: NDArray[np.float32], best: NDArray[np.int64], reach: int
+) -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
+    """Sum of the squared correlations with all cells moved by so many steps, and how many cells have any there."""
+    totals, inside = np.zeros(2 * reach + 1), np.zeros(2 * reach + 1)
+    for i in range(len(best)):
+        for number in range(max(0, reach - best[i]), min(2 * reach + 1, reach - best[i] + score.shape[1])):
+            value = float(score[i, best[i] + number - reach])
+            totals[number] += value * value
+            inside[number] += 1.0
+    return totals, inside
 
 
 def _mended(
