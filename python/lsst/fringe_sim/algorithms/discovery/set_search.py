@@ -158,18 +158,18 @@ class SetSearch:
         ]
 
     def _may_be_in_another_order(self, hypothesis: Hypothesis) -> bool:
-        """Whether much is left that another thickness may explain, and not what pixels do by themselves."""
+        """Whether much is left that another thickness may explain, whatever pixels do by themselves."""
         if not self._leaves_much(hypothesis):
             return False
         forward = self.selector.problem.forward
-        excess = hypothesis.fit.chi2 - self.selector.problem.cells.n_values
         of_pixels = [
             name
             for name in self.selector.others(hypothesis)
             if forward.is_image_effect(name) and not forward.couples_pixels(name)
         ]
         scores = self.selector.score(hypothesis.fit, of_pixels)
-        return all(candidate.gain < HARDLY_LESS * excess for candidate in scores)
+        # A score is no fit: beside a thickness in the wrong order, it may promise all that is left.
+        return not scores or self._leaves_much(self.selector.with_candidate(hypothesis, scores[0]))
 
     def _leaves_much(self, hypothesis: Hypothesis) -> bool:
         noise = self.selector.problem.cells.n_values
