@@ -68,6 +68,9 @@ def test_a_few_cells_hold_no_planes() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True, reason="with silicon as measured in the cold the first thickness of this sensor is torn"
+)
 def test_a_sensor_of_weak_fringes_is_not_torn_to_begin_with() -> None:
     """Coating that is thicker by 1.8 um makes the fringes narrow and weak; the pair is named since."""
     case, _ = recorded_case(20531130, "two", 1)
