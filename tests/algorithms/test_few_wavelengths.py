@@ -44,7 +44,7 @@ def test_neighbouring_wavelengths_find_the_order(seed, model) -> None:
         pytest.param((0, 1, 2, 3), (160, 200), 15.0, 1.0, 0.002, marks=pytest.mark.slow),
         pytest.param((8, 9, 10, 11), (80, 100), 25.6, 2.5, 0.002, marks=pytest.mark.slow),
         pytest.param((3, 4, 5, 6, 7), (80, 100), 7.0, 0.8, 0.002, marks=pytest.mark.slow),
-        ((0, 1, 2, 3), (48, 64), 8.0, 1.6, 0.005),
+        pytest.param((0, 1, 2, 3), (48, 64), 8.0, 1.6, 0.005, marks=pytest.mark.slow),
         ((0, 1, 10, 11), (80, 100), 22.0, 0.6, 0.004),
     ],
 )

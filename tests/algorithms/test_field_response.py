@@ -188,6 +188,7 @@ def test_sky_frames_take_either_response(angular, rng):
     assert frame.quadrature_error == sensor.quadrature_error
 
 
+@pytest.mark.slow
 def test_a_cone_has_one_beam():
     placement = SensorPlacement(0.0, 0.0, 0.4, 0.4)
     for setup, layer in (("monocam", RANGE), ("hsc", (199.9, 200.1))):

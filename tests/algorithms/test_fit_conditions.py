@@ -118,6 +118,7 @@ def test_a_sensor_cut_in_two(model, rng) -> None:
 
 
 @pytest.mark.rng("unequal noise counts")
+@pytest.mark.slow
 def test_unequal_noise_counts(model, rng) -> None:
     """A quarter of the sensor and half of the wavelengths are three times noisier; the pulls stay 1 everywhere."""
     truth = random_field(SHAPE, rng, mean=16.0, span=SPAN_UM)

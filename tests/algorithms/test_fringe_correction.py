@@ -66,7 +66,7 @@ def small_scene(side, rng):
 
 
 @pytest.mark.parametrize(("side", "draws"), first_is_quick([(40, 150), (128, 80), (512, 30)]))
-@pytest.mark.parametrize("stated", [True, False], ids=["variance", "no variance"])
+@pytest.mark.parametrize("stated", first_is_quick([True, False]), ids=["variance", "no variance"])
 @pytest.mark.rng("the errors of the scales hold")
 def test_the_errors_of_the_scales_hold(rng, side, draws, stated):
     options = CorrectionOptions(amplifiers=AmplifierGrid(1, 2))

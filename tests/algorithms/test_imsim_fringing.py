@@ -45,6 +45,7 @@ def test_it_is_called_like_the_class_of_imsim() -> None:
     assert asked == ["self", "x", "y", "amplitude"]
 
 
+@pytest.mark.slow
 def test_the_map_is_the_sky_frame_of_the_package(centre, thickness_um) -> None:
     x, y = np.meshgrid(range(SHAPE[1]), range(SHAPE[0]))
     found = centre.calculate_fringe_amplitude(x, y)

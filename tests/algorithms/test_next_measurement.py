@@ -192,6 +192,7 @@ PUBLISHED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effects", "now", "added", "after"), PUBLISHED, ids=[" ~ ".join(case[0]) for case in PUBLISHED]
 )
@@ -277,6 +278,7 @@ def test_exposures_get_longer_with_more_light_and_a_narrower_line(model: FringeM
         FlatSeries(FLATS, dark_time_s=(10.0,))
 
 
+@pytest.mark.slow
 def test_a_level_that_grows_with_time_is_told_from_one_that_does_not(
     model: FringeModel, few_samples: None
 ) -> None:
@@ -318,6 +320,7 @@ def test_the_silicon_may_be_the_layer_that_varies(few_samples: None) -> None:
     assert ranked.separation > 0.0
 
 
+@pytest.mark.slow
 def test_a_layer_may_be_thinner_than_the_orders_that_are_tried(model: FringeModel, few_samples: None) -> None:
     effects = {"contrast_loss": {"factor": 0.5}, "roughness": {"sigma": 60.0}}
     (ranked,) = rank_measurements(model, effects, thickness_um=(0.5, 0.9), measurements=[AGAIN])

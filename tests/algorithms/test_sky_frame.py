@@ -245,7 +245,7 @@ def test_bad_input_is_named(monocam, sky, response, thickness):
         sky_response(FringeModel.from_setup("ts8_e2v"), sky)
     with pytest.raises(OutOfRangeError, match="thickness range"):
         sky_response(monocam, sky, thickness_range_um=(16.0, 15.0))
-    nothing = SkySpectrum(EmissionLines.oh(band_scale=dict.fromkeys(EmissionLines.oh().bands, 0.0)))
+    nothing = SkySpectrum(EmissionLines.oh().scaled(dict.fromkeys(EmissionLines.oh().bands, 0.0)))
     with pytest.raises(InputError, match="no light behind the bandpass"):
         sky_response(monocam, nothing)
     with pytest.raises(InputError, match="a positive mean"):
@@ -253,7 +253,7 @@ def test_bad_input_is_named(monocam, sky, response, thickness):
 
 
 def test_continuum_without_lines(monocam):
-    nothing = EmissionLines.oh(band_scale=dict.fromkeys(EmissionLines.oh().bands, 0.0))
+    nothing = EmissionLines.oh().scaled(dict.fromkeys(EmissionLines.oh().bands, 0.0))
     only = sky_response(monocam, SkySpectrum(nothing, (airglow_continuum(),)), thickness_range_um=RANGE)
     assert only.component == ("airglow continuum",)
     assert only.bands == ()

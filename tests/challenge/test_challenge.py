@@ -77,6 +77,7 @@ def test_cases_are_of_the_set_up(setup: str, limits_um: tuple[float, float], fwh
     assert 0.0 < abs(case.values["bandwidth.fwhm"] - fwhm_nm) < 1.0
 
 
+@pytest.mark.slow
 def test_a_thickness_is_not_hidden_where_it_varies() -> None:
     only = ["silicon_thickness", "silicon_gradient", "vignetting"]
     cases = [

@@ -80,6 +80,7 @@ def test_both_methods_find_the_truth(flats: list[FringeFlat], frames: MockRun) -
         assert found.detector == NAME
 
 
+@pytest.mark.slow
 def test_only_the_walk_doubts_the_orders_of_single_pixels(flats: list[FringeFlat]) -> None:
     """The walk judges every pixel on its own amplitudes, the global fit on those of the region."""
     slips = {

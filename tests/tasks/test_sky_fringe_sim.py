@@ -96,6 +96,7 @@ def test_photons_migrate() -> None:
     assert 0.8 * pixel.fraction().std() < blurred.fraction().std() < pixel.fraction().std()
 
 
+@pytest.mark.slow
 def test_a_sensor_without_a_map_gets_a_stand_in_if_that_is_wanted() -> None:
     config = SkyFringeSimConfig(beams="centre", stand_in=True, stand_in_shape=[20, 24])
     frame = SkyFringeSimTask(config=config).run(None, EXPOSURE, DETECTOR).sky

@@ -107,6 +107,7 @@ def test_a_blur_that_is_seen_is_not_taken_for_pixels_without_area(blurred) -> No
     assert again.chi2 == pytest.approx(fit.chi2, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_cells_held_out_follow_a_fit_whose_field_is_another_than_without_effects(blurred) -> None:
     """Added to a field in another order, what the others moved by is no thickness of those held out."""
     problem, truth, sigma = blurred

@@ -73,6 +73,7 @@ def test_wavelengths_that_are_off_are_found_from_another_order(sensor, selector,
     assert found.fit.chi2 == pytest.approx(right.chi2, abs=2.0)
 
 
+@pytest.mark.slow
 def test_rivals_fitted_in_another_order_are_fitted_again(sensor, selector) -> None:
     """What was compared before the right order was known says nothing."""
     problem, known, _ = sensor

@@ -59,6 +59,7 @@ def exposures(model: FringeModel, **parts: object) -> SkyExposures:
     ),
     ids=str,
 )
+@pytest.mark.slow
 def test_the_short_sums_are_the_sky_of_the_simulation(setup: str, settings: dict[str, float]) -> None:
     """The unchanged model to rounding of its table, and a few percent of what an effect changes."""
     base, model = FringeModel.from_setup(setup), FringeModel.from_setup(setup, settings)
@@ -171,6 +172,7 @@ def test_a_hidden_effect_is_found_on_the_sky(setup: str, name: str, settings: di
         assert abs(item.value - value) < 5.0 * item.sigma, seed
 
 
+@pytest.mark.slow
 def test_a_map_that_is_known_is_held_at_its_place() -> None:
     """What a map lacks is no effect, however often fits start anew: the score of noise is that of noise."""
     frames, known = sky_frames_of("monocam", {}, 11, 1e5)

@@ -35,6 +35,7 @@ def _covariance(rng: np.random.Generator, sigma: float) -> np.ndarray:
 
 @pytest.mark.parametrize("sigma", first_is_quick([0.1, 1e-4, 1.0]))
 @pytest.mark.rng("draws are draws however well they are known")
+@pytest.mark.slow
 def test_draws_are_draws_however_well_they_are_known(rng: np.random.Generator, sigma: float) -> None:
     chances = []
     for _ in range(300):

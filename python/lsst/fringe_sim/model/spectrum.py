@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, named_units
 from ..notebook import InNotebook, axes_or_new
 from ..optics.system import OpticalSystem
 from ..optics.transfer_matrix import layer_absorption
@@ -21,6 +21,7 @@ __all__ = ["StackSpectrum", "spectrum_of"]
 FloatArray = NDArray[np.float64]
 
 
+@named_units
 @dataclass(frozen=True, eq=False, repr=False)
 class StackSpectrum(InNotebook):
     """Fractions of the incident photons over wavelength.
@@ -84,6 +85,7 @@ NEGLIGIBLE = 1e-3
 """A line that nobody would see in a picture from 0 to 1."""
 
 
+@named_units
 def spectrum_of(system: OpticalSystem, wavelength_nm: FloatArray, thickness_um: float) -> StackSpectrum:
     """Fractions for strictly monochromatic light, averaged over the angles of the beam.
 
