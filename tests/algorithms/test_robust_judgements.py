@@ -26,7 +26,7 @@ AMPLIFIER = "C13"
 Edit = Callable[[np.ndarray, RawAmplifier], None]
 
 
-def make(folder: Path, thickness: np.ndarray, shape: tuple[int, int] = SHAPE, **effects: float) -> MockRun:
+def make(folder: Path, thickness: np.ndarray, **effects: float) -> MockRun:
     return write_mock_flats(
         folder,
         setup="ts8_e2v",
@@ -34,7 +34,7 @@ def make(folder: Path, thickness: np.ndarray, shape: tuple[int, int] = SHAPE, **
         thickness_um=thickness,
         wavelengths_nm=[960.0],
         rng=np.random.default_rng(42),
-        size=f"{shape[1]}x{shape[0]}",
+        size=f"{SHAPE[1]}x{SHAPE[0]}",
         n_bias=1,
         effects={name.replace("__", "."): value for name, value in effects.items()},
     )
@@ -195,24 +195,6 @@ def test_adjacent_bad_columns_are_found(tmp_path: Path, width: int, factor: floa
     found = bad(charge.mask, frame)
     assert set(range(30, 30 + width)) <= set(found[AMPLIFIER])
     assert sum(map(len, found.values())) <= width + 1
-
-
-@pytest.mark.parametrize("width", [2, 3, 5])
-@pytest.mark.parametrize("factor", [0.97, 0.7])
-def test_adjacent_bad_columns_of_a_narrow_sensor_are_found(tmp_path: Path, width: int, factor: float) -> None:
-    """With amplifiers of eight columns and a border, they are no small part of what they are judged by."""
-    shape = (64, 64)
-    made = make(tmp_path, e2v_321(shape, sampling="window", corner=(2900, 600)), shape)
-    frame = RawFrame.read(made.flats[0].path)
-
-    def spoil(data: np.ndarray, amp: RawAmplifier) -> None:
-        columns = data[amp.imaging][:, 1 : 1 + width]
-        columns[:] = 27_000 + np.rint(factor * (columns - 27_000.0)).astype(data.dtype)
-
-    charge = assemble_charge(edited(frame, spoil), None, made.detector, FlatPrepOptions())
-    found = bad(charge.mask, frame)
-    assert set(range(1, 1 + width)) <= set(found[AMPLIFIER])
-    assert sum(map(len, found.values())) == width
 
 
 @pytest.mark.parametrize("contrast", [1.0, 0.13])

@@ -180,20 +180,9 @@ def _rise(profile: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64]
 
 
 def _usual_rise(rise: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """What a group must exceed by the fringes around it, of which a few defects are a small part.
-
-    Where the group and those that share columns with it are more than may exceed what is usual, as in a narrow
-    sensor, they are left out; the sensor is then closed to a ring, so that every other group counts once.
-    """
+    """What a group must exceed by the fringes around it, of which a few defects are a small part."""
     size = min(2 * (NEARBY + 8 * width) + 1, len(rise))
-    own = 2 * (width + 1) + 1
-    around = np.ones(size, dtype=np.bool_)
-    narrow = own > (1.0 - USUAL_PERCENT / 100.0) * size
-    if narrow and own < size:
-        around[size // 2 - width - 1 : size // 2 + width + 2] = False
-    usual: NDArray[np.float64] = percentile_filter(
-        np.abs(rise), USUAL_PERCENT, footprint=around, mode="wrap" if narrow else "reflect"
-    )
+    usual: NDArray[np.float64] = percentile_filter(np.abs(rise), USUAL_PERCENT, size, mode="reflect")
     return EXCEPTIONAL * usual
 
 
