@@ -145,9 +145,10 @@ def test_raw_frames_of_another_simulator(thicker_um: float, tmp_path: Path) -> N
     shape = (96, 128)
     sensor = ForeignSensor(thicker_um={INSULATION: thicker_um})
     flats = sensor.flats(WAVELENGTHS, broad_map(rng, (shape[0] * places, shape[1] * places)), places)
-    write_raw_frames(tmp_path, flats, 30_000.0, rng)
-    out = tmp_path / "verdict"
-    result = CliRunner().invoke(discover_command, [str(tmp_path), "--out", str(out)])
+    raws, out = tmp_path / "raws", tmp_path / "verdict"
+    raws.mkdir()
+    write_raw_frames(raws, flats, 30_000.0, rng)
+    result = CliRunner().invoke(discover_command, [str(raws), "--out", str(out)])
     assert result.exit_code == 0, result.output
     (path,) = out.glob("*.json")
     verdict = Verdict.from_json(path.read_text())
