@@ -263,17 +263,19 @@ class FitsProduct(InNotebook, ABC):
     def __repr__(self) -> str:
         """What it is, how large, and its numbers and names; no arrays."""
         shape = " x ".join(map(str, getattr(self, self.EXTENSIONS[0].field).shape))
-        values = ((card, getattr(self, card.field)) for card in self.CARDS)
-        told = (f", {card.field}={value!r}" for card, value in values if value not in ("", card.default))
+        told = (f", {card.field}={value!r}" for card, value in self._told())
         return f"{type(self).__name__}({shape}{''.join(told)})"
+
+    def _told(self) -> list[tuple[Card, Any]]:
+        """Numbers and names that are not the default."""
+        values = [(card, getattr(self, card.field)) for card in self.CARDS]
+        return [(card, value) for card, value in values if value not in ("", card.default)]
 
     def facts(self) -> dict[str, Any]:
         """Shape of its images, its numbers and names, and the share of the pixels that is masked."""
         shown: dict[str, Any] = {"shape": " × ".join(map(str, getattr(self, self.EXTENSIONS[0].field).shape))}
-        for card in self.CARDS:
-            value = getattr(self, card.field)
-            if value not in ("", card.default):
-                shown[card.what or card.field] = f"{value:g} {card.unit}" if card.unit else value
+        for card, value in self._told():
+            shown[card.what or card.field] = f"{value:g} {card.unit}" if card.unit else value
         mask: NDArray[Any] = getattr(self, "mask")  # noqa: B009
         return {**shown, "masked": f"{100.0 * np.mean(mask != 0):.3g} %"}
 
