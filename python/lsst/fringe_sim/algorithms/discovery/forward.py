@@ -521,28 +521,22 @@ class Forward:
         ``field_um`` (ny, nx). ``cells`` (n,): numbers of the cells; all by default. ``places_um`` (S, n):
         thicknesses of the cells; those of the field by default. Returns (W, S, n).
         """
-        outside = self._within_cells(self.table(settings), field_um, cells, places_um)
-        return self.on_island(name, settings, field_um, cells, places_um), outside
+        return (
+            self.within_cells(settings, field_um, cells, places_um, island=name),
+            self.within_cells(settings, field_um, cells, places_um),
+        )
 
-    def on_island(
+    def within_cells(
         self,
-        name: str,
         settings: Settings,
         field_um: FloatArray,
         cells: NDArray[np.intp] | None = None,
         places_um: FloatArray | None = None,
+        *,
+        island: str = "",
     ) -> FloatArray:
-        """The first of `on_and_off_island`."""
-        return self._within_cells(self._island_table(name, settings), field_um, cells, places_um)
-
-    def _within_cells(
-        self,
-        table: FloatArray,
-        field_um: FloatArray,
-        cells: NDArray[np.intp] | None,
-        places_um: FloatArray | None,
-    ) -> FloatArray:
-        """Light of a table in some cells as wide as the slopes of a field make them, ``(W, S, n)``."""
+        """One of the two of `on_and_off_island`: where the local effect of that name is, or outside of all."""
+        table = self._island_table(island, settings) if island else self.table(settings)
         own = np.arange(field_um.size) if cells is None else cells
         places = field_um.ravel()[own][np.newaxis] if places_um is None else places_um
         spread = [

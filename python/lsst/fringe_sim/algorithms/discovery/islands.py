@@ -85,7 +85,7 @@ def island_starts(
     (size,) = (item for item in coordinates if not item.place)
     sizes = _sizes(size)
     discs, about, none = [], Discs.of(problem.cells.seen), _active(settings, coordinates, size, sizes[0])
-    _, off = problem.forward.on_and_off_island(size.effect, none, state.thickness_um)
+    off = problem.forward.within_cells(none, state.thickness_um)
     for value in sizes:
         if value > size.neighbour:  # it looks like a smaller one
             break
@@ -384,7 +384,7 @@ def _change(
     """
     forward, thickness = problem.forward, state.thickness_um
     shift = _suited_shift(problem, state, name, active)
-    on = forward.on_island(name, active, thickness, None, (thickness + shift).reshape(1, -1))
+    on = forward.within_cells(active, thickness, None, (thickness + shift).reshape(1, -1), island=name)
     return (on - off).reshape(-1, *thickness.shape)
 
 

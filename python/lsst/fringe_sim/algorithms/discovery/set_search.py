@@ -169,7 +169,10 @@ class SetSearch:
         ]
         scores = self.selector.score(hypothesis.fit, of_pixels)
         # A score is no fit: beside a thickness in the wrong order, it may promise all that is left.
-        return not scores or self._leaves_much(self.selector.with_candidate(hypothesis, scores[0]))
+        if not scores:
+            return True
+        names = (*hypothesis.names, scores[0].name)
+        return self._leaves_much(self.selector.hypothesis(names, scores[0].start, hypothesis.fit))
 
     def _leaves_much(self, hypothesis: Hypothesis) -> bool:
         noise = self.selector.problem.cells.n_values
