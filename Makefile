@@ -8,7 +8,7 @@ PYTEST_ARGS ?=
 SHARE ?= 1/1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint types unit slow docs wheel-check bench clean
+.PHONY: help demo test test-all lint types checks unit slow docs wheel-check bench clean
 
 help:
 	@echo "make demo   install into .venv and run the whole chain on the built-in sensor (a few minutes)"
@@ -50,7 +50,12 @@ docs: $(VENV)/.ready-test
 wheel-check: $(VENV)/.ready-test
 	BIN="$(BIN)" bash scripts/check_wheel.sh
 
-test: lint types wheel-check unit
+# Two jobs at once: while types and wheel are checked in one process, tests take what is left of the processors.
+test: lint
+	@$(MAKE) -j 2 checks unit
+
+checks: types
+	@$(MAKE) wheel-check
 
 test-all: test
 	@$(MAKE) slow

@@ -16,7 +16,7 @@ constraints="$root/constraints/python-$version.txt"
 
 echo "Installing $(basename "$wheel") in a clean environment"
 "$bin/python" -m venv "$work/clean"
-"$work/clean/bin/python" -m pip install --quiet --disable-pip-version-check -c "$constraints" "$wheel"
+"$work/clean/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile -c "$constraints" "$wheel"
 
 echo "Smoke run from the wheel, outside the checkout"
 mkdir "$work/run" && cd "$work/run"

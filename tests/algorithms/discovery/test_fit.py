@@ -51,6 +51,7 @@ def held_at(problem: Problem, fit: Fit, position: float) -> float:
     ).chi2
 
 
+@pytest.mark.slow
 def test_curvature_is_that_of_the_misfit_with_everything_else_free(tilted, monkeypatch) -> None:
     problem, fit = tilted
     monkeypatch.setattr(fit_module, "CONVERGED", 1e-4)
@@ -60,6 +61,7 @@ def test_curvature_is_that_of_the_misfit_with_everything_else_free(tilted, monke
     assert fit.information[0, 0] == pytest.approx(profile, rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_prior_draws_a_large_effect_by_a_part_of_its_uncertainty_only(tilted, monkeypatch) -> None:
     problem, fit = tilted
     assert fit.position[0] > 10.0 * fit.coordinates[0].unit_step  # far out in the prior
@@ -68,6 +70,7 @@ def test_the_prior_draws_a_large_effect_by_a_part_of_its_uncertainty_only(tilted
     assert abs(fit.position[0] - free.position[0]) < 0.2 * fit.sigma[0]
 
 
+@pytest.mark.slow
 def test_a_part_does_not_lean_on_the_thickness_of_the_rest(tilted) -> None:
     """What a spline does where it is held by nothing made the fringes of the cells beside it too weak."""
     problem, fit = tilted

@@ -123,6 +123,7 @@ def test_cells_held_out_follow_a_fit_whose_field_is_another_than_without_effects
     np.testing.assert_array_equal(found[~held_out], fit.field.reshape(truth.shape)[~held_out])
 
 
+@pytest.mark.slow
 def test_cells_held_out_have_a_second_start_where_their_order_is_open(blurred) -> None:
     """One block of the unchanged model is an order off, which such weak fringes hardly tell before it is fitted."""
     strong, truth, sigma = blurred

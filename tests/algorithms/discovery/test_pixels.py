@@ -51,7 +51,7 @@ def _cube(thickness: np.ndarray, rng: np.random.Generator, *, points: bool) -> F
 @pytest.mark.parametrize("cell_px", first_is_quick([2, 1]))
 def test_the_fringes_are_averaged_over_the_area_of_a_cell(cell_px: int) -> None:
     """Of a plane whose fringes are four cells wide, inside, where the gradient is that of the plane."""
-    size = 48
+    size = 32
     y, x = np.indices((size, size))
     thickness = 15.0 + (0.06 * x + 0.04 * y) / cell_px
     light = _light(thickness, points=False)

@@ -122,12 +122,13 @@ class _NarrowCoating(ArCoating):
     parameters = (replace(ArCoating.parameters[0], bounds=(0.9, 1.1)),)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "key", "value", "named"),
     [
-        pytest.param(_NarrowCoating(), "ar_coating.scale", 1.103, False, marks=pytest.mark.slow),
+        (_NarrowCoating(), "ar_coating.scale", 1.103, False),
         (ArCoating(), "ar_coating.scale", 1.103, True),
-        pytest.param(LineTriangle(), "line_triangle.fraction", 1.0, True, marks=pytest.mark.slow),
+        (LineTriangle(), "line_triangle.fraction", 1.0, True),
     ],
 )
 def test_what_is_at_the_end_of_what_a_model_is_meant_for_is_not_named(effect, key, value, named) -> None:
