@@ -49,6 +49,11 @@ class FieldBasis(ABC):
     def gather(self, fields: FloatArray) -> FloatArray:
         """Transpose of `expand` for K fields: ``(K, ny, nx)`` to ``(M, K)``."""
 
+    @property
+    @abstractmethod
+    def matrix(self) -> sparse.csr_array:
+        """`expand` as a sparse matrix, one row per cell."""
+
     @abstractmethod
     def normal_matrix(self, curvature: FloatArray, prior: FloatArray | float = 0.0) -> NormalMatrix:
         """Normal matrix for the curvature ``(ny, nx)`` of the cells; ``prior`` is the precision of a coefficient."""
@@ -104,6 +109,11 @@ class SplineBasis(FieldBasis):
         partial = np.matmul(self.along_y.T, np.matmul(fields, self.along_x))
         return np.ascontiguousarray(partial.reshape(len(fields), -1).T)
 
+    @cached_property
+    def matrix(self) -> sparse.csr_array:
+        """Outer product of both directions; see `FieldBasis.matrix`."""
+        return sparse.kron(sparse.csr_array(self.along_y), sparse.csr_array(self.along_x), format="csr")
+
     def fit(self, field: FloatArray, weight: FloatArray) -> FloatArray:
         """Coefficients that continue the field evenly where it has no weight; see `FieldBasis.fit`.
 
@@ -138,10 +148,7 @@ class SplineBasis(FieldBasis):
         self, curvature: FloatArray, prior: FloatArray | float = 0.0
     ) -> NormalMatrix:
         """Banded matrix; see `FieldBasis.normal_matrix_with_changes`."""
-        parts = [
-            sparse.kron(sparse.csr_array(basis.along_y), sparse.csr_array(basis.along_x), format="csr")
-            for basis in (self, *self._changes)
-        ]
+        parts = [basis.matrix for basis in (self, *self._changes)]
         weighted = [
             sum(sparse.diags_array(curvature[row, column].ravel()) @ parts[column] for column in range(3))
             for row in range(3)
@@ -191,6 +198,11 @@ class CellBasis(FieldBasis):
     def gather(self, fields: FloatArray) -> FloatArray:
         """Cells themselves; see `FieldBasis.gather`."""
         return np.ascontiguousarray(fields.reshape(len(fields), -1).T)
+
+    @property
+    def matrix(self) -> sparse.csr_array:
+        """Unit matrix; see `FieldBasis.matrix`."""
+        return sparse.eye_array(self.size, format="csr")
 
     def normal_matrix(self, curvature: FloatArray, prior: FloatArray | float = 0.0) -> NormalMatrix:
         """Diagonal matrix; see `FieldBasis.normal_matrix`."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
+from scipy.sparse import csr_array
 
 from .channels import State
 from .discs import Disc, Discs
@@ -52,8 +55,8 @@ def best_thickness_step(state: State) -> tuple[Disc, float]:
 def _part_left(design: Design, curvature: FloatArray, radius: float) -> FloatArray:
     """Part of χ² of a disc about every cell that the smooth field of a fit does not take up."""
     shape = curvature.shape
-    stride = max(1, round(radius / MIDDLES_PER_RADIUS))
-    along = [np.unique(np.append(np.arange(0, side, stride), side - 1)).astype(float) for side in shape]
+    stride = math.ceil(radius / MIDDLES_PER_RADIUS)
+    along = [np.unique(np.append(np.arange(0, side, stride), side - 1)) for side in shape]
     middles = np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, 2)
     parts = [
         _parts_left(design, curvature, middles[first : first + DISCS_AT_ONCE], radius)
@@ -64,12 +67,17 @@ def _part_left(design: Design, curvature: FloatArray, radius: float) -> FloatArr
     return np.asarray(between(np.stack(everywhere, axis=-1)))
 
 
-def _parts_left(design: Design, curvature: FloatArray, middles: FloatArray, radius: float) -> FloatArray:
-    """Part that is left of discs about some places."""
-    down, along = np.arange(curvature.shape[0])[:, np.newaxis], np.arange(curvature.shape[1])
-    row, column = middles[:, :1, np.newaxis], middles[:, 1:, np.newaxis]
-    discs = (np.hypot(down - row, along - column) <= radius) * curvature
-    alone = discs.sum(axis=(1, 2))
-    gathered = design.basis.gather(discs)
+def _parts_left(
+    design: Design, curvature: FloatArray, middles: NDArray[np.int64], radius: float
+) -> FloatArray:
+    """Part that is left of discs about some cells."""
+    reach = math.floor(radius)
+    side = np.arange(-reach, reach + 1)
+    cells = middles[:, np.newaxis] + np.argwhere(np.hypot(side[:, np.newaxis], side) <= radius) - reach
+    disc, number = np.nonzero(((cells >= 0) & (cells < curvature.shape)).all(axis=-1))
+    place = np.ravel_multi_index(tuple(cells[disc, number].T), curvature.shape)
+    discs = csr_array((curvature.ravel()[place], (disc, place)), shape=(len(middles), curvature.size))
+    alone = discs.sum(axis=1)
+    gathered = (discs @ design.basis.matrix).toarray().T
     taken = (gathered * design.normal.solve(gathered)).sum(axis=0)
     return np.asarray(1.0 - np.divide(taken, alone, out=np.ones(len(alone)), where=alone > 0.0))
