@@ -93,7 +93,6 @@ class Medium:
         low, high = self.wavelength_range_nm
         check_range(f"wavelength [nm] in medium {self.name}", wavelength, low, high)
         check_range("temperature [K]", temperature, *TEMPERATURE_RANGE_K)
-        wavelength, temperature = np.broadcast_arrays(wavelength, temperature)
         n, k = self._index(wavelength, temperature)
         own_n, own_k = n, k
         for name, part in self.toward:
@@ -103,7 +102,9 @@ class Medium:
         cauchy = self.dispersion_um2 * ((1000.0 / wavelength) ** 2 - (1000.0 / 960.0) ** 2)
         n = n * self.index_scale + self.index_offset + cauchy
         k = k * self.extinction_scale + self.extinction_offset
-        return n + 1j * k
+        index = np.empty(np.broadcast_shapes(wavelength.shape, temperature.shape), dtype=complex)
+        index[...] = n + 1j * k
+        return index
 
     def modified(self, **changes: object) -> Medium:
         """Return a copy with some of the modifiers set.
@@ -140,11 +141,31 @@ class _TabulatedIndex:
     def __call__(
         self, wavelength: NDArray[np.float64], temperature: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        if max(wavelength.size, temperature.size) > _MOST_REMEMBERED:
+            return self._computed(wavelength, temperature)
+        return _remembered(self, *((x.tobytes(), x.shape) for x in (wavelength, temperature)))
+
+    def _computed(
+        self, wavelength: NDArray[np.float64], temperature: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         n = self.n(wavelength)
         k = np.zeros(wavelength.shape) if self.log_k is None else np.exp(self.log_k(wavelength))
         if self.law is None:
             return n, k
         return self.law(n, k, wavelength, temperature)
+
+
+_MOST_REMEMBERED = 4096
+"""Wavelengths whose index is remembered: a fit asks for the same few hundred thousands of times."""
+
+
+@functools.lru_cache(maxsize=64)
+def _remembered(
+    table: _TabulatedIndex, *values: tuple[bytes, tuple[int, ...]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Index of a table for wavelengths and temperatures, not to be changed."""
+    wavelength, temperature = (np.frombuffer(text).reshape(shape) for text, shape in values)
+    return table._computed(wavelength, temperature)
 
 
 @dataclass(frozen=True, eq=False)
