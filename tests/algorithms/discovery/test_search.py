@@ -75,6 +75,12 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
     case = draw_case("none", np.random.default_rng(11), size=SIZE)
     verdict = discover(case.cube, case.setup, rng=np.random.default_rng(0))
     assert verdict.verdict == "no_discrepancy"
+    assert verdict.size["of_fringes"] < verdict.size["of_fringes_at_most"] < 0.1
+    assert (
+        replace(verdict, size={**verdict.size, "of_counts": 0.0})
+        .size_text()
+        .endswith("% of the fringes (95 %)")
+    )
     assert verdict.effects == ()
     # Flats do not see the spectrum of the night sky.
     assert not {"sky_continuum", "oh_bands"} & {item["name"] for item in verdict.candidates}

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
+from scipy.stats import chi2 as chi2_distribution
 
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
@@ -35,6 +36,9 @@ MUCH_WORSE = 4.0
 
 NEAR_ISLAND = 8
 """Cells about an island into which a smooth thickness may be bent."""
+
+CONFIDENCE = 0.95
+"""Of the upper limit of a disagreement."""
 
 FEWEST_WAVELENGTHS = 8
 """Wavelengths from which on every fourth is left out at once."""
@@ -204,18 +208,30 @@ def _without_single_wavelengths(problem: Problem, null: Fit, final: Fit) -> Held
 
 def misfit_rms(problem: Problem, fit: Fit) -> float:
     """Rms of data minus model, corrected for the freedom of the nuisances."""
+    return problem.cells.noise_rms * math.sqrt(fit.chi2 / _degrees(problem, fit))
+
+
+def _degrees(problem: Problem, fit: Fit) -> int:
+    """Values that are left when the nuisances are fitted."""
     free = _field_freedom(problem) + problem.level_basis.shape[1] + len(fit.coordinates)
-    return problem.cells.noise_rms * math.sqrt(fit.chi2 / max(problem.cells.n_values - free, 1))
+    return max(problem.cells.n_values - free, 1)
 
 
 def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
     """Size of what a fit leaves beyond noise, as `Verdict.size` states it."""
-    noise = problem.cells.noise_rms
-    counts = math.sqrt(max(misfit_rms(problem, fit) ** 2 - noise**2, 0.0))
+    noise, degrees = problem.cells.noise_rms, _degrees(problem, fit)
+    counts, most = (
+        noise * math.sqrt(max(fit.chi2 / expected - 1.0, 0.0))
+        for expected in (degrees, float(chi2_distribution.isf(CONFIDENCE, degrees)))
+    )
     level, _ = problem.amplitudes(fit.levels)
     pattern = (problem.expected_of(fit) / level - 1.0)[:, problem.cells.seen]
     fringes = math.sqrt(float(pattern.var(axis=1).mean())) if pattern.size else 0.0
-    return {"of_counts": counts, "of_fringes": counts / fringes if fringes > 0.0 else math.nan}
+    return {
+        "of_counts": counts,
+        "of_fringes": counts / fringes if fringes > 0.0 else math.nan,
+        "of_fringes_at_most": most / fringes if fringes > 0.0 else math.nan,
+    }
 
 
 def _field_freedom(problem: Problem) -> int:

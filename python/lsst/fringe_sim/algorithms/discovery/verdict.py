@@ -161,7 +161,8 @@ class Verdict:
         Whether the search came to its end; otherwise it was stopped, and this is the best answer so far.
     size : `dict`
         How large the disagreement with the unchanged model is: ``of_counts``, rms relative to the mean counts without
-        what noise adds, and ``of_fringes``, the same relative to the rms of the fringes.
+        what noise adds, ``of_fringes``, the same relative to the rms of the fringes, and ``of_fringes_at_most``, its
+        upper limit at 95 % confidence.
     """
 
     verdict: str
@@ -306,7 +307,12 @@ class Verdict:
         """How large the disagreement is, for people."""
         counts, fringes = self.size["of_counts"], self.size["of_fringes"]
         if counts == 0.0:
-            return "size of the disagreement: none beyond the noise"
+            found = (
+                "none beyond the noise" if self.verdict == "no_discrepancy" else "too small to be measured"
+            )
+            most = self.size.get("of_fringes_at_most", math.nan)
+            limit = f", at most {100.0 * most:.2g} % of the fringes (95 %)" if math.isfinite(most) else ""
+            return f"size of the disagreement: {found}{limit}"
         return (
             f"size of the disagreement: {100.0 * fringes:.2g} % of the fringes ({counts:.2g} of the counts)"
         )
