@@ -39,6 +39,9 @@ class MadeUpFits:
     def others(self, hypothesis: Hypothesis) -> list[str]:
         return ["partner", *(name for name in SINGLES if name not in hypothesis.names)]
 
+    def score_alike(self, like: Fit, bases: list[Hypothesis]) -> list[list[Candidate]]:
+        return [self.score(base.fit, self.others(base), scan=False) for base in bases]
+
     def score(self, fit: Fit, names: list[str], *, scan: bool) -> list[Candidate]:
         (parent,) = (item.effect for item in fit.coordinates)
         promised = ((name, self.promises.get((parent, name), 0.0)) for name in names)

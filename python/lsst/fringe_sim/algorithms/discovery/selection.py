@@ -313,14 +313,43 @@ class Selector:
 
     def _by_derivative(self, state: State, fit: Fit, name: str) -> tuple[Candidate | None, FloatArray]:
         """Score test of an effect by its derivatives, and these."""
-        coordinates = self.coordinates[name]
-        try:
-            features = self.features(state, fit, name)
-        except InputError:
+        features = self._features_if_any(state, fit, name)
+        if features is None:
             return None, np.zeros(0)
+        return self._along(state, name, features), features
+
+    def _along(self, state: State, name: str, features: FloatArray) -> Candidate:
+        """Score test of an effect whose derivatives are known."""
         score, information = state.design.project(FullColumns(features), state.residual)
-        start, gain, degrees = bounded_minimum(score, information, coordinates)
-        return Candidate(name, gain, degrees, start, gain), features
+        start, gain, degrees = bounded_minimum(score, information, self.coordinates[name])
+        return Candidate(name, gain, degrees, start, gain)
+
+    def score_alike(self, like: Fit, bases: Sequence[Hypothesis]) -> list[list[Candidate]]:
+        """Score tests of all other effects beside each of some sets, by derivatives at a fit like those of the sets.
+
+        Sets that explain about as much predict about the same. What each leaves is its own, and decides.
+        """
+        at, states = self.state(like), [self.state(base.fit) for base in bases]
+        found: list[list[Candidate]] = [[] for _ in bases]
+        for name in self.coordinates:
+            if self.is_sought(name):
+                continue
+            features = None if self.problem.forward.is_island(name) else self._features_if_any(at, like, name)
+            for own, base, state in zip(found, bases, states, strict=True):
+                if name in base.names:
+                    continue
+                if features is None:
+                    own += self.score(base.fit, [name])
+                else:
+                    own.append(self._along(state, name, features))
+        return found
+
+    def _features_if_any(self, state: State, fit: Fit, name: str) -> FloatArray | None:
+        """Derivatives of an effect; `None` if it does not go with those of the fit."""
+        try:
+            return self.features(state, fit, name)
+        except InputError:
+            return None
 
     def _may_be_bent(self, name: str) -> bool:
         """Whether the finite signature of an effect may be another than its derivatives."""

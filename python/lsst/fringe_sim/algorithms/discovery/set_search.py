@@ -34,7 +34,7 @@ MUCH_OF_THE_BEST = 0.3
 """Part of what the best single effect explains that one must which may take narrow fringes away."""
 
 SCANNED_PARENTS = 2
-"""Sets, best first, to which effects are added by their finite signatures, and not by their derivatives alone."""
+"""Sets, best first, to which effects are added by finite signatures, and not by derivatives at the first alone."""
 
 SHIFTING_EFFECTS = 3
 """Effects that are looked for in other fringe orders, each with the set with which it is likeliest."""
@@ -350,9 +350,15 @@ class SetSearch:
         promise is compared. Once one leaves noise, those that promise far too little to come near it are not fitted.
         """
         promised: dict[frozenset[str], tuple[float, Hypothesis, Candidate]] = {}
-        for place, parent in enumerate(self._nearly_as_good(current)):
-            scan = place < SCANNED_PARENTS  # derivatives alone take a tenth of the time
-            for candidate in self.selector.score(parent.fit, self.selector.others(parent), scan=scan):
+        parents = self._nearly_as_good(current)
+        first, rest = parents[:SCANNED_PARENTS], parents[SCANNED_PARENTS:]
+        scores = [
+            self.selector.score(parent.fit, self.selector.others(parent), scan=True) for parent in first
+        ]
+        if rest:
+            scores += self.selector.score_alike(first[0].fit, rest)
+        for parent, candidates in zip(parents, scores, strict=True):
+            for candidate in candidates:
                 key = frozenset((*parent.names, candidate.name))
                 left = parent.fit.chi2 - candidate.promise
                 if candidate.promise > WORTH_FITTING and left < promised.get(key, (math.inf,))[0]:
