@@ -169,6 +169,15 @@ def test_an_error_in_a_flat_names_its_file(tmp_path) -> None:
     assert caught.value.source == str(raw)
 
 
+def test_a_sensor_of_another_vendor_is_refused(raws, tmp_path, capsys) -> None:
+    """Its films are others; the message names a set-up that has them."""
+    assert run(["fit", str(raws), "--setup", "ts8_itl", "--out", str(tmp_path / "fit")]) == 1
+    said = capsys.readouterr().err
+    assert "of e2v" in said
+    assert "ts8_e2v" in said
+    assert not (tmp_path / "fit").exists()
+
+
 def test_two_sensors_are_refused(copy, tmp_path, capsys) -> None:
     with fits.open(flat_at(copy, 930), mode="update") as hdus:
         hdus[0].header["LSST_NUM"] = "E2V-CCD250-357"

@@ -194,3 +194,12 @@ def test_an_image_of_another_size_beside_a_foreign_map_is_refused(tmp_path: Path
     fits.HDUList(images).writeto(tmp_path / "map.fits")
     with pytest.raises(InputError, match=f"shape of {name}"):
         p.ThicknessMap.read_any(tmp_path / "map.fits")
+
+
+def test_a_pattern_that_the_shell_has_spelled_out_is_one(
+    frames: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(frames.parent)
+    (frames / "b.fits").write_bytes((frames / "a.fits").read_bytes())
+    assert run(["fit", "r/a.fits", "r/b.fits", "--out", "r"]) == 1
+    assert "not in r/*.fits, which is read" in capsys.readouterr().err

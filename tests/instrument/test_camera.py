@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.instrument.camera import Camera, Detector
+from lsst.fringe_sim.instrument.setup import Setup, setup_names
 from lsst.fringe_sim.resources import read_table
 
 CAMERAS = ("lsstCam", "ts8", "monocam", "hsc")
@@ -211,3 +212,17 @@ def test_cut_down_sensor_keeps_its_layout(rows: int, columns: int, vendor: int) 
 def test_sizes_that_amplifiers_cannot_share_are_refused(shape: tuple[int, int]) -> None:
     with pytest.raises(InputError, match="positive multiples of 2 rows and 8 columns"):
         Camera.from_name("lsstCam").detector(37).cut_down(shape)
+
+
+@pytest.mark.parametrize("name", setup_names())
+def test_the_sensor_of_a_setup_is_of_the_vendor_of_its_films(name: str) -> None:
+    setup = Setup.from_name(name)
+    own = Camera.from_name(setup.camera).detector(setup.detector)
+    assert own.vendor.lower() in setup.stack.name.lower()
+    setup.refuse_other_vendor(own)
+
+
+def test_a_sensor_of_another_vendor_has_setups_of_its_own() -> None:
+    sensor = Camera.from_name("ts8").detector("RTM-014_S11")
+    with pytest.raises(InputError, match=r"of ITL.*ts8_itl"):
+        Setup.from_name("ts8_e2v").refuse_other_vendor(sensor)

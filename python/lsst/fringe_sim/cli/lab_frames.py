@@ -12,7 +12,7 @@ import click
 from ..algorithms.flat_prep import combine_biases, prepare_flat
 from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..errors import FrameFormatError, FringeSimError, InputError
-from ..instrument.camera import Camera, Detector
+from ..instrument.camera import VENDORS, Camera, Detector
 from ..instrument.raw_files import find_raw_files, pixel_digest
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..model import Setup
@@ -90,8 +90,8 @@ class LabSeries(Series[RawMetadata]):
                 yield frame
                 advance()
 
-        bias = combine_biases(frames(self.biases), options) if self.biases else None
         sensor = self._sensor(setup)
+        bias = combine_biases(frames(self.biases), options) if self.biases else None
 
         def prepared(frame: RawFrame) -> FringeFlat:
             try:
@@ -112,10 +112,14 @@ class LabSeries(Series[RawMetadata]):
     def _sensor(self, setup: Setup) -> Detector:
         camera = Camera.from_name(setup.camera)
         try:
-            return camera.detector(self.serial)
+            sensor = camera.detector(self.serial)
         except FringeSimError:
             # A sensor that is not in the tables is read with the gains of the set-up's own.
-            return replace(camera.detector(setup.detector), serial="", name=self.serial or setup.detector)
+            own = camera.detector(setup.detector)
+            vendor = VENDORS.get(self.serial.partition("-")[0].upper(), own.vendor)
+            sensor = replace(own, serial="", name=self.serial or setup.detector, vendor=vendor)
+        setup.refuse_other_vendor(sensor)
+        return sensor
 
 
 class PlainSeries(Series[PlainImage]):

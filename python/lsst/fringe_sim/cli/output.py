@@ -5,10 +5,11 @@ from __future__ import annotations
 import functools
 import os
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from glob import has_magic, iglob
+from glob import escape, has_magic, iglob
 from pathlib import Path
 from typing import Any
 
@@ -194,14 +195,22 @@ def refuse_among_inputs(folder: Path, inputs: Iterable[str]) -> None:
 
 
 def _inputs_of(context: click.Context, values: dict[str, Any]) -> list[str]:
-    """What a command is given to read: its arguments, and options with a path."""
-    given = []
+    """What a command is given to read: its arguments, and options with a path.
+
+    Several files of a folder are what a shell makes of a pattern, which finds more in a next run.
+    """
+    given: list[str] = []
     for parameter in context.command.params:
         value = values.get(parameter.name or "")
         if value is not None and (
             isinstance(parameter, click.Argument) or isinstance(parameter.type, click.Path)
         ):
-            given += [str(item) for item in (value if isinstance(value, tuple) else (value,))]
+            own = [str(item) for item in (value if isinstance(value, tuple) else (value,))]
+            files = Counter((Path(item).parent, Path(item).suffix) for item in own if Path(item).is_file())
+            given += own
+            given += [
+                f"{escape(str(folder))}/*{end}" for (folder, end), number in files.items() if number > 1
+            ]
     return given
 
 

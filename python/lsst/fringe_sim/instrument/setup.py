@@ -22,6 +22,7 @@ from ..resources import list_resources, read_user_yaml, read_yaml
 
 if TYPE_CHECKING:
     from ..optics.system import OpticalSystem
+    from .detector import Detector
 
 __all__ = ["Setup", "setup_names"]
 
@@ -104,6 +105,30 @@ class Setup(InNotebook):
     airmass: float
     wavelength_accuracy_nm: float = WAVELENGTH_ACCURACY_NM
     laboratory_temperature_k: float | None = None
+
+    def refuse_other_vendor(self, detector: Detector) -> None:
+        """Refuse a sensor of another vendor than the set-up's own, whose films are others.
+
+        Raises
+        ------
+        InputError
+            It is one; the message names the set-ups that are meant for it.
+        """
+        own = _vendor_of(self)
+        if detector.vendor != own:
+            others = [
+                name
+                for name in setup_names()
+                if (setup := _shipped(name)).kind == self.kind
+                and setup.camera == self.camera
+                and _vendor_of(setup) == detector.vendor
+            ]
+            meant = " or ".join([f"a set-up for {detector.vendor}", *others])
+            raise InputError(
+                "sensor",
+                f"{detector.serial or detector.name} of {detector.vendor}",
+                f"one of {own}, which set-up {self.name} is for; or {meant}",
+            )
 
     def facts(self) -> dict[str, Any]:
         """Sensor, temperature and light, with units."""
@@ -257,6 +282,13 @@ class Setup(InNotebook):
 def setup_names() -> tuple[str, ...]:
     """Names of the set-ups shipped with the package."""
     return tuple(name.removesuffix(".yaml") for name in list_resources("setups"))
+
+
+def _vendor_of(setup: Setup) -> str:
+    """Vendor of the set-up's own sensor."""
+    from .camera import Camera
+
+    return Camera.from_name(setup.camera).detector(setup.detector).vendor
 
 
 @functools.lru_cache(maxsize=32)

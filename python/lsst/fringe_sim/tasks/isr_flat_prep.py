@@ -162,6 +162,8 @@ class IsrFlatPrepTask(PipelineTask):
         InputError
             The frame cannot be used; it says why.
         """
+        for note in raw.metadata.notes:
+            self.log.warning("%s: %s", detector.name, note)
         setup = self.config.setup_of(detector.raft)
         flat = prepare_flat(
             raw,

@@ -169,8 +169,10 @@ class FringeModelConfig(CameraConfig):
         return ModelChoice(setup, effects)
 
     def choice_of(self, detector: Detector) -> ModelChoice:
-        """Set-up and effects of a sensor."""
-        return self.choice(detector.raft, detector.name)
+        """Set-up and effects of a sensor; `InputError` if the set-up is for those of another vendor."""
+        choice = self.choice(detector.raft, detector.name)
+        Setup.from_name(choice.setup).refuse_other_vendor(detector)
+        return choice
 
     @property
     def effects_by_raft(self) -> dict[str, dict[str, float]]:
