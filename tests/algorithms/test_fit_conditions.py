@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from contextlib import suppress
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -11,9 +14,10 @@ from slow_cases import first_is_quick
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.algorithms.thickness_fit import Nuisances
 from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import FringeCube, mask_bits
+from lsst.fringe_sim.products import FlatExposures, FringeCube, mask_bits
 
 HALF_ORDER_UM = 0.15
 SHAPE = (160, 180)
@@ -136,3 +140,21 @@ def test_unequal_noise_counts(model, rng) -> None:
     assert pull[:80, :90].std() == pytest.approx(1.0, abs=0.1)
     assert pull[80:].std() == pytest.approx(1.0, abs=0.1)
     assert np.median(fitted.sigma[:80, :90]) > 2.0 * np.median(fitted.sigma[80:])
+
+
+@pytest.mark.parametrize("seed", [3, 4, 7, 13])
+def test_a_pixel_beyond_measure_where_there_are_no_fringes_is_no_traceback(seed: int, model) -> None:
+    """At 720 nm the model has no fringes: the contrast that such a pixel asks for is beyond all numbers."""
+    rng = np.random.default_rng(seed)
+    thickness = 13.0 + 0.2 * rng.random((4, 6))
+    response = model.response(thickness, np.linspace(880.0, 990.0, 3))
+    image = response / response.mean() * (1.0 + 0.003 * rng.standard_normal(response.shape))
+    image[0, 0, 0] = rng.choice([1871.0, 1e30, -1e4, 3e38])
+    hidden = rng.random(image.shape) < rng.choice([0, 0.5])
+    exposures = FlatExposures(np.full(3, 720.0), np.array(2.0), np.array(173.0))
+    variance = np.full(image.shape, 1e-4, np.float32)
+    cube = FringeCube(image.astype(np.float32), variance, hidden.astype(np.int32), exposures, "relative")
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with suppress(InputError):
+            assert fit_thickness(cube, model, "global", range_um=(12.5, 13.5)).mask.all()

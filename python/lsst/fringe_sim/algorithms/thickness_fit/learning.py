@@ -73,12 +73,23 @@ def learn(
     fit = problem.normalised(fit, thickness)
     for _ in range(rounds):
         before = fit
-        thickness, fit = problem.step(fit, thickness)
+        moved, fit = problem.step(fit, thickness)
+        if not (_is_finite(fit) and np.isfinite(moved).all()):
+            # Fringes that the model hardly has would need a contrast beyond all numbers.
+            fit = before
+            break
+        thickness = moved
         # A mean that follows the thickness one step behind lets both swing; a free level makes up for any mean.
         fit = fit if free.patterned else problem.normalised(fit, thickness)
         if _change(before, fit) < _TOLERANCE:
             break
     return problem.conclude(fit, thickness)
+
+
+def _is_finite(fit: NuisanceFit) -> bool:
+    """Whether all that was learned is a number."""
+    learned = (fit.contrast, fit.shift_nm, fit.fading, fit.overtones, fit.coefficients)
+    return all(np.isfinite(np.asarray(each, dtype=float)).all() for each in learned if each is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +147,7 @@ class _Problem:
             value[:, :wavelengths] = (1.0 + value[:, :wavelengths]) / light - 1.0
         found = np.full_like(thickness, np.nan)
         refine_row(value, self.cells.weight, table, fitted.start_um, fitted.step_um, thickness, found)
+        found = np.where(np.isfinite(found), found, thickness)
         place = np.clip((found.astype(float) - fitted.start_um) / fitted.step_um, 2.0, len(table) - 4.0)
 
         def curve(at: FloatArray) -> FloatArray:
