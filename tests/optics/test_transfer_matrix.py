@@ -15,7 +15,7 @@ from lsst.fringe_sim.errors import InputError, OutOfRangeError, StackError
 from lsst.fringe_sim.optics import layer_absorption
 
 CASES_PER_EXAMPLE = 100
-EXAMPLES = 60
+EXAMPLES = 120
 
 Case = tuple[np.ndarray, np.ndarray, float, float]
 

@@ -13,6 +13,7 @@ from scipy.stats import chi2 as chi2_distribution
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
 from .islands import ANOTHER_ORDER, thickness_on_islands
+from .verdict import CONFIDENCE
 
 __all__ = [
     "HeldOut",
@@ -36,9 +37,6 @@ MUCH_WORSE = 4.0
 
 NEAR_ISLAND = 8
 """Cells about an island into which a smooth thickness may be bent."""
-
-CONFIDENCE = 0.95
-"""Of the upper limit of a disagreement."""
 
 FEWEST_WAVELENGTHS = 8
 """Wavelengths from which on every fourth is left out at once."""

@@ -28,6 +28,10 @@ __all__ = [
 VERDICTS = ("named", "no_discrepancy", "unexplained")
 
 
+CONFIDENCE = 0.95
+"""Of the upper limit of a disagreement: a convention of how limits are stated, which decides nothing."""
+
+
 def probability_text(probability: float) -> str:
     """A probability to three digits, rounded down: what missed a threshold does not read as if it had reached it.
 
@@ -311,8 +315,9 @@ class Verdict:
                 "none beyond the noise" if self.verdict == "no_discrepancy" else "too small to be measured"
             )
             most = self.size.get("of_fringes_at_most", math.nan)
-            limit = f", at most {100.0 * most:.2g} % of the fringes (95 %)" if math.isfinite(most) else ""
-            return f"size of the disagreement: {found}{limit}"
+            if math.isfinite(most):
+                found += f", at most {100.0 * most:.2g} % of the fringes ({100.0 * CONFIDENCE:g} %)"
+            return f"size of the disagreement: {found}"
         return (
             f"size of the disagreement: {100.0 * fringes:.2g} % of the fringes ({counts:.2g} of the counts)"
         )

@@ -69,6 +69,10 @@ def rank_orders(
         Thicknesses that are possible [µm].
     """
     thickness, here = learn(cells, base, free, start)
+    if not np.isfinite(
+        here.chi2
+    ):  # no order describes these flats with any likelihood: each is as good as the next
+        return CommonOrder(0.0, here, 0.0, 0.5)
     tried, places = {0.0: here}, {0.0: thickness}
 
     def ask(shift: float, side: float) -> None:
@@ -93,12 +97,10 @@ def rank_orders(
     for side in (-1.0, 1.0):
         shift = side
         ask(shift, side)
-        while shift in places and abs(shift) < _MOST_ORDERS and not clear(shift):
+        while abs(shift) < _MOST_ORDERS and not clear(shift):
             shift += side
             ask(shift, side)
     cost = costs()
-    if not np.isfinite(cost[0.0]):  # no description of these flats is one of any likelihood
-        return CommonOrder(0.0, here, 0.0, 0.5)
     best = min(cost, key=lambda shift: cost[shift])
     excess = np.array([cost[shift] - cost[best] for shift in tried if shift != best])
     odds = float(np.exp(-0.5 * excess).sum())

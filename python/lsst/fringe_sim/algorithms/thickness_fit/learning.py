@@ -89,7 +89,7 @@ def learn(
 def _is_finite(fit: NuisanceFit) -> bool:
     """Whether all that was learned is a number."""
     learned = (fit.contrast, fit.shift_nm, fit.fading, fit.overtones, fit.coefficients)
-    return all(np.isfinite(np.asarray(each, dtype=float)).all() for each in learned if each is not None)
+    return all(np.isfinite(each).all() for each in learned)
 
 
 @dataclass(frozen=True, eq=False)

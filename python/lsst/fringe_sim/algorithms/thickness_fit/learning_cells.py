@@ -79,8 +79,8 @@ def sample_blocks(
         Thickness of one order [µm].
     """
     _, ny, nx = data.shape
-    unknown = np.nan_to_num(phase_sigma, nan=np.inf)  # no phase at all: blocks as large as they may be
-    side = int(np.clip(np.ceil(unknown / _PHASE_SIGMA), 1, min(_LARGEST_BLOCK, ny, nx)))
+    phase_sigma = np.nan_to_num(phase_sigma, nan=np.inf)  # no phase at all: blocks as large as they may be
+    side = int(np.clip(np.ceil(phase_sigma / _PHASE_SIGMA), 1, min(_LARGEST_BLOCK, ny, nx)))
     rng = np.random.default_rng(0)
     count = min(_MOST_BLOCKS, (ny // side) * (nx // side))
     place = np.sort(rng.choice((ny // side) * (nx // side), count, replace=False))
