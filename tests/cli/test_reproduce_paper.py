@@ -28,6 +28,7 @@ OPEN = {
     "row_ratio",
     "lines_strength",
     "red_bands",
+    "walk_slips_foreign",
 }
 """Where neither the paper nor a correction is met; each has a reason in the table."""
 

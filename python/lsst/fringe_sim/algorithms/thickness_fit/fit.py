@@ -167,7 +167,6 @@ def fit_thickness(
         pixels = found.pixels
         slip = slip_probability(found, out=found.border_slip)
         notes |= {"ORDERUM": round(found.order_um, 6), "NORMALIS": found.normalisation}
-        notes |= slope_cards(pixels.value, found.order_um)
         notes["CELLPX"] = int(np.diff(found.cells.y_edges).max())
         flats = flat_fit(found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
         coarse = found.contrast_map
@@ -339,6 +338,9 @@ def _assemble(
 
     run_threaded(flag, -(-len(mask) // _ROWS), threads)
     notes = dict(notes) | {"NWAVE": len(cube.wavelength_nm), "MISFIT": round(scale, 4)}
+    if "ORDERUM" in notes:
+        # A pixel in a wrong order is no slope.
+        notes |= slope_cards(np.where(mask == 0, pixels.value, np.float32(np.nan)), notes["ORDERUM"])
     return ThicknessMap(
         pixels.value, pixels.sigma, pixels.chi2, slip, mask, layer, notes, used, cube.detector
     )
