@@ -157,7 +157,8 @@ def test_noise_is_seeded(thickness, tmp_path) -> None:
     [
         (["--setup", "ts8_e2v"], "behind a telescope"),
         (["--detector", "R22_S19"], "R22_S1"),
-        (["--exptime", "-3"], "positive"),
+        (["--exptime", "-3"], "above 0"),
+        (["--exptime", "1e30"], "1e+06"),
         (["--night", "--exptime", "30"], "--night"),
         (["--effect", "epoxy_absorbtion.k=0.1"], "did you mean epoxy_absorption"),
     ],

@@ -223,9 +223,19 @@ def test_the_place_of_a_rebuilt_raft_is_said() -> None:
 def test_what_is_taken_for_granted_is_said() -> None:
     assert interpret(TS8_HEADER).notes == ()
     assert interpret(LSSTCAM_HEADER).notes == ()
-    (note,) = interpret(TS8_HEADER, TSTAND=None, RAFTBAY="R11", SLOTNAME="S01").notes
-    assert "lsstCam" in note
+    (note,) = interpret(TS8_HEADER, TSTAND=None).notes
+    assert "ts8" in note
     assert "TSTAND" in note
+
+
+@pytest.mark.parametrize("stand", [None, "BOT"])
+def test_a_sensor_of_both_cameras_needs_one_of_them_named(stand: str | None) -> None:
+    """Its detector and exposure numbers are those of the camera."""
+    place = {"TSTAND": stand, "RAFTBAY": "R11", "SLOTNAME": "S01"}
+    with pytest.raises(FrameFormatError, match=r"TSTAND is .*INSTRUME"):
+        interpret(TS8_HEADER, **place)
+    assert interpret(TS8_HEADER, **place, INSTRUME="LSST-TS8").camera == "ts8"
+    assert interpret(TS8_HEADER, **place, INSTRUME="LSSTCam").camera == "lsstCam"
 
 
 # Files ----------------------------------------------------------------------------------------------------
@@ -285,6 +295,22 @@ def test_an_hdu_may_repeat_what_the_first_says(raw: Path) -> None:
         for hdu in hdus[1:]:
             hdu.header.update({"MONOWL": 960.0, "LSST_NUM": "E2V-CCD250-321-Dev", "CCDTEMP": -90.0})
     assert RawFrame.read(raw).metadata.notes == ()
+
+
+@pytest.mark.parametrize("keyword", ["CCDTEMP", "SENSTEMP"])
+def test_a_broken_reading_of_the_temperature_is_not_used_and_said(raw: Path, keyword: str) -> None:
+    with fits.open(raw, mode="update") as hdus:
+        hdus[3].header[keyword] = -260.0
+    for read in (read_raw_metadata, lambda path: RawFrame.read(path).metadata):
+        metadata = read(raw)
+        assert metadata.temperature_k == pytest.approx(273.15 - 90.5)
+        (note,) = metadata.notes
+        assert f"{keyword} of SEGMENT" in note
+
+
+def test_a_broken_reading_alone_is_refused(tmp_path: Path) -> None:
+    write_raw(tmp_path / "raw.fits", {"CCDTEMP": -260.0})
+    both_refuse(tmp_path / "raw.fits", "CCDTEMP is -260")
 
 
 def test_keywords_that_nobody_knows_are_named(raw: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,6 +62,20 @@ def test_bias_and_flats_say_which_sensor_and_how(bias: CombinedBias, flats: list
     assert {flat.bandwidth_fwhm_nm for flat in flats} == {2.0}
     assert {flat.metadata["SETUP"] for flat in flats} == {"ts8_e2v"}
     assert {flat.metadata["SMOOTHPX"] for flat in flats} == {0.0}
+
+
+def test_what_is_taken_for_granted_of_a_frame_is_told(
+    frames: MockRun, bias: CombinedBias, caplog: pytest.LogCaptureFixture
+) -> None:
+    def noted(path: Path, note: str) -> RawFrame:
+        raw = RawFrame.read(path)
+        return dataclasses.replace(raw, metadata=dataclasses.replace(raw.metadata, notes=(note,)))
+
+    FringeBiasTask(config=FringeBiasConfig()).run([noted(frames.bias[0].path, "of a bias")], NAME)
+    IsrFlatPrepTask(config=IsrFlatPrepConfig()).run(noted(frames.flats[0].path, "of a flat"), bias, DETECTOR)
+    told = " ".join(record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert "of a bias" in told
+    assert "of a flat" in told
 
 
 def test_a_flat_among_the_biases_is_refused(frames: MockRun) -> None:

@@ -75,7 +75,7 @@ class PreparedCharge:
     read_noise_e : `Mapping` [`str`, `float`]
         Read noise by amplifier [electrons], measured in the overscan.
     unused : `tuple` [`str`, ...]
-        Amplifiers that read out but are masked whole: dead, hot or saturated.
+        Amplifiers that are masked whole: dead in the flat or in a bias, hot or saturated.
     """
 
     image: Image
@@ -287,6 +287,8 @@ def _mask_odd_amplifiers(frame: RawFrame, image: Image, mask: Mask, read_noise_e
     for amp in frame.amplifiers:
         if amp.name in odd:
             mask[amp.destination] |= mask_bits("BAD")
+        elif np.all(mask[amp.destination] & mask_bits("NO_DATA")):
+            odd.append(amp.name)
     return tuple(sorted(odd))
 
 

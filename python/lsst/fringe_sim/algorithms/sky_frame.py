@@ -16,6 +16,7 @@ from ..effects import ImageGeometry, apply_to_image
 from ..errors import InputError, OutOfRangeError, named_units
 from ..instrument.bandpass import Bandpass
 from ..instrument.night import NightHistory
+from ..instrument.setup import LONGEST_EXPOSURE_S
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel
 from ..products import NOISE, SkyFringe, mask_bits
@@ -117,8 +118,8 @@ def simulate_sky_frame(
     if not known.any():
         raise InputError("thickness map", "no finite value", "a thickness in at least one pixel")
     exposure = model.setup.exposure_s if exposure_s is None else exposure_s
-    if not 0.0 < exposure < math.inf:
-        raise OutOfRangeError("exposure time [s]", exposure, "positive")
+    if not 0.0 < exposure <= LONGEST_EXPOSURE_S:
+        raise OutOfRangeError("exposure time [s]", exposure, f"above 0, up to {LONGEST_EXPOSURE_S:g}")
     if response is None:
         dark = SkySpectrum.dark(airmass=model.setup.airmass) if sky is None else sky
         span = widened_um(model, thickness_span_um(thickness[known]), phase_sigma)

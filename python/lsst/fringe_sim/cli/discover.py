@@ -182,6 +182,7 @@ def _read(
         f"{series.serial or 'sensor'}: {len(series.biases)} bias frames, {len(series.flats)} flats at {listed} nm",
         err=True,
     )
+    series.check(setup)
     if dry_run:
         click.echo(f"would prepare {series.steps} frames and search them")
         return None

@@ -208,6 +208,7 @@ def _prepare(
         f"{series.serial or 'sensor'}: {len(series.biases)} bias frames, {len(series.flats)} flats at {found} nm",
         err=True,
     )
+    series.check(setup)
     missing = series.missing_nm(setup)
     if missing:
         listed = ", ".join(f"{w:g}" for w in missing)
@@ -232,4 +233,5 @@ def section_of_cube(cube: FringeCube, setup: Setup) -> SensorSection | None:
         detector = camera.detector(name)
     except UnknownNameError:
         return None
+    setup.refuse_other_vendor(detector)
     return SensorSection.of_image(detector, cube.shape[1:], cube.metadata)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -64,6 +65,9 @@ class Series(Generic[Header]):
         """Files of all frames."""
         return tuple(frame.source for frame in (*self.biases, *self.flats))
 
+    def check(self, setup: Setup) -> None:
+        """Refuse a set-up of sensors of another vendor, before the frames are read."""
+
     def missing_nm(self, setup: Setup) -> tuple[float, ...]:
         """Usual wavelengths of a set-up of which there is no flat [nm]."""
         return setup.missing_nm(self.wavelengths_nm)
@@ -71,6 +75,11 @@ class Series(Generic[Header]):
 
 class LabSeries(Series[RawMetadata]):
     """Raw frames, with an image for each amplifier."""
+
+    def check(self, setup: Setup) -> None:
+        """Refuse a set-up of sensors of another vendor, before the frames are read; say whose the gains are."""
+        if not self._sensor(setup).serial and self.flats[0].serial:
+            click.echo(f"{self.serial} is in no table: gains are those of {setup.detector}", err=True)
 
     def read(self, setup: Setup, options: FlatPrepOptions, advance: Callable[[], None]) -> FringeCube:
         """Prepare all frames, one at a time.
@@ -110,14 +119,15 @@ class LabSeries(Series[RawMetadata]):
         return FringeCube.from_flats(flats, number=len(self.flats))
 
     def _sensor(self, setup: Setup) -> Detector:
-        camera = Camera.from_name(setup.camera)
+        camera, first = Camera.from_name(setup.camera), self.flats[0]
         try:
-            sensor = camera.detector(self.serial)
+            place = Camera.from_name(first.camera).detector(first.detector)
+            sensor = camera.detector(self.serial) if first.serial else place
         except FringeSimError:
             # A sensor that is not in the tables is read with the gains of the set-up's own.
             own = camera.detector(setup.detector)
             vendor = VENDORS.get(self.serial.partition("-")[0].upper(), own.vendor)
-            sensor = replace(own, serial="", name=self.serial or setup.detector, vendor=vendor)
+            sensor = replace(own, serial="", name=self.serial, vendor=vendor)
         setup.refuse_other_vendor(sensor)
         return sensor
 
@@ -211,15 +221,31 @@ def _raw_series(frames: Sequence[RawMetadata], paths: Sequence[str]) -> LabSerie
     if not flats:
         kinds = ", ".join(sorted({frame.observation_type for frame in frames})) or "no frame"
         raise InputError("flats", kinds, "one flat or more (IMGTYPE FLAT)", source=" ".join(paths))
-    serials = sorted({frame.serial or f"{frame.raft}_{frame.slot}" for frame in flats})
+    serials = sorted({_sensor_name(frame) for frame in flats})
     if len(serials) > 1:
         raise InputError("sensors", ", ".join(serials), "frames of one sensor", source=" ".join(paths))
     _refuse_other_cameras(flats, paths)
     flats.sort(key=lambda frame: (frame.require_wavelength_nm(), frame.exposure_id))
     biases = [
-        frame for frame in frames if frame.observation_type == "bias" and frame.serial == flats[0].serial
+        frame for frame in frames if frame.observation_type == "bias" and _sensor_name(frame) == serials[0]
     ]
-    return LabSeries(flats[0].serial, tuple(biases), tuple(flats))
+    _say_left_out(frames, [*biases, *flats])
+    return LabSeries(serials[0], tuple(biases), tuple(flats))
+
+
+def _sensor_name(frame: RawMetadata) -> str:
+    """Serial number, or the place where the header states none."""
+    return frame.serial or f"{frame.raft}_{frame.slot}"
+
+
+def _say_left_out(frames: Sequence[RawMetadata], used: Sequence[RawMetadata]) -> None:
+    """Frames that are neither flats nor bias frames of the sensor."""
+    sources = {frame.source for frame in used}
+    others = [frame for frame in frames if frame.source not in sources]
+    if others:
+        kinds = Counter(f"{frame.observation_type} of {_sensor_name(frame)}" for frame in others)
+        told = ", ".join(f"{number} {kind}" for kind, number in sorted(kinds.items()))
+        click.echo(f"neither flats nor bias frames of this sensor, left out: {told}", err=True)
 
 
 def _refuse_other_cameras(flats: Sequence[RawMetadata], paths: Sequence[str]) -> None:
@@ -247,8 +273,7 @@ def _each_once(frames: Sequence[RawMetadata]) -> list[RawMetadata]:
     kept: dict[tuple[object, ...], RawMetadata] = {}
     copies = []
     for frame in frames:
-        place = frame.serial or f"{frame.raft}_{frame.slot}"
-        first = kept.setdefault((frame.camera, place, frame.exposure_id), frame)
+        first = kept.setdefault((frame.camera, _sensor_name(frame), frame.exposure_id), frame)
         if first is frame:
             continue
         if pixel_digest(RawFrame.read(first.source)) != pixel_digest(RawFrame.read(frame.source)):

@@ -17,6 +17,7 @@ from .parameters import (
     Quantity,
     laboratory_of_the_mock,
     model_effects,
+    shape_of,
 )
 from .progress import progress
 
@@ -99,7 +100,10 @@ def mock_flats(
     chosen = LABORATORY.convert(setup, None, None)
     camera = Camera.from_name(chosen.camera)
     sensor = camera.detector(detector or chosen.detector)
-    shape = (size[1], size[0]) if size else sensor.shape
+    chosen.refuse_other_vendor(sensor)
+    if silicon is not None:
+        chosen.with_silicon(silicon)
+    shape = shape_of(size, sensor.shape)
     rng = np.random.default_rng(seed)
     settings = dict(effects.settings)
     if temperature is not None:

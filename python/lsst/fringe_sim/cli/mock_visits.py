@@ -9,7 +9,7 @@ import click
 
 from .mock_flats import thickness_map
 from .output import OutputFolder, output_folder
-from .parameters import BUILT_IN, SIZE, SKY, ChosenEffects, model_effects
+from .parameters import BUILT_IN, SIZE, SKY, ChosenEffects, model_effects, shape_of
 from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -79,7 +79,7 @@ def mock_visits(
 
     chosen = SKY.convert(setup, None, None)
     sensor = Camera.from_name(chosen.camera).detector(detector or chosen.detector)
-    shape = (size[1], size[0]) if size else sensor.shape
+    shape = shape_of(size, sensor.shape)
     rng = np.random.default_rng(seed)
     validate_effects(effects.settings)
     layer = thickness_map(thickness, chosen, shape, rng)

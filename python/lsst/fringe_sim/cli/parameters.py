@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from ..errors import InputError
+from ..errors import InputError, OutOfRangeError
 
 if TYPE_CHECKING:  # none of it for --help
     from ..effects import Parameter
@@ -39,6 +39,7 @@ __all__ = [
     "effects_from_option",
     "laboratory_of_the_mock",
     "model_effects",
+    "shape_of",
 ]
 
 
@@ -249,6 +250,19 @@ EFFECT = _EffectSetting()
 LABORATORY = SetupType("monochromator", "a laboratory set-up with a monochromator")
 ANY_LIGHT = SetupType("", "a set-up")
 SKY = SetupType("sky", "one behind a telescope, as lsst_e2v, monocam or hsc")
+
+
+def shape_of(size: tuple[int, int] | None, whole: tuple[int, int]) -> tuple[int, int]:
+    """Rows and columns of a cut-down sensor by ``--size``, those of the whole one without.
+
+    `OutOfRangeError`: it is larger than the whole.
+    """
+    shape = (size[1], size[0]) if size else whole
+    if shape[0] > whole[0] or shape[1] > whole[1]:
+        allowed = f"up to the {whole[1]}x{whole[0]} of the sensor"
+        raise OutOfRangeError("--size", f"{shape[1]}x{shape[0]}", allowed)
+    return shape
+
 
 laboratory_of_the_mock = LABORATORY.name_option("ts8_e2v", "Laboratory set-up: name or file.")
 """Set-up that the mock reads itself: the command gets it as it was written."""

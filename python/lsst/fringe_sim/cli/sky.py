@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import InputError, OutOfRangeError, to_number
+from ..instrument.setup import LONGEST_EXPOSURE_S
 from .output import OutputFolder, output_folder
 from .parameters import BUILT_IN, SKY, ChosenEffects, Quantity, model_effects
 from .progress import progress
@@ -307,8 +308,8 @@ def _check_exposure(exptime: float | None, night: bool) -> None:
         raise InputError(
             "--exptime", exptime, "nothing beside --night, whose frames have the set-up's exposure"
         )
-    if exptime is not None and not exptime > 0.0:
-        raise OutOfRangeError("exposure time [s]", exptime, "positive")
+    if exptime is not None and not 0.0 < exptime <= LONGEST_EXPOSURE_S:
+        raise OutOfRangeError("exposure time [s]", exptime, f"above 0, up to {LONGEST_EXPOSURE_S:g}")
 
 
 def map_header(thickness: str) -> Mapping[str, Any]:

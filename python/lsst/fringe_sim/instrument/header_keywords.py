@@ -53,7 +53,11 @@ def _of_raw(place: str, name: str, letters: str, what: str) -> HeaderKeyword:
 
 _PRIMARY = (
     ("INSTRUME", "uuu", "camera; one that is not known is refused"),
-    ("TSTAND", "uuu", "camera where INSTRUME is absent; without both, what is assumed is said"),
+    (
+        "TSTAND",
+        "uuu",
+        "camera where INSTRUME is absent; without both, what is assumed is said, or refused where two would do",
+    ),
     ("OBSID", "cuc", "begins with MC for the LSST Camera and with TS for TS8; numbers exposures of TS8"),
     ("CAMCODE", "ccc", "the letters with which OBSID begins"),
     ("CREATOR", "ccc", "not another simulator"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -14,6 +15,10 @@ __all__ = ["find_raw_files", "pixel_digest"]
 
 SUFFIXES = (".fits", ".fits.fz", ".fits.gz", ".fz")
 """Endings of the files that are taken from a directory."""
+
+_ENDINGS = f"one that ends in {', '.join(SUFFIXES)}, or the file itself as PATH"
+
+_LIKE_FITS = re.compile(r"[^.].*\.(fits|fit|fts)(\.(gz|fz|bz2|xz|zip|z))?", re.IGNORECASE)
 
 
 def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[str]]:
@@ -29,7 +34,8 @@ def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[str]]:
     files : `list` [`str`]
         Absolute paths, sorted, each once.
     refused : `list` [`str`]
-        One message for each path that leads to no file.
+        One message for each path that leads to no file, and for each file of a directory that is named like a FITS
+        file, but not as those that are taken from one.
     """
     files: set[str] = set()
     refused = []
@@ -41,7 +47,16 @@ def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[str]]:
             )
             refused.append(str(InputError("path", path, allowed)))
         files.update(str(file.absolute()) for file in found)
+        refused += [str(InputError("name", str(other), _ENDINGS)) for other in _left_out(Path(path))]
     return sorted(files), refused
+
+
+def _left_out(folder: Path) -> list[Path]:
+    """Files of a directory that look like frames and are not taken."""
+    if not folder.is_dir():
+        return []
+    others = (file for file in folder.rglob("*") if not file.name.endswith(SUFFIXES) and file.is_file())
+    return sorted(file for file in others if _LIKE_FITS.fullmatch(file.name))
 
 
 def pixel_digest(frame: RawFrame) -> str:

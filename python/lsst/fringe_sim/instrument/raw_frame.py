@@ -26,7 +26,7 @@ from .raw_checks import refuse_binning, refuse_other_unit, refuse_other_vendor
 from .raw_header import header_value
 from .raw_layout import N_AMPLIFIERS, Section, amplifier_layouts, image_shape
 from .raw_metadata import OBSERVATION_TYPES, RawMetadata
-from .stated_facts import refuse_contradictions
+from .stated_facts import NO_READING_C, refuse_contradictions
 
 __all__ = [
     "N_AMPLIFIERS",
@@ -246,13 +246,27 @@ def _merged_header(hdus: Sequence[Any], source: str) -> fits.Header:
         if hdu.name in _CONDITION_HDUS:
             for keyword in _CONDITIONS:
                 value = header_value(hdu.header, keyword)
-                if value is not None and header_value(header, keyword) is None:
+                if value is None or _is_no_reading(keyword, value):
+                    continue
+                if header_value(header, keyword) is None:
                     header[keyword] = (value, f"from {hdu.name}")
     return header
 
 
+def _is_no_reading(keyword: str, value: Any) -> bool:
+    return keyword in ("CCDTEMP", "SENSTEMP") and isinstance(value, int | float) and value <= NO_READING_C
+
+
 def _with_unused(metadata: RawMetadata, hdus: Sequence[Any]) -> RawMetadata:
-    """Keywords that nothing depends on and that are not known to be of no use are said."""
+    """What of the headers is not used is said: keywords that nothing depends on, and broken readings."""
+    broken = [
+        f"{keyword} of {hdu.name} is {value:g} °C, which is no reading: not used"
+        for hdu in hdus[1:]
+        for keyword in ("CCDTEMP", "SENSTEMP")
+        if _is_no_reading(keyword, value := header_value(hdu.header, keyword))
+    ]
+    if broken:
+        metadata = dataclasses.replace(metadata, notes=(*metadata.notes, *broken))
     images = [hdu for hdu in hdus if hdu.is_image]  # all of the tables is of the electronics
     unknown = dict.fromkeys(keyword for hdu in images for keyword in hdu.header if is_unknown(keyword))
     if not unknown:

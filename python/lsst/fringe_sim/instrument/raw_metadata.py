@@ -17,7 +17,7 @@ from .camera import Camera, Detector
 from .raw_checks import refuse_no_flat, refuse_other_instrument, refuse_other_sensor, refuse_stutter
 from .raw_header import DeclaredHeader, header_value
 from .raw_times import DAY_ROLLOVER_H, begin_of_exposure, day_and_sequence, exposure_id, time_scale
-from .stated_facts import SAME_SECONDS, refuse_contradictions, refuse_other_filter
+from .stated_facts import NO_READING_C, SAME_SECONDS, refuse_contradictions, refuse_other_filter
 
 __all__ = ["DAY_ROLLOVER_H", "OBSERVATION_TYPES", "RawMetadata", "header_value"]
 
@@ -53,7 +53,7 @@ WITHOUT_LIGHT = frozenset({"bias", "dark"})
 WAVELENGTH_RANGE_NM = (200.0, 1300.0)
 """Wavelengths to which a silicon CCD and its monochromator can be set."""
 
-TEMPERATURE_RANGE_C = (-200.0, 60.0)
+TEMPERATURE_RANGE_C = (NO_READING_C, 60.0)
 """Temperatures that a CCD can have while it is read; a value in kelvin falls outside."""
 
 ZERO_CELSIUS_K = 273.15
@@ -248,10 +248,13 @@ def _camera(header: DeclaredHeader) -> str:
         return _CAMERAS[instrument]
     if "TS8" in header.text("TSTAND").upper():
         return "ts8"
-    if _bay(header) is not None:
-        return "lsstCam"
-    if _module(header) is not None or header.value("LSST_NUM") is not None:
-        return "ts8"
+    bay = _bay(header) is not None
+    sensor = _module(header) is not None or header.value("LSST_NUM") is not None
+    if bay and sensor:  # the headers of both have them
+        found = header.value("TSTAND")
+        raise header.refuse("TSTAND", found, "TS8 for a frame of ts8, or INSTRUME, which names the camera")
+    if bay or sensor:
+        return "lsstCam" if bay else "ts8"
     raise header.refuse(
         "INSTRUME",
         None,

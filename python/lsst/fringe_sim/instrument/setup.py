@@ -37,6 +37,9 @@ _BEAM_KEYS = {
 SAME_WAVELENGTH_NM = 1.0
 """A flat within this distance of a usual wavelength counts as taken there."""
 
+LONGEST_EXPOSURE_S = 1e6
+"""Exposures of the sky up to this are simulated [s]."""
+
 WAVELENGTH_ACCURACY_NM = 0.5
 """Accuracy of a monochromator where the set-up states none [nm]; an assumption, of the order of what makers state."""
 
@@ -213,7 +216,7 @@ class Setup(InNotebook):
             bandpass="" if laboratory else light.text("bandpass"),
             effective_area_m2=0.0 if laboratory else light.number("effective_area_m2", low=1e-6, high=1e6),
             pixel_scale_arcsec=0.0 if laboratory else light.number("pixel_scale_arcsec", low=1e-6, high=1e4),
-            exposure_s=0.0 if laboratory else light.number("exposure_s", low=0.0, high=1e6),
+            exposure_s=0.0 if laboratory else light.number("exposure_s", low=0.0, high=LONGEST_EXPOSURE_S),
             airmass=0.0 if laboratory else light.number("airmass", low=1.0, high=10.0),
             wavelength_accuracy_nm=(
                 light.number("wavelength_accuracy_nm", low=0.0, high=20.0, default=WAVELENGTH_ACCURACY_NM)

@@ -14,6 +14,7 @@ from ..errors import FrameFormatError, InputError, to_number
 
 __all__ = [
     "FILTER_RANGE_NM",
+    "NO_READING_C",
     "RAW_FACTS",
     "SAME_CELSIUS",
     "SAME_SECONDS",
@@ -32,6 +33,9 @@ SAME_CELSIUS = 5.0
 
 In headers of obs_lsst that state both (TS3, TS8) it is 0.1 to 0.5; flats of one series may lie as far apart as this.
 """
+
+NO_READING_C = -200.0
+"""Readings up to this are those of a sensor of temperature that is not connected, as -260 [°C]."""
 
 SAME_SECONDS = 0.1
 """Digits of exposure times: those of obs_lsst are repeated to a millisecond."""
@@ -107,7 +111,9 @@ RAW_FACTS = (
         ("CCDTEMP", "SENSTEMP", "TEMP_SET"),
         SAME_CELSIUS,
         "°C",
-        "set point and measurement differ by 0.1 to 0.5 °C in real headers, flats of one series by up to 5",
+        "set point and measurement differ by 0.1 to 0.5 °C in real headers, flats of one series by up to 5; -200 and "
+        "less is no reading",
+        lambda celsius: celsius if celsius > NO_READING_C else None,
     ),
     Fact(
         "wavelength",

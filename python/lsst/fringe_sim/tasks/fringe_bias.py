@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from lsst.pipe.base import (
@@ -104,7 +104,14 @@ class FringeBiasTask(PipelineTask):
         FrameFormatError
             A frame is no bias, or of another sensor or size.
         """
-        bias: CombinedBias = combine_biases(raws, self.config.options())
+        bias: CombinedBias = combine_biases(self._told(raws), self.config.options())
         self.log.info("%s: %d bias frames combined", detector, bias.n_frames)
         metadata = {**common_header(self.config), **bias.metadata}
         return Struct(bias=dataclasses.replace(bias, detector=detector, metadata=metadata))
+
+    def _told(self, raws: Iterable[RawFrame]) -> Iterator[RawFrame]:
+        """The frames; what was taken for granted of each is said."""
+        for raw in raws:
+            for note in raw.metadata.notes:
+                self.log.warning("bias exposure %s: %s", raw.metadata.exposure_id, note)
+            yield raw
