@@ -51,17 +51,17 @@ def test_one_frame_is_written_with_its_errors(usual) -> None:
 @pytest.mark.slow
 def test_the_sky_of_the_command_is_that_of_the_task(thickness, tmp_path) -> None:
     """One map has one sky: the beam of every pixel in both."""
-    arguments = ["--detector", "R10_S00", "--airmass", str(AIRMASS), "--noiseless", "--out", str(tmp_path)]
+    arguments = ["--detector", "R30_S00", "--airmass", str(AIRMASS), "--noiseless", "--out", str(tmp_path)]
     assert run(["sky", "--thickness", thickness, *arguments]) == 0
-    frame = SkyFringe.read_fits(tmp_path / "sky_R10_S00_00.fits")
+    frame = SkyFringe.read_fits(tmp_path / "sky_R30_S00_00.fits")
     layer = np.asarray(fits.getdata(thickness), np.float32)
     known = np.isfinite(layer)
     sigma, mask = np.where(known, 0.001, np.nan), np.where(known, 0, mask_bits("NO_DATA"))
     one = np.ones(layer.shape)
-    mapped = ThicknessMap(layer, sigma, one, 0.0 * one, mask, "adhesive", {}, 12 * known, "R10_S00")
+    mapped = ThicknessMap(layer, sigma, one, 0.0 * one, mask, "adhesive", {}, 12 * known, "R30_S00")
     task = SkyFringeSimTask(config=SkyFringeSimTask.ConfigClass(noise=False, night="steady"))
     exposure = SkyExposure(1, 20260115, 23.0, 30.0, AIRMASS, "y_10")
-    theirs = task.run(mapped, exposure, Camera.from_name("lsstCam").detector("R10_S00")).sky
+    theirs = task.run(mapped, exposure, Camera.from_name("lsstCam").detector("R30_S00")).sky
     np.testing.assert_allclose(frame.image[known], theirs.image[known], rtol=2e-6)
 
 
@@ -79,19 +79,19 @@ def test_maps_of_both_layers_have_one_sky(tmp_path) -> None:
         "--silicon-thickness",
         str(tmp_path / "silicon.fits"),
     ]
-    given = ["--detector", "R10_S00", "--airmass", str(AIRMASS), "--noiseless", "--templates"]
+    given = ["--detector", "R30_S00", "--airmass", str(AIRMASS), "--noiseless", "--templates"]
     assert run(["sky", *maps, *given, "--out", str(tmp_path / "out")]) == 0
-    frame = SkyFringe.read_fits(tmp_path / "out" / "sky_R10_S00_00.fits")
+    frame = SkyFringe.read_fits(tmp_path / "out" / "sky_R30_S00_00.fits")
     assert np.all(frame.mask[:2] != 0)
     assert np.all(frame.mask[2:] == 0)
     task = SkyFringeSimTask(config=SkyFringeSimTask.ConfigClass(noise=False, night="steady", silicon="map"))
     exposure = SkyExposure(1, 20260115, 23.0, 30.0, AIRMASS, "y_10")
     read = [ThicknessMap.read_any(tmp_path / f"{name}.fits", of) for name, of in LAYERS]
-    theirs = task.run(read[0], exposure, Camera.from_name("lsstCam").detector("R10_S00"), read[1]).sky
+    theirs = task.run(read[0], exposure, Camera.from_name("lsstCam").detector("R30_S00"), read[1]).sky
     np.testing.assert_array_equal(theirs.mask, frame.mask)
     np.testing.assert_allclose(frame.image[2:], theirs.image[2:], rtol=2e-6)
     assert theirs.metadata["PHASERMS"] == pytest.approx(frame.metadata["PHASERMS"], rel=1e-4)
-    templates = TemplateFolder(tmp_path / "out").of("R10_S00")
+    templates = TemplateFolder(tmp_path / "out").of("R30_S00")
     assert [each.metadata["TEMPKIND"] for each in templates] == ["sky", "phase"]
     np.testing.assert_allclose(
         templates[0].image[2:], frame.fraction()[2:] - frame.fraction()[2:].mean(), atol=2e-6
