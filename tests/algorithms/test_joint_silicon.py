@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.io import fits
+from scipy.stats import chi2
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.algorithms.thickness_fit import (
@@ -34,12 +35,15 @@ ORDER_UM = 0.3
 
 
 def places(size: int) -> np.ndarray:
-    """Places of pixels from -1 to 1."""
-    return (2.0 * np.arange(size) + 1.0) / size - 1.0
+    """Places of pixels: -1 in the first, 1 in the last, as in the effects of a sensor."""
+    return np.linspace(-1.0, 1.0, size)
 
 
 def sensor(
-    coefficients: tuple[float, ...], rng: np.random.Generator, narrow_nm: float | None = NARROW_NM
+    coefficients: tuple[float, ...],
+    rng: np.random.Generator,
+    narrow_nm: float | None = NARROW_NM,
+    noise: float = NOISE,
 ) -> tuple[FringeModel, np.ndarray, FringeCube]:
     """Broad flats, and narrow ones if wanted, of a sensor with tilted silicon.
 
@@ -63,10 +67,10 @@ def sensor(
             found = seen.response(truth[:, columns].ravel(), wavelength[rows])
             image[rows, :, columns] = found.reshape(-1, SHAPE[0], columns.size)
     image /= image.mean(axis=(1, 2), keepdims=True)
-    image += NOISE * rng.standard_normal(image.shape)
+    image += noise * rng.standard_normal(image.shape)
     cube = FringeCube(
         image.astype(np.float32),
-        np.full(image.shape, NOISE**2, np.float32),
+        np.full(image.shape, max(noise, 1e-6) ** 2, np.float32),
         np.zeros(image.shape, np.int16),
         FlatExposures(wavelength, width, np.array(model.setup.temperature_k)),
         "relative",
@@ -152,6 +156,25 @@ def test_tilted_silicon(rng) -> None:
     pull = pulls(fitted, truth)
     assert pull.mean() == pytest.approx(0.0, abs=0.05)
     assert pull.std() == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.rng("pulls of a plane of silicon")
+def test_pulls_of_a_plane(rng) -> None:
+    """Mean and slopes scatter as stated when noise alone differs; a slope is that from the middle to the last pixel."""
+    true, draws = np.array([0.03, 0.1, 0.0]), 6
+    model, truth, cube = sensor((0.03, 0.1), rng, noise=0.0)
+    flats = SiliconModel(model, cube.wavelength_nm, cube.exposures.bandwidth_fwhm_nm)
+    search = SiliconSearch(degree=1, span_um=0.1, tilt_um=0.12)
+    total, variance = 0.0, np.full(cube.image.shape, NOISE**2, np.float32)
+    for _ in range(draws):
+        image = cube.image + NOISE * rng.standard_normal(cube.image.shape, np.float32)
+        seen = amplitudes_from_cube(replace(cube, image=image, variance=variance))
+        found = find_silicon(seen, truth.astype(np.float32), flats, search, ORDER_UM)
+        error = found.coefficients - true
+        total += float(error @ np.linalg.solve(found.covariance, error))
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], true.size * draws)
+    assert low < total < high
 
 
 @pytest.mark.slow

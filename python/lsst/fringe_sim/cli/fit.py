@@ -192,7 +192,14 @@ def _silicon_line(fitted: ThicknessMap) -> str:
         f"{1e3 * found[f'SICOEF{k}']:+.2f} ± {1e3 * found[f'SISIGM{k}']:.2f}"
         for k in range(sum(key.startswith("SICOEF") for key in found))
     ]
-    return f"silicon minus that of the model, terms 1, x, y, x², xy, y²: {', '.join(parts)} nm"
+    terms = (
+        ""
+        if len(parts) == 1
+        else ", terms 1, x, y, x², xy, y² (places from −1 in the first to 1 in the last pixel)"
+    )
+    return (
+        f"silicon minus that of the model{terms}: {', '.join(parts)} nm, if wavelengths and index are exact"
+    )
 
 
 def _prepare(

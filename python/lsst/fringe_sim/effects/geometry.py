@@ -102,12 +102,12 @@ class ImageGeometry:
     @property
     def v(self) -> FloatArray:
         """Position along y from -1 at the first to 1 at the last row, shape ``(ny, 1)``."""
-        return _unit(self.y_px, self.shape[0])[:, np.newaxis]
+        return unit_place(self.y_px, self.shape[0])[:, np.newaxis]
 
     @property
     def u(self) -> FloatArray:
         """Position along x from -1 at the first to 1 at the last column, shape ``(1, nx)``."""
-        return _unit(self.x_px, self.shape[1])[np.newaxis, :]
+        return unit_place(self.x_px, self.shape[1])[np.newaxis, :]
 
     @property
     def upper_half(self) -> NDArray[np.bool_]:
@@ -159,7 +159,8 @@ class ImageGeometry:
         return self.dark_time_s[:, np.newaxis, np.newaxis]
 
 
-def _unit(position: FloatArray, size: int) -> FloatArray:
+def unit_place(position: FloatArray, size: int) -> FloatArray:
+    """Pixels along one side as places from -1 at the first to 1 at the last of ``size``."""
     half = 0.5 * (size - 1)
     scaled: FloatArray = (position - half) / max(half, 0.5)
     return scaled

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from ...compiled import kernel
+from ...effects.geometry import unit_place
 from ...errors import InputError, OutOfRangeError
 from ...model import FringeModel
 from ...products import ThicknessMap, mask_bits
@@ -103,7 +104,10 @@ class SiliconSearch:
             raise OutOfRangeError("slip limit", self.slip_limit, "above 0, at most 1")
 
     def terms(self, y: FloatArray, x: FloatArray) -> FloatArray:
-        """Monomials at places from -1 to 1 over the sensor, shape ``(n, n_terms)``: 1, x, y, x², xy, y²."""
+        """Monomials 1, x, y, x², xy, y² at places of pixels, shape ``(n, n_terms)``.
+
+        A place is -1 in the first and 1 in the last row or column, so that a wedge is twice its term from edge to edge.
+        """
         columns = [np.ones_like(x), x, y, x * x, x * y, y * y]
         return np.stack(columns[: (1, 3, 6)[self.degree]], axis=-1)
 
@@ -457,8 +461,8 @@ def find_silicon(
 
 
 def _places(size: int) -> FloatArray:
-    """Places of pixels from -1 to 1 over a sensor."""
-    return (2.0 * np.arange(size) + 1.0) / size - 1.0
+    """Places of pixels, as effects of a sensor have them."""
+    return unit_place(np.arange(size, dtype=float), size)
 
 
 def _sample(data: Amplitudes, thickness_um: NDArray[np.floating], search: SiliconSearch) -> _Sample:
