@@ -161,7 +161,7 @@ def test_tilted_silicon(rng) -> None:
 @pytest.mark.slow
 @pytest.mark.rng("pulls of a plane of silicon")
 def test_pulls_of_a_plane(rng) -> None:
-    """Mean and slopes scatter as stated when noise alone differs; a slope is that from the middle to the last pixel."""
+    """Mean and slopes scatter as stated when noise alone differs; a slope is from the middle to the last pixel."""
     true, draws = np.array([0.03, 0.1, 0.0]), 6
     model, truth, cube = sensor((0.03, 0.1), rng, noise=0.0)
     flats = SiliconModel(model, cube.wavelength_nm, cube.exposures.bandwidth_fwhm_nm)

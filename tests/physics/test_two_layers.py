@@ -9,12 +9,14 @@ import pytest
 import tmm
 from sky_frames import bright_lines
 
+from lsst.fringe_sim.algorithms.field_response import sensor_response
 from lsst.fringe_sim.algorithms.sensor_placement import SensorPlacement
 from lsst.fringe_sim.algorithms.sky_frame import sky_response
 from lsst.fringe_sim.algorithms.sky_of_maps import silicon_nodes_um, sky_of_maps
 from lsst.fringe_sim.algorithms.sky_response import Response, electrons_on_grid
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.instrument.bandpass import Bandpass
+from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
 from lsst.fringe_sim.model import FringeModel
@@ -132,3 +134,23 @@ def test_a_tenth_of_a_micrometre_of_silicon_is_another_pattern() -> None:
     # With the constants of the paper, and with those measured in the cold.
     assert found["Si_green2008"] == pytest.approx([0.59, 0.39], abs=0.03)
     assert found["Si"] == pytest.approx([0.73, 0.54], abs=0.03)
+
+
+@pytest.mark.slow
+def test_continua_between_two_thicknesses_of_the_silicon() -> None:
+    """In every beam of the LSST they are on a straight line; a thickness between has the pattern of its own sum."""
+    model = FringeModel.from_setup("lsst_e2v")
+    place = SensorPlacement.of(Camera.from_name("lsstCam").detector("R22_S11"), 0.2)
+    sky, span = SkySpectrum.dark(bright_lines(4)), (15.0, 15.6)
+    steps = []
+    nodes = silicon_nodes_um(model, np.array([99.97, 100.03]))
+    made = sky_of_maps(model, sky, place, span, nodes, phase_sigma=0.0, advance=lambda: steps.append(1))
+    assert len(steps) == len(nodes) == len(made.responses)
+    number = len(nodes) - 3
+    system = model.base_system.with_layer("detection", thickness_um=nodes[number])
+    own = sensor_response(replace(model, base_system=system), sky, place, made.thickness_range_um)
+    thickness = np.linspace(*span, 400).reshape(20, 20)
+    ours, theirs = (each.sky().frame(thickness).astype(float) for each in (made.responses[number], own))
+    error = own.quadrature_error + 1e-6
+    np.testing.assert_allclose(ours / ours.mean(), theirs / theirs.mean(), rtol=0.0, atol=error)
+    assert np.ptp(theirs / theirs.mean()) > 10.0 * error

@@ -26,7 +26,14 @@ from .sky_response import (
     white_light,
 )
 
-__all__ = ["ANGLES", "CONTINUUM_ANGLES", "AngularResponse", "angular_response", "of_other_silicon"]
+__all__ = [
+    "ANGLES",
+    "CONTINUUM_ANGLES",
+    "AngularResponse",
+    "angular_response",
+    "of_other_silicon",
+    "silicon_um",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -36,6 +43,9 @@ ANGLES = 192
 CONTINUUM_ANGLES = 128
 """The same for continua, whose fringes average out over wavelength: 2e-4 of the peak-to-peak where fringes are
 faintest (96 give 4e-3)."""
+
+_SUM_ERROR = 1e-9
+"""Error allowed in the sum over lines under one angle, relative to its fringes; interpolation has 3e-7 of the sky."""
 
 _CELLS = 16_384
 """Cells of the histogram of rays; the phase between two of them differs by less than 0.01 rad."""
@@ -61,6 +71,8 @@ class AngularResponse:
     interpolation_error: float
     quadrature_error: float
     airmass: float  # airmass of the sky
+    n_lines: int  # how many of the components are bands of lines; they come first
+    silicon_um: float  # thickness of the detection layer
 
     def weights(self, sin_squared: ArrayLike) -> FloatArray:
         """Weights of the nodes that stand for a beam.
@@ -124,13 +136,25 @@ def angular_response(
         table.interpolation_error,
         error / level,
         sky.airmass,
+        len(merged),
+        silicon_um(model),
     )
 
 
-def of_other_silicon(known: AngularResponse, model: FringeModel, sky: SkySpectrum) -> AngularResponse:
+def silicon_um(model: FringeModel) -> float:
+    """Thickness of the detection layer of a model with its effects [µm]."""
+    stack = model.system.stack
+    return float(stack.layers[stack.position(model.system.detection)].thickness_um)
+
+
+def of_other_silicon(
+    known: AngularResponse, model: FringeModel, sky: SkySpectrum, other: AngularResponse | None = None
+) -> AngularResponse:
     """Another response on the grids of one that is known, with its errors, for silicon of another thickness.
 
-    Errors are found once: they do not depend on a part in a thousand of the silicon.
+    Errors are found once: they do not depend on a part in a thousand of the silicon. ``other``: one of a third
+    thickness. Continua and white light, which do not show the fringes of the silicon, are then those on the straight
+    line through the two.
     """
     fineness, band = SkyQuadrature(), bandpass_of(model)
     angles, points = known.flat.shape
@@ -139,11 +163,21 @@ def of_other_silicon(known: AngularResponse, model: FringeModel, sky: SkySpectru
     merged, continua = _components(sky, band, fineness)
     few = math.ceil(angles * CONTINUUM_ANGLES / ANGLES)
     refine = _legendre_interpolation(few, angles)
-    of_lines = [_single_angles(model, item, known.limits, angles, grid)[0] for item in merged]
-    smooth = [refine @ _single_angles(model, item, known.limits, few, grid)[0] for item in continua]
-    light = white_light(band, fineness.continuum_step_nm) if sky.flat is None else sky.flat.component(band)
-    flat = _single_angles(model, light, known.limits, angles if sky.flat else few, grid)[0]
-    return replace(known, values=np.stack([*of_lines, *smooth]), flat=flat if sky.flat else refine @ flat)
+    own_um = silicon_um(model)
+    lines = [_single_angles(model, item, known.limits, angles, grid)[0] for item in merged]
+    if other is not None:
+        part = (own_um - known.silicon_um) / (other.silicon_um - known.silicon_um)
+        smooth = list((1.0 - part) * known.values[len(merged) :] + part * other.values[len(merged) :])
+        flat = (1.0 - part) * known.flat + part * other.flat
+    else:
+        smooth = [refine @ _single_angles(model, item, known.limits, few, grid)[0] for item in continua]
+        flat = known.flat
+    if sky.flat is not None:
+        flat = _single_angles(model, sky.flat.component(band), known.limits, angles, grid)[0]
+    elif other is None:
+        light = white_light(band, fineness.continuum_step_nm)
+        flat = refine @ _single_angles(model, light, known.limits, few, grid)[0]
+    return replace(known, values=np.stack([*lines, *smooth]), flat=flat, silicon_um=own_um)
 
 
 def _components(
@@ -173,7 +207,10 @@ def _single_angles(
     reduced = model.system.reduce(light)
     photons = float(component.photons.sum())
     return [
-        photons * model.finish(reduced, light, reduced.averaged_on_grid(light.weight, *grid), None)
+        photons
+        * model.finish(
+            reduced, light, reduced.averaged_on_grid(light.weight, *grid, tolerance=_SUM_ERROR), None
+        )
         for grid in grids
     ]
 

@@ -108,6 +108,7 @@ class SensorResponse:
 
     field: FieldResponse  # tabulated at the radii of the sensor
     placement: SensorPlacement  # where its pixels lie
+    flat_level: float = 1.0  # of the flat field of the whole sensor, over that of this silicon
 
     @property
     def component(self) -> tuple[str, ...]:
@@ -133,12 +134,18 @@ class SensorResponse:
         """Factor on every component, 1 unless named; errors as of `SkyResponse.factors`."""
         return component_factors(self.component, self.field.angular.photons, scale)
 
-    def of_other_silicon(self, model: FringeModel, sky: SkySpectrum) -> SensorResponse:
-        """The same for silicon of another thickness. Frames are divided by one flat field of the whole sensor."""
-        angular = of_other_silicon(self.field.angular, model, sky)
-        flats = [float((self.field.weights @ each.flat).mean()) for each in (self.field.angular, angular)]
-        values = angular.values * (flats[0] / flats[1])
-        return replace(self, field=replace(self.field, angular=replace(angular, values=values)))
+    def of_other_silicon(
+        self, model: FringeModel, sky: SkySpectrum, other: SensorResponse | None = None
+    ) -> SensorResponse:
+        """The same for silicon of another thickness. Frames are divided by one flat field of the whole sensor.
+
+        ``other``: as of `angular_response.of_other_silicon`.
+        """
+        known = self.field.angular
+        angular = of_other_silicon(known, model, sky, None if other is None else other.field.angular)
+        flats = [float((self.field.weights @ each.flat).mean()) for each in (known, angular)]
+        field = replace(self.field, angular=angular)
+        return replace(self, field=field, flat_level=self.flat_level * flats[0] / flats[1])
 
     def sky(self, scale: Mapping[str, float] | None = None) -> FieldTable:
         """Electrons s⁻¹ m⁻² arcsec⁻² over field radius and thickness."""
@@ -159,7 +166,7 @@ class SensorResponse:
     def _flat_fielded(self, values: FloatArray) -> FloatArray:
         """Values ``[angle, thickness]`` for the beam of each field radius, over the flat field there."""
         flat = self.field.weights @ self.field.angular.flat
-        return np.asarray((self.field.weights @ values) * (flat.mean() / flat))
+        return np.asarray((self.field.weights @ values) * (self.flat_level * flat.mean() / flat))
 
     def _table(self, rows: FloatArray, wavelength_nm: float, error: float) -> FieldTable:
         angular = self.field.angular
@@ -252,7 +259,7 @@ def sensor_response(
     sky: SkySpectrum,
     placement: SensorPlacement,
     thickness_range_um: tuple[float, float] | None = None,
-    like: Response | None = None,
+    like: tuple[Response, ...] = (),
 ) -> Response:
     """Response of one sensor with the beam of every pixel and with its local effects.
 
@@ -260,14 +267,14 @@ def sensor_response(
 
     It has the one beam of the model behind a cone, and behind a telescope whose beams do not depend on
     the distance from the axis alone. ``like``: that of the same sensor with silicon of another thickness, whose
-    grids and errors it takes over.
+    grids and errors it takes over; and, if there is a second, that of the other end of a range of the silicon.
     """
-    known = iter(parts_of(like))
+    known = zip(*(parts_of(each) for each in like), strict=True)
 
     def respond(own: FringeModel) -> Response:
-        earlier = next(known, None)
-        if isinstance(earlier, SensorResponse):
-            return earlier.of_other_silicon(own, sky)
+        earlier = [each for each in next(known, ()) if isinstance(each, SensorResponse)]
+        if earlier:
+            return earlier[0].of_other_silicon(own, sky, *earlier[1:])
         beams = beam_field(own.setup.telescope)
         if beams is None:
             return sky_response(own, sky, None, thickness_range_um)

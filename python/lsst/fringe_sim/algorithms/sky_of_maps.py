@@ -6,6 +6,7 @@ tabulated for evenly spaced thicknesses of the silicon, and every pixel interpol
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -16,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError, OutOfRangeError
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel
-from ..optics.system import OpticalSystem
 from ..products import ThicknessMap
+from .angular_response import silicon_um as silicon_of
 from .field_response import SensorPlacement, sensor_response
 from .laboratory_shift import widened_um
 from .sky_response import FrameTable, Response, bandpass_of
@@ -26,7 +27,7 @@ __all__ = ["SiliconSeries", "known_silicon_um", "silicon_nodes_um", "sky_of_maps
 
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
-Respond = Callable[[FringeModel, tuple[float, float], Response | None], Response]
+Respond = Callable[[FringeModel, tuple[float, float], tuple[Response, ...]], Response]
 
 NODES_PER_ORDER = 10
 """Thicknesses in one fringe order of the silicon. The error of the interpolation is stated with every frame."""
@@ -39,6 +40,13 @@ REMAINDER = (2.5 * 1.5 * 0.5) ** 2 / 720.0
 
 MOST_NODES = 400
 """More thicknesses than these, 4 µm of silicon, are refused: they would not fit into the memory."""
+
+SMOOTH_UM = 0.5
+"""Range of the silicon over which continua lie on a straight line: they leave it by 1e-6 of the sky [µm]."""
+
+CHECKED = 3
+"""Node, a third of an order of the silicon from the first, at which that line is compared with the whole sum; it is
+taken where the difference is within the stated error of the sum, as it would not be behind a narrow filter."""
 
 PROBE = 16
 """Rows and columns of the thicknesses at which the interpolation is judged."""
@@ -95,10 +103,6 @@ def _step_um(model: FringeModel) -> float:
     return round(0.5e-3 * shortest / index / NODES_PER_ORDER, 5)
 
 
-def _silicon_um(system: OpticalSystem) -> float:
-    return system.stack.layers[system.stack.position(system.detection)].thickness_um
-
-
 def sky_of_maps(
     model: FringeModel,
     sky: SkySpectrum,
@@ -108,28 +112,70 @@ def sky_of_maps(
     *,
     phase_sigma: float = 0.0,
     respond: Respond | None = None,
+    advance: Callable[[], None] | None = None,
 ) -> SiliconSeries:
     """Response of a sensor, for the thicknesses of its silicon that `silicon_nodes_um` gives.
 
     ``phase_sigma``: that of `simulate_sky_frame`. ``respond``: ``(model, range, like) -> response`` of a sensor, by
-    default that of `sensor_response`; ``like`` is one of the same sensor with other silicon, or `None`.
+    default that of `sensor_response`; ``like`` is one of the same sensor with other silicon, or two, or none.
+    ``advance``: called after each thickness of the silicon.
     """
     model.checked_thickness_um(thickness_range_um)
     span = widened_um(model, thickness_range_um, phase_sigma)
 
-    def in_every_beam(own: FringeModel, range_um: tuple[float, float], like: Response | None) -> Response:
+    def in_every_beam(
+        own: FringeModel, range_um: tuple[float, float], like: tuple[Response, ...]
+    ) -> Response:
         return sensor_response(own, sky, placement, range_um, like=like)
 
     make = in_every_beam if respond is None else respond
     if silicon_nodes_um is None:
-        return SiliconSeries(np.empty(0), (make(model, span, None),), span)
-    made: list[Response] = []
-    for node in silicon_nodes_um:
-        # Effects add to the thickness; the map holds what they add.
-        added = _silicon_um(model.system) - _silicon_um(model.base_system)
-        system = model.base_system.with_layer(model.base_system.detection, thickness_um=node - added)
-        made.append(make(replace(model, base_system=system), span, made[0] if made else None))
-    return SiliconSeries(np.array(silicon_nodes_um), tuple(made), span)
+        return SiliconSeries(np.empty(0), (make(model, span, ()),), span)
+    nodes = silicon_nodes_um
+    layer = model.base_system.detection
+    nominal = model.base_system.stack
+    # Effects add to the thickness; the map holds what they add.
+    added = silicon_of(model) - nominal.layers[nominal.position(layer)].thickness_um
+
+    def at(number: int, *like: Response) -> Response:
+        system = model.base_system.with_layer(layer, thickness_um=nodes[number] - added)
+        return make(replace(model, base_system=system), span, like)
+
+    return SiliconSeries(np.array(nodes), _at_all(at, nodes, span, advance or (lambda: None)), span)
+
+
+def _at_all(
+    at: Callable[..., Response],
+    nodes: tuple[float, ...],
+    span: tuple[float, float],
+    advance: Callable[[], None],
+) -> tuple[Response, ...]:
+    """Responses at all nodes; continua from those at the ends of ranges, if they lie on a straight line."""
+    made = {0: at(0)}
+    advance()
+    pieces = max(math.ceil((nodes[-1] - nodes[0]) / SMOOTH_UM), 1)
+    ends = np.unique(np.linspace(0, len(nodes) - 1, pieces + 1).astype(int)).tolist()
+    straight: bool | None = None
+    for low, high in itertools.pairwise(ends):
+        made[high] = at(high, made[0])
+        advance()
+        for number in range(low + 1, high):
+            if straight is None and number == CHECKED:
+                made[number] = at(number, made[0])
+                whole, between = (
+                    _probed(each, span) for each in (made[number], at(number, made[low], made[high]))
+                )
+                straight = bool(np.abs(whole - between).max() <= made[number].quadrature_error * whole.mean())
+            else:
+                made[number] = at(number, *((made[low], made[high]) if straight else (made[0],)))
+            advance()
+    return tuple(made[number] for number in range(len(nodes)))
+
+
+def _probed(response: Response, thickness_range_um: tuple[float, float]) -> FloatArray:
+    """Sky at thicknesses of the whole range."""
+    probe = np.linspace(*thickness_range_um, PROBE**2).reshape(PROBE, PROBE)
+    return response.sky().frame(probe).astype(float)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -236,15 +237,20 @@ def _response(layers: Layers, model: FringeModel, sensor: Detector, exposure: Ex
     from ..products.thickness_map import thickness_span_um
 
     dark = replace(SkySpectrum.dark(airmass=exposure.airmass), flat=exposure.flat)
-    click.echo("tabulating the response to the sky", err=True)
-    made = sky_of_maps(
-        model,
-        dark,
-        SensorPlacement.of(sensor, model.setup.pixel_scale_arcsec, layers.section),
-        thickness_span_um(layers.thickness_um, MARGIN_UM),
-        None if layers.silicon_um is None else silicon_nodes_um(model, layers.silicon_um),
-        phase_sigma=layers.phase_sigma,
-    )
+    nodes = None if layers.silicon_um is None else silicon_nodes_um(model, layers.silicon_um)
+    many = 1 if nodes is None else len(nodes)
+    of_silicon = f" for {many} thicknesses of the silicon" if many > 1 else ""
+    click.echo(f"tabulating the response to the sky{of_silicon}", err=True)
+    with progress("tabulating", many) if many > 1 else nullcontext() as advance:
+        made = sky_of_maps(
+            model,
+            dark,
+            SensorPlacement.of(sensor, model.setup.pixel_scale_arcsec, layers.section),
+            thickness_span_um(layers.thickness_um, MARGIN_UM),
+            nodes,
+            phase_sigma=layers.phase_sigma,
+            advance=advance,
+        )
     return made.on(layers.silicon_um)
 
 

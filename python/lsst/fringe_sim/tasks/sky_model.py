@@ -95,7 +95,7 @@ class SkyModel:
 def _response(sky_model: SkyModel) -> tuple[FringeModel, SkySpectrum, SiliconSeries]:
     model, sky = sky_model.fringe_model(), sky_model.spectrum()
 
-    def in_one_beam(own: FringeModel, span: tuple[float, float], like: Response | None) -> Response:
+    def in_one_beam(own: FringeModel, span: tuple[float, float], like: tuple[Response, ...]) -> Response:
         return response_with_islands(own, lambda part: sky_response(part, sky, thickness_range_um=span))
 
     series = sky_of_maps(

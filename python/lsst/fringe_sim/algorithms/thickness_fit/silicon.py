@@ -106,7 +106,7 @@ class SiliconSearch:
     def terms(self, y: FloatArray, x: FloatArray) -> FloatArray:
         """Monomials 1, x, y, x², xy, y² at places of pixels, shape ``(n, n_terms)``.
 
-        A place is -1 in the first and 1 in the last row or column, so that a wedge is twice its term from edge to edge.
+        A place is -1 in the first and 1 in the last row or column: a wedge is twice its term from edge to edge.
         """
         columns = [np.ones_like(x), x, y, x * x, x * y, y * y]
         return np.stack(columns[: (1, 3, 6)[self.degree]], axis=-1)
