@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -128,3 +130,35 @@ def test_the_command(tmp_path) -> None:
     assert [path.name for path in night] == [path.name for path in truth]
     assert len(night) == 2
     assert run(arguments) == 1
+
+
+@pytest.mark.slow
+def test_a_night_with_another_table_of_silicon(tmp_path) -> None:
+    """Templates with the right table leave what the noise of their scales does, those of another twice of it."""
+    y, x = np.mgrid[:192, :192]
+    fits.PrimaryHDU(16.0 + 0.9 * np.sin(x / 30) + 0.8 * np.cos(y / 25)).writeto(tmp_path / "map.fits")
+    words = ["--thickness", str(tmp_path / "map.fits")]
+    night = ["--size", "192x192", "--seed", "3", "--stars", "1", "--moon", "0.1", "--visits", "3"]
+    other = [*night, "--silicon", "Si_franta2017", "--truth", str(tmp_path / "truth")]
+    assert run(["mock-visits", str(tmp_path / "night"), *words, *other]) == 0
+    own = files("lsst.fringe_sim").joinpath("data/setups/lsst_e2v.yaml").read_text()
+    (tmp_path / "franta.yaml").write_text(f"{own}\nsilicon: Si_franta2017\n")
+    left = []
+    for setup in (str(tmp_path / "franta.yaml"), "lsst_e2v"):
+        model, out = tmp_path / f"model_{len(left)}", tmp_path / f"corrected_{len(left)}"
+        assert run(["sky", "--setup", setup, *words, "--templates", "--noiseless", "--out", str(model)]) == 0
+        assert run(["correct", str(tmp_path / "night"), "--templates", str(model), "--out", str(out)]) == 0
+        parts = []
+        for visit in sorted((tmp_path / "night").glob("*.fits")):
+            taken = fits.getdata(visit, "IMAGE") - fits.getdata(out / f"{visit.stem}_corrected.fits", "IMAGE")
+            truth = fits.getdata(tmp_path / "truth" / visit.name)
+            parts.append(np.std(truth - taken, dtype=float) / np.std(truth, dtype=float))
+        left.append(np.sqrt(np.mean(np.square(parts))))
+    assert left[0] < 0.3
+    assert left[1] > 1.5 * left[0]
+
+
+def test_a_table_that_is_no_silicon_is_refused_before_work(tmp_path, capsys) -> None:
+    arguments = ["--size", "64x64", "--seed", "1", "--silicon", "nosuch", "--dry-run"]
+    assert run(["mock-visits", str(tmp_path / "night"), *arguments]) == 1
+    assert "nosuch" in capsys.readouterr().err

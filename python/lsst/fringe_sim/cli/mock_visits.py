@@ -40,6 +40,9 @@ __all__ = ["mock_visits"]
 @click.option(
     "--size", type=SIZE, default=None, help="Cut-down sensor, columns x rows; full size if not given."
 )
+@click.option(
+    "--silicon", default=None, help="Table of silicon, as Si_franta2017; that of the set-up if not given."
+)
 @click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all randomness.")
 @click.option(
     "--truth",
@@ -57,6 +60,7 @@ def mock_visits(
     moon: float,
     effects: ChosenEffects,
     size: tuple[int, int] | None,
+    silicon: str | None,
     seed: int,
     truth: Path | None,
     dry_run: bool,
@@ -78,6 +82,8 @@ def mock_visits(
     from ..mock.visits import VisitConditions, write_mock_visits
 
     chosen = SKY.convert(setup, None, None)
+    if silicon is not None:
+        chosen.with_silicon(silicon)
     sensor = Camera.from_name(chosen.camera).detector(detector or chosen.detector)
     shape = shape_of(size, sensor.shape)
     rng = np.random.default_rng(seed)
@@ -98,6 +104,7 @@ def mock_visits(
             effects=effects.settings,
             size=f"{shape[1]}x{shape[0]}" if size else None,
             conditions=VisitConditions(stars_per_arcmin2=stars, moon=moon),
+            silicon=silicon,
         )
         for visit in written:
             if truth is not None:

@@ -78,7 +78,11 @@ class DetectedSky:
 
 
 def detected_sky(
-    setup: str, sensor: Detector, thickness_um: NDArray[np.floating], effects: Mapping[str, Any] | None = None
+    setup: str,
+    sensor: Detector,
+    thickness_um: NDArray[np.floating],
+    effects: Mapping[str, Any] | None = None,
+    silicon: str | None = None,
 ) -> DetectedSky:
     """Sum the light of the night sky over lines, angles and polarisations, for every pixel of a sensor.
 
@@ -86,14 +90,15 @@ def detected_sky(
     ``sensor``: where in the field the sensor lies. A map of any size covers all of it.
     ``thickness_um``: thickness of the layer that varies [µm].
     ``effects``: hidden effects of the sensor, as for `validate_effects`.
-    `InputError`: a set-up without a telescope and a filter, or an effect that does not act on the layers of a
-        whole sensor.
+    ``silicon``: table of its optical constants, as ``Si_franta2017``; by default that of the set-up.
+    `InputError`: a set-up without a telescope and a filter, an effect that does not act on the layers of a
+        whole sensor, or no table of silicon.
     """
     content = read_setup_file(setup)
     light = content["illumination"]
     if light["kind"] != "sky" or light["beam"]["kind"] != "telescope":
         raise InputError("set-up", setup, "one with a sky and a telescope")
-    optics = with_hidden_optics(_optics(content, setup), _of_the_sensor(effects))
+    optics = with_hidden_optics(_optics(content, setup, silicon), _of_the_sensor(effects))
     sky = SkySpectrum.dark(airmass=float(light["airmass"]))
     parts = sky.components(Bandpass.from_name(str(light["bandpass"])), CONTINUUM_STEP_NM)
     lines = frozenset(sky.lines.bands)
@@ -122,10 +127,10 @@ def _angles(beam: Mapping[str, Any], radius_deg: float, nodes: int) -> tuple[Flo
     return found.theta, found.weight
 
 
-def _optics(content: Mapping[str, Any], setup: str) -> FlatFieldOptics:
+def _optics(content: Mapping[str, Any], setup: str, silicon: str | None) -> FlatFieldOptics:
     # The line of a monochromator plays no part in sums over lines of the sky.
     return FlatFieldOptics(
-        films=films_of(content, setup),
+        films=films_of(content, setup, silicon),
         temperature_k=float(content["temperature_k"]),
         bandwidth_fwhm_nm=1.0,
         varying=str(content["varying"]),
@@ -209,6 +214,7 @@ def write_mock_visits(
     effects: Mapping[str, Any] | None = None,
     size: str | None = None,
     conditions: VisitConditions | None = None,
+    silicon: str | None = None,
 ) -> Iterator[MockVisit]:
     """Write visits of one night, after the removal of the instrument's signature.
 
@@ -222,6 +228,7 @@ def write_mock_visits(
     ``size``: ``"NXxNY"`` for a cut-down sensor, whose pixels are spread over the same part of the field for
         the beam, and have their usual size for sources.
     ``conditions``: sources, seeing, light, and what disturbs.
+    ``silicon``: as for `detected_sky`.
     Returns the files, each written when it is asked for, and the truth, which stands nowhere in them.
     `InputError`, `OutOfRangeError`, `UnknownNameError`: an argument cannot be used; nothing has been written
         then.
@@ -233,7 +240,7 @@ def write_mock_visits(
     whole = Camera.from_name(str(content["camera"])).detector(detector)
     sensor = whole if size is None else whole.cut_down(parse_size(size))
     thickness = checked_thickness(thickness_um, sensor.shape)
-    sky = detected_sky(setup, whole, thickness, effects)
+    sky = detected_sky(setup, whole, thickness, effects, silicon)
     scene_rng, band_rng, *visit_rngs = rng.spawn(2 + visits)
     light = content["illumination"]
     scene = Scene.draw(light, night, sensor.shape, scene_rng)
