@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -226,3 +226,9 @@ def test_bars_are_the_numbers_of_the_verdict() -> None:
     )
     heights = [bar.get_height() for bar in gap_figure(NAMED).axes[0].patches]
     assert np.allclose(heights, [0.78, 0.707, 0.778, 0.703])
+
+
+def test_what_is_written_is_read() -> None:
+    """All of it, the upper limit of the disagreement too."""
+    sized = replace(NAMED, size={"of_counts": 0.003, "of_fringes": 0.05, "of_fringes_at_most": 0.06})
+    assert asdict(Verdict.from_json(sized.to_json())) == asdict(sized)

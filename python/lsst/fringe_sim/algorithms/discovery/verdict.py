@@ -28,6 +28,8 @@ __all__ = [
 VERDICTS = ("named", "no_discrepancy", "unexplained")
 
 
+_SIZES = ("of_counts", "of_fringes", "of_fringes_at_most")
+
 CONFIDENCE = 0.95
 """Of the upper limit of a disagreement: a convention of how limits are stated, which decides nothing."""
 
@@ -182,7 +184,7 @@ class Verdict:
     notes: tuple[str, ...] = ()
     data: dict[str, Any] = field(default_factory=dict)
     complete: bool = True
-    size: dict[str, float] = field(default_factory=lambda: {"of_counts": math.nan, "of_fringes": math.nan})
+    size: dict[str, float] = field(default_factory=lambda: dict.fromkeys(_SIZES, math.nan))
 
     @property
     def settings(self) -> dict[str, float]:
@@ -265,7 +267,7 @@ class Verdict:
             tuple(content["notes"]),
             content["data"],
             content.get("complete", True),
-            {key: _number(content.get("size", {}).get(key)) for key in ("of_counts", "of_fringes")},
+            {key: _number(content.get("size", {}).get(key)) for key in _SIZES},
         )
 
     def table(self) -> Table:
@@ -314,7 +316,7 @@ class Verdict:
             found = (
                 "none beyond the noise" if self.verdict == "no_discrepancy" else "too small to be measured"
             )
-            most = self.size.get("of_fringes_at_most", math.nan)
+            most = self.size["of_fringes_at_most"]
             if math.isfinite(most):
                 found += f", at most {100.0 * most:.2g} % of the fringes ({100.0 * CONFIDENCE:g} %)"
             return f"size of the disagreement: {found}"
