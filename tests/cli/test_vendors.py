@@ -66,8 +66,8 @@ def map_file(path: Path, detector: str) -> Path:
     [
         ("sky", "--thickness", "{}"),
         ("focal-plane", "--sensor", "R22_S11", "--thickness", "R22_S11={}"),
-        ("mock-visits", "--seed", "1", "--thickness", "{}"),
-        ("mock-flats", "--seed", "1", "--thickness", "{}"),
+        ("mock-visits", "--seed", "1", "--size", "64x64", "--thickness", "{}"),
+        ("mock-flats", "--seed", "1", "--size", "64x64", "--thickness", "{}"),
         ("amplitudes", "--thickness", "{}"),
     ],
 )
