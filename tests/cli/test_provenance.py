@@ -161,3 +161,21 @@ def test_errors_of_templates_are_measured() -> None:
     # A straight line between points of a sine: amplitude * (phase step / 2)^2 / 2.
     assert 1e-6 < interpolation < 1e-4
     assert template_errors(model, [880.0, 990.0], (13.0, 14.0))[1] <= interpolation * 1.01
+
+
+def test_a_key_stated_twice_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.json"
+    path.write_text('{"provenance": {"SETUP": "ts8_e2v", "SETUP": "ts8_itl"}}', encoding="utf-8")
+    assert run(["provenance", str(path)]) == 1
+    assert "a.json: key is 'SETUP'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("key", ["SETUP", "EFFECT0", "TABLE0", "INPUT0", "VERSION X", "OTHER"])
+def test_a_long_value_is_not_printed_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], key: str
+) -> None:
+    path = tmp_path / "a.json"
+    content = {"EFFVAL0": 1.0, key: "x" * 600_000}
+    path.write_text(json.dumps({"provenance": content}), encoding="utf-8")
+    assert run(["provenance", str(path)]) == 0
+    assert len(capsys.readouterr().out) < 2000

@@ -219,3 +219,16 @@ def test_a_map_that_no_fit_has_written_is_refused(cards, factor, words, tmp_path
     given = ["sky", "--thickness", str(tmp_path / "map.fits"), "--detector", "R22_S11"]
     assert run([*given, "--out", str(tmp_path / "sky")]) == 1
     assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["sky", "discover"])
+def test_a_map_with_a_card_that_cannot_be_read_is_refused(tmp_path, capsys, command) -> None:
+    path = tmp_path / "map.fits"
+    hdu = fits.PrimaryHDU(np.full((16, 64), 16.0))
+    hdu.header["NOTE"] = "plain"
+    hdu.writeto(path)
+    path.write_bytes(path.read_bytes().replace(b"'plain", b"'\x1b[31m"))
+    given = [str(path)] if command == "discover" else []
+    setup = ["--setup", "lsst_e2v", "--thickness", str(path), "--out", str(tmp_path / "o"), "--dry-run"]
+    assert run([command, *given, *setup]) == 1
+    assert "map.fits" in capsys.readouterr().err

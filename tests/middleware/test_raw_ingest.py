@@ -97,7 +97,9 @@ def test_record_of_a_flat(butler: Butler, tmp_path: Path) -> None:
 
 def test_frames_of_the_camera_go_to_the_camera(butler: Butler, tmp_path: Path) -> None:
     camera = {key: value for key, value in LSSTCAM_HEADER.items() if key != "OBSID"}
-    write_raw(tmp_path / "bias.fits", {"IMGTYPE": "BIAS", "FILTER": None, "SEQNUM": 1}, base=camera)
+    write_raw(
+        tmp_path / "bias.fits", {"IMGTYPE": "BIAS", "EXPTIME": 0.0, "FILTER": None, "SEQNUM": 1}, base=camera
+    )
     write_raw(tmp_path / "y.fits", {"FILTER": "y_04", "SEQNUM": 2}, base=camera)
     write_raw(tmp_path / "lambda.fits", {"FILTER": None, "MONOWL": 950.0, "SEQNUM": 3}, base=camera)
     write_raw(tmp_path / "stand.fits")

@@ -150,6 +150,7 @@ def test_equal_pixels_at_another_wavelength_are_refused(flats: Path) -> None:
         ({"TEMPK": 173.0, "CCDTEMP": 20.0}, "TEMPK and CCDTEMP"),
         ({"MONOWL": 950.0, "WAVELEN": 960.0}, "MONOWL and WAVELEN"),
         ({"EXPTIME": 0.0}, "EXPTIME"),
+        ({"IMGTYPE": "BIAS", "EXPTIME": 3.0}, "EXPTIME"),
         ({"FILTER": "r_57"}, "FILTER"),
     ],
 )

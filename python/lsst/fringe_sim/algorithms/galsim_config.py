@@ -16,7 +16,6 @@ from galsim.config.image_scattered import ScatteredImageBuilder
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel, Setup
@@ -102,7 +101,7 @@ def _sensor(
 ) -> tuple[NDArray[np.float64], FringeModel, Response]:
     """Thickness [µm], model and response of a sensor; kept for its next exposure."""
     chosen = Setup.from_name(setup)
-    sensor = Camera.from_name(chosen.camera).detector(detector)
+    sensor = chosen.sensor(detector)
     layer, header = _layer(thickness, chosen, sensor)
     section = SensorSection.of_image(sensor, layer.shape, header)
     placement = SensorPlacement.of(sensor, chosen.pixel_scale_arcsec, section)
@@ -115,7 +114,11 @@ def _sensor(
 
 def _layer(path: str, setup: Setup, sensor: Detector) -> tuple[NDArray[np.float64], dict[str, Any]]:
     """Thickness of the varying layer [µm], NaN where it is not known, and what its header says."""
-    found = ThicknessMap.read_any(path, setup.varying) if path else stand_in_thickness(setup, sensor)
+    found = (
+        ThicknessMap.read_any(path, setup.varying).of_setup(setup, path)
+        if path
+        else stand_in_thickness(setup, sensor)
+    )
     return found.known_um().astype(float), dict(found.metadata)
 
 

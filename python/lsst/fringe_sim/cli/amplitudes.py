@@ -10,6 +10,7 @@ from ..algorithms.amplitude_table import CASES, SkyCase, compare_amplitudes
 from ..errors import printable_name
 from ..files import table_text, write_whole
 from ..instrument.measured_thickness import e2v_321
+from ..model import Setup
 from ..resources import read_user_table
 from .inputs import read_thickness
 from .output import OutputFolder, output_folder
@@ -60,7 +61,9 @@ def amplitudes(
     """
     skies = [read_line_list(path) for path in lines] + list(SkyCase.palace())
     adhesive = (
-        e2v_321()[::STEP_PX, ::STEP_PX] if thickness == BUILT_IN else read_thickness(thickness, "adhesive")
+        e2v_321()[::STEP_PX, ::STEP_PX]
+        if thickness == BUILT_IN
+        else read_thickness(thickness, Setup.from_name("ts8_e2v"))
     )
     if dry_run:
         click.echo(f"would compute every set-up with {', '.join(sky.name for sky in skies)}")

@@ -166,12 +166,13 @@ def _read(
 ) -> FringeCube | None:
     """Cube of one sensor, or `None` after a dry run."""
     from ..algorithms.flat_prep_options import FlatPrepOptions
-    from .lab_frames import find_series, read_cube
+    from .lab_frames import find_series, of_vendor, read_cube
 
     if len(paths) == 1 and (Path(paths[0]) / "butler.yaml").is_file():
-        cube: FringeCube | None = _from_repository(paths[0], collections, detector)
+        stored = _from_repository(paths[0], collections, detector)
+        cube: FringeCube | None = of_vendor(stored, setup, paths[0])
     else:
-        cube = read_cube(paths[0]) if len(paths) == 1 else None
+        cube = read_cube(paths[0], setup) if len(paths) == 1 else None
     if cube is not None:
         if dry_run:
             click.echo(f"would search {cube.shape[0]} flats of {cube.shape[1]} x {cube.shape[2]} pixels")

@@ -124,17 +124,20 @@ def fit(
             "--zones, --illumination-degree, --contrast", "given", "nothing with method guo2022 or --silicon"
         )
     free = None if asked == (None, None, None) else _free(*asked, setup.wavelength_accuracy_nm)
-    cube, used = (read_cube(paths[0]) if len(paths) == 1 else None), paths
+    cube, used = (read_cube(paths[0], setup) if len(paths) == 1 else None), paths
     if cube is None:
         kernel_px = SMOOTHING_PX[method] if smoothing is None else smoothing
         cube, used = _prepare(paths, setup, kernel_px, skip_bad, dry_run)
-    if dry_run:
+    if dry_run and cube is None:
         return
     if cube is None or len(np.unique(cube.wavelength_nm)) < LEAST_WAVELENGTHS:
         found = 0 if cube is None else len(np.unique(cube.wavelength_nm))
         raise InputError("number of wavelengths", found, f"{LEAST_WAVELENGTHS} or more")
     section = section_of_cube(cube, setup)
     model = model_of_flats(model, cube.exposures)
+    if dry_run:
+        click.echo(f"would fit the layer {setup.varying} to {len(cube.wavelength_nm)} flats")
+        return
     folder = out.prepare()
     cards = {
         **effect_cards(model),
@@ -240,5 +243,4 @@ def section_of_cube(cube: FringeCube, setup: Setup) -> SensorSection | None:
         detector = camera.detector(name)
     except UnknownNameError:
         return None
-    setup.refuse_other_vendor(detector)
     return SensorSection.of_image(detector, cube.shape[1:], cube.metadata)

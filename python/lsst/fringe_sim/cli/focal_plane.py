@@ -128,15 +128,14 @@ def focal_plane(
     for path in measured.values():
         if not path.is_file():
             raise InputError("--thickness", str(path), "an existing FITS file")
+    vendors = {item.name: item.vendor for item in Camera.from_name("lsstCam").science}
+    thickness = {
+        name: read_thickness(path, Setup.from_name(SETUPS[vendors[name]])) for name, path in measured.items()
+    }
     if dry_run:
         click.echo(FocalPlaneCost(len(chosen), len(NightHistory.guo2022())).describe())
         return
     folder = out.prepare()
-    vendors = {item.name: item.vendor for item in Camera.from_name("lsstCam").science}
-    thickness = {
-        name: read_thickness(path, Setup.from_name(SETUPS[vendors[name]]).varying)
-        for name, path in measured.items()
-    }
     observed = random_nights(nights, seed)
     sky = replace(SkySpectrum.dark(airmass=airmass), flat=flat)
     tables = []

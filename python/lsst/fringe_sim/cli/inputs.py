@@ -15,7 +15,7 @@ from ..effects import activate_effects, known_effects
 from ..effects.active import flat_settings
 from ..errors import InputError
 from ..instrument.detector import Detector
-from ..model import FringeModel
+from ..model import FringeModel, Setup
 from ..model.effects_override import read_effects_override
 from ..model.provenance import model_cards, software_cards
 from ..products import SensorSection, ThicknessMap
@@ -31,9 +31,13 @@ __all__ = [
 ]
 
 
-def read_thickness(path: str | os.PathLike[str], layer: str | None = None) -> NDArray[np.float64]:
-    """Thickness [µm] from a file that `ThicknessMap.read_any` reads; NaN where there is none."""
-    return ThicknessMap.read_any(path, layer).known_um().astype(float)
+def read_thickness(path: str | os.PathLike[str], setup: Setup) -> NDArray[np.float64]:
+    """Thickness [µm] of the varying layer, from a file that `ThicknessMap.read_any` reads; NaN where there is none.
+
+    `InputError`: the map is of another layer, or of a sensor of another vendor.
+    """
+    found = ThicknessMap.read_any(path, setup.varying).of_setup(setup, str(path))
+    return found.known_um().astype(float)
 
 
 def read_section(

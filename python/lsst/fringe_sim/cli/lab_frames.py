@@ -13,7 +13,7 @@ import click
 from ..algorithms.flat_prep import combine_biases, prepare_flat
 from ..algorithms.flat_prep_options import FlatPrepOptions
 from ..errors import FrameFormatError, FringeSimError, InputError
-from ..instrument.camera import VENDORS, Camera, Detector
+from ..instrument.camera import Camera, Detector
 from ..instrument.raw_files import find_raw_files, pixel_digest
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..model import Setup
@@ -21,7 +21,7 @@ from ..products import FringeCube, FringeFlat
 from ..products.plain_flats import PlainImage, refuse_other_sensors, stack_plain_flats
 from ..resources import complete_fits
 
-__all__ = ["LabSeries", "PlainSeries", "find_series", "read_cube"]
+__all__ = ["LabSeries", "PlainSeries", "find_series", "of_vendor", "read_cube"]
 
 LEAST_SIZE = (16, 64)
 """Rows and columns below which a frame is no sensor."""
@@ -126,7 +126,7 @@ class LabSeries(Series[RawMetadata]):
         except FringeSimError:
             # A sensor that is not in the tables is read with the gains of the set-up's own.
             own = camera.detector(setup.detector)
-            vendor = VENDORS.get(self.serial.partition("-")[0].upper(), own.vendor)
+            vendor = camera.vendor_of(self.serial) or own.vendor
             sensor = replace(own, serial="", name=self.serial, vendor=vendor)
         setup.refuse_other_vendor(sensor)
         return sensor
@@ -134,6 +134,10 @@ class LabSeries(Series[RawMetadata]):
 
 class PlainSeries(Series[PlainImage]):
     """Images of a sensor without a layout of its own; what their headers do not say, the set-up does."""
+
+    def check(self, setup: Setup) -> None:
+        """Refuse a set-up of sensors of another vendor, where the headers name the sensor."""
+        setup.refuse_vendor_of(self.serial, self.flats[0].source)
 
     def read(self, setup: Setup, _: FlatPrepOptions, advance: Callable[[], None]) -> FringeCube:
         """Stack all images; they are not smoothed."""
@@ -285,14 +289,24 @@ def _each_once(frames: Sequence[RawMetadata]) -> list[RawMetadata]:
     return list(kept.values())
 
 
-def read_cube(path: str) -> FringeCube | None:
-    """The fringe cube in a file, or `None` if the path is something else."""
+def read_cube(path: str, setup: Setup) -> FringeCube | None:
+    """The fringe cube in a file, or `None` if the path is something else.
+
+    `InputError`: it names a sensor of another vendor than that of the set-up.
+    """
     if not Path(path).is_file():
         return None
     with complete_fits(path) as hdus:
         if "EXPOSURES" not in hdus or "IMAGE" not in hdus:
             return None
-    return FringeCube.read_fits(path)
+    return of_vendor(FringeCube.read_fits(path), setup, path)
+
+
+def of_vendor(cube: FringeCube, setup: Setup, source: str) -> FringeCube:
+    """The cube itself, if it names no sensor of another vendor than that of the set-up."""
+    for name in (str(cube.metadata.get("SERIAL", "")), cube.detector):
+        setup.refuse_vendor_of(name, source)
+    return cube
 
 
 def _readable(file: str) -> RawMetadata:

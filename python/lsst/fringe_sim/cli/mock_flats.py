@@ -93,14 +93,11 @@ def mock_flats(
     """
     import numpy as np
 
-    from ..instrument.camera import Camera
     from ..mock.hidden_effects import validate_effects
     from ..mock.raw_frames import Defects, write_mock_flats
 
     chosen = LABORATORY.convert(setup, None, None)
-    camera = Camera.from_name(chosen.camera)
-    sensor = camera.detector(detector or chosen.detector)
-    chosen.refuse_other_vendor(sensor)
+    sensor = chosen.sensor(detector)
     if silicon is not None:
         chosen.with_silicon(silicon)
     shape = shape_of(size, sensor.shape)
@@ -158,5 +155,5 @@ def thickness_map(
         if setup.varying != "adhesive":
             raise InputError("--thickness", text, f"'random' or a file for the layer {setup.varying}")
         return e2v_321(shape)
-    layer = read_thickness(text, setup.varying)
+    layer = read_thickness(text, setup)
     return layer if layer.shape == shape else fit_to_sensor(layer, shape)

@@ -77,14 +77,13 @@ def mock_visits(
     """
     import numpy as np
 
-    from ..instrument.camera import Camera
     from ..mock.hidden_effects import validate_effects
     from ..mock.visits import VisitConditions, write_mock_visits
 
     chosen = SKY.convert(setup, None, None)
     if silicon is not None:
         chosen.with_silicon(silicon)
-    sensor = Camera.from_name(chosen.camera).detector(detector or chosen.detector)
+    sensor = chosen.sensor(detector)
     shape = shape_of(size, sensor.shape)
     rng = np.random.default_rng(seed)
     validate_effects(effects.settings)

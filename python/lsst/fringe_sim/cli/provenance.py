@@ -12,7 +12,14 @@ from uuid import UUID
 
 import click
 
-from ..errors import FrameFormatError, InputError, UnknownNameError, printable_name
+from ..errors import (
+    LONGEST_VALUE,
+    FrameFormatError,
+    InputError,
+    UnknownNameError,
+    printable_name,
+    shown,
+)
 
 __all__ = ["describe", "provenance", "read_header"]
 
@@ -78,8 +85,8 @@ def read_header(path: str) -> dict[str, Any]:
             header = readers.get(suffix, _fits_header)(path)
             _check_text(header, path)
             return header
-    except InputError:
-        raise
+    except InputError as error:
+        raise (error if error.source else error.in_source(path)) from None
     except damage as error:
         raise FrameFormatError(
             "file", first_line(error), "an undamaged FITS, ECSV or JSON product", source=path
@@ -117,12 +124,20 @@ def _table_header(path: str) -> dict[str, Any]:
 def _document_header(path: str) -> dict[str, Any]:
     from ..resources import read_user_text
 
-    content = json.loads(read_user_text(path, "document"))
+    content = json.loads(read_user_text(path, "document"), object_pairs_hook=_each_key_once)
     if not isinstance(content, dict) or not isinstance(content.get("provenance"), dict):
         raise FrameFormatError(
             "JSON document", "no provenance", "one with an entry 'provenance'", source=path
         )
     return dict(content["provenance"])
+
+
+def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    made = dict(pairs)
+    if len(made) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise FrameFormatError("key", next(key for key in keys if keys.count(key) > 1), "a key once")
+    return made
 
 
 def describe(header: Mapping[str, Any]) -> dict[str, Any]:
@@ -255,20 +270,25 @@ def _as_text(record: Mapping[str, Any]) -> str:
     lines = [str(record["file"])]
     for name in ("product", "setup"):
         if record[name] is not None:
-            lines.append(f"  {name}: {record[name]}")
+            lines.append(f"  {name}: {_short(record[name])}")
     for name in ("software", "configuration", "effects", "seeds", "errors", "dataset", "other"):
         content = record[name]
         if content:
             lines.append(f"  {name}:")
-            lines += [f"    {key}: {value}" for key, value in content.items()]
+            lines += [f"    {_short(key)}: {_short(value)}" for key, value in content.items()]
     if record["tables"]:
         lines.append("  tables:")
         lines += [
-            f"    {item['table']} {item['revision']}"
+            f"    {_short(item['table'])} {_short(item['revision'])}"
             + ("" if item["here"] == "same" else f" ({item['here']} here)")
             for item in record["tables"]
         ]
     if record["inputs"]:
         lines.append(f"  inputs: {len(record['inputs'])}")
-        lines += [f"    {' '.join(item.values())}" for item in record["inputs"]]
+        lines += [f"    {' '.join(map(_short, item.values()))}" for item in record["inputs"]]
     return "\n".join(lines)
+
+
+def _short(value: Any) -> str:
+    """What people see of a value; JSON has all of it."""
+    return shown(str(value), LONGEST_VALUE)

@@ -120,7 +120,6 @@ def sky(
       fringe-sim sky --setup monocam --thickness e2v_321 --noiseless --exptime 60s --out sky
       fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky_with_effects
     """
-    from ..instrument.camera import Camera
     from ..instrument.flat_spectrum import FlatSpectrum
     from ..instrument.night import NightHistory
     from ..report.figures import sky_figure
@@ -129,10 +128,10 @@ def sky(
     from .inputs import sky_settings
 
     _check_exposure(exptime, night)
-    sensor = Camera.from_name(setup.camera).detector(detector or setup.detector)
+    sensor = setup.sensor(detector)
     header = map_header(thickness)
     contrast = laboratory_contrast(header, thickness)
-    layer, section = _layer(thickness, sensor, setup.varying)
+    layer, section = _layer(thickness, sensor, setup)
     silicon = None if silicon_thickness is None else _silicon(silicon_thickness, layer)
     settings = sky_settings(effects.settings)
     history = NightHistory.guo2022() if night else None
@@ -321,16 +320,13 @@ def _check_exposure(exptime: float | None, night: bool) -> None:
 def map_header(thickness: str) -> Mapping[str, Any]:
     """First header of the file of a map; empty for the built-in one."""
     from ..products.fits_product import check_noted
-    from ..resources import open_user_fits
+    from ..resources import complete_fits
 
     if thickness == BUILT_IN:
         return {}
-    with open_user_fits(thickness) as hdus:
+    with complete_fits(thickness) as hdus:
         header = dict(hdus[0].header)
-    try:
         check_noted(header)
-    except InputError as error:
-        raise error.in_source(thickness) from None
     return header
 
 
@@ -365,7 +361,7 @@ def _silicon(path: str, layer: FloatArray) -> FloatArray:
     return silicon
 
 
-def _layer(thickness: str, sensor: Detector, name: str) -> tuple[FloatArray, SensorSection | None]:
+def _layer(thickness: str, sensor: Detector, setup: Setup) -> tuple[FloatArray, SensorSection | None]:
     """Thickness of the varying layer [µm], and the part of the sensor that it is of."""
     from ..instrument.measured_thickness import e2v_321
     from ..products import SensorSection
@@ -374,7 +370,7 @@ def _layer(thickness: str, sensor: Detector, name: str) -> tuple[FloatArray, Sen
     if thickness == BUILT_IN:
         layer = e2v_321()
         return layer, SensorSection.of_image(sensor, (layer.shape[0], layer.shape[1]), {})
-    layer = read_thickness(thickness, name)
+    layer = read_thickness(thickness, setup)
     return layer, read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
 
 

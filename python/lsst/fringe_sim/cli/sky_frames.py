@@ -10,7 +10,6 @@ import click
 
 from ..algorithms.field_response import SensorPlacement
 from ..errors import InputError
-from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
 from ..products import SkyFrames, SkyFringe, ThicknessMap
@@ -45,9 +44,8 @@ def read_sky_frames(paths: Sequence[str], setup: Setup, thickness: str | None) -
         raise InputError("--thickness", None, "a thickness map: frames of the sky alone do not tell it")
     files = _files(paths)
     frames = _each_once(files)
-    sky = SkyFrames(frames, ThicknessMap.read_any(thickness, setup.varying))
-    sensor = Camera.from_name(setup.camera).detector(sky.detector or setup.detector)
-    return SkyData(sky, setup, sensor)
+    sky = SkyFrames(frames, ThicknessMap.read_any(thickness, setup.varying).of_setup(setup, thickness))
+    return SkyData(sky, setup, setup.sensor(sky.detector))
 
 
 def _each_once(files: Sequence[Path]) -> list[SkyFringe]:

@@ -82,6 +82,20 @@ class Camera:
                 "content", reason, "the description of a camera in YAML", source=str(path)
             ) from None
 
+    def vendor_of(self, name: str) -> str | None:
+        """Vendor of a sensor that a file names, by serial number or by place in this camera, else in any.
+
+        `None` if no table has the name, which a number is not, or if the cameras do not agree.
+        """
+        key = name.strip().removesuffix("-Dev")
+        if not key or key.isdigit():
+            return None
+        for cameras in ((self,), map(_load_camera, _camera_names())):
+            vendors = {one.detectors[one._index[key]].vendor for one in cameras if key in one._index}
+            if vendors:
+                return vendors.pop() if len(vendors) == 1 else None
+        return VENDORS.get(key.partition("-")[0].upper())
+
     @property
     def science(self) -> tuple[Detector, ...]:
         """Detectors that take science images."""
@@ -163,15 +177,17 @@ def _raft_names(detector: Detector) -> tuple[str, str, str]:
     return detector.raft, module, module.rpartition("_")[2]
 
 
+def _camera_names() -> tuple[str, ...]:
+    return (*_FROM_TABLES, *(file.removesuffix(".yaml") for file in list_resources("instrument", ".yaml")))
+
+
 @functools.cache
 def _load_camera(name: str) -> Camera:
-    from_tables: dict[str, Callable[[], Camera]] = {"lsstCam": _load_lsstcam, "ts8": _load_ts8}
-    described = [file.removesuffix(".yaml") for file in list_resources("instrument", ".yaml")]
-    if name in from_tables:
-        return from_tables[name]()
-    if name in described:
+    if name in _FROM_TABLES:
+        return _FROM_TABLES[name]()
+    if name in _camera_names():
         return _from_mapping(name, read_yaml("instrument", f"{name}.yaml"))
-    raise UnknownNameError("camera", name, [*from_tables, *described])
+    raise UnknownNameError("camera", name, _camera_names())
 
 
 def _vendor(spelling: str) -> str:
@@ -398,3 +414,6 @@ def _refuse_twins(field: str, values: Sequence[Any]) -> None:
     for value in values:
         if values.count(value) > 1:
             raise InputError(f"{field} of a detector", value, "a value of its own for each detector")
+
+
+_FROM_TABLES: dict[str, Callable[[], Camera]] = {"lsstCam": _load_lsstcam, "ts8": _load_ts8}

@@ -73,9 +73,13 @@ _PRIMARY = (
     (
         "EXPTIME",
         "uuu",
-        "exposure time in s, more than 0 of a monochromatic flat; dark time where DARKTIME is absent",
+        "exposure time in s, more than 0 of a monochromatic flat, 0 of a bias; dark time where DARKTIME is absent",
     ),
-    ("SHUTTIME", "uuu", "exposure time in s in place of EXPTIME where it is more than 0"),
+    (
+        "SHUTTIME",
+        "uuu",
+        "exposure time in s in place of EXPTIME where it is more than 0, as it is not of a bias",
+    ),
     ("DARKTIME", "uuu", "time of the dark current in s, not less than the exposure time"),
     ("CCDTEMP", "uuu", "temperature in °C, -200 to 60"),
     ("SENSTEMP", "uuu", "temperature where CCDTEMP is absent"),

@@ -11,6 +11,7 @@ from astropy.io import fits
 
 from ..errors import FrameFormatError, InputError, to_number
 from .header_keywords import RAW_KEYWORDS
+from .stated_facts import SAME_SECONDS
 
 __all__ = ["DeclaredHeader", "header_value"]
 
@@ -38,6 +39,10 @@ def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[st
     if isinstance(value, fits.card.Undefined) or (isinstance(value, str) and not value.strip()):
         return None
     return value.strip() if isinstance(value, str) else value
+
+
+def _is_no_time(seconds: float) -> bool:
+    return 0.0 <= seconds <= SAME_SECONDS
 
 
 def _differ(values: Sequence[Any]) -> bool:
@@ -97,6 +102,12 @@ class DeclaredHeader:
         if not (math.isfinite(number) and accept(number)):
             raise self.refuse(keyword, value, allowed)
         return number
+
+    def seconds_of_light(self, keyword: str, value: Any, kind: str) -> float:
+        """An exposure time [s]; 0 of a bias, as in all seven headers of biases that obs_lsst has."""
+        if kind == "bias":
+            return self.number(keyword, value, "0 s for a bias, which sees no light", _is_no_time)
+        return self.number(keyword, value, "seconds, 0 or more", lambda s: s >= 0)
 
     def refuse(self, keyword: str, value: Any, allowed: str) -> FrameFormatError:
         """An error over a value."""

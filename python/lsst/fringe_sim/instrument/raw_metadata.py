@@ -361,11 +361,11 @@ def _times(header: DeclaredHeader, observation_type: str) -> tuple[float, float]
     value = header.value("EXPTIME")
     if value is None and observation_type == "bias":
         value = 0.0
-    asked = exposure = header.number("EXPTIME", value, "seconds, 0 or more", lambda s: s >= 0)
+    asked = exposure = header.seconds_of_light("EXPTIME", value, observation_type)
     shutter = header.value("SHUTTIME")
     if shutter is not None:
         # 0 where the shutter stayed closed.
-        exposure = header.number("SHUTTIME", shutter, "seconds, 0 or more", lambda s: s >= 0) or exposure
+        exposure = header.seconds_of_light("SHUTTIME", shutter, observation_type) or exposure
     dark = header.value("DARKTIME")
     if dark is None:
         return exposure, exposure

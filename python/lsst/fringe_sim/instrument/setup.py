@@ -109,6 +109,36 @@ class Setup(InNotebook):
     wavelength_accuracy_nm: float = WAVELENGTH_ACCURACY_NM
     laboratory_temperature_k: float | None = None
 
+    def sensor(self, name: str | None = None) -> Detector:
+        """A sensor of the set-up's camera, by default its own.
+
+        Raises
+        ------
+        UnknownNameError
+            The camera has none of this name.
+        InputError
+            It is of another vendor than the set-up is for.
+        """
+        from .camera import Camera
+
+        detector = Camera.from_name(self.camera).detector(name or self.detector)
+        self.refuse_other_vendor(detector)
+        return detector
+
+    def refuse_vendor_of(self, name: str, source: str) -> None:
+        """Refuse a file that names a sensor of another vendor; a name that no table has tells none.
+
+        Raises
+        ------
+        InputError
+            See `refuse_other_vendor`.
+        """
+        from .camera import Camera
+
+        vendor = Camera.from_name(self.camera).vendor_of(name)
+        if vendor is not None:
+            self._refuse_vendor(vendor, name, source)
+
     def refuse_other_vendor(self, detector: Detector) -> None:
         """Refuse a sensor of another vendor than the set-up's own, whose films are others.
 
@@ -117,21 +147,21 @@ class Setup(InNotebook):
         InputError
             It is one; the message names the set-ups that are meant for it.
         """
+        self._refuse_vendor(detector.vendor, detector.serial or detector.name, None)
+
+    def _refuse_vendor(self, vendor: str, name: str, source: str | None) -> None:
         own = _vendor_of(self)
-        if detector.vendor != own:
+        if vendor != own:
             others = [
                 name
                 for name in setup_names()
                 if (setup := _shipped(name)).kind == self.kind
                 and setup.camera == self.camera
-                and _vendor_of(setup) == detector.vendor
+                and _vendor_of(setup) == vendor
             ]
-            meant = " or ".join([f"a set-up for {detector.vendor}", *others])
-            raise InputError(
-                "sensor",
-                f"{detector.serial or detector.name} of {detector.vendor}",
-                f"one of {own}, which set-up {self.name} is for; or {meant}",
-            )
+            meant = " or ".join([f"a set-up for {vendor}", *others])
+            allowed = f"one of {own}, which set-up {self.name} is for; or {meant}"
+            raise InputError("sensor", f"{name} of {vendor}", allowed, source=source)
 
     def facts(self) -> dict[str, Any]:
         """Sensor, temperature and light, with units."""

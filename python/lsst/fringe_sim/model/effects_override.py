@@ -135,7 +135,7 @@ def _is_complete(text: str, source: str | None) -> bool:
         raise InputError(
             "override file",
             "not what a search has written: cut short, or changed",
-            "the whole file (run the search again), or one without its first line, if it was changed by hand",
+            "the whole file (run the search again), or one without its first two lines, if it was changed by hand",
             source=source,
         )
     return True

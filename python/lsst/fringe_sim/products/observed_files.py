@@ -167,6 +167,8 @@ def observed_images(path: Path) -> list[ObservedImage]:
             for number, hdu in enumerate(hdus)
             if hdu.is_image and len(hdu.shape) == 2 and not hdu.name.upper().endswith(_NOT_SKY)
         ]
+        for image in found:
+            _refuse_two_statements(hdus, image, alone=len(found) == 1)
         sensors = [detector_of(_merged(hdus, image.index)) for image in found]
     if not found:
         raise FrameFormatError("images", 0, "one or more of two axes (y, x)", source=str(path))
@@ -253,6 +255,15 @@ def _merged(hdus: fits.HDUList, index: int) -> dict[str, Any]:
     return {**dict(hdus[0].header), **dict(hdus[index].header)}
 
 
+def _refuse_two_statements(hdus: fits.HDUList, image: ObservedImage, *, alone: bool) -> None:
+    """Refuse an image whose header contradicts the primary one, in its sensor too if it is the only image."""
+    for keyword in ("BUNIT", *FILTER_NAMES, *(SENSOR_NAMES if alone else ())):
+        first, own = (_text(hdus[number].header, keyword) for number in (0, image.index))
+        if first and own and first.casefold() != own.casefold():
+            allowed = "the same in the primary header and in that of the image"
+            raise FrameFormatError(keyword, f"{first} and {own}", allowed)
+
+
 def _text(header: Mapping[str, Any], keyword: str) -> str:
     """Value of a declared keyword; empty if there is none."""
     value = header_value(header, keyword, _DECLARED)
@@ -303,13 +314,20 @@ def _companion(path: Path, image: ObservedImage, shape: tuple[int, ...] | None =
 def _named(planes: Mapping[int, str], stored: NDArray[Any], *, bits: bool, others: str = "BAD") -> IntArray:
     """Mask of this package from bits or codes of another."""
     mask = np.zeros(stored.shape, dtype=np.int32)
-    rest = stored.astype(np.int64)
+    rest = _whole(stored)
     for number, name in planes.items():
         chosen = (rest >> number & 1) == 1 if bits else rest == number
         mask[chosen] |= mask_bits(name)
         rest = rest & ~(1 << number) if bits else np.where(chosen, 0, rest)
     mask[rest != 0] |= mask_bits(others)
     return mask
+
+
+def _whole(stored: NDArray[Any]) -> NDArray[np.int64]:
+    """Bits or codes of a mask, which another type may hold but no fraction."""
+    if stored.dtype.kind == "f" and not np.array_equal(stored, np.rint(stored)):
+        raise FrameFormatError("mask", f"fractions in {stored.dtype}", "whole numbers, bits or codes")
+    return stored.astype(np.int64)
 
 
 def _decam_mask(image: ObservedImage, _: fits.HDUList, header: Mapping[str, Any]) -> IntArray | None:
@@ -347,7 +365,7 @@ def _own_mask(image: ObservedImage, hdus: fits.HDUList, _: Mapping[str, Any]) ->
     }
     harmless = sum(1 << bit for name, bit in bits.items() if name in _HARMLESS)
     planes = {bit: _plane(name) for name, bit in bits.items() if name not in _HARMLESS}
-    return _named(planes, np.asarray(hdu.data).astype(np.int64) & ~harmless, bits=True)
+    return _named(planes, _whole(np.asarray(hdu.data)) & ~harmless, bits=True)
 
 
 def _bit(keyword: str, value: Any) -> int:
@@ -390,14 +408,23 @@ def _inverse(weight: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def _beside(hdus: fits.HDUList, image: ObservedImage, names: tuple[str, ...]) -> Any:
-    """HDU with one of these names that belongs to an image: of its version, or that begins with its name."""
+    """HDU with one of these names that belongs to an image: of its version, or that begins with its name.
+
+    `FrameFormatError`: several do, or one has the shape of no image of the file.
+    """
     own = hdus[image.index]
-    shape = own.shape
-    for hdu in hdus:
-        named = hdu.name.upper() in {*names, *(f"{own.name}_{name}".upper() for name in names)}
-        if named and hdu.is_image and hdu.shape == shape and (hdu.ver == own.ver or len(hdus) <= 4):
-            return hdu
-    return None
+    every = {*names, *(f"{own.name}_{name}".upper() for name in names)}
+    named = [hdu for hdu in hdus if hdu.name.upper() in every and hdu.is_image]
+    near = [hdu for hdu in named if hdu.ver == own.ver] or (named if len(hdus) <= 4 else [])
+    found = [hdu for hdu in near if hdu.shape == own.shape]
+    if len(found) > 1:
+        listed = ", ".join(hdu.name for hdu in found)
+        raise FrameFormatError(f"extensions for {image.name}", listed, f"one of {', '.join(names)}")
+    others = {hdu.shape for hdu in hdus if hdu.is_image and hdu not in named}
+    stray = next((hdu for hdu in near if hdu.shape not in others), None)
+    if not found and stray is not None:
+        raise FrameFormatError(f"shape of {stray.name}", stray.shape, f"{own.shape}, that of its image")
+    return found[0] if found else None
 
 
 def is_companion(path: Path) -> bool:

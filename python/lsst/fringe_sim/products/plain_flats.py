@@ -77,8 +77,8 @@ class PlainImage:
             return cls(header.source, kind, shape)
         _refuse_overscan(header, shape)
         seconds = header.value("EXPTIME")
-        if kind == "flat" and seconds is not None:
-            header.number("EXPTIME", seconds, "more than 0 s for a flat", lambda s: s > 0)
+        if seconds is not None and header.seconds_of_light("EXPTIME", seconds, kind) == 0 and kind == "flat":
+            raise header.refuse("EXPTIME", seconds, "more than 0 s for a flat")
         noise, full = header.value("RDNOISE"), header.value("SATURATE")
         return cls(
             source=header.source,

@@ -13,6 +13,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError, OutOfRangeError
+from ..instrument.setup import Setup
 from ..resources import open_user_fits, refuse_damage
 from . import _check as check
 from . import _fits as io
@@ -196,6 +197,17 @@ class ThicknessMap(SensorProduct):
             where = source or self.detector or None
             raise InputError("layer of the thickness map", self.layer, layer, source=where)
         return self
+
+    def of_setup(self, setup: Setup, source: str | None = None) -> Self:
+        """The map itself, if it is of the varying layer of a set-up, and not of another vendor's sensor.
+
+        Raises
+        ------
+        InputError
+            It is something else.
+        """
+        setup.refuse_vendor_of(self.detector, source or self.detector)
+        return self.of_layer(setup.varying, source)
 
     def known_um(self) -> NDArray[np.float32]:
         """Thickness [µm], NaN where there is none; what a mask only doubts keeps its value."""

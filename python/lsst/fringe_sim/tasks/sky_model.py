@@ -245,8 +245,7 @@ def _band(setup: Setup) -> str:
 
 def _check_map(thickness: ThicknessMap, choice: ModelChoice) -> None:
     """Refuse a map that means something else than the model takes it for."""
-    varying = Setup.from_name(choice.setup).varying
-    thickness.of_layer(varying)
+    thickness.of_setup(Setup.from_name(choice.setup))
     if "SETUP" not in thickness.metadata:
         return  # not fitted here
     fitted = effects_of_header(thickness.metadata)
