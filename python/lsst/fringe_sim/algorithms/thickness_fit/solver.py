@@ -21,7 +21,7 @@ from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, subtract_offset
 from .orders import SURE, solve_orders
 from .pixels import CellSurface
-from .shared_misfit import leaves_only_noise
+from .shared_misfit import cells_leave_only_noise, leaves_only_noise
 from .templates import FringeTemplates
 
 __all__ = ["Solver", "State", "surface_of"]
@@ -122,7 +122,8 @@ class Solver:
         narrow = held._mean_is_open(probe) or not held._is_wide(probe)
         if narrow:
             state = held._solve_held(cells, templates, probe)
-            return state if self._leaves_only_noise(state) else None
+            alone = cells_leave_only_noise(state.cells, state.templates, state.thickness_um)
+            return state if alone and self._leaves_only_noise(state) else None
         if not self._leaves_only_noise(held.adjust(replace(probe, normalisation="sensor"))):
             return None
         state = held._solve_held(cells, templates, probe)
