@@ -1,28 +1,27 @@
 """Flats of sensors that are not as the model has them, and how a thickness map stands up to them.
 
-The optics are those of `field_matrices`, which share nothing with the package but the tables of the media. Run as
-a script, this prints a table: ``python tests/helpers/laboratory_flats.py [--maps N] [--size N] [ROW ...]``.
+The optics are those of `field_matrices`, which share nothing with the package but the tables of the media.
+`benchmarks/laboratory.py` prints a table of them.
 """
 
 from __future__ import annotations
 
-import argparse
-import itertools
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import field_matrices
 import numpy as np
 from field_matrices import ForeignSensor
 from scipy.ndimage import gaussian_filter1d
+from scipy.special import erfc
 
 from lsst.fringe_sim.algorithms import fit_thickness
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FlatExposures, FringeCube, ThicknessMap
 
-__all__ = ["ROWS", "Laboratory", "Result", "judge", "make_flats"]
+__all__ = ["CERTAIN", "ROWS", "Laboratory", "Result", "expected_margin", "fit_one", "judge", "make_flats"]
 
 TEN_NM = np.arange(880.0, 991.0, 10.0)
 ORDER_UM = 0.3
@@ -93,7 +92,9 @@ class Result:
     """How a map compares with the truth: shares of pixels, σ in nm, width of the pulls of right orders.
 
     ``own`` is the width of the pulls about their mean, without the uncertainty that all pixels share; ``common`` is
-    that mean over this uncertainty, one number for a sensor.
+    that mean over this uncertainty, one number for a sensor. ``margin`` is the chi-square by which the next order is
+    said to be worse, and ``right`` whether the order of the sensor is right, masked or not. ``foretold`` is the share
+    of unmasked pixels that their uncertainty alone puts off by more than half an order.
     """
 
     wrong: float
@@ -105,12 +106,16 @@ class Result:
     misfit: float
     own: float
     common: float
+    margin: float
+    right: bool
+    foretold: float
 
     def __str__(self) -> str:
         return (
-            f"wrong {self.wrong:8.1e}  masked {self.masked:7.1e}  sigma {self.sigma_nm:6.2f} nm  "
-            f"pulls {self.pull:5.2f}  own {self.own:5.2f}  "
-            f"common {self.common:+5.2f}  slip {self.slip:7.1e}  misfit {self.misfit:5.2f}  {self.seconds:5.1f} s"
+            f"wrong {self.wrong:8.1e} (foretold {self.foretold:7.1e})  masked {self.masked:7.1e}  "
+            f"sigma {self.sigma_nm:6.2f} nm  pulls {self.pull:5.2f}  own {self.own:5.2f}  "
+            f"common {self.common:+5.2f}  slip {self.slip:7.1e}  misfit {self.misfit:5.2f}  "
+            f"margin {self.margin:6.4g}  {self.seconds:5.1f} s"
         )
 
 
@@ -183,6 +188,9 @@ def judge(fitted: ThicknessMap, truth: np.ndarray, seconds: float = 0.0) -> Resu
         float(fitted.metadata.get("MISFIT", 0.0)),
         float(np.sqrt(np.mean(own**2))) if own.size else float("nan"),
         mean / float(shared.mean()) if own.size and shared.any() else 0.0,
+        float(fitted.metadata.get("ORDMARG", np.inf)),
+        abs(float(np.nanmedian(fitted.value - truth))) < 0.5 * ORDER_UM,
+        float(np.mean(erfc(0.5 * ORDER_UM / (np.sqrt(2.0) * sigma)))) if good.any() else 0.0,
     )
 
 
@@ -192,66 +200,22 @@ def draw_map(rng: np.random.Generator, size: int) -> np.ndarray:
     return random_field((size, size), rng, mean=mean, span=span)
 
 
-def one(
-    laboratory: Laboratory, seed: int, model: FringeModel, size: int, **options: Any
+def fit_one(
+    laboratory: Laboratory, seed: int, model: FringeModel, size: int, noisy: bool = True, **options: Any
 ) -> tuple[ThicknessMap, Result]:
     """Fit one map that a seed draws."""
     rng = np.random.default_rng(seed)
     truth = draw_map(rng, size)
-    cube = make_flats(laboratory, truth, rng)
+    cube = make_flats(laboratory, truth, rng, noisy=noisy)
     start = time.process_time()
     fitted = fit_thickness(cube, model, **options)
     return fitted, judge(fitted, truth, time.process_time() - start)
 
 
-def decidable(laboratory: Laboratory, seed: int, model: FringeModel, size: int) -> bool:
-    """Whether the expected chi-square of the best rival of the true order is 25 or more, all nuisances being free.
+def expected_margin(laboratory: Laboratory, seed: int, model: FringeModel, size: int) -> float:
+    """Chi-square by which the best rival of the true order is worse, all nuisances being free; 0 if one is better.
 
     The chi-square differences of flats without noise, with its variances, are those expected.
     """
-    rng = np.random.default_rng(seed)
-    truth = draw_map(rng, size)
-    fitted = fit_thickness(make_flats(laboratory, truth, rng, noisy=False), model)
-    right = abs(float(np.median(fitted.value - truth))) < 0.5 * ORDER_UM
-    return right and float(fitted.metadata["ORDMARG"]) >= CERTAIN
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("rows", nargs="*", help="parts of the names of rows; all if none is given")
-    parser.add_argument("--maps", type=int, default=1)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--contrast", default=None)
-    parser.add_argument("--method", default="global")
-    parser.add_argument("--contrasts", type=float, nargs="*", default=[None])
-    parser.add_argument("--electrons", type=float, nargs="*", default=[None])
-    parser.add_argument("--decidable", action="store_true", help="ask whether the order can be told at all")
-    arguments = parser.parse_args()
-    model = FringeModel.from_setup("ts8_e2v")
-    options: dict[str, Any] = {"method": arguments.method}
-    if arguments.contrast:
-        options["contrast"] = arguments.contrast
-    for name, laboratory in ROWS.items():
-        if arguments.rows and not any(part in name for part in arguments.rows):
-            continue
-        for contrast, electrons in itertools.product(arguments.contrasts, arguments.electrons):
-            asked = replace(
-                laboratory,
-                contrast=laboratory.contrast if contrast is None else contrast,
-                electrons=laboratory.electrons if electrons is None else electrons,
-            )
-            for seed in range(arguments.first, arguments.first + arguments.maps):
-                try:
-                    result = str(one(asked, seed, model, arguments.size, **options)[1])
-                    if arguments.decidable:
-                        result += f"  decidable {decidable(asked, seed, model, arguments.size)}"
-                except Exception as error:
-                    result = f"{type(error).__name__}: {error}"
-                case = f"c {asked.contrast:4.2f}  {asked.electrons:6.0f} e-"
-                print(f"{name:32s} {case}  map {seed}  {result}", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+    result = fit_one(laboratory, seed, model, size, noisy=False)[1]
+    return result.margin if result.right else 0.0

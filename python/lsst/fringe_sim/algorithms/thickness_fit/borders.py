@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel, subkernel
 from .amplitudes import Amplitudes
+from .misfit import Misfit
 from .newton import gauss_newton
 from .pixels import PixelFit
 from .templates import LANES, FringeTemplates
@@ -23,6 +24,8 @@ _PRICE = 2.0
 _SWEEPS = 6
 _SAME_SURFACE = 0.25
 _MOST_SURFACES = 6
+_MOST_JUDGED = 20_000
+"""Pixels that show how far all are off."""
 
 
 def settle_borders(
@@ -63,8 +66,9 @@ def settle_borders(
         return pixels, slip
     value, weight = gather_pixels(data, rows, columns)
     freedom = np.maximum(np.count_nonzero(weight > 0, axis=1) - 1, 1).astype(np.float32)
+    misfit = _misfit_of(pixels)
     arguments = (
-        value, weight, freedom, rows, columns, templates.table(),
+        value, weight, freedom, misfit.scale, misfit.tail, rows, columns, templates.table(),
         templates.start_um, templates.step_um, order_um, temper,
         pixels.value, pixels.sigma, pixels.chi2, slip,
     )  # fmt: skip
@@ -72,6 +76,17 @@ def settle_borders(
         if _sweep(*arguments, sweep % 2 == 1) == 0:
             break
     return pixels, slip
+
+
+def _misfit_of(pixels: PixelFit) -> Misfit:
+    """How far pixels are off beyond their noise."""
+    some = slice(
+        None, None, pixels.chi2.size // _MOST_JUDGED | 1
+    )  # an odd stride does not fall on the same columns
+    chi2, used = pixels.chi2.ravel()[some], pixels.n_wavelengths.ravel()[some]
+    freedom = max(int(used.max(initial=0)) - 1.0, 1.0)
+    known = (used == freedom + 1.0) & np.isfinite(chi2)
+    return Misfit.of(freedom * chi2[known].astype(float), freedom)
 
 
 def gather_pixels(
@@ -106,7 +121,7 @@ def _jump_price(jump, order):  # type: ignore[no-untyped-def]
 
 @kernel
 def _sweep(  # type: ignore[no-untyped-def]
-    value, weight, freedom, rows, columns, table, start, step, order, temper,
+    value, weight, freedom, scale, tail, rows, columns, table, start, step, order, temper,
     thickness, sigma, reduced, slip, backwards,
 ):  # fmt: skip
     """Ask every pixel once; returns how many changed their mind."""
@@ -146,7 +161,8 @@ def _sweep(  # type: ignore[no-untyped-def]
             at = start + step * place
             if g > 0 and abs(at - guess[g]) > _SAME_SURFACE * order:
                 continue
-            cost = temper * max(chi2, np.float32(0.0))
+            # Student's: what a pixel leaves over beyond its noise is error of the model, which chooses no side.
+            cost = temper * (tail + freedom[k]) * np.log1p(max(chi2, np.float32(0.0)) / (tail * scale))
             for b in range(max(y - 1, 0), min(y + 2, ny)):
                 for a in range(max(x - 1, 0), min(x + 2, nx)):
                     if (b != y or a != x) and np.isfinite(thickness[b, a]):

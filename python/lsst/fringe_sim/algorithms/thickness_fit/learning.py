@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .evidence import refine_row
 from .learning_cells import LearningCells
-from .misfit import Misfit, shared_variance
+from .misfit import Misfit, shared_variances
 from .nuisances import OVERTONES, NuisanceFit, Nuisances, light_widths
 from .templates import FringeTemplates
 from .wavelengths import CommonError, common_error, shift_precision
@@ -345,7 +345,7 @@ class _Problem:
             fit,
             contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale,
             misfit=misfit.scale * squares, chi2=self.cells.temper * misfit.cost(each), prior=self._prior_chi2(fit),
-            shared=shared_variance(standard, (np.arange(len(rest)), by_phase)),
+            shared=float(shared_variances(standard, (np.arange(len(rest)), by_phase))[-1]),
         )  # fmt: skip
 
     def _trust(self, rest: FloatArray, weight: FloatArray) -> tuple[Misfit, FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-__all__ = ["Misfit", "shared_variance"]
+__all__ = ["Misfit", "shared_variances"]
 
 FloatArray = NDArray[np.float64]
 
@@ -60,8 +60,8 @@ class Misfit:
         return float(each.sum() + 2.0 * norm * chi2.size)
 
 
-def shared_variance(rest: FloatArray, orders: Iterable[NDArray[np.intp]]) -> float:
-    """Variance of sums over cells, relative to that of cells which err each by itself; at least 1.
+def shared_variances(rest: FloatArray, orders: Iterable[NDArray[np.intp]]) -> FloatArray:
+    """Variance of sums over 1, 2, 4, ... cells, relative to that of cells which err each by itself; never falls.
 
     Parameters
     ----------
@@ -70,12 +70,13 @@ def shared_variance(rest: FloatArray, orders: Iterable[NDArray[np.intp]]) -> flo
     orders : iterable of `numpy.ndarray` of `int`
         Rows of cells in which neighbours may err alike.
     """
-    most = 1.0
+    sizes = [1]
+    while _FEWEST_BATCHES * 2 * sizes[-1] <= len(rest):
+        sizes.append(2 * sizes[-1])
+    most = np.ones(len(sizes))
     for order in orders:
-        size = 2
-        while _FEWEST_BATCHES * size <= len(rest):
+        for at, size in enumerate(sizes[1:], 1):
             count = len(rest) // size
             means = rest[order[: count * size]].reshape(count, size, -1).mean(axis=1)
-            most = max(most, size * float(np.mean(means**2)))
-            size *= 2
-    return most
+            most[at] = max(most[at], size * float(np.mean(means**2)))
+    return np.maximum.accumulate(most)

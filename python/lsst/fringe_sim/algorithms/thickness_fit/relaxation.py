@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells, cell_independence, effective_number
-from .evidence import EVIDENCE_CAP, IMPOSSIBLE, MISFIT, OrderEvidence
+from .evidence import EVIDENCE_CAP, IMPOSSIBLE, OrderEvidence
 from .lone_surfaces import settle_lone_surfaces
-from .medians import middle_of, sort_first
-from .newton import gauss_newton, score
+from .misfit import Misfit, shared_variances
+from .newton import gauss_newton
 from .templates import FringeTemplates
 
 __all__ = ["SettledCells", "settle_orders"]
@@ -30,11 +30,10 @@ BREAK_PRICE = 8.0
 """Chi-square that a break of half an order or more between two neighbouring cells costs."""
 SAME_SURFACE = 0.25
 """Cells that agree within this many orders, slopes allowed for, lie on one surface."""
-_LONE = 0.1
-"""A cell this many orders off the surface of its neighbours is looked at again."""
 _LARGEST_MENDED = 400
 """Largest surface, in cells, that is moved onto the one around it, whatever the jump."""
-_MEND_ROUNDS = 4
+_MOST_JUDGED = 20_000
+"""Cells that show how far all are off."""
 _LARGEST_BLOCK = 64
 _BOLD_BLOCK = 8
 _SWEEPS = 3
@@ -107,23 +106,14 @@ def settle_orders(
     rise_x = slope_x * np.diff(cells.x_edges).astype(np.float32)[None, :]
     table = templates.table()
     grid = (templates.start_um, templates.step_um)
-    flat_value = cells.value.reshape(-1, cells.value.shape[-1])
-    flat_weight = cells.weight.reshape(flat_value.shape)
-    misfit = _misfits(flat_value, flat_weight, table, *grid, thickness.ravel())
-    limit = MISFIT * max(float(np.median(misfit[np.isfinite(misfit)])), 1.0)
-    for _ in range(_MEND_ROUNDS):
-        moved = _mend(
-            flat_value, flat_weight, table, *grid, thickness, rise_y, rise_x, order_um, temper, limit
-        )
-        if moved == 0:
-            break
+    misfit, alike = _judge_cells(cells, templates, thickness, order_um)
     shifted = np.zeros((*thickness.shape, 2 * SHIFTS + 1), np.float32)
     cost = np.zeros_like(shifted)
 
     def ask(row: int) -> None:
         _ask_row(
-            cells.value[row], cells.weight[row], table, *grid, thickness[row], order_um, *range_um, temper, limit,
-            shifted[row], cost[row],
+            cells.value[row], cells.weight[row], table, *grid, thickness[row], order_um, *range_um, temper,
+            misfit.scale, misfit.tail, shifted[row], cost[row],
         )  # fmt: skip
 
     for _ in range(_MOST_ROUNDS):
@@ -148,7 +138,7 @@ def settle_orders(
         thickness = np.take_along_axis(shifted, (label + SHIFTS)[..., None], axis=2)[..., 0]
         segment = _segments(thickness, rise_y, rise_x, order_um)
         price = _segment_prices(cost, shifted, label, segment, rise_y, rise_x, order_um)
-    share = _small_surfaces(segment, cells, correlation_px)
+    share = _small_surfaces(segment, cells, correlation_px) / _alike(segment, alike)
     excess = share[:, None] * (price - price[:, SHIFTS : SHIFTS + 1])
     odds = np.exp(-0.5 * excess.clip(-200.0, 2000.0)).sum(axis=1)
     segment_slip = 1.0 - 1.0 / (odds + _far_odds(found, thickness, segment, share))
@@ -167,16 +157,21 @@ def settle_orders(
     return SettledCells(thickness, segment, segment_slip, cell_slip)
 
 
-@kernel
-def _misfits(value, weight, table, start, step, thickness):  # type: ignore[no-untyped-def]
-    """Reduced chi-square of every cell; NaN where there is no data."""
-    out = np.full(thickness.shape[0], np.nan, np.float32)
-    for c in range(thickness.shape[0]):
-        if np.isfinite(thickness[c]):
-            place = min(max((thickness[c] - start) / step, 0.0), table.shape[0] - 1.0)
-            _, _, chi2 = score(table, place, value, weight, c)
-            out[c] = chi2 / max(_used(weight, c) - 1, 1)
-    return out
+def _judge_cells(
+    cells: Cells, templates: FringeTemplates, thickness: NDArray[np.float32], order: float
+) -> tuple[Misfit, NDArray[np.float64]]:
+    """How far cells are off beyond their noise, and how far sums over 1, 2, 4, ... of them err alike."""
+    some = slice(
+        None, None, 1 + thickness.size // _MOST_JUDGED
+    )  # whole rows, in which neighbours stay beside each other
+    known = np.isfinite(thickness[some])
+    wavelengths, own = templates.n_wavelengths, thickness[some][known]
+    value, weight = (part[some][known][:, :wavelengths] for part in (cells.value, cells.weight))
+    rest = np.sqrt(weight) * (value - templates.amplitude_at(own).T)
+    chi2 = (rest**2).sum(axis=1)
+    misfit = Misfit.of(chi2, max(wavelengths - 1.0, 1.0))
+    rest *= np.sqrt(misfit.trust(chi2))[:, None]
+    return misfit, shared_variances(rest, (np.arange(len(rest)), np.argsort(own % order)))
 
 
 @subkernel
@@ -189,10 +184,9 @@ def _used(weight, item):  # type: ignore[no-untyped-def]
 
 
 @subkernel(expand=True)
-def _trust(misfit, temper, limit):  # type: ignore[no-untyped-def]
-    """Factor on the chi-square differences of a cell: less for one that fits badly, least beside better ones."""
-    share = min(limit / misfit, 1.0) if misfit > 0.0 else 1.0
-    return temper / max(1.0, misfit) * share * share
+def _improbability(chi2, freedom, scale, tail):  # type: ignore[no-untyped-def]
+    """Twice the negative logarithm of Student's distribution of a cell, but for a constant."""
+    return (tail + freedom) * np.log1p(max(chi2, 0.0) / (tail * scale))
 
 
 @subkernel(expand=True)
@@ -240,118 +234,11 @@ def _top(parent, cell):  # type: ignore[no-untyped-def]
     return cell
 
 
-@subkernel
-def _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond):  # type: ignore[no-untyped-def]
-    """Jumps from the cells of a surface to the cells around it; returns how many there are."""
-    ny, nx = thickness.shape
-    number = np.int64(0)
-    for cell in members:
-        y, x = cell // nx, cell % nx
-        for side in range(4):
-            b = y - 1 if side == 0 else (y + 1 if side == 1 else y)
-            a = x - 1 if side == 2 else (x + 1 if side == 3 else x)
-            if 0 <= b < ny and 0 <= a < nx and surface[b, a] >= 0 and surface[b, a] != own:
-                rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (
-                    a - x
-                )
-                jumps[number] = thickness[b, a] - thickness[y, x] - rise
-                beyond[number] = surface[b, a]
-                number += 1
-    return number
-
-
-@subkernel
-def _main_jump(jumps, beyond, number, kept):  # type: ignore[no-untyped-def]
-    """Middle jump to the neighbour that shares most of the border."""
-    for k in range(number):
-        kept[k] = beyond[k]
-    sort_first(kept, number)
-    most, longest, run = kept[0], 0, 0
-    for k in range(number):
-        run = run + 1 if k > 0 and kept[k] == kept[k - 1] else 1
-        if run > longest:
-            most, longest = kept[k], run
-    count = np.int64(0)
-    for k in range(number):
-        if beyond[k] == most:
-            kept[count] = jumps[k]
-            count += 1
-    return middle_of(kept, count)
-
-
-def _mend(
-    value: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    table: NDArray[np.float32],
-    start: float,
-    step: float,
-    thickness: NDArray[np.float32],
-    rise_y: NDArray[np.float32],
-    rise_x: NDArray[np.float32],
-    order: float,
-    temper: float,
-    limit: float,
-) -> int:
-    """Move small surfaces onto the one around them, if that costs less; returns how many moved."""
-    surface, count = _surfaces(thickness, rise_y, rise_x, _LONE * order)
-    if count <= 1:
-        return 0
-    flat = surface.ravel()
-    size = np.bincount(flat[flat >= 0], minlength=count)
-    listed = np.argsort(flat, kind="stable")[np.count_nonzero(flat < 0) :]
-    first = np.concatenate([[0], np.cumsum(size)])
-    moved = 0
-    for own in np.argsort(size, kind="stable"):
-        if size[own] > _LARGEST_MENDED:
-            break
-        moved += _move_surface(
-            value, weight, table, start, step, thickness, rise_y, rise_x, order, temper, limit,
-            surface, listed[first[own] : first[own + 1]], own,
-        )  # fmt: skip
-    return moved
-
-
 @kernel
-def _move_surface(  # type: ignore[no-untyped-def]
-    value, weight, table, start, step, thickness, rise_y, rise_x, order, temper, limit, surface, members, own
+def _ask_row(  # type: ignore[no-untyped-def]
+    value, weight, table, start, step, thickness, order, low, high, temper, scale, tail, shifted, cost
 ):
-    """Move one surface by its main jump, if that costs less; returns whether it moved."""
-    nx = thickness.shape[1]
-    most = 4 * members.shape[0]
-    jumps, kept, beyond = np.empty(most, np.float64), np.empty(most, np.float64), np.empty(most, np.int64)
-    found = np.empty(members.shape[0], np.float64)
-    top = table.shape[0] - 1.0
-    number = _links_out(thickness, surface, rise_y, rise_x, members, own, jumps, beyond)
-    if number == 0:
-        return 0
-    move = _main_jump(jumps, beyond, number, kept)
-    change = 0.0
-    for k in range(number):
-        change += _break_price(jumps[k] - move, order) - _break_price(jumps[k], order)
-    for k in range(members.shape[0]):
-        item = members[k]
-        own_thickness = thickness[item // nx, item % nx]
-        place = min(max((own_thickness - start) / step, 0.0), top)
-        _, _, here = score(table, place, value, weight, item)
-        target = min(max((own_thickness + move - start) / step, 0.0), top)
-        place, _, there = gauss_newton(table, target, value, weight, item, np.int64(5), 0.03 / step)
-        found[k] = start + step * place
-        if abs(place - target) * step > _LONE * order:
-            # No minimum there: the cell would have to lie on the surface against its own data.
-            found[k] = start + step * target
-            _, _, there = score(table, target, value, weight, item)
-        misfit = min(here, there) / max(_used(weight, item) - 1, 1)
-        change += _trust(misfit, temper, limit) * (there - here)
-    if change >= 0.0:
-        return 0
-    for k in range(members.shape[0]):
-        thickness[members[k] // nx, members[k] % nx] = found[k]
-    return 1
-
-
-@kernel
-def _ask_row(value, weight, table, start, step, thickness, order, low, high, temper, limit, shifted, cost):  # type: ignore[no-untyped-def]
-    """Chi-square of each cell at whole orders around its thickness, above the least of them."""
+    """Improbability of each cell at whole orders around its thickness, above the least of them."""
     top = table.shape[0] - 1.0
     shifts = shifted.shape[1]
     for c in range(value.shape[0]):
@@ -361,6 +248,7 @@ def _ask_row(value, weight, table, start, step, thickness, order, low, high, tem
         if not np.isfinite(thickness[c]):
             continue
         least = np.inf
+        freedom = max(_used(weight, c) - 1, 1)
         for k in range(shifts):
             at = thickness[c] + (k - shifts // 2) * order
             if at < low - 0.05 * order or at > high + 0.05 * order:
@@ -372,13 +260,11 @@ def _ask_row(value, weight, table, start, step, thickness, order, low, high, tem
             found = start + step * place
             # What ran away has no minimum there.
             shifted[c, k] = found if abs(found - at) < SAME_SURFACE * order else at
-            cost[c, k] = max(chi2, np.float32(0.0))
+            cost[c, k] = temper * _improbability(chi2, freedom, scale, tail)
             least = min(least, cost[c, k])
-        used = _used(weight, c)
-        scale = _trust(least / max(used - 1, 1), temper, limit)
         for k in range(shifts):
             if np.isfinite(cost[c, k]):
-                cost[c, k] = min(scale * (cost[c, k] - least), EVIDENCE_CAP)
+                cost[c, k] = min(cost[c, k] - least, EVIDENCE_CAP)
             else:
                 cost[c, k] = IMPOSSIBLE
 
@@ -523,6 +409,12 @@ def _small_surfaces(segment: NDArray[np.int32], cells: Cells, correlation_px: fl
         for n in np.unique(side)
     }
     return np.array([max(factor[int(n)], 1.0) for n in side])
+
+
+def _alike(segment: NDArray[np.int32], alike: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far the cells of each surface err alike, which makes the sum of their evidence worth less."""
+    size = np.bincount(segment[segment >= 0], minlength=1)
+    return alike[np.minimum(np.log2(size).astype(int), len(alike) - 1)]
 
 
 def _far_odds(

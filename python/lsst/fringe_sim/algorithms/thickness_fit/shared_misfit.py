@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from .amplitudes import Amplitudes
 from .borders import gather_pixels
+from .cells import Cells
 from .evidence import refine_row
 from .pixels import CellSurface
 from .templates import FringeTemplates
 
-__all__ = ["doubt_from_shared_misfit", "leaves_only_noise"]
+__all__ = ["cells_leave_only_noise", "doubt_from_shared_misfit", "leaves_only_noise"]
 
 _MOST_PIXELS = 4000
 _MOST_PAIRS = 40_000
@@ -108,7 +109,26 @@ def leaves_only_noise(data: Amplitudes, templates: FringeTemplates, surface: Cel
         refine_row(value, weight, templates.table(), templates.start_um, templates.step_um, start, found)
         pulls.append(_pull(templates, value, weight, np.nan_to_num(found, nan=templates.start_um)))
         pulls[-1][~np.isfinite(found)] = np.nan
-    product = (pulls[0] * pulls[1]).sum(axis=1)
+    return _is_noise((pulls[0] * pulls[1]).sum(axis=1))
+
+
+def cells_leave_only_noise(
+    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32]
+) -> bool:
+    """Whether what a model leaves over in neighbouring cells has nothing in common.
+
+    A cell has less noise than its pixels: fringes so weak that no pixel shows them are seen in cells. Taken for the
+    whole fringes of a sensor that is nearly flat, they leave over what no thickness explains.
+    """
+    value, weight = (part.reshape(-1, part.shape[-1]) for part in (cells.value, cells.weight))
+    pulls = _pull(templates, value, weight, np.nan_to_num(thickness_um.ravel(), nan=templates.start_um))
+    pulls[~np.isfinite(thickness_um.ravel())] = np.nan
+    pulls = pulls.reshape(*thickness_um.shape, -1)
+    return _is_noise((pulls[:, 1:] * pulls[:, :-1]).sum(axis=-1).ravel())
+
+
+def _is_noise(product: NDArray[np.float64]) -> bool:
+    """Whether products of neighbours scatter about zero."""
     product = product[np.isfinite(product)]
     if product.size == 0:
         return False

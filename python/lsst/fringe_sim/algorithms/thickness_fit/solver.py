@@ -16,12 +16,12 @@ from .first_nuisances import first_nuisances
 from .learning import learn
 from .learning_cells import LearningCells, sample_blocks, some_of
 from .mean_response import SENSOR_ORDERS, normalise_to_cells, normalise_to_pixels, spans_orders
-from .misfit import Misfit, shared_variance
+from .misfit import Misfit, shared_variances
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, subtract_offset
 from .orders import SURE, solve_orders
 from .pixels import CellSurface
-from .shared_misfit import leaves_only_noise
+from .shared_misfit import cells_leave_only_noise, leaves_only_noise
 from .templates import FringeTemplates
 
 __all__ = ["Solver", "State", "surface_of"]
@@ -122,7 +122,8 @@ class Solver:
         narrow = held._mean_is_open(probe) or not held._is_wide(probe)
         if narrow:
             state = held._solve_held(cells, templates, probe)
-            return state if self._leaves_only_noise(state) else None
+            alone = cells_leave_only_noise(state.cells, state.templates, state.thickness_um)
+            return state if alone and self._leaves_only_noise(state) else None
         if not self._leaves_only_noise(held.adjust(replace(probe, normalisation="sensor"))):
             return None
         state = held._solve_held(cells, templates, probe)
@@ -228,7 +229,7 @@ class Solver:
         chi2 = (rest**2).sum(axis=1)
         rest *= np.sqrt(Misfit.of(chi2, max(wavelengths - 1.0, 1.0)).trust(chi2))[:, None]
         orders = (np.arange(len(rest)), np.argsort(thickness % self.order_um))
-        return 1.0 + (shared_variance(rest, orders) - 1.0) * every.size / max(known.size, 1)
+        return 1.0 + (shared_variances(rest, orders)[-1] - 1.0) * every.size / max(known.size, 1)
 
     def _narrow(self, cells: Cells, first: State) -> State:
         """Orders of a sensor of few orders, whose mean response depends on them, and they on it.
