@@ -36,8 +36,9 @@ PLACES_REFITTED, STEPS_ALONE, PLACES_KEPT = 8, 8, 2
 less than half an order away), and the best ones, from which all effects are fitted."""
 
 STRONGEST = 2.0
-"""Most by which effects that are not in the set yet may strengthen the fringes: nearly all of them weaken them. A cone
-so wide that it takes all fringes away is no start for a fit, however well fringes many times as strong would do."""
+"""Most by which effects that are not in the set yet may strengthen the fringes: nearly all of them weaken them. A
+cone so wide that it takes all fringes away is no start for a fit, however well fringes many times as strong would
+do."""
 
 LEAST_THICKNESS_UM, MOST_SIGMAS = 0.5, 4.0
 """Thinnest layer, and how far a map that is known may be moved, over its uncertainty."""

@@ -754,9 +754,7 @@ class Selector:
                 break
             start = fit.position.copy()
             start[number] = places[index]
-            trial = fit_model(
-                self.problem, fit.coordinates, start, fit.field, fit.levels, rival=best.chi2
-            )
+            trial = fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels, rival=best.chi2)
             best = min(best, trial, key=lambda item: item.chi2)
         return best
 

@@ -22,8 +22,8 @@ WORTH_FITTING = 9.0
 """Fall of χ² that an effect must promise to be fitted."""
 
 MORE_THAN_PROMISED, PROMISE_KEPT = 3.0, 1.5
-"""By how much a fit may bring more than its score promised: where all effects are asked whether they can explain what is
-left, and beside a set that leaves noise. Of 140 fits to flats with one and two effects the most was 1.18."""
+"""By how much a fit may bring more than its score promised: where all effects are asked whether they can explain what
+is left, and beside a set that leaves noise. Of 140 fits to flats with one and two effects the most was 1.18."""
 
 MUCH_LEFT = 0.05
 """χ² above that of noise, over the number of values, that is surely no error of the noise."""
