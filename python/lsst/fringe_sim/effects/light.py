@@ -236,8 +236,9 @@ class ConvergingBeam(PlainNullEffect):
     def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
         """Widen the beam by a cone."""
         aperture = values["numerical_aperture"]
-        # Phase between axis and rim in 265 um of silicon is 240 rad times the aperture squared: a node per 2 rad.
-        nodes = 6 + math.ceil(120.0 * aperture**2)
+        # Phase between axis and rim in 265 um of silicon is 240 rad times the aperture squared: a node per 2 rad,
+        # and three for what remains: 1e-5 of the fringes without the cone or less, at every aperture up to 0.5.
+        nodes = 3 + math.ceil(120.0 * aperture**2)
         cone = Beam.cone(0.5 / aperture, nodes=nodes)
         if system.beam.theta.any():
             cone = widened(system.beam, cone, system.beam.theta.size + nodes)

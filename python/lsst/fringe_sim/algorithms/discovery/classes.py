@@ -25,8 +25,8 @@ off 500 to 5000, for seven ghost images and stains of other seeds than the recor
 
 RIVALS_REFITTED = 3
 MUCH_OF_IT = 0.9
-"""Best replacements of an effect that are fitted again, and the part of the log evidence from which on as many that
-shift the phase are looked for at other sizes and in other orders."""
+"""Best replacements of an effect that are fitted again, and the part of the log evidence that it brings from which on
+as many that shift the phase are looked for at other sizes and in other orders."""
 
 LEAST_PROMISE = 4.0
 ALIKE = 0.8
@@ -68,7 +68,7 @@ def _class_of(selector: Selector, chosen: Hypothesis, name: str, width: float) -
     rest = tuple(other for other in chosen.names if other != name)
     without = selector.improved(rest, chosen.fit)
     found = {name: chosen, **_replacements(selector, chosen, name, without)}
-    _refit_rivals(selector, chosen, found, width)
+    _refit_rivals(selector, chosen, without, found, width)
     significance = math.sqrt(max(without.fit.chi2 - chosen.fit.chi2, 0.0))
     return _compared(name, found, width, significance)
 
@@ -114,7 +114,9 @@ def classes_in_all_data(
     return found
 
 
-def _refit_rivals(selector: Selector, chosen: Hypothesis, found: dict[str, Hypothesis], width: float) -> None:
+def _refit_rivals(
+    selector: Selector, chosen: Hypothesis, without: Hypothesis, found: dict[str, Hypothesis], width: float
+) -> None:
     """Fit the best replacements again from where the set itself has come: it may have found a deeper valley since.
 
     Those that shift the phase are looked for at other sizes and in other orders too.
@@ -123,7 +125,8 @@ def _refit_rivals(selector: Selector, chosen: Hypothesis, found: dict[str, Hypot
         n: h for n, h in found.items() if h is not chosen and h.log_evidence < chosen.log_evidence - width
     }
     ranked = sorted(behind, key=lambda n: -behind[n].log_evidence)
-    much = (n for n in ranked if behind[n].log_evidence > MUCH_OF_IT * chosen.log_evidence)
+    brought = chosen.log_evidence - without.log_evidence
+    much = (n for n in ranked if behind[n].log_evidence > chosen.log_evidence - (1.0 - MUCH_OF_IT) * brought)
     shifting = list(islice((n for n in much if selector.shifts_phase(behind[n])), RIVALS_REFITTED))
     for name in dict.fromkeys((*ranked[:RIVALS_REFITTED], *shifting)):
         found[name] = selector.improved(behind[name].names, chosen.fit, scan=name in shifting)

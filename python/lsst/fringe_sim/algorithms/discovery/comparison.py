@@ -47,10 +47,13 @@ def chi2_with_free_levels(model: FloatArray, value: FloatArray, weight: FloatArr
     return float((weight * (value - level[:, None, None] * model) ** 2).sum())
 
 
-def chi2_with_free_fringes(models: FloatArray, value: FloatArray, weight: FloatArray) -> FloatArray:
+def chi2_with_free_fringes(
+    models: FloatArray, value: FloatArray, weight: FloatArray, strongest: float = math.inf
+) -> FloatArray:
     """χ² of several models, with the best level and the best contrast, not a negative one, at each wavelength.
 
-    ``models`` (W, S, ny, nx). ``value``, ``weight`` (W, ny, nx). Returns (S,).
+    ``models`` (W, S, ny, nx). ``value``, ``weight`` (W, ny, nx). ``strongest``: largest contrast, relative to the
+    models'. Returns (S,).
     """
     waves = len(value)
     weights = weight.reshape(waves, -1, 1)
@@ -62,5 +65,6 @@ def chi2_with_free_fringes(models: FloatArray, value: FloatArray, weight: FloatA
     flat = flat - ((flat[:, :1] @ weights) / total[:, None])
     cross, mean = (flat @ (weights * rest))[..., 0], (flat @ weights)[..., 0] / total
     square = np.einsum("wsn,wsn,wn->ws", flat, flat, weights[..., 0]) - mean**2 * total
-    taken = np.divide(np.maximum(cross, 0.0) ** 2, square, out=np.zeros_like(cross), where=square > 0.0)
-    return np.asarray((weights * rest**2).sum() - taken.sum(axis=0))
+    best = np.divide(np.maximum(cross, 0.0), square, out=np.zeros_like(cross), where=square > 0.0)
+    contrast = np.minimum(best, strongest)
+    return np.asarray((weights * rest**2).sum() - (contrast * (2.0 * cross - contrast * square)).sum(axis=0))

@@ -52,8 +52,9 @@ CONVERGED = 0.02
 FAR_BEHIND = 100.0
 CATCHING_UP = 75.0
 FEWEST_ITERATIONS = 4
+STEEPER = 4
 """Distance in χ² from which on a fit may be behind a better one for good, the steps that it would have to catch up,
-and those that it gets in any case."""
+those that it gets in any case, and by how much those that are left to it may bring more than the last one did."""
 
 
 @dataclass(frozen=True)
@@ -696,7 +697,8 @@ class _Solver:
             if gain < CONVERGED:
                 converged = True
                 break
-            if count >= FEWEST_ITERATIONS and point.chi2 - rival > max(FAR_BEHIND, CATCHING_UP * gain):
+            further = min(CATCHING_UP, STEEPER * (iterations - count)) * gain
+            if count >= FEWEST_ITERATIONS and point.chi2 - rival > max(FAR_BEHIND, further):
                 break
         design = self.linearise(point)
         number = len(self.coordinates)

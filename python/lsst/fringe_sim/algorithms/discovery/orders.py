@@ -35,6 +35,11 @@ PLACES_REFITTED, STEPS_ALONE, PLACES_KEPT = 8, 8, 2
 """Places from which the size of an effect is fitted alone, the steps of such a fit (a fifth of an order at most, from
 less than half an order away), and the best ones, from which all effects are fitted."""
 
+STRONGEST = 2.0
+"""Most by which effects that are not in the set yet may strengthen the fringes: nearly all of them weaken them. A
+cone so wide that it takes all fringes away is no start for a fit, however well fringes many times as strong would
+do."""
+
 LEAST_THICKNESS_UM, MOST_SIGMAS = 0.5, 4.0
 """Thinnest layer, and how far a map that is known may be moved, over its uncertainty."""
 
@@ -188,7 +193,7 @@ class _Trial:
         settings = {c.key: c.value(x) for c, x in zip(self.fit.coordinates, position, strict=True)}
         model = self.problem.forward.sampled(settings, self.fields_um).value
         value, weight = self.problem.cells.value[self.sample], self.problem.cells.weight[self.sample]
-        chi2 = chi2_with_free_fringes(model, value, weight).reshape(2, -1)
+        chi2 = chi2_with_free_fringes(model, value, weight, STRONGEST).reshape(2, -1)
         lowest = [_vertex(self.shifts_um, each) for each in chi2]
         even = lowest[1][1] < lowest[0][1]
         return _Place(number, position, lowest[even][0], even, lowest[even][1])

@@ -66,6 +66,10 @@ PAIR = 2
 effect and a thickness that is wrong in places."""
 
 
+FEW_MENDED = 0.01
+"""Part of the cells that may change their fringe order without moving where effects alone are by more than a fit that
+starts there finds."""
+
 FOR_JUDGEMENT = 0.2
 """Part of a time budget that is kept for the judgement of the best answer on the data held out."""
 
@@ -387,10 +391,11 @@ class _Search:
         Where these are not seen the thickness is any, and a fit to it explains less than effects that weaken all of
         them. Once it is continued from where they are, it explains more.
 
-        Also where the effects alone are, if all cells are in the fringe order in which they were fitted.
+        Also where the effects alone are, if nearly all cells are in the fringe order in which they were fitted.
         """
         best, mended = self._refined(whole, sets.to_judge_with(singles))
-        places = {} if mended else {one.names[0]: one.fit.position for one in singles}
+        few = mended <= FEW_MENDED * np.count_nonzero(self.cells.seen)
+        places = {one.names[0]: one.fit.position for one in singles} if few else {}
         for blur in sets.that_may_hide_fringes(singles):
             other, _ = self._refined(whole, blur)
             if other is not None and is_judged_better(other, best or self.prepared):

@@ -741,27 +741,33 @@ class Selector:
 
     def _deeper_along(self, fit: Fit, number: int) -> Fit:
         """The fit, or a better one in a neighbouring minimum of one coordinate; the others follow."""
-        item, state = fit.coordinates[number], self.state(fit.holding(number))
+        item = fit.coordinates[number]
         reach = np.arange(-MINIMA_TRIED * STEPS_PER_MINIMUM, MINIMA_TRIED * STEPS_PER_MINIMUM + 1)
         around = fit.position[number] + reach * (item.neighbour / STEPS_PER_MINIMUM)
         places = np.unique([item.clip(x) for x in around])
+        fall = self._falls(fit, number, places)
+        away = np.abs(places - fit.position[number]) > 0.5 * item.neighbour
+        minima = [index for index in local_minima(-fall) if away[index] and fall[index] > 0.0]
+        best = fit
+        for index in sorted(minima, key=lambda index: -fall[index])[:MINIMA_REFITTED]:
+            if fall[index] <= fit.chi2 - best.chi2:
+                break
+            start = fit.position.copy()
+            start[number] = places[index]
+            trial = fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels, rival=best.chi2)
+            best = min(best, trial, key=lambda item: item.chi2)
+        return best
+
+    def _falls(self, fit: Fit, number: int, places: FloatArray) -> FloatArray:
+        """Fall of χ² that other places of one coordinate promise; the others follow in proportion."""
+        item, state = fit.coordinates[number], self.state(fit.holding(number))
         fall = np.zeros(len(places))
         for index, place in enumerate(places):
             settings = {**fit.settings, item.key: item.value(place)}
             column = FullColumns(self._signature(state, fit, settings)[np.newaxis])
             score, information = state.design.project(column, state.residual)
             fall[index] = 2.0 * score[0] - information[0, 0]
-        away = np.abs(places - fit.position[number]) > 0.5 * item.neighbour
-        minima = [index for index in local_minima(-fall) if away[index]]
-        best = sorted(minima, key=lambda index: -fall[index])[:MINIMA_REFITTED]
-        trials = []
-        for index in map(int, best):
-            start = fit.position.copy()
-            start[number] = places[index]
-            trials.append(
-                fit_model(self.problem, fit.coordinates, start, fit.field, fit.levels, rival=fit.chi2)
-            )
-        return min((fit, *trials), key=lambda trial: trial.chi2)
+        return fall
 
     def settled(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis in the deepest of its neighbouring minima; how far the others reach is in its uncertainty.

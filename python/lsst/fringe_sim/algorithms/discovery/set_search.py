@@ -21,8 +21,9 @@ SURELY = 1e-7
 WORTH_FITTING = 9.0
 """Fall of χ² that an effect must promise to be fitted."""
 
-MORE_THAN_PROMISED = 3.0
-"""By how much a fit may bring more than its score promised."""
+MORE_THAN_PROMISED, PROMISE_KEPT = 3.0, 1.5
+"""By how much a fit may bring more than its score promised: where all effects are asked whether they can explain what
+is left, and beside a set that leaves noise. Of 140 fits to flats with one and two effects the most was 1.18."""
 
 MUCH_LEFT = 0.05
 """χ² above that of noise, over the number of values, that is surely no error of the noise."""
@@ -492,7 +493,7 @@ class SetSearch:
 
 def _may_reach(chi2: float, base: Hypothesis, candidate: Candidate) -> bool:
     """Whether a set may come down to a χ² with an effect more, which may bring more than it promises."""
-    return MORE_THAN_PROMISED * candidate.promise > base.fit.chi2 - chi2
+    return PROMISE_KEPT * candidate.promise > base.fit.chi2 - chi2
 
 
 def _surely_gains(selector: Selector, candidate: Candidate, wrong: float = 0.0) -> bool:
