@@ -23,6 +23,7 @@ from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.cli.provenance import read_header
 from lsst.fringe_sim.errors import FrameFormatError
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_metadata
+from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.products import FringeCube, ThicknessMap
 from lsst.fringe_sim.products.xarray_export import read_exported
 from lsst.fringe_sim.resources import check_axes
@@ -51,13 +52,15 @@ def product(name: str, folder: Path) -> bytes:
     return path.read_bytes()
 
 
+SETUP = Setup.from_name("ts8_e2v")
+
 READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "raw frame": ("raw", RawFrame.read),
     "raw header": ("raw", read_raw_metadata),
     "map": ("ThicknessMap", ThicknessMap.read_fits),
-    "map of anybody": ("ThicknessMap", read_thickness),
+    "map of anybody": ("ThicknessMap", lambda path: read_thickness(path, SETUP)),
     "cube": ("FringeCube", FringeCube.read_fits),
-    "cube of a command": ("FringeCube", read_cube),
+    "cube of a command": ("FringeCube", lambda path: read_cube(path, SETUP)),
     "provenance": ("FringeCube", read_header),
     "export": ("FringeCube", read_exported),
     "place of a map": ("ThicknessMap", lambda path: read_section(path, small_detector(), (6, 8))),
@@ -89,7 +92,7 @@ def test_a_cube_with_other_axes_than_it_has_is_refused(value: str, tmp_path: Pat
     path = tmp_path / "cube.fits"
     path.write_bytes(replaced(product("FringeCube", tmp_path), "NAXIS", value))
     with pytest.raises(FrameFormatError):
-        read_cube(str(path))
+        read_cube(str(path), SETUP)
     assert run(["fit", str(path), "--out", str(tmp_path / "out")]) == 1
 
 
@@ -156,4 +159,4 @@ def test_only_headers_are_looked_at(compress: Callable[[bytes], bytes]) -> None:
 def test_sound_files_pass(tmp_path: Path) -> None:
     path = tmp_path / "sound.fits.gz"
     fits.PrimaryHDU(np.ones((5, 7), np.float32)).writeto(path)
-    assert read_thickness(path).shape == (5, 7)
+    assert read_thickness(path, SETUP).shape == (5, 7)

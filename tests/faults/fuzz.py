@@ -279,7 +279,7 @@ def thickness_file(data: st.DataObject, folder: Path) -> None:
 def use_thickness(path: Path, folder: Path) -> None:
     """The map as commands read it."""
     with guarded("thickness maps", folder):
-        read_thickness(path)
+        read_thickness(path, MODEL.setup)
 
 
 def sky_frame_file(data: st.DataObject, folder: Path) -> None:
@@ -402,7 +402,7 @@ def use_cube(path: Path, folder: Path) -> None:
 
 
 def _fit(path: Path, method: str) -> None:
-    found = read_cube(str(path))
+    found = read_cube(str(path), MODEL.setup)
     if found is None:
         return
     fitted = fit_thickness(found, MODEL, method, range_um=RANGE_UM)

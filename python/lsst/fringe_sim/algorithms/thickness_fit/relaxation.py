@@ -414,7 +414,7 @@ def _small_surfaces(segment: NDArray[np.int32], cells: Cells, correlation_px: fl
 def _alike(segment: NDArray[np.int32], alike: NDArray[np.float64]) -> NDArray[np.float64]:
     """How far the cells of each surface err alike, which makes the sum of their evidence worth less."""
     size = np.bincount(segment[segment >= 0], minlength=1)
-    return alike[np.minimum(np.log2(size).astype(int), len(alike) - 1)]
+    return alike[np.minimum(np.log2(np.maximum(size, 1)).astype(int), len(alike) - 1)]
 
 
 def _far_odds(
