@@ -37,10 +37,10 @@ def smooth_masked(
     ``image``, ``variance``: values with independent noise, and their variance.
     ``good``: pixels to use.
     ``sigma_px``: standard deviation of the kernel [px], cut off at four of them; 0 leaves good pixels as they
-        are.
+    are.
     Returns NaN in pixels that are not good and have less than 2 % of the kernel on good ones. Neighbouring
-        values are correlated: the noise of the result has a Gaussian correlation of standard deviation
-        ``sqrt(2) sigma_px``.
+    values are correlated: the noise of the result has a Gaussian correlation of standard deviation
+    ``sqrt(2) sigma_px``.
     `InputError`: the arrays have different shapes, or are not two-dimensional.
     `OutOfRangeError`: ``sigma_px`` is negative.
     """

@@ -77,7 +77,7 @@ def gauss_rule(value: ArrayLike, weight: ArrayLike, nodes: int) -> tuple[FloatAr
     ``value``, ``weight`` ``(N,)``: points of the measure and their weights.
     ``nodes``: number of nodes wanted.
     Returns at most ``nodes`` ascending nodes inside the range of ``value``, and weights that sum to the sum
-        of ``weight``.
+    of ``weight``.
     """
     if nodes < 1:
         raise OutOfRangeError("number of beam angles", nodes, "1 or more")
