@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel, subkernel
 from .amplitudes import Amplitudes
-from .misfit import Misfit
+from .misfit import Misfit, improbability
 from .newton import gauss_newton
 from .pixels import PixelFit
 from .templates import LANES, FringeTemplates
@@ -80,9 +80,8 @@ def settle_borders(
 
 def _misfit_of(pixels: PixelFit) -> Misfit:
     """How far pixels are off beyond their noise."""
-    some = slice(
-        None, None, pixels.chi2.size // _MOST_JUDGED | 1
-    )  # an odd stride does not fall on the same columns
+    # An odd stride does not fall on the same columns.
+    some = slice(None, None, pixels.chi2.size // _MOST_JUDGED | 1)
     chi2, used = pixels.chi2.ravel()[some], pixels.n_wavelengths.ravel()[some]
     freedom = max(int(used.max(initial=0)) - 1.0, 1.0)
     known = (used == freedom + 1.0) & np.isfinite(chi2)
@@ -162,7 +161,7 @@ def _sweep(  # type: ignore[no-untyped-def]
             if g > 0 and abs(at - guess[g]) > _SAME_SURFACE * order:
                 continue
             # Student's: what a pixel leaves over beyond its noise is error of the model, which chooses no side.
-            cost = temper * (tail + freedom[k]) * np.log1p(max(chi2, np.float32(0.0)) / (tail * scale))
+            cost = temper * improbability(chi2, freedom[k], scale, tail)
             for b in range(max(y - 1, 0), min(y + 2, ny)):
                 for a in range(max(x - 1, 0), min(x + 2, nx)):
                     if (b != y or a != x) and np.isfinite(thickness[b, a]):

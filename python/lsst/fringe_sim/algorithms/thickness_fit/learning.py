@@ -340,12 +340,11 @@ class _Problem:
         freedom = np.maximum(seen * (1.0 - 1.0 / wavelengths) - (own - held), 1.0)
         squares = (trust[:, None] * weight * rest**2).sum(axis=0) / freedom
         standard = np.sqrt(trust[:, None] * weight / np.maximum(squares, 1.0)) * rest
-        by_phase = np.argsort(thickness % self.cells.order_um)
         return thickness, replace(
             fit,
             contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale,
             misfit=misfit.scale * squares, chi2=self.cells.temper * misfit.cost(each), prior=self._prior_chi2(fit),
-            shared=float(shared_variances(standard, (np.arange(len(rest)), by_phase))[-1]),
+            shared=float(shared_variances(standard, thickness, self.cells.order_um)[-1]),
         )  # fmt: skip
 
     def _trust(self, rest: FloatArray, weight: FloatArray) -> tuple[Misfit, FloatArray, FloatArray]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from ...compiled import subkernel
 
-__all__ = ["middle_of", "sort_first"]
+__all__ = ["middle_of"]
 
 
 @subkernel
-def sort_first(values, count):  # type: ignore[no-untyped-def]
+def _sort_first(values, count):  # type: ignore[no-untyped-def]
     """Sort the first ``count`` numbers in place (Shell 1959, gaps of Ciura 2001)."""
     for gap in (701, 301, 132, 57, 23, 10, 4, 1):
         for k in range(gap, count):
@@ -23,5 +23,5 @@ def sort_first(values, count):  # type: ignore[no-untyped-def]
 @subkernel
 def middle_of(values, count):  # type: ignore[no-untyped-def]
     """Sort the first ``count`` numbers in place and return the middle one (the upper of two)."""
-    sort_first(values, count)
+    _sort_first(values, count)
     return values[count // 2]

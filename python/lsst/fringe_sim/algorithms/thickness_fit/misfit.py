@@ -9,14 +9,16 @@ cells err alike: how far they do is seen in the means of batches of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-__all__ = ["Misfit", "shared_variances"]
+from ...compiled import subkernel
+from .templates import FringeTemplates
+
+__all__ = ["Misfit", "improbability", "judge_cells", "shared_variances"]
 
 FloatArray = NDArray[np.float64]
 
@@ -60,21 +62,51 @@ class Misfit:
         return float(each.sum() + 2.0 * norm * chi2.size)
 
 
-def shared_variances(rest: FloatArray, orders: Iterable[NDArray[np.intp]]) -> FloatArray:
+@subkernel(expand=True)
+def improbability(chi2, freedom, scale, tail):  # type: ignore[no-untyped-def]
+    """Twice the negative logarithm of Student's distribution of a cell, but for a constant."""
+    return (tail + freedom) * np.log1p(max(chi2, 0.0) / (tail * scale))
+
+
+def judge_cells(
+    value: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    templates: FringeTemplates,
+    thickness_um: NDArray[np.floating],
+    order_um: float,
+) -> tuple[Misfit, FloatArray]:
+    """How far cells are off beyond their noise, and how far they err alike: see `shared_variances`.
+
+    ``value``, ``weight``: one row for each cell of ``thickness_um``, padded.
+    """
+    wavelengths = templates.n_wavelengths
+    expected = templates.amplitude_at(thickness_um).T
+    rest = np.sqrt(weight[:, :wavelengths]) * (value[:, :wavelengths] - expected)
+    chi2 = (rest**2).sum(axis=1)
+    misfit = Misfit.of(chi2, max(wavelengths - 1.0, 1.0))
+    rest *= np.sqrt(misfit.trust(chi2))[:, None]
+    return misfit, shared_variances(rest, thickness_um, order_um)
+
+
+def shared_variances(rest: FloatArray, thickness_um: NDArray[np.floating], order_um: float) -> FloatArray:
     """Variance of sums over 1, 2, 4, ... cells, relative to that of cells which err each by itself; never falls.
+
+    Cells beside each other may err alike, and those of the same phase of the fringes.
 
     Parameters
     ----------
     rest : `numpy.ndarray`, shape ``(n_cells, n_wavelengths)``
         What cells leave over, in standard deviations.
-    orders : iterable of `numpy.ndarray` of `int`
-        Rows of cells in which neighbours may err alike.
+    thickness_um : `numpy.ndarray`, shape ``(n_cells,)``
+        Their thickness [µm], neighbours one after the other.
+    order_um : `float`
+        Thickness of a fringe [µm].
     """
     sizes = [1]
     while _FEWEST_BATCHES * 2 * sizes[-1] <= len(rest):
         sizes.append(2 * sizes[-1])
     most = np.ones(len(sizes))
-    for order in orders:
+    for order in (np.arange(len(rest)), np.argsort(thickness_um % order_um)):
         for at, size in enumerate(sizes[1:], 1):
             count = len(rest) // size
             means = rest[order[: count * size]].reshape(count, size, -1).mean(axis=1)

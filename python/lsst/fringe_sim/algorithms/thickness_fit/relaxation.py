@@ -18,7 +18,7 @@ from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells, cell_independence, effective_number
 from .evidence import EVIDENCE_CAP, IMPOSSIBLE, OrderEvidence
 from .lone_surfaces import settle_lone_surfaces
-from .misfit import Misfit, shared_variances
+from .misfit import Misfit, improbability, judge_cells
 from .newton import gauss_newton
 from .templates import FringeTemplates
 
@@ -161,17 +161,11 @@ def _judge_cells(
     cells: Cells, templates: FringeTemplates, thickness: NDArray[np.float32], order: float
 ) -> tuple[Misfit, NDArray[np.float64]]:
     """How far cells are off beyond their noise, and how far sums over 1, 2, 4, ... of them err alike."""
-    some = slice(
-        None, None, 1 + thickness.size // _MOST_JUDGED
-    )  # whole rows, in which neighbours stay beside each other
+    # Whole rows, in which neighbours stay beside each other.
+    some = slice(None, None, 1 + thickness.size // _MOST_JUDGED)
     known = np.isfinite(thickness[some])
-    wavelengths, own = templates.n_wavelengths, thickness[some][known]
-    value, weight = (part[some][known][:, :wavelengths] for part in (cells.value, cells.weight))
-    rest = np.sqrt(weight) * (value - templates.amplitude_at(own).T)
-    chi2 = (rest**2).sum(axis=1)
-    misfit = Misfit.of(chi2, max(wavelengths - 1.0, 1.0))
-    rest *= np.sqrt(misfit.trust(chi2))[:, None]
-    return misfit, shared_variances(rest, (np.arange(len(rest)), np.argsort(own % order)))
+    value, weight = (part[some][known] for part in (cells.value, cells.weight))
+    return judge_cells(value, weight, templates, thickness[some][known], order)
 
 
 @subkernel
@@ -181,12 +175,6 @@ def _used(weight, item):  # type: ignore[no-untyped-def]
     for band in range(weight.shape[1]):
         number += 1 if weight[item, band] > 0.0 else 0
     return number
-
-
-@subkernel(expand=True)
-def _improbability(chi2, freedom, scale, tail):  # type: ignore[no-untyped-def]
-    """Twice the negative logarithm of Student's distribution of a cell, but for a constant."""
-    return (tail + freedom) * np.log1p(max(chi2, 0.0) / (tail * scale))
 
 
 @subkernel(expand=True)
@@ -260,7 +248,7 @@ def _ask_row(  # type: ignore[no-untyped-def]
             found = start + step * place
             # What ran away has no minimum there.
             shifted[c, k] = found if abs(found - at) < SAME_SURFACE * order else at
-            cost[c, k] = temper * _improbability(chi2, freedom, scale, tail)
+            cost[c, k] = temper * improbability(chi2, freedom, scale, tail)
             least = min(least, cost[c, k])
         for k in range(shifts):
             if np.isfinite(cost[c, k]):

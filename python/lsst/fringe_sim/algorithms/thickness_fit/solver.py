@@ -16,7 +16,7 @@ from .first_nuisances import first_nuisances
 from .learning import learn
 from .learning_cells import LearningCells, sample_blocks, some_of
 from .mean_response import SENSOR_ORDERS, normalise_to_cells, normalise_to_pixels, spans_orders
-from .misfit import Misfit, shared_variances
+from .misfit import judge_cells
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
 from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, subtract_offset
 from .orders import SURE, solve_orders
@@ -220,16 +220,11 @@ class Solver:
         thickness = state.found.best_um.ravel()
         every = np.flatnonzero(np.isfinite(thickness))
         known = some_of(every, _MOST_COMPARED)
-        wavelengths, thickness = state.templates.n_wavelengths, thickness[known]
         value, weight = (
-            part.reshape(-1, part.shape[-1])[known, :wavelengths]
-            for part in (state.cells.value, state.cells.weight)
+            part.reshape(-1, part.shape[-1])[known] for part in (state.cells.value, state.cells.weight)
         )
-        rest = np.sqrt(weight) * (value - state.templates.amplitude_at(thickness).T)
-        chi2 = (rest**2).sum(axis=1)
-        rest *= np.sqrt(Misfit.of(chi2, max(wavelengths - 1.0, 1.0)).trust(chi2))[:, None]
-        orders = (np.arange(len(rest)), np.argsort(thickness % self.order_um))
-        return 1.0 + (shared_variances(rest, orders)[-1] - 1.0) * every.size / max(known.size, 1)
+        _, alike = judge_cells(value, weight, state.templates, thickness[known], self.order_um)
+        return 1.0 + (float(alike[-1]) - 1.0) * every.size / max(known.size, 1)
 
     def _narrow(self, cells: Cells, first: State) -> State:
         """Orders of a sensor of few orders, whose mean response depends on them, and they on it.
