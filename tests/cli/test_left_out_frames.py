@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +13,6 @@ from lsst.fringe_sim.cli.lab_frames import LabSeries, find_series
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.errors import FrameFormatError
 from lsst.fringe_sim.instrument.setup import Setup
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("raws") / "raws"
-    size = ("--size", "64x64", "--wavelengths", "900,950", "--bias-frames", "2", "--seed", "1")
-    assert run(["mock-flats", str(folder), *size]) == 0
-    return folder
-
-
-@pytest.fixture
-def raws(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "raws"))
 
 
 def change(raws: Path, pattern: str, **cards: Any) -> None:

@@ -13,24 +13,10 @@ from product_makers import MAKERS
 
 from lsst.fringe_sim.algorithms.flat_prep_options import DEFAULT_OPTIONS
 from lsst.fringe_sim.cli.lab_frames import find_series
-from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.cli.sky_frames import read_sky_frames
 from lsst.fringe_sim.errors import FrameFormatError, InputError
 from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.products import FringeCube, SkyFrames, SkyFringe
-
-
-@pytest.fixture(scope="module")
-def raws(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("raws") / "raws"
-    size = ("--size", "64x64", "--wavelengths", "900,950", "--bias-frames", "2", "--seed", "1")
-    assert run(["mock-flats", str(folder), *size]) == 0
-    return folder
-
-
-@pytest.fixture
-def twice(raws: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(raws, tmp_path / "raws"))
 
 
 def flat_of(folder: Path) -> Path:
@@ -55,29 +41,29 @@ def copy_all(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("copied", [rename, compress, copy_all])
-def test_a_copy_counts_once(twice: Path, copied, capsys: pytest.CaptureFixture[str]) -> None:
-    copied(twice)
-    series = find_series([str(twice)])
+def test_a_copy_counts_once(raws: Path, copied, capsys: pytest.CaptureFixture[str]) -> None:
+    copied(raws)
+    series = find_series([str(raws)])
     assert (len(series.biases), len(series.flats)) == (2, 2)
     assert capsys.readouterr().err.count("not counted again") == 1
 
 
-def test_one_exposure_with_two_contents_is_refused(twice: Path) -> None:
-    rename(twice)
-    with fits.open(twice / "renamed.fits", mode="update") as hdus:
+def test_one_exposure_with_two_contents_is_refused(raws: Path) -> None:
+    rename(raws)
+    with fits.open(raws / "renamed.fits", mode="update") as hdus:
         hdus[3].data[10, 10] += 1
     with pytest.raises(FrameFormatError, match="other pixels"):
-        find_series([str(twice)])
+        find_series([str(raws)])
 
 
 @pytest.mark.parametrize("card", [("DATE-OBS", "2026-01-01T00:00:00.000"), ("MONOWL", 951.0)])
-def test_equal_pixels_under_another_header_are_refused(twice: Path, card: tuple[str, object]) -> None:
-    rename(twice)
-    with fits.open(twice / "renamed.fits", mode="update") as hdus:
+def test_equal_pixels_under_another_header_are_refused(raws: Path, card: tuple[str, object]) -> None:
+    rename(raws)
+    with fits.open(raws / "renamed.fits", mode="update") as hdus:
         del hdus[0].header["DAYOBS"]
         hdus[0].header["DATE-OBS"] = "2026-01-02T00:00:00.000"
         hdus[0].header[card[0]] = card[1]
-    series = find_series([str(twice)])
+    series = find_series([str(raws)])
     assert len(series.flats) == 3
     with pytest.raises(FrameFormatError, match="light of its own"):
         series.read(Setup.from_name("ts8_e2v"), DEFAULT_OPTIONS, lambda: None)

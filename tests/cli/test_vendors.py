@@ -53,9 +53,9 @@ def test_flats_that_name_a_sensor_of_the_other_vendor(
     assert not (tmp_path / "out").exists()
 
 
-def map_file(path: Path, detector: str) -> Path:
+def map_file(path: Path, detector: str, thickness_um: float = 16.0) -> Path:
     """A map from elsewhere, which does not name its layer."""
-    hdu = fits.PrimaryHDU(np.full((16, 64), 16.0))
+    hdu = fits.PrimaryHDU(np.full((16, 64), thickness_um))
     hdu.header["DETNAME"] = detector
     hdu.writeto(path)
     return path
@@ -107,3 +107,15 @@ def test_the_name_of_a_sensor_tells_its_vendor_in_every_camera() -> None:
     # A number is one in each camera; MonoCam and Hyper Suprime-Cam have a sensor of this name.
     assert [camera.vendor_of(name) for name in ("", "37", "R00_S00", "unheard of")] == [None] * 4
     assert Camera.from_name("hsc").vendor_of("R00_S00") == "Hamamatsu"
+
+
+def test_a_map_of_the_silicon_that_names_a_sensor_of_the_other_vendor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    layer, out = map_file(tmp_path / "layer.fits", "R22_S12"), tmp_path / "out"
+    for name, refused in (("ITL-3800C-023", True), ("R22_S12", False)):
+        silicon = map_file(tmp_path / f"silicon{name}.fits", name, 100.0)
+        maps = ["--thickness", str(layer), "--silicon-thickness", str(silicon)]
+        assert run(["sky", *maps, "--out", str(out), "--dry-run"]) == refused
+        assert (f"{name} of" in capsys.readouterr().err) == refused
+    assert not out.exists()

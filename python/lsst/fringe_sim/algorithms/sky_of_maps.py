@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, OutOfRangeError
 from ..instrument.sky import SkySpectrum
-from ..model import FringeModel
+from ..model import FringeModel, Setup
 from ..products import ThicknessMap
 from .angular_response import silicon_um as silicon_of
 from .field_response import SensorPlacement, sensor_response
@@ -58,12 +58,14 @@ BESIDE = "silicon_gradient"
 """Effect that a map takes the place of."""
 
 
-def known_silicon_um(silicon: ThicknessMap, shape: tuple[int, int]) -> FloatArray:
+def known_silicon_um(
+    silicon: ThicknessMap, shape: tuple[int, int], setup: Setup, source: str | None = None
+) -> FloatArray:
     """Thickness of the silicon [µm] on the pixels of the map of another layer; NaN where there is none.
 
-    `InputError`: it is of another layer, or of other pixels.
+    `InputError`: it is of another layer, of another vendor's sensor, or of other pixels.
     """
-    found = silicon.of_layer(DETECTION).known_um().astype(float)
+    found = silicon.of_setup(setup, source, DETECTION).known_um().astype(float)
     if found.shape != shape:
         raise InputError("shape of the map of the silicon", found.shape, f"{shape}, that of the other layer")
     return found

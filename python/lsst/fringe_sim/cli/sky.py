@@ -132,7 +132,7 @@ def sky(
     header = map_header(thickness)
     contrast = laboratory_contrast(header, thickness)
     layer, section = _layer(thickness, sensor, setup)
-    silicon = None if silicon_thickness is None else _silicon(silicon_thickness, layer)
+    silicon = None if silicon_thickness is None else _silicon(silicon_thickness, layer, setup)
     settings = sky_settings(effects.settings)
     history = NightHistory.guo2022() if night else None
     flat = None if flat_spectrum is None else FlatSpectrum.from_name(flat_spectrum)
@@ -351,12 +351,12 @@ def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:
     )
 
 
-def _silicon(path: str, layer: FloatArray) -> FloatArray:
+def _silicon(path: str, layer: FloatArray, setup: Setup) -> FloatArray:
     """Thickness of the silicon [µm] on the pixels of another layer, which loses those where it is not known."""
     from ..algorithms.sky_of_maps import DETECTION, known_silicon_um
     from ..products import ThicknessMap
 
-    silicon = known_silicon_um(ThicknessMap.read_any(path, DETECTION), layer.shape)
+    silicon = known_silicon_um(ThicknessMap.read_any(path, DETECTION), layer.shape, setup, path)
     layer[silicon != silicon] = math.nan  # not known
     return silicon
 

@@ -230,6 +230,8 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
         ) from error
 
 
+_TEMPERATURES = ("CCDTEMP", "SENSTEMP")
+
 _CONDITION_HDUS = ("TEST_COND", "REB_COND")
 _CONDITIONS = ("MONOWL", "CCDTEMP", "SENSTEMP", "TEMP_SET")
 
@@ -254,7 +256,7 @@ def _merged_header(hdus: Sequence[Any], source: str) -> fits.Header:
 
 
 def _is_no_reading(keyword: str, value: Any) -> bool:
-    return keyword in ("CCDTEMP", "SENSTEMP") and isinstance(value, int | float) and value <= NO_READING_C
+    return keyword in _TEMPERATURES and isinstance(value, int | float) and value <= NO_READING_C
 
 
 def _with_unused(metadata: RawMetadata, hdus: Sequence[Any]) -> RawMetadata:
@@ -262,7 +264,7 @@ def _with_unused(metadata: RawMetadata, hdus: Sequence[Any]) -> RawMetadata:
     broken = [
         f"{keyword} of {hdu.name} is {value:g} °C, which is no reading: not used"
         for hdu in hdus[1:]
-        for keyword in ("CCDTEMP", "SENSTEMP")
+        for keyword in _TEMPERATURES
         if _is_no_reading(keyword, value := header_value(hdu.header, keyword))
     ]
     if broken:

@@ -198,8 +198,8 @@ class ThicknessMap(SensorProduct):
             raise InputError("layer of the thickness map", self.layer, layer, source=where)
         return self
 
-    def of_setup(self, setup: Setup, source: str | None = None) -> Self:
-        """The map itself, if it is of the varying layer of a set-up, and not of another vendor's sensor.
+    def of_setup(self, setup: Setup, source: str | None = None, layer: str | None = None) -> Self:
+        """The map itself, if it is not of another vendor's sensor, and of one layer, by default the varying one.
 
         Raises
         ------
@@ -207,7 +207,7 @@ class ThicknessMap(SensorProduct):
             It is something else.
         """
         setup.refuse_vendor_of(self.detector, source or self.detector)
-        return self.of_layer(setup.varying, source)
+        return self.of_layer(layer or setup.varying, source)
 
     def known_um(self) -> NDArray[np.float32]:
         """Thickness [µm], NaN where there is none; what a mask only doubts keeps its value."""

@@ -244,8 +244,9 @@ class SkyFringeSimTask(PipelineTask):
         if choice.left_out:
             self.log.info("%s: on the sky without %s", detector.name, ", ".join(choice.left_out))
         known = layer.known_um()
-        silicon_um = None if silicon is None else known_silicon_um(silicon, known.shape)
-        if silicon_um is not None:
+        silicon_um = None
+        if silicon is not None:
+            silicon_um = known_silicon_um(silicon, known.shape, Setup.from_name(choice.setup))
             known = np.where(np.isfinite(silicon_um), known, np.float32(np.nan))
         sky_model = self.config.sky_model(detector, exposure.airmass, known, layer.metadata)
         sky_model = dataclasses.replace(sky_model, phase_sigma=self.config.phase_sigma)
