@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, OutOfRangeError
+from ..instrument.camera import Camera
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel, Setup
 from ..products import ThicknessMap
@@ -59,15 +60,20 @@ BESIDE = "silicon_gradient"
 
 
 def known_silicon_um(
-    silicon: ThicknessMap, shape: tuple[int, int], setup: Setup, source: str | None = None
+    silicon: ThicknessMap, shape: tuple[int, int], setup: Setup, source: str | None = None, sensor: str = ""
 ) -> FloatArray:
     """Thickness of the silicon [µm] on the pixels of the map of another layer; NaN where there is none.
 
-    `InputError`: it is of another layer, of another vendor's sensor, or of other pixels.
+    ``shape``, ``sensor``: of the other map; no name tells nothing.
+    `InputError`: it is of another layer, of another sensor, or of other pixels.
     """
     found = silicon.of_setup(setup, source, DETECTION).known_um().astype(float)
+    if Camera.from_name(setup.camera).are_two_sensors(silicon.detector, sensor):
+        allowed = f"{sensor}, of which the map of the other layer is"
+        raise InputError("sensor of the map of the silicon", silicon.detector, allowed, source=source)
     if found.shape != shape:
-        raise InputError("shape of the map of the silicon", found.shape, f"{shape}, that of the other layer")
+        allowed = f"{shape}, that of the other layer"
+        raise InputError("shape of the map of the silicon", found.shape, allowed, source=source)
     return found
 
 

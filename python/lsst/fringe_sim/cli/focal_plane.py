@@ -122,15 +122,13 @@ def focal_plane(
       fringe-sim focal-plane --sensor R22 --thickness R22_S11=fit/thickness.fits --out centre
     """
     chosen = _chosen(sensors)
-    measured = {Camera.from_name("lsstCam").detector(item.name).name: item.path for item in maps}
+    measured = _measured(maps, chosen)
     settings = sky_settings(read_settings(effects_file) if effects_file else {})
     flat = None if flat_spectrum == "white" else FlatSpectrum.from_name(flat_spectrum)
-    for path in measured.values():
-        if not path.is_file():
-            raise InputError("--thickness", str(path), "an existing FITS file")
-    vendors = {item.name: item.vendor for item in Camera.from_name("lsstCam").science}
     thickness = {
-        name: read_thickness(path, Setup.from_name(SETUPS[vendors[name]])) for name, path in measured.items()
+        sensor.name: read_thickness(measured[sensor.name], Setup.from_name(SETUPS[sensor.vendor]), sensor)
+        for sensor in chosen
+        if sensor.name in measured
     }
     if dry_run:
         click.echo(FocalPlaneCost(len(chosen), len(NightHistory.guo2022())).describe())
@@ -175,6 +173,22 @@ def _chosen(names: Iterable[str]) -> list[Detector]:
                 raise InputError("--sensor", name, "a science sensor or a raft of them")
             found[detector.name] = detector
     return list(found.values())
+
+
+def _measured(maps: Iterable[SensorMap], chosen: Iterable[Detector]) -> dict[str, Path]:
+    """Files with the maps of sensors; each is of one that is forecast, and the only one of it."""
+    camera, forecast = Camera.from_name("lsstCam"), {sensor.name for sensor in chosen}
+    found: dict[str, Path] = {}
+    for item in maps:
+        name = camera.detector(item.name).name
+        if name not in forecast:
+            raise InputError("--thickness", item.name, "a science sensor that --sensor chooses")
+        if name in found:
+            raise InputError("--thickness", item.name, "one map of a sensor")
+        if not item.path.is_file():
+            raise InputError("--thickness", str(item.path), "an existing FITS file")
+        found[name] = item.path
+    return found
 
 
 def _of_stack(settings: dict[str, Any], setup_name: str) -> dict[str, Any]:

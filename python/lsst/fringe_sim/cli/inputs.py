@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..effects import activate_effects, known_effects
 from ..effects.active import flat_settings
 from ..errors import InputError
+from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
 from ..model.effects_override import read_effects_override
@@ -24,6 +25,7 @@ from ..resources import LONGEST_USER_FILE, complete_fits, read_user_text, read_u
 
 __all__ = [
     "effect_cards",
+    "read_map",
     "read_section",
     "read_settings",
     "read_thickness",
@@ -31,13 +33,22 @@ __all__ = [
 ]
 
 
-def read_thickness(path: str | os.PathLike[str], setup: Setup) -> NDArray[np.float64]:
-    """Thickness [µm] of the varying layer, from a file that `ThicknessMap.read_any` reads; NaN where there is none.
+def read_map(path: str | os.PathLike[str], setup: Setup, sensor: Detector | None = None) -> ThicknessMap:
+    """Map of the varying layer, as `ThicknessMap.read_any` reads it; it is said if it is not of ``sensor``.
 
     `InputError`: the map is of another layer, or of a sensor of another vendor.
     """
     found = ThicknessMap.read_any(path, setup.varying).of_setup(setup, str(path))
-    return found.known_um().astype(float)
+    if sensor is not None and Camera.from_name(setup.camera).are_two_sensors(found.detector, sensor.name):
+        click.echo(f"{path}: a map of {found.detector}, taken for {sensor.name}", err=True)
+    return found
+
+
+def read_thickness(
+    path: str | os.PathLike[str], setup: Setup, sensor: Detector | None = None
+) -> NDArray[np.float64]:
+    """Thickness [µm] of the map that `read_map` reads; NaN where there is none."""
+    return read_map(path, setup, sensor).known_um().astype(float)
 
 
 def read_section(

@@ -132,7 +132,11 @@ def sky(
     header = map_header(thickness)
     contrast = laboratory_contrast(header, thickness)
     layer, section = _layer(thickness, sensor, setup)
-    silicon = None if silicon_thickness is None else _silicon(silicon_thickness, layer, setup)
+    silicon = (
+        None
+        if silicon_thickness is None
+        else _silicon(silicon_thickness, layer, setup, str(header.get("DETNAME", "")))
+    )
     settings = sky_settings(effects.settings)
     history = NightHistory.guo2022() if night else None
     flat = None if flat_spectrum is None else FlatSpectrum.from_name(flat_spectrum)
@@ -351,12 +355,12 @@ def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:
     )
 
 
-def _silicon(path: str, layer: FloatArray, setup: Setup) -> FloatArray:
+def _silicon(path: str, layer: FloatArray, setup: Setup, sensor: str) -> FloatArray:
     """Thickness of the silicon [µm] on the pixels of another layer, which loses those where it is not known."""
     from ..algorithms.sky_of_maps import DETECTION, known_silicon_um
     from ..products import ThicknessMap
 
-    silicon = known_silicon_um(ThicknessMap.read_any(path, DETECTION), layer.shape, setup, path)
+    silicon = known_silicon_um(ThicknessMap.read_any(path, DETECTION), layer.shape, setup, path, sensor)
     layer[silicon != silicon] = math.nan  # not known
     return silicon
 
@@ -370,7 +374,7 @@ def _layer(thickness: str, sensor: Detector, setup: Setup) -> tuple[FloatArray, 
     if thickness == BUILT_IN:
         layer = e2v_321()
         return layer, SensorSection.of_image(sensor, (layer.shape[0], layer.shape[1]), {})
-    layer = read_thickness(thickness, setup)
+    layer = read_thickness(thickness, setup, sensor)
     return layer, read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
 
 

@@ -12,8 +12,9 @@ from ..algorithms.field_response import SensorPlacement
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
-from ..products import SkyFrames, SkyFringe, ThicknessMap
+from ..products import SkyFrames, SkyFringe
 from ..products.same_light import pixels_digest
+from .inputs import read_map
 
 __all__ = ["SkyData", "read_sky_frames"]
 
@@ -44,8 +45,8 @@ def read_sky_frames(paths: Sequence[str], setup: Setup, thickness: str | None) -
         raise InputError("--thickness", None, "a thickness map: frames of the sky alone do not tell it")
     files = _files(paths)
     frames = _each_once(files)
-    sky = SkyFrames(frames, ThicknessMap.read_any(thickness, setup.varying).of_setup(setup, thickness))
-    return SkyData(sky, setup, setup.sensor(sky.detector))
+    sensor = setup.sensor(next((frame.detector for frame in frames if frame.detector), None))
+    return SkyData(SkyFrames(frames, read_map(thickness, setup, sensor)), setup, sensor)
 
 
 def _each_once(files: Sequence[Path]) -> list[SkyFringe]:

@@ -96,6 +96,19 @@ class Camera:
                 return vendors.pop() if len(vendors) == 1 else None
         return VENDORS.get(key.partition("-")[0].upper())
 
+    def are_two_sensors(self, first: str, second: str) -> bool:
+        """Whether two names, serial numbers or places, are of two sensors of this camera, else of any.
+
+        A name that no table has tells nothing, and a number neither.
+        """
+        keys = {name.strip().removesuffix("-Dev") for name in (first, second)}
+        if any(key.isdigit() for key in keys):
+            return False
+        for camera in (self, *map(_load_camera, _camera_names())):
+            if keys <= camera._index.keys():
+                return len({camera._index[key] for key in keys}) == 2
+        return False
+
     @property
     def science(self) -> tuple[Detector, ...]:
         """Detectors that take science images."""

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import math
 import os
 import platform
 from collections.abc import Iterable, Mapping
@@ -100,10 +101,13 @@ def effects_of_header(header: Mapping[str, Any]) -> dict[str, float]:
     number = 0
     while f"EFFECT{number}" in header:
         name, value = str(header[f"EFFECT{number}"]), header.get(f"EFFVAL{number}")
+        allowed = f"a finite number, the value of {name}"
         try:
-            found[name] = to_number(f"EFFVAL{number}", value, f"a number, the value of {name}")
+            found[name] = to_number(f"EFFVAL{number}", value, allowed)
         except InputError as error:
             raise FrameFormatError(error.field, error.value, error.allowed) from None
+        if not math.isfinite(found[name]):
+            raise FrameFormatError(f"EFFVAL{number}", value, allowed)
         number += 1
     return found
 

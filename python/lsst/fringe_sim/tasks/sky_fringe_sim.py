@@ -246,7 +246,9 @@ class SkyFringeSimTask(PipelineTask):
         known = layer.known_um()
         silicon_um = None
         if silicon is not None:
-            silicon_um = known_silicon_um(silicon, known.shape, Setup.from_name(choice.setup))
+            silicon_um = known_silicon_um(
+                silicon, known.shape, Setup.from_name(choice.setup), sensor=layer.detector
+            )
             known = np.where(np.isfinite(silicon_um), known, np.float32(np.nan))
         sky_model = self.config.sky_model(detector, exposure.airmass, known, layer.metadata)
         sky_model = dataclasses.replace(sky_model, phase_sigma=self.config.phase_sigma)
