@@ -101,12 +101,27 @@ def test_a_simulated_night_through_the_pipelines(command: Command, empty_repo: P
         *("-c", "fringeCorrection:connections.frame=skyFringe"),
     )
     assert done.code == 0, done.text
-    with Butler.from_config(str(repo), collections=["u/clean"], instrument="MonoCam") as butler:
-        rows = [butler.get(ref) for ref in butler.query_datasets("fringeCorrectionSummary")]
-        frames = [butler.get(ref) for ref in butler.query_datasets("fringeCorrected")]
-    assert len(rows) == len(frames) == 5
-    assert all(frame.metadata["FRINGCOR"] == 1 for frame in frames)
-    before, after = (np.array([row[f"structure_{when}"][0] for row in rows]) for when in ("before", "after"))
-    # So few pixels of so smooth a stand-in hold little of a fringe that no background takes.
-    assert after.mean() < before.mean()
-    assert (after < before + 0.05).all()
+    # Templates of the thickness that made the frames, in place of those of the frames themselves.
+    done = command(
+        *(*common, "-i", "MonoCam/raw/all", "-o", "u/map", "-p", f"{PIPELINES}/monocam/mapTemplates.yaml"),
+        *("-c", "mapTemplates:stand_in_shape=[160, 120]"),
+    )
+    assert done.code == 0, done.text
+    done = command(
+        *(*common, "-i", "u/map,u/sky", "-o", "u/of_map"),
+        *("-p", f"{PIPELINES}/monocam/fringeCorrection.yaml#correction"),
+        *("-c", "fringeCorrection:connections.frame=skyFringe"),
+    )
+    assert done.code == 0, done.text
+    for collection, count in (("u/clean", 1), ("u/of_map", 2)):
+        with Butler.from_config(str(repo), collections=[collection], instrument="MonoCam") as butler:
+            rows = [butler.get(ref) for ref in butler.query_datasets("fringeCorrectionSummary")]
+            frames = [butler.get(ref) for ref in butler.query_datasets("fringeCorrected")]
+        assert len(rows) == len(frames) == 5
+        before, after = (
+            np.array([row[f"structure_{when}"][0] for row in rows]) for when in ("before", "after")
+        )
+        # So few pixels of so smooth a stand-in hold little of a fringe that no background takes.
+        assert after.mean() < before.mean()
+        assert (after < before + 0.05).all()
+        assert all(frame.metadata["FRINGCOR"] == count for frame in frames)

@@ -1,4 +1,4 @@
-"""The sky task without a repository."""
+"""The tasks that make a sky of a map, or its templates, without a repository."""
 
 from __future__ import annotations
 
@@ -16,8 +16,14 @@ from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import SkyFringe, ThicknessMap, bands_of_header, mask_bits
-from lsst.fringe_sim.tasks import RaftConfig, SkyFringeSimConfig, SkyFringeSimTask
+from lsst.fringe_sim.products import FringeTemplates, SkyFringe, ThicknessMap, bands_of_header, mask_bits
+from lsst.fringe_sim.tasks import (
+    MapTemplatesConfig,
+    MapTemplatesTask,
+    RaftConfig,
+    SkyFringeSimConfig,
+    SkyFringeSimTask,
+)
 from lsst.fringe_sim.tasks.sky_fringe_sim import SkyExposure
 
 ROWS, COLUMNS = 12, 16
@@ -195,3 +201,63 @@ def test_configurations_that_make_no_sense(spoil: Any, message: str) -> None:
     spoil(config)
     with pytest.raises(FieldValidationError, match=message):
         config.validate()
+
+
+MADE = "2026-11-21T03:43:40"
+WARM_K = 183.0
+
+
+def warm_map() -> ThicknessMap:
+    """A map of flats that were taken warmer than the sky is."""
+    return thickness(metadata={"LABTEMP": WARM_K})
+
+
+def templates_of(layer: ThicknessMap | None = None, **config: Any) -> FringeTemplates:
+    made = MapTemplatesConfig(beams="centre", **config)
+    made.validate()
+    task = MapTemplatesTask(config=made)
+    found: FringeTemplates = task.run(layer or warm_map(), DETECTOR, EXPOSURE.physical_filter, MADE).templates
+    return found
+
+
+def fringes(layer: ThicknessMap, **config: Any) -> np.ndarray:
+    frame = run(layer, night="steady", **config)
+    good = frame.mask == 0
+    relative = frame.image / frame.image[good].mean(dtype=float)
+    return np.asarray(np.where(good, relative - 1.0, 0.0))
+
+
+def test_templates_are_the_sky_of_the_map_and_what_the_phase_changes() -> None:
+    templates = templates_of()
+    good = templates.mask == 0
+    sky = fringes(warm_map())[good]
+    first, second = (pattern[good] - pattern[good].mean() for pattern in templates.patterns)
+    assert np.abs(first - sky).max() < 1e-5
+    # Half the difference of the skies at both ends of what is not known.
+    longer, shorter = (
+        fringes(warm_map(), effects={"epoxy_temperature.phase_per_10k": sign * 0.3})[good] for sign in (1, -1)
+    )
+    change = 0.5 * (longer - shorter)
+    error = 2.0 * run(warm_map(), night="steady").quadrature_error
+    assert np.abs(change - second).max() < error < 0.5 * np.std(change)
+
+
+def test_what_the_templates_say_of_themselves() -> None:
+    templates = templates_of()
+    assert (templates.detector, templates.physical_filter) == (DETECTOR.name, EXPOSURE.physical_filter)
+    assert templates.creation_datetime == MADE
+    assert {"CFGHASH", "SETUP", "LINELIST", "PHASESIG"} <= templates.metadata.keys()
+    # Doubts about the map stay doubts; pixels without a thickness have no template.
+    assert templates.mask[5, 5] & mask_bits("SLIP")
+    assert not templates.coverage[0, :3].any()
+    assert not templates.patterns[:, 0, :3].any()
+
+
+def test_a_map_of_the_temperature_of_the_sky_leaves_no_phase_open() -> None:
+    assert len(templates_of(phase_sigma=0.0).patterns) == 1
+
+
+def test_templates_need_a_map_unless_a_stand_in_is_wanted() -> None:
+    task = MapTemplatesTask(config=MapTemplatesConfig(beams="centre"))
+    with pytest.raises(InputError, match="thickness map"):
+        task.run(None, DETECTOR, "y_10", MADE)

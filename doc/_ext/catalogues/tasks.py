@@ -144,7 +144,13 @@ def _set(item: dict[str, Any]) -> str:
 def _labels_in_pipelines() -> list[str]:
     base = resources.files("lsst.fringe_sim") / "pipelines" / "_ingredients"
     labels: list[str] = []
-    for name in ("labFlats.yaml", "skyFringe.yaml", "discovery.yaml", "skyDiscovery.yaml"):
+    for name in (
+        "labFlats.yaml",
+        "skyFringe.yaml",
+        "mapTemplates.yaml",
+        "discovery.yaml",
+        "skyDiscovery.yaml",
+    ):
         if (base / name).is_file():
             labels += list(yaml.safe_load((base / name).read_text(encoding="utf-8"))["tasks"])
     return labels

@@ -28,6 +28,8 @@ _LAZY = {
     "FringePcaTask": ".fringe_pca",
     "IsrFlatPrepConfig": ".isr_flat_prep",
     "IsrFlatPrepTask": ".isr_flat_prep",
+    "MapTemplatesConfig": ".map_templates",
+    "MapTemplatesTask": ".map_templates",
     "ObservedFringeConfig": ".observed_fringe",
     "ObservedFringeTask": ".observed_fringe",
     "RaftConfig": ".model_config",

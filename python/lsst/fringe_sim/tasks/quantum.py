@@ -104,7 +104,11 @@ def config_digest(config: Config) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def run_datetime(run: str, otherwise: datetime.datetime) -> str:
+NO_DATE = datetime.datetime(1970, 1, 1)
+"""Of what a model makes, where nothing tells a date."""
+
+
+def run_datetime(run: str, otherwise: datetime.datetime = NO_DATE) -> str:
     """Date of a run, ``YYYY-MM-DDThh:mm:ss``, from the timestamp at the end of its name.
 
     The clock is not asked: repeating a quantum in its run gives the same bytes.

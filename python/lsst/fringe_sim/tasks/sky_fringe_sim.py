@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField, RangeField
+from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField
 from lsst.pipe.base import (
     PipelineTask,
     PipelineTaskConfig,
@@ -19,11 +19,10 @@ from lsst.pipe.base import (
     QuantumContext,
     Struct,
 )
-from lsst.pipe.base.connectionTypes import Input, Output
+from lsst.pipe.base.connectionTypes import Output
 
 from ..algorithms.photon_migration import photon_migration
 from ..algorithms.sky_frame import simulate_sky_frame, throughput_electrons
-from ..algorithms.sky_of_maps import known_silicon_um, silicon_nodes_um
 from ..errors import OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
@@ -33,12 +32,11 @@ from ..instrument.telescope import Telescope
 from ..middleware.night import airmass_of, hour_of_night
 from ..model import FringeModel, Setup
 from ..products import ThicknessMap, band_cards
-from ..products.sensor_section import SECTION_KEYWORDS
-from .quantum import common_header, data_id_of, sensor_of, unusable
+from .quantum import data_id_of, sensor_of, unusable
 from .sky_model import (
-    LINE_LIST,
+    SensorMapsConfig,
     SkyModel,
-    SkyModelConfig,
+    silicon_input,
     takes_images,
     thickness_input,
     without_constraint,
@@ -78,12 +76,7 @@ class SkyFringeSimConnections(PipelineTaskConnections, dimensions=("instrument",
     config: SkyFringeSimConfig
 
     thickness = thickness_input()
-    silicon = Input(
-        doc="Thickness of the silicon on the same pixels; only where the configuration asks for it.",
-        name="siliconThickness",
-        storageClass="ThicknessMap",
-        dimensions=("instrument", "detector"),
-    )
+    silicon = silicon_input()
     sky = Output(
         doc="Night sky with its fringes, in electrons.",
         name="skyFringe",
@@ -107,7 +100,7 @@ class SkyFringeSimConnections(PipelineTaskConnections, dimensions=("instrument",
                 adjuster.remove_quantum(data_id)
 
 
-class SkyFringeSimConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnections=SkyFringeSimConnections):
+class SkyFringeSimConfig(SensorMapsConfig, PipelineTaskConfig, pipelineConnections=SkyFringeSimConnections):
     """Configuration of `SkyFringeSimTask`."""
 
     task_name: ClassVar[str] = "skyFringeSim"
@@ -133,24 +126,6 @@ class SkyFringeSimConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnections
             "model": "what the stack itself detects",
             "throughput": "what the measured quantum efficiency in the throughput tables detects",
         },
-    )
-    silicon: ChoiceField[str] = ChoiceField(
-        dtype=str,
-        default="even",
-        doc="Thickness of the silicon above the varying layer.",
-        allowed={
-            "even": "that of the stack, the same everywhere",
-            "map": "that of a map, which a fit to flats with a narrow line makes",
-        },
-    )
-    phase_sigma: Any = RangeField(
-        dtype=float,
-        default=0.3,
-        min=0.0,
-        max=2.0,
-        inclusiveMax=True,
-        doc="Standard uncertainty of the phase of the adhesive between laboratory and sky temperature, rad per "
-        "10 K; what it leaves open goes into the header. Its value is the effect epoxy_temperature.phase_per_10k.",
     )
     noise: Field[bool] = Field(
         dtype=bool,
@@ -243,19 +218,9 @@ class SkyFringeSimTask(PipelineTask):
         layer = self.config.map_of(thickness, detector)
         if choice.left_out:
             self.log.info("%s: on the sky without %s", detector.name, ", ".join(choice.left_out))
-        known = layer.known_um()
-        silicon_um = None
-        if silicon is not None:
-            silicon_um = known_silicon_um(
-                silicon, known.shape, Setup.from_name(choice.setup), sensor=layer.detector
-            )
-            known = np.where(np.isfinite(silicon_um), known, np.float32(np.nan))
-        sky_model = self.config.sky_model(detector, exposure.airmass, known, layer.metadata)
-        sky_model = dataclasses.replace(sky_model, phase_sigma=self.config.phase_sigma)
-        if silicon_um is not None:
-            nodes = silicon_nodes_um(sky_model.fringe_model(), silicon_um)
-            sky_model = dataclasses.replace(sky_model, silicon_nodes_um=nodes)
-        model, sky, response = sky_model.response(silicon_um)
+        known, sky_model, model, sky, response = self.config.sensor_sky(
+            detector, exposure.airmass, layer, silicon
+        )
         scale = self._band_scale(exposure, sky.lines)
         frame = simulate_sky_frame(
             known,
@@ -273,16 +238,12 @@ class SkyFringeSimTask(PipelineTask):
             physical_filter=exposure.physical_filter,
         )
         metadata = {
-            **common_header(self.config),
-            **choice.header(),
-            **{key: layer.metadata[key] for key in ("STANDSD", *SECTION_KEYWORDS) if key in layer.metadata},
+            **self.config.map_header(
+                detector, layer, stand_in=thickness is None, silicon=silicon is not None
+            ),
             **({"NIGHTSD": self.config.seed} if self.config.night == "random" else {}),
-            "LINELIST": LINE_LIST,
             "NIGHT": self.config.night,
             "LEVEL": self.config.level,
-            "BEAMS": self.config.beams,
-            "STANDIN": thickness is None,
-            "SIMAP": silicon is not None,
             **band_cards(scale),
             **frame.metadata,
         }

@@ -5,19 +5,19 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lsst.daf.butler import DataCoordinate
-from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField
+from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField, RangeField
 from lsst.pipe.base.connectionTypes import Input
 
 from ..algorithms.field_response import SensorPlacement
 from ..algorithms.island_response import response_with_islands
 from ..algorithms.sky_frame import sky_response
-from ..algorithms.sky_of_maps import SiliconSeries, sky_of_maps
+from ..algorithms.sky_of_maps import SiliconSeries, known_silicon_um, silicon_nodes_um, sky_of_maps
 from ..algorithms.sky_response import Response
 from ..algorithms.thickness_stand_in import stand_in_thickness
 from ..effects import activate_effects, known_effects
@@ -29,13 +29,18 @@ from ..instrument.sky import EmissionLines, SkySpectrum
 from ..model import LABORATORY_TEMPERATURE, FringeModel, Setup
 from ..model.provenance import effects_of_header
 from ..products import SensorSection, ThicknessMap
+from ..products.sensor_section import SECTION_KEYWORDS
 from ..products.thickness_map import thickness_span_um
 from .model_config import FringeModelConfig, ModelChoice
+from .quantum import common_header
 
 __all__ = [
     "LINE_LIST",
+    "SensorMapsConfig",
+    "SensorSky",
     "SkyModel",
     "SkyModelConfig",
+    "silicon_input",
     "takes_images",
     "thickness_input",
     "without_constraint",
@@ -108,6 +113,16 @@ def _response(sky_model: SkyModel) -> tuple[FringeModel, SkySpectrum, SiliconSer
         respond=in_one_beam if sky_model.beams == "centre" else None,
     )
     return model, sky, series
+
+
+class SensorSky(NamedTuple):
+    """A sensor under the sky: thickness of its layer [µm], NaN where a map is not known, and what it responds."""
+
+    known_um: NDArray[np.float32]
+    sky_model: SkyModel
+    model: FringeModel
+    sky: SkySpectrum
+    response: Response
 
 
 class SkyModelConfig(FringeModelConfig):
@@ -216,6 +231,69 @@ class SkyModelConfig(FringeModelConfig):
             laboratory_temperature_k=None if stated is None else to_number(LABORATORY_TEMPERATURE, stated),
             flat_spectrum=self.flat_spectrum or "",
         )
+
+
+class SensorMapsConfig(SkyModelConfig):
+    """What the maps of a sensor say of its sky: also the silicon, and what is not known of the adhesive."""
+
+    silicon: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default="even",
+        doc="Thickness of the silicon above the varying layer.",
+        allowed={
+            "even": "that of the stack, the same everywhere",
+            "map": "that of a map, which a fit to flats with a narrow line makes",
+        },
+    )
+    phase_sigma: Any = RangeField(
+        dtype=float,
+        default=0.3,
+        min=0.0,
+        max=2.0,
+        inclusiveMax=True,
+        doc="Standard uncertainty of the phase of the adhesive between laboratory and sky temperature, rad per "
+        "10 K; what it leaves open goes into the header. Its value is the effect epoxy_temperature.phase_per_10k.",
+    )
+
+    def sensor_sky(
+        self, detector: Detector, airmass: float, layer: ThicknessMap, silicon: ThicknessMap | None
+    ) -> SensorSky:
+        """Response of a sensor to the sky, and the thickness of the layer on the pixels where all maps are known."""
+        known, silicon_um = layer.known_um(), None
+        if silicon is not None:
+            setup = Setup.from_name(self.choice_of(detector).setup)
+            silicon_um = known_silicon_um(silicon, known.shape, setup, sensor=layer.detector)
+            known = np.where(np.isfinite(silicon_um), known, np.float32(np.nan))
+        made = self.sky_model(detector, airmass, known, layer.metadata)
+        made = dataclasses.replace(made, phase_sigma=self.phase_sigma)
+        if silicon_um is not None:
+            nodes = silicon_nodes_um(made.fringe_model(), silicon_um)
+            made = dataclasses.replace(made, silicon_nodes_um=nodes)
+        return SensorSky(known, made, *made.response(silicon_um))
+
+    def map_header(
+        self, detector: Detector, layer: ThicknessMap, *, stand_in: bool, silicon: bool
+    ) -> dict[str, Any]:
+        """Header keywords of what is made of the maps of a sensor."""
+        return {
+            **common_header(self),
+            **self.choice_of(detector).header(),
+            **{key: layer.metadata[key] for key in ("STANDSD", *SECTION_KEYWORDS) if key in layer.metadata},
+            "LINELIST": LINE_LIST,
+            "BEAMS": self.beams,
+            "STANDIN": stand_in,
+            "SIMAP": silicon,
+        }
+
+
+def silicon_input() -> Input:
+    """Connection to a map of the silicon of each sensor."""
+    return Input(
+        doc="Thickness of the silicon on the same pixels; only where the configuration asks for it.",
+        name="siliconThickness",
+        storageClass="ThicknessMap",
+        dimensions=("instrument", "detector"),
+    )
 
 
 def thickness_input() -> Input:

@@ -1,0 +1,150 @@
+"""From the thickness map of a sensor to the templates of its sky."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from lsst.pex.config import Field
+from lsst.pipe.base import (
+    PipelineTask,
+    PipelineTaskConfig,
+    PipelineTaskConnections,
+    QuantaAdjuster,
+    QuantumContext,
+    Struct,
+)
+from lsst.pipe.base.connectionTypes import Output
+
+from ..algorithms.laboratory_shift import template_pair
+from ..instrument.detector import Detector
+from ..products import FringeTemplates, ThicknessMap
+from .quantum import data_id_of, run_datetime, sensor_of, unusable
+from .sky_model import SensorMapsConfig, silicon_input, takes_images, thickness_input, without_constraint
+
+__all__ = ["MapTemplatesConfig", "MapTemplatesConnections", "MapTemplatesTask"]
+
+
+class MapTemplatesConnections(
+    PipelineTaskConnections, dimensions=("instrument", "physical_filter", "detector")
+):
+    """Maps of a sensor in, templates of its sky in a filter out."""
+
+    config: MapTemplatesConfig
+
+    thickness = thickness_input()
+    silicon = silicon_input()
+    templates = Output(
+        doc="The sky of the map, and how the phase of the adhesive, which the laboratory does not tell, changes it.",
+        name="fringeTemplates",
+        storageClass="FringeTemplates",
+        dimensions=("instrument", "physical_filter", "detector"),
+        isCalibration=True,
+    )
+
+    def __init__(self, *, config: MapTemplatesConfig | None = None) -> None:
+        if config is not None and config.stand_in:
+            self.thickness = without_constraint(self.thickness)
+        if config is not None and config.silicon != "map":
+            del self.silicon
+
+    def adjust_all_quanta(self, adjuster: QuantaAdjuster) -> None:
+        """Keep the science sensors, and the filters in the band of the set-up."""
+        for data_id in list(adjuster.iter_data_ids()):
+            expanded = adjuster.expand_quantum_data_id(data_id)
+            if expanded["band"] != self.config.band or not takes_images(expanded):
+                adjuster.remove_quantum(data_id)
+
+
+class MapTemplatesConfig(SensorMapsConfig, PipelineTaskConfig, pipelineConnections=MapTemplatesConnections):
+    """Configuration of `MapTemplatesTask`."""
+
+    task_name: ClassVar[str] = "mapTemplates"
+
+    airmass: Field[float] = Field(
+        dtype=float, default=1.2, doc="Airmass of the exposures.", check=lambda airmass: 1.0 <= airmass < 10.0
+    )
+
+
+class MapTemplatesTask(PipelineTask):
+    """Make the templates that a correction fits from what the laboratory knows of a sensor."""
+
+    ConfigClass = MapTemplatesConfig
+    config: MapTemplatesConfig
+    _DefaultName = "mapTemplates"
+
+    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+        """Read the maps, make the templates, store."""
+        data_id = data_id_of(butlerQC)
+        detector = sensor_of(data_id)
+        created = run_datetime(outputRefs.templates.run)
+        with unusable(f"{detector.name}, {data_id['physical_filter']}"):
+            thickness, silicon = (
+                butlerQC.get(getattr(inputRefs, name)) if hasattr(inputRefs, name) else None
+                for name in ("thickness", "silicon")
+            )
+            result = self.run(thickness, detector, str(data_id["physical_filter"]), created, silicon)
+        butlerQC.put(result, outputRefs)
+
+    def run(
+        self,
+        thickness: ThicknessMap | None,
+        detector: Detector,
+        physical_filter: str,
+        creation_datetime: str,
+        silicon: ThicknessMap | None = None,
+    ) -> Struct:
+        """Make the templates of one sensor.
+
+        Parameters
+        ----------
+        thickness : `ThicknessMap` or `None`
+            Thickness of the varying layer of this sensor; `None` where a stand-in is wanted.
+        detector : `Detector`
+            The sensor; its place in the focal plane decides the beam.
+        physical_filter : `str`
+            Filter, as the instrument names it.
+        creation_datetime : `str`
+            When the calibration is made, ``YYYY-MM-DDThh:mm:ss``.
+        silicon : `ThicknessMap`, optional
+            Thickness of its silicon on the same pixels; that of the stack everywhere if not given.
+
+        Returns
+        -------
+        result : `~lsst.pipe.base.Struct`
+            ``templates``, a `FringeTemplates`: the sky, and the phase of the adhesive where it is open.
+
+        Raises
+        ------
+        InputError
+            The map is of another layer, or was fitted with other effects than those configured here.
+        """
+        layer = self.config.map_of(thickness, detector)
+        found = self.config.sensor_sky(detector, self.config.airmass, layer, silicon)
+        pair = template_pair(
+            found.known_um, found.model, found.response, self.config.phase_sigma, creation_datetime
+        )
+        patterns = np.stack([template.image for template in pair])
+        header = self.config.map_header(
+            detector, layer, stand_in=thickness is None, silicon=silicon is not None
+        )
+        mask = pair[0].mask | layer.mask
+        templates = FringeTemplates(
+            coverage=(pair[0].mask == 0).astype(np.float32),
+            patterns=patterns,
+            variance=np.zeros_like(patterns),
+            # The one frame that they are made of is the sky of the map itself.
+            scores=np.eye(1, len(pair)),
+            mask=mask,
+            creation_datetime=creation_datetime,
+            metadata={**header, "PHASESIG": self.config.phase_sigma},
+            detector=detector.name,
+            physical_filter=physical_filter,
+        )
+        self.log.info(
+            "%s in %s: rms of the templates %s",
+            *(detector.name, physical_filter),
+            ", ".join(f"{100 * float(pattern[mask == 0].std()):.4f} %" for pattern in patterns),
+        )
+        return Struct(templates=templates)
