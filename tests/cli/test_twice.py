@@ -56,6 +56,7 @@ ELSEWHERE = {
     "mock-visits": "tests/mock/test_visits.py::test_the_command",
     "templates": "tests/cli/test_correct.py",
     "correct": "tests/cli/test_correct.py",
+    "fit-sky": "tests/cli/test_fit_sky.py",
     "reproduce-paper": "tests/cli/test_reproduce_paper.py",
     "evidence": "tests/cli/test_evidence.py",
 }

@@ -28,6 +28,7 @@ __all__ = [
     "CorrectedFrame",
     "FrameRecord",
     "correct_frame",
+    "frame_weight",
     "injected_table",
     "make_templates",
     "recover_sources",
@@ -371,10 +372,11 @@ def _first_of_alike(frames: Sequence[Callable[[], ObservedFrame]], names: Sequen
 
 def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     read = frame()
-    return read.image, _weight(read)
+    return read.image, frame_weight(read)
 
 
-def _weight(frame: ObservedFrame) -> NDArray[np.float32]:
+def frame_weight(frame: ObservedFrame) -> NDArray[np.float32]:
+    """Inverse variance of the background of a frame, 0 in pixels that are masked or hold no number."""
     good = (frame.mask == 0) & np.isfinite(frame.image)
     weight = steady_weight(good, frame.variance, frame.image)
     refuse_negative_sky(frame.image, weight)

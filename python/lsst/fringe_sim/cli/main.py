@@ -37,6 +37,7 @@ _COMMANDS = {
     "sky": ("sky", "Simulate the fringes of the night sky."),
     "templates": ("templates", "Make fringe templates from observed frames."),
     "correct": ("correct", "Subtract fringe templates from observed frames."),
+    "fit-sky": ("fit_sky", "Hold a thickness map against frames of the sky, and move it."),
     "focal-plane": ("focal_plane", "Forecast the fringes of every sensor of the LSST Camera."),
     "amplitudes": ("amplitudes", "Tabulate the fringe amplitudes of every set-up of the paper."),
     "discover": ("discover", "Find the effect that the model lacks."),

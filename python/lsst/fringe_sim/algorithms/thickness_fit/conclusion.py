@@ -166,11 +166,13 @@ def slope_cards(thickness_um: NDArray[np.float32], order_um: float) -> dict[str,
     """Header keywords: orders from one pixel to the next, and the contrast that is left of fringes so dense.
 
     A pixel averages the fringes over what the thickness changes within it, which the model does not: it has one
-    thickness. Where they turn by an order within a pixel, nothing is left.
+    thickness. Where they turn by an order within a pixel, nothing is left. Pixels that are masked count: they are
+    where fringes are densest. Whole orders between neighbours do not, because one of both is in a wrong order.
     """
     some = [max(1, length // _SOME) for length in thickness_um.shape]
     steps = [np.diff(thickness_um[:: some[0]], axis=1), np.diff(thickness_um[:, :: some[1]], axis=0)]
-    orders = [np.abs(step[np.isfinite(step)]) / order_um for step in steps]
+    turns = [step[np.isfinite(step)] / order_um for step in steps]
+    orders = [np.abs(turn - np.rint(turn)) for turn in turns]
     if not all(part.size for part in orders):
         return {}
     left = np.prod([np.abs(np.sinc(part)).mean() for part in orders])

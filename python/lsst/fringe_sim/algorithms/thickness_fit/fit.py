@@ -339,8 +339,7 @@ def _assemble(
     run_threaded(flag, -(-len(mask) // _ROWS), threads)
     notes = dict(notes) | {"NWAVE": len(cube.wavelength_nm), "MISFIT": round(scale, 4)}
     if "ORDERUM" in notes:
-        # A pixel in a wrong order is no slope.
-        notes |= slope_cards(np.where(mask == 0, pixels.value, np.float32(np.nan)), notes["ORDERUM"])
+        notes |= slope_cards(pixels.value, notes["ORDERUM"])
     return ThicknessMap(
         pixels.value, pixels.sigma, pixels.chi2, slip, mask, layer, notes, used, cube.detector
     )

@@ -1,0 +1,190 @@
+"""A thickness map held against observed frames of its sensor: frames made comparable, and the map that follows."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from ..errors import InputError
+from ..products import ObservedFrame, ThicknessMap, mask_bits
+from .correction.background import BackgroundTerms
+from .correction.objects import fit_frame
+from .fringe_correction import CorrectionOptions
+from .observed_frames import frame_weight
+from .sky_response import Response
+from .sky_shift import MAP_SIGMA_ORDERS, SkyShift, fit_sky_shift
+
+__all__ = ["MapOnSky", "map_on_sky", "reach_um"]
+
+FloatArray = NDArray[np.float64]
+
+LARGEST_STEP_RAD = 0.5
+"""Change of phase from one end of a cell of pixels to the other in all but a twentieth of the cells: the mean of the
+fringes over such a cell is that of its middle to 1 %."""
+
+SMALLEST_SIDE = 64
+"""Cells along a side below which no more pixels are put together."""
+
+
+class MapOnSky(NamedTuple):
+    """What a night says of a map."""
+
+    shift: SkyShift
+    cell_px: int  # side of the cells of `shift` [px]
+    moved: ThicknessMap
+
+
+def reach_um(order_um: float, map_sigma_um: float | None = None) -> float:
+    """How far from the map a response has to be known [µm]."""
+    return order_um + 4.0 * (map_sigma_um or MAP_SIGMA_ORDERS * order_um)
+
+
+def map_on_sky(
+    frames: Sequence[Callable[[], ObservedFrame]],
+    thickness: ThicknessMap,
+    response: Response,
+    order_um: float,
+    options: CorrectionOptions | None = None,
+    *,
+    map_sigma_um: float | None = None,
+    advance: Callable[[], None] = lambda: None,
+) -> MapOnSky:
+    """Say where the sky and a thickness map disagree, and move the map there.
+
+    Parameters
+    ----------
+    frames : sequence of callables
+        Each returns a frame with its fringes and its background; they are asked one at a time.
+    thickness : `ThicknessMap`
+        The map, on the pixels of the frames.
+    response : `Response`
+        Of the sensor to the dark sky, at least `reach_um` beyond the thicknesses of the map.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    options : `CorrectionOptions`, optional
+        Background, amplifiers, objects.
+    map_sigma_um : `float`, optional
+        See `fit_sky_shift`.
+    advance : callable, optional
+        Called after each frame.
+
+    Raises
+    ------
+    InputError
+        Frames of another size than the map, or without pixels that both know.
+    """
+    chosen = options or CorrectionOptions()
+    known = thickness.known_um().astype(float)
+    middle = float(np.nanmean(known))
+    whole = response.sky().frame(np.where(np.isfinite(known), known, middle))
+    level = float(whole.mean(dtype=float))
+    cell = _cell_px(known, order_um)
+    patterns = _patterns(response, known, order_um)
+    values, weights = [], []
+    for frame in frames:
+        value, weight = _fringes_alone(frame(), patterns, chosen, known.shape)
+        weight[~np.isfinite(known)] = 0.0
+        values.append(_cell_means(value, weight, cell))
+        weights.append(_cell_sums(weight, cell))
+        advance()
+    layer = _cell_means(known, np.isfinite(known).astype(float), cell)
+    layer[_cell_sums(np.isfinite(known).astype(float), cell) == 0.0] = np.nan
+    low, high = (
+        np.nanmin(known) - reach_um(order_um, map_sigma_um),
+        np.nanmax(known) + reach_um(order_um, map_sigma_um),
+    )
+    tables = [
+        response.sky({name: float(name == band) for name in response.component}) for band in response.bands
+    ]
+
+    def predict(thickness_um: FloatArray) -> FloatArray:
+        inside = np.clip(thickness_um, low, high)
+        return np.stack([table.frame(inside) for table in tables]).astype(float) / level
+
+    shift = fit_sky_shift(values, weights, layer, predict, order_um, map_sigma_um=map_sigma_um)
+    return MapOnSky(shift, cell, _moved(thickness, shift, cell))
+
+
+def _cell_px(known: FloatArray, order_um: float) -> int:
+    """Pixels along a side of a cell: a power of two, as many as the fringes allow."""
+    gradient = np.hypot(*np.gradient(known))
+    step = 2.0 * math.pi / order_um * float(np.nanpercentile(gradient, 95.0))
+    largest = min(known.shape) // SMALLEST_SIDE
+    cell = 1
+    while 2 * cell <= largest and 2 * cell * step <= LARGEST_STEP_RAD:
+        cell *= 2
+    return cell
+
+
+def _patterns(response: Response, known: FloatArray, order_um: float) -> list[NDArray[np.float32]]:
+    """The sky of the map, and a quarter of an order away, of mean 0: any common shift is their sum."""
+    table = response.sky()
+    good = np.isfinite(known)
+    made = []
+    for part in (0.0, 0.25):
+        frame = table.frame(known + part * order_um).astype(float)
+        made.append(np.where(good, frame / frame[good].mean() - 1.0, 0.0).astype(np.float32))
+    return made
+
+
+def _fringes_alone(
+    frame: ObservedFrame,
+    patterns: list[NDArray[np.float32]],
+    options: CorrectionOptions,
+    shape: tuple[int, ...],
+) -> tuple[FloatArray, FloatArray]:
+    """A frame over its background, minus one, and its inverse variance, 0 in objects."""
+    if frame.shape != shape:
+        raise InputError("shape of a frame", frame.shape, f"{shape}, that of the thickness map")
+    weight = frame_weight(frame)
+    background = BackgroundTerms(frame.shape, options.spacing_px, options.amplifiers)
+    image = np.where(np.isfinite(frame.image), frame.image, 0.0)
+    found = fit_frame(image, weight, patterns, background)
+    surface = found.background.astype(float)
+    used = (weight > 0.0) & (~found.objects if options.find_objects else True) & (surface > 0.0)
+    value = np.divide(image, surface, out=np.ones(image.shape), where=used) - 1.0
+    return value, np.where(used, weight * surface**2, 0.0)
+
+
+def _cell_sums(image: FloatArray, cell: int) -> FloatArray:
+    """Sums over cells; rows and columns that do not fill one are left out."""
+    rows, columns = (side // cell for side in image.shape)
+    cut = image[: rows * cell, : columns * cell]
+    return np.asarray(cut.reshape(rows, cell, columns, cell).sum(axis=(1, 3)))
+
+
+def _cell_means(image: FloatArray, weight: FloatArray, cell: int) -> FloatArray:
+    total = _cell_sums(weight, cell)
+    share = _cell_sums(np.where(weight > 0.0, image, 0.0) * weight, cell)
+    return np.divide(share, total, out=np.zeros(total.shape), where=total > 0.0)
+
+
+def _moved(thickness: ThicknessMap, shift: SkyShift, cell: int) -> ThicknessMap:
+    """The map with its shift; its uncertainty is that of both."""
+    rows, columns = (
+        np.clip((np.arange(side) + 0.5) / cell - 0.5, 0.0, cells - 1.0)
+        for side, cells in zip(thickness.shape, shift.shift_um.shape, strict=True)
+    )
+    places = np.meshgrid(rows, columns, indexing="ij")
+    added, sigma = (map_coordinates(values, places, order=1) for values in (shift.shift_um, shift.sigma_um))
+    value = thickness.value + added
+    below = (thickness.mask == 0) & ~(value > 0.0)
+    return dataclasses.replace(
+        thickness,
+        value=value.astype(np.float32),
+        sigma=np.hypot(thickness.sigma, sigma).astype(np.float32),
+        mask=thickness.mask | np.where(below, mask_bits("NO_DATA"), 0).astype(np.int32),
+        slip_probability=np.maximum(thickness.slip_probability, shift.chance_other_order).astype(np.float32),
+        metadata={
+            **thickness.metadata,
+            "SKYMEAN": float(np.mean(shift.shift_um)),
+            "SKYSIGMA": float(np.median(shift.sigma_um)),
+            "SKYKEPT": shift.chance_unmoved,
+        },
+    )

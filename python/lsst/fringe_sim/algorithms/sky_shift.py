@@ -1,0 +1,498 @@
+"""A thickness map from the laboratory, checked on frames of the night sky and moved where they disagree."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import logsumexp
+
+from ..errors import InputError, named_units
+
+__all__ = ["SkyShift", "fit_sky_shift"]
+
+FloatArray = NDArray[np.float64]
+Predictor = Callable[[FloatArray], FloatArray]
+
+MAP_SIGMA_ORDERS = 0.15
+"""What a map may be off by as a whole before the sky is seen [orders]: 1 rad of phase, as much as the adhesive may
+change between the temperatures of laboratory and sky."""
+
+STEPS_PER_ORDER = 24
+"""Shifts in one order at which a night is compared before anything is linear: 15 degrees of phase."""
+
+SPANS = (0, 1, 2, 4, 8, 16)
+"""Spans of the splines along a side that compete; with none, all pixels have one shift."""
+
+LEAST_PX_OF_SPAN = 8
+"""Pixels in a span: fewer would not carry a cubic."""
+
+BAND_SIGMA = 1.0
+"""Fringes of a band in a frame over those of the dark sky are 1, give or take this, and not negative: bands change by
+half and more (Noll et al. 2015, doi 10.5194/acp-15-3647-2015), and a sensor may show less contrast than its model."""
+
+SPREADS = 13
+"""Spreads of the shifts over which the evidence is averaged, from a thousandth of an order to one order."""
+
+MOST_STARTS = 4
+"""Most common shifts from which splines begin; an order has about one."""
+
+NEGLIGIBLE = 10.0
+"""Splines whose evidence is e to this less than that of coarser ones end the search for finer ones."""
+
+ROUNDS, FINISHED_ORDERS = 25, 1e-3
+"""Most rounds of Gauss and Newton, and the step at which they end [orders]; the spread is sought in every fourth."""
+
+DERIVATIVE_ORDERS = 1e-2
+"""Half the distance of the two predictions that make a derivative [orders]; its error is 6e-4 of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class SkyShift:
+    """How far a map is from what the sky shows.
+
+    Attributes
+    ----------
+    shift_um, sigma_um : `numpy.ndarray`, shape ``(ny, nx)``
+        What is to be added to the map, and its uncertainty [µm], averaged over all that compete by their evidence.
+    chance_unmoved : `float`
+        Probability that the map is right as it is.
+    chance_other_order : `float`
+        Probability that all of it is whole fringe orders away from the shift that is stated.
+    spans : `int`
+        Spans along a side of the likeliest splines; -1 if the map is likeliest as it is, 0 for one shift.
+    strength, strength_sigma : `float`
+        Fringes of the frames over those predicted for the dark sky.
+    residual : `float`
+        Mean square of the residuals over their variance where the map is as it was, over that with the shift.
+    alone_um : `float`
+        Median uncertainty that the frames alone give to shifts over an eighth of the sensor [µm].
+    """
+
+    shift_um: FloatArray
+    sigma_um: FloatArray
+    chance_unmoved: float
+    chance_other_order: float
+    spans: int
+    strength: float
+    strength_sigma: float
+    residual: float
+    alone_um: float
+
+    @named_units
+    def frames_for(self, sigma_um: float, frames: int) -> int:
+        """Frames like the ``frames`` that were used, from which an eighth of the sensor is known to ``sigma_um``."""
+        return math.ceil(frames * (self.alone_um / sigma_um) ** 2)
+
+
+@named_units
+def fit_sky_shift(
+    values: Sequence[ArrayLike],
+    weights: Sequence[ArrayLike],
+    thickness_um: ArrayLike,
+    predict: Predictor,
+    order_um: float,
+    *,
+    map_sigma_um: float | None = None,
+) -> SkyShift:
+    """How a thickness map must move for the fringes of sky frames.
+
+    Parameters
+    ----------
+    values, weights : sequence of array_like, F of shape ``(ny, nx)``
+        Frames over their mean, minus one, and inverse variances in any unit; 0 leaves a pixel out.
+    thickness_um : array_like, shape ``(ny, nx)``
+        The map [µm]; NaN where it is not known.
+    predict : callable
+        ``thickness_um -> (B, ny, nx)``: light of the OH bands of the dark sky, over the mean of that sky.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    map_sigma_um : `float`, optional
+        What all of the map may be off by, one standard deviation [µm]; by default 0.15 orders.
+
+    Returns
+    -------
+    shift : `SkyShift`
+
+    Raises
+    ------
+    InputError
+        No frames, frames of another shape than the map, or too few pixels that both know.
+
+    Notes
+    -----
+    The shift is a spline whose coefficients have a common mean, normal about zero, and a normal spread about it,
+    over which the evidence is averaged. Its number of spans, one shift for all, and none at all compete by evidence
+    (Laplace's, about the best point). In each frame the strength of each band and a background of second degree are
+    free, and integrated over. The variance of each frame is that of its residuals.
+    """
+    layer = np.asarray(thickness_um, dtype=float)
+    frames = _frames(values, weights, layer)
+    known = np.isfinite(layer)
+    filled = np.where(known, layer, float(layer[known].mean()))
+    night = _Night(frames, filled, predict, order_um, map_sigma_um or MAP_SIGMA_ORDERS * order_um)
+    tried = [night.fitted(_Splines.of(layer.shape, spans), night.starts()[0]) for spans in (0, 1)]
+    night = night.with_noise_of(max(tried, key=lambda fit: fit.log_evidence))
+    found: list[_Fit] = []
+    others: list[_Fit] = []
+    starts = night.starts()
+    for spans in SPANS:
+        if spans * LEAST_PX_OF_SPAN > min(layer.shape):
+            break
+        each = [night.fitted(_Splines.of(layer.shape, spans), start) for start in starts]
+        best = max(each, key=lambda fit: fit.log_evidence)
+        found.append(best)
+        others.extend(each)
+        if spans > 0:
+            starts = [best.shift_um]
+            if best.log_evidence < max(fit.log_evidence for fit in found) - NEGLIGIBLE:
+                break
+    unmoved = night.state(np.zeros(layer.shape))
+    return _averaged(night, unmoved, found, others)
+
+
+def _frames(
+    values: Sequence[ArrayLike], weights: Sequence[ArrayLike], layer: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    if not values or len(values) != len(weights):
+        raise InputError(
+            "sky frames, weights", (len(values), len(weights)), "as many of each, and one or more"
+        )
+    made = []
+    for value, weight in zip(values, weights, strict=True):
+        image, inverse = np.asarray(value, dtype=float), np.asarray(weight, dtype=float)
+        if image.shape != layer.shape or inverse.shape != layer.shape:
+            allowed = f"{layer.shape}, that of the thickness map"
+            raise InputError("shape of a sky frame", image.shape, allowed)
+        good = np.isfinite(image) & np.isfinite(inverse) & (inverse > 0.0) & np.isfinite(layer)
+        if np.count_nonzero(good) < LEAST_PX_OF_SPAN**2:
+            allowed = f"{LEAST_PX_OF_SPAN**2} or more that the thickness map knows"
+            raise InputError("pixels of a sky frame", int(np.count_nonzero(good)), allowed)
+        made.append((np.where(good, image, 0.0), np.where(good, inverse, 0.0)))
+    return made
+
+
+@dataclass(frozen=True, eq=False)
+class _Splines:
+    """Tensor product of cubic B-splines over an image; without spans a constant."""
+
+    rows: FloatArray  # (ny, k)
+    columns: FloatArray  # (nx, l)
+    spans: int
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], spans: int) -> _Splines:
+        rows, columns = (_basis(side, spans) for side in shape)
+        return cls(rows, columns, spans)
+
+    @property
+    def count(self) -> int:
+        return self.rows.shape[1] * self.columns.shape[1]
+
+    def surface(self, coefficient: FloatArray) -> FloatArray:
+        inner = coefficient.reshape(self.rows.shape[1], self.columns.shape[1])
+        return np.asarray(self.rows @ inner @ self.columns.T)
+
+    def sums(self, image: FloatArray) -> FloatArray:
+        """Sum of an image times each spline, ``(count,)``."""
+        return np.asarray(self.rows.T @ image @ self.columns).ravel()
+
+    def products(self, image: FloatArray) -> FloatArray:
+        """Sum of an image times each pair of splines, ``(count, count)``."""
+        k, m = self.rows.shape[1], self.columns.shape[1]
+        along = (self.columns[:, :, None] * self.columns[:, None, :]).reshape(-1, m * m)
+        across = (self.rows[:, :, None] * self.rows[:, None, :]).reshape(-1, k * k)
+        pairs = (across.T @ (image @ along)).reshape(k, k, m, m)
+        return np.asarray(pairs.transpose(0, 2, 1, 3)).reshape(k * m, k * m)
+
+    def variance(self, covariance: FloatArray) -> FloatArray:
+        """Variance of the surface of every pixel."""
+        k, m = self.rows.shape[1], self.columns.shape[1]
+        pairs = covariance.reshape(k, m, k, m).transpose(0, 2, 1, 3).reshape(k * k, m * m)
+        along = (self.columns[:, :, None] * self.columns[:, None, :]).reshape(-1, m * m)
+        across = (self.rows[:, :, None] * self.rows[:, None, :]).reshape(-1, k * k)
+        return np.asarray(across @ pairs @ along.T)
+
+
+def _basis(side: int, spans: int) -> FloatArray:
+    if spans == 0:
+        return np.ones((side, 1))
+    knots = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, spans + 1), [1.0] * 3])
+    place = (np.arange(side) + 0.5) / side
+    return np.asarray(BSpline.design_matrix(place, knots, 3).toarray())
+
+
+class _State(NamedTuple):
+    """A night at one shift, with the best levels of its bands and backgrounds."""
+
+    half_chi2: float  # with the prior of the bands
+    log_volume: float  # -0.5 log det of the levels
+    slopes: list[FloatArray]  # (ny, nx) each: change of a frame with the shift [1/µm]
+    designs: list[FloatArray]  # (terms, pixels) each
+    inverses: list[FloatArray]  # (terms, terms) each: covariance of the levels
+    residuals: list[FloatArray]  # (ny, nx) each
+    strength: FloatArray  # (F,): fringes over those of the dark sky
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The best point of one kind of splines."""
+
+    splines: _Splines
+    coefficient: FloatArray
+    covariance: FloatArray
+    information: FloatArray
+    shift_um: FloatArray
+    log_evidence: float
+    state: _State
+
+
+@dataclass(frozen=True, eq=False)
+class _Night:
+    """Frames of a night, and what is expected of them."""
+
+    frames: list[tuple[FloatArray, FloatArray]]
+    layer_um: FloatArray
+    predict: Predictor
+    order_um: float
+    map_sigma_um: float
+
+    def starts(self) -> list[FloatArray]:
+        """Common shifts to begin with: all at which the night is likelier than on either side, and none."""
+        half = max(STEPS_PER_ORDER, math.ceil(3.0 * STEPS_PER_ORDER * self.map_sigma_um / self.order_um))
+        steps = np.arange(-half, half + 1) * (self.order_um / STEPS_PER_ORDER)
+        thin = max(1, min(self.layer_um.shape) // 128)
+        some = replace(
+            self,
+            frames=[
+                (value[::thin, ::thin], thin**2 * weight[::thin, ::thin]) for value, weight in self.frames
+            ],
+            layer_um=self.layer_um[::thin, ::thin],
+            predict=_thinned(self.predict, self.layer_um, thin),
+        )
+        log = np.array([-some.state(np.full(some.layer_um.shape, step)).half_chi2 for step in steps])
+        log -= 0.5 * (steps / self.map_sigma_um) ** 2
+        padded = np.pad(log, 1, constant_values=-np.inf)
+        peaks = np.flatnonzero((log >= padded[:-2]) & (log >= padded[2:]))
+        best = peaks[np.argsort(-log[peaks])][:MOST_STARTS]
+        return [np.full(self.layer_um.shape, step) for step in (*steps[best], 0.0)]
+
+    def with_noise_of(self, fit: _Fit) -> _Night:
+        """The same with weights of the residuals' own variance."""
+        frames = []
+        for (value, weight), residual in zip(self.frames, fit.state.residuals, strict=True):
+            freedom = np.count_nonzero(weight)
+            frames.append((value, weight * (freedom / float((weight * residual**2).sum()))))
+        return replace(self, frames=frames)
+
+    def state(self, shift_um: FloatArray) -> _State:
+        """The night at a shift, with the levels that suit it best."""
+        step = DERIVATIVE_ORDERS * self.order_um
+        bands, above, below = (self.predict(self.layer_um + shift_um + d) for d in (0.0, step, -step))
+        gradient = (above - below) / (2.0 * step)
+        made = _State(0.0, 0.0, [], [], [], [], np.zeros(len(self.frames)))
+        half_chi2 = log_volume = 0.0
+        for number, (value, weight) in enumerate(self.frames):
+            middle = np.average(bands, axis=(1, 2), weights=weight)
+            design = np.concatenate([bands - middle[:, None, None], _polynomials(value.shape)])
+            flat = design.reshape(len(design), -1)
+            weighted = flat * weight.ravel()
+            level, inverse, log_det = _levels(weighted @ flat.T, weighted @ value.ravel(), len(bands))
+            residual = value - np.tensordot(level, design, axes=1)
+            away = (level[: len(bands)] - 1.0) / BAND_SIGMA
+            half_chi2 += 0.5 * float((weight * residual**2).sum() + away @ away)
+            log_volume -= 0.5 * log_det
+            made.slopes.append(np.tensordot(level[: len(bands)], gradient, axes=1))
+            made.designs.append(flat)
+            made.inverses.append(inverse)
+            made.residuals.append(residual)
+            power = (weight * np.square(bands - middle[:, None, None])).sum(axis=(1, 2))
+            made.strength[number] = float(level[: len(bands)] @ power / max(power.sum(), 1e-300))
+        return made._replace(half_chi2=half_chi2, log_volume=log_volume)
+
+    def normal(self, splines: _Splines, state: _State) -> tuple[FloatArray, FloatArray]:
+        """Information on the coefficients, the levels being free, and minus the gradient of half the χ²."""
+        gradient = np.zeros(splines.count)
+        total = np.zeros(self.layer_um.shape)
+        reduced = np.zeros((splines.count, splines.count))
+        frames = zip(self.frames, state.slopes, state.designs, state.inverses, state.residuals, strict=True)
+        for (_, weight), slope, design, inverse, residual in frames:
+            total += weight * slope**2
+            gradient += splines.sums(weight * slope * residual)
+            cross = np.stack(
+                [splines.sums(weight * slope * each.reshape(weight.shape)) for each in design], axis=1
+            )
+            reduced += cross @ inverse @ cross.T
+        return splines.products(total) - reduced, gradient
+
+    def fitted(self, splines: _Splines, start_um: FloatArray) -> _Fit:
+        """Gauss and Newton from a start, with the spread of the coefficients that the evidence prefers."""
+        coefficient = _nearest(splines, start_um)
+        reach = self.map_sigma_um
+        spreads = self.order_um * np.geomspace(1e-3, 1.0, SPREADS)
+        spread = float(spreads[SPREADS // 2])
+        state = self.state(splines.surface(coefficient))
+        for number in range(ROUNDS):
+            information, gradient = self.normal(splines, state)
+            if number % 4 == 0:
+                spread, _ = _evidence(information, gradient, coefficient, spreads, reach)
+            penalty = np.asarray(np.linalg.inv(_prior(splines.count, spread, reach)), dtype=float)
+            wanted = gradient - penalty @ coefficient
+            step = np.asarray(np.linalg.solve(information + penalty, wanted), dtype=float)
+            moved, state = self._moved(splines, coefficient, step, penalty, state)
+            change = float(np.abs(moved - coefficient).max())
+            coefficient = moved
+            if change < FINISHED_ORDERS * self.order_um:
+                break
+        information, gradient = self.normal(splines, state)
+        spread, log_evidence = _evidence(information, gradient, coefficient, spreads, reach)
+        covariance = np.linalg.inv(information + np.linalg.inv(_prior(splines.count, spread, reach)))
+        total = log_evidence - state.half_chi2 + state.log_volume
+        return _Fit(splines, coefficient, covariance, information, splines.surface(coefficient), total, state)
+
+    def _moved(
+        self, splines: _Splines, coefficient: FloatArray, step: FloatArray, penalty: FloatArray, state: _State
+    ) -> tuple[FloatArray, _State]:
+        """As much of a step as makes the fit better."""
+        limit = (
+            0.25 * self.order_um / max(float(np.abs(step).max()), 1e-300)
+        )  # a quarter of a fringe is not linear
+        step = min(1.0, limit) * step
+        before = state.half_chi2 + 0.5 * float(coefficient @ penalty @ coefficient)
+        for _ in range(6):
+            tried = coefficient + step
+            new = self.state(splines.surface(tried))
+            if new.half_chi2 + 0.5 * float(tried @ penalty @ tried) <= before:
+                return tried, new
+            step = 0.5 * step
+        return coefficient, state
+
+
+_POWERS = tuple((y, x) for y, x in itertools.product(range(3), range(3)) if y + x <= 2)
+
+
+def _levels(products: FloatArray, side: FloatArray, bands: int) -> tuple[FloatArray, FloatArray, float]:
+    """Strength of bands and terms of the background, their covariance, and the log of its inverse's determinant.
+
+    A band that would be negative is not there, and has no freedom.
+    """
+    prior = np.where(np.arange(side.size) < bands, BAND_SIGMA**-2.0, 0.0)
+    there = np.ones(side.size, dtype=bool)
+    matrix = products + np.diag(prior)
+    log_det = float(np.linalg.slogdet(matrix)[1])
+    while True:
+        kept = np.flatnonzero(there)
+        inverse = np.zeros_like(matrix)
+        inverse[np.ix_(kept, kept)] = np.linalg.inv(matrix[np.ix_(kept, kept)])
+        level = inverse @ (side + prior)
+        negative = there & (level < 0.0) & (prior > 0.0)
+        if not negative.any():
+            return level, inverse, log_det
+        there &= ~negative
+
+
+def _polynomials(shape: tuple[int, ...]) -> FloatArray:
+    y, x = (np.linspace(-1.0, 1.0, side) for side in shape)
+    return np.stack([np.outer(y**row, x**column) for row, column in _POWERS])
+
+
+def _thinned(predict: Predictor, layer_um: FloatArray, thin: int) -> Predictor:
+    """Predictions of every ``thin``-th pixel, whose places in the field are those of the whole image."""
+    if thin == 1:
+        return predict
+
+    def of_some(thickness_um: FloatArray) -> FloatArray:
+        whole = np.repeat(np.repeat(thickness_um, thin, axis=0), thin, axis=1)
+        return predict(whole[: layer_um.shape[0], : layer_um.shape[1]])[:, ::thin, ::thin]
+
+    return of_some
+
+
+def _nearest(splines: _Splines, surface: FloatArray) -> FloatArray:
+    """Coefficients of the surface nearest to another."""
+    rows, columns = np.linalg.pinv(splines.rows), np.linalg.pinv(splines.columns)
+    return np.asarray(rows @ surface @ columns.T).ravel()
+
+
+def _prior(count: int, spread_um: float, reach_um: float) -> FloatArray:
+    """Covariance of the coefficients: a common mean, as far as the map may be off, and a spread about it."""
+    own = spread_um**2 if count > 1 else 0.0
+    return own * np.eye(count) + reach_um**2
+
+
+def _evidence(
+    information: FloatArray,
+    gradient: FloatArray,
+    coefficient: FloatArray,
+    spreads: FloatArray,
+    reach_um: float,
+) -> tuple[float, float]:
+    """The likeliest spread, and the log of the evidence over the likelihood at the coefficients.
+
+    Half the χ² about the coefficients is ``-gradient @ d + 0.5 d @ information @ d``.
+    """
+    count = coefficient.size
+    linear = gradient + information @ coefficient
+    at_zero = -float(gradient @ coefficient) - 0.5 * float(coefficient @ information @ coefficient)
+    logs = []
+    for spread in spreads if count > 1 else spreads[:1]:
+        root = np.linalg.cholesky(_prior(count, float(spread), reach_um) + 1e-14 * np.eye(count))
+        inner = np.eye(count) + root.T @ information @ root
+        factor = cho_factor(inner, lower=True)
+        side = root.T @ linear
+        gain = 0.5 * float(side @ cho_solve(factor, side))
+        logs.append(gain - float(np.log(np.diag(factor[0])).sum()))
+    best = int(np.argmax(logs))
+    return float(spreads[best]), at_zero + float(logsumexp(logs)) - math.log(len(logs))
+
+
+def _averaged(night: _Night, unmoved: _State, fits: Sequence[_Fit], others: Sequence[_Fit]) -> SkyShift:
+    """All that compete, by their evidence; ``others`` began elsewhere."""
+    logs = np.array([unmoved.log_volume - unmoved.half_chi2, *(fit.log_evidence for fit in fits)])
+    weight = np.exp(logs - logsumexp(logs))
+    shift = sum((w * fit.shift_um for w, fit in zip(weight[1:], fits, strict=True)), np.zeros(1))
+    variance = weight[0] * shift**2
+    for w, fit in zip(weight[1:], fits, strict=True):
+        variance = variance + w * (fit.splines.variance(fit.covariance) + (fit.shift_um - shift) ** 2)
+    best = int(logs.argmax())
+    state = unmoved if best == 0 else fits[best - 1].state
+    eighth = min(fits, key=lambda fit: abs(fit.splines.spans - 8))
+    alone = eighth.splines.variance(
+        np.asarray(np.linalg.pinv(eighth.information, hermitian=True), dtype=float)
+    )
+    ratio = _mean_square(night, unmoved) / _mean_square(night, state)
+    strength = state.strength
+    return SkyShift(
+        shift,
+        np.sqrt(np.maximum(variance, 0.0)),
+        float(weight[0]),
+        _other_order(night, fits, others),
+        -1 if best == 0 else fits[best - 1].splines.spans,
+        float(strength.mean()),
+        float(strength.std(ddof=1) / math.sqrt(strength.size)) if strength.size > 1 else math.nan,
+        ratio,
+        float(np.sqrt(np.median(alone))),
+    )
+
+
+def _other_order(night: _Night, fits: Sequence[_Fit], others: Sequence[_Fit]) -> float:
+    """Chance of what ended half an order or more from the likeliest."""
+    best = max(fits, key=lambda fit: fit.log_evidence)
+    logs = np.array([fit.log_evidence for fit in others])
+    away = np.array(
+        [abs(float(np.mean(fit.shift_um - best.shift_um))) > 0.5 * night.order_um for fit in others]
+    )
+    return float(np.exp(logsumexp(logs[away]) - logsumexp(logs))) if away.any() else 0.0
+
+
+def _mean_square(night: _Night, state: _State) -> float:
+    pairs = list(zip(night.frames, state.residuals, strict=True))
+    total = sum(float((weight * residual**2).sum()) for (_, weight), residual in pairs)
+    return total / sum(int(np.count_nonzero(weight)) for (_, weight), _ in pairs)

@@ -1,0 +1,174 @@
+"""``fringe-sim fit-sky``."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+from ..errors import InputError
+from .observed import background_options, background_path, grid_of, images_of, refuse_bad
+from .output import OutputFolder, output_folder
+from .parameters import SKY, ChosenEffects, model_effects
+from .progress import progress
+
+if TYPE_CHECKING:
+    from ..algorithms.map_on_sky import MapOnSky
+    from ..algorithms.sky_response import Response
+    from ..instrument.detector import Detector
+    from ..instrument.setup import Setup
+    from ..products import SensorSection, ThicknessMap
+    from ..products.observed_files import ObservedImage
+
+__all__ = ["fit_sky"]
+
+WORTH_ORDERS = 0.02
+"""Uncertainty to which a map is wanted, for what the command says of more frames [orders]: 0.13 rad of phase leave a
+hundredth of the power of the fringes."""
+
+
+@click.command()
+@click.argument("frames", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option(
+    "--thickness", required=True, type=click.Path(exists=True, dir_okay=False), help="Map of the sensor."
+)
+@SKY.option("lsst_e2v", "Set-up with a telescope: name or file.")
+@click.option("--detector", default=None, help="Place in the focal plane; by default as the frames say.")
+@click.option(
+    "--map-sigma",
+    type=click.FloatRange(0.0, 10.0, min_open=True),
+    default=None,
+    help="What all of the map may be off by, one σ [µm]; by default 0.15 fringe orders.",
+)
+@background_options
+@model_effects("Effect on the sky; may be repeated.")
+@output_folder("Folder for the moved map and the report.", "thickness.fits", "report.html")
+@click.option("--skip-bad", is_flag=True, help="Go on without frames that cannot be read.")
+@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+def fit_sky(
+    frames: tuple[Path, ...],
+    thickness: str,
+    setup: Setup,
+    detector: str | None,
+    map_sigma: float | None,
+    background: Path | None,
+    background_px: float,
+    amplifiers: tuple[int, int] | None,
+    effects: ChosenEffects,
+    out: OutputFolder,
+    skip_bad: bool,
+    dry_run: bool,
+) -> None:
+    """Hold a thickness map against frames of the night sky, and move it where they disagree.
+
+    FRAMES are those of one sensor in one filter, after the removal of the instrument's signature and before the
+    subtraction of background and fringes. The strength of every OH band is free in every frame, so that nights in
+    which the bands vary tell more. The map that is written holds the shift, and its uncertainty.
+
+    \b
+    Examples:
+      fringe-sim fit-sky night --thickness fit/thickness.fits --detector R22_S11 --out on_sky
+    """
+    from ..algorithms.fringe_correction import CorrectionOptions
+    from ..algorithms.map_on_sky import map_on_sky, reach_um
+    from ..model import FringeModel
+    from ..model.provenance import input_cards, software_cards
+    from ..products import refuse_corrected
+    from ..report.map_on_sky_page import write_map_on_sky_report
+    from .inputs import read_map, read_section
+
+    images, unusable = images_of(frames, refuse_corrected)
+    refuse_bad(unusable, skip_bad)
+    sensor = setup.sensor(detector or _sensor_of(images))
+    layer = read_map(thickness, setup, sensor)
+    section = read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
+    order_um = float(FringeModel.from_setup(setup).fringe_order_um(960.0))
+    if dry_run:
+        click.echo(f"would hold the map of {sensor.name} against {len(images)} frames")
+        return
+    folder = out.prepare()
+    response = _response(layer, setup, sensor, section, effects, reach_um(order_um, map_sigma))
+    loaders = [partial(image.read, background_path(background, image)) for image in images]
+    with progress("finding fringes", len(images)) as advance:
+        found = map_on_sky(
+            loaders,
+            layer,
+            response,
+            order_um,
+            CorrectionOptions(background_px, grid_of(amplifiers)),
+            map_sigma_um=map_sigma,
+            advance=advance,
+        )
+    given: list[str | Path] = [thickness, *dict.fromkeys(image.path for image in images)]
+    found.moved.write_fits(folder / "thickness.fits", {**software_cards(), **input_cards(given)})
+    lines = said(found, len(images), order_um)
+    page = write_map_on_sky_report(folder / "report.html", found, layer, lines)
+    for line in lines:
+        click.echo(line)
+    click.echo(str(folder / "thickness.fits"))
+    click.echo(str(page))
+
+
+def said(found: MapOnSky, frames: int, order_um: float) -> list[str]:
+    """What the frames say of the map, line by line."""
+    shift = found.shift
+    rms, median = float(shift.shift_um.std()), float(np.median(shift.sigma_um))
+    strength = f"{shift.strength:.3g}"
+    if shift.strength_sigma == shift.strength_sigma:
+        strength += f" ± {shift.strength_sigma:.1g}"
+    lines = [
+        f"the map is right as it is with a probability of {shift.chance_unmoved:.2g}",
+        f"shift: mean {shift.shift_um.mean():+.4f} µm, rms about it {rms:.4f} µm, median σ {median:.4f} µm",
+        f"whole orders away with a probability of {shift.chance_other_order:.2g}",
+        f"fringes of the frames over those of the dark sky: {strength}",
+    ]
+    wanted = WORTH_ORDERS * order_um
+    needed = shift.frames_for(wanted, frames)
+    known = f"parts of an eighth of the sensor are known to {shift.alone_um:.4f} µm by the frames alone"
+    more = (
+        f"; {needed} such frames would tell {wanted:.4f} µm ({WORTH_ORDERS:g} orders)"
+        if needed > frames
+        else ""
+    )
+    return [*lines, known + more]
+
+
+def _sensor_of(images: list[ObservedImage]) -> str | None:
+    """Sensor that all frames name, if they name one."""
+    from ..products.observed_files import detector_of
+
+    names = sorted({detector_of(image.header()) for image in images} - {""})
+    if len(names) > 1:
+        raise InputError("sensors of the frames", names, "one")
+    return names[0] if names else None
+
+
+def _response(
+    layer: ThicknessMap,
+    setup: Setup,
+    sensor: Detector,
+    section: SensorSection | None,
+    effects: ChosenEffects,
+    reach_um: float,
+) -> Response:
+    """Response of the sensor to the dark sky, as far beyond the map as it may be off."""
+    from ..algorithms.field_response import SensorPlacement
+    from ..algorithms.sky_of_maps import sky_of_maps
+    from ..instrument.sky import SkySpectrum
+    from ..model import FringeModel
+    from ..products.thickness_map import thickness_span_um
+    from .inputs import sky_settings
+
+    place = SensorPlacement.of(sensor, setup.pixel_scale_arcsec, section)
+    model = FringeModel.from_setup(
+        setup,
+        sky_settings(effects.settings),
+        field_x_deg=place.field_x_deg,
+        field_y_deg=place.field_y_deg,
+    )
+    click.echo("tabulating the response to the sky", err=True)
+    span = thickness_span_um(layer.known_um(), reach_um)
+    return sky_of_maps(model, SkySpectrum.dark(airmass=setup.airmass), place, span, None).on(None)

@@ -1,0 +1,60 @@
+"""A map against a night of frames, by the command: noisy frames of a sensor whose map is off, and is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.products import ThicknessMap
+
+SIDE = 160
+Y, X = np.mgrid[:SIDE, :SIDE] / SIDE
+TRUE_UM = 15.0 + 2.2 * X + 1.2 * np.sin(2.5 * Y + 1.3 * X)
+ERROR_UM = 0.03 + 0.04 * np.sin(3.0 * Y) * np.cos(2.0 * X)
+
+
+def write_map(path: Path, value: np.ndarray, detector: str = "R22_S11") -> str:
+    zero = np.zeros((SIDE, SIDE))
+    made = ThicknessMap(value, zero + 1e-3, zero, zero, zero.astype(int), "adhesive", detector=detector)
+    made.write_fits(path)
+    return str(path)
+
+
+@pytest.mark.slow
+@pytest.mark.rng("a night for a map")
+def test_a_map_is_moved_to_where_the_sky_is(tmp_path: Path, rng: np.random.Generator) -> None:
+    night, seed = str(tmp_path / "night"), str(rng.integers(1 << 20))
+    truth = write_map(tmp_path / "true.fits", TRUE_UM)
+    assert run(["sky", "--thickness", truth, "--night", "--seed", seed, "--out", night]) == 0
+    for name, error in (("wrong", ERROR_UM), ("right", 0.0)):
+        path, out = write_map(tmp_path / f"{name}.fits", TRUE_UM - error), tmp_path / f"on_{name}"
+        assert run(["fit-sky", night, "--thickness", path, "--out", str(out)]) == 0
+        assert run(["fit-sky", night, "--thickness", path, "--out", str(out)]) == 1  # the folder is used
+        moved = ThicknessMap.read_fits(out / "thickness.fits")
+        left = moved.value - TRUE_UM
+        pull = float(np.sqrt(np.mean((left / moved.sigma) ** 2)))
+        assert (out / "report.html").is_file()
+        if name == "wrong":
+            assert moved.metadata["SKYKEPT"] < 1e-3
+            assert np.sqrt(np.mean(left**2)) < 0.4 * np.sqrt(np.mean(ERROR_UM**2))
+            assert pull < 2.5
+        else:
+            assert moved.metadata["SKYKEPT"] > 0.05
+            assert np.abs(left).max() < 4.0 * moved.sigma.max()
+
+
+def test_what_is_refused_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_map(tmp_path / "map.fits", TRUE_UM)
+    frame = str(tmp_path / "frame.fits")
+    fits.PrimaryHDU((3000.0 + X).astype(np.float32)).writeto(frame)
+    out = ["--out", str(tmp_path / "out"), "--dry-run"]
+    for given, reason in (
+        ([frame, "--thickness", path, "--detector", "R01_S00"], "lsst_itl"),
+        ([frame, "--thickness", path, "--setup", "ts8_e2v"], "telescope"),
+    ):
+        assert run(["fit-sky", *given, *out]) != 0
+        assert reason in capsys.readouterr().err
