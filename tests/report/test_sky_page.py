@@ -54,7 +54,7 @@ def test_page_of_a_night_in_a_browser(tmp_path) -> None:
     """With components and coadds; a single frame with noise has neither."""
     path = write_sky_report(tmp_path / "night.html", night(), "lsst_e2v", 1)
     text = path.read_text(encoding="utf-8")
-    for words in ("Components", "Coadds", "coadd_correlation.ecsv", "sky_fringe_amplitudes.ecsv"):
+    for words in ("Components", "Coadds", "coadds.ecsv", "sky_fringe_amplitudes.ecsv"):
         assert words in text
     alone = write_sky_report(tmp_path / "one.html", night(hours=1), "lsst_e2v", 1).read_text(encoding="utf-8")
     assert "Components" not in alone

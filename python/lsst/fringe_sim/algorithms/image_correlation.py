@@ -41,6 +41,9 @@ LARGEST_REGION_PX = 240
 
 SMALLEST_REGION_PX = 16
 
+LARGEST_PART = 4
+"""The largest square in which pixels are averaged is at most this part of a region: there must be several of them."""
+
 
 @dataclass(frozen=True)
 class LogBins:
@@ -112,6 +115,13 @@ class CoaddCorrelation:
         ``xi_1 / N + (1 - 1 / N) xi_floor`` for the same counts, without noise.
     single, floor : `CorrelationFunction`
         Mean correlation of one exposure's fringes, and of the fringes of two different exposures.
+    square_px : `numpy.ndarray`, shape ``(S,)``
+        Sides of squares over which pixels are averaged [px].
+    fringes : `numpy.ndarray`, shape ``(N, S)``
+        Standard deviation of the means of such squares in the coadds of the same counts, without noise; that of one
+        exposure is the mean over all.
+    noise : `numpy.ndarray`, shape ``(N, S)``
+        The same of white noise alone, as expected.
     """
 
     counts: tuple[int, ...]
@@ -120,6 +130,9 @@ class CoaddCorrelation:
     model: tuple[FloatArray, ...]
     single: CorrelationFunction
     floor: CorrelationFunction
+    square_px: NDArray[np.int64]
+    fringes: FloatArray
+    noise: FloatArray
 
 
 def correlation_function(
@@ -275,17 +288,21 @@ def coadd_correlation(
         raise InputError("fringe patterns", 0, "one or more")
     chosen = LogBins(1.0, 0.5 * region_px, 20) if bins is None else bins
     fringes, noise = np.zeros((region_px, region_px)), np.zeros((region_px, region_px))
-    coadds, nulls = [], []
+    coadds, nulls, squares = [], [], []
     own = np.zeros(chosen.count)
+    sides = np.unique(np.geomspace(1, max(1, region_px // LARGEST_PART), 12).astype(int))
+    own_squares = np.zeros(sides.size)
     for number in range(1, wanted[-1] + 1):
         cut = random_cutout(splines[rng.integers(len(splines))], region_px, rng)
         cut -= cut.mean()
         own += correlation_function(cut, bins=chosen).xi
+        own_squares += _square_variance(cut, sides)
         fringes += cut
         noise += noise_rms * rng.standard_normal(cut.shape)
         if number in wanted:
             coadds.append(correlation_function(_centred((fringes + noise) / number), bins=chosen))
             nulls.append(correlation_function(_centred(noise / number), bins=chosen))
+            squares.append(_square_variance(fringes / number, sides))
     total = wanted[-1]
     last = correlation_function(_centred(fringes / total), bins=chosen)
     mean_own = own / total
@@ -294,7 +311,25 @@ def coadd_correlation(
     single = CorrelationFunction(last.separation_px, mean_own, last.weight)
     floor = CorrelationFunction(last.separation_px, beyond, last.weight)
     models = tuple(coadd_model(mean_own, beyond, count) for count in wanted)
-    return CoaddCorrelation(wanted, tuple(coadds), tuple(nulls), models, single, floor)
+    if wanted[0] == 1:
+        squares[0] = own_squares / total
+    white = noise_rms / (np.sqrt(wanted)[:, None] * sides)
+    return CoaddCorrelation(
+        *(wanted, tuple(coadds), tuple(nulls), models, single, floor),
+        square_px=sides,
+        fringes=np.sqrt(squares),
+        noise=white,
+    )
+
+
+def _square_variance(image: FloatArray, sides: NDArray[np.int64]) -> FloatArray:
+    """Variance of the means over all squares of each side."""
+    total = np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    sums = (
+        total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side]
+        for side in sides
+    )
+    return np.array([(each / side**2).var() for each, side in zip(sums, sides, strict=True)])
 
 
 def _autocorrelation(values: FloatArray, weights: FloatArray, bins: LogBins) -> CorrelationFunction:

@@ -20,8 +20,8 @@ from ..products import FringeComponents, FringeCube, FringeFrame, SkyFringe, Thi
 from ..report.discovery_figures import candidates_figure, where_figure
 from ..report.discovery_page import headline
 from ..report.figures import (
+    coadds_figure,
     components_figure,
-    correlation_figure,
     flats_figure,
     phase_figure,
     residuals_figure,
@@ -31,7 +31,7 @@ from ..report.figures import (
     thickness_figure,
 )
 from ..report.page import Report
-from ..report.sky_page import sky_amplitudes
+from ..report.sky_page import COADDS_CAPTION, sky_amplitudes
 from ..report.thickness_page import phase_folded, residual_of_fit, residual_table
 from ..style import save_figure
 
@@ -133,9 +133,10 @@ def _sky_section(report: Report, add: Any, datasets: DemoDatasets) -> None:
     if coadds is not None:
         report.section(
             "Coadds",
-            "What stays of uncorrected fringes in coadds of randomly placed and rotated pieces of these frames.",
+            "What stays of uncorrected fringes in coadds of randomly placed and rotated pieces of these frames, "
+            "beside the photon noise.",
         )
-        add("coadds", correlation_figure(coadds), "Correlation against separation; a line ends below zero.")
+        add("coadds", coadds_figure(coadds), COADDS_CAPTION)
 
 
 def _pixel_section(report: Report, add: Any, model: FringeModel) -> None:

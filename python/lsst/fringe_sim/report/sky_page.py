@@ -12,12 +12,17 @@ from astropy.table import Table
 from ..algorithms.image_correlation import CoaddCorrelation, coadds_of_frames
 from ..algorithms.pca import fit_pca
 from ..products import SkyFringe
-from .figures import components_figure, correlation_figure, sky_figure
+from .figures import coadds_figure, components_figure, sky_figure
 from .page import Report
 
-__all__ = ["sky_amplitudes", "write_sky_report"]
+__all__ = ["COADDS_CAPTION", "coadd_table", "sky_amplitudes", "write_sky_report"]
 
 PERCENT = 100.0
+
+COADDS_CAPTION = (
+    "Standard deviation of means over squares: of the largest against the number of exposures, and of the deepest "
+    "coadd against the side. The Dark Energy Survey asks for fringes below a tenth of the noise up to 20 arcsec."
+)
 
 
 def sky_amplitudes(frames: Sequence[SkyFringe]) -> Table:
@@ -63,20 +68,21 @@ def write_sky_report(path: Path, frames: Sequence[SkyFringe], setup: str, seed: 
     if found is not None:
         report.section(
             "Coadds",
-            "What stays of uncorrected fringes in coadds of randomly placed and rotated pieces of these frames with "
-            "photon noise, beside the noise of as many exposures.",
+            "What stays of uncorrected fringes in coadds of randomly placed and rotated pieces of these frames, "
+            "beside the photon noise.",
         )
-        report.figure(correlation_figure(found), "Correlation against separation; a line ends below zero.")
-        report.table(_correlation_table(found), "coadd_correlation")
+        report.figure(coadds_figure(found), COADDS_CAPTION)
+        report.table(coadd_table(found), "coadds")
     return report.write(path)
 
 
-def _correlation_table(found: CoaddCorrelation) -> Table:
-    table = Table({"separation": found.single.separation_px * units.pixel})
-    for count, coadd, null in zip(found.counts, found.coadd, found.null, strict=True):
-        table[f"fringes, {count}"] = coadd.xi
-        table[f"noise, {count}"] = null.xi
-    table["separation"].info.format = ".2f"
-    for name in table.colnames[1:]:
-        table[name].info.format = ".2e"
+def coadd_table(found: CoaddCorrelation) -> Table:
+    """Fringes and noise in the largest squares, one row per coadd."""
+    table = Table({"exposures": found.counts})
+    table["square"] = [found.square_px[-1]] * len(found.counts) * units.pixel
+    for name, values in (("fringes", found.fringes), ("noise", found.noise)):
+        table[name] = PERCENT * values[:, -1] * units.percent
+        table[name].info.format = ".2g"
+    table["fringes over noise"] = table["fringes"] / table["noise"]
+    table["fringes over noise"].info.format = ".2f"
     return table
