@@ -2,7 +2,7 @@
 
 Rubin's own tasks do not install from a package index. Stand-ins have the names, dimensions and storage classes of
 their connections, as read in lsst/ip_isr d2a69bf, lsst/pipe_tasks 5b638a4, lsst/drp_tasks dc28b94 and lsst/drp_pipe
-0e84d75.
+a5ef3ba.
 """
 
 from __future__ import annotations

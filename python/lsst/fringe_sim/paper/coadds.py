@@ -115,8 +115,8 @@ def coadd(context: Context) -> Section:
         "photon noise.",
         {"coadd_800": excess, "coadd_treecorr": _against_treecorr(patterns[0])},
         (Graph("correlation of coadds", "separation [px]", "ξ [sky²]", tuple(curves), logarithmic=True),),
-        "Correlation of fringes in more and more exposures, and that of the deepest coadd with its noise; a line ends "
-        "where the correlation turns negative.",
+        "Correlation of fringes in more and more exposures, and that of the deepest coadd with its noise; a line "
+        "ends where the correlation turns negative.",
     )
 
 
