@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import treecorr
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import gaussian_filter, spline_filter
 
 from lsst.fringe_sim.algorithms.image_correlation import (
@@ -94,20 +93,6 @@ def patterns():
         np.sin(2 * np.pi * (x * np.cos(a) + y * np.sin(a)) / (25 + 3 * a) + 1e-4 * (x - 150) ** 2)
         for a in (0.0, 1.0, 2.0)
     ]
-
-
-def test_squares_of_a_coadd(patterns):
-    """The standard deviation of means over all squares of the very piece that was coadded."""
-    result = coadd_correlation(patterns[:1], (1,), 0.7, np.random.default_rng(6), region_px=48)
-    rng = np.random.default_rng(6)
-    rng.integers(1)
-    piece = random_cutout(spline_filter(patterns[0]), 48, rng)
-    assert result.square_px[0] == 1
-    assert result.square_px[-1] == 12
-    for side, fringes, noise in zip(result.square_px, result.fringes[0], result.noise[0], strict=True):
-        means = sliding_window_view(piece, (side, side)).mean(axis=(2, 3))
-        assert fringes == pytest.approx(means.std(), rel=1e-9)
-        assert noise == pytest.approx(0.7 / side)
 
 
 @pytest.mark.rng("coadds average fringes away down to the floor")

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import affine_transform, spline_filter
 
 from ..errors import InputError, OutOfRangeError
-from ..products import SkyFringe
 
 __all__ = [
     "CoaddCorrelation",
@@ -26,23 +25,11 @@ __all__ = [
     "LogBins",
     "coadd_correlation",
     "coadd_model",
-    "coadds_of_frames",
     "correlation_function",
     "random_cutout",
 ]
 
 FloatArray = NDArray[np.float64]
-
-COADDS = (1, 10, 100)
-"""Exposures in the coadds of `coadds_of_frames`."""
-
-LARGEST_REGION_PX = 240
-"""Side of the region that is coadded [px]; that of the paper's figure is 200."""
-
-SMALLEST_REGION_PX = 16
-
-LARGEST_PART = 4
-"""The largest square in which pixels are averaged is at most this part of a region: there must be several of them."""
 
 
 @dataclass(frozen=True)
@@ -115,13 +102,6 @@ class CoaddCorrelation:
         ``xi_1 / N + (1 - 1 / N) xi_floor`` for the same counts, without noise.
     single, floor : `CorrelationFunction`
         Mean correlation of one exposure's fringes, and of the fringes of two different exposures.
-    square_px : `numpy.ndarray`, shape ``(S,)``
-        Sides of squares over which pixels are averaged [px].
-    fringes : `numpy.ndarray`, shape ``(N, S)``
-        Standard deviation of the means of such squares in the coadds of the same counts, without noise; that of one
-        exposure is the mean over all.
-    noise : `numpy.ndarray`, shape ``(N, S)``
-        The same of white noise alone, as expected.
     """
 
     counts: tuple[int, ...]
@@ -130,9 +110,6 @@ class CoaddCorrelation:
     model: tuple[FloatArray, ...]
     single: CorrelationFunction
     floor: CorrelationFunction
-    square_px: NDArray[np.int64]
-    fringes: FloatArray
-    noise: FloatArray
 
 
 def correlation_function(
@@ -161,27 +138,6 @@ def correlation_function(
     """
     values, weights = _weighted(image, weight)
     return _autocorrelation(values, weights, _bins_for(values, bins))
-
-
-def coadds_of_frames(frames: Sequence[SkyFringe], rng: np.random.Generator) -> CoaddCorrelation | None:
-    """Correlation left in coadds of randomly placed and rotated pieces of the frames.
-
-    ``rng``: places, angles, and the photon noise of each exposure. Returns `None` for frames too small to be
-    rotated.
-    """
-    # A region that is rotated by any angle needs its diagonal, and the spline a few pixels more.
-    region = min(LARGEST_REGION_PX, int((min(frames[0].shape) - 8) / np.sqrt(2.0)) - 1)
-    if region < SMALLEST_REGION_PX:
-        return None
-    patterns = [_filled(frame) for frame in frames]
-    noise = 1.0 / np.sqrt(np.mean([frame.mean_electrons for frame in frames]))
-    return coadd_correlation(patterns, COADDS, float(noise), rng, region_px=region)
-
-
-def _filled(frame: SkyFringe) -> NDArray[np.float64]:
-    """Pattern with the mean sky where it is not known."""
-    values = frame.fraction().astype(float)
-    return np.where((frame.mask == 0) & np.isfinite(values), values, 0.0)
 
 
 def coadd_model(single: ArrayLike, floor: ArrayLike, count: int) -> FloatArray:
@@ -288,21 +244,17 @@ def coadd_correlation(
         raise InputError("fringe patterns", 0, "one or more")
     chosen = LogBins(1.0, 0.5 * region_px, 20) if bins is None else bins
     fringes, noise = np.zeros((region_px, region_px)), np.zeros((region_px, region_px))
-    coadds, nulls, squares = [], [], []
+    coadds, nulls = [], []
     own = np.zeros(chosen.count)
-    sides = np.unique(np.geomspace(1, max(1, region_px // LARGEST_PART), 12).astype(int))
-    own_squares = np.zeros(sides.size)
     for number in range(1, wanted[-1] + 1):
         cut = random_cutout(splines[rng.integers(len(splines))], region_px, rng)
         cut -= cut.mean()
         own += correlation_function(cut, bins=chosen).xi
-        own_squares += _square_variance(cut, sides)
         fringes += cut
         noise += noise_rms * rng.standard_normal(cut.shape)
         if number in wanted:
             coadds.append(correlation_function(_centred((fringes + noise) / number), bins=chosen))
             nulls.append(correlation_function(_centred(noise / number), bins=chosen))
-            squares.append(_square_variance(fringes / number, sides))
     total = wanted[-1]
     last = correlation_function(_centred(fringes / total), bins=chosen)
     mean_own = own / total
@@ -311,25 +263,7 @@ def coadd_correlation(
     single = CorrelationFunction(last.separation_px, mean_own, last.weight)
     floor = CorrelationFunction(last.separation_px, beyond, last.weight)
     models = tuple(coadd_model(mean_own, beyond, count) for count in wanted)
-    if wanted[0] == 1:
-        squares[0] = own_squares / total
-    white = noise_rms / (np.sqrt(wanted)[:, None] * sides)
-    return CoaddCorrelation(
-        *(wanted, tuple(coadds), tuple(nulls), models, single, floor),
-        square_px=sides,
-        fringes=np.sqrt(squares),
-        noise=white,
-    )
-
-
-def _square_variance(image: FloatArray, sides: NDArray[np.int64]) -> FloatArray:
-    """Variance of the means over all squares of each side."""
-    total = np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    sums = (
-        total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side]
-        for side in sides
-    )
-    return np.array([(each / side**2).var() for each, side in zip(sums, sides, strict=True)])
+    return CoaddCorrelation(wanted, tuple(coadds), tuple(nulls), models, single, floor)
 
 
 def _autocorrelation(values: FloatArray, weights: FloatArray, bins: LogBins) -> CorrelationFunction:

@@ -29,7 +29,7 @@ from ..style import (
 )
 
 if TYPE_CHECKING:
-    from ..algorithms.image_correlation import CoaddCorrelation
+    from ..algorithms.coadds import Coadds
     from ..algorithms.single_pixel import SinglePixelFit
 
 __all__ = [
@@ -254,26 +254,28 @@ def components_figure(components: FringeComponents) -> Figure:
         return made
 
 
-def coadds_figure(found: CoaddCorrelation) -> Figure:
+def coadds_figure(found: Coadds) -> Figure:
     """Fringes and noise in coadds: against the number of exposures, and against the size of a square."""
     from ..algorithms.focal_plane import DES_CRITERION
 
-    count, side = np.array(found.counts), found.square_px
     with figure(8.4, 3.7) as made:
         axes = made.subplots(1, 2, sharey=True)
-        for axis, x, at in ((axes[0], count, np.s_[:, -1]), (axes[1], side, np.s_[-1])):
+        for axis, x, at in ((axes[0], found.counts, np.s_[:, -1]), (axes[1], found.square_px, np.s_[-1])):
             noise = PERCENT * found.noise[at]
             axis.loglog(x, PERCENT * found.fringes[at], "o-", ms=4, color=LINES[1], label="fringes")
+            if found.corrected is not None:
+                left = PERCENT * found.corrected[at]
+                axis.loglog(x, left, "s-", ms=4, color=LINES[2], label="less one template")
             axis.loglog(x, noise, color=LINES[0], label="noise")
-            label = f"{DES_CRITERION:g} × noise, what DES allows"
-            axis.loglog(x, DES_CRITERION * noise, "--", color=LINES[0], label=label)
+            axis.loglog(x, DES_CRITERION * noise, "--", color=LINES[0], label="a tenth of the noise")
             for each in (axis.xaxis, axis.yaxis):
                 each.set_major_formatter(StrMethodFormatter("{x:g}"))
                 each.set_minor_formatter(NullFormatter())
-        axes[0].set_title(f"means of {side[-1]} × {side[-1]} px")
+        side = found.square_px[-1]
+        axes[0].set_title(f"means of {side} × {side} px")
         axes[0].set_xlabel("exposures in the coadd")
         axes[0].set_ylabel("rms [% of the sky]")
-        axes[1].set_title(f"{count[-1]} exposures")
+        axes[1].set_title(f"{found.counts[-1]} exposures")
         axes[1].set_xlabel("side of the square that is averaged [px]")
         axes[1].legend(fontsize=8)
         return made
