@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,9 +115,9 @@ class VisitPlaces:
         return min(LARGEST_REGION_PX, int(side[worst]))
 
 
-def _numbers(table: object, name: str, source: str) -> FloatArray:
+def _numbers(table: Any, name: str, source: str) -> FloatArray:
     try:
-        values = np.asarray(table[name], dtype=float)  # type: ignore[index]
+        values: FloatArray = np.asarray(table[name], dtype=np.float64)
     except (TypeError, ValueError):
         raise InputError(name, "not numbers", "numbers", source=source) from None
     if not np.all(np.isfinite(values)):
