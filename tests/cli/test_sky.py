@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 from astropy.wcs import WCS
 
 from lsst.fringe_sim.cli.main import run
@@ -46,6 +47,19 @@ def test_one_frame_is_written_with_its_errors(usual) -> None:
     assert 0.0 < frame.quadrature_error < 1e-4
     assert (usual / "sky.png").read_bytes().startswith(b"\x89PNG")
     assert "Coadds" in (usual / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_visits_of_a_table_are_coadded(thickness, tmp_path, capsys) -> None:
+    visits = tmp_path / "visits.ecsv"
+    Table({"x": [90.0, 110.0], "y": [95.0, 104.0], "rotation": [0.0, 60.0]}).write(visits)
+    given = ["sky", "--thickness", thickness, "--noiseless", "--visits", str(visits)]
+    assert run([*given, "--out", str(tmp_path / "sky")]) == 0
+    assert "coadds of the given visits" in (tmp_path / "sky" / "report.html").read_text(encoding="utf-8")
+    Table({"x": [90.0, 2.0], "y": [95.0, 104.0], "rotation": [0.0, 60.0]}).write(visits, overwrite=True)
+    assert run([*given, "--out", str(tmp_path / "off")]) == 1
+    assert "place of visit 1" in capsys.readouterr().err
+    assert not (tmp_path / "off").exists()
 
 
 @pytest.mark.slow
@@ -161,6 +175,8 @@ def test_noise_is_seeded(thickness, tmp_path) -> None:
         (["--exptime", "1e30"], "1e+06"),
         (["--night", "--exptime", "30"], "--night"),
         (["--effect", "epoxy_absorbtion.k=0.1"], "did you mean epoxy_absorption"),
+        (["--visits", "none.ecsv"], "--noiseless"),
+        (["--visits", "none.ecsv", "--noiseless"], "an existing file"),
     ],
 )
 def test_bad_requests(thickness, tmp_path, capsys, arguments, words) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import types
 from pathlib import Path
@@ -15,7 +16,7 @@ from toy_repository import Invoke, put_fringe
 
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.middleware import LsstCamFringe
-from lsst.fringe_sim.middleware.handoff import EXPOSURE_FORMATTER, write_handoff
+from lsst.fringe_sim.middleware.handoff import EXPOSURE_FORMATTER, isr_override, write_handoff
 
 pytestmark = pytest.mark.middleware
 
@@ -147,3 +148,10 @@ def test_repository_without_fringe_frames(butler: Butler, tmp_path: Path) -> Non
     butler.collections.register("empty")
     with pytest.raises(InputError, match="fringe frames is 0"):
         write_handoff(butler, "empty", tmp_path / "out")
+
+
+def test_the_guide_shows_the_configuration_that_is_written() -> None:
+    page = Path(__file__).parents[2] / "doc" / "guide" / "pipelines.md"
+    (shown,) = re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    written = [line for line in isr_override(["y_10"]).splitlines() if not line.startswith("#")]
+    assert shown.split() == " ".join(written).replace("'", '"').split()

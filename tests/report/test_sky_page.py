@@ -7,7 +7,6 @@ import pytest
 from browser import check_page
 
 from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
-from lsst.fringe_sim.algorithms.image_correlation import coadds_of_frames
 from lsst.fringe_sim.products import SkyFringe
 from lsst.fringe_sim.report.figures import residuals_figure
 from lsst.fringe_sim.report.sky_page import sky_amplitudes, write_sky_report
@@ -41,20 +40,11 @@ def test_amplitudes_are_those_of_the_frames() -> None:
         assert row["half peak to peak"] == pytest.approx(100 * expected.half_peak_to_peak, abs=1e-4)
 
 
-def test_coadds_keep_less_than_one_exposure() -> None:
-    found = coadds_of_frames(night(), np.random.default_rng(3))
-    assert found is not None
-    assert found.counts == (1, 10, 100)
-    first, _, last = (curve.xi[0] for curve in found.coadd)
-    assert 0.0 < last < 0.2 * first
-    assert coadds_of_frames(night((20, 20)), np.random.default_rng(3)) is None
-
-
 def test_page_of_a_night_in_a_browser(tmp_path) -> None:
     """With components and coadds; a single frame with noise has neither."""
     path = write_sky_report(tmp_path / "night.html", night(), "lsst_e2v", 1)
     text = path.read_text(encoding="utf-8")
-    for words in ("Components", "Coadds", "coadd_correlation.ecsv", "sky_fringe_amplitudes.ecsv"):
+    for words in ("Components", "Coadds", "coadds.ecsv", "sky_fringe_amplitudes.ecsv"):
         assert words in text
     alone = write_sky_report(tmp_path / "one.html", night(hours=1), "lsst_e2v", 1).read_text(encoding="utf-8")
     assert "Components" not in alone

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import shutil
+import types
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +19,7 @@ from task_commands import Command
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.middleware import MonoCamFringe
 from lsst.fringe_sim.middleware.night import NightPlan, define_night
-from lsst.fringe_sim.products import FringeTemplates, ObservedFrame
+from lsst.fringe_sim.products import MASK_PLANES, FringeTemplates, ObservedFrame
 from lsst.fringe_sim.tasks import (
     FringeCorrectionConfig,
     FringeCorrectionTask,
@@ -60,6 +63,59 @@ def test_a_frame_is_corrected_once(night: ObservedNight, templates: FringeTempla
     assert made.corrected.metadata["FRINGCOR"] == 1
     with pytest.raises(InputError, match="FRINGCOR"):
         task.run(made.corrected, templates)
+
+
+class Mask:
+    """A mask of afw, with planes in places of its own."""
+
+    def __init__(self, array: np.ndarray) -> None:
+        self.array = array
+
+    def getMaskPlaneDict(self) -> dict[str, int]:
+        return {"SAT": 1, "SUSPECT": 20, "SPIKE": 25}
+
+    def getPlaneBitMask(self, name: str) -> int:
+        return 1 << self.getMaskPlaneDict()[name]
+
+
+def exposure_of(image: np.ndarray) -> Any:
+    """As much of afw's exposure as the task touches; its last pixel is in a plane that only afw knows."""
+    mask = np.zeros(image.shape, dtype=np.int32)
+    mask[-1, -1] = 1 << 25
+    header = {"OBSID": "MC_O_20260115_000001", "LSST ISR UNITS": "electron"}
+    return types.SimpleNamespace(
+        image=types.SimpleNamespace(array=image.copy()),
+        mask=Mask(mask),
+        variance=types.SimpleNamespace(array=np.maximum(image, 1)),
+        getMetadata=lambda: header,
+        getDetector=lambda: types.SimpleNamespace(getName=lambda: "S11"),
+        getFilter=lambda: None,
+    )
+
+
+def test_an_exposure_stays_one(night: ObservedNight, templates: FringeTemplates) -> None:
+    """Pixels, mask and header change as those of a frame would; a second correction is refused."""
+    image = night.images[4]
+    unseen = templates.mask.copy()
+    unseen[10, 20] = 1 << MASK_PLANES["NO_DATA"]
+    known = dataclasses.replace(templates, mask=unseen)
+    task = FringeCorrectionTask(
+        config=FringeCorrectionConfig(amplifier_columns=2, frame_storage_class="Exposure")
+    )
+    given = exposure_of(image)
+    made = task.run(given, known)
+    assert made.corrected is given
+    assert list(made.summary["unit"]) == ["electron"]
+    fringes = night.fringes[4] - night.fringes[4].mean()
+    assert np.corrcoef((image - given.image.array).ravel(), fringes.ravel())[0, 1] > 0.8
+    assert given.image.array[10, 20] == image[10, 20]
+    assert given.mask.array[10, 20] == 1 << 20
+    assert given.mask.array[-1, -1] == 1 << 25
+    assert given.getMetadata()["OBSID"] == "MC_O_20260115_000001"
+    assert given.getMetadata()["FRINGCOR"] == 1
+    assert {type(value) for value in given.getMetadata().values()} <= {bool, int, float, str}
+    with pytest.raises(InputError, match="FRINGCOR"):
+        task.run(given, known)
 
 
 @pytest.mark.middleware

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import affine_transform, spline_filter
 
 from ..errors import InputError, OutOfRangeError
-from ..products import SkyFringe
 
 __all__ = [
     "CoaddCorrelation",
@@ -26,20 +25,11 @@ __all__ = [
     "LogBins",
     "coadd_correlation",
     "coadd_model",
-    "coadds_of_frames",
     "correlation_function",
     "random_cutout",
 ]
 
 FloatArray = NDArray[np.float64]
-
-COADDS = (1, 10, 100)
-"""Exposures in the coadds of `coadds_of_frames`."""
-
-LARGEST_REGION_PX = 240
-"""Side of the region that is coadded [px]; that of the paper's figure is 200."""
-
-SMALLEST_REGION_PX = 16
 
 
 @dataclass(frozen=True)
@@ -148,27 +138,6 @@ def correlation_function(
     """
     values, weights = _weighted(image, weight)
     return _autocorrelation(values, weights, _bins_for(values, bins))
-
-
-def coadds_of_frames(frames: Sequence[SkyFringe], rng: np.random.Generator) -> CoaddCorrelation | None:
-    """Correlation left in coadds of randomly placed and rotated pieces of the frames.
-
-    ``rng``: places, angles, and the photon noise of each exposure. Returns `None` for frames too small to be
-    rotated.
-    """
-    # A region that is rotated by any angle needs its diagonal, and the spline a few pixels more.
-    region = min(LARGEST_REGION_PX, int((min(frames[0].shape) - 8) / np.sqrt(2.0)) - 1)
-    if region < SMALLEST_REGION_PX:
-        return None
-    patterns = [_filled(frame) for frame in frames]
-    noise = 1.0 / np.sqrt(np.mean([frame.mean_electrons for frame in frames]))
-    return coadd_correlation(patterns, COADDS, float(noise), rng, region_px=region)
-
-
-def _filled(frame: SkyFringe) -> NDArray[np.float64]:
-    """Pattern with the mean sky where it is not known."""
-    values = frame.fraction().astype(float)
-    return np.where((frame.mask == 0) & np.isfinite(values), values, 0.0)
 
 
 def coadd_model(single: ArrayLike, floor: ArrayLike, count: int) -> FloatArray:

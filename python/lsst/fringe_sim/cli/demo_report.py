@@ -11,17 +11,17 @@ from astropy.table import Table
 
 from lsst.daf.butler import Butler
 
+from ..algorithms.coadds import coadds_of_frames
 from ..algorithms.discovery import Verdict
 from ..algorithms.flat_residual import relative_flats
-from ..algorithms.image_correlation import coadds_of_frames
 from ..algorithms.single_pixel import fit_single_pixel, published_pixel
 from ..model import FringeModel
 from ..products import FringeComponents, FringeCube, FringeFrame, SkyFringe, ThicknessMap
 from ..report.discovery_figures import candidates_figure, where_figure
 from ..report.discovery_page import headline
 from ..report.figures import (
+    coadds_figure,
     components_figure,
-    correlation_figure,
     flats_figure,
     phase_figure,
     residuals_figure,
@@ -31,7 +31,7 @@ from ..report.figures import (
     thickness_figure,
 )
 from ..report.page import Report
-from ..report.sky_page import sky_amplitudes
+from ..report.sky_page import COADDS_CAPTION, COADDS_TEXT, sky_amplitudes
 from ..report.thickness_page import phase_folded, residual_of_fit, residual_table
 from ..style import save_figure
 
@@ -39,7 +39,7 @@ __all__ = ["DemoDatasets", "write_demo_report"]
 
 PERCENT = 100.0
 COADD_SEED = 16
-"""Of places, angles and noise of the coadds; the number of the paper's figure."""
+"""Of places and angles of the coadds; the number of the paper's figure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +131,8 @@ def _sky_section(report: Report, add: Any, datasets: DemoDatasets) -> None:
     add("template", template_figure(datasets.template), "The certified fringe frame.")
     coadds = coadds_of_frames(datasets.sky, np.random.default_rng(COADD_SEED))
     if coadds is not None:
-        report.section(
-            "Coadds",
-            "What stays of uncorrected fringes in coadds of randomly placed and rotated pieces of these frames.",
-        )
-        add("coadds", correlation_figure(coadds), "Correlation against separation; a line ends below zero.")
+        report.section("Coadds", COADDS_TEXT)
+        add("coadds", coadds_figure(coadds), COADDS_CAPTION)
 
 
 def _pixel_section(report: Report, add: Any, model: FringeModel) -> None:

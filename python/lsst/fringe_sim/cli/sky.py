@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     import numpy as np
     from numpy.typing import NDArray
 
+    from ..algorithms.coadds import VisitPlaces
     from ..algorithms.sky_response import Response
     from ..instrument.detector import Detector
     from ..instrument.flat_spectrum import FlatSpectrum
@@ -82,6 +83,13 @@ NO_DATE = "1970-01-01T00:00:00"  # of templates of a model: two runs agree to th
 )
 @click.option("--noiseless/--noise", default=False, help="Without photon and read noise, as for templates.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the noise.")
+@click.option(
+    "--visits",
+    default=None,
+    metavar="FILE",
+    help="Table (ECSV) of visits for the coadd in the report of noiseless frames: x, y [px] and rotation [deg] of a "
+    "region of the sky on the sensor, perhaps the number of its frame; by default at random.",
+)
 @model_effects()
 @output_folder(
     "Folder for frames, figure and report.",
@@ -105,6 +113,7 @@ def sky(
     templates: bool,
     noiseless: bool,
     seed: int,
+    visits: str | None,
     effects: ChosenEffects,
     out: OutputFolder,
     dry_run: bool,
@@ -141,6 +150,7 @@ def sky(
     history = NightHistory.guo2022() if night else None
     flat = None if flat_spectrum is None else FlatSpectrum.from_name(flat_spectrum)
     count = 1 if history is None else len(history)
+    places = None if visits is None else _places(visits, noiseless, count, layer.shape)
     if dry_run:
         click.echo(
             f"would simulate {count} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
@@ -167,7 +177,7 @@ def sky(
     if templates:
         _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
     save_figure(sky_figure(made), folder / "sky.png")
-    page = write_sky_report(folder / "report.html", made, setup.name, seed)
+    page = write_sky_report(folder / "report.html", made, setup.name, seed, places)
     for frame in made:
         click.echo(_describe(frame))
     if "PHASERMS" in made[0].metadata:
@@ -310,6 +320,17 @@ def _open_phase(frame: SkyFringe, model: FringeModel) -> str:
         f"the map was measured {colder:.0f} K warmer: an unknown phase of the adhesive of "
         f"± {float(frame.metadata['PHASESIG']):.2g} rad per 10 K changes the pattern by {rms:.4f} % rms"
     )
+
+
+def _places(visits: str, noiseless: bool, frames: int, shape: tuple[int, ...]) -> VisitPlaces:
+    """Read the visits, and check that a region lies on the sensor in all of them."""
+    from ..algorithms.coadds import VisitPlaces
+
+    if not noiseless:
+        raise InputError("--visits", visits, "a table for frames that are --noiseless")
+    places = VisitPlaces.read(visits, frames)
+    places.region_px(shape)
+    return places
 
 
 def _check_exposure(exptime: float | None, night: bool) -> None:

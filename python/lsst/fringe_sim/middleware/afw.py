@@ -1,4 +1,4 @@
-"""Fringe frames as afw exposures, where afw is installed. It is not needed for anything else."""
+"""Frames and templates as afw exposures, where afw is installed. It is not needed for anything else."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..products import MASK_PLANES, FringeFrame, ObservedFrame
+from ..products import MASK_PLANES, FringeFrame, ObservedFrame, mask_bits
+from ..products.sky_frame import CORRECTED_BY
 
-__all__ = ["frame_from_exposure", "observed_from_exposure", "read_exposure"]
+__all__ = ["frame_from_exposure", "observed_from_exposure", "put_into_exposure", "read_exposure"]
+
+UNITS = ("BUNIT", "LSST ISR UNITS")
+"""Keywords that name the unit of an exposure: that of FITS, and that of ip_isr."""
 
 
 def read_exposure(path: str) -> Any:
@@ -60,10 +64,26 @@ def observed_from_exposure(exposure: Any) -> ObservedFrame:
         image=np.array(exposure.image.array, dtype=np.float32),
         mask=_known_planes(exposure.mask),
         variance=np.array(exposure.variance.array, dtype=np.float32),
-        unit=str(header["BUNIT"]) if "BUNIT" in header else "",
+        unit=next((str(header[name]) for name in UNITS if name in header), ""),
+        metadata={name: header[name] for name in CORRECTED_BY if name in header},
         detector="" if detector is None else str(detector.getName()),
         physical_filter="" if label is None else str(label.physicalLabel),
     )
+
+
+def put_into_exposure(exposure: Any, corrected: ObservedFrame) -> Any:
+    """Give an exposure the pixels of its corrected frame; what else it holds (its WCS, its visit) stays.
+
+    ``exposure``: the one that `observed_from_exposure` was asked for. It is changed, and returned.
+    ``corrected``: its frame after the correction, whose keywords join those of the exposure.
+    """
+    exposure.image.array[...] = corrected.image
+    without_template = corrected.mask & mask_bits("SUSPECT") != 0
+    exposure.mask.array[without_template] |= exposure.mask.getPlaneBitMask("SUSPECT")
+    header = exposure.getMetadata()
+    for name, value in corrected.metadata.items():
+        header[name] = value
+    return exposure
 
 
 def _known_planes(mask: Any) -> np.ndarray:

@@ -93,15 +93,16 @@ def coadd(context: Context) -> Section:
     close = result.coadd[-1].separation_px < NULL_SCATTER_BELOW_PX
     null = result.null[-1].xi[close]
     excess = float((result.coadd[-1].xi[close].mean() - null.mean()) / null.std(ddof=1))
+    last, deepest = result.coadd[-1], counts[-1]
+    separation = last.separation_px
     curves = [
-        Curve(found.separation_px, found.xi, "1 exposure" if count == 1 else f"{count} exposures")
-        for count, found in zip(result.counts, result.coadd, strict=True)
+        Curve(separation, model, "1 exposure" if count == 1 else f"{count} exposures")
+        for count, model in zip(counts, result.model, strict=True)
     ]
-    last = result.null[-1]
-    curves.append(Curve(last.separation_px, np.abs(last.xi), f"|noise|, {counts[-1]}", "--"))
-    curves.append(
-        Curve(last.separation_px, result.model[-1], f"ξ₁/N + (1 − 1/N) ξ_floor, N = {counts[-1]}", ".")
-    )
+    curves.append(Curve(separation, last.xi, f"{deepest}, with noise", "."))
+    # Of white noise the products of n pairs have this standard deviation.
+    scatter = 1.0 / (SKY_E * deepest * np.sqrt(last.weight))
+    curves.append(Curve(separation, scatter, f"σ of noise, {deepest}", "--"))
     rms = PERCENT * float(np.sqrt(np.mean([pattern.var() for pattern in patterns])))
     sensors = (
         "the nine sensors of the raft"
@@ -114,8 +115,8 @@ def coadd(context: Context) -> Section:
         "photon noise.",
         {"coadd_800": excess, "coadd_treecorr": _against_treecorr(patterns[0])},
         (Graph("correlation of coadds", "separation [px]", "ξ [sky²]", tuple(curves), logarithmic=True),),
-        "Correlation of more and more exposures against that of as many exposures of noise; a line ends where the "
-        "correlation turns negative.",
+        "Correlation of fringes in more and more exposures, and that of the deepest coadd with its noise; a line "
+        "ends where the correlation turns negative.",
     )
 
 

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
@@ -29,13 +29,13 @@ from ..style import (
 )
 
 if TYPE_CHECKING:
-    from ..algorithms.image_correlation import CoaddCorrelation
+    from ..algorithms.coadds import Coadds
     from ..algorithms.single_pixel import SinglePixelFit
 
 __all__ = [
+    "coadds_figure",
     "components_figure",
     "contrast_figure",
-    "correlation_figure",
     "flats_figure",
     "focal_plane_figure",
     "phase_figure",
@@ -254,29 +254,31 @@ def components_figure(components: FringeComponents) -> Figure:
         return made
 
 
-def correlation_figure(found: CoaddCorrelation) -> Figure:
-    """Correlation of coadds of more and more exposures, that of as many of noise, and the law they follow."""
-    with figure(7.5, 4.2) as made:
-        axes = made.subplots()
-        sets = zip(found.counts, found.coadd, found.null, found.model, strict=True)
-        for (count, coadd, null, model), color in zip(sets, LINES, strict=False):
-            label = f"{count} exposure{'s' if count > 1 else ''}"
-            axes.loglog(coadd.separation_px, _positive(coadd.xi), "o-", ms=3, color=color, label=label)
-            axes.loglog(null.separation_px, np.abs(null.xi), ":", lw=1, color=color)
-            axes.loglog(coadd.separation_px, _positive(model), "--", lw=1, color=color)
-        axes.plot([], [], ":", color="0.4", label="noise alone, absolute")
-        axes.plot([], [], "--", color="0.4", label="ξ₁/N + (1 − 1/N) ξ_floor")
-        axes.set_xlabel("separation [px]")
-        axes.set_ylabel("ξ [sky²]")
-        axes.set_title("correlation of coadds")
-        axes.legend(fontsize=7)
+def coadds_figure(found: Coadds) -> Figure:
+    """Fringes and noise in coadds: against the number of exposures, and against the size of a square."""
+    from ..algorithms.focal_plane import DES_CRITERION
+
+    with figure(8.4, 3.7) as made:
+        axes = made.subplots(1, 2, sharey=True)
+        for axis, x, at in ((axes[0], found.counts, np.s_[:, -1]), (axes[1], found.square_px, np.s_[-1])):
+            noise = PERCENT * found.noise[at]
+            axis.loglog(x, PERCENT * found.fringes[at], "o-", ms=4, color=LINES[1], label="fringes")
+            if found.corrected is not None:
+                left = PERCENT * found.corrected[at]
+                axis.loglog(x, left, "s-", ms=4, color=LINES[2], label="less one template")
+            axis.loglog(x, noise, color=LINES[0], label="noise")
+            axis.loglog(x, DES_CRITERION * noise, "--", color=LINES[0], label="a tenth of the noise")
+            for each in (axis.xaxis, axis.yaxis):
+                each.set_major_formatter(StrMethodFormatter("{x:g}"))
+                each.set_minor_formatter(NullFormatter())
+        side = found.square_px[-1]
+        axes[0].set_title(f"means of {side} × {side} px")
+        axes[0].set_xlabel("exposures in the coadd")
+        axes[0].set_ylabel("rms [% of the sky]")
+        axes[1].set_title(f"{found.counts[-1]} exposures")
+        axes[1].set_xlabel("side of the square that is averaged [px]")
+        axes[1].legend(fontsize=8)
         return made
-
-
-def _positive(values: ArrayLike) -> NDArray[np.float64]:
-    """Values for a logarithmic axis; NaN where they are not positive."""
-    given = np.asarray(values, dtype=float)
-    return np.where(given > 0.0, given, np.nan)
 
 
 def template_figure(template: FringeFrame) -> Figure:

@@ -9,15 +9,30 @@ import numpy as np
 from astropy import units
 from astropy.table import Table
 
-from ..algorithms.image_correlation import CoaddCorrelation, coadds_of_frames
+from ..algorithms.coadds import Coadds, VisitPlaces, coadds_of_frames
 from ..algorithms.pca import fit_pca
 from ..products import SkyFringe
-from .figures import components_figure, correlation_figure, sky_figure
+from .figures import coadds_figure, components_figure, sky_figure
 from .page import Report
 
-__all__ = ["sky_amplitudes", "write_sky_report"]
+__all__ = ["COADDS_CAPTION", "COADDS_TEXT", "coadd_table", "sky_amplitudes", "write_sky_report"]
 
 PERCENT = 100.0
+
+COADDS_TEXT = (
+    "What stays of the fringes in coadds of randomly placed and rotated pieces of these frames, uncorrected and "
+    "after the subtraction of the one template that takes most of them, beside the photon noise."
+)
+
+COADDS_OF_VISITS_TEXT = (
+    "What stays of the fringes in coadds of the given visits, uncorrected and after the subtraction of the one "
+    "template that takes most of them, beside the photon noise."
+)
+
+COADDS_CAPTION = (
+    "Standard deviation of means over squares: of the largest against the number of exposures, and of the deepest "
+    "coadd against the side. The Dark Energy Survey asks for fringes below a tenth of the noise up to 20 arcsec."
+)
 
 
 def sky_amplitudes(frames: Sequence[SkyFringe]) -> Table:
@@ -39,10 +54,12 @@ def sky_amplitudes(frames: Sequence[SkyFringe]) -> Table:
     return table
 
 
-def write_sky_report(path: Path, frames: Sequence[SkyFringe], setup: str, seed: int) -> Path:
+def write_sky_report(
+    path: Path, frames: Sequence[SkyFringe], setup: str, seed: int, places: VisitPlaces | None = None
+) -> Path:
     """Write the page.
 
-    ``seed``: of places, angles and noise of the coadds.
+    ``seed``: of places and angles of the coadds, where ``places`` are not given.
     """
     first = frames[0]
     report = Report(
@@ -59,24 +76,23 @@ def write_sky_report(path: Path, frames: Sequence[SkyFringe], setup: str, seed: 
     if len(frames) > 1:
         report.section("Components", "Principal components of the frames: the templates of a correction.")
         report.figure(components_figure(fit_pca(frames)), "Mean, first components, explained variance.")
-    found = None if first.seed is not None else coadds_of_frames(frames, np.random.default_rng(seed))
+    found = None if first.seed is not None else coadds_of_frames(frames, np.random.default_rng(seed), places)
     if found is not None:
-        report.section(
-            "Coadds",
-            "What stays of uncorrected fringes in coadds of randomly placed and rotated pieces of these frames with "
-            "photon noise, beside the noise of as many exposures.",
-        )
-        report.figure(correlation_figure(found), "Correlation against separation; a line ends below zero.")
-        report.table(_correlation_table(found), "coadd_correlation")
+        report.section("Coadds", COADDS_TEXT if places is None else COADDS_OF_VISITS_TEXT)
+        report.figure(coadds_figure(found), COADDS_CAPTION)
+        report.table(coadd_table(found), "coadds")
     return report.write(path)
 
 
-def _correlation_table(found: CoaddCorrelation) -> Table:
-    table = Table({"separation": found.single.separation_px * units.pixel})
-    for count, coadd, null in zip(found.counts, found.coadd, found.null, strict=True):
-        table[f"fringes, {count}"] = coadd.xi
-        table[f"noise, {count}"] = null.xi
-    table["separation"].info.format = ".2f"
-    for name in table.colnames[1:]:
-        table[name].info.format = ".2e"
+def coadd_table(found: Coadds) -> Table:
+    """Fringes and noise in the largest squares, one row per coadd."""
+    table = Table({"exposures": found.counts})
+    table["square"] = np.full(len(found.counts), found.square_px[-1]) * units.pixel
+    kinds = {"fringes": found.fringes, "less one template": found.corrected, "noise": found.noise}
+    for name, values in kinds.items():
+        if values is not None:
+            table[name] = PERCENT * values[:, -1] * units.percent
+            table[name].info.format = ".2g"
+    table["fringes over noise"] = found.fringes[:, -1] / found.noise[:, -1]
+    table["fringes over noise"].info.format = ".2f"
     return table

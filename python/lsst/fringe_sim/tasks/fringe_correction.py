@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
-from lsst.pex.config import Field
+from lsst.pex.config import ChoiceField, Field
 from lsst.pipe.base import (
     InputQuantizedConnection,
     OutputQuantizedConnection,
@@ -19,6 +20,7 @@ from lsst.pipe.base.connectionTypes import Input, Output, PrerequisiteInput
 from ..algorithms.fringe_correction import CorrectionOptions
 from ..algorithms.observed_frames import correct_frame, summary_table
 from ..errors import InputError
+from ..middleware.afw import observed_from_exposure, put_into_exposure
 from ..products import FringeTemplates, ObservedFrame
 from .observed_fringe import BackgroundConfig
 from .quantum import common_header, data_id_of, sensor_of, unusable
@@ -58,7 +60,13 @@ class FringeCorrectionConnections(PipelineTaskConnections, dimensions=("instrume
     )
 
     def __init__(self, *, config: FringeCorrectionConfig | None = None) -> None:
-        if config is not None and config.certified_templates:
+        if config is None:
+            return
+        self.frame, self.corrected = (
+            dataclasses.replace(each, storageClass=config.frame_storage_class)
+            for each in (self.frame, self.corrected)
+        )
+        if config.certified_templates:
             fields = ("doc", "name", "storageClass", "dimensions", "isCalibration")
             same = {name: getattr(self.templates, name) for name in fields}
             self.templates = PrerequisiteInput(**same)
@@ -74,6 +82,15 @@ class FringeCorrectionConfig(
         default=False,
         doc="Whether the templates come from a calibration collection, by the time of the exposure; otherwise from "
         "the run in which they are made.",
+    )
+    frame_storage_class: ChoiceField[str] = ChoiceField(
+        dtype=str,
+        default="ObservedFrame",
+        doc="Storage class of the frame, before and after.",
+        allowed={
+            "ObservedFrame": "readable with this package alone",
+            "Exposure": "as the next task of Rubin's pipelines wants it; needs lsst.afw",
+        },
     )
     pixel_arcsec: Field[float] = Field(
         dtype=float,
@@ -103,13 +120,13 @@ class FringeCorrectionTask(PipelineTask):
             result = self.run(butlerQC.get(inputRefs.frame), butlerQC.get(inputRefs.templates), name)
         butlerQC.put(result, outputRefs)
 
-    def run(self, frame: ObservedFrame, templates: FringeTemplates, name: str = "") -> Struct:
+    def run(self, frame: Any, templates: FringeTemplates, name: str = "") -> Struct:
         """Correct one frame.
 
         Parameters
         ----------
-        frame : `ObservedFrame`
-            Frame with its fringes.
+        frame : `ObservedFrame` or ``lsst.afw.image.Exposure``
+            Frame with its fringes. An exposure is changed in place.
         templates : `FringeTemplates`
             Templates of its sensor.
         name : `str`, optional
@@ -118,7 +135,7 @@ class FringeCorrectionTask(PipelineTask):
         Returns
         -------
         result : `~lsst.pipe.base.Struct`
-            ``corrected``, an `ObservedFrame`, and ``summary``, an `astropy.table.Table` with one row.
+            ``corrected``, of the type of ``frame``, and ``summary``, an `astropy.table.Table` with one row.
 
         Raises
         ------
@@ -128,7 +145,8 @@ class FringeCorrectionTask(PipelineTask):
             Its pixels do not decide the scales.
         """
         options = CorrectionOptions(self.config.background_px, self.config.grid)
-        made = correct_frame(frame, templates.frames(), options, pixel_arcsec=self.config.pixel_arcsec)
+        observed = frame if isinstance(frame, ObservedFrame) else observed_from_exposure(frame)
+        made = correct_frame(observed, templates.frames(), options, pixel_arcsec=self.config.pixel_arcsec)
         if not made.proof.passed:
             allowed = f"what a good template gives (worst: {made.proof.worst})"
             raise InputError("probability of the correction", float(f"{made.proof.probability:.4g}"), allowed)
@@ -139,7 +157,8 @@ class FringeCorrectionTask(PipelineTask):
             *(name, made.proof.structure_before, made.proof.structure_after),
         )
         metadata = {**made.frame.metadata, **common_header(self.config)}
+        corrected = dataclasses.replace(made.frame, metadata=metadata)
         return Struct(
-            corrected=dataclasses.replace(made.frame, metadata=metadata),
+            corrected=corrected if observed is frame else put_into_exposure(frame, corrected),
             summary=summary_table([made.record(name)]),
         )

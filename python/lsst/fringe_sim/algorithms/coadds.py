@@ -1,0 +1,278 @@
+"""What is left of fringes in coadds of visits that lie differently on a sensor, before and after a correction."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import affine_transform, spline_filter
+
+from ..errors import InputError, OutOfRangeError
+from ..products import SkyFringe
+from ..resources import read_user_table
+
+__all__ = ["Coadds", "VisitPlaces", "coadd_visits", "coadds_of_frames"]
+
+FloatArray = NDArray[np.float64]
+
+COUNTS = (1, 10, 100, 1000)
+"""Exposures in coadds that are looked at, besides the deepest."""
+
+VISITS = 100
+"""Exposures in the deepest coadd where no visits are given; the y band of LSST has some more in ten years."""
+
+LARGEST_REGION_PX = 400
+"""Side of the region that is coadded [px]; a quarter of it is 20 arcsec of LSST."""
+
+SMALLEST_REGION_PX = 16
+
+CELLS = 100
+"""Cells in a side of the region, or somewhat more, where it has more pixels: 4 px of LSST, 0.8 arcsec."""
+
+LARGEST_PART = 4
+"""The largest square in which pixels are averaged is at most this part of a region: there must be several of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class VisitPlaces:
+    """Where one region of the sky lies on a sensor, visit by visit.
+
+    Attributes
+    ----------
+    x_px, y_px : `numpy.ndarray`, shape ``(V,)``
+        Centre of the region [px, from 0].
+    rotation_deg : `numpy.ndarray`, shape ``(V,)``
+        Angle between the axes of the sky and of the sensor [deg].
+    frame : `numpy.ndarray` of `int`, shape ``(V,)``
+        Which of the frames has the fringes of the visit.
+    """
+
+    x_px: FloatArray
+    y_px: FloatArray
+    rotation_deg: FloatArray
+    frame: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return int(self.x_px.size)
+
+    @classmethod
+    def random(
+        cls, shape: tuple[int, int], region_px: int, visits: int, frames: int, rng: np.random.Generator
+    ) -> VisitPlaces:
+        """Uniform over the places at which a region fits under every angle, over angles, and over frames."""
+        reach = 0.5 * math.sqrt(2.0) * (region_px - 1) + 1.0
+        y, x = (rng.uniform(reach, size - 1.0 - reach, visits) for size in shape)
+        return cls(x, y, rng.uniform(0.0, 360.0, visits), rng.integers(frames, size=visits))
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str], frames: int) -> VisitPlaces:
+        """Read an ECSV table with columns ``x``, ``y`` [px], ``rotation`` [deg], and perhaps ``frame``.
+
+        Without the last the visits go through the frames in turn.
+
+        Raises
+        ------
+        InputError
+            No such table, fewer than two visits, values that are not finite, or a frame that does not exist.
+        """
+        table, source = read_user_table(path, "visits"), str(path)
+        missing = [name for name in ("x", "y", "rotation") if name not in table.colnames]
+        if missing:
+            raise InputError("columns of the visits", table.colnames, "x, y, rotation", source=source)
+        x, y, rotation = (_numbers(table, name, source) for name in ("x", "y", "rotation"))
+        if x.size < 2:
+            raise InputError("visits", x.size, "two or more", source=source)
+        frame = _numbers(table, "frame", source) if "frame" in table.colnames else np.arange(x.size) % frames
+        if not np.all(np.isin(frame, np.arange(frames))):
+            raise InputError("frame of a visit", float(frame.max()), f"0 to {frames - 1}", source=source)
+        return cls(x, y, rotation, frame.astype(int))
+
+    def region_px(self, shape: tuple[int, ...]) -> int:
+        """Side of the largest region that lies on the sensor in every visit, but at most `LARGEST_REGION_PX`.
+
+        Raises
+        ------
+        OutOfRangeError
+            There is none; a visit is named in which the region is not on the sensor.
+        """
+        angle = np.radians(self.rotation_deg)
+        inside = [
+            np.minimum(at, size - 1.0 - at) for at, size in zip((self.y_px, self.x_px), shape, strict=True)
+        ]
+        side = 1.0 + 2.0 * (np.min(inside, axis=0) - 1.0) / (np.abs(np.cos(angle)) + np.abs(np.sin(angle)))
+        worst = int(np.argmin(side))
+        if side[worst] < SMALLEST_REGION_PX:
+            raise OutOfRangeError(
+                f"place of visit {worst} [px]",
+                (float(self.x_px[worst]), float(self.y_px[worst])),
+                f"far enough inside {shape[1]} x {shape[0]} for a region of {SMALLEST_REGION_PX} px",
+            )
+        return min(LARGEST_REGION_PX, int(side[worst]))
+
+
+def _numbers(table: Any, name: str, source: str) -> FloatArray:
+    try:
+        values: FloatArray = np.asarray(table[name], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(name, "not numbers", "numbers", source=source) from None
+    if not np.all(np.isfinite(values)):
+        raise InputError(name, "not finite", "finite numbers", source=source)
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class Coadds:
+    """Standard deviation of means over squares in coadds of more and more visits, as fractions of the sky.
+
+    Attributes
+    ----------
+    counts : `numpy.ndarray` of `int`, shape ``(N,)``
+        Visits in the coadds.
+    square_px : `numpy.ndarray` of `int`, shape ``(S,)``
+        Sides of the squares [px].
+    fringes : `numpy.ndarray`, shape ``(N, S)``
+        Of the fringes: the mean over as many coadds as the visits give, one after the other.
+    corrected : `numpy.ndarray`, shape ``(N, S)``, or `None`
+        Of what a correction leaves of them.
+    noise : `numpy.ndarray`, shape ``(N, S)``
+        Of white noise, as expected.
+    """
+
+    counts: NDArray[np.int64]
+    square_px: NDArray[np.int64]
+    fringes: FloatArray
+    corrected: FloatArray | None
+    noise: FloatArray
+
+
+def coadds_of_frames(
+    frames: Sequence[SkyFringe], rng: np.random.Generator, places: VisitPlaces | None = None
+) -> Coadds | None:
+    """Fringes left in coadds of pieces of the frames, before a correction and after one with one template.
+
+    The template is the one pattern that takes most of the frames, so that a single frame has no correction.
+
+    Parameters
+    ----------
+    frames : sequence of `SkyFringe`
+        Frames of one sensor without noise.
+    rng : `numpy.random.Generator`
+        Source of places and angles, where none are given.
+    places : `VisitPlaces`, optional
+        Where a region of the sky lies on the sensor; `VISITS` at random by default.
+
+    Returns
+    -------
+    coadds : `Coadds` or `None`
+        `None` for frames that are too small to be rotated.
+
+    Raises
+    ------
+    OutOfRangeError
+        A visit in which no region lies on the sensor.
+    """
+    shape = frames[0].shape
+    if places is None:
+        # A region that is rotated by any angle needs its diagonal, and the spline a few pixels more.
+        region = min(LARGEST_REGION_PX, int((min(shape) - 8) / np.sqrt(2.0)) - 1)
+        if region < SMALLEST_REGION_PX:
+            return None
+        places = VisitPlaces.random(shape, region, VISITS, len(frames), rng)
+    else:
+        region = places.region_px(shape)
+    patterns = [_filled(frame) for frame in frames]
+    noise = np.sqrt(np.mean([1.0 / frame.mean_electrons for frame in frames]))
+    return coadd_visits(patterns, places, float(noise), region, 1 if len(frames) > 1 else 0)
+
+
+def coadd_visits(
+    patterns: Sequence[NDArray[np.floating]],
+    places: VisitPlaces,
+    noise_rms: float,
+    region_px: int,
+    templates: int = 0,
+) -> Coadds:
+    """Fringes left in coadds of a region of the sky.
+
+    Parameters
+    ----------
+    patterns : sequence of array_like, shape ``(ny, nx)``
+        Fringe patterns of the sensor as fractions of the sky; 0 where they are not known.
+    places : `VisitPlaces`
+        Place, angle and pattern of each visit.
+    noise_rms : `float`
+        White noise of a pixel of one visit, as a fraction of the sky.
+    region_px : `int`
+        Side of the region [px].
+    templates : `int`, optional
+        Templates of the correction: the patterns that take most of the given ones, subtracted without errors.
+
+    Notes
+    -----
+    Patterns are averaged over cells, `CELLS` in a side of the region, and interpolated with cubic splines. The mean
+    of the region is subtracted from every visit.
+    """
+    step = max(1, region_px // CELLS)
+    cells = region_px // step
+    means = np.array([_cell_means(pattern, step) for pattern in patterns])
+    kinds = [means] if templates == 0 else [means, _corrected(means, templates)]
+    splines = [[spline_filter(image, order=3) for image in images] for images in kinds]
+    counts = np.array([*(count for count in COUNTS if count < len(places)), len(places)])
+    sides = np.unique(np.geomspace(1, max(1, cells // LARGEST_PART), 12).astype(int))
+    sums = np.zeros((len(counts), len(kinds), cells, cells))
+    variance = np.zeros((len(counts), len(kinds), sides.size))
+    for number in range(len(places)):
+        frame = places.frame[number]
+        sums += [_piece(images[frame], places, number, cells, step) for images in splines]
+        for k in np.flatnonzero((number + 1) % counts == 0):
+            variance[k] += [_square_variance(each / counts[k], sides) for each in sums[k]]
+            sums[k] = 0.0
+    rms = np.sqrt(variance / (len(places) // counts)[:, None, None])
+    noise = noise_rms / (np.sqrt(counts)[:, None] * step * sides)
+    return Coadds(counts, step * sides, rms[:, 0], rms[:, 1] if templates else None, noise)
+
+
+def _cell_means(pattern: NDArray[np.floating], step: int) -> FloatArray:
+    ny, nx = (size // step for size in pattern.shape)
+    cells = pattern[: ny * step, : nx * step].reshape(ny, step, nx, step)
+    return np.asarray(cells.mean(axis=(1, 3), dtype=float))
+
+
+def _corrected(patterns: FloatArray, templates: int) -> FloatArray:
+    """What is left of each pattern after the subtraction of those that take most of all."""
+    flat = patterns.reshape(len(patterns), -1)
+    _, vectors = np.linalg.eigh(flat @ flat.T)
+    taken = vectors[:, vectors.shape[1] - templates :]
+    return np.asarray((flat - taken @ (taken.T @ flat)).reshape(patterns.shape))
+
+
+def _piece(spline: FloatArray, places: VisitPlaces, number: int, cells: int, step: int) -> FloatArray:
+    """The region in one visit, less its mean."""
+    angle = math.radians(places.rotation_deg[number])
+    cosine, sine = math.cos(angle), math.sin(angle)
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    centre = (np.array([places.y_px[number], places.x_px[number]]) + 0.5) / step - 0.5
+    start = centre - turn @ np.full(2, 0.5 * (cells - 1))
+    piece = affine_transform(spline, turn, start, (cells, cells), order=3, prefilter=False, mode="nearest")
+    return np.asarray(piece - piece.mean())
+
+
+def _square_variance(image: FloatArray, sides: NDArray[np.int64]) -> FloatArray:
+    """Variance of the means over all squares of each side."""
+    total = np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    sums = (
+        total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side]
+        for side in sides
+    )
+    return np.array([(each / side**2).var() for each, side in zip(sums, sides, strict=True)])
+
+
+def _filled(frame: SkyFringe) -> NDArray[np.float32]:
+    """Pattern with the mean sky where it is not known."""
+    values = frame.fraction()
+    return np.where((frame.mask == 0) & np.isfinite(values), values, np.float32(0))
