@@ -167,13 +167,14 @@ def test_a_frame_that_is_given_twice_counts_once(
     assert "would correct 4 images" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("same", [str, str.upper])
 def test_frames_that_would_become_one_file_are_refused(
-    made: Path, night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made: Path, night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], same: Callable[[str], str]
 ) -> None:
     (night / "other").mkdir()
-    (night / "visit_0.fits").rename(night / "other" / NAME)
+    (night / "visit_0.fits").rename(night / "other" / NAME.replace("visit", same("visit")))
     assert correct(made / "templates", tmp_path / "out", night, night / "other") == 1
-    assert "both would become visit_1_corrected.fits" in capsys.readouterr().err
+    assert f"both would become {same('visit')}_1_corrected.fits" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

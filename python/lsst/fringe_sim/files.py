@@ -8,6 +8,7 @@ import os
 import re
 import secrets
 import stat
+import unicodedata
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from astropy.table import Table
 
-__all__ = ["all_or_nothing", "table_text", "write_together", "write_whole"]
+__all__ = ["all_or_nothing", "same_file_key", "table_text", "write_together", "write_whole"]
 
 
 @contextmanager
@@ -69,6 +70,14 @@ def write_together(folder: Path, contents: Mapping[str, str]) -> Path:
         with suppress(OSError):
             _to_disk(folder)
     return folder / index
+
+
+def same_file_key(name: str) -> str:
+    """What two names have in common that are one file where a file system does not tell letters apart.
+
+    Those of macOS and Windows take upper and lower case for the same, and accents however they are coded.
+    """
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 
 def table_text(table: Table) -> str:
