@@ -189,7 +189,7 @@ def _plain_images(files: Sequence[str]) -> tuple[list[PlainImage], list[FringeSi
         if image is None:
             return None
         images.append(image)
-    return (images, bad) if images else None
+    return (images, bad) if files else None
 
 
 def _plain_series(images: Sequence[PlainImage]) -> PlainSeries:

@@ -80,7 +80,8 @@ class PlainImage:
         seconds = header.value("EXPTIME")
         if seconds is not None and header.seconds_of_light("EXPTIME", seconds, kind) == 0 and kind == "flat":
             raise header.refuse("EXPTIME", seconds, "more than 0 s for a flat")
-        refuse_noiseless({NOISE: header.value(NOISE)}, header.source)
+        if kind == "flat":
+            refuse_noiseless({NOISE: header.value(NOISE)}, header.source)
         noise, full = header.value("RDNOISE"), header.value("SATURATE")
         return cls(
             source=header.source,

@@ -713,8 +713,8 @@ def _settle(
         notes.append(f"noise of neighbouring cells is correlated ({noise.neighbour_correlation:.2f})")
     if noise.measured and noise.factor.max() < 1.0 - STATED_UNCERTAINTY:
         notes.append(
-            f"the noise is {noise.factor.max():.2g} of the stated one at most: the data are smoothed, of another gain, "
-            "or simulated without noise"
+            f"the noise is {noise.factor.max():.2g} of the stated one at most: the data are smoothed, of another "
+            "gain, or simulated without noise"
         )
     if not noise.measured:
         notes.append("noise level taken as stated: too few cells to measure it")
