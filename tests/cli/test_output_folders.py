@@ -12,8 +12,9 @@ import pytest
 from click.testing import CliRunner
 
 from lsst.fringe_sim.cli.main import cli, run
-from lsst.fringe_sim.cli.output import OutputFolder, refuse_unfinished
+from lsst.fringe_sim.cli.output import OutputFolder
 from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.files import refuse_unfinished
 
 FRAMES = ("--size", "64x64", "--wavelengths", "900", "--bias-frames", "1", "--seed", "1")
 

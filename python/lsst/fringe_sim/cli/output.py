@@ -16,10 +16,10 @@ from typing import Any
 import click
 
 from ..errors import InputError
+from ..files import LOCK, refuse_unfinished
 
-__all__ = ["OutputFolder", "output_folder", "refuse_among_inputs", "refuse_unfinished", "refuse_used_file"]
+__all__ = ["OutputFolder", "output_folder", "refuse_among_inputs", "refuse_used_file"]
 
-LOCK = ".fringe-sim.lock"
 OURS = (b"ORIGIN  = 'lsst.fringe_sim'", b"FRINGTID=", b"FRINGUND=")
 """What a FITS file of this program says in its first header: its origin, or that fringes were taken or put back."""
 
@@ -164,58 +164,6 @@ def _is_same(path: Path, descriptor: int) -> bool:
     with suppress(FileNotFoundError):
         return os.path.samestat(path.stat(), os.fstat(descriptor))
     return False
-
-
-def refuse_unfinished(inputs: Iterable[str]) -> None:
-    """Refuse to read series of files from a folder whose run is at work, or was stopped before its end.
-
-    Parameters
-    ----------
-    inputs : iterable of `str`
-        Folders, which are read with all below them, and patterns; single files are whole.
-
-    Raises
-    ------
-    InputError
-        There is the lock of a run in one of the folders.
-    """
-    for given in inputs:
-        for lock in _locks_in(given):
-            try:
-                descriptor = os.open(lock, os.O_RDONLY | os.O_NOFOLLOW)
-            except FileNotFoundError:
-                continue
-            is_left = _is_unlocked(descriptor)
-            allowed = (
-                "one whose run came to its end: some files may be missing. Run it again with --overwrite, or remove "
-                f"{LOCK} there to take what there is"
-                if is_left
-                else "one into which no run is writing just now"
-            )
-            raise InputError("folder that is read", str(lock.parent), allowed)
-
-
-def _locks_in(given: str) -> list[Path]:
-    """Locks in a folder and in those below it, or where a pattern finds several files."""
-    path = Path(given)
-    if path.is_dir():
-        # A repository is written by the middleware, and is large.
-        return [path / LOCK] if (path / "butler.yaml").exists() else sorted(path.rglob(LOCK))
-    found = {Path(name).parent for name in iglob(given, recursive=True)} if has_magic(given) else set()
-    return [parent / LOCK for parent in sorted(found)]
-
-
-def _is_unlocked(descriptor: int) -> bool:
-    """Whether nobody holds the lock of a file, which is closed."""
-    import fcntl
-
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    finally:
-        os.close(descriptor)
-    return True
 
 
 def _is_ours(path: Path) -> bool:
