@@ -14,8 +14,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+from threadpoolctl import threadpool_info, threadpool_limits
+
 import lsst.fringe_sim
-from lsst.fringe_sim.compiled import subkernel
+from lsst.fringe_sim.compiled import one_blas_thread, subkernel
 
 OF_TWO_TYPES = {
     f"lsst.fringe_sim.{name}._frame_kernel" for name in ("model.response_table", "algorithms.field_response")
@@ -109,3 +112,13 @@ def test_every_function_is_compiled_once() -> None:
     }
     assert sum(number > 0 for number in versions.values()) > 10
     assert {name for name, number in versions.items() if number > 1} <= OF_TWO_TYPES
+
+
+def test_one_thread_of_the_linear_algebra() -> None:
+    @one_blas_thread
+    def threads(size: int) -> set[int]:
+        np.eye(size) @ np.eye(size)
+        return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        assert threads(3) <= {1}

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from lsst.fringe_sim.files import all_or_nothing, write_together, write_whole
+from lsst.fringe_sim.files import all_or_nothing, same_file_key, write_together, write_whole
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -111,3 +111,9 @@ def test_files_of_two_writes_never_stand_beside_the_index(
 def test_a_folder_that_is_missing_is_said(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         write_whole(tmp_path / "missing" / "file", "")
+
+
+@pytest.mark.parametrize("pair", [("Süd", "SÜD"), ("s\u00fcd", "su\u0308d"), ("groß", "GROSS")])
+def test_names_that_are_one_file_on_some_systems(pair: tuple[str, str]) -> None:
+    assert same_file_key(pair[0]) == same_file_key(pair[1])
+    assert same_file_key(pair[0]) != same_file_key("nord")

@@ -25,8 +25,8 @@ def test_the_contrast_within_a_pixel_is_that_of_its_mean(dx: float, dy: float) -
     assert found["SLOPEORD"] == pytest.approx(np.hypot(dx, dy), abs=1e-3)
 
 
-def said(slope: float, left: float, contrast: float) -> str:
-    metadata = {"CONTRAST": contrast, "CONTRSIG": 0.01, "CELLMISF": 3.0, "ORDMARG": 1e6, "SCALESIG": 0.0}
+def said(slope: float, left: float, contrast: float, misfit: float = 3.0) -> str:
+    metadata = {"CONTRAST": contrast, "CONTRSIG": 0.01, "CELLMISF": misfit, "ORDMARG": 1e6, "SCALESIG": 0.0}
     metadata |= {"SLOPEORD": slope, "SLOPECON": left}
     ones = np.ones(2)
     flats = FlatFit(np.array([900.0, 960.0]), contrast * ones, 0.01 * ones, 0 * ones, 0 * ones, 3 * ones)
@@ -39,6 +39,12 @@ def test_slopes_that_explain_the_contrast_are_the_reason() -> None:
     for other in (said(1e-3, 1.0, 0.62), said(0.08, 0.97, 0.62), said(0.35, 0.65, 0.1)):
         assert "discover" in other
         assert "too dense" not in other
+
+
+def test_less_scatter_than_noise_is_said() -> None:
+    """Flats without noise whose headers do not say so are fitted, and look better than any flats can."""
+    assert "without noise" in said(1e-3, 1.0, 1.0, 1e-6)
+    assert "scatter" not in said(1e-3, 1.0, 1.0, 0.95)
 
 
 @pytest.mark.slow

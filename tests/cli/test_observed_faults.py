@@ -103,6 +103,31 @@ def mask_of_no_plane(night: Path) -> None:
     fits.HDUList([fits.PrimaryHDU(image, header), mask]).writeto(night / NAME, overwrite=True)
 
 
+def block_beyond_all_numbers(night: Path) -> None:
+    def change(image: np.ndarray) -> np.ndarray:
+        image[10:30, 10:30] = 3e38
+        return image
+
+    rewrite(night / NAME, change)
+
+
+def variance_of_another_unit(night: Path) -> None:
+    image, header = fits.getdata(night / NAME), fits.getheader(night / NAME)
+    variance = fits.ImageHDU((1e20 * image).astype(np.float32), name="VARIANCE")
+    fits.HDUList([fits.PrimaryHDU(image, header), variance]).writeto(night / NAME, overwrite=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spoil", [block_beyond_all_numbers, variance_of_another_unit])
+def test_numbers_that_single_precision_cannot_square_do_not_matter(
+    made: Path, night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], None]
+) -> None:
+    """Such pixels are left out, without a warning, and a variance counts up to a factor."""
+    spoil(night)
+    assert correct(made / "templates", tmp_path / "out", night / NAME) == 0
+    assert "fringes at" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "spoil",
@@ -167,13 +192,14 @@ def test_a_frame_that_is_given_twice_counts_once(
     assert "would correct 4 images" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("same", [str, str.upper])
 def test_frames_that_would_become_one_file_are_refused(
-    made: Path, night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made: Path, night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], same: Callable[[str], str]
 ) -> None:
     (night / "other").mkdir()
-    (night / "visit_0.fits").rename(night / "other" / NAME)
+    (night / "visit_0.fits").rename(night / "other" / NAME.replace("visit", same("visit")))
     assert correct(made / "templates", tmp_path / "out", night, night / "other") == 1
-    assert "both would become visit_1_corrected.fits" in capsys.readouterr().err
+    assert f"both would become {same('visit')}_1_corrected.fits" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,8 @@ from click.testing import CliRunner
 
 from lsst.fringe_sim.cli.main import cli, run
 from lsst.fringe_sim.cli.output import OutputFolder
+from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.files import refuse_unfinished
 
 FRAMES = ("--size", "64x64", "--wavelengths", "900", "--bias-frames", "1", "--seed", "1")
 
@@ -95,3 +98,68 @@ def test_links_are_cleared_and_not_what_they_lead_to(tmp_path: Path) -> None:
     folder(tmp_path / "out", overwrite=True).prepare()
     assert not (tmp_path / "out" / "report.html").is_symlink()
     assert (tmp_path / "elsewhere.html").read_text() == "mine"
+
+
+def test_frames_of_a_run_that_is_at_work_or_was_stopped_are_not_read(
+    used: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A part of a series looks like a series."""
+    fit = ("fit", str(used), "--out", str(used.parent / "fit"), "--dry-run")
+    with (used / ".fringe-sim.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert run(fit) == 1
+        assert "into which no run is writing" in capsys.readouterr().err
+    assert run(fit) == 1
+    assert "run it again with --overwrite" in capsys.readouterr().err.lower()
+    assert run(["mock-flats", str(used), *FRAMES, "--overwrite"]) == 0
+    run(fit)
+    assert "number of wavelengths" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("made", [("report.html",), ()])
+def test_a_run_that_fails_is_told_by_its_products(tmp_path: Path, made: tuple[str, ...]) -> None:
+    @click.command()
+    def command() -> None:
+        target = folder(tmp_path / "out").prepare()
+        for name in made:
+            (target / name).write_text("")
+        raise KeyboardInterrupt
+
+    CliRunner().invoke(command)
+    if not made:
+        refuse_unfinished([str(tmp_path)])
+        return
+    with pytest.raises(InputError, match="came to its end"):
+        refuse_unfinished([str(tmp_path)])
+    with pytest.raises(InputError, match="came to its end"):
+        refuse_unfinished([str(tmp_path / "*" / "*.html")])
+    refuse_unfinished([str(tmp_path / "out" / "report.html")])
+
+
+def test_the_lock_of_another_run_stays(tmp_path: Path) -> None:
+    """The folder was replaced while a command was at work, and another one has begun in the new one."""
+    out = tmp_path / "out"
+
+    @click.command()
+    def command() -> None:
+        folder(out).prepare()
+        out.rename(tmp_path / "away")
+        out.mkdir()
+        (out / ".fringe-sim.lock").write_text("of another")
+
+    assert CliRunner().invoke(command).exit_code == 0
+    assert (out / ".fringe-sim.lock").read_text() == "of another"
+
+
+def test_the_truth_of_visits_does_not_take_their_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    night, truth = str(tmp_path / "night"), tmp_path / "truth"
+    visits = ("mock-visits", night, "--size", "64x64", "--seed", "1", "--dry-run", "--truth")
+    assert run([*visits, night]) == 1
+    assert "another folder" in capsys.readouterr().err
+    truth.mkdir()
+    assert run([*visits, str(truth)]) == 0
+    (truth / "visit_1.fits").write_text("of an earlier run")
+    assert run([*visits, str(truth)]) == 1
+    assert "--overwrite" in capsys.readouterr().err

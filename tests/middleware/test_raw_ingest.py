@@ -153,6 +153,13 @@ def test_the_real_frame_is_ingested_and_read_back(butler: Butler, shared_dir: Pa
 # What is there already, and what cannot be used
 
 
+def test_a_folder_whose_run_was_stopped_is_not_ingested(butler: Butler, tmp_path: Path) -> None:
+    (tmp_path / "raws").mkdir()
+    (tmp_path / "raws" / ".fringe-sim.lock").touch()
+    with pytest.raises(InputError, match="came to its end"):
+        ingest_raws(butler, [str(tmp_path / "raws")])
+
+
 def test_ingesting_again_changes_nothing(butler: Butler, tmp_path: Path) -> None:
     paths = series(tmp_path / "raw")
     ingest_raws(butler, [str(tmp_path / "raw")])

@@ -87,6 +87,8 @@ def test_settings_round_trip() -> None:
 def test_wavelengths_outside_the_tables_are_refused(model) -> None:
     with pytest.raises(OutOfRangeError, match="wavelength"):
         model.response([14.0], [2000.0])
+    with pytest.raises(InputError, match="one or more"):
+        model.response([14.0], [])
 
 
 @pytest.mark.parametrize("thickness", [-1.0, np.nan, np.inf])

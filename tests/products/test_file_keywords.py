@@ -49,6 +49,7 @@ def read_map(path: Path) -> Any:
 
 def read_cube(path: Path) -> Any:
     cube = p.FringeCube.read_fits(path)
+    p.refuse_noiseless(cube.metadata)
     return cube.unit, cube.layer, cube.metadata, cube.mask.tobytes()
 
 
@@ -134,8 +135,9 @@ VALUES: dict[tuple[str, str], tuple[int, tuple[Any, ...]]] = {
     ("fringe cube", "BUNIT"): (1, ("adu", "relative")),
     ("fringe cube", "LAYER"): (0, ("other",)),
     ("fringe cube", "SMOOTHPX"): (0, (1.5,)),
+    ("fringe cube", "NOISE"): (0, (False, "F")),
     ("sky frame", "BUNIT"): (1, ("adu",)),
-    ("sky frame", "NOISE"): (0, (False,)),
+    ("sky frame", "NOISE"): (0, (False, 0, "no")),
     ("sky frame", "FRINGCOR"): (0, (2,)),
     ("sky frame", "SETUP"): (0, ("hsc",)),
     ("sky frame", "BEAMS"): (0, ("centre",)),
@@ -154,6 +156,7 @@ VALUES: dict[tuple[str, str], tuple[int, tuple[Any, ...]]] = {
     ("plain flat", "BUNIT"): (0, ("electron", "jansky")),
     ("plain flat", "GAIN"): (0, (0.8, -1.0)),
     ("plain flat", "RDNOISE"): (0, (9.0, -9.0)),
+    ("plain flat", "NOISE"): (0, (False, "F")),
     ("plain flat", "SATURATE"): (0, (895.0,)),
     **{("plain flat", name): (0, ("S1",)) for name in SENSOR_NAMES},
     ("plain flat", "DATASEC"): (0, ("[2:4,1:3]",)),

@@ -187,6 +187,18 @@ def test_one_without_its_wavelength_is_named_and_can_be_skipped(flats: Path, cap
     assert run([*words, "--skip-bad"]) == 0
 
 
+def test_what_is_wrong_with_all_of_them_is_said_of_plain_flats(flats: Path, capsys) -> None:
+    for path in flats.iterdir():
+        with fits.open(path, mode="update") as hdus:
+            hdus[-1].header["NOISE"] = False
+    assert (
+        run(["fit", str(flats), "--setup", "ts8_e2v", "--out", str(flats.parent / "fit"), "--dry-run"]) == 1
+    )
+    said = capsys.readouterr().err
+    assert said.count("NOISE is False") == len(WAVELENGTHS_NM)
+    assert "amplifier" not in said
+
+
 def test_a_dry_run_reads_no_pixels(flats: Path, tmp_path: Path, capsys) -> None:
     """Compressed pixels that cannot be unpacked, behind headers that are sound."""
     for path in list(flats.iterdir()):

@@ -237,6 +237,13 @@ def test_flats_may_come_one_by_one_and_pass_on_what_they_share() -> None:
             FringeCube.from_flats(iter(flats), number=number)
 
 
+def test_one_flat_without_noise_makes_a_cube_without() -> None:
+    marks: list[dict[str, Any]] = [{}, {"NOISE": True}, {"NOISE": False}]
+    flats = [flat(number=k, wavelength_nm=880.0 + k, metadata=mark) for k, mark in enumerate(marks)]
+    assert FringeCube.from_flats(flats).metadata["NOISE"] is False
+    assert "NOISE" not in FringeCube.from_flats(flats[:2]).metadata
+
+
 def test_flats_that_do_not_belong_together() -> None:
     with pytest.raises(InputError, match="at least one flat"):
         FringeCube.from_flats([])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 
 import numpy as np
@@ -136,6 +137,12 @@ def test_the_command(tmp_path, capsys, monkeypatch) -> None:
     capsys.readouterr()
     assert run(["export", files[0], files[0], "--out", str(out)]) == 1
     assert "different names" in capsys.readouterr().err
+    (tmp_path / "CUBE.fits").symlink_to(files[0])
+    assert run(["export", files[0], str(tmp_path / "CUBE.fits"), "--out", str(tmp_path / "other")]) == 1
+    assert "different names" in capsys.readouterr().err
+    shutil.copy(files[0], tmp_path / "cube[1].fits")
+    bracket = ("export", str(tmp_path / "cube[1].fits"), "--out", str(tmp_path / "brackets"))
+    assert [run(bracket), run(bracket)] == [0, 1]
     monkeypatch.setitem(sys.modules, "xarray", None)
     assert run(["export", files[0], "--out", str(tmp_path / "other")]) == 1
     assert "lsst-fringe-sim[xarray]" in capsys.readouterr().err

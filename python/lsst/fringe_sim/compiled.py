@@ -12,17 +12,31 @@ always put into what calls it, and no compiled function may call a relaxed `kern
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
+from threadpoolctl import threadpool_limits
 
-__all__ = ["contiguous", "kernel", "limit_threads", "processors", "run_shares", "run_threaded", "subkernel"]
+__all__ = [
+    "contiguous",
+    "kernel",
+    "limit_threads",
+    "one_blas_thread",
+    "processors",
+    "run_shares",
+    "run_threaded",
+    "subkernel",
+]
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 _LOG = logging.getLogger(__name__)
 
@@ -140,6 +154,20 @@ def limit_threads(threads: int | None) -> None:
 
 
 _limit: list[int | None] = [None]
+
+
+def one_blas_thread(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Run a function with one thread in the matrix products of numpy and scipy.
+
+    With more, sums are made in other parts and round otherwise, and a choice between two fits may hang on that.
+    """
+
+    @functools.wraps(function)
+    def limited(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+        with threadpool_limits(limits=1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return limited
 
 
 def run_threaded(work: Callable[[int], object], count: int, threads: int | None = None) -> None:

@@ -8,15 +8,31 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
+import unicodedata
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from glob import has_magic, iglob
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from .errors import InputError
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-__all__ = ["all_or_nothing", "table_text", "write_together", "write_whole"]
+__all__ = [
+    "LOCK",
+    "all_or_nothing",
+    "refuse_unfinished",
+    "same_file_key",
+    "table_text",
+    "write_together",
+    "write_whole",
+]
+
+LOCK = ".fringe-sim.lock"
+"""File in a folder into which a command writes, locked as long as it does."""
 
 
 @contextmanager
@@ -71,11 +87,66 @@ def write_together(folder: Path, contents: Mapping[str, str]) -> Path:
     return folder / index
 
 
+def same_file_key(name: str) -> str:
+    """What two names have in common that are one file where a file system does not tell letters apart.
+
+    Those of macOS and Windows take upper and lower case for the same, and accents however they are coded.
+    """
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
 def table_text(table: Table) -> str:
     """A table as ECSV, for `write_whole` and `write_together`."""
     text = io.StringIO()
     table.write(text, format="ascii.ecsv")
     return text.getvalue()
+
+
+def refuse_unfinished(inputs: Iterable[str]) -> None:
+    """Refuse to read series of files from a folder whose run is at work, or was stopped before its end.
+
+    ``inputs``: folders, which are read with all below them, patterns and files. A file alone is whole.
+    `InputError`: there is the lock of a run in one of the folders.
+    """
+    for lock in _locks_in(list(inputs)):
+        try:
+            descriptor = os.open(lock, os.O_RDONLY | os.O_NOFOLLOW)
+        except FileNotFoundError:
+            continue
+        allowed = (
+            "one whose run came to its end: some files may be missing. Run it again with --overwrite, or remove "
+            f"{LOCK} there to take what there is"
+            if _is_unlocked(descriptor)
+            else "one into which no run is writing just now"
+        )
+        raise InputError("folder that is read", str(lock.parent), allowed)
+
+
+def _locks_in(inputs: Sequence[str]) -> list[Path]:
+    """Where there are locks in folders and below them, and beside several files or what a pattern finds."""
+    folders = [Path(given) for given in inputs if Path(given).is_dir()]
+    beside = Counter(Path(given).parent for given in inputs if Path(given).is_file())
+    found = {folder for folder, number in beside.items() if number > 1}
+    for given in inputs:
+        if has_magic(given) and not Path(given).exists():
+            found |= {Path(name).parent for name in iglob(given, recursive=True)}
+    # A repository is written by the middleware, and is large.
+    deep = [folder for folder in folders if not (folder / "butler.yaml").exists()]
+    return [
+        *(folder / LOCK for folder in sorted(found)),
+        *(lock for folder in deep for lock in folder.rglob(LOCK)),
+    ]
+
+
+def _is_unlocked(descriptor: int) -> bool:
+    """Whether nobody holds the lock of a file, which is closed."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return True
 
 
 @contextmanager

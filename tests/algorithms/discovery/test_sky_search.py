@@ -9,7 +9,7 @@ import pytest
 from sky_frames import SHAPE, sky_frames_of
 from slow_cases import first_is_quick
 
-from lsst.fringe_sim.algorithms.discovery import discover_sky
+from lsst.fringe_sim.algorithms.discovery import discover_sky, placement_in_frames
 from lsst.fringe_sim.algorithms.discovery.cells import CellData
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.sky_search import BeamsOverSensor, SkyExposures
@@ -21,7 +21,7 @@ from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import SkyFringe, band_cards, bands_of_header
+from lsst.fringe_sim.products import SkyFrames, SkyFringe, band_cards, bands_of_header
 
 CATALOGUE = (
     "contrast_loss",
@@ -225,3 +225,21 @@ def test_headers_state_the_bands() -> None:
     cards = band_cards({"8-4": 0.5, "5-2": 2.0})
     assert cards == {"BAND 8-4": 0.5, "BAND 5-2": 2.0}
     assert bands_of_header({**cards, "SETUP": "monocam"}) == {"8-4": 0.5, "5-2": 2.0}
+
+
+@pytest.mark.parametrize("unit", ["electron", "fraction"])
+def test_frames_without_noise_are_refused_though_no_header_says_so(unit: str) -> None:
+    sensor = Camera.from_name("lsstCam").detector("R22_S11")
+    y, x = np.mgrid[:40, :50]
+    light = 2000.0 + 2.0 * np.sin(x / 5.0 + y / 9.0)
+
+    def placement(image: np.ndarray) -> SensorPlacement | None:
+        thickness = np.full(light.shape, 14.0)
+        (frame,) = SkyFrames.from_arrays(image[None], thickness, metadata={"BEAMS": "centre"}).frames
+        if unit == "fraction":
+            frame = replace(frame, image=frame.fraction(), unit=unit)
+        return placement_in_frames([frame], sensor, 0.2)
+
+    with pytest.raises(InputError, match="scatter of the pixels"):
+        placement(light)
+    assert placement(np.random.default_rng(1).poisson(light).astype(float)) is None

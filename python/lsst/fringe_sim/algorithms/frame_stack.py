@@ -152,7 +152,8 @@ class FrameStack:
             for row, image, offset in zip(tile, self.frames, relative, strict=True):
                 values = np.asarray(image[part]).ravel()
                 exact = precision if values.dtype == first.dtype == np.float32 else np.float64
-                np.subtract(values, first, out=row, dtype=exact, casting="same_kind")
+                with np.errstate(invalid="ignore"):  # of infinities
+                    np.subtract(values, first, out=row, dtype=exact, casting="same_kind")
                 if offset != 0.0:
                     row -= offset
             good = self.good[part].reshape(-1)

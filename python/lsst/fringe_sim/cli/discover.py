@@ -16,6 +16,7 @@ from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..algorithms.discovery import SearchOptions, Verdict
+    from ..algorithms.field_response import SensorPlacement
     from ..algorithms.flat_residual import ResidualPair
     from ..instrument.setup import Setup
     from ..model import FringeModel
@@ -80,7 +81,7 @@ def discover(
     """
     import numpy as np
 
-    from ..algorithms.discovery import SKY_SEARCH, SearchOptions
+    from ..algorithms.discovery import SKY_SEARCH, SearchOptions, placement_in_frames
     from ..algorithms.discovery import discover as search
     from ..algorithms.flat_residual import residual_pair
     from ..model import FringeModel
@@ -93,14 +94,14 @@ def discover(
     }
     if setup.kind == "sky":
         data = read_sky_frames(paths, setup, thickness)
+        placement = placement_in_frames(data.sky.frames, data.detector, setup.pixel_scale_arcsec)
         if dry_run:
             click.echo(
                 f"would search {len(data.sky.frames)} frames of {data.sky.shape[1]} x {data.sky.shape[0]} pixels"
             )
             return
-        _search_sky(
-            data, data.model(sky_settings(effects.settings)), out, seed, replace(SKY_SEARCH, **limits)
-        )
+        model = data.model(sky_settings(effects.settings))
+        _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, **limits))
         return
     if thickness is not None:
         raise InputError("--thickness", thickness, "only with the set-up of a telescope, as lsst_e2v")
@@ -120,11 +121,16 @@ def discover(
 
 
 def _search_sky(
-    data: SkyData, model: FringeModel, out: OutputFolder, seed: int, options: SearchOptions
+    data: SkyData,
+    model: FringeModel,
+    placement: SensorPlacement | None,
+    out: OutputFolder,
+    seed: int,
+    options: SearchOptions,
 ) -> None:
     import numpy as np
 
-    from ..algorithms.discovery import discover_sky, placement_in_frames
+    from ..algorithms.discovery import discover_sky
 
     folder = out.prepare()
     verdict = discover_sky(
@@ -132,7 +138,7 @@ def _search_sky(
         data.sky.thickness_um,
         data.sky.thickness_sigma_um,
         model,
-        placement=placement_in_frames(data.sky.frames, data.detector, data.setup.pixel_scale_arcsec),
+        placement=placement,
         rng=np.random.default_rng(seed),
         options=options,
         report=lambda line: click.echo(line, err=True),

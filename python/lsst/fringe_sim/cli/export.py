@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from glob import escape
 from pathlib import Path
 
 import click
 
 from ..errors import InputError
+from ..files import same_file_key
 from .output import OutputFolder, output_folder
 from .progress import progress
 
@@ -32,11 +34,12 @@ def export(files: tuple[Path, ...], out: OutputFolder, dry_run: bool) -> None:
     from ..products.xarray_export import read_exported, to_xarray, write_netcdf
 
     targets = [out.path / f"{file.stem}.nc" for file in files]
+    taken: dict[str, int] = {}
     for number, target in enumerate(targets):
-        if target in targets[:number]:
-            other = files[targets.index(target)]
-            raise InputError("files", f"{other} and {files[number]}", "files of different names")
-    out = out.holding(*(target.name for target in targets))
+        other = taken.setdefault(same_file_key(target.name), number)
+        if other != number:
+            raise InputError("files", f"{files[other]} and {files[number]}", "files of different names")
+    out = out.holding(*(escape(target.name) for target in targets))
     out.refuse_used()
     if not dry_run:
         out.prepare()

@@ -17,7 +17,7 @@ from ..instrument.camera import Camera, Detector
 from ..instrument.raw_files import find_raw_files, pixel_digest
 from ..instrument.raw_frame import RawFrame, RawMetadata, read_raw_metadata
 from ..model import Setup
-from ..products import FringeCube, FringeFlat
+from ..products import FringeCube, FringeFlat, refuse_noiseless
 from ..products.plain_flats import PlainImage, refuse_other_sensors, stack_plain_flats
 from ..resources import complete_fits
 
@@ -189,7 +189,7 @@ def _plain_images(files: Sequence[str]) -> tuple[list[PlainImage], list[FringeSi
         if image is None:
             return None
         images.append(image)
-    return (images, bad) if images else None
+    return (images, bad) if files else None
 
 
 def _plain_series(images: Sequence[PlainImage]) -> PlainSeries:
@@ -292,14 +292,16 @@ def _each_once(frames: Sequence[RawMetadata]) -> list[RawMetadata]:
 def read_cube(path: str, setup: Setup) -> FringeCube | None:
     """The fringe cube in a file, or `None` if the path is something else.
 
-    `InputError`: it names a sensor of another vendor than that of the set-up.
+    `InputError`: it names a sensor of another vendor than that of the set-up, or says that it has no noise.
     """
     if not Path(path).is_file():
         return None
     with complete_fits(path) as hdus:
         if "EXPOSURES" not in hdus or "IMAGE" not in hdus:
             return None
-    return of_vendor(FringeCube.read_fits(path), setup, path)
+    cube = of_vendor(FringeCube.read_fits(path), setup, path)
+    refuse_noiseless(cube.metadata, path)
+    return cube
 
 
 def of_vendor(cube: FringeCube, setup: Setup, source: str) -> FringeCube:

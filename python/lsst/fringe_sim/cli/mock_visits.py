@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from ..errors import InputError
 from .mock_flats import thickness_map
 from .output import OutputFolder, output_folder
 from .parameters import BUILT_IN, SIZE, SKY, ChosenEffects, model_effects, shape_of
@@ -18,9 +20,11 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
 
 __all__ = ["mock_visits"]
 
+VISITS = "visit_*.fits"  # in both folders
+
 
 @click.command("mock-visits")
-@output_folder("Folder for the visits.", "visit_*.fits", argument=True)
+@output_folder("Folder for the visits.", VISITS, argument=True)
 @SKY.name_option("lsst_e2v", "Set-up behind a telescope: name or file.")
 @click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
 @click.option(
@@ -46,7 +50,7 @@ __all__ = ["mock_visits"]
 @click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all randomness.")
 @click.option(
     "--truth",
-    type=click.Path(path_type=Path),
+    type=click.Path(path_type=Path, writable=True),
     help="Another folder, for the fringes of each visit as FITS [e⁻].",
 )
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
@@ -88,10 +92,13 @@ def mock_visits(
     rng = np.random.default_rng(seed)
     validate_effects(effects.settings)
     layer = thickness_map(thickness, chosen, shape, rng)
+    aside = None if truth is None else _truth_folder(truth, out)
     if dry_run:
         click.echo(f"would write {visits} visits of {sensor.name}, {shape[1]} x {shape[0]} pixels, to {out}")
         return
     folder = out.prepare()
+    if aside is not None:
+        aside.prepare()
     with progress("writing visits", visits) as advance:
         written = write_mock_visits(
             folder,
@@ -106,10 +113,22 @@ def mock_visits(
             silicon=silicon,
         )
         for visit in written:
-            if truth is not None:
-                _write_truth(truth / visit.path.name, visit.fringes)
+            if aside is not None:
+                _write_truth(aside.path / visit.path.name, visit.fringes)
             advance()
     click.echo(f"{visits} visits in {folder}")
+
+
+def _truth_folder(path: Path, out: OutputFolder) -> OutputFolder:
+    """Folder for the fringes of each visit, in files named as the visits are.
+
+    `InputError`: it is that of the visits, or used.
+    """
+    if path.resolve() == out.path.resolve():
+        raise InputError("--truth", str(path), "another folder than that of the visits")
+    folder = replace(out, path=path)
+    folder.refuse_used()
+    return folder
 
 
 def _write_truth(path: Path, fringes: NDArray[np.float32]) -> None:
@@ -117,8 +136,8 @@ def _write_truth(path: Path, fringes: NDArray[np.float32]) -> None:
 
     from ..files import all_or_nothing
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     hdu = fits.PrimaryHDU(fringes)
+    hdu.header["ORIGIN"] = "lsst.fringe_sim"  # which a run with --overwrite may clear
     hdu.header["BUNIT"] = ("electron", "light of the sky less its mean")
     with all_or_nothing(path) as temporary:
         hdu.writeto(temporary)

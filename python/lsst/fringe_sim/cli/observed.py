@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import InputError, UnknownNameError
+from ..files import same_file_key
 from .parameters import SIZE
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -134,7 +135,7 @@ def target_names(images: Sequence[ObservedImage], ending: str, former: str = "")
     names = {path: f"{stem_of(path).removesuffix(former)}{ending}.fits" for path in _paths(images)}
     taken: dict[str, Path] = {}
     for path, name in names.items():
-        other = taken.setdefault(name, path)
+        other = taken.setdefault(same_file_key(name), path)
         if other != path:
             raise InputError("frames", f"{other} and {path}", f"names that differ: both would become {name}")
     return names

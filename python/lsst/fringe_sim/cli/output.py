@@ -6,7 +6,7 @@ import functools
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from glob import escape, has_magic, iglob
@@ -16,12 +16,15 @@ from typing import Any
 import click
 
 from ..errors import InputError
+from ..files import LOCK, refuse_unfinished
 
 __all__ = ["OutputFolder", "output_folder", "refuse_among_inputs", "refuse_used_file"]
 
-LOCK = ".fringe-sim.lock"
 OURS = (b"ORIGIN  = 'lsst.fringe_sim'", b"FRINGTID=", b"FRINGUND=")
 """What a FITS file of this program says in its first header: its origin, or that fringes were taken or put back."""
+
+AT_WORK = f"{__name__}.at_work"
+"""Entry of the memory of a command that has begun to write and has not come to its end."""
 
 HEADER_BYTES = 57_600  # of a FITS file, in which its ORIGIN is looked for
 
@@ -90,6 +93,9 @@ class OutputFolder(os.PathLike[str]):
             part.unlink(missing_ok=True)
         if self.overwrite:
             self._clear()
+        context = click.get_current_context(silent=True)
+        if context is not None:
+            context.meta[AT_WORK] = True
         return self.path
 
     def _left(self) -> list[Path]:
@@ -116,44 +122,48 @@ class OutputFolder(os.PathLike[str]):
                 file.unlink(missing_ok=True)
 
     def _lock(self) -> None:
-        """Lock that the system releases when the process ends, however it does."""
-        for descriptor in _locks(self.path / LOCK):
-            if descriptor is None:
-                raise InputError(
-                    "output folder", str(self), "one into which no other run is writing just now"
-                )
-            context = click.get_current_context(silent=True)
-            if context is not None:
-                context.call_on_close(functools.partial(_release, self.path / LOCK, descriptor))
-            return
+        """Lock that the system releases when the process ends, however it does.
+
+        Its file stays beside the products of a run that did not come to its end, which are not all there.
+        """
+        descriptor = _locked(self.path / LOCK)
+        if descriptor is None:
+            raise InputError("output folder", str(self), "one into which no other run is writing just now")
+        context = click.get_current_context(silent=True)
+        if context is not None:
+            context.call_on_close(functools.partial(self._release, context.meta, descriptor))
+
+    def _release(self, meta: dict[str, Any], descriptor: int) -> None:
+        lock = self.path / LOCK
+        with suppress(OSError):  # the folder may be another one by now, with a lock that is not ours
+            if _is_same(lock, descriptor) and not (AT_WORK in meta and self._left()):
+                lock.unlink()
+        os.close(descriptor)
 
 
-def _locks(path: Path) -> Iterator[int | None]:
-    """One lock, `None` where another process has it, nothing where the file system knows no locks."""
+def _locked(path: Path) -> int | None:
+    """Descriptor of a lock, `None` where another process has it. Some network file systems know no locks."""
     import fcntl
 
     while True:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            current = path.stat().st_ino if path.exists() else None
         except BlockingIOError:
             os.close(descriptor)
-            yield None
-            return
-        except OSError:  # some network file systems
-            os.close(descriptor)
-            return
-        if current == os.fstat(descriptor).st_ino:
-            yield descriptor
-            return
+            return None
+        except OSError:
+            return descriptor
+        if _is_same(path, descriptor):
+            return descriptor
         os.close(descriptor)  # the former holder has just removed it
 
 
-def _release(path: Path, descriptor: int) -> None:
-    with suppress(OSError):
-        path.unlink(missing_ok=True)
-    os.close(descriptor)
+def _is_same(path: Path, descriptor: int) -> bool:
+    """Whether a file still has the name under which it was opened."""
+    with suppress(FileNotFoundError):
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    return False
 
 
 def _is_ours(path: Path) -> bool:
@@ -195,15 +205,17 @@ def refuse_among_inputs(folder: Path, inputs: Iterable[str]) -> None:
 
 
 def _inputs_of(context: click.Context, values: dict[str, Any]) -> list[str]:
-    """What a command is given to read: its arguments, and options with a path.
+    """What a command is given to read: its arguments, and options with a path that is not to be written.
 
     Several files of a folder are what a shell makes of a pattern, which finds more in a next run.
     """
     given: list[str] = []
     for parameter in context.command.params:
         value = values.get(parameter.name or "")
-        if value is not None and (
-            isinstance(parameter, click.Argument) or isinstance(parameter.type, click.Path)
+        if (
+            value is not None
+            and (isinstance(parameter, click.Argument) or isinstance(parameter.type, click.Path))
+            and not getattr(parameter.type, "writable", False)
         ):
             own = [str(item) for item in (value if isinstance(value, tuple) else (value,))]
             files = Counter((Path(item).parent, Path(item).suffix) for item in own if Path(item).is_file())
@@ -246,11 +258,19 @@ def output_folder(
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def with_folder(*, out: Path | None, overwrite: bool, **others: Any) -> None:
+            context = click.get_current_context()
             folder = None if out is None else OutputFolder(out, products, overwrite, resumes)
+            read = _inputs_of(context, others)
             if folder is not None:
                 folder.refuse_used()
-                refuse_among_inputs(folder.path, _inputs_of(click.get_current_context(), others))
-            command(out=folder, **others)
+                refuse_among_inputs(folder.path, read)
+            refuse_unfinished(read)
+            try:
+                command(out=folder, **others)
+            except click.exceptions.Exit:  # the end too, with frames that were refused
+                context.meta.pop(AT_WORK, None)
+                raise
+            context.meta.pop(AT_WORK, None)
 
         kind = click.Path(path_type=Path)
         if argument:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import InputError
+from ..files import same_file_key
 from .observed import (
     TemplateFolder,
     background_options,
@@ -119,7 +120,7 @@ def _by_sensor(images: list[ObservedImage]) -> dict[str, list[ObservedImage]]:
     for name, found in sensors.items():
         if len(found) < LEAST_FRAMES:
             raise InputError(f"frames of sensor {name!r}", len(found), f"{LEAST_FRAMES} or more")
-        other = files.setdefault(_file_name(name), name)
+        other = files.setdefault(same_file_key(_file_name(name)), name)
         if other != name:
             allowed = f"names that differ in letters and digits: both become {_file_name(name)}"
             raise InputError("sensors", f"{other} and {name}", allowed)

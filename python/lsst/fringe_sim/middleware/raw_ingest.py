@@ -32,6 +32,7 @@ from lsst.daf.butler.time_utils import TimeConverter
 from lsst.resources import ResourcePath
 
 from ..errors import FrameFormatError, InputError
+from ..files import refuse_unfinished
 from ..instrument.raw_files import find_raw_files
 from ..instrument.raw_frame import RawMetadata, read_raw_header
 from ..resources import first_line
@@ -130,9 +131,11 @@ def ingest_raws(
     ``run``: run for the files; by default ``<instrument>/raw/all``.
     ``dry_run``: look at the files and report, but store nothing.
     Returns what became of each file.
-    `InputError`: the repository holds raw frames of another kind, or other processes ingest the same frames
-        over and over.
+    `InputError`: the repository holds raw frames of another kind, other processes ingest the same frames over and
+        over, or a run of `fringe-sim` writes into one of the folders or was stopped there.
     """
+    paths = [str(path) for path in paths]
+    refuse_unfinished(paths)
     files, refused = find_raw_files(paths)
     registered = _registered_instruments(butler)
     usable: list[RawExposure] = []

@@ -397,6 +397,8 @@ class FringeModel(InNotebook):
     def _wavelength(self, wavelength_nm: ArrayLike) -> FloatArray:
         """Nominal wavelengths ``(W,)`` at which every layer is known."""
         wavelength = np.atleast_1d(np.asarray(without_unit("wavelength", wavelength_nm, "nm"), dtype=float))
+        if not wavelength.size:
+            raise InputError("wavelength [nm]", "none", "one or more")
         known = [layer.medium.wavelength_range_nm for layer in self.system.stack.layers]
         check_range(
             "wavelength [nm]", wavelength, max(low for low, _ in known), min(high for _, high in known)

@@ -19,6 +19,7 @@ from .flat_exposures import ExposureTable, FlatExposures
 from .fringe_flat import FringeFlat
 from .mask import mask_bits
 from .same_light import refuse_equal_pixels
+from .sky_frame import NOISE, is_noiseless
 
 __all__ = ["CUBE_UNITS", "FlatExposures", "FringeCube"]
 
@@ -232,7 +233,8 @@ class FringeCube(FitsProduct):
         """Stack prepared flats into a relative cube, sorted by wavelength.
 
         Equal wavelengths keep the order in which they are given. Masked pixels without a number become 1
-        with variance 0, and stay masked. Metadata that all flats share become those of the cube.
+        with variance 0, and stay masked. Metadata that all flats share become those of the cube; it has no noise if
+        one of them has none.
 
         Parameters
         ----------
@@ -261,7 +263,11 @@ class FringeCube(FitsProduct):
             FlatExposures(*np.array(stack.rows)[order].T),
             "relative",
             detector=stack.detector,
-            metadata={**stack.metadata, **({} if metadata is None else metadata)},
+            metadata={
+                **stack.metadata,
+                **({NOISE: False} if stack.noiseless else {}),
+                **({} if metadata is None else metadata),
+            },
         )
 
     def _extension_cards(self, name: str) -> list[tuple[str, Any, str]]:
@@ -312,6 +318,7 @@ class _Stack:
     detector: str
     metadata: dict[str, Any]
     rows: list[tuple[float, ...]] = field(default_factory=list)
+    noiseless: bool = False  # whether any flat is
 
     @classmethod
     def of(cls, flats: Iterable[FringeFlat], number: int | None) -> _Stack:
@@ -348,6 +355,8 @@ class _Stack:
             raise FrameFormatError(
                 name, f"sensor {flat.detector or 'unnamed'}", f"sensor {self.detector or 'unnamed'}"
             )
+        if is_noiseless(flat.metadata):
+            self.noiseless = True
         plane = len(self.rows)
         if plane == len(self.image):
             raise InputError("flats", f"more than {plane}", f"{plane}, as announced")

@@ -21,6 +21,7 @@ from .file_keywords import SENSOR_NAMES, declared_names
 from .fringe_cube import FringeCube
 from .mask import mask_bits
 from .same_light import pixels_digest
+from .sky_frame import NOISE, refuse_noiseless
 
 __all__ = ["PlainImage", "read_plain_flats", "refuse_other_sensors", "stack_plain_flats"]
 
@@ -79,6 +80,8 @@ class PlainImage:
         seconds = header.value("EXPTIME")
         if seconds is not None and header.seconds_of_light("EXPTIME", seconds, kind) == 0 and kind == "flat":
             raise header.refuse("EXPTIME", seconds, "more than 0 s for a flat")
+        if kind == "flat":
+            refuse_noiseless({NOISE: header.value(NOISE)}, header.source)
         noise, full = header.value("RDNOISE"), header.value("SATURATE")
         return cls(
             source=header.source,

@@ -14,7 +14,15 @@ from ..errors import InputError, UnknownNameError, named_units
 from . import _fits as io
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
 
-__all__ = ["CORRECTED", "NOISE", "SKY_UNITS", "SkyFringe", "refuse_corrected", "refuse_noiseless"]
+__all__ = [
+    "CORRECTED",
+    "NOISE",
+    "SKY_UNITS",
+    "SkyFringe",
+    "is_noiseless",
+    "refuse_corrected",
+    "refuse_noiseless",
+]
 
 CORRECTED = "FRINGCOR"
 """Keyword of an exposure from which fringes were subtracted; its value is the number of templates."""
@@ -164,6 +172,12 @@ def refuse_noiseless(header: Mapping[str, Any], source: str | None = None) -> No
     InputError
         The header says that there is none.
     """
-    if header.get(NOISE) is False:
+    if is_noiseless(header):
         allowed = "an exposure with photon and read noise: one without is good for templates only"
-        raise InputError(NOISE, False, allowed, source=source)
+        raise InputError(NOISE, header[NOISE], allowed, source=source)
+
+
+def is_noiseless(header: Mapping[str, Any]) -> bool:
+    """Whether a header says, as a truth value or in words, that no noise was added."""
+    said = header.get(NOISE)
+    return said is not None and str(said).strip().upper() in _NO[1:]

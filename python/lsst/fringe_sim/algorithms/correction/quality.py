@@ -195,8 +195,9 @@ def _plain_weight(
     """Weight without objects and outliers of a frame whose fringes nobody knows."""
     good = weight > 0
     objects = find_objects(residual, good, rounding_of(sums.level))
-    pull2 = np.square(residual)
-    pull2 *= weight
+    with np.errstate(over="ignore"):  # beyond all numbers is beyond the limit
+        pull2 = np.square(residual)
+        pull2 *= weight
     step = (pull2.size // NOISE_SAMPLE) | 1
     some = pull2.ravel()[::step][sums.used.ravel()[::step]]
     limit = CLIP_SIGMA**2 * 1.4826**2 * float(np.median(some)) if some.size else math.inf
@@ -378,7 +379,7 @@ def _products(sums: FrameSums) -> dict[str, float]:
 
 def _chance(blocks: NDArray[Any], sided: int) -> float:
     """Probability of a mean over blocks that is so large by chance."""
-    values = blocks[blocks != 0.0]
+    values = np.asarray(blocks[blocks != 0.0], dtype=float)  # squares in single precision may all be 0
     if values.size < 3:
         return 1.0
     pull = float(values.mean() / (values.std(ddof=1) / math.sqrt(values.size)))

@@ -306,8 +306,9 @@ def _kept(sums: FrameSums, allowed: BoolArray, residual: NDArray[np.float32], cl
     kept = np.empty(allowed.shape, dtype=bool)
     for start in range(0, len(kept), _ROWS):
         rows = slice(start, start + _ROWS)
-        pull2 = np.square(residual[rows])
-        pull2 *= sums.weight[rows]
+        with np.errstate(over="ignore"):  # beyond all numbers is beyond the limit
+            pull2 = np.square(residual[rows])
+            pull2 *= sums.weight[rows]
         np.less_equal(pull2, most, out=kept[rows])
     kept &= allowed
     return kept

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..flat_prep_options import GAUSSIAN_MAD
 from .cells import CellData
 
-__all__ = ["NoiseEstimate", "estimate_noise", "map_variance_share", "noise_ratio"]
+__all__ = ["NoiseEstimate", "estimate_noise", "map_variance_share", "noise_ratio", "scatter_of_pixels"]
 
 FloatArray = NDArray[np.float64]
 
@@ -95,6 +95,20 @@ def estimate_noise(cells: CellData, residual: FloatArray) -> NoiseEstimate:
     return NoiseEstimate(
         np.sqrt(independent / stated), float(np.sqrt(scatter)), True, _neighbour_correlation(difference, good)
     )
+
+
+def scatter_of_pixels(image: NDArray[np.floating], good: NDArray[np.bool_]) -> float:
+    """Standard deviation of what neighbouring pixels do not share, from the median of their second differences.
+
+    ``image``, ``good`` (ny, nx). Infinite where too few pixels tell.
+    """
+    if min(image.shape) < 3:
+        return float("inf")
+    use = _all_of_nine(good[np.newaxis])
+    if use.sum() < LEAST_TRIPLES:
+        return float("inf")
+    known = np.where(good, image, 0.0).astype(float)
+    return GAUSSIAN_MAD * float(np.median(np.abs(_second_difference(known[np.newaxis])[use])))
 
 
 def _common_variance(difference: FloatArray, measured: FloatArray) -> float:

@@ -711,6 +711,11 @@ def _settle(
     notes = _part_told(stated)
     if abs(noise.neighbour_correlation) > 0.1:
         notes.append(f"noise of neighbouring cells is correlated ({noise.neighbour_correlation:.2f})")
+    if noise.measured and noise.factor.max() < 1.0 - STATED_UNCERTAINTY:
+        notes.append(
+            f"the noise is {noise.factor.max():.2g} of the stated one at most: the data are smoothed, of another "
+            "gain, or simulated without noise"
+        )
     if not noise.measured:
         notes.append("noise level taken as stated: too few cells to measure it")
     return Prepared(problem, settled, noise, index, _is_rich(stated), stated, tuple(notes), fit.field)

@@ -41,6 +41,7 @@ from ..sky_response import (
     split_components,
     white_light,
 )
+from .noise import scatter_of_pixels
 from .search import Report, SearchOptions, search_exposures
 from .verdict import Verdict
 
@@ -70,6 +71,10 @@ LINE_SHIFT_NM = 0.02
 
 TOLERANCE = 1e-7
 """Error of the sums over harmonics, relative to the fringes of one line, 300 times those of all together."""
+
+LEAST_SCATTER_E, COUNTED_E = 1.0, 100.0
+"""Scatter of pixels that counted electrons have, whatever was averaged: whole numbers alone scatter by 0.3. And the
+level above which they scatter by ten times that [e⁻]."""
 
 AIRMASS_RANGE = 0.2
 """Largest difference in airmass of frames that are searched together."""
@@ -457,6 +462,21 @@ def _check_frames(frames: Sequence[SkyFringe]) -> None:
     for frame in frames:
         refuse_corrected(frame.metadata, frame.detector or None)
         refuse_noiseless(frame.metadata, frame.detector or None)
+        if frame.mean_electrons > COUNTED_E:
+            _refuse_uncounted(frame)
+
+
+def _refuse_uncounted(frame: SkyFringe) -> None:
+    """Refuse a frame without noise whose header does not say so."""
+    scatter = scatter_of_pixels(_electrons(frame), frame.mask == 0)
+    if scatter < LEAST_SCATTER_E:
+        allowed = (
+            f"{LEAST_SCATTER_E:g} or more: {frame.mean_electrons:.4g} counted electrons scatter by "
+            f"{np.sqrt(frame.mean_electrons):.3g}. The frame is simulated without noise, or smoothed"
+        )
+        raise InputError(
+            "scatter of the pixels [electron]", f"{scatter:.2g}", allowed, source=frame.detector or None
+        )
 
 
 def _check_components(sky: SkySpectrum, scales: Sequence[Mapping[str, float]]) -> None:

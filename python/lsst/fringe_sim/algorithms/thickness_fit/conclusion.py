@@ -231,6 +231,11 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
         )
     if float(metadata["CELLMISF"]) > MISFIT:
         said.append(_said_of_misfit(metadata, flats))
+    if float(metadata["CELLMISF"]) < 1.0 / MISFIT:
+        said.append(
+            f"small blocks of pixels scatter by only {np.sqrt(float(metadata['CELLMISF'])):.2g} of their noise: σ is "
+            "too large. The gain or the smoothing is another than stated, or the flats are simulated without noise"
+        )
     if "WORSTFLT" in metadata:
         label, offset = metadata["WORSTFLT"], metadata["WORSTOFF"]
         said.append(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compiled import kernel, processors, run_threaded
+from ...compiled import kernel, one_blas_thread, processors, run_threaded
 from ...errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ...model import FringeModel
 from ...optics.system import OBSERVABLES
@@ -45,6 +45,7 @@ _ROWS = 64
 
 
 @named_units
+@one_blas_thread
 def fit_thickness(
     cube: FringeCube,
     model: FringeModel,
