@@ -74,7 +74,7 @@ def test_pulls(rng: np.random.Generator) -> None:
     """Many sensors with an error of their own: what is stated is what scatters."""
     mean, local = [], []
     for _ in range(20):
-        a, b, c = 0.04 * rng.standard_normal(3)
+        a, b, c = 0.02 * rng.standard_normal(3)
         error = a + b * np.cos(np.pi * X / SHAPE[1]) + c * np.sin(np.pi * Y / SHAPE[0])
         found = fitted(error, rng)
         place = tuple(rng.integers(0, side) for side in SHAPE)

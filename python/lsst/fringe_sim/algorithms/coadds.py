@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, spline_filter
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import InputError, OutOfRangeError, named_units
 from ..products import SkyFringe
 from ..resources import read_user_table
 
@@ -38,6 +38,7 @@ LARGEST_PART = 4
 """The largest square in which pixels are averaged is at most this part of a region: there must be several of them."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class VisitPlaces:
     """Where one region of the sky lies on a sensor, visit by visit.
