@@ -44,6 +44,9 @@ SPREADS = 13
 MOST_STARTS = 4
 """Most common shifts from which splines begin; an order has about one."""
 
+NEGLIGIBLE_WEIGHT = 1e-4
+"""Spreads of less weight are left out of an average; they change it by less than this of a standard deviation."""
+
 NEGLIGIBLE = 10.0
 """Splines whose evidence is e to this less than that of coarser ones end the search for finer ones."""
 
@@ -128,7 +131,7 @@ def fit_sky_shift(
 
     Notes
     -----
-    The shift is a spline whose coefficients have a common mean, normal about zero, and a normal spread about it,
+    The shift is a spline whose coefficients have mean and tilts, normal about zero, and a normal spread about them,
     over which the evidence is averaged. Its number of spans, one shift for all, and none at all compete by evidence
     (Laplace's, about the best point). In each frame the strength of each band and a background of second degree are
     free, and integrated over. The variance of each frame is that of its residuals.
@@ -342,8 +345,8 @@ class _Night:
         for number in range(ROUNDS):
             information, gradient = self.normal(splines, state)
             if number % 4 == 0:
-                spread, _ = _evidence(information, gradient, coefficient, spreads, reach)
-            penalty = np.asarray(np.linalg.inv(_prior(splines.count, spread, reach)), dtype=float)
+                spread = _Spread.of(splines, information, gradient, coefficient, spreads, reach).likeliest
+            penalty = np.asarray(np.linalg.inv(_prior(splines, spread, reach)), dtype=float)
             wanted = gradient - penalty @ coefficient
             step = np.asarray(np.linalg.solve(information + penalty, wanted), dtype=float)
             moved, state = self._moved(splines, coefficient, step, penalty, state)
@@ -351,11 +354,10 @@ class _Night:
             coefficient = moved
             if change < FINISHED_ORDERS * self.order_um:
                 break
-        information, gradient = self.normal(splines, state)
-        spread, log_evidence = _evidence(information, gradient, coefficient, spreads, reach)
-        covariance = np.linalg.inv(information + np.linalg.inv(_prior(splines.count, spread, reach)))
-        total = log_evidence - state.half_chi2 + state.log_volume
-        return _Fit(splines, coefficient, covariance, information, splines.surface(coefficient), total, state)
+        found = _Spread.of(splines, *self.normal(splines, state), coefficient, spreads, reach)
+        total = found.log_evidence - state.half_chi2 + state.log_volume
+        mean, covariance = found.posterior()
+        return _Fit(splines, mean, covariance, found.information, splines.surface(mean), total, state)
 
     def _moved(
         self, splines: _Splines, coefficient: FloatArray, step: FloatArray, penalty: FloatArray, state: _State
@@ -421,36 +423,76 @@ def _nearest(splines: _Splines, surface: FloatArray) -> FloatArray:
     return np.asarray(rows @ surface @ columns.T).ravel()
 
 
-def _prior(count: int, spread_um: float, reach_um: float) -> FloatArray:
-    """Covariance of the coefficients: a common mean, as far as the map may be off, and a spread about it."""
-    own = spread_um**2 if count > 1 else 0.0
-    return own * np.eye(count) + reach_um**2
+def _prior(splines: _Splines, spread_um: float, reach_um: float) -> FloatArray:
+    """Covariance of the coefficients: mean and tilts, as far as the map may be off, and a spread about them.
 
-
-def _evidence(
-    information: FloatArray,
-    gradient: FloatArray,
-    coefficient: FloatArray,
-    spreads: FloatArray,
-    reach_um: float,
-) -> tuple[float, float]:
-    """The likeliest spread, and the log of the evidence over the likelihood at the coefficients.
-
-    Half the χ² about the coefficients is ``-gradient @ d + 0.5 d @ information @ d``.
+    The spread has parts that all of a row share, that all of a column share, and of each coefficient, equally large.
     """
-    count = coefficient.size
-    linear = gradient + information @ coefficient
-    at_zero = -float(gradient @ coefficient) - 0.5 * float(coefficient @ information @ coefficient)
-    logs = []
-    for spread in spreads if count > 1 else spreads[:1]:
-        root = np.linalg.cholesky(_prior(count, float(spread), reach_um) + 1e-14 * np.eye(count))
-        inner = np.eye(count) + root.T @ information @ root
-        factor = cho_factor(inner, lower=True)
-        side = root.T @ linear
-        gain = 0.5 * float(side @ cho_solve(factor, side))
-        logs.append(gain - float(np.log(np.diag(factor[0])).sum()))
-    best = int(np.argmax(logs))
-    return float(spreads[best]), at_zero + float(logsumexp(logs)) - math.log(len(logs))
+    if splines.count == 1:
+        return np.full((1, 1), reach_um**2)
+    sides = (splines.rows.shape[1], splines.columns.shape[1])
+    rows, columns = (np.eye(side) + 1.0 for side in sides)
+    across, along = (np.linspace(-1.0, 1.0, side) for side in sides)
+    plane = np.stack([np.ones(splines.count), np.repeat(across, sides[1]), np.tile(along, sides[0])])
+    return np.asarray(spread_um**2 * np.kron(rows, columns) + reach_um**2 * (plane.T @ plane))
+
+
+@dataclass(frozen=True, eq=False)
+class _Spread:
+    """How large the spread of the coefficients may be, from the quadratic form of half the χ² about a point."""
+
+    splines: _Splines
+    information: FloatArray
+    linear: FloatArray  # half the χ² is a constant less ``linear @ c``, and ``0.5 c @ information @ c``
+    spreads_um: FloatArray
+    reach_um: float
+    log_each: FloatArray  # log of the evidence of each spread, over the likelihood at the point
+
+    @classmethod
+    def of(
+        cls,
+        splines: _Splines,
+        information: FloatArray,
+        gradient: FloatArray,
+        coefficient: FloatArray,
+        spreads_um: FloatArray,
+        reach_um: float,
+    ) -> _Spread:
+        linear = gradient + information @ coefficient
+        at_zero = -float(gradient @ coefficient) - 0.5 * float(coefficient @ information @ coefficient)
+        tried = spreads_um if splines.count > 1 else spreads_um[:1]
+        logs = []
+        for spread in tried:
+            root = np.linalg.cholesky(_prior(splines, float(spread), reach_um))
+            factor = cho_factor(np.eye(splines.count) + root.T @ information @ root, lower=True)
+            side = root.T @ linear
+            gain = 0.5 * float(side @ cho_solve(factor, side))
+            logs.append(at_zero + gain - float(np.log(np.diag(factor[0])).sum()))
+        return cls(splines, information, linear, tried, reach_um, np.array(logs))
+
+    @property
+    def likeliest(self) -> float:
+        """Spread of the largest evidence [µm]."""
+        return float(self.spreads_um[self.log_each.argmax()])
+
+    @property
+    def log_evidence(self) -> float:
+        """Averaged over the spreads, each factor between them counting alike."""
+        return float(logsumexp(self.log_each)) - math.log(self.log_each.size)
+
+    def posterior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of the coefficients, whatever the spread is."""
+        weights = np.exp(self.log_each - logsumexp(self.log_each))
+        parts = []
+        for weight, spread in zip(weights, self.spreads_um, strict=True):
+            if weight > NEGLIGIBLE_WEIGHT:
+                inverse = np.linalg.inv(_prior(self.splines, float(spread), self.reach_um))
+                covariance = np.asarray(np.linalg.inv(self.information + inverse), dtype=float)
+                parts.append((weight, covariance @ self.linear, covariance))
+        total = sum(weight for weight, *_ in parts)
+        mean = np.asarray(sum(weight * middle for weight, middle, _ in parts) / total)
+        spread_of = [w * (c + np.outer(m - mean, m - mean)) for w, m, c in parts]
+        return mean, np.asarray(np.sum(spread_of, axis=0) / total)
 
 
 def _averaged(night: _Night, unmoved: _State, fits: Sequence[_Fit], others: Sequence[_Fit]) -> SkyShift:
