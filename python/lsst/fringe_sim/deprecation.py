@@ -75,10 +75,10 @@ def deprecated(
 
         changed: Any = with_warning
         if inspect.isclass(callee):
-            callee.__init__ = with_warning  # type: ignore[misc]
+            callee.__init__ = with_warning  # type: ignore[method-assign]
             changed = callee
         changed.__doc__ = _with_directive(callee.__doc__, since, message)
-        return changed  # type: ignore[no-any-return]
+        return changed
 
     return decorate
 
