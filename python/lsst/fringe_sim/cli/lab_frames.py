@@ -160,8 +160,8 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries | 
     files, refused = find_raw_files(paths)
     plain = _plain_images(files)
     if plain is not None:
-        images, bad = plain
-        refuse_bad([*refused, *bad], skip_bad=skip_bad, others=bool(images))
+        images, spoilt = plain
+        refuse_bad([*refused, *spoilt], skip_bad=skip_bad, others=bool(images))
         return _plain_series(images)
     frames: list[RawMetadata] = []
     bad: list[FringeSimError] = []

@@ -35,8 +35,9 @@ __all__ = [
     "check_noted",
 ]
 
-_NEEDED = object()
-"""Stands for no default: a header must have the keyword."""
+
+class _NEEDED:
+    """Stands for no default: a header must have the keyword."""
 
 
 @dataclass(frozen=True)
