@@ -5,6 +5,7 @@
 #   --list        print the commands, run nothing
 #   --only REGEX, --skip REGEX   extended regular expressions for the commands to run, and for those to leave out
 #   FOLDER        where to work; by default a new folder in the temporary directory
+# What the commands read and do not make is taken from `make demo`: without it, those of folders of flats fail.
 # BIN: folder of the programs; by default that of the environment which `make` creates in the clone.
 # PAGES: pages with the commands, relative to the checkout.
 set -euo pipefail
@@ -16,7 +17,7 @@ while [ $# -gt 0 ]; do
         --list) list=yes ;;
         --only) only=$2; shift ;;
         --skip) skip=$2; shift ;;
-        -*) sed -n '2,9s/^# //p' "$0" >&2; exit 2 ;;
+        -*) sed -n '2,10s/^# //p' "$0" >&2; exit 2 ;;
         *) work=$1 ;;
     esac
     shift
