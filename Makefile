@@ -21,6 +21,9 @@ help:
 $(VENV)/.ready-run: pyproject.toml constraints/*.txt scripts/set_up.sh
 	@PYTHON="$(PYTHON)" VENV="$(VENV)" bash scripts/set_up.sh run
 
+$(VENV)/.ready-docs: pyproject.toml constraints/*.txt scripts/set_up.sh
+	@PYTHON="$(PYTHON)" VENV="$(VENV)" bash scripts/set_up.sh docs
+
 $(VENV)/.ready-test: pyproject.toml constraints/*.txt scripts/set_up.sh
 	@PYTHON="$(PYTHON)" VENV="$(VENV)" bash scripts/set_up.sh test
 
@@ -43,7 +46,7 @@ unit: $(VENV)/.ready-test
 slow: $(VENV)/.ready-test
 	$(PYTEST) -m slow --share=$(SHARE) $(PYTEST_ARGS)
 
-docs: $(VENV)/.ready-test
+docs: $(VENV)/.ready-docs
 	$(BIN)/python -m sphinx -b html -W --keep-going -q doc doc/_build
 	@echo "documentation: doc/_build/index.html"
 

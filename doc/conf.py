@@ -14,14 +14,20 @@ author = "the lsst.fringe_sim developers"
 copyright = author
 version = release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "catalogues", "mathml"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc", "catalogues", "mathml"]
 suppress_warnings = ["myst.header"]  # a page may leave out a level of headings
-source_suffix = {".md": "markdown"}
+source_suffix = {".md": "myst-nb"}
 exclude_patterns = ["_build", "changes"]
 root_doc = "index"
 
 myst_enable_extensions = ["deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 3
+
+# Pages of doc/notebooks are executed whenever they are built; what they write is thrown away.
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
 
 smartquotes = False  # two hyphens begin an option
 # Docstrings put names in single backquotes; those that are documented here become links.

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Create the virtual environment and install the package with pinned dependencies.
-# usage: set_up.sh run|test      (PYTHON and VENV from the environment)
+# usage: set_up.sh run|docs|test      (PYTHON and VENV from the environment)
 set -euo pipefail
-flavour=${1:?run or test}
+flavour=${1:?run, docs or test}
 python=${PYTHON:-python3}
 venv=${VENV:-.venv}
 
@@ -24,12 +24,14 @@ if [ ! -x "$venv/bin/python" ]; then
     echo "Creating $venv with $("$python" --version)"
     "$python" -m venv "$venv"
 fi
-extra=""
-[ "$flavour" = test ] && extra="[test,docs,postgres]"
+case $flavour in
+    run) extra="" ready="run" ;;
+    docs) extra="[docs]" ready="run docs" ;;
+    test) extra="[test,docs,postgres]" ready="run docs test" ;;
+    *) echo "set_up.sh run|docs|test" >&2; exit 2 ;;
+esac
 echo "Installing lsst-fringe-sim$extra into $venv (about 500 MB the first time)"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c "$constraints" --editable ".$extra"
 echo "Compiling for this processor, so that no command waits for it (once, less than a minute)"
 "$venv/bin/fringe-sim" compile || echo "That failed; commands compile what they need themselves." >&2
-touch "$venv/.ready-run"
-[ "$flavour" = test ] && touch "$venv/.ready-test"
-exit 0
+for name in $ready; do touch "$venv/.ready-$name"; done

@@ -205,6 +205,8 @@ def test_site_is_whole_and_needs_no_network(site: Path) -> None:
     for path, parsed in pages.items():
         for target in parsed.loads:
             url = urlsplit(target)
+            if url.scheme == "data":  # the picture itself
+                continue
             assert not url.netloc, f"{path.name} loads {target}"
             assert (path.parent / unquote(url.path)).is_file(), f"{path.name} lacks {target}"
         for target in parsed.links:
@@ -215,6 +217,16 @@ def test_site_is_whole_and_needs_no_network(site: Path) -> None:
             assert place.is_file(), f"{path.name} links to {target}"
             if url.fragment and place in pages:
                 assert unquote(url.fragment) in pages[place].anchors, f"{path.name} links to {target}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("notebook", "figures"), [("flats_to_thickness", 4), ("thickness_to_sky", 4)])
+def test_notebooks_show_what_they_computed(site: Path, notebook: str, figures: int) -> None:
+    parsed = _Links()
+    parsed.feed((site / "notebooks" / f"{notebook}.html").read_text(encoding="utf-8"))
+    assert sum(source.startswith("../_images/") for source in parsed.loads) == figures
+    # Products, set-ups and models show a table, with a picture where there is one.
+    assert sum(source.startswith("data:image/png") for source in parsed.loads) == 2
 
 
 @pytest.mark.slow

@@ -29,10 +29,16 @@ def test_near_misses_are_offered() -> None:
     assert "R11" in str(error)
 
 
-def test_long_lists_are_cut() -> None:
-    error = UnknownNameError("detector", "zzz", [f"d{i:03d}" for i in range(189)])
-    assert "189 in all" in str(error)
-    assert len(str(error)) < 400
+@pytest.mark.parametrize("given", ["zzz", "d01", "d"])
+def test_of_a_long_list_three_names_are_shown(given: str) -> None:
+    known = [f"d{i:03d}" for i in range(189)]
+    error = UnknownNameError("detector", given, known)
+    assert "189" in str(error)
+    assert sum(name in str(error) for name in known) == 3
+
+
+def test_a_short_list_is_shown_whole() -> None:
+    assert "ts8_e2v, ts8_itl" in str(UnknownNameError("set-up", "qqq", ["ts8_itl", "ts8_e2v"]))
 
 
 @pytest.mark.parametrize("kind", [InputError, OutOfRangeError])

@@ -13,6 +13,7 @@ PACKAGE = Path(lsst.fringe_sim.__file__).parent
 ROOT = "lsst.fringe_sim"
 ORDER = (
     "errors",
+    "deprecation",
     "lazy",
     "files",
     "style",
@@ -27,12 +28,21 @@ ORDER = (
     "algorithms",
 )
 ALLOWED: dict[str, set[str]] = {room: set(ORDER[: i + 1]) for i, room in enumerate(ORDER)}
-ALLOWED["mock"] = {"errors", "files", "compiled", "resources", "instrument", "effects", "mock"}
-ALLOWED["middleware"] = {"errors", "files", "resources", "instrument", "products", "middleware"}
+ALLOWED["mock"] = {"errors", "deprecation", "files", "compiled", "resources", "instrument", "effects", "mock"}
+ALLOWED["middleware"] = {
+    "errors",
+    "deprecation",
+    "files",
+    "resources",
+    "instrument",
+    "products",
+    "middleware",
+}
 ALLOWED["tasks"] = set(ORDER) | {"middleware", "tasks"}
 ALLOWED["paper"] = set(ORDER) | {"mock", "paper"}
 ALLOWED["report"] = {
     "errors",
+    "deprecation",
     "files",
     "style",
     "compiled",

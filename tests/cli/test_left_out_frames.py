@@ -11,7 +11,7 @@ from astropy.io import fits
 from lsst.fringe_sim.algorithms.flat_prep_options import DEFAULT_OPTIONS
 from lsst.fringe_sim.cli.lab_frames import LabSeries, find_series
 from lsst.fringe_sim.cli.main import run
-from lsst.fringe_sim.errors import FrameFormatError
+from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.setup import Setup
 
 
@@ -42,14 +42,11 @@ def test_frames_that_are_left_out_are_said(
 
 
 @pytest.mark.parametrize("ending", [".FITS", ".fits.bz2", ".fit"])
-def test_files_named_like_frames_are_not_passed_over(
-    raws: Path, capsys: pytest.CaptureFixture[str], ending: str
-) -> None:
+def test_files_named_like_frames_are_not_passed_over(raws: Path, ending: str) -> None:
     flat = next(raws.glob("*_0950_*"))
     renamed = flat.rename(flat.with_name(f"{flat.stem}{ending}"))
-    with pytest.raises(FrameFormatError, match="1 unusable"):
+    with pytest.raises(InputError, match=rf"{renamed.name}.*--skip-bad"):
         find_series([str(raws)])
-    assert renamed.name in capsys.readouterr().err
     assert len(find_series([str(raws)], skip_bad=True).flats) == 1
 
 

@@ -53,6 +53,29 @@ def test_effects_as_json(capsys) -> None:
     assert rows["bandwidth"]["parameters"][0]["null"] is None
 
 
+def test_one_effect(capsys) -> None:
+    assert run(["effects", "bandwidth"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("bandwidth ")
+    assert "insulation" not in text
+
+
+def test_a_name_like_no_other_brings_the_command_that_lists_them(capsys) -> None:
+    assert run(["effects", "zzzzz"]) == 1
+    told = capsys.readouterr().err
+    assert "fringe-sim effects lists them" in told
+    assert len(told) < 160
+
+
+@pytest.mark.parametrize("command", ["fit", "templates"])
+def test_one_error_is_one_line(command, tmp_path, capsys) -> None:
+    (tmp_path / "empty").mkdir()
+    assert run([command, str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 1
+    told = capsys.readouterr().err
+    assert "empty" in told
+    assert told.count("\n") == 1
+
+
 def test_internal_failures_have_their_own_status(monkeypatch, capsys) -> None:
     def broken(*args: object, **kwargs: object) -> None:
         raise ZeroDivisionError("a bug")

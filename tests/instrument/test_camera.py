@@ -60,9 +60,9 @@ def test_test_stand_knows_where_its_sensors_are_today() -> None:
     ("camera", "key", "offered"),
     [
         ("lsstCam", "R11_S0", "did you mean R11_S"),
-        ("lsstCam", 999, "R01_S00"),
-        ("lsstCam", -1, "R01_S00"),
-        ("lsstCam", "", "R01_S00"),
+        ("lsstCam", 999, "R00_SG0"),
+        ("lsstCam", -1, "R00_SG0"),
+        ("lsstCam", "", "R00_SG0"),
         ("lsstCam", "E2V-CCD250-1290", "E2V-CCD250-129"),
         ("ts8", "RTM-020_S33", "RTM-020_S"),
         ("monocam", "R11_S01", "R00_S00"),

@@ -152,7 +152,8 @@ class UnknownNameError(InputError):
         near = difflib.get_close_matches(str(value), names, n=3, cutoff=0.5)
         near += [name for name in names if value and str(value) in name and name not in near][: 3 - len(near)]
         if near:
-            allowed = f"did you mean {' or '.join(near)}? ({len(names)} are known)"
+            others = f" ({len(names)} are known)" if len(names) > len(near) else ""
+            allowed = f"did you mean {' or '.join(near)}?{others}"
         else:
             allowed = _shorten(names)
         super().__init__(field, value, allowed, source=source)
@@ -379,8 +380,8 @@ def _plain(name: str, value: Any, unit: str) -> Any:
     return type(value)(_plain(name, item, unit) if has_unit(item) else item for item in value)
 
 
-def _shorten(names: list[str], most: int = 24) -> str:
+def _shorten(names: list[str], most: int = 10) -> str:
+    """All names of a short list; of a long one, in which none is like what was given, three as examples."""
     if not names:
         return "nothing is registered"
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown}, … ({len(names)} in all)"
+    return ", ".join(names) if len(names) <= most else f"{', '.join(names[:3])}, … ({len(names)} in all)"

@@ -144,7 +144,7 @@ def amplitude_table(
     adhesive_um: ArrayLike,
     skies: Sequence[SkyCase] | None = None,
     effects: Mapping[str, Any] | None = None,
-    cases: Sequence[AmplitudeCase] = CASES,
+    cases: Sequence[AmplitudeCase] | None = None,
     *,
     silicon: str | None = None,
 ) -> Table:
@@ -152,11 +152,11 @@ def amplitude_table(
 
     ``adhesive_um`` (ny, nx): thickness of the adhesive of E2V-CCD250-321; every 16th pixel will do. ``skies``:
     spectra of the night sky; PALACE with and without continua by default. ``effects``: effects that the set-ups
-    lack, by ``name.parameter``; those of the laboratory are left out on the sky. Without any, this is the
-    undamped model of the paper. ``silicon``: another table of silicon than that of the set-ups, as the
-    ``Si_green2008`` of the paper. Returns one row per case and sky. Amplitudes in per cent of the mean: of the
-    frame itself (``rms``, ``half_peak_to_peak``, ``half_range_1_99``), and ``rms_flat_fielded`` after division
-    by a flat field of white light, which takes out how absorption changes with the thickness of silicon.
+    lack, by ``name.parameter``; those of the laboratory are left out on the sky. Without any, this is the undamped
+    model of the paper. ``cases``: `CASES` by default. ``silicon``: another table of silicon than that of the
+    set-ups, as the ``Si_green2008`` of the paper. Returns one row per case and sky. Amplitudes in per cent of the
+    mean: of the frame itself (``rms``, ``half_peak_to_peak``, ``half_range_1_99``), and ``rms_flat_fielded`` after
+    division by a flat field of white light, which takes out how absorption changes with the thickness of silicon.
     """
     adhesive = np.asarray(adhesive_um, dtype=float)
     if adhesive.ndim != 2:
@@ -165,7 +165,7 @@ def amplitude_table(
     activate_effects(settings, known_effects())
     chosen = SkyCase.palace() if skies is None else tuple(skies)
     rows = []
-    for case in cases:
+    for case in CASES if cases is None else cases:
         model = _model(case, settings, silicon)
         thickness = adhesive if case.own_map else _stand_in(case.setup)
         for sky in chosen if case.on_sky else (None,):
@@ -186,7 +186,7 @@ def compare_amplitudes(
     adhesive_um: ArrayLike,
     skies: Sequence[SkyCase] | None = None,
     effects: Mapping[str, Any] | None = None,
-    cases: Sequence[AmplitudeCase] = CASES,
+    cases: Sequence[AmplitudeCase] | None = None,
 ) -> Table:
     """`amplitude_table` without effects and, if there are any, with them, in one table.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..errors import OutOfRangeError, UnknownNameError
+from ..notebook import OneLine
 
 __all__ = ["DEFAULT_OPTIONS", "GAUSSIAN_MAD", "FlatPrepOptions"]
 
@@ -12,8 +13,8 @@ GAUSSIAN_MAD = 1.4826
 """Standard deviation of a Gaussian over its median absolute deviation."""
 
 
-@dataclass(frozen=True)
-class FlatPrepOptions:
+@dataclass(frozen=True, repr=False)
+class FlatPrepOptions(OneLine):
     """Choices of the preparation; the defaults suit LSST sensors on a test stand.
 
     Attributes

@@ -14,6 +14,7 @@ from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 from ..errors import InputError, named_units
+from ..notebook import do_nothing
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
 from ..products.same_light import refuse_equal_pixels
 from .correction.empirical import TemplateOptions, fit_templates
@@ -159,7 +160,7 @@ def make_templates(
     options: TemplateOptions | None = None,
     prior: Sequence[FringeFrame] = (),
     metadata: Mapping[str, Any] | None = None,
-    advance: Callable[[], None] = lambda: None,
+    advance: Callable[[], None] = do_nothing,
     names: Sequence[str] = (),
 ) -> FringeTemplates:
     """Make the templates of one sensor in one filter.

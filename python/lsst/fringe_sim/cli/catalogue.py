@@ -117,7 +117,7 @@ def effects(names: tuple[str, ...], as_json: bool) -> None:
 
 
 def _describe(parameter: Parameter) -> str:
-    null = "as the set-up says" if math.isnan(parameter.null) else f"{parameter.null:g}"
+    null = "by default as the set-up says" if math.isnan(parameter.null) else f"absent at {parameter.null:g}"
     unit = f" {parameter.unit}" if parameter.unit else ""
     low, high = parameter.bounds
-    return f".{parameter.name}: {parameter.description}; {low:g} to {high:g}{unit}, absent at {null}"
+    return f".{parameter.name}: {parameter.description}; {low:g} to {high:g}{unit}, {null}"

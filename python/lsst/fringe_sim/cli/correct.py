@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import InputError
+from .bad_files import refuse_bad
 from .observed import (
     TemplateFolder,
     background_options,
     background_path,
     grid_of,
     images_of,
-    refuse_bad,
     stem_of,
     target_names,
 )
@@ -98,7 +98,7 @@ def correct(
     names = target_names(images, *(("_restored", "_corrected") if undo else ("_corrected",)))
     if dry_run:
         click.echo(f"would {'restore' if undo else 'correct'} {len(images)} images")
-        refuse_bad(unusable, skip_bad=False)
+        refuse_bad(unusable, skip_bad=False, others=False)
         return
     target = out.prepare()
     if undo:
@@ -108,11 +108,11 @@ def correct(
         options = CorrectionOptions(background_px, grid_of(amplifiers))
         make = partial(_correct_one, known, options, pixel_scale, inject)
         done, refused = _corrected(images, make, background, target, names)
-        _write_report(target, done, [*unusable, *refused])
+        _write_report(target, done, [*map(str, unusable), *refused])
         passed = all(each.proof.passed for each in done)
         for record in done:
             click.echo(_describe(record))
-    for line in [*unusable, *refused]:
+    for line in [*map(str, unusable), *refused]:
         click.echo(line)
     if not undo:
         click.echo(str(target / "report.html"))

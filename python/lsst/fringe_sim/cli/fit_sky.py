@@ -10,7 +10,8 @@ import click
 import numpy as np
 
 from ..errors import InputError
-from .observed import background_options, background_path, grid_of, images_of, refuse_bad
+from .bad_files import refuse_bad
+from .observed import background_options, background_path, grid_of, images_of
 from .output import OutputFolder, output_folder
 from .parameters import SKY, ChosenEffects, model_effects
 from .progress import progress
@@ -81,7 +82,7 @@ def fit_sky(
     from .inputs import read_map, read_section
 
     images, unusable = images_of(frames, refuse_corrected)
-    refuse_bad(unusable, skip_bad)
+    refuse_bad(unusable, skip_bad=skip_bad)
     sensor = setup.sensor(detector or _sensor_of(images))
     layer = read_map(thickness, setup, sensor)
     section = read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))

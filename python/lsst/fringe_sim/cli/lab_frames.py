@@ -20,6 +20,7 @@ from ..model import Setup
 from ..products import FringeCube, FringeFlat, refuse_noiseless
 from ..products.plain_flats import PlainImage, refuse_other_sensors, stack_plain_flats
 from ..resources import complete_fits
+from .bad_files import refuse_bad
 
 __all__ = ["LabSeries", "PlainSeries", "find_series", "of_vendor", "read_cube"]
 
@@ -159,17 +160,17 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries | 
     files, refused = find_raw_files(paths)
     plain = _plain_images(files)
     if plain is not None:
-        images, bad = plain
-        _refuse_bad([*refused, *map(str, bad)], images, paths, skip_bad)
+        images, spoilt = plain
+        refuse_bad([*refused, *spoilt], skip_bad=skip_bad, others=bool(images))
         return _plain_series(images)
     frames: list[RawMetadata] = []
-    bad = []
+    bad: list[FringeSimError] = []
     for file in files:
         try:
             frames.append(_readable(file))
         except FringeSimError as error:
             bad.append(error)
-    _refuse_bad([*refused, *map(str, bad)], frames, paths, skip_bad)
+    refuse_bad([*refused, *bad], skip_bad=skip_bad, others=bool(frames))
     return _raw_series(_each_once(frames), paths)
 
 
@@ -204,18 +205,6 @@ def _plain_series(images: Sequence[PlainImage]) -> PlainSeries:
         "plain flats" + ("" if biases else ", taken as bias-subtracted: there are no bias images"), err=True
     )
     return PlainSeries(name, biases, tuple(flats))
-
-
-def _refuse_bad(messages: Sequence[str], good: Sequence[Any], paths: Sequence[str], skip_bad: bool) -> None:
-    """Name what cannot be used; end here unless it is to be skipped and something else is left."""
-    for message in messages:
-        click.echo(f"refused: {message}", err=True)
-    if messages and skip_bad and not good:
-        raise InputError("PATH", " ".join(paths), "flats, or folders that hold some")
-    if messages and not skip_bad:
-        raise FrameFormatError(
-            "frames", f"{len(messages)} unusable", "complete frames, or --skip-bad to go on"
-        )
 
 
 def _raw_series(frames: Sequence[RawMetadata], paths: Sequence[str]) -> LabSeries:

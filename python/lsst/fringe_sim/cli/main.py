@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import click
 
 from .. import __version__
-from ..errors import LONGEST_MESSAGE, FringeSimError, shown
+from ..errors import LONGEST_MESSAGE, FringeSimError, UnknownNameError, shown
 
 __all__ = ["cli", "main"]
 
@@ -49,6 +49,10 @@ _COMMANDS = {
     "completion": ("completion", "Print what makes a shell complete commands, options and names."),
     "challenge": ("challenge", "Hide effects in simulated sensors and count what the search finds."),
 }
+
+
+_LISTED = {"effect": "effects", "set-up": "setups"}
+"""Commands that list the names of a field."""
 
 
 class _LazyGroup(click.Group):
@@ -147,7 +151,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         error.show()
         return EXIT_BAD_INPUT
     except FringeSimError as error:
-        _complain(str(error))
+        known = _LISTED.get(error.field) if isinstance(error, UnknownNameError) else None
+        _complain(f"{error}; fringe-sim {known} lists them" if known else str(error))
         return EXIT_BAD_INPUT
     except OSError as error:
         named = f"{error.filename}: {error.strerror}" if error.filename else str(error)

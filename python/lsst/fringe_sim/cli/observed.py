@@ -13,6 +13,7 @@ import click
 
 from ..errors import InputError, UnknownNameError
 from ..files import same_file_key
+from .bad_files import refuse_bad
 from .parameters import SIZE
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -28,7 +29,6 @@ __all__ = [
     "grid_of",
     "images_of",
     "latest_date",
-    "refuse_bad",
     "stem_of",
     "target_names",
 ]
@@ -72,8 +72,8 @@ def grid_of(amplifiers: tuple[int, int] | None) -> AmplifierGrid:
 
 def images_of(
     paths: Sequence[Path], accept: Callable[[Mapping[str, Any], str], None]
-) -> tuple[list[ObservedImage], list[str]]:
-    """Images in files and in the files of folders, and a line for each file that cannot be used.
+) -> tuple[list[ObservedImage], list[InputError]]:
+    """Images in files and in the files of folders, and an error for each file that cannot be used.
 
     Companions such as masks and weights are no frames. A file that is meant twice counts once.
 
@@ -103,25 +103,10 @@ def images_of(
             bad.append(error)
         else:
             images.extend(parts)
-    if bad and not images:
-        raise bad[0]
     if not images:
+        refuse_bad(bad, skip_bad=False, others=False)
         raise InputError("frames", [str(path) for path in paths], "FITS files, or folders with them")
-    return images, [str(error) for error in bad]
-
-
-def refuse_bad(messages: Sequence[str], skip_bad: bool) -> None:
-    """Name files that cannot be used, and end here unless they are to be skipped.
-
-    Raises
-    ------
-    InputError
-        There are some.
-    """
-    for message in messages:
-        click.echo(f"refused: {message}", err=True)
-    if messages and not skip_bad:
-        raise InputError("frames", f"{len(messages)} unusable", "complete frames, or --skip-bad to go on")
+    return images, bad
 
 
 def target_names(images: Sequence[ObservedImage], ending: str, former: str = "") -> dict[Path, str]:

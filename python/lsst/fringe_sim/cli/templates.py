@@ -12,6 +12,7 @@ import click
 
 from ..errors import InputError
 from ..files import same_file_key
+from .bad_files import refuse_bad
 from .observed import (
     TemplateFolder,
     background_options,
@@ -19,7 +20,6 @@ from .observed import (
     grid_of,
     images_of,
     latest_date,
-    refuse_bad,
 )
 from .output import OutputFolder, output_folder
 from .progress import progress
@@ -83,7 +83,7 @@ def templates(
     from ..report.correction_page import write_templates_report
 
     images, unusable = images_of(frames, refuse_corrected)
-    refuse_bad(unusable, skip_bad)
+    refuse_bad(unusable, skip_bad=skip_bad)
     sensors = _by_sensor(images)
     options = TemplateOptions(
         components, least_frames=least_frames, spacing_px=background_px, amplifiers=grid_of(amplifiers)

@@ -194,6 +194,10 @@ class Effect(Described, ABC):
     search: ClassVar[SearchHints] = SearchHints()
     """What a search must know of it."""
 
+    def __repr__(self) -> str:
+        """As it is made."""
+        return f"{type(self).__name__}()"
+
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.sky_only = cls.sky_only or getattr(cls, "acts_on", "") == "spectrum"

@@ -24,6 +24,7 @@ from ..errors import (
     UnknownNameError,
     named_units,
 )
+from ..notebook import OneLine
 from ..resources import list_resources, read_table, read_yaml
 
 __all__ = ["Atmosphere", "Bandpass", "bandpass_names"]
@@ -80,8 +81,8 @@ class Atmosphere:
 
 
 @named_units
-@dataclass(frozen=True, eq=False)
-class Bandpass:
+@dataclass(frozen=True, eq=False, repr=False)
+class Bandpass(OneLine):
     """Filter and optics without detector and air.
 
     Attributes

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError, printable_name
+from ..notebook import OneLine
 from ..resources import first_line, list_resources, read_table, read_user_yaml, read_yaml
 from .detector import Amplifier, Detector, RawSegment
 
@@ -30,8 +31,8 @@ READOUT_FROM_LSSTCAM = "median of LSSTCam"
 """Value of ``readout`` in a camera's YAML file for sensors whose own readout is not published."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Camera:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Camera(OneLine):
     """A set of detectors under one name.
 
     Attributes

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from ..errors import InputError, UnknownNameError, named_units
+from ..notebook import OneLine
 
 __all__ = ["Amplifier", "Detector", "RawSegment"]
 
@@ -85,8 +86,8 @@ class Amplifier:
 
 
 @named_units
-@dataclasses.dataclass(frozen=True)
-class Detector:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Detector(OneLine):
     """One sensor.
 
     Attributes

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from ..errors import InputError, OutOfRangeError, named_units
+from ..notebook import OneLine
 from ..resources import read_table
 
 __all__ = ["AirglowField", "NightHistory", "StochasticNight", "join_nights", "random_nights"]
@@ -19,8 +20,8 @@ FloatArray = NDArray[np.float64]
 
 
 @named_units
-@dataclass(frozen=True, eq=False)
-class NightHistory:
+@dataclass(frozen=True, eq=False, repr=False)
+class NightHistory(OneLine):
     """Relative intensity of the OH bands at several times.
 
     Bands with the same upper vibrational level vary alike, because their lines leave the same level; between

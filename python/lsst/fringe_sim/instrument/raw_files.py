@@ -21,7 +21,7 @@ _ENDINGS = f"one that ends in {', '.join(SUFFIXES)}, or the file itself as PATH"
 _LIKE_FITS = re.compile(r"[^.].*\.(fits|fit|fts)(\.(gz|fz|bz2|xz|zip|z))?", re.IGNORECASE)
 
 
-def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[str]]:
+def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[InputError]]:
     """Find the files that are meant.
 
     Parameters
@@ -33,21 +33,21 @@ def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[str]]:
     -------
     files : `list` [`str`]
         Absolute paths, sorted, each once.
-    refused : `list` [`str`]
-        One message for each path that leads to no file, and for each file of a directory that is named like a FITS
+    refused : `list` [`InputError`]
+        One for each path that leads to no file, and for each file of a directory that is named like a FITS
         file, but not as those that are taken from one.
     """
     files: set[str] = set()
-    refused = []
+    refused: list[InputError] = []
     for path in paths:
         found = list(_expand(path))
         if not found:
             allowed = (
                 f"a file, a directory that holds {'/'.join(SUFFIXES)} files, or a pattern that matches some"
             )
-            refused.append(str(InputError("path", path, allowed)))
+            refused.append(InputError("path", path, allowed))
         files.update(str(file.absolute()) for file in found)
-        refused += [str(InputError("name", str(other), _ENDINGS)) for other in _left_out(Path(path))]
+        refused += [InputError("name", str(other), _ENDINGS) for other in _left_out(Path(path))]
     return sorted(files), refused
 
 

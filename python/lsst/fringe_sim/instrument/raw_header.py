@@ -18,8 +18,10 @@ __all__ = ["DeclaredHeader", "header_value"]
 _DECLARED = frozenset(keyword.name for keyword in RAW_KEYWORDS)
 
 
-def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[str] = _DECLARED) -> Any:
-    """Value of a keyword; `None` if it is absent, undefined or blank. ``declared``: those that may be asked for.
+def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[str] | None = None) -> Any:
+    """Value of a keyword; `None` if it is absent, undefined or blank.
+
+    ``declared``: those that may be asked for; by default those of raw frames.
 
     Raises
     ------
@@ -28,7 +30,7 @@ def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[st
     LookupError
         The keyword is not declared: a fault of the program.
     """
-    if keyword not in declared:
+    if keyword not in (_DECLARED if declared is None else declared):
         raise LookupError(f"{keyword} is not declared")
     try:
         value = header.get(keyword)
@@ -66,15 +68,15 @@ class DeclaredHeader:
         The header.
     source : `str`
         The file.
-    declared : `frozenset` [`str`]
-        Keywords that may be asked for.
+    declared : `frozenset` [`str`], optional
+        Keywords that may be asked for; by default those of raw frames.
     others : `tuple` of mappings
         Headers of other HDUs, which may state a keyword too, but not differently.
     """
 
     cards: Mapping[str, Any]
     source: str
-    declared: frozenset[str] = _DECLARED
+    declared: frozenset[str] | None = None
     others: tuple[Mapping[str, Any], ...] = ()
 
     def value(self, keyword: str) -> Any:

@@ -45,7 +45,7 @@ WAVELENGTH_ACCURACY_NM = 0.5
 
 
 @named_units
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Setup(InNotebook):
     """Sensor, temperature and light of one instrument or test stand.
 
@@ -162,6 +162,10 @@ class Setup(InNotebook):
             meant = " or ".join([f"a set-up for {vendor}", *others])
             allowed = f"one of {own}, which set-up {self.name} is for; or {meant}"
             raise InputError("sensor", f"{name} of {vendor}", allowed, source=source)
+
+    def __repr__(self) -> str:
+        """Name and description; `facts` has the numbers."""
+        return f"Setup({self.name!r}, {self.title!r})"
 
     def facts(self) -> dict[str, Any]:
         """Sensor, temperature and light, with units."""

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError, named_units
+from ..notebook import OneLine
 from ..resources import read_table
 from .oh_levels import SECOND_RADIATION_CM_K, RotationalLevels, boltzmann
 
@@ -60,8 +61,8 @@ _SOLAR_TEMPERATURE_K = 5900.0
 
 
 @named_units
-@dataclass(frozen=True, eq=False)
-class EmissionLines:
+@dataclass(frozen=True, eq=False, repr=False)
+class EmissionLines(OneLine):
     """Airglow lines.
 
     Attributes
@@ -261,8 +262,8 @@ class ContinuumTerm:
 
 
 @named_units
-@dataclass(frozen=True, eq=False)
-class SpectralComponent:
+@dataclass(frozen=True, eq=False, repr=False)
+class SpectralComponent(OneLine):
     """Light of one origin as it reaches the sensor; only its level changes during a night.
 
     Attributes
@@ -280,8 +281,8 @@ class SpectralComponent:
     photons: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class SkySpectrum:
+@dataclass(frozen=True, eq=False, repr=False)
+class SkySpectrum(OneLine):
     """Lines and continua of one moment.
 
     Attributes

@@ -136,7 +136,8 @@ def ingest_raws(
     """
     paths = [str(path) for path in paths]
     refuse_unfinished(paths)
-    files, refused = find_raw_files(paths)
+    files, unusable = find_raw_files(paths)
+    refused = [str(error) for error in unusable]
     registered = _registered_instruments(butler)
     usable: list[RawExposure] = []
     for file in files:

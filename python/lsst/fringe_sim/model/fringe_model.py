@@ -46,7 +46,7 @@ PHASE_MEAN_SAMPLES = 256
 """Thicknesses over which the phase average is taken; the fringe harmonics are below 1e-12 beyond the 20th."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FringeModel(InNotebook):
     """Response of a sensor, with effects.
 
@@ -132,6 +132,11 @@ class FringeModel(InNotebook):
         return replace(
             self, setup=setup, base_system=replace(self.base_system, laboratory_temperature_k=kelvin)
         )
+
+    def __repr__(self) -> str:
+        """Name of the set-up, and the effects."""
+        effects = f", effects={self.effect_settings}" if self.effects else ""
+        return f"FringeModel({self.setup.name!r}{effects})"
 
     def facts(self) -> dict[str, Any]:
         """Those of the set-up, and the effects."""

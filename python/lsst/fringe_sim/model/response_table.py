@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 
 from ..compiled import contiguous, kernel, run_shares
 from ..errors import ConvergenceError, InputError, OutOfRangeError, named_units
+from ..notebook import OneLine
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
 
@@ -34,8 +35,8 @@ _REFINEMENTS = 6
 
 
 @named_units
-@dataclass(frozen=True, eq=False)
-class ResponseTable:
+@dataclass(frozen=True, eq=False, repr=False)
+class ResponseTable(OneLine):
     """Response on a uniform grid of thickness, interpolated by a cubic spline.
 
     Attributes

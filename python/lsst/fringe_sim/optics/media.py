@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import OutOfRangeError, ResourceError, UnknownNameError, named_units
+from ..notebook import OneLine
 from ..resources import read_table, read_yaml
 
 if TYPE_CHECKING:
@@ -35,8 +36,8 @@ WARM_TABLE = "nk_Si_green2008.ecsv"
 
 
 @named_units
-@dataclass(frozen=True)
-class Medium:
+@dataclass(frozen=True, repr=False)
+class Medium(OneLine):
     """A homogeneous, isotropic optical medium.
 
     Attributes

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, ResourceError, StackError, UnknownNameError, named_units
+from ..notebook import OneLine
 from ..resources import list_resources, read_yaml
 from .media import Medium, get_medium
 
@@ -16,8 +17,8 @@ __all__ = ["Layer", "LayerStack"]
 
 
 @named_units
-@dataclass(frozen=True)
-class Layer:
+@dataclass(frozen=True, repr=False)
+class Layer(OneLine):
     """One plane-parallel layer.
 
     Attributes
@@ -40,8 +41,8 @@ class Layer:
     thickness_spread_um: float = 0.0
 
 
-@dataclass(frozen=True)
-class LayerStack:
+@dataclass(frozen=True, repr=False)
+class LayerStack(OneLine):
     """Layers in the order in which the light meets them.
 
     Attributes

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError, named_units
+from ..notebook import OneLine
 from .diffuse import DiffuseReturn
 from .illumination import DEFAULT_STEP_NM, Beam, Illumination, LampSpectrum, SpectralProfile
 from .phase_response import PhaseResponse, reduce_to_phase
@@ -31,8 +32,8 @@ class Structure:
 
 
 @named_units
-@dataclass(frozen=True)
-class OpticalSystem:
+@dataclass(frozen=True, repr=False)
+class OpticalSystem(OneLine):
     """Stack, illumination and observable.
 
     Attributes

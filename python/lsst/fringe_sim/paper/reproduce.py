@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from astropy.table import Table
 
+from ..notebook import do_nothing
 from . import coadds, laboratory, optics, sky, stack
 from .published import Finding, published_number
 from .section import COLD_SILICON, Context, Section
@@ -128,8 +129,8 @@ def findings_table(findings: Sequence[Finding]) -> Table:
 
 def reproduce(
     context: Context,
-    sections: Sequence[Callable[[Context], Section]] = SECTIONS,
-    advance: Callable[[], None] = lambda: None,
+    sections: Sequence[Callable[[Context], Section]] | None = None,
+    advance: Callable[[], None] = do_nothing,
 ) -> Reproduction:
     """Recompute the paper.
 
@@ -138,13 +139,13 @@ def reproduce(
     context : `Context`
         Thickness maps, sizes, and where published curves are.
     sections : sequence of callables, optional
-        Recomputations.
+        Recomputations; `SECTIONS` by default.
     advance : callable, optional
         Called after each section.
     """
     made, findings = [], []
     cold_context = replace(context, silicon=COLD_SILICON)
-    for compute in sections:
+    for compute in SECTIONS if sections is None else sections:
         section = compute(context)
         made.append(section)
         cold = compute(cold_context).values if compute in WITH_COLD_SILICON else {}

@@ -35,8 +35,9 @@ __all__ = [
     "check_noted",
 ]
 
-_NEEDED = object()
-"""Stands for no default: a header must have the keyword."""
+
+class _NEEDED:
+    """Stands for no default: a header must have the keyword."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +276,8 @@ class FitsProduct(InNotebook, ABC):
         """Shape of its images, its numbers and names, and the share of the pixels that is masked."""
         shown: dict[str, Any] = {"shape": " × ".join(map(str, getattr(self, self.EXTENSIONS[0].field).shape))}
         for card, value in self._told():
-            shown[card.what or card.field] = f"{value:g} {card.unit}" if card.unit else value
+            number = f"{value:.4g}" if isinstance(value, float) else value
+            shown[card.what or card.field] = f"{number} {card.unit}" if card.unit else number
         mask: NDArray[Any] = getattr(self, "mask")  # noqa: B009
         return {**shown, "masked": f"{100.0 * np.mean(mask != 0):.3g} %"}
 

@@ -11,6 +11,7 @@ from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FrameFormatError, InputError, OutOfRangeError, named_units, without_unit
+from ..notebook import OneLine
 from . import _check as check
 from . import _fits as io
 from .fits_product import Extension
@@ -19,8 +20,8 @@ __all__ = ["ExposureTable", "FlatExposures"]
 
 
 @named_units
-@dataclass(frozen=True, eq=False)
-class FlatExposures:
+@dataclass(frozen=True, eq=False, repr=False)
+class FlatExposures(OneLine):
     """How each plane of a cube was illuminated.
 
     Parameters

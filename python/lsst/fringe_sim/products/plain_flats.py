@@ -16,6 +16,7 @@ from ..instrument.raw_header import DeclaredHeader
 from ..instrument.raw_layout import Section
 from ..instrument.raw_metadata import TEMPERATURE_RANGE_C, WAVELENGTH_RANGE_NM, ZERO_CELSIUS_K
 from ..instrument.stated_facts import SAME_CELSIUS, SETTING_NM, Fact, refuse_other_filter
+from ..notebook import do_nothing
 from ..resources import complete_fits
 from .file_keywords import SENSOR_NAMES, declared_names
 from .fringe_cube import FringeCube
@@ -170,8 +171,8 @@ def stack_plain_flats(
     bandwidth_fwhm_nm: float,
     f_number: float,
     detector: str = "",
-    advance: Callable[[], None] = lambda: None,
-    note: Callable[[str], None] = lambda line: None,
+    advance: Callable[[], None] = do_nothing,
+    note: Callable[[str], None] = do_nothing,
 ) -> FringeCube:
     """See `read_plain_flats`. ``note``: takes a line that names copies; ``advance``: called after each image."""
     flats = sorted(

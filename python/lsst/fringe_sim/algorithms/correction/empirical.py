@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, UndeterminedError
+from ...notebook import do_nothing
 from .background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .denoise import shrink_noise
 from .objects import fit_frame
@@ -110,7 +111,7 @@ def fit_templates(
     frames: Sequence[Callable[[], tuple[NDArray[Any], NDArray[np.float32]]]],
     options: TemplateOptions | None = None,
     prior: Sequence[NDArray[np.float32]] = (),
-    advance: Callable[[], None] = lambda: None,
+    advance: Callable[[], None] = do_nothing,
 ) -> ObservedTemplates:
     """Find the fringes that frames of one sensor share.
 

@@ -14,6 +14,7 @@ from astropy.table import Table
 from ...errors import named_units
 from ...files import table_text, write_together
 from ...model.effects_override import effects_override
+from ...notebook import InNotebook
 
 __all__ = [
     "Gap",
@@ -88,6 +89,13 @@ class NamedEffect:
     share: float = 1.0
     significance: float = math.nan
 
+    def values_text(self) -> str:
+        """Values with their standard deviations and units, for people."""
+        values = (
+            f"{name} = {p.value:.6g} ± {p.sigma:.2g} {p.unit}".rstrip() for name, p in self.parameters.items()
+        )
+        return ", ".join(values)
+
 
 @named_units
 @dataclass(frozen=True)
@@ -139,8 +147,8 @@ class Step:
     consistent: bool
 
 
-@dataclass(frozen=True)
-class Verdict:
+@dataclass(frozen=True, repr=False)
+class Verdict(InNotebook):
     """Outcome of a search.
 
     Attributes
@@ -185,6 +193,24 @@ class Verdict:
     data: dict[str, Any] = field(default_factory=dict)
     complete: bool = True
     size: dict[str, float] = field(default_factory=lambda: dict.fromkeys(_SIZES, math.nan))
+
+    def __repr__(self) -> str:
+        """What was found, and with which set-up."""
+        found = f", {self.settings}" if self.effects else ""
+        return f"Verdict({self.verdict!r}{found}, setup={self.setup!r})"
+
+    def facts(self) -> dict[str, str]:
+        """What was found, with values and probabilities, and how large the disagreement is."""
+        shown = {
+            "verdict": self.verdict if self.complete else f"{self.verdict}, of a search that was stopped"
+        }
+        shown["set-up"] = self.setup
+        for effect in self.effects:
+            shown[effect.name] = f"{effect.values_text()}; probability {probability_text(effect.probability)}"
+        if math.isfinite(self.size["of_counts"]):
+            what, _, size = self.size_text().partition(": ")
+            shown[what] = size
+        return shown
 
     @property
     def settings(self) -> dict[str, float]:
@@ -331,10 +357,7 @@ class Verdict:
         if math.isfinite(self.size["of_counts"]):
             lines.append(f"  {self.size_text()}")
         for effect in self.effects:
-            values = ", ".join(
-                f"{name} = {p.value:.6g} ± {p.sigma:.2g} {p.unit}".rstrip()
-                for name, p in effect.parameters.items()
-            )
+            values = effect.values_text()
             lines.append(f"  {effect.name}: {values}  (probability {probability_text(effect.probability)})")
             if effect.ambiguous_with:
                 lines.append(f"    these data cannot tell it from: {', '.join(effect.ambiguous_with)}")

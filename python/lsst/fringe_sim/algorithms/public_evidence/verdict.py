@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ...errors import InputError
+from ...notebook import do_nothing
 from ..discovery.options import SearchOptions
 from .joint import Axis, JointFit, Predictor, parse_set
 from .kinds import (
@@ -194,22 +195,22 @@ class Comparison:
 
 
 def compare(
-    sets: Sequence[Sequence[str]] = RIVALS,
+    sets: Sequence[Sequence[str]] | None = None,
     kinds: Sequence[Kind] | None = None,
-    advance: Callable[[], None] = lambda: None,
+    advance: Callable[[], None] = do_nothing,
 ) -> Comparison:
     """Compare sets of effects, and none at all, on all public data.
 
     Parameters
     ----------
-    sets : sequence of sequences of `str`
-        Effects, or single parameters as ``effect.parameter``.
+    sets : sequence of sequences of `str`, optional
+        Effects, or single parameters as ``effect.parameter``; `RIVALS` by default.
     kinds : sequence of `Kind`, optional
         Data; `public_kinds` by default.
     advance : callable, optional
         Called after each set.
     """
-    wanted = [parse_set(names) for names in ((), *sets)]
+    wanted = [parse_set(names) for names in ((), *(RIVALS if sets is None else sets))]
     predictor = Predictor(public_kinds() if kinds is None else kinds)
     _refuse_unfelt({axis.key: axis for axes in wanted for axis in axes}, predictor)
     fits = []
