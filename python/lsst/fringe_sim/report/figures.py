@@ -21,6 +21,7 @@ from ..style import (
     DIVERGING,
     LINES,
     SEQUENTIAL,
+    TITLE_PLACE,
     block_mean,
     figure,
     finite_range,
@@ -186,7 +187,7 @@ def phase_figure(
             panel.plot(
                 phase, PERCENT * modelled, "-", lw=1, color=LINES[1], label="model at the fitted thickness"
             )
-            panel.set_title(f"{wavelength:g} nm")
+            panel.set_title(f"{wavelength:g} nm", y=TITLE_PLACE)
         panels[0].legend(fontsize=7)
         width, height = made.get_size_inches()
         made.supxlabel("thickness over one fringe order [1]", y=0.07 / height, va="bottom")
