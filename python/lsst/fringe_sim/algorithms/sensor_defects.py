@@ -84,7 +84,8 @@ def _is_far_from_cross(
     most, least = ([np.where(good[at], image[at], none) for at in beside] for none in (-np.inf, np.inf))
     # Of two pairs, the second highest of all is the lower of the highest ones, or the higher of the lowest ones.
     highest, lowest = (
-        [np.maximum(each[k], each[k + 1]) for k in (0, 2)] + [np.minimum(each[k], each[k + 1]) for k in (0, 2)]
+        [np.maximum(each[k], each[k + 1]) for k in (0, 2)]
+        + [np.minimum(each[k], each[k + 1]) for k in (0, 2)]
         for each in (most, least)
     )
     high2 = np.maximum(np.minimum(*highest[:2]), np.maximum(*highest[2:]))
