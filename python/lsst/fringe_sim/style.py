@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import functools
 import io
-import os
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Literal
 
 import matplotlib
@@ -20,8 +18,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
-from .files import write_whole
-
 __all__ = [
     "DIVERGING",
     "LINES",
@@ -32,7 +28,6 @@ __all__ = [
     "figure",
     "finite_range",
     "gallery",
-    "save_figure",
     "show_image",
     "to_png",
 ]
@@ -169,11 +164,6 @@ def to_png(made: Figure) -> bytes:
         buffer, metadata={"Software": None}, pil_kwargs={"compress_type": zlib.Z_RLE}
     )
     return buffer.getvalue()
-
-
-def save_figure(made: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write the figure as PNG; an existing file is replaced when the new one is complete."""
-    return write_whole(path, to_png(made))
 
 
 def _thin(values: NDArray[np.float64], most_px: int) -> NDArray[np.float64]:

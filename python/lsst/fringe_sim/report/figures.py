@@ -208,7 +208,8 @@ def sky_figure(frames: Sequence[SkyFringe]) -> Figure:
             label="sky / mean - 1 [%]",
             title=f"{first.detector} {first.physical_filter}, {first.hour % 24.0:g} h, {first.exposure_s:g} s",
         )
-        for frame in (frames[0], frames[len(frames) // 2], frames[-1]):
+        for number in sorted({0, len(frames) // 2, len(frames) - 1}):
+            frame = frames[number]
             values = PERCENT * _fraction(frame)[frame.mask == 0]
             middle.hist(values, bins=120, histtype="step", density=True, label=f"{frame.hour % 24.0:g} h")
         middle.set_xlabel("sky / mean - 1 [%]")
