@@ -329,7 +329,7 @@ def _evidence_row(  # type: ignore[no-untyped-def]
         if np.isfinite(centre[c]):
             low = _first_from(place, centre[c] - (reach + 0.5) * order)
             high = max(_first_from(place, centre[c] + (reach + 0.5) * order), low + 2)
-            low = max(min(low, count - 2), 0)
+            low = max(min(low, count - 2), 0)  # type: ignore[arg-type]
             high = min(high, count)
         while True:  # of one call the code is there once
             used, number, at = _search(
