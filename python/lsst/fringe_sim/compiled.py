@@ -41,8 +41,6 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 _LOG = logging.getLogger(__name__)
 
