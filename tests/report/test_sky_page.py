@@ -62,3 +62,13 @@ def test_residuals_are_averaged_without_the_masked(tmp_path) -> None:
     panels = [axes for axes in made.axes if axes.images]
     assert [axes.get_title() for axes in panels] == ["880 nm", "930 nm", "980 nm"]
     assert panels[0].images[0].get_extent() == [-0.5, 239.5, -0.5, 219.5]
+
+
+def test_panels_of_a_gallery_have_ticks_where_none_is_beside_them() -> None:
+    left = np.random.default_rng(0).normal(0, 0.01, (8, 20, 20))
+    panels = [axes for axes in residuals_figure(left, list(range(880, 960, 10))).axes if axes.images]
+    with_rows = [number for number, axes in enumerate(panels) if axes.yaxis.get_visible()]
+    with_columns = [number for number, axes in enumerate(panels) if axes.xaxis.get_visible()]
+    assert with_rows == [0, 6]
+    assert with_columns == [2, 3, 4, 5, 6, 7]
+    assert len({(*axes.get_xlim(), *axes.get_ylim()) for axes in panels}) == 1

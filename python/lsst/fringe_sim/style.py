@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import io
-import os
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Literal
 
 import matplotlib
@@ -18,18 +18,16 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
-from .files import write_whole
-
 __all__ = [
     "DIVERGING",
     "LINES",
     "MOST_PIXELS",
     "SEQUENTIAL",
+    "TITLE_PLACE",
     "block_mean",
     "figure",
     "finite_range",
     "gallery",
-    "save_figure",
     "show_image",
     "to_png",
 ]
@@ -41,6 +39,9 @@ LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000
 
 BETWEEN_COLUMNS = 0.06
 """Space between the panels of a gallery, in their widths."""
+
+TITLE_PLACE = 1.0
+"""Height of titles in axes without ticks above. Where it is not given, matplotlib looks at every tick for it."""
 
 MOST_PIXELS = 600
 """Images are averaged down to about this many pixels a side before drawing."""
@@ -72,7 +73,7 @@ def figure(
 def gallery(
     made: Figure, count: int, most_columns: int, margins: tuple[float, float, float, float], gap: float
 ) -> list[Axes]:
-    """Equal panels with common axes, as many as are wanted, in a figure without a layout.
+    """Equal panels with common axes, in a figure without a layout; ticks are on the outer ones only.
 
     What a solver finds for dozens of panels after seconds is known beforehand where all are alike.
 
@@ -93,10 +94,15 @@ def gallery(
         wspace=BETWEEN_COLUMNS,
         hspace=gap / up,
     )
-    panels = np.ravel(np.asarray(grid.subplots(sharex=True, sharey=True)))
-    for panel in panels[count:]:
-        panel.set_visible(False)
-    return list(panels[:count])
+    panels: list[Axes] = []
+    for place in range(count):
+        first = panels[0] if panels else None
+        panel = made.add_subplot(grid[divmod(place, columns)], sharex=first, sharey=first)
+        # Ticks that a panel beside has too would take most of the time.
+        panel.xaxis.set_visible(place + columns >= count)
+        panel.yaxis.set_visible(place % columns == 0)
+        panels.append(panel)
+    return panels
 
 
 def finite_range(
@@ -141,7 +147,7 @@ def show_image(
     drawn = axes.imshow(
         thin, cmap=cmap, vmin=low, vmax=high, extent=(-0.5, nx - 0.5, -0.5, ny - 0.5), aspect="equal"
     )
-    axes.set_title(title)
+    axes.set_title(title, y=TITLE_PLACE)
     axes.set_xlabel("column [px]")
     axes.set_ylabel("row [px]")
     if colorbar:
@@ -152,14 +158,12 @@ def show_image(
 def to_png(made: Figure) -> bytes:
     """The figure as PNG without time stamps."""
     buffer = io.BytesIO()
-    # `Figure.savefig` would draw everything once more for the sake of the layout.
-    FigureCanvasAgg(made).print_png(buffer, metadata={"Software": None})
+    # `Figure.savefig` would draw everything once more for the sake of the layout. Images with noise are packed in
+    # less than half of the time, and 4 % larger, if nothing is looked for in them but runs.
+    FigureCanvasAgg(made).print_png(
+        buffer, metadata={"Software": None}, pil_kwargs={"compress_type": zlib.Z_RLE}
+    )
     return buffer.getvalue()
-
-
-def save_figure(made: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write the figure as PNG; an existing file is replaced when the new one is complete."""
-    return write_whole(path, to_png(made))
 
 
 def _thin(values: NDArray[np.float64], most_px: int) -> NDArray[np.float64]:
@@ -172,7 +176,13 @@ def block_mean(values: NDArray[np.float64], block: int) -> NDArray[np.float64]:
     if block == 1:
         return values
     ny, nx = (size // block * block for size in values.shape)
-    blocks = values[:ny, :nx].reshape(ny // block, block, nx // block, block)
-    count = np.isfinite(blocks).sum(axis=(1, 3))
-    total = np.nansum(blocks, axis=(1, 3))
+    values = values[:ny, :nx]
+    known = np.isfinite(values)
+
+    def summed(plane: NDArray[Any]) -> NDArray[Any]:  # a few long sums take less time than many short ones
+        rows = functools.reduce(np.add, (plane[k::block] for k in range(block)))
+        columns: NDArray[Any] = functools.reduce(np.add, (rows[:, k::block] for k in range(block)))
+        return columns
+
+    total, count = summed(np.where(known, values, 0.0)), summed(known.astype(np.int32))
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)

@@ -87,8 +87,13 @@ def relative_flats(cube: FringeCube) -> FloatArray:
     -------
     relative : `numpy.ndarray`, shape ``(W, ny, nx)``
     """
-    image = np.where(cube.mask == 0, np.asarray(cube.image, dtype=float), np.nan)
-    return image / _plane_mean(image) - 1.0
+    relative = np.full(cube.shape, np.nan)
+    for plane, (image, mask) in enumerate(zip(cube.image, cube.mask, strict=True)):
+        good = (mask == 0) & np.isfinite(image)
+        if good.any():
+            np.divide(image, np.mean(image, where=good, dtype=float), out=relative[plane], where=good)
+    relative -= 1.0
+    return relative
 
 
 @named_units
@@ -202,10 +207,3 @@ def residual_pair(cube: FringeCube, model: FringeModel, verdict: Verdict) -> Res
     except InputError:
         return None
     return ResidualPair(before, after, float(model.fringe_order_um(float(np.median(cube.wavelength_nm)))))
-
-
-def _plane_mean(image: FloatArray) -> FloatArray:
-    """Mean of each plane over its numbers, shape ``(W, 1, 1)``; NaN for a plane without any."""
-    count = np.isfinite(image).sum(axis=(1, 2), keepdims=True)
-    total = np.nansum(image, axis=(1, 2), keepdims=True)
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)

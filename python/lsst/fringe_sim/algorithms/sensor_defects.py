@@ -46,6 +46,8 @@ def isolated_defects(
     for start in range(1, ny - 1, _BAND_ROWS):
         rows = slice(start, min(start + _BAND_ROWS, ny - 1))
         y, x = _candidates(image, variance, good, options.defect_sigma, rows)
+        far = _is_far_from_cross(image, variance, good, options.defect_sigma, y, x)
+        y, x = y[far], x[far]
         isolated = _is_isolated(image, variance, good, options, y, x)
         defect[y[isolated], x[isolated]] = True
     return defect
@@ -66,6 +68,31 @@ def _candidates(
     beyond = np.maximum(high, low)
     y, x = np.nonzero((beyond**2 > 0.25 * sigma**2 * variance[rows, 1:-1]) & good[rows, 1:-1])
     return y + rows.start, x + 1
+
+
+def _is_far_from_cross(
+    image: Image,
+    variance: Image,
+    good: NDArray[np.bool_],
+    sigma: float,
+    y: NDArray[np.intp],
+    x: NDArray[np.intp],
+) -> NDArray[np.bool_]:
+    """Whether pixels are far enough from all but one of the good neighbours along x and y, which is necessary too."""
+    beside = (y, x - 1), (y, x + 1), (y - 1, x), (y + 1, x)
+    value = image[y, x].astype(np.float64)
+    most, least = ([np.where(good[at], image[at], none) for at in beside] for none in (-np.inf, np.inf))
+    # Of two pairs, the second highest of all is the lower of the highest ones, or the higher of the lowest ones.
+    highest, lowest = (
+        [np.maximum(each[k], each[k + 1]) for k in (0, 2)]
+        + [np.minimum(each[k], each[k + 1]) for k in (0, 2)]
+        for each in (most, least)
+    )
+    high2 = np.maximum(np.minimum(*highest[:2]), np.maximum(*highest[2:]))
+    low2 = np.minimum(np.minimum(*lowest[:2]), np.maximum(*lowest[2:]))
+    beyond = np.maximum(value - high2, low2 - value)
+    # The noise of the neighbours is that of the pixel, less at most the root of how far it is from them.
+    return beyond * (beyond + sigma**2) > sigma**2 * variance[y, x]
 
 
 def _is_isolated(

@@ -33,7 +33,6 @@ from ..report.figures import (
 from ..report.page import Report
 from ..report.sky_page import COADDS_CAPTION, COADDS_TEXT, sky_amplitudes
 from ..report.thickness_page import phase_folded, residual_of_fit, residual_table
-from ..style import save_figure
 
 __all__ = ["DemoDatasets", "write_demo_report"]
 
@@ -86,8 +85,7 @@ def write_demo_report(folder: Path, datasets: DemoDatasets) -> None:
     figures.mkdir(exist_ok=True)
 
     def add(name: str, made: Any, caption: str) -> None:
-        save_figure(made, figures / f"{name}.png")
-        report.figure(made, caption)
+        report.figure(made, caption, figures / f"{name}.png")
 
     model = FringeModel.from_setup("ts8_e2v")
     wavelength = [float(w) for w in datasets.cube.wavelength_nm]

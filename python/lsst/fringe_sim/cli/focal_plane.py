@@ -32,9 +32,7 @@ from ..instrument.night import NightHistory, random_nights
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel, Setup
 from ..products.thickness_map import thickness_span_um
-from ..report.figures import focal_plane_figure
 from ..report.focal_plane_page import write_focal_plane_page
-from ..style import save_figure
 from .inputs import read_settings, read_thickness, sky_settings
 from .output import OutputFolder, output_folder
 from .parameters import effects_file_option
@@ -151,14 +149,11 @@ def focal_plane(
                 advance()
     cells, summary = _gather(tables)
     write_together(folder, {"cells.ecsv": table_text(cells), "focal_plane.ecsv": table_text(summary)})
-    drawn = focal_plane_figure(cells, summary)
-    save_figure(drawn, folder / "focal_plane.png")
-    page = folder / "report.html"
-    lines = write_focal_plane_page(page, drawn, summary, airmass, nights, len(measured))
+    lines = write_focal_plane_page(folder, cells, summary, airmass, nights, len(measured))
     for line in lines:
         click.echo(line)
     click.echo(str(folder))
-    click.echo(str(page))
+    click.echo(str(folder / "report.html"))
 
 
 def _chosen(names: Iterable[str]) -> list[Detector]:

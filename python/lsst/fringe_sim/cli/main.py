@@ -5,6 +5,7 @@ Exit status: 0 done, 1 bad input, 2 usage, 3 internal failure, 130 stopped by Ct
 
 from __future__ import annotations
 
+import gc
 import importlib
 import io
 import logging
@@ -19,6 +20,9 @@ from .. import __version__
 from ..errors import LONGEST_MESSAGE, FringeSimError, UnknownNameError, shown
 
 __all__ = ["cli", "main"]
+
+MOST_NEW_OBJECTS = 10_000
+"""Objects after which Python looks for unused ones."""
 
 EXIT_BAD_INPUT = 1
 EXIT_USAGE = 2
@@ -128,6 +132,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Threads that wait for work by spinning keep a second command on the same machine from its processors. OpenMP
     # reads this when it is loaded, with the first compiled loop.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # So many objects live as long as the command that looking for unused ones among them takes a second.
+    gc.set_threshold(MOST_NEW_OBJECTS)
     # A terminal that knows no σ gets an escape for it: no command that has done its work ends in an error over that.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

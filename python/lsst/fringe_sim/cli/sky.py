@@ -131,9 +131,7 @@ def sky(
     """
     from ..instrument.flat_spectrum import FlatSpectrum
     from ..instrument.night import NightHistory
-    from ..report.figures import sky_figure
     from ..report.sky_page import write_sky_report
-    from ..style import save_figure
     from .inputs import sky_settings
 
     _check_exposure(exptime, night)
@@ -176,8 +174,9 @@ def sky(
     made = _written(series, scales, folder / f"sky_{sensor.name}", cards, section)
     if templates:
         _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
-    save_figure(sky_figure(made), folder / "sky.png")
-    page = write_sky_report(folder / "report.html", made, setup.name, seed, places)
+    page = write_sky_report(
+        folder / "report.html", made, setup.name, seed, places, picture=folder / "sky.png"
+    )
     for frame in made:
         click.echo(_describe(frame))
     if "PHASERMS" in made[0].metadata:

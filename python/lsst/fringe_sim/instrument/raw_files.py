@@ -8,6 +8,8 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import InputError
 from .raw_frame import RawFrame
 
@@ -63,7 +65,7 @@ def pixel_digest(frame: RawFrame) -> str:
     """Digest of all pixels: equal for the same light in a copy, compressed or not, whatever its header says."""
     digest = hashlib.blake2b(digest_size=16)
     for amp in frame.amplifiers:
-        digest.update(amp.data.astype("<i4").tobytes())
+        digest.update(np.ascontiguousarray(amp.data, "<i4").data)
     return digest.hexdigest()
 
 

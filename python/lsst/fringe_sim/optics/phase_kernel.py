@@ -79,9 +79,14 @@ def _reduce_share(
         for layer in range(1, count - 1):
             length = 0.0 if layer == varying else thickness[layer]
             travel[layer] = _travelled((2.0 * np.pi / wave * length) * normal[layer] + 0.5 * phase[layer])
-        _sweep(down, up, travel, top, varying, one, seen, lit)
-        reflect_up = _sweep(up, down, travel, varying, top, -one, seen, back)
-        reflect_low = _sweep(down, up, travel, varying, count - one, one, seen, low)
+        reflect_up, reflect_low = 0j, 0j
+        for way in range(3):  # from the top, to the top and to the bottom; the code of one call is there once
+            along, against = (up, down) if way == 1 else (down, up)
+            start = top if way == 0 else varying
+            end = varying if way == 0 else (top if way == 1 else count - one)
+            step = -one if way == 1 else one
+            reflect_up = reflect_low
+            reflect_low = _sweep(along, against, travel, start, end, step, seen, room[4 + way])
         entering = lit[0, varying]
         coupling = entering * reflect_low
         g[node] = -reflect_up * reflect_low

@@ -360,8 +360,11 @@ class _Stack:
         plane = len(self.rows)
         if plane == len(self.image):
             raise InputError("flats", f"more than {plane}", f"{plane}, as announced")
-        self.image[plane] = np.nan_to_num(flat.image + np.float32(1), nan=1, posinf=1, neginf=1)
-        self.variance[plane] = np.nan_to_num(flat.variance, nan=0, posinf=0, neginf=0)
+        np.add(flat.image, np.float32(1), out=self.image[plane])
+        self.variance[plane] = flat.variance
+        for values, instead in ((self.image[plane], 1.0), (self.variance[plane], 0.0)):
+            if not (known := np.isfinite(values)).all():
+                values[~known] = instead
         self._add_mask(plane, flat.mask)
         self.metadata = {
             keyword: value

@@ -21,6 +21,7 @@ from ..style import (
     DIVERGING,
     LINES,
     SEQUENTIAL,
+    TITLE_PLACE,
     block_mean,
     figure,
     finite_range,
@@ -186,7 +187,7 @@ def phase_figure(
             panel.plot(
                 phase, PERCENT * modelled, "-", lw=1, color=LINES[1], label="model at the fitted thickness"
             )
-            panel.set_title(f"{wavelength:g} nm")
+            panel.set_title(f"{wavelength:g} nm", y=TITLE_PLACE)
         panels[0].legend(fontsize=7)
         width, height = made.get_size_inches()
         made.supxlabel("thickness over one fringe order [1]", y=0.07 / height, va="bottom")
@@ -207,15 +208,17 @@ def sky_figure(frames: Sequence[SkyFringe]) -> Figure:
             label="sky / mean - 1 [%]",
             title=f"{first.detector} {first.physical_filter}, {first.hour % 24.0:g} h, {first.exposure_s:g} s",
         )
-        for frame in (frames[0], frames[len(frames) // 2], frames[-1]):
+        rms = []
+        for number, frame in enumerate(frames):
             values = PERCENT * _fraction(frame)[frame.mask == 0]
-            middle.hist(values, bins=120, histtype="step", density=True, label=f"{frame.hour % 24.0:g} h")
+            rms.append(values.std())
+            if number in (0, len(frames) // 2, len(frames) - 1):
+                middle.hist(values, bins=120, histtype="step", density=True, label=f"{frame.hour % 24.0:g} h")
         middle.set_xlabel("sky / mean - 1 [%]")
         middle.set_ylabel("density")
         middle.set_title("distribution over pixels")
         middle.legend()
         hours = np.arange(len(frames))
-        rms = [PERCENT * _fraction(frame)[frame.mask == 0].std() for frame in frames]
         right.plot(hours, rms, "o-")
         right.set_xticks(hours, [f"{frame.hour % 24.0:g}" for frame in frames])
         right.set_xlabel("local time [h]")

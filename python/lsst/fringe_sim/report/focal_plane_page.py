@@ -7,21 +7,21 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
-from matplotlib.figure import Figure
 
 from ..algorithms.focal_plane import DES_CRITERION
+from .figures import focal_plane_figure
 from .page import Report
 
 __all__ = ["write_focal_plane_page"]
 
 
 def write_focal_plane_page(
-    path: Path, drawn: Figure, summary: Table, airmass: float, nights: int, measured: int
+    folder: Path, cells: Table, summary: Table, airmass: float, nights: int, measured: int
 ) -> list[str]:
-    """Write the page and return what it says in words.
+    """Write ``report.html``, and its figure beside it; return what the page says in words.
 
-    ``summary``: one row per sensor (`summary_table`). ``nights``: those that were corrected. ``measured``: sensors
-    with a map of their thickness.
+    ``cells``: as for `focal_plane_figure`. ``summary``: one row per sensor (`summary_table`). ``nights``: those that
+    were corrected. ``measured``: sensors with a map of their thickness.
     """
     lines = list(_describe(summary))
     page = Report(
@@ -33,10 +33,11 @@ def write_focal_plane_page(
     page.section("Focal plane")
     for line in lines:
         page.paragraph(line)
-    page.figure(drawn, "Strength, ratio to the shot noise, what a correction leaves, and field radius.")
+    caption = "Strength, ratio to the shot noise, what a correction leaves, and field radius."
+    page.figure(focal_plane_figure(cells, summary), caption, folder / "focal_plane.png")
     page.section("Sensors")
     page.table(_shown(summary), "focal_plane", download=summary)
-    page.write(path)
+    page.write(folder / "report.html")
     return lines
 
 

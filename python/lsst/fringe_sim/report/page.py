@@ -79,9 +79,12 @@ class Report:
         """Add lines to be typed."""
         self._body.append(f"<pre>{html.escape(text)}</pre>")
 
-    def figure(self, made: Figure, caption: str) -> None:
-        """Add a figure; a click enlarges it."""
-        data = base64.b64encode(to_png(made)).decode("ascii")
+    def figure(self, made: Figure, caption: str, file: Path | None = None) -> None:
+        """Add a figure; a click enlarges it. It is also written into a file, if one is named."""
+        picture = to_png(made)
+        if file is not None:
+            write_whole(file, picture)
+        data = base64.b64encode(picture).decode("ascii")
         text = html.escape(caption, quote=True)
         self._body.append(
             f'<figure><label class="zoom"><input type="checkbox"><img alt="{text}" '

@@ -55,11 +55,17 @@ def sky_amplitudes(frames: Sequence[SkyFringe]) -> Table:
 
 
 def write_sky_report(
-    path: Path, frames: Sequence[SkyFringe], setup: str, seed: int, places: VisitPlaces | None = None
+    path: Path,
+    frames: Sequence[SkyFringe],
+    setup: str,
+    seed: int,
+    places: VisitPlaces | None = None,
+    picture: Path | None = None,
 ) -> Path:
     """Write the page.
 
-    ``seed``: of places and angles of the coadds, where ``places`` are not given.
+    ``seed``: of places and angles of the coadds, where ``places`` are not given. ``picture``: file for its first
+    figure alone, if wanted.
     """
     first = frames[0]
     report = Report(
@@ -71,7 +77,8 @@ def write_sky_report(
     report.section(
         "Fringes", "Departure from the mean sky. Three numbers are called amplitude; all are given."
     )
-    report.figure(sky_figure(frames), "A frame, the distribution over its pixels, and the strength by time.")
+    caption = "A frame, the distribution over its pixels, and the strength by time."
+    report.figure(sky_figure(frames), caption, picture)
     report.table(sky_amplitudes(frames), "sky_fringe_amplitudes")
     if len(frames) > 1:
         report.section("Components", "Principal components of the frames: the templates of a correction.")

@@ -127,17 +127,18 @@ def phase_folded(
     place = (thickness - low) / step
     index = np.minimum(place.astype(int), count - 2)
     fraction = place - index
-    data = relative_flats(cube)
     measured = np.empty((len(table), PHASE_BINS))
     modelled = np.empty_like(measured)
-    orders = model.fringe_order_um(cube.wavelength_nm)
-    for row, (values, order_um) in enumerate(zip(table, orders, strict=True)):
-        bins = np.minimum(((thickness / order_um) % 1.0 * PHASE_BINS).astype(int), PHASE_BINS - 1)
+    order_of = model.fringe_order_um(cube.wavelength_nm)
+    for row, (values, order_um) in enumerate(zip(table, order_of, strict=True)):
+        orders = thickness / order_um
+        bins = np.minimum(((orders - np.floor(orders)) * PHASE_BINS).astype(int), PHASE_BINS - 1)
         weight = np.maximum(np.bincount(bins, minlength=PHASE_BINS), 1)
         predicted = values[index] * (1.0 - fraction) + values[index + 1] * fraction
         predicted = (predicted / predicted.mean() - 1.0) * (
             1.0 if fitted.contrast is None else fitted.contrast[row]
         )
-        measured[row] = np.bincount(bins, data[row][good], PHASE_BINS) / weight
+        flat = np.asarray(cube.image[row], dtype=float)[good]
+        measured[row] = np.bincount(bins, flat / flat.mean() - 1.0, PHASE_BINS) / weight
         modelled[row] = np.bincount(bins, predicted, PHASE_BINS) / weight
     return (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS, measured, modelled

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm as normal
-from scipy.stats import t as student
+from scipy.special import ndtr, stdtr
 
 from ...compiled import run_threaded
 from ...errors import InputError
@@ -352,7 +351,7 @@ def _rises(
             rise -= 2.0 * _dot(band, moment[corner])
         error = 2.0 * math.sqrt(chi2 * power)
         rise += power - noise
-        looks[f"structure of {width} px"] = float(normal.sf(rise / error)) if error > 0.0 else 1.0
+        looks[f"structure of {width} px"] = float(ndtr(-rise / error)) if error > 0.0 else 1.0
         fringes, weight, moment = coarser, square_sums(weight, 2), square_sums(moment, 2)
         width *= 2
     return looks
@@ -383,7 +382,7 @@ def _chance(blocks: NDArray[Any], sided: int) -> float:
     if values.size < 3:
         return 1.0
     pull = float(values.mean() / (values.std(ddof=1) / math.sqrt(values.size)))
-    return float(sided * student.sf(abs(pull) if sided == 2 else pull, values.size - 1))
+    return float(sided * stdtr(values.size - 1, -(abs(pull) if sided == 2 else pull)))
 
 
 def _corrected(looks: dict[str, float]) -> tuple[float, str]:

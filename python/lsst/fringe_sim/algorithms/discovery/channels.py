@@ -9,9 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, irfft2, next_fast_len, rfft2
-from scipy.stats import chi2 as chi2_distribution
-from scipy.stats import f as f_distribution
-from scipy.stats import ncx2
+from scipy.special import chdtrc, fdtrc, gammaincinv
 
 from ...effects import AMPLIFIERS, ImageGeometry
 from .fit import Columns, Design, FullColumns, PlaneColumns, Whitener
@@ -20,6 +18,7 @@ __all__ = [
     "Channel",
     "State",
     "beside_thickness",
+    "chance_beyond",
     "combined_probability",
     "fringe_phase",
     "in_looks",
@@ -35,6 +34,9 @@ BANDS = 8
 
 SPATIAL_ORDER = 4
 """Cosine patterns up to this order along both axes together."""
+
+MEDIAN_OF_SQUARE = 2.0 * float(gammaincinv(0.5, 0.5))
+"""Median of χ² of one degree of freedom."""
 
 RANK_TOLERANCE = 1e-7
 
@@ -122,8 +124,16 @@ def in_looks(chance: float, looks: float) -> float:
 
 def _feature_channel(name: str, columns: Columns, state: State, imprecision: float = 0.0) -> Channel:
     statistic, degrees = project_test(state.design, columns, state.residual)
-    noise = ncx2(max(degrees, 1), imprecision) if imprecision > 0.0 else chi2_distribution(max(degrees, 1))
-    return Channel(name, statistic, degrees, float(noise.sf(statistic)))
+    return Channel(name, statistic, degrees, chance_beyond(statistic, max(degrees, 1), imprecision))
+
+
+def chance_beyond(statistic: float, degrees: float, noncentrality: float = 0.0) -> float:
+    """Chance that a χ² is at least as large."""
+    if noncentrality > 0.0:
+        from scipy.stats import ncx2  # slow to import
+
+        return float(ncx2.sf(statistic, degrees, noncentrality))
+    return float(chdtrc(degrees, max(statistic, 0.0)))
 
 
 def phase_features(state: State, geometry: ImageGeometry, index: FloatArray) -> PlaneColumns:
@@ -190,8 +200,8 @@ def texture_channels(state: State, correlation: float = 0.0) -> list[Channel]:
         planes = 1 if name.startswith("achromatic") else len(state.residual)
         result.append(_band_channel(name, power, planes, float(used.mean())))
     shared[0, 0] = 0.0
-    top = shared / np.median(shared[shared > 0]) * chi2_distribution.ppf(0.5, 1)
-    single = float(chi2_distribution.sf(top.max(), 1))
+    top = shared / np.median(shared[shared > 0]) * MEDIAN_OF_SQUARE
+    single = float(chdtrc(1, top.max()))
     result.append(Channel("achromatic peak", float(top.max()), 1.0, in_looks(single, top.size)))
     return result
 
@@ -215,7 +225,7 @@ def _band_channel(name: str, power: FloatArray, planes: int, filled: float) -> C
             continue
         count = planes * int(inside.sum()) * filled
         ratio = float(power[inside].mean()) / max(base, 1e-300)
-        chance = float(f_distribution.sf(ratio, count, base_count))
+        chance = float(fdtrc(count, base_count, ratio))
         if chance < smallest:
             smallest, statistic, degrees = chance, ratio * count, count
     return Channel(name, statistic, degrees, in_looks(smallest, BANDS - 1))
@@ -257,7 +267,7 @@ def _largest(groups: Sequence[FloatArray]) -> tuple[float, float]:
     """Largest of many χ² of one degree of freedom, and the chance of so large a one."""
     looks = sum(values.size for values in groups)
     largest = max((float(values.max()) for values in groups if values.size), default=0.0)
-    single = float(chi2_distribution.sf(largest, 1))
+    single = float(chdtrc(1, largest))
     return largest, in_looks(single, looks)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn
 from scipy.ndimage import gaussian_filter, label
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from ...effects import AMPLIFIERS, ImageGeometry
 from ..flat_prep_options import GAUSSIAN_MAD
@@ -225,7 +225,7 @@ def _radial_power(state: State, cell_px: int) -> list[dict[str, float]]:
             mean = float(power[inside].mean())
             rows.append(
                 {"scale_px": cell_px / float(np.sqrt(low * high)), "power": mean,
-                 "probability": float(chi2_distribution.sf(mean * count, count))}
+                 "probability": float(chdtrc(count, mean * count))}
             )  # fmt: skip
     return rows
 

@@ -714,15 +714,16 @@ def _interpolate_blocks(  # type: ignore[no-untyped-def]
             i = first + j
             position = (thickness[i] - start) / step
             spread, tail = second[i] / (step * step), fourth[i] / (step * step) ** 2
-            if abs(spread) < LEAST_SPREAD:
-                _add_lookup(own_value[j], own_slope[j], column, position, 1.0, step)
-            elif spread > 0.0 and tail >= spread * spread:
-                away, weight = math.sqrt(tail / spread), 0.5 * spread * spread / tail
-                _add_lookup(own_value[j], own_slope[j], column, position, 1.0 - 2.0 * weight, step)
-                _add_lookup(own_value[j], own_slope[j], column, position - away, weight, step)
-                _add_lookup(own_value[j], own_slope[j], column, position + away, weight, step)
-            else:
-                _add_series(own_value[j], own_slope[j], column, position, 0.5 * spread, tail / 24.0, step)
+            away, weight, places = 0.0, 0.0, 1
+            if not abs(spread) < LEAST_SPREAD:
+                if not (spread > 0.0 and tail >= spread * spread):
+                    _add_series(own_value[j], own_slope[j], column, position, 0.5 * spread, tail / 24.0, step)
+                    continue
+                away, weight, places = math.sqrt(tail / spread), 0.5 * spread * spread / tail, 3
+            for part in range(places):  # in the middle, before and behind; the code of one call is there once
+                place = position if part == 0 else (position - away if part == 1 else position + away)
+                share = 1.0 - 2.0 * weight if part == 0 else weight
+                _add_lookup(own_value[j], own_slope[j], column, place, share, step)
         for w in range(waves):
             for j in range(number):
                 value[w, first + j] = own_value[j, w]

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
-from scipy.stats import ncx2
+from scipy.special import chdtrc
 
 from ...effects import Effect, Residuals
 from ...errors import InputError
-from .channels import Channel, State, combined_probability, measure_channels
+from .channels import Channel, State, chance_beyond, combined_probability, measure_channels
 from .comparison import local_minima
 from .evidence import log_evidence, prior_cost
 from .fit import (
@@ -261,7 +260,7 @@ class Selector:
             - self.problem.level_basis.shape[1]
             - len(fit.coordinates)
         )
-        chance = float(chi2_distribution.sf(fit.chi2, max(degrees, 1))) if degrees > 0 else 1.0
+        chance = float(chdtrc(max(degrees, 1), fit.chi2)) if degrees > 0 else 1.0
         return Channel("all values", fit.chi2, float(max(degrees, 0)), chance)
 
     def has_many(self, name: str) -> bool:
@@ -957,5 +956,4 @@ def _inverse_root(matrix: FloatArray) -> FloatArray:
 
 def chance_of(gain: float, degrees: int, undescribed: float) -> float:
     """Chance that noise, and what the description of the fringes lacks, give as large a gain in χ²."""
-    noise = ncx2(degrees, undescribed) if undescribed > 0.0 else chi2_distribution(degrees)
-    return float(noise.sf(gain))
+    return chance_beyond(gain, degrees, undescribed)

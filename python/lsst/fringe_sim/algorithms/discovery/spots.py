@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from .channels import Channel, State, beside_thickness
 
@@ -181,4 +181,4 @@ def _chance_of_maximum(height: float, shape: tuple[int, ...], length: float) -> 
     density = math.exp(-0.5 * height**2)
     inside = shape[0] * shape[1] / length**2 * height / (2.0 * math.pi) ** 1.5 * density
     along_edges = (shape[0] + shape[1]) / length / (2.0 * math.pi) * density
-    return 2.0 * (inside + along_edges + float(norm.sf(height)))
+    return 2.0 * (inside + along_edges + float(ndtr(-height)))

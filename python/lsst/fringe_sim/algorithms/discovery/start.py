@@ -504,28 +504,32 @@ def _cliffs(field: NDArray[np.int64], order: float) -> int:
     return sum(int((np.abs(np.diff(field, 2, axis=axis)) > 0.6 * order).sum()) for axis in (0, 1))
 
 
-@kernel
-def _grow(
-    score: NDArray[np.float32], rows: int, columns: int, reach: int
-) -> NDArray[np.int64]:  # pragma: no cover - compiled
-    """Follow the best correlation from cell to cell, clearest first.
-
-    The cells at the rim of the grown region wait in buckets by their clarity.
-    """
-    cells, _count = score.shape
-    best = np.full(cells, -1, np.int64)
-    clarity = np.zeros(cells)
-    for i in range(cells):
-        clarity[i] = score[i].max()
-    seed = 0
-    middle = 0.0
-    for i in range(cells):
-        # the seed lies inside, where it has neighbours on all sides
-        y, x = i // columns, i % columns
-        inside = min(y, rows - 1 - y) + 1 > rows // 8 and min(x, columns - 1 - x) + 1 > columns // 8
-        if inside and clarity[i] > middle:
-            middle, seed = clarity[i], i
+def _grow(score: NDArray[np.float32], rows: int, columns: int, reach: int) -> NDArray[np.int64]:
+    """Follow the best correlation from cell to cell, clearest first."""
+    clarity = score.max(axis=1).astype(float)
+    # The seed lies inside, where it has neighbours on all sides.
+    y, x = np.divmod(np.arange(len(score)), columns)
+    inside = np.minimum(y, rows - 1 - y) + 1 > rows // 8
+    inside &= np.minimum(x, columns - 1 - x) + 1 > columns // 8
+    seed = int(np.argmax(np.where(inside & (clarity > 0.0), clarity, 0.0)))
+    best = np.full(len(score), -1, np.int64)
     best[seed] = np.argmax(score[seed])
+    _grow_from(seed, score, clarity, rows, columns, reach, best)
+    return best
+
+
+@kernel
+def _grow_from(
+    seed: int,
+    score: NDArray[np.float32],
+    clarity: FloatArray,
+    rows: int,
+    columns: int,
+    reach: int,
+    best: NDArray[np.int64],
+) -> None:  # pragma: no cover - compiled
+    """The cells at the rim of the grown region wait in buckets by their clarity."""
+    cells = len(best)
     buckets = 64
     head = np.full(buckets, -1, np.int64)
     follow = np.full(cells, -1, np.int64)
@@ -553,7 +557,6 @@ def _grow(
                 place = min(buckets - 1, max(0, int(clarity[j] * (buckets - 1))))
                 follow[j] = head[place]
                 head[place] = j
-    return best
 
 
 @subkernel

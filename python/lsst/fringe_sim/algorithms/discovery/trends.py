@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from .channels import Channel
 
@@ -40,7 +40,7 @@ def trend_channel(name: str, wavelength_nm: FloatArray, error: FloatArray, covar
     _, flat, smooth = beside
     left = len(error) - ORDER - 1
     statistic = (flat - smooth) / ORDER / max(smooth / left, 1e-300)
-    return Channel(name, ORDER * statistic, float(ORDER), float(f_distribution.sf(statistic, ORDER, left)))
+    return Channel(name, ORDER * statistic, float(ORDER), float(fdtrc(ORDER, left, max(statistic, 0.0))))
 
 
 def _whitened_fit(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
@@ -220,7 +220,7 @@ def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
     noise, degrees = problem.cells.noise_rms, _degrees(problem, fit)
     counts, most = (
         noise * math.sqrt(max(fit.chi2 / expected - 1.0, 0.0))
-        for expected in (degrees, float(chi2_distribution.isf(CONFIDENCE, degrees)))
+        for expected in (degrees, float(chdtri(degrees, CONFIDENCE)))
     )
     level, _ = problem.amplitudes(fit.levels)
     pattern = (problem.expected_of(fit) / level - 1.0)[:, problem.cells.seen]

@@ -278,7 +278,7 @@ def _average_strip(  # type: ignore[no-untyped-def]
         widest = max(widest, x_edges[c + 1] - x_edges[c])
     sums = np.zeros((3, columns), np.float32)
     column_sum, column_var, column_count = sums[0], sums[1], sums[2]
-    keep_row, keep_column = np.empty(rows, np.bool_), np.empty(widest, np.bool_)
+    keep = np.empty((2, max(rows, widest)), np.bool_)  # of rows, and of columns
     line, line_count = np.empty(max(rows, widest), np.float32), np.empty(max(rows, widest), np.float32)
     for r in range(rows):
         for x in range(columns):
@@ -317,18 +317,21 @@ def _average_strip(  # type: ignore[no-untyped-def]
             for x in range(low, high):
                 row_count += np.float32(1.0) if inverse[r, x] > 0.0 else np.float32(0.0)
             line_count[r] = row_count
-        rejected = _reject(line, line_count, rows, noise, correlated, curvature, keep_row)
-        rise_y[c, band] = _slope(line, line_count, rows, keep_row)
-        for x in range(width):
-            line[x], line_count[x] = column_sum[low + x], column_count[low + x]
-        rejected += _reject(line, line_count, width, noise, correlated, curvature, keep_column)
-        rise_x[c, band] = _slope(line, line_count, width, keep_column)
+        rejected = np.int64(0)
+        for axis in range(2):  # each function is called at one place, so that its code is there once
+            if axis == 1:
+                for x in range(width):
+                    line[x], line_count[x] = column_sum[low + x], column_count[low + x]
+            size = rows if axis == 0 else width
+            rejected += _reject(line, line_count, size, noise, correlated, curvature, keep[axis])
+            rise = rise_y if axis == 0 else rise_x
+            rise[c, band] = _slope(line, line_count, size, keep[axis])
         if rejected > 0:
             total, count, var = 0.0, 0.0, 0.0
             for r in range(rows):
-                if keep_row[r]:
+                if keep[0, r]:
                     for x in range(width):
-                        if keep_column[x] and inverse[r, low + x] > 0.0:
+                        if keep[1, x] and inverse[r, low + x] > 0.0:
                             total += value[r, low + x]
                             var += 1.0 / inverse[r, low + x]
                             count += 1.0

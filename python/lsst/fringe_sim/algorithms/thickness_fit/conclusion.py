@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import gammaincinv
 
 from ...products import FlatFit
 from .cells import Cells
@@ -61,7 +61,7 @@ def model_error(pixels: PixelFit, scale_sigma: float) -> PixelFit:
     most = int(pixels.n_wavelengths.max(initial=0))
     if most < 3:
         return pixels
-    expected = float(chi2_distribution.median(most - 1)) / (most - 1)
+    expected = 2.0 * float(gammaincinv(0.5 * (most - 1), 0.5)) / (most - 1)
     # A median has the scatter of a mean of about half as many numbers.
     scatter = _SIGNIFICANT * 1.5 * np.sqrt(2.0 / (most - 1))
     middle, count = _block_medians(pixels.chi2)

@@ -223,7 +223,8 @@ def _minima(place, chi2, marks, where, depth):  # type: ignore[no-untyped-def]
     """
     count = chi2.shape[0]
     full = 8 * ((count + 7) // 8)
-    marks[count - 1 : full] = 0
+    for k in range(count - 1, full):
+        marks[k] = np.uint8(0)
     for k in range(1, count - 1):
         marks[k] = (chi2[k] <= chi2[k - 1]) & (chi2[k] < chi2[k + 1])
     marks[0] = chi2[0] < chi2[1]
@@ -291,6 +292,19 @@ def _search(value, weight, item, nodes, place, table, start, step, low, high, ch
     return used, number, at
 
 
+@subkernel
+def _first_from(place, least):  # type: ignore[no-untyped-def]
+    """Number of the first of ascending places that is not below a number."""
+    low, high = np.int64(0), np.int64(place.shape[0])
+    while low < high:
+        middle = (low + high) // 2
+        if place[middle] < least:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
 @kernel
 def _evidence_row(  # type: ignore[no-untyped-def]
     value, weight, rise_y, rise_x, nodes, place, table, start, step, order, temper,
@@ -313,34 +327,22 @@ def _evidence_row(  # type: ignore[no-untyped-def]
             continue
         low, high = np.int64(0), np.int64(count)
         if np.isfinite(centre[c]):
-            low = np.searchsorted(place, centre[c] - (reach + 0.5) * order)
-            high = max(np.searchsorted(place, centre[c] + (reach + 0.5) * order), low + 2)
+            low = _first_from(place, centre[c] - (reach + 0.5) * order)
+            high = max(_first_from(place, centre[c] + (reach + 0.5) * order), low + 2)
             low = max(min(low, count - 2), 0)  # type: ignore[arg-type]
             high = min(high, count)
-        used, number, at = _search(
-            value, weight, c, nodes, place, table, start, step, low, high, chi2, marks, where, depth
-        )
+        while True:  # of one call the code is there once
+            used, number, at = _search(
+                value, weight, c, nodes, place, table, start, step, low, high, chi2, marks, where, depth
+            )
+            if used == 0 or high - low == count:
+                break
+            near_end = min(where[at] - place[low], place[high - 1] - where[at]) < order
+            if not (near_end or depth[at] > limit):
+                break
+            low, high = np.int64(0), np.int64(count)
         if used == 0:
             continue
-        if high - low < count:
-            near_end = min(where[at] - place[low], place[high - 1] - where[at]) < order
-            if near_end or depth[at] > limit:
-                used, number, at = _search(
-                    value,
-                    weight,
-                    c,
-                    nodes,
-                    place,
-                    table,
-                    start,
-                    step,
-                    np.int64(0),
-                    np.int64(count),
-                    chi2,
-                    marks,
-                    where,
-                    depth,
-                )
         thickness, least = where[at], depth[at]
         first = thickness - np.floor((thickness - place[0]) / order) * order
         scale = temper / max(1.0, least / max(used - 1, 1))

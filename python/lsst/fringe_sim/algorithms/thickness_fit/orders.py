@@ -23,6 +23,7 @@ Herráez, Burton, Lalor & Gdeisat 2002, Applied Optics 41, 7437 (phase unwrappin
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,56 +106,39 @@ def _centred(evidence: NDArray[np.float32]) -> NDArray[np.float32]:
     return out
 
 
-@subkernel
-def _wrap(difference, order):  # type: ignore[no-untyped-def]
-    return difference - order * np.rint(difference / order)
-
-
-@kernel
-def _links(phase, rise_y, rise_x, order):  # type: ignore[no-untyped-def]
+def _links(
+    phase_um: NDArray[np.float32], rise_y: NDArray[np.float32], rise_x: NDArray[np.float32], order_um: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.uint16]]:
     """Pairs of neighbouring cells, the orders between their phases, and how unreliable each pair is.
 
     The slopes inside the cells foretell the difference; what is left of it, on this link and on the others
     of its two cells, is the unreliability (in 1/4096 of an order).
     """
-    ny, nx = phase.shape
-    rough, number_of = np.zeros((ny, nx), np.float64), np.zeros((ny, nx), np.int64)
-    left = np.full((2, ny, nx), np.nan, np.float64)
-    for y in range(ny):
-        for x in range(nx):
-            for k in range(2):
-                yy, xx = (y, x + 1) if k == 0 else (y + 1, x)
-                if yy >= ny or xx >= nx:
-                    continue
-                rise = (
-                    0.5 * (rise_x[y, x] + rise_x[yy, xx]) if k == 0 else 0.5 * (rise_y[y, x] + rise_y[yy, xx])
-                )
-                miss = _wrap(float(phase[yy, xx]) - float(phase[y, x]) - rise, order) / order
-                if np.isfinite(miss):
-                    left[k, y, x] = miss
-                    for v, u in ((y, x), (yy, xx)):
-                        rough[v, u] += miss * miss
-                        number_of[v, u] += 1
-    first, second = np.empty(2 * ny * nx, np.int64), np.empty(2 * ny * nx, np.int64)
-    turn, key = np.empty(2 * ny * nx, np.int64), np.empty(2 * ny * nx, np.uint16)
-    number = 0
-    for y in range(ny):
-        for x in range(nx):
-            for k in range(2):
-                if np.isfinite(left[k, y, x]):
-                    yy, xx = (y, x + 1) if k == 0 else (y + 1, x)
-                    rise = (
-                        0.5 * (rise_x[y, x] + rise_x[yy, xx])
-                        if k == 0
-                        else 0.5 * (rise_y[y, x] + rise_y[yy, xx])
-                    )
-                    first[number] = y * nx + x
-                    second[number] = yy * nx + xx
-                    turn[number] = int(np.rint((float(phase[y, x]) + rise - float(phase[yy, xx])) / order))
-                    around = rough[y, x] / number_of[y, x] + rough[yy, xx] / number_of[yy, xx]
-                    key[number] = min(int(4096.0 * np.sqrt(left[k, y, x] ** 2 + 0.5 * around)), 65535)
-                    number += 1
-    return first[:number], second[:number], turn[:number], key[:number]
+    ny, nx = phase_um.shape
+    # The last axis is for the links to the right and to the cell below.
+    beyond, rise = np.full((ny, nx, 2), np.nan, np.float32), np.full((ny, nx, 2), np.nan)
+    beyond[:, :-1, 0], rise[:, :-1, 0] = phase_um[:, 1:], 0.5 * (rise_x[:, :-1] + rise_x[:, 1:])
+    beyond[:-1, :, 1], rise[:-1, :, 1] = phase_um[1:], 0.5 * (rise_y[:-1] + rise_y[1:])
+    difference = beyond - phase_um[..., np.newaxis] - rise
+    miss = (difference - order_um * np.rint(difference / order_um)) / order_um
+    linked = np.isfinite(miss)
+    rough, number = _sums_at_cells(np.where(linked, miss * miss, 0.0)), _sums_at_cells(linked)
+    y, x, below = np.nonzero(linked)
+    y_next, x_next = y + below, x + 1 - below
+    turn = np.rint((phase_um[y, x] + rise[linked] - beyond[linked]) / order_um).astype(np.int64)
+    around = rough[y, x] / number[y, x] + rough[y_next, x_next] / number[y_next, x_next]
+    key = np.minimum(4096.0 * np.sqrt(miss[linked] ** 2 + 0.5 * around), 65535.0).astype(np.uint16)
+    return y * nx + x, y_next * nx + x_next, turn, key
+
+
+def _sums_at_cells(links: NDArray[Any]) -> NDArray[np.float64]:
+    """Sum over the links that end at each cell, whose last axis is for those to the right and below."""
+    total = np.zeros(links.shape[:2])
+    total[1:] += links[:-1, :, 1]
+    total[:, 1:] += links[:, :-1, 0]
+    total += links[..., 0]
+    total += links[..., 1]
+    return total
 
 
 @subkernel
