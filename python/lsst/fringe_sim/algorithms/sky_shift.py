@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BSpline
-from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
 from ..errors import InputError, named_units
+from .smooth_field import Splines, Spread, nearest_coefficients, prior_covariance
 
 __all__ = ["SkyShift", "fit_sky_shift"]
 
@@ -43,9 +42,6 @@ SPREADS = 13
 
 MOST_STARTS = 4
 """Most common shifts from which splines begin; an order has about one."""
-
-NEGLIGIBLE_WEIGHT = 1e-4
-"""Spreads of less weight are left out of an average; they change it by less than this of a standard deviation."""
 
 NEGLIGIBLE = 10.0
 """Splines whose evidence is e to this less than that of coarser ones end the search for finer ones."""
@@ -141,7 +137,7 @@ def fit_sky_shift(
     known = np.isfinite(layer)
     filled = np.where(known, layer, float(layer[known].mean()))
     night = _Night(frames, filled, predict, order_um, map_sigma_um or MAP_SIGMA_ORDERS * order_um)
-    tried = [night.fitted(_Splines.of(layer.shape, spans), night.starts()[0]) for spans in (0, 1)]
+    tried = [night.fitted(Splines.of(layer.shape, spans), night.starts()[0]) for spans in (0, 1)]
     night = night.with_noise_of(max(tried, key=lambda fit: fit.log_evidence))
     found: list[_Fit] = []
     others: list[_Fit] = []
@@ -149,7 +145,7 @@ def fit_sky_shift(
     for spans in SPANS:
         if spans * LEAST_PX_OF_SPAN > min(layer.shape):
             break
-        each = [night.fitted(_Splines.of(layer.shape, spans), start) for start in starts]
+        each = [night.fitted(Splines.of(layer.shape, spans), start) for start in starts]
         best = max(each, key=lambda fit: fit.log_evidence)
         found.append(best)
         others.extend(each)
@@ -182,56 +178,6 @@ def _frames(
     return made
 
 
-@dataclass(frozen=True, eq=False)
-class _Splines:
-    """Tensor product of cubic B-splines over an image; without spans a constant."""
-
-    rows: FloatArray  # (ny, k)
-    columns: FloatArray  # (nx, l)
-    spans: int
-
-    @classmethod
-    def of(cls, shape: tuple[int, ...], spans: int) -> _Splines:
-        rows, columns = (_basis(side, spans) for side in shape)
-        return cls(rows, columns, spans)
-
-    @property
-    def count(self) -> int:
-        return self.rows.shape[1] * self.columns.shape[1]
-
-    def surface(self, coefficient: FloatArray) -> FloatArray:
-        inner = coefficient.reshape(self.rows.shape[1], self.columns.shape[1])
-        return np.asarray(self.rows @ inner @ self.columns.T)
-
-    def sums(self, image: FloatArray) -> FloatArray:
-        """Sum of an image times each spline, ``(count,)``."""
-        return np.asarray(self.rows.T @ image @ self.columns).ravel()
-
-    def products(self, image: FloatArray) -> FloatArray:
-        """Sum of an image times each pair of splines, ``(count, count)``."""
-        k, m = self.rows.shape[1], self.columns.shape[1]
-        along = (self.columns[:, :, None] * self.columns[:, None, :]).reshape(-1, m * m)
-        across = (self.rows[:, :, None] * self.rows[:, None, :]).reshape(-1, k * k)
-        pairs = (across.T @ (image @ along)).reshape(k, k, m, m)
-        return np.asarray(pairs.transpose(0, 2, 1, 3)).reshape(k * m, k * m)
-
-    def variance(self, covariance: FloatArray) -> FloatArray:
-        """Variance of the surface of every pixel."""
-        k, m = self.rows.shape[1], self.columns.shape[1]
-        pairs = covariance.reshape(k, m, k, m).transpose(0, 2, 1, 3).reshape(k * k, m * m)
-        along = (self.columns[:, :, None] * self.columns[:, None, :]).reshape(-1, m * m)
-        across = (self.rows[:, :, None] * self.rows[:, None, :]).reshape(-1, k * k)
-        return np.asarray(across @ pairs @ along.T)
-
-
-def _basis(side: int, spans: int) -> FloatArray:
-    if spans == 0:
-        return np.ones((side, 1))
-    knots = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, spans + 1), [1.0] * 3])
-    place = (np.arange(side) + 0.5) / side
-    return np.asarray(BSpline.design_matrix(place, knots, 3).toarray())
-
-
 class _State(NamedTuple):
     """A night at one shift, with the best levels of its bands and backgrounds."""
 
@@ -248,7 +194,7 @@ class _State(NamedTuple):
 class _Fit:
     """The best point of one kind of splines."""
 
-    splines: _Splines
+    splines: Splines
     coefficient: FloatArray
     covariance: FloatArray
     information: FloatArray
@@ -320,7 +266,7 @@ class _Night:
             made.strength[number] = float(level[: len(bands)] @ power / max(power.sum(), 1e-300))
         return made._replace(half_chi2=half_chi2, log_volume=log_volume)
 
-    def normal(self, splines: _Splines, state: _State) -> tuple[FloatArray, FloatArray]:
+    def normal(self, splines: Splines, state: _State) -> tuple[FloatArray, FloatArray]:
         """Information on the coefficients, the levels being free, and minus the gradient of half the χ²."""
         gradient = np.zeros(splines.count)
         total = np.zeros(self.layer_um.shape)
@@ -335,9 +281,9 @@ class _Night:
             reduced += cross @ inverse @ cross.T
         return splines.products(total) - reduced, gradient
 
-    def fitted(self, splines: _Splines, start_um: FloatArray) -> _Fit:
+    def fitted(self, splines: Splines, start_um: FloatArray) -> _Fit:
         """Gauss and Newton from a start, with the spread of the coefficients that the evidence prefers."""
-        coefficient = _nearest(splines, start_um)
+        coefficient = nearest_coefficients(splines, start_um)
         reach = self.map_sigma_um
         spreads = self.order_um * np.geomspace(1e-3, 1.0, SPREADS)
         spread = float(spreads[SPREADS // 2])
@@ -345,8 +291,8 @@ class _Night:
         for number in range(ROUNDS):
             information, gradient = self.normal(splines, state)
             if number % 4 == 0:
-                spread = _Spread.of(splines, information, gradient, coefficient, spreads, reach).likeliest
-            penalty = np.asarray(np.linalg.inv(_prior(splines, spread, reach)), dtype=float)
+                spread = Spread.of(splines, information, gradient, coefficient, spreads, reach).likeliest
+            penalty = np.asarray(np.linalg.inv(prior_covariance(splines, spread, reach)), dtype=float)
             wanted = gradient - penalty @ coefficient
             step = np.asarray(np.linalg.solve(information + penalty, wanted), dtype=float)
             moved, state = self._moved(splines, coefficient, step, penalty, state)
@@ -354,13 +300,13 @@ class _Night:
             coefficient = moved
             if change < FINISHED_ORDERS * self.order_um:
                 break
-        found = _Spread.of(splines, *self.normal(splines, state), coefficient, spreads, reach)
+        found = Spread.of(splines, *self.normal(splines, state), coefficient, spreads, reach)
         total = found.log_evidence - state.half_chi2 + state.log_volume
         mean, covariance = found.posterior()
         return _Fit(splines, mean, covariance, found.information, splines.surface(mean), total, state)
 
     def _moved(
-        self, splines: _Splines, coefficient: FloatArray, step: FloatArray, penalty: FloatArray, state: _State
+        self, splines: Splines, coefficient: FloatArray, step: FloatArray, penalty: FloatArray, state: _State
     ) -> tuple[FloatArray, _State]:
         """As much of a step as makes the fit better."""
         limit = (
@@ -415,84 +361,6 @@ def _thinned(predict: Predictor, layer_um: FloatArray, thin: int) -> Predictor:
         return predict(whole[: layer_um.shape[0], : layer_um.shape[1]])[:, ::thin, ::thin]
 
     return of_some
-
-
-def _nearest(splines: _Splines, surface: FloatArray) -> FloatArray:
-    """Coefficients of the surface nearest to another."""
-    rows, columns = np.linalg.pinv(splines.rows), np.linalg.pinv(splines.columns)
-    return np.asarray(rows @ surface @ columns.T).ravel()
-
-
-def _prior(splines: _Splines, spread_um: float, reach_um: float) -> FloatArray:
-    """Covariance of the coefficients: mean and tilts, as far as the map may be off, and a spread about them.
-
-    The spread has parts that all of a row share, that all of a column share, and of each coefficient, equally large.
-    """
-    if splines.count == 1:
-        return np.full((1, 1), reach_um**2)
-    sides = (splines.rows.shape[1], splines.columns.shape[1])
-    rows, columns = (np.eye(side) + 1.0 for side in sides)
-    across, along = (np.linspace(-1.0, 1.0, side) for side in sides)
-    plane = np.stack([np.ones(splines.count), np.repeat(across, sides[1]), np.tile(along, sides[0])])
-    return np.asarray(spread_um**2 * np.kron(rows, columns) + reach_um**2 * (plane.T @ plane))
-
-
-@dataclass(frozen=True, eq=False)
-class _Spread:
-    """How large the spread of the coefficients may be, from the quadratic form of half the χ² about a point."""
-
-    splines: _Splines
-    information: FloatArray
-    linear: FloatArray  # half the χ² is a constant less ``linear @ c``, and ``0.5 c @ information @ c``
-    spreads_um: FloatArray
-    reach_um: float
-    log_each: FloatArray  # log of the evidence of each spread, over the likelihood at the point
-
-    @classmethod
-    def of(
-        cls,
-        splines: _Splines,
-        information: FloatArray,
-        gradient: FloatArray,
-        coefficient: FloatArray,
-        spreads_um: FloatArray,
-        reach_um: float,
-    ) -> _Spread:
-        linear = gradient + information @ coefficient
-        at_zero = -float(gradient @ coefficient) - 0.5 * float(coefficient @ information @ coefficient)
-        tried = spreads_um if splines.count > 1 else spreads_um[:1]
-        logs = []
-        for spread in tried:
-            root = np.linalg.cholesky(_prior(splines, float(spread), reach_um))
-            factor = cho_factor(np.eye(splines.count) + root.T @ information @ root, lower=True)
-            side = root.T @ linear
-            gain = 0.5 * float(side @ cho_solve(factor, side))
-            logs.append(at_zero + gain - float(np.log(np.diag(factor[0])).sum()))
-        return cls(splines, information, linear, tried, reach_um, np.array(logs))
-
-    @property
-    def likeliest(self) -> float:
-        """Spread of the largest evidence [µm]."""
-        return float(self.spreads_um[self.log_each.argmax()])
-
-    @property
-    def log_evidence(self) -> float:
-        """Averaged over the spreads, each factor between them counting alike."""
-        return float(logsumexp(self.log_each)) - math.log(self.log_each.size)
-
-    def posterior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of the coefficients, whatever the spread is."""
-        weights = np.exp(self.log_each - logsumexp(self.log_each))
-        parts = []
-        for weight, spread in zip(weights, self.spreads_um, strict=True):
-            if weight > NEGLIGIBLE_WEIGHT:
-                inverse = np.linalg.inv(_prior(self.splines, float(spread), self.reach_um))
-                covariance = np.asarray(np.linalg.inv(self.information + inverse), dtype=float)
-                parts.append((weight, covariance @ self.linear, covariance))
-        total = sum(weight for weight, *_ in parts)
-        mean = np.asarray(sum(weight * middle for weight, middle, _ in parts) / total)
-        spread_of = [w * (c + np.outer(m - mean, m - mean)) for w, m, c in parts]
-        return mean, np.asarray(np.sum(spread_of, axis=0) / total)
 
 
 def _averaged(night: _Night, unmoved: _State, fits: Sequence[_Fit], others: Sequence[_Fit]) -> SkyShift:
