@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from ..errors import InputError
+from ..errors import InputError, named_units
 from ..products import ObservedFrame, ThicknessMap, mask_bits
 from .correction.background import BackgroundTerms
 from .correction.objects import fit_frame
@@ -40,11 +40,13 @@ class MapOnSky(NamedTuple):
     moved: ThicknessMap
 
 
+@named_units
 def reach_um(order_um: float, map_sigma_um: float | None = None) -> float:
     """How far from the map a response has to be known [µm]."""
     return order_um + 4.0 * (map_sigma_um or MAP_SIGMA_ORDERS * order_um)
 
 
+@named_units
 def map_on_sky(
     frames: Sequence[Callable[[], ObservedFrame]],
     thickness: ThicknessMap,

@@ -53,6 +53,7 @@ DERIVATIVE_ORDERS = 1e-2
 """Half the distance of the two predictions that make a derivative [orders]; its error is 6e-4 of it."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class SkyShift:
     """How far a map is from what the sky shows.
