@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from ..errors import InputError, named_units
+from ..notebook import do_nothing
 from ..products import ObservedFrame, ThicknessMap, mask_bits
 from .correction.background import BackgroundTerms
 from .correction.objects import fit_frame
@@ -55,7 +56,7 @@ def map_on_sky(
     options: CorrectionOptions | None = None,
     *,
     map_sigma_um: float | None = None,
-    advance: Callable[[], None] = lambda: None,
+    advance: Callable[[], None] = do_nothing,
 ) -> MapOnSky:
     """Say where the sky and a thickness map disagree, and move the map there.
 
