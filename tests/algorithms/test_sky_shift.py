@@ -24,7 +24,11 @@ def predict(thickness_um: np.ndarray) -> np.ndarray:
 
 
 def fitted(
-    error: np.ndarray | float, rng: np.random.Generator, contrast: float = 1.0, frames: int = FRAMES
+    error: np.ndarray | float,
+    rng: np.random.Generator,
+    contrast: float = 1.0,
+    frames: int = FRAMES,
+    unknown: float = 0.0,
 ) -> SkyShift:
     """Bands that change from frame to frame, below a gradient of the sky, with noise of an unknown size."""
     values, weights = [], []
@@ -32,6 +36,7 @@ def fitted(
         scale = contrast * rng.uniform(0.6, 1.4, len(BANDS))
         bands = predict(MAP_UM + error)
         sky = np.tensordot(scale, bands - bands.mean(axis=(1, 2), keepdims=True), axes=1)
+        sky += unknown * np.cos(2.0 * np.pi * 1.31 * MAP_UM / ORDER_UM)
         sky += 0.01 * X / SHAPE[1] + NOISE * rng.standard_normal(SHAPE)
         values.append(sky - sky.mean())
         weights.append(np.where(rng.random(SHAPE) < 0.05, 0.0, 2.0 / NOISE**2))
@@ -91,6 +96,11 @@ def test_frames_that_say_nothing_say_how_many_would(rng: np.random.Generator) ->
     found = fitted(0.02, rng, contrast=0.02, frames=2)
     assert found.chance_unmoved > 0.1
     assert found.frames_for(0.01, 2) > 50
+
+
+def test_what_all_frames_have_beyond_the_model_makes_a_shift_uncertain() -> None:
+    known, less = (fitted(0.02, np.random.default_rng(7), unknown=unknown) for unknown in (0.0, 0.003))
+    assert np.median(less.sigma_um) > 1.3 * np.median(known.sigma_um)
 
 
 def test_frames_of_another_shape_are_refused() -> None:

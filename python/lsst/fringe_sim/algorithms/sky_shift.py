@@ -131,7 +131,8 @@ def fit_sky_shift(
     The shift is a spline whose coefficients have mean and tilts, normal about zero, and a normal spread about them,
     over which the evidence is averaged. Its number of spans, one shift for all, and none at all compete by evidence
     (Laplace's, about the best point). In each frame the strength of each band and a background of second degree are
-    free, and integrated over. The variance of each frame is that of its residuals.
+    free, and integrated over. The variance of each frame is that of its residuals, and larger where the frames miss
+    something alike.
     """
     layer = np.asarray(thickness_um, dtype=float)
     frames = _frames(values, weights, layer)
@@ -235,12 +236,36 @@ class _Night:
         return [np.full(self.layer_um.shape, step) for step in (*steps[best], 0.0)]
 
     def with_noise_of(self, fit: _Fit) -> _Night:
-        """The same with weights of the residuals' own variance."""
+        """The same with weights of the residuals' own variance, and of what all frames miss alike."""
         frames = []
         for (value, weight), residual in zip(self.frames, fit.state.residuals, strict=True):
             freedom = np.count_nonzero(weight)
             frames.append((value, weight * (freedom / float((weight * residual**2).sum()))))
-        return replace(self, frames=frames)
+        share = self._noise_share([weight for _, weight in frames], fit)
+        return replace(self, frames=[(value, share * weight) for value, weight in frames])
+
+    def _noise_share(self, weights: Sequence[FloatArray], fit: _Fit) -> float:
+        """Part of the variance of the mean residual that is noise, in squares of a quarter of a fringe.
+
+        Noise differs from frame to frame; what a model lacks, other lines or layers, is there in all of them and does
+        not shrink with their number. Neighbouring pixels share it within a quarter of a fringe.
+        """
+        total = np.sum(weights, axis=0)
+        shared = np.sum(
+            [weight * each for weight, each in zip(weights, fit.state.residuals, strict=True)], axis=0
+        )
+        slope = float(np.median(np.hypot(*np.gradient(self.layer_um))))
+        side = max(
+            1, min(round(0.25 * self.order_um / max(slope, 1e-12)), min(total.shape) // LEAST_PX_OF_SPAN)
+        )
+        sums = [
+            np.add.reduceat(np.add.reduceat(each, np.arange(0, len(each), side), axis=0),
+                            np.arange(0, each.shape[1], side), axis=1)
+            for each in (shared, total)
+        ]  # fmt: skip
+        known = sums[1] > 0.0
+        # Where all is noise, these squares have a mean of 1, and the scatter of a mean.
+        return min(1.0, 1.0 / float(np.mean(sums[0][known] ** 2 / sums[1][known])))
 
     def state(self, shift_um: FloatArray) -> _State:
         """The night at a shift, with the levels that suit it best."""

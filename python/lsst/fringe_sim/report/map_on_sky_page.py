@@ -23,7 +23,9 @@ def write_map_on_sky_report(path: Path, found: MapOnSky, layer: ThicknessMap, sa
         f"Map of {layer.detector or 'one sensor'} on the sky",
         f"Layer {layer.layer}, cells of {found.cell_px} px.",
     )
-    report.section("What the frames say of the map", ". ".join(said) + ".")
+    report.section(
+        "What the frames say of the map", ". ".join(line[0].upper() + line[1:] for line in said) + "."
+    )
     report.figure(
         _figure(found),
         "What is added to the map, and the uncertainty of that, averaged over all that compete.",
