@@ -48,6 +48,7 @@ QUANTUM_COSTS: Mapping[str, QuantumCost] = MappingProxyType(
         "skyEffectDiscovery": QuantumCost(740.0, 6144 * MIB),
         "skyFringeSim": QuantumCost(16.3, 1262 * MIB),
         "fringePca": QuantumCost(10.7, 3428 * MIB),
+        "mapTemplates": QuantumCost(16.8, 1529 * MIB),
         "observedFringe": QuantumCost(570.0, 4096 * MIB),
         "fringeCorrection": QuantumCost(62.0, 2500 * MIB),
         "fringeForecast": QuantumCost(21.4, 1255 * MIB),
@@ -59,7 +60,8 @@ QUANTUM_COSTS: Mapping[str, QuantumCost] = MappingProxyType(
 The search for effects found none; with effects it takes longer. That on the sky has not been measured on a full
 sensor: its time is that of a small one with an effect, its memory that of eleven frames, counted. Neither have the
 two tasks of observed frames: their times are sixteen times those of 1024 x 1024 pixels, of eleven frames for
-templates, and their memory is that of the images they hold, counted.
+templates, and their memory is that of the images they hold, counted. ``mapTemplates`` was measured without a
+repository.
 """
 
 
