@@ -6,6 +6,7 @@ compared.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import sys
 from collections.abc import Callable
@@ -233,10 +234,13 @@ def by_task(path: Path) -> Any:
 
 
 def plain(product: Any) -> dict[str, Any]:
+    """All that a product holds, to be compared; what it shows of itself is less."""
     return {
-        name: value.tobytes() if isinstance(value, np.ndarray) else repr(value)
+        name: value.tobytes() if isinstance(value, np.ndarray)
+        else plain(value) if dataclasses.is_dataclass(value)
+        else repr(value)
         for name, value in vars(product).items()
-    }
+    }  # fmt: skip
 
 
 BY: dict[str, Callable[[Path], Any]] = dict(zip(READERS, (by_fit, by_ingest, by_task), strict=True))
