@@ -15,11 +15,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import lsst.fringe_sim
-from lsst.fringe_sim.compiled import in_order, limit_threads, one_blas_thread, subkernel
+from lsst.fringe_sim.compiled import one_blas_thread, subkernel
 
 OF_TWO_TYPES = {
     f"lsst.fringe_sim.{name}._frame_kernel" for name in ("model.response_table", "algorithms.field_response")
@@ -123,29 +122,3 @@ def test_one_thread_of_the_linear_algebra() -> None:
 
     with threadpool_limits(limits=2, user_api="blas"):
         assert threads(3) <= {1}
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_results_of_threads_come_in_order_and_nothing_is_drawn_far_ahead(threads: int) -> None:
-    drawn: list[int] = []
-
-    def draw() -> Iterator[int]:
-        for item in range(7):
-            drawn.append(item)
-            yield item
-
-    def work(item: int) -> int:
-        if item == 5:
-            raise ValueError("five")
-        return item * item
-
-    limit_threads(threads)
-    try:
-        results = in_order(work, draw(), 2)
-        for number in range(5):
-            assert next(results) == number * number
-            assert len(drawn) <= number + 3
-        with pytest.raises(ValueError, match="five"):
-            next(results)
-    finally:
-        limit_threads(None)

@@ -14,9 +14,8 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, ParamSpec, TypeVar
 
@@ -27,7 +26,6 @@ from threadpoolctl import threadpool_limits
 
 __all__ = [
     "contiguous",
-    "in_order",
     "kernel",
     "limit_threads",
     "one_blas_thread",
@@ -39,8 +37,6 @@ __all__ = [
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 _LOG = logging.getLogger(__name__)
 
@@ -195,27 +191,6 @@ def run_threaded(work: Callable[[int], object], count: int, threads: int | None 
 def _share(work: Callable[[int], object], first: int, count: int, threads: int) -> None:
     for item in range(first, count, threads):
         work(item)
-
-
-def in_order(work: Callable[[Item], Result], items: Iterable[Item], most: int) -> Iterator[Result]:
-    """Results of calls of ``work``, in the order of the items, while the next ones are worked on in threads.
-
-    ``work``: as for `run_threaded`.
-    ``items``: drawn in the calling thread, one after the other.
-    ``most``: items that are worked on at the same time, at most.
-    """
-    threads = min(processors(), most)
-    if threads <= 1:
-        yield from map(work, items)
-        return
-    waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        for item in items:
-            if len(waiting) == threads:
-                yield waiting.popleft().result()
-            waiting.append(pool.submit(work, item))
-        while waiting:
-            yield waiting.popleft().result()
 
 
 def run_shares(work: Callable[[int, int], object], count: int, least: int) -> None:

@@ -12,7 +12,6 @@ import click
 
 from ..algorithms.flat_prep import combine_biases, prepare_flat
 from ..algorithms.flat_prep_options import FlatPrepOptions
-from ..compiled import in_order
 from ..errors import FrameFormatError, FringeSimError, InputError
 from ..instrument.camera import Camera, Detector
 from ..instrument.raw_files import find_raw_files, pixel_digest
@@ -24,10 +23,6 @@ from ..resources import complete_fits
 from .bad_files import refuse_bad
 
 __all__ = ["LabSeries", "PlainSeries", "find_series", "of_vendor", "read_cube"]
-
-PREPARED_AT_ONCE = 2
-"""Flats that are prepared at the same time. Each takes a few times the memory of a frame, and more gain nothing
-beside the one thread that reads."""
 
 LEAST_SIZE = (16, 64)
 """Rows and columns below which a frame is no sensor."""
@@ -88,7 +83,7 @@ class LabSeries(Series[RawMetadata]):
             click.echo(f"{self.serial} is in no table: gains are those of {setup.detector}", err=True)
 
     def read(self, setup: Setup, options: FlatPrepOptions, advance: Callable[[], None]) -> FringeCube:
-        """Prepare all frames, a few at a time.
+        """Prepare all frames, one at a time.
 
         ``setup``: decides the bandpass and the focal ratio where the headers do not.
         """
@@ -121,8 +116,8 @@ class LabSeries(Series[RawMetadata]):
             except InputError as error:
                 raise error.in_source(frame.metadata.source) from None
 
-        flats = in_order(prepared, frames(self.flats), PREPARED_AT_ONCE)
-        return FringeCube.from_flats(map(_say_masked, flats), number=len(self.flats))
+        flats = (_say_masked(prepared(frame)) for frame in frames(self.flats))
+        return FringeCube.from_flats(flats, number=len(self.flats))
 
     def _sensor(self, setup: Setup) -> Detector:
         camera, first = Camera.from_name(setup.camera), self.flats[0]
