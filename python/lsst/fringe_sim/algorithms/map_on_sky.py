@@ -18,7 +18,7 @@ from .correction.background import BackgroundTerms
 from .correction.objects import fit_frame
 from .fringe_correction import CorrectionOptions
 from .observed_frames import frame_weight
-from .sky_response import Response
+from .sky_response import FrameTable, Response
 from .sky_shift import MAP_SIGMA_ORDERS, SkyShift, fit_sky_shift
 
 __all__ = ["MapOnSky", "map_on_sky", "reach_um"]
@@ -84,24 +84,21 @@ def map_on_sky(
     """
     chosen = options or CorrectionOptions()
     known = thickness.known_um().astype(float)
-    middle = float(np.nanmean(known))
-    whole = response.sky().frame(np.where(np.isfinite(known), known, middle))
-    level = float(whole.mean(dtype=float))
-    cell = _cell_px(known, order_um)
-    patterns = _patterns(response, known, order_um)
+    good = np.isfinite(known)
+    reach = reach_um(order_um, map_sigma_um)
+    low, high = np.nanmin(known) - reach, np.nanmax(known) + reach
+    dark, cell = response.sky(), _cell_px(known, order_um)
+    level = float(dark.frame(np.where(good, known, np.nanmean(known))).mean(dtype=float))
+    patterns = [_pattern(dark, known + part * order_um) for part in (0.0, 0.25)]
     values, weights = [], []
     for frame in frames:
         value, weight = _fringes_alone(frame(), patterns, chosen, known.shape)
-        weight[~np.isfinite(known)] = 0.0
+        weight[~good] = 0.0
         values.append(_cell_means(value, weight, cell))
         weights.append(_cell_sums(weight, cell))
         advance()
-    layer = _cell_means(known, np.isfinite(known).astype(float), cell)
-    layer[_cell_sums(np.isfinite(known).astype(float), cell) == 0.0] = np.nan
-    low, high = (
-        np.nanmin(known) - reach_um(order_um, map_sigma_um),
-        np.nanmax(known) + reach_um(order_um, map_sigma_um),
-    )
+    seen = good.astype(float)
+    layer = np.where(_cell_sums(seen, cell) > 0.0, _cell_means(known, seen, cell), np.nan)
     tables = [
         response.sky({name: float(name == band) for name in response.component}) for band in response.bands
     ]
@@ -125,15 +122,11 @@ def _cell_px(known: FloatArray, order_um: float) -> int:
     return cell
 
 
-def _patterns(response: Response, known: FloatArray, order_um: float) -> list[NDArray[np.float32]]:
-    """The sky of the map, and a quarter of an order away, of mean 0: any common shift is their sum."""
-    table = response.sky()
-    good = np.isfinite(known)
-    made = []
-    for part in (0.0, 0.25):
-        frame = table.frame(known + part * order_um).astype(float)
-        made.append(np.where(good, frame / frame[good].mean() - 1.0, 0.0).astype(np.float32))
-    return made
+def _pattern(dark: FrameTable, thickness_um: FloatArray) -> NDArray[np.float32]:
+    """The sky of a map, of mean 0: two that are a quarter of an order apart add up to that of any common shift."""
+    good = np.isfinite(thickness_um)
+    frame = dark.frame(thickness_um).astype(float)
+    return np.where(good, frame / frame[good].mean() - 1.0, 0.0).astype(np.float32)
 
 
 def _fringes_alone(

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
 from ..errors import InputError, named_units
+from .correction.objects import square_sums
 from .smooth_field import Splines, Spread, nearest_coefficients, prior_covariance
 
 __all__ = ["SkyShift", "fit_sky_shift"]
@@ -139,7 +140,8 @@ def fit_sky_shift(
     known = np.isfinite(layer)
     filled = np.where(known, layer, float(layer[known].mean()))
     night = _Night(frames, filled, predict, order_um, map_sigma_um or MAP_SIGMA_ORDERS * order_um)
-    tried = [night.fitted(Splines.of(layer.shape, spans), night.starts()[0]) for spans in (0, 1)]
+    likeliest = night.starts()[0]
+    tried = [night.fitted(Splines.of(layer.shape, spans), likeliest) for spans in (0, 1)]
     night = night.with_noise_of(max(tried, key=lambda fit: fit.log_evidence))
     found: list[_Fit] = []
     others: list[_Fit] = []
@@ -183,9 +185,10 @@ def _frames(
 class _State(NamedTuple):
     """A night at one shift, with the best levels of its bands and backgrounds."""
 
+    shift_um: FloatArray
     half_chi2: float  # with the prior of the bands
     log_volume: float  # -0.5 log det of the levels
-    slopes: list[FloatArray]  # (ny, nx) each: change of a frame with the shift [1/µm]
+    levels: list[FloatArray]  # (B,) each: of the bands
     designs: list[FloatArray]  # (terms, pixels) each
     inverses: list[FloatArray]  # (terms, terms) each: covariance of the levels
     residuals: list[FloatArray]  # (ny, nx) each
@@ -258,25 +261,19 @@ class _Night:
         side = max(
             1, min(round(0.25 * self.order_um / max(slope, 1e-12)), min(total.shape) // LEAST_PX_OF_SPAN)
         )
-        sums = [
-            np.add.reduceat(np.add.reduceat(each, np.arange(0, len(each), side), axis=0),
-                            np.arange(0, each.shape[1], side), axis=1)
-            for each in (shared, total)
-        ]  # fmt: skip
-        known = sums[1] > 0.0
+        shared, total = (square_sums(each, side) for each in (shared, total))
+        known = total > 0.0
         # Where all is noise, these squares have a mean of 1, and the scatter of a mean.
-        return min(1.0, 1.0 / float(np.mean(sums[0][known] ** 2 / sums[1][known])))
+        return min(1.0, 1.0 / float(np.mean(shared[known] ** 2 / total[known], dtype=float)))
 
     def state(self, shift_um: FloatArray) -> _State:
         """The night at a shift, with the levels that suit it best."""
-        step = DERIVATIVE_ORDERS * self.order_um
-        bands, above, below = (self.predict(self.layer_um + shift_um + d) for d in (0.0, step, -step))
-        gradient = (above - below) / (2.0 * step)
-        made = _State(0.0, 0.0, [], [], [], [], np.zeros(len(self.frames)))
+        bands, smooth = self.predict(self.layer_um + shift_um), _polynomials(self.layer_um.shape)
+        made = _State(shift_um, 0.0, 0.0, [], [], [], [], np.zeros(len(self.frames)))
         half_chi2 = log_volume = 0.0
         for number, (value, weight) in enumerate(self.frames):
             middle = np.average(bands, axis=(1, 2), weights=weight)
-            design = np.concatenate([bands - middle[:, None, None], _polynomials(value.shape)])
+            design = np.concatenate([bands - middle[:, None, None], smooth])
             flat = design.reshape(len(design), -1)
             weighted = flat * weight.ravel()
             level, inverse, log_det = _levels(weighted @ flat.T, weighted @ value.ravel(), len(bands))
@@ -284,7 +281,7 @@ class _Night:
             away = (level[: len(bands)] - 1.0) / BAND_SIGMA
             half_chi2 += 0.5 * float((weight * residual**2).sum() + away @ away)
             log_volume -= 0.5 * log_det
-            made.slopes.append(np.tensordot(level[: len(bands)], gradient, axes=1))
+            made.levels.append(level[: len(bands)])
             made.designs.append(flat)
             made.inverses.append(inverse)
             made.residuals.append(residual)
@@ -294,11 +291,15 @@ class _Night:
 
     def normal(self, splines: Splines, state: _State) -> tuple[FloatArray, FloatArray]:
         """Information on the coefficients, the levels being free, and minus the gradient of half the χ²."""
+        apart = DERIVATIVE_ORDERS * self.order_um
+        above, below = (self.predict(self.layer_um + state.shift_um + step) for step in (apart, -apart))
+        change = (above - below) / (2.0 * apart)  # of each band with the shift [1/µm]
         gradient = np.zeros(splines.count)
         total = np.zeros(self.layer_um.shape)
         reduced = np.zeros((splines.count, splines.count))
-        frames = zip(self.frames, state.slopes, state.designs, state.inverses, state.residuals, strict=True)
-        for (_, weight), slope, design, inverse, residual in frames:
+        frames = zip(self.frames, state.levels, state.designs, state.inverses, state.residuals, strict=True)
+        for (_, weight), level, design, inverse, residual in frames:
+            slope = np.tensordot(level, change, axes=1)
             total += weight * slope**2
             gradient += splines.sums(weight * slope * residual)
             cross = np.stack(
@@ -335,9 +336,8 @@ class _Night:
         self, splines: Splines, coefficient: FloatArray, step: FloatArray, penalty: FloatArray, state: _State
     ) -> tuple[FloatArray, _State]:
         """As much of a step as makes the fit better."""
-        limit = (
-            0.25 * self.order_um / max(float(np.abs(step).max()), 1e-300)
-        )  # a quarter of a fringe is not linear
+        # Beyond a quarter of a fringe nothing is linear.
+        limit = 0.25 * self.order_um / max(float(np.abs(step).max()), 1e-300)
         step = min(1.0, limit) * step
         before = state.half_chi2 + 0.5 * float(coefficient @ penalty @ coefficient)
         for _ in range(6):

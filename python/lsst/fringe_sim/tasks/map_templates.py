@@ -21,7 +21,14 @@ from ..algorithms.laboratory_shift import template_pair
 from ..instrument.detector import Detector
 from ..products import FringeTemplates, ThicknessMap
 from .quantum import data_id_of, run_datetime, sensor_of, unusable
-from .sky_model import SensorMapsConfig, silicon_input, takes_images, thickness_input, without_constraint
+from .sky_model import (
+    SensorMapsConfig,
+    maps_of,
+    silicon_input,
+    takes_images,
+    thickness_input,
+    without_constraint,
+)
 
 __all__ = ["MapTemplatesConfig", "MapTemplatesConnections", "MapTemplatesTask"]
 
@@ -80,10 +87,7 @@ class MapTemplatesTask(PipelineTask):
         detector = sensor_of(data_id)
         created = run_datetime(outputRefs.templates.run)
         with unusable(f"{detector.name}, {data_id['physical_filter']}"):
-            thickness, silicon = (
-                butlerQC.get(getattr(inputRefs, name)) if hasattr(inputRefs, name) else None
-                for name in ("thickness", "silicon")
-            )
+            thickness, silicon = maps_of(butlerQC, inputRefs)
             result = self.run(thickness, detector, str(data_id["physical_filter"]), created, silicon)
         butlerQC.put(result, outputRefs)
 

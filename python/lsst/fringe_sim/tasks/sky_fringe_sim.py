@@ -36,6 +36,7 @@ from .quantum import data_id_of, sensor_of, unusable
 from .sky_model import (
     SensorMapsConfig,
     SkyModel,
+    maps_of,
     silicon_input,
     takes_images,
     thickness_input,
@@ -175,10 +176,7 @@ class SkyFringeSimTask(PipelineTask):
                 airmass=airmass_of(record) or setup.airmass,
                 physical_filter=str(data_id["physical_filter"]),
             )
-            thickness, silicon = (
-                butlerQC.get(getattr(inputRefs, name)) if hasattr(inputRefs, name) else None
-                for name in ("thickness", "silicon")
-            )
+            thickness, silicon = maps_of(butlerQC, inputRefs)
             result = self.run(thickness, exposure, detector, silicon)
         butlerQC.put(result, outputRefs)
 

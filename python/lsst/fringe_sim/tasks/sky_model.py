@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField, RangeField
+from lsst.pipe.base import QuantumContext
 from lsst.pipe.base.connectionTypes import Input
 
 from ..algorithms.field_response import SensorPlacement
@@ -40,6 +41,7 @@ __all__ = [
     "SensorSky",
     "SkyModel",
     "SkyModelConfig",
+    "maps_of",
     "silicon_input",
     "takes_images",
     "thickness_input",
@@ -284,6 +286,14 @@ class SensorMapsConfig(SkyModelConfig):
             "STANDIN": stand_in,
             "SIMAP": silicon,
         }
+
+
+def maps_of(butlerQC: QuantumContext, inputRefs: Any) -> list[ThicknessMap | None]:
+    """Maps of the varying layer and of the silicon, `None` for those that a quantum does without."""
+    return [
+        butlerQC.get(getattr(inputRefs, name)) if hasattr(inputRefs, name) else None
+        for name in ("thickness", "silicon")
+    ]
 
 
 def silicon_input() -> Input:
