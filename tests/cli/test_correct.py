@@ -11,7 +11,7 @@ from astropy.table import Table
 from observed_night import observed_night
 
 from lsst.fringe_sim.cli.main import run
-from lsst.fringe_sim.cli.observed import _other_light
+from lsst.fringe_sim.cli.observed import other_light
 from lsst.fringe_sim.products import FringeFrame
 
 
@@ -238,5 +238,5 @@ def test_dry_run_writes_nothing(night: Path, made: Path, tmp_path: Path) -> None
     ],
 )
 def test_bands_of_a_model_and_of_a_frame_must_agree(template, frame, refused) -> None:
-    assert _other_light(template, frame, True) is refused
-    assert _other_light(template, frame, False)
+    assert other_light(template, frame, True) is refused
+    assert other_light(template, frame, False)

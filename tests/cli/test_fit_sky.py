@@ -47,14 +47,40 @@ def test_a_map_is_moved_to_where_the_sky_is(tmp_path: Path, rng: np.random.Gener
             assert np.abs(left).max() < 4.0 * moved.sigma.max()
 
 
-def test_what_is_refused_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def write_frame(path: Path, seed: int, side: int = SIDE, **cards: object) -> str:
+    hdu = fits.PrimaryHDU(np.random.default_rng(seed).normal(3e3, 50.0, (side, side)).astype(np.float32))
+    hdu.header.update(cards)
+    hdu.writeto(path)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("cards", "options", "reason"),
+    [
+        ({}, ("--detector", "R01_S00"), "lsst_itl"),
+        ({}, ("--setup", "ts8_e2v"), "telescope"),
+        ({"NOISE": False}, (), "NOISE"),
+        ({"FRINGCOR": 1}, (), "FRINGCOR"),
+        ({"DETNAME": "R10_S01"}, ("--detector", "R22_S11"), "R10_S01"),
+        ({"FILTER": "z_10"}, (), "filter of the frames"),
+        ({"side": 64}, (), "shape of the frames"),
+        ({"seed": 1}, (), "pixels"),  # one frame twice
+        ({}, ("--effect", "void.depth=1"), "void"),
+    ],
+)
+def test_what_is_refused_before_any_work(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    cards: dict[str, object],
+    options: tuple[str, ...],
+    reason: str,
+) -> None:
     path = write_map(tmp_path / "map.fits", TRUE_UM)
-    frame = str(tmp_path / "frame.fits")
-    fits.PrimaryHDU((3000.0 + X).astype(np.float32)).writeto(frame)
-    out = ["--out", str(tmp_path / "out"), "--dry-run"]
-    for given, reason in (
-        ([frame, "--thickness", path, "--detector", "R01_S00"], "lsst_itl"),
-        ([frame, "--thickness", path, "--setup", "ts8_e2v"], "telescope"),
-    ):
-        assert run(["fit-sky", *given, *out]) != 0
-        assert reason in capsys.readouterr().err
+    changed = {name: value for name, value in cards.items() if name not in ("seed", "side")}
+    side = SIDE if cards.get("side") is None else 64
+    first = write_frame(tmp_path / "a.fits", 1, side, **changed)
+    second = write_frame(tmp_path / "b.fits", 1 if "seed" in cards else 2, side, **changed)
+    command = ["fit-sky", first, second, "--thickness", path, *options, "--out", str(tmp_path / "out")]
+    assert run(command) != 0
+    assert reason in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

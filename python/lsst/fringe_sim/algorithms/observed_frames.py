@@ -29,6 +29,7 @@ __all__ = [
     "CorrectedFrame",
     "FrameRecord",
     "correct_frame",
+    "first_of_alike",
     "frame_weight",
     "injected_table",
     "make_templates",
@@ -192,7 +193,9 @@ def make_templates(
         The frames do not decide a template.
     """
     chosen = options or TemplateOptions()
-    first = _first_of_alike(frames, names)
+    if len(frames) < LEAST_FRAMES:
+        raise InputError("frames for templates", len(frames), "three or more, of different places on the sky")
+    first = first_of_alike(frames, names, "frames for templates")
     expected = [np.where(each.mask == 0, each.image, 0).astype(np.float32) for each in prior]
     found = fit_templates([partial(_loaded, frame) for frame in frames], chosen, expected, advance)
     unseen = found.coverage < chosen.least_frames
@@ -355,10 +358,13 @@ def _block_means(image: NDArray[Any], good: NDArray[np.bool_], side: int) -> NDA
     return np.divide(total, number, out=np.full(number.shape, np.nan, np.float32), where=number > 0)
 
 
-def _first_of_alike(frames: Sequence[Callable[[], ObservedFrame]], names: Sequence[str]) -> ObservedFrame:
-    """The first frame, when all have been read and found to belong together."""
-    if len(frames) < LEAST_FRAMES:
-        raise InputError("frames for templates", len(frames), "three or more, of different places on the sky")
+def first_of_alike(
+    frames: Sequence[Callable[[], ObservedFrame]], names: Sequence[str], purpose: str
+) -> ObservedFrame:
+    """The first frame, when all have been read and found to belong together, each being there once.
+
+    `InputError`: one is of another sensor, filter, unit or size, was corrected, or is there twice.
+    """
     first = frames[0]()
 
     def images() -> Iterator[NDArray[np.float32]]:
@@ -367,7 +373,7 @@ def _first_of_alike(frames: Sequence[Callable[[], ObservedFrame]], names: Sequen
             _refuse_other(read, first)
             yield read.image
 
-    refuse_equal_pixels("frames for templates", images(), names)
+    refuse_equal_pixels(purpose, images(), names)
     return first
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
 from ..errors import InputError
 from .bad_files import refuse_bad
-from .observed import background_options, background_path, grid_of, images_of
+from .observed import background_options, background_path, grid_of, images_of, other_light
 from .output import OutputFolder, output_folder
 from .parameters import SKY, ChosenEffects, model_effects
 from .progress import progress
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
     from ..algorithms.sky_response import Response
     from ..instrument.detector import Detector
     from ..instrument.setup import Setup
-    from ..products import SensorSection, ThicknessMap
+    from ..model import FringeModel
+    from ..products import ObservedFrame, SensorSection, ThicknessMap
     from ..products.observed_files import ObservedImage
 
 __all__ = ["fit_sky"]
@@ -75,24 +77,24 @@ def fit_sky(
     """
     from ..algorithms.fringe_correction import CorrectionOptions
     from ..algorithms.map_on_sky import map_on_sky, reach_um
-    from ..model import FringeModel
     from ..model.provenance import input_cards, software_cards
-    from ..products import refuse_corrected
     from ..report.map_on_sky_page import write_map_on_sky_report
-    from .inputs import read_map, read_section
+    from .inputs import placed_model, read_map, read_section, sky_settings
 
-    images, unusable = images_of(frames, refuse_corrected)
+    images, unusable = images_of(frames, _refuse_unfit)
     refuse_bad(unusable, skip_bad=skip_bad)
-    sensor = setup.sensor(detector or _sensor_of(images))
+    sensor = _sensor_of(images, setup, detector)
     layer = read_map(thickness, setup, sensor)
     section = read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
-    order_um = float(FringeModel.from_setup(setup).fringe_order_um(960.0))
+    model = placed_model(setup, sky_settings(effects.settings), sensor)
+    order_um = float(model.fringe_order_um(960.0))
+    loaders = [partial(image.read, background_path(background, image)) for image in images]
+    _check_frames(loaders, images, layer, setup)
     if dry_run:
         click.echo(f"would hold the map of {sensor.name} against {len(images)} frames")
         return
     folder = out.prepare()
-    response = _response(layer, setup, sensor, section, effects, reach_um(order_um, map_sigma))
-    loaders = [partial(image.read, background_path(background, image)) for image in images]
+    response = _response(layer, model, sensor, section, reach_um(order_um, map_sigma))
     with progress("finding fringes", len(images)) as advance:
         found = map_on_sky(
             loaders,
@@ -137,39 +139,56 @@ def said(found: MapOnSky, frames: int, order_um: float) -> list[str]:
     return [*lines, known + more]
 
 
-def _sensor_of(images: list[ObservedImage]) -> str | None:
-    """Sensor that all frames name, if they name one."""
+def _refuse_unfit(header: Mapping[str, Any], source: str) -> None:
+    from ..products import refuse_corrected, refuse_noiseless
+
+    refuse_corrected(header, source)
+    refuse_noiseless(header, source)
+
+
+def _sensor_of(images: list[ObservedImage], setup: Setup, chosen: str | None) -> Detector:
+    """Sensor that is chosen, or that all frames name; the set-up's own where neither tells."""
+    from ..instrument.camera import Camera
     from ..products.observed_files import detector_of
 
     names = sorted({detector_of(image.header()) for image in images} - {""})
     if len(names) > 1:
         raise InputError("sensors of the frames", names, "one")
-    return names[0] if names else None
+    sensor = setup.sensor(chosen or next(iter(names), None))
+    if names and Camera.from_name(setup.camera).are_two_sensors(names[0], sensor.name):
+        raise InputError("--detector", chosen, f"{names[0]}, which the frames name")
+    return sensor
+
+
+def _check_frames(
+    loaders: Sequence[Callable[[], ObservedFrame]],
+    images: Sequence[ObservedImage],
+    layer: ThicknessMap,
+    setup: Setup,
+) -> None:
+    """Refuse frames that do not belong together, or not to the map or the band of the set-up."""
+    from ..algorithms.observed_frames import first_of_alike
+
+    names = [f"{image.path}[{image.name}]" for image in images]
+    first = first_of_alike(loaders, names, "frames of the sky")
+    if first.shape != layer.shape:
+        raise InputError("shape of the frames", first.shape, f"{layer.shape}, that of the thickness map")
+    if other_light(setup.bandpass, first.physical_filter, is_model=True):
+        raise InputError(
+            "filter of the frames", first.physical_filter, f"{setup.bandpass}, that of the set-up"
+        )
 
 
 def _response(
-    layer: ThicknessMap,
-    setup: Setup,
-    sensor: Detector,
-    section: SensorSection | None,
-    effects: ChosenEffects,
-    reach_um: float,
+    layer: ThicknessMap, model: FringeModel, sensor: Detector, section: SensorSection | None, reach_um: float
 ) -> Response:
     """Response of the sensor to the dark sky, as far beyond the map as it may be off."""
-    from ..algorithms.field_response import SensorPlacement
+    from ..algorithms.sensor_placement import SensorPlacement
     from ..algorithms.sky_of_maps import sky_of_maps
     from ..instrument.sky import SkySpectrum
-    from ..model import FringeModel
     from ..products.thickness_map import thickness_span_um
-    from .inputs import sky_settings
 
-    place = SensorPlacement.of(sensor, setup.pixel_scale_arcsec, section)
-    model = FringeModel.from_setup(
-        setup,
-        sky_settings(effects.settings),
-        field_x_deg=place.field_x_deg,
-        field_y_deg=place.field_y_deg,
-    )
+    place = SensorPlacement.of(sensor, model.setup.pixel_scale_arcsec, section)
     click.echo("tabulating the response to the sky", err=True)
     span = thickness_span_um(layer.known_um(), reach_um)
-    return sky_of_maps(model, SkySpectrum.dark(airmass=setup.airmass), place, span, None).on(None)
+    return sky_of_maps(model, SkySpectrum.dark(airmass=model.setup.airmass), place, span, None).on(None)

@@ -25,12 +25,23 @@ from ..resources import LONGEST_USER_FILE, complete_fits, read_user_text, read_u
 
 __all__ = [
     "effect_cards",
+    "placed_model",
     "read_map",
     "read_section",
     "read_settings",
     "read_thickness",
     "sky_settings",
 ]
+
+
+def placed_model(setup: Setup, settings: Mapping[str, Any], sensor: Detector) -> FringeModel:
+    """A sensor of a camera behind its telescope, with effects, in the beam of its centre."""
+    from ..algorithms.sensor_placement import SensorPlacement
+
+    centre = SensorPlacement.of(sensor, setup.pixel_scale_arcsec)
+    return FringeModel.from_setup(
+        setup, settings, field_x_deg=centre.field_x_deg, field_y_deg=centre.field_y_deg
+    )
 
 
 def read_map(path: str | os.PathLike[str], setup: Setup, sensor: Detector | None = None) -> ThicknessMap:

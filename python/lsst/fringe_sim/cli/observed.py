@@ -29,6 +29,7 @@ __all__ = [
     "grid_of",
     "images_of",
     "latest_date",
+    "other_light",
     "stem_of",
     "target_names",
 ]
@@ -199,7 +200,7 @@ class TemplateFolder:
         files = tuple(self._files[detector if detector in self._files else names[0]])
         found = _read_templates(files)
         for name in {each.physical_filter for each in found}:
-            if _other_light(name, physical_filter, _keyword(files[0], "PRODUCT") == "FringeFrame"):
+            if other_light(name, physical_filter, _keyword(files[0], "PRODUCT") == "FringeFrame"):
                 raise InputError("filter of a frame", physical_filter, f"{name}, that of the templates")
         return found
 
@@ -213,7 +214,7 @@ class TemplateFolder:
         return self._last[1]
 
 
-def _other_light(template: str, frame: str, is_model: bool) -> bool:
+def other_light(template: str, frame: str, is_model: bool) -> bool:
     """Whether the names of two filters are of different ones.
 
     A model names its filter as its telescope does, which a file need not: only the bands of both can differ.

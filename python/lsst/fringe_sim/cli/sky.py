@@ -132,7 +132,7 @@ def sky(
     from ..instrument.flat_spectrum import FlatSpectrum
     from ..instrument.night import NightHistory
     from ..report.sky_page import write_sky_report
-    from .inputs import sky_settings
+    from .inputs import placed_model, sky_settings
 
     _check_exposure(exptime, night)
     sensor = setup.sensor(detector)
@@ -154,7 +154,7 @@ def sky(
             f"would simulate {count} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
         )
         return
-    model = _model(setup, settings, sensor).at_laboratory_temperature(header)
+    model = placed_model(setup, settings, sensor).at_laboratory_temperature(header)
     maps = [name for name in (thickness, silicon_thickness) if name not in (BUILT_IN, None)]
     given: list[str | Path] = [*maps, *effects.files]
     cards = _cards(model, given, contrast, section)
@@ -206,16 +206,6 @@ class Exposure:
     night: NightHistory | None  # a frame for each of its times; one frame of the dark sky without
     measured: bool  # whether the level is that of the measured quantum efficiency
     flat: FlatSpectrum | None  # light of the flat field
-
-
-def _model(setup: Setup, settings: Mapping[str, Any], sensor: Detector) -> FringeModel:
-    from ..algorithms.field_response import SensorPlacement
-    from ..model import FringeModel
-
-    centre = SensorPlacement.of(sensor, setup.pixel_scale_arcsec)
-    return FringeModel.from_setup(
-        setup, settings, field_x_deg=centre.field_x_deg, field_y_deg=centre.field_y_deg
-    )
 
 
 def _cards(

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import click
 
-from ..algorithms.field_response import SensorPlacement
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
 from ..products import SkyFrames, SkyFringe
 from ..products.same_light import pixels_digest
-from .inputs import read_map
+from .inputs import placed_model, read_map
 
 __all__ = ["SkyData", "read_sky_frames"]
 
@@ -29,10 +28,7 @@ class SkyData:
 
     def model(self, settings: Mapping[str, float]) -> FringeModel:
         """The sensor in its place, with effects that are known."""
-        place = SensorPlacement.of(self.detector, self.setup.pixel_scale_arcsec)
-        return FringeModel.from_setup(
-            self.setup, settings, field_x_deg=place.field_x_deg, field_y_deg=place.field_y_deg
-        )
+        return placed_model(self.setup, settings, self.detector)
 
 
 def read_sky_frames(paths: Sequence[str], setup: Setup, thickness: str | None) -> SkyData:
