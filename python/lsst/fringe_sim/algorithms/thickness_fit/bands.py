@@ -1,4 +1,4 @@
-"""Bands of rows of a sensor, as the compiled loops of the fit want them: amplitudes and weights."""
+"""Bands of rows of a sensor, or some of its pixels, as compiled loops want them: amplitudes and weights."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel
 from .amplitudes import Amplitudes, core
+from .templates import LANES
 
-__all__ = ["BAND_ROWS", "load_band"]
+__all__ = ["BAND_ROWS", "gather_pixels", "load_band"]
 
 BAND_ROWS = 8
 """Rows that are loaded at once: all wavelengths of a full sensor then stay in the cache of a processor."""
@@ -54,6 +55,30 @@ def load_band(
             amplitude[band], weight[band],
         )  # fmt: skip
     return amplitude, weight
+
+
+def gather_pixels(
+    data: Amplitudes, rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Amplitudes and weights of some pixels, shape ``(n, padded wavelengths)``."""
+    wavelengths = data.shape[0]
+    padded = -(-wavelengths // LANES) * LANES
+    value, weight = np.zeros((rows.size, padded), np.float32), np.zeros((rows.size, padded), np.float32)
+    scale = data.scale.astype(np.float32)
+    cell_of_row = data.cell_of_row()
+    for band in range(wavelengths):
+        image = data.image[band][rows, columns].astype(np.float32)
+        variance = data.variance[band][rows, columns].astype(np.float32) * scale[band] ** 2
+        good = (
+            (data.bad[band][rows, columns] == 0) & np.isfinite(image) & np.isfinite(variance) & (variance > 0)
+        )
+        amplitude = image * scale[band] - 1
+        if len(data.offset):
+            light = data.offset[band][cell_of_row[rows], np.searchsorted(data.x_edges, columns, "right") - 1]
+            amplitude = (amplitude - light) / (1 + light)
+        value[:, band] = np.where(good, amplitude, 0)
+        weight[:, band] = np.where(good, 1 / np.where(good, variance, 1), 0)
+    return value, weight
 
 
 def _to_read(array: NDArray[Any]) -> NDArray[Any]:

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel, subkernel
 from .amplitudes import Amplitudes
+from .bands import gather_pixels
 from .misfit import Misfit, improbability
 from .newton import gauss_newton
 from .pixels import PixelFit
-from .templates import LANES, FringeTemplates
+from .templates import FringeTemplates
 
-__all__ = ["gather_pixels", "settle_borders"]
+__all__ = ["settle_borders"]
 
 _PRICE = 2.0
 """Chi-square that a break of half an order or more between two neighbouring pixels costs."""
@@ -86,30 +87,6 @@ def _misfit_of(pixels: PixelFit) -> Misfit:
     freedom = max(int(used.max(initial=0)) - 1.0, 1.0)
     known = (used == freedom + 1.0) & np.isfinite(chi2)
     return Misfit.of(freedom * chi2[known].astype(float), freedom)
-
-
-def gather_pixels(
-    data: Amplitudes, rows: NDArray[np.intp], columns: NDArray[np.intp]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Amplitudes and weights of some pixels, shape ``(n, padded wavelengths)``."""
-    wavelengths = data.shape[0]
-    padded = -(-wavelengths // LANES) * LANES
-    value, weight = np.zeros((rows.size, padded), np.float32), np.zeros((rows.size, padded), np.float32)
-    scale = data.scale.astype(np.float32)
-    cell_of_row = data.cell_of_row()
-    for band in range(wavelengths):
-        image = data.image[band][rows, columns].astype(np.float32)
-        variance = data.variance[band][rows, columns].astype(np.float32) * scale[band] ** 2
-        good = (
-            (data.bad[band][rows, columns] == 0) & np.isfinite(image) & np.isfinite(variance) & (variance > 0)
-        )
-        amplitude = image * scale[band] - 1
-        if len(data.offset):
-            light = data.offset[band][cell_of_row[rows], np.searchsorted(data.x_edges, columns, "right") - 1]
-            amplitude = (amplitude - light) / (1 + light)
-        value[:, band] = np.where(good, amplitude, 0)
-        weight[:, band] = np.where(good, 1 / np.where(good, variance, 1), 0)
-    return value, weight
 
 
 @subkernel(expand=True)

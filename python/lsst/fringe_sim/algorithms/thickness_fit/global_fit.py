@@ -132,7 +132,7 @@ def global_fit(
     pixels = rescue_pixels(
         fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
-    pixels = model_error(pixels, state.nuisance.scale_sigma)
+    pixels = model_error(pixels, state.nuisance.scale_sigma, state.nuisance.learned_sigma_um)
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))
         pixels = replace(pixels, sigma=np.asarray(whole, np.float32))

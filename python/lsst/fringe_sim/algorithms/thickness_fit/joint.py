@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
-from .bands import BAND_ROWS, load_band
-from .borders import gather_pixels
+from .bands import BAND_ROWS, gather_pixels, load_band
 from .conclusion import MISFIT
 from .global_fit import GlobalFit, global_fit
 from .nuisances import Nuisances

@@ -36,6 +36,8 @@ _OVERTONE, _OVERTONE_BY_WAVELENGTH = 0.5, 0.2
 """Standard deviations of what is added of the overtones of the model: what wavelengths share, and what each has
 besides."""
 _TEMPLATE_MARGIN_UM = 0.5
+_MOST_ASKED = 1000
+"""Cells that show what an error of the nuisances does to the thickness."""
 _FREE = 1e-4
 """Precision of what has no prior."""
 
@@ -318,7 +320,7 @@ class _Problem:
         thickness, model, slope, rest = self.residual(fit, thickness)
         normal, _ = self._system(fit, thickness, model, slope, rest)
         precision, _ = self._prior(fit)
-        variance = np.linalg.inv(normal)
+        variance = np.asarray(np.linalg.inv(normal), dtype=float)
         wavelengths, own, count = self.base.n_wavelengths, self.own, self.cells.pattern.shape[1]
         diagonal = np.sqrt(np.maximum(np.diag(variance), 0.0))
         table = diagonal[: wavelengths * own].reshape(wavelengths, own)
@@ -345,7 +347,31 @@ class _Problem:
             contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale,
             misfit=misfit.scale * squares, chi2=self.cells.temper * misfit.cost(each), prior=self._prior_chi2(fit),
             shared=float(shared_variances(standard, thickness, self.cells.order_um)[-1]),
+            learned_sigma_um=self._learned_sigma(fit, thickness, model, slope, variance),
         )  # fmt: skip
+
+    def _learned_sigma(
+        self,
+        fit: NuisanceFit,
+        thickness: NDArray[np.float32],
+        model: FloatArray,
+        slope: FloatArray,
+        variance: FloatArray,
+    ) -> float:
+        """Rms uncertainty of the thickness from all that was learned but the common error of the wavelengths [µm]."""
+        some = slice(None, None, -(-len(thickness) // _MOST_ASKED))
+        wavelengths, size = self.base.n_wavelengths, self.base.n_wavelengths * self.own
+        problem = replace(self, cells=replace(self.cells, pattern=self.cells.pattern[some]))
+        each, common = problem._design(fit, thickness[some], model[some], slope[some])
+        lean = self.cells.weight[some, :wavelengths] * slope[some]
+        information = np.maximum((lean * slope[some]).sum(axis=1), 1e-30)
+        moves = (each * lean.T[:, None]).reshape(size, len(information))
+        moves = np.concatenate([moves, (common * lean.T[:, None]).sum(axis=0)]) / information
+        if self.free.wavelength_accuracy_nm > 0.0:
+            along = self._along(fit)
+            place = np.arange(self.own - 1, size, self.own)
+            moves[place] -= np.outer(along, along @ moves[place]) / (along @ along)
+        return float(np.sqrt(np.mean(np.einsum("in,ij,jn->n", moves, variance, moves, optimize=True))))
 
     def _trust(self, rest: FloatArray, weight: FloatArray) -> tuple[Misfit, FloatArray, FloatArray]:
         """How far cells can be off, the chi-square of each, and how far it is to be trusted."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .amplitudes import Amplitudes
-from .borders import gather_pixels
+from .bands import gather_pixels
 from .cells import Cells, effective_number
 from .nuisances import Nuisances, light_patterns, patterns_of_cells
 from .pixels import CellSurface

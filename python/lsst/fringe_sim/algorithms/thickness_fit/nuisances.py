@@ -153,6 +153,8 @@ class NuisanceFit:
         Mean response over the sensor to which level and contrast belong; empty if it is not known.
     chi2, prior : `float`
         Twice the negative logarithm of the probability of the cells looked at, and of the prior of the nuisances.
+    learned_sigma_um : `float`
+        Standard uncertainty of the thickness from all of this but the scale [µm].
     shared : `float`
         Variance of sums over cells relative to that of cells which err each by itself.
     """
@@ -171,6 +173,7 @@ class NuisanceFit:
     chi2: float = np.inf
     prior: float = 0.0
     shared: float = 1.0
+    learned_sigma_um: float = 0.0
 
     @classmethod
     def none(cls, wavelengths: int, patterns: int = 0) -> NuisanceFit:

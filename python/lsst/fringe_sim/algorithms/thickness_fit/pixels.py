@@ -11,14 +11,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, uniform_filter
 
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
-from .bands import BAND_ROWS, load_band
+from .bands import BAND_ROWS, gather_pixels, load_band
 from .medians import middle_of
 from .newton import gauss_newton, newton_block
-from .posterior import widen_band, widest_parabola
+from .posterior import (
+    NODES,
+    SHARE,
+    SurfacePrior,
+    chi2_about,
+    learn_prior,
+    local_width,
+    nodes_about,
+    settle_band,
+    widest_parabola,
+)
 from .templates import FringeTemplates
 
 __all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels"]
@@ -32,6 +42,8 @@ _SAME_SURFACE = 0.25
 _LONE_CELL_PENALTY = 12.0
 """Chi-square by which a surface shown by a single cell must be better than one that several show."""
 _BLOCK = 32
+_MOST_ASKED = 32768
+"""Pixels that show how far all lie from their surface: a width of a tenth of the noise of a pixel is then seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +80,8 @@ class CellSurface:
         Whether a cell and its eight neighbours lie on one surface.
     known : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
         Whether a cell has data; the thickness of the others is borrowed, and no evidence for a surface.
+    sigma_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Standard uncertainty of the thickness from the noise of the flats [µm]; infinite where it is not known.
     """
 
     thickness_um: NDArray[np.float32]
@@ -77,6 +91,7 @@ class CellSurface:
     x_centre: NDArray[np.float64]
     smooth: NDArray[np.bool_]
     known: NDArray[np.bool_]
+    sigma_um: NDArray[np.float32]
 
     @classmethod
     def from_cells(
@@ -88,6 +103,7 @@ class CellSurface:
         x_centre: NDArray[np.float64],
         order_um: float,
         known: NDArray[np.bool_],
+        sigma_um: NDArray[np.float32],
     ) -> CellSurface:
         """Find out which cells lie on one surface."""
         rise = np.diff(y_centre)[:, None] * 0.5 * (slope_y[1:] + slope_y[:-1])
@@ -108,6 +124,7 @@ class CellSurface:
             x_centre,
             ~broken,
             known,
+            sigma_um,
         )
 
     def at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
@@ -143,7 +160,18 @@ def calm_surface(surface: CellSurface, threads: int = 2) -> CellSurface:
         )  # fmt: skip
 
     run_threaded(work, len(out), threads)
-    return replace(surface, thickness_um=out)
+    calm = surface.smooth & (surface.sigma_um > 0.0)
+    density = np.where(calm, 1.0 / np.where(calm, surface.sigma_um, 1.0), 0.0)
+    number, total = (
+        25.0 * uniform_filter(each.astype(float), 5, mode="constant") for each in (surface.smooth, density)
+    )
+    # The median of independent normal numbers about one value, each of an uncertainty of its own.
+    sigma = np.sqrt(0.5 * np.pi * np.maximum(number, 0.0)) / np.maximum(total, 1e-30)
+    return replace(
+        surface,
+        thickness_um=out,
+        sigma_um=np.where(surface.smooth, sigma, surface.sigma_um).astype(np.float32),
+    )
 
 
 @kernel
@@ -207,10 +235,95 @@ def fit_pixels(
             surface.smooth, surface.known, low, below_y, share_y, below_x, share_x,
             value[low:high], sigma[low:high], chi2[low:high], used[low:high],
         )  # fmt: skip
-        widen_band(amplitude, weight, *grid, limit, value[low:high], sigma[low:high])
 
     run_threaded(work, -(-ny // BAND_ROWS), threads)
-    return PixelFit(value, sigma, chi2, used)
+    return _settle(data, templates, surface, PixelFit(value, sigma, chi2, used), limit, order_um, threads)
+
+
+def _settle(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    surface: CellSurface,
+    pixels: PixelFit,
+    limit: NDArray[np.float32],
+    order_um: float,
+    threads: int,
+) -> PixelFit:
+    """Pixels that do not tell their thickness by themselves: the surface of the cells enters as a prior."""
+    _, ny, nx = data.shape
+    place = (pixels.value - templates.start_um) / templates.step_um
+    inside = (place >= 0.0) & (place <= len(limit) - 1.0)
+    weak = inside & (pixels.sigma / templates.step_um > limit[np.where(inside, place, 0.0).astype(np.intp)])
+    if not weak.any():
+        return pixels
+    rows, columns = (np.arange(length) for length in (ny, nx))
+    nearest = np.ix_(
+        *(
+            np.abs(np.subtract.outer(at, centre)).argmin(axis=1)
+            for at, centre in ((rows, surface.y_centre), (columns, surface.x_centre))
+        )
+    )
+    spread = surface.sigma_um[nearest]
+    follows = (surface.smooth & surface.known)[nearest] & np.isfinite(spread)
+    begin = surface.at(rows, columns)
+    prior = _learned(data, templates, begin, spread, weak & follows, order_um)
+    width = np.where(follows, np.hypot(spread, np.float32(prior.width_um)), np.float32(np.inf))
+    alone = pixels.value.copy()
+    _settle_asked(data, templates, pixels, weak, begin, width, prior.apart, order_um, threads)
+    shift, sigma = (
+        np.where(weak & follows, each, np.float32(np.nan)) for each in (pixels.value - begin, pixels.sigma)
+    )
+    window = 2 * (int(np.diff(surface.y_centre).max(initial=2)) // 2) + 1
+    wider = local_width(shift, sigma, width, window)
+    again = weak & follows & (wider > width)
+    pixels.value[again] = alone[again]
+    _settle_asked(data, templates, pixels, again, begin, wider, prior.apart, order_um, threads)
+    return pixels
+
+
+def _settle_asked(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    pixels: PixelFit,
+    asked: NDArray[np.bool_],
+    surface: NDArray[np.float32],
+    width: NDArray[np.float32],
+    apart: float,
+    order_um: float,
+    threads: int,
+) -> None:
+    """Posterior of some pixels, in place."""
+    table, start, step = templates.table(), templates.start_um, templates.step_um
+    away = nodes_about(order_um / step)
+
+    def work(band: int) -> None:
+        part = slice(band * BAND_ROWS, min((band + 1) * BAND_ROWS, len(asked)))
+        if asked[part].any():
+            amplitude, weight = load_band(data, part.start, part.stop)
+            settle_band(
+                amplitude, weight, table, start, step, asked[part], surface[part], width[part], away, SHARE, apart,
+                pixels.value[part], pixels.sigma[part], pixels.chi2[part], pixels.n_wavelengths[part],
+            )  # fmt: skip
+
+    run_threaded(work, -(-len(asked) // BAND_ROWS), threads)
+
+
+def _learned(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    surface: NDArray[np.float32],
+    spread: NDArray[np.float32],
+    asked: NDArray[np.bool_],
+    order_um: float,
+) -> SurfacePrior:
+    """Prior that some of the pixels in question show."""
+    found = np.flatnonzero(asked)
+    rows, columns = np.unravel_index(found[:: -(-found.size // _MOST_ASKED) or 1], asked.shape)
+    value, weight = gather_pixels(data, rows, columns)
+    place = (surface[rows, columns].astype(float) - templates.start_um) / templates.step_um
+    chi2 = np.empty((rows.size, NODES))
+    chi2_about(value, weight, templates.table(), place, nodes_about(order_um / templates.step_um), chi2)
+    return learn_prior(chi2, spread[rows, columns].astype(float), order_um)
 
 
 def bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

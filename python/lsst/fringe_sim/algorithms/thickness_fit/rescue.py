@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from ...compiled import kernel
 from .amplitudes import Amplitudes
-from .borders import gather_pixels
+from .bands import gather_pixels
 from .cells import Cells
 from .evidence import order_evidence
 from .medians import middle_of

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .amplitudes import Amplitudes
-from .borders import gather_pixels
+from .bands import gather_pixels
 from .cells import Cells
 from .evidence import refine_row
 from .pixels import CellSurface

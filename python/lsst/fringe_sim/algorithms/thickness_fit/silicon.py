@@ -31,7 +31,7 @@ from ...model import FringeModel
 from ...products import ThicknessMap, mask_bits
 from ..thickness_fit_options import SILICON_FIELDS
 from .amplitudes import Amplitudes
-from .borders import gather_pixels
+from .bands import gather_pixels
 from .newton import gauss_newton
 from .templates import FringeTemplates, pad_wavelengths
 

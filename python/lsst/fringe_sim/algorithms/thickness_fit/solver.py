@@ -360,4 +360,20 @@ def surface_of(state: State, order: float) -> CellSurface:
         thickness = thickness[tuple(near)]
         slope_y, slope_x = np.where(empty, 0.0, slope_y), np.where(empty, 0.0, slope_x)
     cells = state.cells
-    return CellSurface.from_cells(thickness, slope_y, slope_x, cells.y_centre, cells.x_centre, order, ~empty)
+    sigma = _noise_of_cells(cells, state.templates, thickness)
+    return CellSurface.from_cells(
+        thickness, slope_y, slope_x, cells.y_centre, cells.x_centre, order, ~empty, sigma
+    )
+
+
+def _noise_of_cells(
+    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Uncertainty of the thickness of each cell from the noise of its mean amplitudes [µm]; infinite if unknown."""
+    slope = np.gradient(templates.amplitude(), templates.step_um, axis=0)
+    place = (thickness_um - templates.start_um) / templates.step_um
+    place = np.clip(np.nan_to_num(place), 0, len(slope) - 1).astype(np.intp)
+    weight = cells.weight[..., : templates.n_wavelengths]
+    information = (weight * slope[place] ** 2).sum(axis=-1)
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / np.sqrt(information), np.float32)
