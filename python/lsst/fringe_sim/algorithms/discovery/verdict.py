@@ -347,7 +347,8 @@ class Verdict(InNotebook):
                 found += f", at most {100.0 * most:.2g} % of the fringes ({100.0 * CONFIDENCE:g} %)"
             return f"size of the disagreement: {found}"
         return (
-            f"size of the disagreement: {100.0 * fringes:.2g} % of the fringes ({counts:.2g} of the counts)"
+            f"size of the disagreement: {100.0 * fringes:.2g} % of the fringes "
+            f"({100.0 * counts:.2g} % of the counts)"
         )
 
     def summary(self) -> str:
