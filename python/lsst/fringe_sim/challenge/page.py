@@ -58,7 +58,8 @@ def write_challenge_report(path: str | Path, result: ChallengeResult, origin: Or
         "Which verdict each hidden cause led to. A name counts as right if the truth is in its class; a class has "
         "several members where the data do not tell them apart.",
     )
-    report.figure(confusion_figure(result), "Hidden cause against verdict, numbers of cases.")
+    if result.cases:
+        report.figure(confusion_figure(result), "Hidden cause against verdict, numbers of cases.")
     if len(result.accuracy()):
         report.figure(
             accuracy_figure(result), "Single effects against the signal to noise that an oracle sees."

@@ -135,15 +135,15 @@ def said(found: MapOnSky, frames: int, order_um: float) -> list[str]:
         strength += f" ± {shift.strength_sigma:.1g}"
     lines = [
         f"the map is right as it is with a probability of {shift.chance_unmoved:.2g}",
-        f"shift: mean {mean:+.3g} nm, rms about it {rms:.2g} nm, median σ {median:.2g} nm",
+        f"shift: mean {mean:+.3g} nm, rms about it {rms:.3g} nm, median σ {median:.3g} nm",
         f"whole orders away with a probability of {shift.chance_other_order:.2g}",
         f"fringes of the frames over those of the dark sky: {strength}",
     ]
     wanted = WORTH_ORDERS * order_um
     needed = shift.frames_for(wanted, frames)
-    known = f"parts of an eighth of the sensor are known to {NM * shift.alone_um:.2g} nm by the frames alone"
+    known = f"parts of an eighth of the sensor are known to {NM * shift.alone_um:.3g} nm by the frames alone"
     more = (
-        f"; {needed} such frames would tell {NM * wanted:.2g} nm ({WORTH_ORDERS:g} orders)"
+        f"; {needed} such frames would tell {NM * wanted:.3g} nm ({WORTH_ORDERS:g} orders)"
         if needed > frames
         else ""
     )

@@ -79,10 +79,8 @@ def _summary_of_templates(facts: Sequence[_Facts]) -> list[tuple[str, str]]:
     }
     percent = {name: span_text(PERCENT * np.array(column[name])) for name in ("rms", "sigma", "masked")}
     return [
-        (
-            "result",
-            f"Fringe templates of {who}: {span_text(column['count'])} from {span_text(column['frames'])} frames",
-        ),
+        ("result", f"{span_text(column['count'])} fringe templates of {who}"),
+        ("frames", span_text(column["frames"])),
         ("first template, rms", f"{percent['rms']} % of the sky"),
         ("median σ of a pixel of it", f"{percent['sigma']} % of the sky"),
         ("masked", f"{percent['masked']} % of the pixels"),
@@ -101,9 +99,9 @@ def write_correction_report(
     report.summary(_summary(records, refused))
     report.section(
         "Frames",
-        "Evidence of the fringes: natural logarithm; below 0 they are not seen, and the frame is left as it is. Fringes: "
-        "rms of what was subtracted. Structure: beyond the noise in apertures up to 20 arcsec, as a fraction of it. Left: "
-        "part of the fringes that is left. Probability: that a good template does so badly.",
+        "Evidence of the fringes: natural logarithm; below 0 they are not seen, and the frame is left as it is. "
+        "Fringes: rms of what was subtracted. Structure: beyond the noise in apertures up to 20 arcsec, over it. "
+        "Left: part of the fringes that is left. Probability: that a good template does so badly.",
     )
     if len(table):
         marks = ["good" if each.proof.passed else "bad" for each in records]
@@ -185,8 +183,8 @@ def _proofs(report: Report, records: Sequence[FrameRecord]) -> None:
     if sources is not None:
         report.section(
             "Injected sources",
-            "Stars and exponential discs in copies of the frames: bias and scatter of their fluxes, with the fringes and "
-            "without. Magnitudes are those of counts, without a zero point.",
+            "Stars and exponential discs in copies of the frames: bias and scatter of their fluxes, with the fringes "
+            "and without. Magnitudes are those of counts, without a zero point.",
         )
         report.table(_by_magnitude(sources), "injected", download=sources)
 

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..algorithms.discovery import Verdict
+from ..algorithms.discovery.verdict import MOST_CANDIDATES
 from ..style import DIVERGING, LINES, figure, panels
 from .figures import CURVE_INCH
 
@@ -26,7 +27,9 @@ CHANCE_LIMIT = 1e-3
 LARGEST_LINEAR = 30.0
 """Axes that reach beyond this are logarithmic."""
 
-MOST_CANDIDATES = 15
+CANDIDATE_INCH, BAR_INCH, LEAST_BARS = (6.4, 1.2), 0.27, 3
+"""Size of the figure of candidates without its bars, that of a bar, and the bars for which there is always room."""
+
 BAR_PLACES = {1: (0.0,), 2: (-0.2, 0.2)}
 """Where bars beside each other stand, by their number."""
 
@@ -60,34 +63,10 @@ def _of_those_with_data(*parts: tuple[Callable[[Axes, Any], None], Sequence[Any]
 
 def candidates_figure(verdict: Verdict) -> Figure:
     """Fall of χ² that each effect promises, the most promising first; those that were found stand out."""
-    found = {effect.name for effect in verdict.effects}
-    alike = {other for effect in verdict.effects for other in effect.ambiguous_with} - found
-    shown = [item for item in verdict.candidates if item["score"] > 0.0][:MOST_CANDIDATES]
-    with figure(8.0, 1.2 + 0.27 * max(len(shown), 3)) as made:
-        axes = made.subplots()
-        kinds = [
-            ("named", LINES[1], "", found),
-            ("in the same class", LINES[5], "//", alike),
-            ("not chosen", LINES[4], "", {item["name"] for item in shown} - found - alike),
-        ]
-        place = np.arange(len(shown))
-        for label, color, hatch, names in kinds:
-            chosen = [k for k, item in enumerate(shown) if item["name"] in names]
-            if chosen:
-                axes.barh(
-                    place[chosen],
-                    [shown[k]["score"] for k in chosen],
-                    color=color,
-                    hatch=hatch,
-                    edgecolor="white",
-                    label=label,
-                )
-        axes.set_yticks(place, [item["name"] for item in shown])
-        axes.invert_yaxis()
-        axes.set_xlabel("fall of χ² promised by the score test [1]")
-        axes.set_title("candidates")
-        if shown:
-            axes.legend(loc="lower right", fontsize=8, frameon=True)
+    promising = sum(item["score"] > 0.0 for item in verdict.candidates)
+    shown = min(max(promising, LEAST_BARS), MOST_CANDIDATES)
+    with figure(CANDIDATE_INCH[0], CANDIDATE_INCH[1] + BAR_INCH * shown) as made:
+        verdict.plot(made.subplots())
         return made
 
 

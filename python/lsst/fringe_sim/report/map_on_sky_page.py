@@ -77,7 +77,7 @@ def _strength(shift: SkyShift) -> str:
 
 
 def _figure(found: MapOnSky) -> Figure:
-    """Shift, in colours that show nothing which its uncertainty allows for, if one is likely, and this uncertainty."""
+    """Shift, if one is likely, in colours that show nothing which its uncertainty allows for, and that."""
     shift, step = found.shift, float(found.cell_px)
     reach = NM * max(float(np.abs(shift.shift_um).max()), LEAST_SIGMAS * float(np.median(shift.sigma_um)))
     with map_row(1 if shift.chance_unmoved > EVEN else 2) as (made, (*others, right)):

@@ -29,17 +29,17 @@ MOST_DECIMALS, MOST_PLAIN = 100.0, 1e6
 
 def amplitude_text(fraction: float) -> str:
     """A fraction of the counts or of the sky."""
-    return f"{PERCENT * fraction:.3g} %"
+    return f"{number_text(PERCENT * fraction)} %"
 
 
 def masked_text(mask: NDArray[Any]) -> str:
     """Share of the pixels that are masked."""
-    return f"{PERCENT * float(np.mean(np.asarray(mask) != 0)):.2g} % of the pixels"
+    return f"{number_text(PERCENT * float(np.mean(np.asarray(mask) != 0)), 2)} % of the pixels"
 
 
 def sigma_text(sigma_um: NDArray[np.floating]) -> str:
     """Median uncertainty of thicknesses [µm]; empty where there are none."""
-    return f"{NM * float(np.median(sigma_um)):.2g} nm" if np.size(sigma_um) else ""
+    return f"{number_text(NM * float(np.median(sigma_um)), 2)} nm" if np.size(sigma_um) else ""
 
 
 def of_sensor(shape: tuple[int, ...], section: SensorSection | None) -> str:
@@ -52,16 +52,16 @@ def of_sensor(shape: tuple[int, ...], section: SensorSection | None) -> str:
         return f"{said}, the whole sensor"
     part = PERCENT * rows * columns / float(np.prod(section.detector.shape))
     x, y = (sorted(ends) for ends in (section.x, section.y))
-    return f"{said}, {part:.2g} % of the sensor: columns {x[0]} to {x[1]}, rows {y[0]} to {y[1]}"
+    return f"{said}, {number_text(part, 2)} % of the sensor: columns {x[0]} to {x[1]}, rows {y[0]} to {y[1]}"
 
 
-def number_text(value: float) -> str:
-    """Three digits of a number, more only before its decimal point; a dash for none."""
+def number_text(value: float, digits: int = 3) -> str:
+    """So many digits of a number, more only before its decimal point; a dash for none."""
     if value is np.ma.masked or math.isnan(value):
         return "–"
     whole = value == round(value) if math.isfinite(value) else False
     plain = abs(value) < MOST_PLAIN and (whole or abs(value) >= MOST_DECIMALS)
-    return f"{value:.0f}" if plain else f"{value:#.3g}"
+    return f"{value:.0f}" if plain else f"{value:#.{digits}g}".rstrip(".")
 
 
 def measured_text(value: float, sigma: float) -> tuple[str, str]:
