@@ -61,7 +61,7 @@ def read(path: Path) -> Reader:
 @pytest.fixture(params=SMALL_PAGES)
 def page(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """One of the pages, in a folder beside that of another page."""
-    beside, folder = tmp_path / "other folder", tmp_path / "made"
+    beside, folder = tmp_path / "other folder", tmp_path / request.param
     beside.mkdir()
     folder.mkdir()
     other = Report("Other & page").write(beside / "report.html")
@@ -89,7 +89,7 @@ def test_every_page_begins_with_a_summary_and_its_links_resolve(page: Path) -> N
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:All-NaN")
 def test_every_page_fits_on_a_telephone(page: Path, tmp_path: Path) -> None:
-    check_page(page, tmp_path, PHONE, f"page_{page.stem}_{PHONE}")
+    check_page(page, tmp_path, PHONE, f"page_{page.parent.name.replace(' ', '_')}_{PHONE}")
 
 
 def test_pages_beside_what_a_command_was_given_are_found(tmp_path: Path) -> None:

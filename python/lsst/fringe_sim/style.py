@@ -115,7 +115,8 @@ def finite_range(
     if symmetric:
         reach = max(abs(low), abs(high)) or 1e-12
         return -reach, reach
-    return (low, high) if high > low else (low - 1e-12, high + 1e-12)
+    around = 0.01 * abs(low) or 1e-12  # of a map that is the same everywhere
+    return (low, high) if high > low else (low - around, high + around)
 
 
 def show_image(

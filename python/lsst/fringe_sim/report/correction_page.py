@@ -35,12 +35,10 @@ def write_templates_report(
         report.section(
             name or "Sensor",
             f"{len(product.patterns)} templates from {len(product.scores)} frames in "
-            f"{product.physical_filter or 'a filter without a name'}.",
+            f"{product.physical_filter or 'a filter without a name'}. A pixel is seen by "
+            f"{span_text(product.coverage)} of them.",
         )
-        report.figure(
-            _templates_figure(product),
-            "Templates in percent of the sky, and how many frames see each pixel.",
-        )
+        report.figure(_templates_figure(product), "Templates, and how many frames see each pixel.")
         table = Table({"frame": np.arange(len(product.scores))})
         for number, scores in enumerate(product.scores.T):
             table[f"scale {number}"] = scores
@@ -54,7 +52,7 @@ class _Facts(NamedTuple):
     """Numbers of the templates of a sensor."""
 
     name: str
-    count: int
+    templates: int
     frames: int
     rms: float  # of the first template, part of the sky
     sigma: float  # median of a pixel of it
@@ -75,11 +73,11 @@ def _summary_of_templates(facts: Sequence[_Facts]) -> list[tuple[str, str]]:
     who = facts[0].name if len(facts) == 1 else f"{len(facts)} sensors"
     column = {
         name: [getattr(each, name) for each in facts]
-        for name in ("count", "frames", "rms", "sigma", "masked")
+        for name in ("templates", "frames", "rms", "sigma", "masked")
     }
     percent = {name: span_text(PERCENT * np.array(column[name])) for name in ("rms", "sigma", "masked")}
     return [
-        ("result", f"{span_text(column['count'])} fringe templates of {who}"),
+        ("result", f"{span_text(column['templates'])} fringe templates of {who}"),
         ("frames", span_text(column["frames"])),
         ("first template, rms", f"{percent['rms']} % of the sky"),
         ("median σ of a pixel of it", f"{percent['sigma']} % of the sky"),
@@ -242,7 +240,8 @@ def frame_figure(record: FrameRecord) -> Figure:
 
 def _templates_figure(product: FringeTemplates) -> Figure:
     count = len(product.patterns)
-    with map_row(count + 1) as (made, shown):
+    seen_alike = int(product.coverage.min()) == int(product.coverage.max())
+    with map_row(count + (0 if seen_alike else 1)) as (made, shown):
         for number, axes in enumerate(shown[:count]):
             show_image(
                 axes,
@@ -252,8 +251,9 @@ def _templates_figure(product: FringeTemplates) -> Figure:
                 title=f"template {number}",
                 diverging=True,
             )
-        bar = show_image(shown[count], product.coverage, label="frames", title="coverage").colorbar
-        if bar is not None:
-            bar.locator = MaxNLocator(integer=True)
-            bar.update_ticks()
+        for axes in shown[count:]:
+            bar = show_image(axes, product.coverage, label="frames", title="coverage").colorbar
+            if bar is not None:
+                bar.locator = MaxNLocator(integer=True)
+                bar.update_ticks()
     return made

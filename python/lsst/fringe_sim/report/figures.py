@@ -291,6 +291,7 @@ def sky_figure(frames: Sequence[SkyFringe]) -> Figure:
             right.plot(hours, rms, "o-")
             right.set_xticks(hours, [f"{frame.hour % 24.0:g}" for frame in frames])
             right.set_xlabel("local time [h]")
+            right.yaxis.set_major_formatter(StrMethodFormatter("{x:.3g}"))
             right.set_ylabel("rms over pixels [%]")
             right.set_title("through the night")
         return made

@@ -19,10 +19,14 @@ from ..algorithms.focal_plane import DES_CRITERION
 from ..errors import InputError
 from ..style import DIVERGING, LINES, SEQUENTIAL, figure, panels
 from .page import Origin, Report
+from .words import span_text
 
 __all__ = ["focal_plane_figure", "write_focal_plane_page"]
 
-PLANE_INCH = (5.1, 4.4)
+PLAIN = "{x:.2g}"
+"""Format of logarithmic scales."""
+
+PLANE_INCH = (4.6, 3.7)
 """Width and height of a panel."""
 
 
@@ -72,15 +76,13 @@ def _shown(summary: Table) -> Table:
     """Columns of the summary that fit on a page."""
     names = ("detector", "vendor", "field_radius", "rms", "over_noise")
     table = summary[[*names, *(name for name in summary.colnames if name.startswith("residual_"))]].copy()
-    for name in table.colnames[2:]:
-        table[name].info.format = ".3g"
     return table
 
 
 def _answer(summary: Table) -> str:
     """Strength of the fringes, and in how many sensors a correction leaves little enough of them."""
     rms, last = np.asarray(summary["rms"]), max(_templates(summary), 1)
-    said = f"{rms.min():.2g} to {rms.max():.2g} % of the sky, rms over a sensor"
+    said = f"{span_text(rms)} % of the sky, rms over a sensor"
     if f"residual_{last}" not in summary.colnames:
         return said
     good = int(np.count_nonzero(np.asarray(summary[f"residual_{last}"]) < DES_CRITERION))
@@ -99,8 +101,8 @@ def _describe(summary: Table) -> Iterator[str]:
         rows = summary[summary["vendor"] == vendor]
         rms, ratio = np.asarray(rows["rms"]), np.asarray(rows["over_noise"])
         yield (
-            f"{vendor}: {len(rows)} sensors, fringe rms {rms.min():.3g} to {rms.max():.3g} %, "
-            f"{ratio.min():.2f} to {ratio.max():.2f} times the shot noise at up to 20 arcsec"
+            f"{vendor}: {len(rows)} sensors, fringe rms {span_text(rms)} %, "
+            f"{span_text(ratio)} times the shot noise at up to 20 arcsec"
         )
         for number in range(1, 1 + _templates(rows)):
             left = np.asarray(rows[f"residual_{number}"])
@@ -127,17 +129,20 @@ def focal_plane_figure(cells: Table, sensors: Table) -> Figure:
         other = bar.ax.secondary_yaxis("left", functions=(_times(brightness), _times(1.0 / brightness)))
         other.set_ylabel("rms [µJy arcsec⁻²]")
         strength.set_title("rms of the fringes in cells of each sensor")
+        also = f"the same after correction, {templates} template{'s' if templates > 1 else ''}"
         for panel, column, title in (
             (noise, "over_noise", "fringes over shot noise, largest at 1 to 20″"),
-            (residual, "residual_over_noise", f"the same after correction with {templates} templates"),
+            (residual, "residual_over_noise", also),
         ):
             values = np.asarray(cells[column], dtype=float)
             reach = float(np.nanpercentile(np.abs(np.log(values / DES_CRITERION)), 99.0))
             norm = LogNorm(DES_CRITERION * np.exp(-reach), DES_CRITERION * np.exp(reach))
             drawn = _draw_cells(panel, cells, column, norm, DIVERGING)
-            panel.figure.colorbar(
-                drawn, ax=panel, label=f"ratio (white: {DES_CRITERION:g}, criterion of DES)", shrink=0.85
+            label = f"ratio (white: {DES_CRITERION:g}, criterion of DES)"
+            bar = panel.figure.colorbar(
+                drawn, ax=panel, label=label, shrink=0.85, format=StrMethodFormatter(PLAIN)
             )
+            bar.ax.yaxis.set_minor_formatter(PLAIN)
             panel.set_title(title)
         _draw_radius(radius, sensors)
         return made
@@ -156,7 +161,8 @@ def _draw_radius(axes: Axes, sensors: Table) -> None:
     axes.set_xlabel("distance of the sensor from the axis [deg]")
     axes.set_ylabel("fringe rms of the sensor [%]")
     axes.set_title("strength over field radius")
-    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_major_formatter(PLAIN)
+    axes.yaxis.set_minor_formatter(PLAIN)
     axes.legend()
 
 

@@ -219,7 +219,7 @@ class Report:
         words = [column.dtype.kind in "US" for column in table.itercols()]
         kinds = [' class="words"' if word else "" for word in words]
         heads = "".join(
-            f"<th{kind}>{html.escape(column.name)}{f' [{column.unit}]' if column.unit else ''}</th>"
+            f"<th{kind}>{html.escape(column.name.replace('_', ' '))}{f' [{column.unit}]' if column.unit else ''}</th>"
             for column, kind in zip(table.itercols(), kinds, strict=True)
         )
         if marks is not None and kinds:

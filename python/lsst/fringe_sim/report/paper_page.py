@@ -17,6 +17,7 @@ from ..paper.section import Graph, Picture, Section
 from ..style import figure, panels, show_image
 from .figures import CURVE_INCH, MAP_INCH
 from .page import Origin, Report
+from .words import number_text
 
 __all__ = ["section_figures", "write_paper_page"]
 
@@ -85,7 +86,7 @@ def _summary(made: Reproduction, open_points: Sequence[Finding]) -> list[tuple[s
     return [
         ("result", f"{made.summary()[0].upper()}{made.summary()[1:]}"),
         ("where they differ", ", ".join(dict.fromkeys(f.number.place for f in open_points)) or "nowhere"),
-        ("largest relative difference of these", f"{100.0 * max(off):.2g} %" if off else ""),
+        ("largest relative difference of these", f"{number_text(100.0 * max(off), 2)} %" if off else ""),
     ]
 
 

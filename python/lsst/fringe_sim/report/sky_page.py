@@ -113,9 +113,7 @@ def write_sky_report(
 def _without_noise(frames: Sequence[SkyFringe], keyword: str, measured: NDArray[np.floating]) -> str:
     """An amplitude as the frames state it, without noise; as it was measured where they do not."""
     stated = [PERCENT * float(each.metadata[keyword]) for each in frames if keyword in each.metadata]
-    if len(stated) == len(frames):
-        return f"{span_text(stated)} %"
-    return f"{span_text(measured)} %" + (", noise included," if frames[0].seed is not None else "")
+    return span_text(stated if len(stated) == len(frames) else measured)
 
 
 def _first_of(frames: Sequence[SkyFringe]) -> str:
@@ -130,6 +128,8 @@ def _summary(
     frames: Sequence[SkyFringe], amplitudes: Table, found: Coadds | None, section: SensorSection | None
 ) -> list[tuple[str, str]]:
     first = frames[0]
+    told = first.seed is None or all("FRINGRMS" in each.metadata for each in frames)
+    noise = "" if told else ", noise included"
     rms = _without_noise(frames, "FRINGRMS", amplitudes["rms"])
     trimmed = _without_noise(frames, "FRING198", amplitudes["half range 1-99"])
     deepest = ""
@@ -137,8 +137,8 @@ def _summary(
         ratio = float(found.fringes[-1, -1] / found.noise[-1, -1])
         deepest = f"{ratio:.2g} times the noise of {found.counts[-1]} exposures, uncorrected"
     return [
-        ("fringes", f"{rms} of the sky, rms"),
-        ("half of the range from 1 to 99 %", f"{trimmed} of the sky"),
+        ("fringes", f"{rms} % of the sky, rms{noise}"),
+        ("half of the range from 1 to 99 %", f"{trimmed} % of the sky{noise}"),
         ("sky", f"{span_text(amplitudes['sky'])} electrons in a pixel"),
         ("photon noise of a pixel", f"{PERCENT / math.sqrt(first.mean_electrons):.2g} % of the sky"),
         (f"fringes in means of {found.square_px[-1]} px" if found else "coadds", deepest),

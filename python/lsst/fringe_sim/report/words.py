@@ -57,7 +57,7 @@ def of_sensor(shape: tuple[int, ...], section: SensorSection | None) -> str:
 
 def number_text(value: float, digits: int = 3) -> str:
     """So many digits of a number, more only before its decimal point; a dash for none."""
-    if value is np.ma.masked or math.isnan(value):
+    if np.ma.is_masked(value) or math.isnan(value):
         return "–"
     whole = value == round(value) if math.isfinite(value) else False
     plain = abs(value) < MOST_PLAIN and (whole or abs(value) >= MOST_DECIMALS)
