@@ -209,7 +209,7 @@ def _draw_tests(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     if max(-math.log10(value) for value in [*chance, 1.0]) > LARGEST_LINEAR:
         axes.set_xscale("symlog", linthresh=3.0)
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("−log₁₀ of the chance under noise (dashed: 10⁻³) [1]")
+    axes.set_xlabel("−log₁₀ of the chance (dashed: 10⁻³) [1]")
     axes.set_title("tests, each on its own")
 
 

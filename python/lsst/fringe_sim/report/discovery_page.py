@@ -115,7 +115,9 @@ def _summary(
         rows.append(("size of the disagreement", verdict.size_text().partition(": ")[2]))
     rows.append(("chance that noise alone disagrees as much", _chance(verdict.global_probability)))
     if math.isfinite(gap.heldout_before):
-        held = f"{amplitude_text(gap.heldout_before)} → {amplitude_text(gap.heldout_after)}"
+        held = amplitude_text(gap.heldout_before)
+        if verdict.effects:
+            held += f" → {amplitude_text(gap.heldout_after)}"
         rows.append(("rms on held-out data", f"{held}; noise floor {amplitude_text(gap.noise_floor)}"))
     if residuals is not None:
         best = residuals.after or residuals.before
@@ -132,8 +134,10 @@ def _found(verdict: Verdict) -> str:
             f"{effect.name}: {_values(effect)}; probability {probability_text(effect.probability)}"
             for effect in verdict.effects
         )
-    reason = str(verdict.unexplained.get("reason") or "")
-    return f"{reason[0].upper()}{reason[1:]}" if reason else verdict.verdict.replace("_", " ").capitalize()
+    if verdict.verdict == "no_discrepancy":
+        return f"Noise alone disagrees as much with a chance of {_chance(verdict.global_probability)}"
+    reason = str(verdict.unexplained.get("reason") or "no known effect explains it")
+    return f"No name: {reason}"
 
 
 def _values(effect: NamedEffect) -> str:
