@@ -70,6 +70,9 @@ NOISE_SIGMAS = 5.0
 LEGEND_ROOM = 5.0
 """Factor by which the axis of coadds goes on beyond the largest value."""
 
+PIXEL_ROOM = 0.3
+"""Part by which the axis of a pixel goes on above its points, for the legend."""
+
 LEAST_CHANCE = 1e-12
 """Smallest chance of a slipped order that is drawn."""
 
@@ -283,7 +286,7 @@ def sky_figure(frames: Sequence[SkyFringe]) -> Figure:
             if number in (0, len(frames) // 2, len(frames) - 1):
                 middle.hist(values, bins=120, histtype="step", density=True, label=f"{frame.hour % 24.0:g} h")
         middle.set_xlabel("sky / mean − 1 [%]")
-        middle.set_ylabel("density [1/%]")
+        middle.yaxis.set_visible(False)
         middle.set_title("distribution over pixels")
         middle.legend()
         for right in others:
@@ -292,8 +295,7 @@ def sky_figure(frames: Sequence[SkyFringe]) -> Figure:
             right.set_xticks(hours, [f"{frame.hour % 24.0:g}" for frame in frames])
             right.set_xlabel("local time [h]")
             right.yaxis.set_major_formatter(StrMethodFormatter("{x:.3g}"))
-            right.set_ylabel("rms over pixels [%]")
-            right.set_title("through the night")
+            right.set_title("rms through the night [%]")
         return made
 
 
@@ -314,8 +316,7 @@ def components_figure(components: FringeComponents) -> Figure:
             scree.yaxis.set_minor_formatter(NullFormatter())
             scree.xaxis.set_major_locator(MaxNLocator(integer=True))
             scree.set_xlabel("component")
-            scree.set_ylabel("share [%]")
-            scree.set_title("share of the variance")
+            scree.set_title("share of the variance [%]")
         return made
 
 
@@ -364,8 +365,7 @@ def template_figure(template: FringeFrame) -> Figure:
         row = template.image.shape[0] // 2
         right.plot(PERCENT * template.image[row], lw=0.8)
         right.set_xlabel("column [px]")
-        right.set_ylabel("sky / mean − 1 [%]")
-        right.set_title(f"row {row}")
+        right.set_title(f"row {row}: sky / mean − 1 [%]")
         return made
 
 
@@ -392,7 +392,9 @@ def single_pixel_figure(
             right.plot(fit.searched_um, PERCENT * fit.searched_rms, lw=0.7, color=color)
         left.set_xlabel("wavelength [nm]")
         left.set_ylabel("fringe amplitude [%]")
-        left.legend(fontsize=7)
+        low, high = left.get_ylim()
+        left.set_ylim(low, high + PIXEL_ROOM * (high - low))
+        left.legend(fontsize=7, loc="upper left")
         left.set_title("pixel (2100, 2100) of E2V-CCD250-321")
         right.set_xlabel("adhesive thickness [µm]")
         right.set_ylabel("rms misfit [%]")
