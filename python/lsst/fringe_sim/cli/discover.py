@@ -90,10 +90,9 @@ def discover(
     from .inputs import sky_settings
     from .sky_frames import read_sky_frames
 
-    limits: dict[str, Any] = {
-        "most_cells": cells,
-        "time_budget_s": math.inf if time_budget is None else time_budget,
-    }
+    most_s = math.inf if time_budget is None else time_budget
+    limits: dict[str, Any] = {"most_cells": cells, "time_budget_s": most_s}
+    given: list[str | Path] = [*paths, *([thickness] if thickness else []), *effects.files]
     if setup.kind == "sky":
         data = read_sky_frames(paths, setup, thickness)
         placement = placement_in_frames(data.sky.frames, data.detector, setup.pixel_scale_arcsec)
@@ -103,8 +102,7 @@ def discover(
             )
             return
         model = data.model(sky_settings(effects.settings))
-        verdict = _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, **limits))
-        _write(verdict, out.path, None, None, [*paths, str(thickness), *effects.files])
+        _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, **limits), given)
         return
     if thickness is not None:
         raise InputError("--thickness", thickness, "only with the set-up of a telescope, as lsst_e2v")
@@ -120,8 +118,7 @@ def discover(
         options=SearchOptions(**limits),
         report=lambda line: click.echo(line, err=True),
     )
-    section = section_of_cube(cube, setup)
-    _write(verdict, folder, residual_pair(cube, model, verdict), section, [*paths, *effects.files])
+    _write(verdict, folder, residual_pair(cube, model, verdict), section_of_cube(cube, setup), given)
 
 
 def _search_sky(
@@ -131,13 +128,14 @@ def _search_sky(
     out: OutputFolder,
     seed: int,
     options: SearchOptions,
-) -> Verdict:
+    given: Sequence[str | Path],
+) -> None:
     import numpy as np
 
     from ..algorithms.discovery import discover_sky
 
-    out.prepare()
-    return discover_sky(
+    folder = out.prepare()
+    verdict = discover_sky(
         data.sky.frames,
         data.sky.thickness_um,
         data.sky.thickness_sigma_um,
@@ -147,6 +145,7 @@ def _search_sky(
         options=options,
         report=lambda line: click.echo(line, err=True),
     )
+    _write(verdict, folder, None, None, given)
 
 
 def _write(

@@ -109,19 +109,12 @@ def fit_sky(
     given: list[str | Path] = [thickness, *dict.fromkeys(image.path for image in images)]
     found.moved.write_fits(folder / "thickness.fits", {**software_cards(), **input_cards(given)})
     lines = said(found, len(images), order_um)
+    origin = origin_of(folder, [*given, *effects.files])
     page = write_map_on_sky_report(
-        folder / "report.html",
-        found,
-        layer,
-        lines,
-        frames=len(images),
-        section=section,
-        origin=origin_of(folder, [*given, *effects.files]),
+        folder / "report.html", found, layer, lines, frames=len(images), section=section, origin=origin
     )
-    for line in lines:
+    for line in [*lines, str(folder / "thickness.fits"), str(page)]:
         click.echo(line)
-    click.echo(str(folder / "thickness.fits"))
-    click.echo(str(page))
 
 
 def said(found: MapOnSky, frames: int, order_um: float) -> list[str]:
