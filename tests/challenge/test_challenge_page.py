@@ -18,7 +18,7 @@ def test_page_tells_what_was_reached_and_what_is_wanted(tmp_path) -> None:
     page = write_challenge_report(tmp_path / "page.html", result).read_text()
     assert "2 with one effect" in page
     assert "2 of 2" in page
-    assert page.count("<img") == 4
+    assert page.count("<figure>") == 4
 
 
 def test_page_without_cases(tmp_path) -> None:

@@ -46,7 +46,9 @@ def test_one_frame_is_written_with_its_errors(usual) -> None:
     assert np.all(frame.mask[:5, :5] != 0)
     assert 0.0 < frame.quadrature_error < 1e-4
     assert (usual / "sky.png").read_bytes().startswith(b"\x89PNG")
-    assert "Coadds" in (usual / "report.html").read_text(encoding="utf-8")
+    page = (usual / "report.html").read_text(encoding="utf-8")
+    assert "Coadds" in page
+    assert "fringe-sim sky --thickness" in page, "the page says which command made it"
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 from astropy.table import Table
+from matplotlib import pyplot
 
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Step, Where
@@ -226,6 +227,32 @@ def test_bars_are_the_numbers_of_the_verdict() -> None:
     )
     heights = [bar.get_height() for bar in gap_figure(NAMED).axes[0].patches]
     assert np.allclose(heights, [0.78, 0.707, 0.778, 0.703])
+
+
+def test_what_is_not_there_is_not_drawn() -> None:
+    """No empty bars, no blank maps."""
+    assert len(where_figure(replace(NAMED, where=replace(WHERE, amplifier=()))).axes) == 3
+    assert len(gap_figure(AGREES).axes) == 1
+    assert len(gap_figure(AGREES).axes[0].patches) == 2, (
+        "nothing was added: one bar for all data, one for held out"
+    )
+    silent = tuple({**item, "score": 0.0} for item in NAMED.candidates)
+    assert "The most promising" in discovery_page(NAMED).to_html()
+    assert "The most promising" not in discovery_page(replace(AGREES, candidates=silent)).to_html()
+
+
+def test_a_verdict_draws_its_candidates() -> None:
+    axes = NAMED.plot(pyplot.figure().add_subplot())
+    assert [label.get_text() for label in axes.get_yticklabels()] == [
+        "dark_pedestal",
+        "ghost_pedestal",
+        "tilt",
+    ]
+    legend = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert legend == ["named", "in the same class", "not chosen"]
+    assert "data:image/png;base64," in NAMED._repr_html_()
+    assert TOO_POOR.plot(pyplot.figure().add_subplot()).get_title() == "no effect promises anything"
+    pyplot.close("all")
 
 
 def test_what_is_written_is_read() -> None:

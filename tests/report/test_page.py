@@ -35,6 +35,7 @@ class Checker(HTMLParser):
 
 def build() -> Report:
     report = Report("Fringes of <sensor>", "A & B")
+    report.summary([("answer", "it is 0.14 % < 1 %")])
     report.section("Map", "What the map shows.")
     with figure(4.0, 3.0) as made:
         show_image(made.subplots(), np.arange(12.0).reshape(3, 4), label="x [µm]")
@@ -67,7 +68,9 @@ def test_tables_come_back_from_the_link() -> None:
     assert table["rms"].unit == units.percent
 
 
-def test_same_input_same_page() -> None:
+def test_same_input_same_page_at_the_same_time(monkeypatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    assert "2023-11-14 22:13 UTC" in build().to_html()
     assert build().to_html() == build().to_html()
 
 

@@ -64,11 +64,18 @@ def test_residuals_are_averaged_without_the_masked(tmp_path) -> None:
     assert panels[0].images[0].get_extent() == [-0.5, 239.5, -0.5, 219.5]
 
 
-def test_panels_of_a_gallery_have_ticks_where_none_is_beside_them() -> None:
-    left = np.random.default_rng(0).normal(0, 0.01, (8, 20, 20))
-    panels = [axes for axes in residuals_figure(left, list(range(880, 960, 10))).axes if axes.images]
-    with_rows = [number for number, axes in enumerate(panels) if axes.yaxis.get_visible()]
-    with_columns = [number for number, axes in enumerate(panels) if axes.xaxis.get_visible()]
-    assert with_rows == [0, 6]
-    assert with_columns == [2, 3, 4, 5, 6, 7]
-    assert len({(*axes.get_xlim(), *axes.get_ylim()) for axes in panels}) == 1
+@pytest.mark.rng("residuals on the scale of their noise")
+def test_residuals_are_on_the_scale_of_the_noise_of_their_means(rng) -> None:
+    """Whether the noise is told or measured; a pattern does not count as noise."""
+    noise = np.array([0.01, 0.03])
+    left = rng.normal(0.0, 1.0, (2, 400, 400)) * noise[:, None, None]
+    left += 0.004 * np.sin(np.arange(400) / 30.0)
+    for told in (noise, None):
+        made = residuals_figure(left, [880.0, 930.0], told)
+        shown = [np.asarray(axes.images[0].get_array(), dtype=float) for axes in made.axes if axes.images]
+        assert all(axes.images[0].get_clim() == (-5.0, 5.0) for axes in made.axes if axes.images)
+        for image, sigma in zip(shown, noise, strict=True):
+            assert image.shape == (100, 100)
+            difference = (image[:, 1:] - image[:, :-1])[::2, ::2] / np.sqrt(2.0)
+            assert difference.std() == pytest.approx(1.0, abs=0.1)
+            assert np.abs(image.mean(axis=0)).max() == pytest.approx(0.004 / (sigma / 4.0), abs=0.35)

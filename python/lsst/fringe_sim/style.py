@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
+from PIL import Image
 
 __all__ = [
     "DIVERGING",
@@ -27,8 +28,11 @@ __all__ = [
     "block_mean",
     "figure",
     "finite_range",
-    "gallery",
+    "map_to_png",
+    "panels",
+    "pixels_to_png",
     "show_image",
+    "to_pieces",
     "to_png",
 ]
 
@@ -37,8 +41,8 @@ DIVERGING = "PuOr_r"
 LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 """Okabe & Ito 2008: distinct for all common kinds of colour vision."""
 
-BETWEEN_COLUMNS = 0.06
-"""Space between the panels of a gallery, in their widths."""
+BAD_COLOR, BAD_GREY = 255, 0.75
+"""Place of the colour of masked pixels behind those of the numbers, and the colour."""
 
 TITLE_PLACE = 1.0
 """Height of titles in axes without ticks above. Where it is not given, matplotlib looks at every tick for it."""
@@ -70,39 +74,34 @@ def figure(
         yield made
 
 
-def gallery(
-    made: Figure, count: int, most_columns: int, margins: tuple[float, float, float, float], gap: float
+def panels(
+    made: Figure,
+    count: int,
+    most_columns: int,
+    margins: tuple[float, float, float, float] | None = None,
+    last_row: float = 1.0,
 ) -> list[Axes]:
-    """Equal panels with common axes, in a figure without a layout; ticks are on the outer ones only.
+    """Axes of panels, each in a part of the figure of its own, which a page may put wherever there is room.
 
-    What a solver finds for dozens of panels after seconds is known beforehand where all are alike.
-
-    ``margins`` are left, right, bottom and top, and ``gap`` is between rows, which have titles, all in inches.
+    ``most_columns``: panels side by side where the figure is shown as a whole. ``margins``: left, right, bottom and
+    top of every panel, in inches, in a figure without a layout: what a solver finds for dozens of them after seconds
+    is known before. ``last_row``: height of the last row over that of the others.
     """
     columns = min(most_columns, count)
     rows = -(-count // columns)
-    width, height = made.get_size_inches()
-    left, right, bottom, top = margins
-    up = (height - bottom - top + gap) / rows - gap
-    grid = made.add_gridspec(
-        rows,
-        columns,
-        left=left / width,
-        right=1.0 - right / width,
-        bottom=bottom / height,
-        top=1.0 - top / height,
-        wspace=BETWEEN_COLUMNS,
-        hspace=gap / up,
-    )
-    panels: list[Axes] = []
-    for place in range(count):
-        first = panels[0] if panels else None
-        panel = made.add_subplot(grid[divmod(place, columns)], sharex=first, sharey=first)
-        # Ticks that a panel beside has too would take most of the time.
-        panel.xaxis.set_visible(place + columns >= count)
-        panel.yaxis.set_visible(place % columns == 0)
-        panels.append(panel)
-    return panels
+    heights = [*[1.0] * (rows - 1), last_row]
+    parts = made.subfigures(rows, columns, squeeze=False, height_ratios=heights).ravel()[:count]
+    if margins is None:
+        return [part.subplots() for part in parts]
+    axes = []
+    for part in parts:
+        width, height = part.bbox.size / made.dpi
+        left, right, bottom, top = margins
+        place = part.add_gridspec(
+            left=left / width, right=1.0 - right / width, bottom=bottom / height, top=1.0 - top / height
+        )
+        axes.append(part.add_subplot(place[0, 0]))
+    return axes
 
 
 def finite_range(
@@ -116,7 +115,8 @@ def finite_range(
     if symmetric:
         reach = max(abs(low), abs(high)) or 1e-12
         return -reach, reach
-    return (low, high) if high > low else (low - 1e-12, high + 1e-12)
+    around = 0.01 * abs(low) or 1e-12  # of a map that is the same everywhere
+    return (low, high) if high > low else (low - around, high + around)
 
 
 def show_image(
@@ -142,7 +142,7 @@ def show_image(
         values = np.where(np.asarray(mask) == 0, values, np.nan)
     thin = _thin(values, most_px)
     low, high = limits or finite_range(thin, symmetric=diverging)
-    cmap = matplotlib.colormaps[DIVERGING if diverging else SEQUENTIAL].with_extremes(bad="0.75")
+    cmap = matplotlib.colormaps[DIVERGING if diverging else SEQUENTIAL].with_extremes(bad=str(BAD_GREY))
     ny, nx = (size * step_px for size in values.shape)
     drawn = axes.imshow(
         thin, cmap=cmap, vmin=low, vmax=high, extent=(-0.5, nx - 0.5, -0.5, ny - 0.5), aspect="equal"
@@ -157,13 +157,68 @@ def show_image(
 
 def to_png(made: Figure) -> bytes:
     """The figure as PNG without time stamps."""
+    return pixels_to_png(_pixels(made))
+
+
+def to_pieces(made: Figure) -> tuple[NDArray[np.uint8], list[tuple[str, NDArray[np.uint8]]]]:
+    """Pixels of a figure, and of each of its `panels` with its title; the figure itself where it has none.
+
+    It is drawn once.
+    """
+    whole = _pixels(made)
+    pieces = []
+    for part in made.subfigs:
+        if part.axes:
+            x0, y0, x1, y1 = (round(edge) for edge in part.bbox.extents)
+            rows = slice(max(len(whole) - y1, 0), len(whole) - y0)
+            pieces.append((part.axes[0].get_title(), whole[rows, x0:x1]))
+    return whole, pieces or [("", whole)]
+
+
+def _pixels(made: Figure) -> NDArray[np.uint8]:
+    """Red, green and blue of a figure."""
+    # `Figure.savefig` would draw everything once more for the sake of the layout.
+    canvas = FigureCanvasAgg(made)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3]
+
+
+def pixels_to_png(pixels: NDArray[np.uint8], palette: NDArray[np.uint8] | None = None) -> bytes:
+    """A picture as PNG without time stamps.
+
+    ``pixels`` (ny, nx, 3): colours; or (ny, nx): their numbers in ``palette`` (256, 3).
+    """
+    picture = Image.fromarray(np.ascontiguousarray(pixels))
+    if palette is not None:
+        picture.putpalette(palette.tobytes())
     buffer = io.BytesIO()
-    # `Figure.savefig` would draw everything once more for the sake of the layout. Images with noise are packed in
-    # less than half of the time, and 4 % larger, if nothing is looked for in them but runs.
-    FigureCanvasAgg(made).print_png(
-        buffer, metadata={"Software": None}, pil_kwargs={"compress_type": zlib.Z_RLE}
-    )
+    # Images with noise are packed in less than half of the time, and 4 % larger, if nothing is looked for in them
+    # but runs.
+    picture.save(buffer, "png", compress_type=zlib.Z_RLE)
     return buffer.getvalue()
+
+
+def map_to_png(
+    image: NDArray[np.floating],
+    limits: tuple[float, float],
+    *,
+    mask: NDArray[Any] | None = None,
+    diverging: bool = False,
+) -> bytes:
+    """A map as PNG, one pixel for each of its own, the first row at the bottom; grey where there is no number.
+
+    ``limits``: values of the first and the last colour.
+    """
+    colors = matplotlib.colormaps[DIVERGING if diverging else SEQUENTIAL](np.linspace(0.0, 1.0, BAD_COLOR))
+    palette = np.vstack([colors[:, :3], np.full((1, 3), BAD_GREY)])
+    low, high = limits
+    scaled = (np.asarray(image, dtype=np.float32) - np.float32(low)) * np.float32(
+        (BAD_COLOR - 1) / (high - low)
+    )
+    known = np.isfinite(scaled) if mask is None else np.isfinite(scaled) & (np.asarray(mask) == 0)
+    np.clip(scaled, 0.0, BAD_COLOR - 1, out=scaled)
+    numbers = np.where(known, np.rint(scaled, out=scaled), BAD_COLOR).astype(np.uint8)
+    return pixels_to_png(numbers[::-1], np.rint(255.0 * palette).astype(np.uint8))
 
 
 def _thin(values: NDArray[np.float64], most_px: int) -> NDArray[np.float64]:

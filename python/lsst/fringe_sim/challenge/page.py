@@ -10,8 +10,9 @@ from astropy.table import Table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..report.page import Report
-from ..style import LINES, SEQUENTIAL, figure
+from ..report.figures import CURVE_INCH
+from ..report.page import Origin, Report
+from ..style import LINES, SEQUENTIAL, figure, panels
 from .result import VISIBLE, ChallengeResult
 
 __all__ = [
@@ -26,8 +27,11 @@ LARGEST_PULL = 6.0
 WANTED_SHRINKAGE = 0.95
 MIDDLE = 0.5  # of the colours
 
+DECISIVE = ("one_right_class", "one_exact_where_separable", "two_right_class", "outsiders_named")
+"""What the summary counts, of `ChallengeResult.summary`."""
 
-def write_challenge_report(path: str | Path, result: ChallengeResult) -> Path:
+
+def write_challenge_report(path: str | Path, result: ChallengeResult, origin: Origin | None = None) -> Path:
     """Write the page of a challenge; a section without cases says so.
 
     Parameters
@@ -36,24 +40,39 @@ def write_challenge_report(path: str | Path, result: ChallengeResult) -> Path:
         The page.
     result : `ChallengeResult`
         Results of all cases.
+    origin : `Origin`, optional
+        Command.
     """
     kinds = ", ".join(
         f"{sum(case.kind == kind for case in result.cases)} {name}" for kind, name in _KINDS.items()
     )
-    report = Report("Challenge of the search for missing effects", f"Seed {result.seed}; cases: {kinds}.")
+    report = Report(
+        "Challenge of the search for missing effects",
+        f"Seed {result.seed}; cases: {kinds}.",
+        origin or Origin(),
+    )
+    report.summary(_summary(result))
     report.table(_summary_table(result), "summary")
     report.section(
         "Names",
         "Which verdict each hidden cause led to. A name counts as right if the truth is in its class; a class has "
         "several members where the data do not tell them apart.",
     )
-    report.figure(confusion_figure(result), "Hidden cause against verdict, numbers of cases.")
-    report.figure(accuracy_figure(result), "Single effects against the signal to noise that an oracle sees.")
+    if result.cases:
+        report.figure(confusion_figure(result), "Hidden cause against verdict, numbers of cases.")
+    if len(result.accuracy()):
+        report.figure(
+            accuracy_figure(result), "Single effects against the signal to noise that an oracle sees."
+        )
     report.section("Numbers", "Whether uncertainties and probabilities are what they say.")
-    report.figure(pulls_figure(result), "Errors of the parameters of exact names over their uncertainties.")
-    report.figure(
-        calibration_figure(result), "How often a name is right against how probable it was said to be."
-    )
+    if result.pulls().size:
+        report.figure(
+            pulls_figure(result), "Errors of the parameters of exact names over their uncertainties."
+        )
+    if len(result.calibration()):
+        report.figure(
+            calibration_figure(result), "How often a name is right against how probable it was said to be."
+        )
     report.table(result.table(), "challenge")
     return report.write(Path(path))
 
@@ -101,8 +120,8 @@ def _label(names: str) -> str:
 def accuracy_figure(result: ChallengeResult) -> Figure:
     """Right classes and exact names by signal to noise, and the gap that was closed."""
     single = [case for case in result.of_kind("one") if np.isfinite(case.signal_to_noise)]
-    with figure(9.5, 3.6) as made:
-        names, gap = made.subplots(1, 2)
+    with figure(2 * CURVE_INCH[0], CURVE_INCH[1]) as made:
+        names, gap = panels(made, 2, 2)
         _draw_accuracy(names, result.accuracy())
         right = [case for case in single if case.right_class and np.isfinite(case.shrinkage)]
         gap.semilogx([max(c.signal_to_noise, 1.0) for c in right], [c.shrinkage for c in right], ".", ms=5)
@@ -169,6 +188,19 @@ def calibration_figure(result: ChallengeResult) -> Figure:
         axes.set_ylabel("part that is right [1]")
         axes.legend(loc="upper left")
         return made
+
+
+def _summary(result: ChallengeResult) -> list[tuple[str, str]]:
+    """The numbers that decide, and on what."""
+    found = result.summary()
+    named, null = found["false_discoveries"]
+    rows = [(text, _told(found[key])) for key, text, _ in _LEVELS[1:] if key in DECISIVE and found[key][1]]
+    right, of = found["named_right"]
+    return [
+        ("result", f"{right} of {of} names are right; {named} names in {null} cases without an effect"),
+        *rows,
+        ("cases", f"{len(result.cases)}"),
+    ]
 
 
 def _summary_table(result: ChallengeResult) -> Table:

@@ -10,7 +10,7 @@ import click
 
 from ..errors import InputError
 from ..files import write_whole
-from .output import OutputFolder, output_folder
+from .output import OutputFolder, origin_of, output_folder
 from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def challenge(
         counts, seed, size=(size[1], size[0]), setup=setup, known=known, jobs=jobs, progress=keep
     )
     path = result.write(out.path)
-    write_challenge_report(out.path / "challenge.html", result)
+    write_challenge_report(out.path / "challenge.html", result, origin_of(out.path, ()))
     click.echo(json.dumps(result.summary(), indent=2))
     click.echo(str(path))
 

@@ -21,7 +21,7 @@ from .observed import (
     stem_of,
     target_names,
 )
-from .output import OutputFolder, output_folder
+from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ..algorithms.observed_frames import CorrectedFrame, FrameRecord
     from ..products import ObservedFrame
     from ..products.observed_files import ObservedImage
+    from ..report.page import Origin
 
 __all__ = ["correct"]
 
@@ -108,7 +109,8 @@ def correct(
         options = CorrectionOptions(background_px, grid_of(amplifiers))
         make = partial(_correct_one, known, options, pixel_scale, inject)
         done, refused = _corrected(images, make, background, target, names)
-        _write_report(target, done, [*map(str, unusable), *refused])
+        origin = origin_of(target, [folder, *frames])
+        _write_report(target, done, [*map(str, unusable), *refused], origin)
         passed = all(each.proof.passed for each in done)
         for record in done:
             click.echo(_describe(record))
@@ -220,7 +222,7 @@ def _restore(
     return refused
 
 
-def _write_report(target: Path, done: list[FrameRecord], refused: list[str]) -> None:
+def _write_report(target: Path, done: list[FrameRecord], refused: list[str], origin: Origin) -> None:
     from ..algorithms.observed_frames import injected_table, summary_table
     from ..files import table_text, write_whole
     from ..report.correction_page import write_correction_report
@@ -229,7 +231,7 @@ def _write_report(target: Path, done: list[FrameRecord], refused: list[str]) -> 
     sources = injected_table(done)
     if sources is not None:
         write_whole(target / "injected.ecsv", table_text(sources))
-    write_correction_report(target / "report.html", done, refused)
+    write_correction_report(target / "report.html", done, refused, origin)
 
 
 def _describe(record: FrameRecord) -> str:

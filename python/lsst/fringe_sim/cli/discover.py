@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import InputError
-from .output import OutputFolder, output_folder
+from .output import OutputFolder, origin_of, output_folder
 from .parameters import ANY_LIGHT, ChosenEffects, model_effects
 from .progress import progress
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..algorithms.flat_residual import ResidualPair
     from ..instrument.setup import Setup
     from ..model import FringeModel
-    from ..products import FringeCube
+    from ..products import FringeCube, SensorSection
     from .sky_frames import SkyData
 
 __all__ = ["discover"]
@@ -85,13 +86,13 @@ def discover(
     from ..algorithms.discovery import discover as search
     from ..algorithms.flat_residual import residual_pair
     from ..model import FringeModel
+    from .fit import section_of_cube
     from .inputs import sky_settings
     from .sky_frames import read_sky_frames
 
-    limits: dict[str, Any] = {
-        "most_cells": cells,
-        "time_budget_s": math.inf if time_budget is None else time_budget,
-    }
+    most_s = math.inf if time_budget is None else time_budget
+    limits: dict[str, Any] = {"most_cells": cells, "time_budget_s": most_s}
+    given: list[str | Path] = [*paths, *([thickness] if thickness else []), *effects.files]
     if setup.kind == "sky":
         data = read_sky_frames(paths, setup, thickness)
         placement = placement_in_frames(data.sky.frames, data.detector, setup.pixel_scale_arcsec)
@@ -101,7 +102,7 @@ def discover(
             )
             return
         model = data.model(sky_settings(effects.settings))
-        _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, **limits))
+        _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, **limits), given)
         return
     if thickness is not None:
         raise InputError("--thickness", thickness, "only with the set-up of a telescope, as lsst_e2v")
@@ -117,7 +118,7 @@ def discover(
         options=SearchOptions(**limits),
         report=lambda line: click.echo(line, err=True),
     )
-    _write(verdict, folder, residual_pair(cube, model, verdict))
+    _write(verdict, folder, residual_pair(cube, model, verdict), section_of_cube(cube, setup), given)
 
 
 def _search_sky(
@@ -127,6 +128,7 @@ def _search_sky(
     out: OutputFolder,
     seed: int,
     options: SearchOptions,
+    given: Sequence[str | Path],
 ) -> None:
     import numpy as np
 
@@ -143,14 +145,21 @@ def _search_sky(
         options=options,
         report=lambda line: click.echo(line, err=True),
     )
-    _write(verdict, folder, None)
+    _write(verdict, folder, None, None, given)
 
 
-def _write(verdict: Verdict, folder: Path, residuals: ResidualPair | None) -> None:
+def _write(
+    verdict: Verdict,
+    folder: Path,
+    residuals: ResidualPair | None,
+    section: SensorSection | None,
+    given: Sequence[str | Path],
+) -> None:
     from ..report.discovery_page import discovery_page
 
     path = verdict.write(folder)
-    discovery_page(verdict, residuals).write(folder / "report.html")
+    page = discovery_page(verdict, residuals, section=section, origin=origin_of(folder, given))
+    page.write(folder / "report.html")
     _say(verdict)
     for name in (path.name, "discovery.ecsv", "effects.py", "report.html"):
         click.echo(str(folder / name))

@@ -9,7 +9,7 @@ import click
 
 from ..algorithms.thickness_fit_options import CONTRASTS, FIT_METHODS, SILICON_FIELDS, ZONES
 from ..errors import InputError, UnknownNameError
-from .output import OutputFolder, output_folder
+from .output import OutputFolder, origin_of, output_folder
 from .parameters import EFFECT, LABORATORY, effect_settings, effects_from_option
 from .progress import progress
 
@@ -30,7 +30,9 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
 @LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file.")
-@output_folder("Folder for maps, figures, report.", "thickness.fits", "silicon.fits", "report.html")
+@output_folder(
+    "Folder for maps, figures, report.", "thickness.fits", "silicon.fits", "thickness.png", "report.html"
+)
 @click.option(
     "--method",
     type=click.Choice(FIT_METHODS),
@@ -155,7 +157,8 @@ def fit(
     of_silicon = silicon_map(fitted, model)
     if of_silicon is not None:
         of_silicon.write_fits(folder / "silicon.fits", about, section=section)
-    write_thickness_report(folder, cube, fitted, model, method)
+    origin = origin_of(folder, [*paths, *([effects_file] if effects_file else [])])
+    write_thickness_report(folder, cube, fitted, model, method, section=section, origin=origin)
     low, high = np.percentile(fitted.value[good], [1.0, 99.0])
     click.echo(
         f"{fitted.layer}: {low:.3f} to {high:.3f} µm (1–99 %), median σ "

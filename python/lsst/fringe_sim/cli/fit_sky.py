@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError
 from .bad_files import refuse_bad
 from .observed import background_options, background_path, grid_of, images_of, other_light
-from .output import OutputFolder, output_folder
+from .output import OutputFolder, origin_of, output_folder
 from .parameters import SKY, ChosenEffects, model_effects
 from .progress import progress
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["fit_sky"]
 
+NM = 1000.0
 WORTH_ORDERS = 0.02
 """Uncertainty to which a map is wanted, for what the command says of more frames [orders]: 0.13 rad of phase leave a
 hundredth of the power of the fringes."""
@@ -48,7 +49,7 @@ hundredth of the power of the fringes."""
 )
 @background_options
 @model_effects("Effect on the sky; may be repeated.")
-@output_folder("Folder for the moved map and the report.", "thickness.fits", "report.html")
+@output_folder("Folder for the moved map and the report.", "thickness.fits", "thickness.png", "report.html")
 @click.option("--skip-bad", is_flag=True, help="Go on without frames that cannot be read.")
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def fit_sky(
@@ -108,31 +109,34 @@ def fit_sky(
     given: list[str | Path] = [thickness, *dict.fromkeys(image.path for image in images)]
     found.moved.write_fits(folder / "thickness.fits", {**software_cards(), **input_cards(given)})
     lines = said(found, len(images), order_um)
-    page = write_map_on_sky_report(folder / "report.html", found, layer, lines)
-    for line in lines:
+    origin = origin_of(folder, [*given, *effects.files])
+    page = write_map_on_sky_report(
+        folder / "report.html", found, layer, lines, frames=len(images), section=section, origin=origin
+    )
+    for line in [*lines, str(folder / "thickness.fits"), str(page)]:
         click.echo(line)
-    click.echo(str(folder / "thickness.fits"))
-    click.echo(str(page))
 
 
 def said(found: MapOnSky, frames: int, order_um: float) -> list[str]:
     """What the frames say of the map, line by line."""
     shift = found.shift
-    rms, median = float(shift.shift_um.std()), float(np.median(shift.sigma_um))
+    mean, rms, median = (
+        NM * float(each) for each in (shift.shift_um.mean(), shift.shift_um.std(), np.median(shift.sigma_um))
+    )
     strength = f"{shift.strength:.3g}"
     if shift.strength_sigma == shift.strength_sigma:
         strength += f" ± {shift.strength_sigma:.1g}"
     lines = [
         f"the map is right as it is with a probability of {shift.chance_unmoved:.2g}",
-        f"shift: mean {shift.shift_um.mean():+.4f} µm, rms about it {rms:.4f} µm, median σ {median:.4f} µm",
+        f"shift: mean {mean:+.3g} nm, rms about it {rms:.3g} nm, median σ {median:.3g} nm",
         f"whole orders away with a probability of {shift.chance_other_order:.2g}",
         f"fringes of the frames over those of the dark sky: {strength}",
     ]
     wanted = WORTH_ORDERS * order_um
     needed = shift.frames_for(wanted, frames)
-    known = f"parts of an eighth of the sensor are known to {shift.alone_um:.4f} µm by the frames alone"
+    known = f"parts of an eighth of the sensor are known to {NM * shift.alone_um:.3g} nm by the frames alone"
     more = (
-        f"; {needed} such frames would tell {wanted:.4f} µm ({WORTH_ORDERS:g} orders)"
+        f"; {needed} such frames would tell {NM * wanted:.3g} nm ({WORTH_ORDERS:g} orders)"
         if needed > frames
         else ""
     )

@@ -34,7 +34,7 @@ from ..model import FringeModel, Setup
 from ..products.thickness_map import thickness_span_um
 from ..report.focal_plane_page import write_focal_plane_page
 from .inputs import read_settings, read_thickness, sky_settings
-from .output import OutputFolder, output_folder
+from .output import OutputFolder, origin_of, output_folder
 from .parameters import effects_file_option
 from .progress import progress
 
@@ -149,7 +149,9 @@ def focal_plane(
                 advance()
     cells, summary = _gather(tables)
     write_together(folder, {"cells.ecsv": table_text(cells), "focal_plane.ecsv": table_text(summary)})
-    lines = write_focal_plane_page(folder, cells, summary, airmass, nights, len(measured))
+    given = [*measured.values(), *([effects_file] if effects_file else [])]
+    origin = origin_of(folder, given)
+    lines = write_focal_plane_page(folder, cells, summary, airmass, nights, len(measured), origin)
     for line in lines:
         click.echo(line)
     click.echo(str(folder))

@@ -144,7 +144,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     try:
-        result = cli.main(args=arguments, prog_name="fringe-sim", standalone_mode=False)
+        words = list(sys.argv[1:] if arguments is None else arguments)
+        result = cli.main(args=words, prog_name="fringe-sim", standalone_mode=False, obj=words)
     except click.exceptions.Exit as stop:
         return int(stop.exit_code)
     except (click.Abort, KeyboardInterrupt):

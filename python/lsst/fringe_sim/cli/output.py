@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import shlex
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -11,20 +12,27 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from glob import escape, has_magic, iglob
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import InputError
+from ..errors import InputError, shown
 from ..files import LOCK, refuse_unfinished
 
-__all__ = ["OutputFolder", "output_folder", "refuse_among_inputs", "refuse_used_file"]
+if TYPE_CHECKING:
+    from ..report.page import Origin
+
+__all__ = ["OutputFolder", "origin_of", "output_folder", "refuse_among_inputs", "refuse_used_file"]
 
 OURS = (b"ORIGIN  = 'lsst.fringe_sim'", b"FRINGTID=", b"FRINGUND=")
 """What a FITS file of this program says in its first header: its origin, or that fringes were taken or put back."""
 
 AT_WORK = f"{__name__}.at_work"
 """Entry of the memory of a command that has begun to write and has not come to its end."""
+
+PAGE = "report.html"
+LONGEST_COMMAND = 300
+"""Name of pages, and characters of a command that they show."""
 
 HEADER_BYTES = 57_600  # of a FITS file, in which its ORIGIN is looked for
 
@@ -224,6 +232,30 @@ def _inputs_of(context: click.Context, values: dict[str, Any]) -> list[str]:
                 f"{escape(str(folder))}/*{end}" for (folder, end), number in files.items() if number > 1
             ]
     return given
+
+
+def origin_of(out: Path, given: Iterable[str | os.PathLike[str]]) -> Origin:
+    """Command that runs, and pages of this program that lie beside what it was given.
+
+    Parameters
+    ----------
+    out : `pathlib.Path`
+        Folder of the page to be written.
+    given : iterable of path-like
+        Files and folders that were read, or their names.
+    """
+    from ..report.page import Origin, title_of
+
+    context = click.get_current_context(silent=True)
+    words = None if context is None else context.obj
+    command = "" if words is None else shown(shlex.join(["fringe-sim", *words]), LONGEST_COMMAND)
+    folders = dict.fromkeys(path if path.is_dir() else path.parent for path in map(Path, given))
+    pages = {}
+    for page in (folder / PAGE for folder in folders if folder.resolve() != out.resolve()):
+        title = title_of(page)
+        if title:
+            pages[os.path.relpath(page, out)] = title
+    return Origin(command, tuple((title, address) for address, title in pages.items()))
 
 
 def refuse_used_file(option: str, file: Path, overwrite: bool) -> None:

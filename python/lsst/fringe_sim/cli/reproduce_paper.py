@@ -9,7 +9,7 @@ import click
 
 from ..errors import InputError
 from ..files import table_text, write_whole
-from .output import OutputFolder, output_folder
+from .output import OutputFolder, origin_of, output_folder
 from .parameters import SIZE
 from .progress import progress
 
@@ -94,7 +94,7 @@ def reproduce_paper(
     with progress("recomputing", len(SECTIONS)) as advance:
         made = reproduce(context, advance=advance)
     write_whole(target / "paper.ecsv", table_text(made.table()))
-    write_paper_page(made, target / "paper.html", notices)
+    write_paper_page(made, target / "paper.html", notices, origin_of(target, ()))
     for finding in made.all_findings:
         if finding.status == "differs":
             number = finding.number

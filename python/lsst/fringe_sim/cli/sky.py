@@ -14,7 +14,7 @@ import click
 
 from ..errors import InputError, OutOfRangeError, to_number
 from ..instrument.setup import LONGEST_EXPOSURE_S
-from .output import OutputFolder, output_folder
+from .output import OutputFolder, origin_of, output_folder
 from .parameters import BUILT_IN, SKY, ChosenEffects, Quantity, model_effects
 from .progress import progress
 
@@ -175,7 +175,14 @@ def sky(
     if templates:
         _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
     page = write_sky_report(
-        folder / "report.html", made, setup.name, seed, places, picture=folder / "sky.png"
+        folder / "report.html",
+        made,
+        setup.name,
+        seed,
+        places,
+        picture=folder / "sky.png",
+        section=section,
+        origin=origin_of(folder, given),
     )
     for frame in made:
         click.echo(_describe(frame))

@@ -21,7 +21,7 @@ from .observed import (
     images_of,
     latest_date,
 )
-from .output import OutputFolder, output_folder
+from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 
 if TYPE_CHECKING:
@@ -104,8 +104,9 @@ def templates(
             click.echo(_describe(name, product))
             yield name, product
 
+    origin = origin_of(folder, [*frames, *([prior] if prior else [])])
     with progress("finding fringes", steps) as advance:
-        page = write_templates_report(folder / "report.html", made(advance))
+        page = write_templates_report(folder / "report.html", made(advance), origin)
     click.echo(str(page))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..algorithms.discovery import Verdict
-from ..style import DIVERGING, LINES, figure
+from ..algorithms.discovery.verdict import MOST_CANDIDATES
+from ..style import DIVERGING, LINES, figure, panels
+from .figures import CURVE_INCH
 
 __all__ = ["candidates_figure", "gap_figure", "leftover_figure", "where_figure"]
 
@@ -25,7 +27,12 @@ CHANCE_LIMIT = 1e-3
 LARGEST_LINEAR = 30.0
 """Axes that reach beyond this are logarithmic."""
 
-MOST_CANDIDATES = 15
+CANDIDATE_INCH, BAR_INCH, LEAST_BARS = (6.4, 1.2), 0.27, 3
+"""Size of the figure of candidates without its bars, that of a bar, and the bars for which there is always room."""
+
+BAR_PLACES = {1: (0.0,), 2: (-0.2, 0.2)}
+"""Where bars beside each other stand, by their number."""
+
 HALVES = ("C1", "C0")
 """Rows of amplifiers, the upper one first."""
 
@@ -33,61 +40,51 @@ CHANNELS_PER_HALF = 8
 
 
 def where_figure(verdict: Verdict) -> Figure:
-    """Disagreement before anything is added: by wavelength, fringe phase, amplifier and test."""
+    """Disagreement before anything is added: by wavelength, fringe phase, amplifier and test, as far as there is."""
     where = verdict.where
-    with figure(10.5, 7.2) as made:
-        (colour, phase), (amplifier, tests) = made.subplots(2, 2)
-        _draw_wavelengths(colour, where.wavelength)
-        _draw_phase(phase, where.thickness_phase)
-        _draw_amplifiers(amplifier, where.amplifier)
-        _draw_tests(tests, where.channels)
+    known = [row for row in where.amplifier if row["sigma"] > 0.0]
+    return _of_those_with_data(
+        (_draw_wavelengths, where.wavelength),
+        (_draw_phase, where.thickness_phase),
+        (_draw_amplifiers, known),
+        (_draw_tests, where.channels),
+    )
+
+
+def _of_those_with_data(*parts: tuple[Callable[[Axes, Any], None], Sequence[Any]]) -> Figure:
+    """Panels of what can be drawn."""
+    filled = [(draw, rows) for draw, rows in parts if rows]
+    count, columns = len(filled), min(2, len(filled))
+    with figure(columns * CURVE_INCH[0], -(-count // 2) * CURVE_INCH[1]) as made:
+        for axes, (draw, rows) in zip(panels(made, count, columns), filled, strict=True):
+            draw(axes, rows)
         return made
 
 
 def candidates_figure(verdict: Verdict) -> Figure:
     """Fall of χ² that each effect promises, the most promising first; those that were found stand out."""
-    found = {effect.name for effect in verdict.effects}
-    alike = {other for effect in verdict.effects for other in effect.ambiguous_with} - found
-    shown = [item for item in verdict.candidates if item["score"] > 0.0][:MOST_CANDIDATES]
-    with figure(8.0, 1.2 + 0.27 * max(len(shown), 3)) as made:
-        axes = made.subplots()
-        kinds = [
-            ("named", LINES[1], "", found),
-            ("in the same class", LINES[5], "//", alike),
-            ("not chosen", LINES[4], "", {item["name"] for item in shown} - found - alike),
-        ]
-        place = np.arange(len(shown))
-        for label, color, hatch, names in kinds:
-            chosen = [k for k, item in enumerate(shown) if item["name"] in names]
-            if chosen:
-                axes.barh(
-                    place[chosen],
-                    [shown[k]["score"] for k in chosen],
-                    color=color,
-                    hatch=hatch,
-                    edgecolor="white",
-                    label=label,
-                )
-        axes.set_yticks(place, [item["name"] for item in shown])
-        axes.invert_yaxis()
-        axes.set_xlabel("fall of χ² promised by the score test [1]")
-        axes.set_title("candidates")
-        if shown:
-            axes.legend(loc="lower right", fontsize=8, frameon=True)
+    promising = sum(item["score"] > 0.0 for item in verdict.candidates)
+    shown = min(max(promising, LEAST_BARS), MOST_CANDIDATES)
+    with figure(CANDIDATE_INCH[0], CANDIDATE_INCH[1] + BAR_INCH * shown) as made:
+        verdict.plot(made.subplots())
         return made
 
 
 def gap_figure(verdict: Verdict) -> Figure:
-    """Rms of data minus model before and after, for all data and for those held out, above the noise floor."""
+    """Rms of data minus model before and after, for all data and for those held out, above the noise floor.
+
+    The second panel, step by step, is there where effects were added.
+    """
     gap = verdict.gap
-    with figure(9.0, 3.6) as made:
-        left, right = made.subplots(1, 2, width_ratios=(2, 3))
+    count = 2 if verdict.steps else 1
+    with figure(count * CURVE_INCH[0], CURVE_INCH[1]) as made:
+        left, *others = panels(made, count, count)
         pairs = (("all data", gap.before, gap.after), ("held out", gap.heldout_before, gap.heldout_after))
         for place, (_, before, after) in enumerate(pairs):
-            for offset, value, color, label in (
-                (-0.2, before, LINES[4], "without the effects"),
-                (0.2, after, LINES[1], "with the effects"),
-            ):
+            bars = [(before, LINES[4], "without the effects"), (after, LINES[1], "with the effects")]
+            if not verdict.effects:
+                bars = [(before, LINES[4], "unchanged model")]
+            for (value, color, label), offset in zip(bars, BAR_PLACES[len(bars)], strict=True):
                 left.bar(
                     place + offset, PERCENT * value, 0.36, color=color, label=label if place == 0 else None
                 )
@@ -97,45 +94,48 @@ def gap_figure(verdict: Verdict) -> Figure:
         finite = [value for _, *values in pairs for value in values if math.isfinite(value)]
         if finite:
             left.set_ylim(0.0, PERCENT * max(*finite, gap.noise_floor) * 1.45)
-        left.legend(fontsize=7, loc="upper right")
+        left.legend(fontsize=8, loc="upper right")
         left.set_title("gap")
         values = [step.gap_before for step in verdict.steps[:1]] + [step.gap_after for step in verdict.steps]
         labels = ["before"] + ["+ " + " + ".join(step.added) for step in verdict.steps]
-        if values:
+        for right in others:
             right.plot(range(len(values)), [PERCENT * value for value in values], "o-", color=LINES[0])
             right.axhline(PERCENT * gap.noise_floor, color="black", ls="--", lw=1)
-            right.set_xticks(range(len(values)), labels)
+            right.set_xticks(range(len(values)), [label.replace(" + ", "\n+ ") for label in labels])
             right.set_xlim(-0.4, len(values) - 0.6)
             right.set_ylabel("rms of data − model [%]")
             right.set_title("step by step, on the data of the selection")
-        else:
-            right.set_visible(False)
         return made
 
 
 def leftover_figure(unexplained: Mapping[str, Any]) -> Figure:
     """What is left over: waveform over the fringe phase, wavelengths, spatial scales."""
-    with figure(13.0, 3.6) as made:
-        phase, colour, scale = made.subplots(1, 3)
-        _draw_phase(phase, unexplained.get("thickness_phase_waveform", ()))
-        rows = unexplained.get("wavelength", ())
-        colour.plot(
-            [row["wavelength_nm"] for row in rows],
-            [PERCENT * row["variance_beyond_noise"] for row in rows],
-            "o-",
-        )
-        colour.axhline(0.0, color="0.6", lw=0.8)
-        colour.set_xlabel("wavelength [nm]")
-        colour.set_ylabel("variance beyond noise [% of the noise]")
-        colour.set_title("by wavelength")
-        power = unexplained.get("spatial_power", ())
-        scale.semilogx([row["scale_px"] for row in power], [row["power"] for row in power], "o-")
-        scale.axhline(1.0, color="black", ls="--", lw=1, label="noise")
-        scale.set_xlabel("spatial scale [px]")
-        scale.set_ylabel("power over that of noise [1]")
-        scale.set_title("by scale")
-        scale.legend()
-        return made
+    return _of_those_with_data(
+        (_draw_phase, unexplained.get("thickness_phase_waveform", ())),
+        (_draw_colour, unexplained.get("wavelength", ())),
+        (_draw_scales, unexplained.get("spatial_power", ())),
+    )
+
+
+def _draw_colour(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
+    axes.plot(
+        [row["wavelength_nm"] for row in rows],
+        [PERCENT * row["variance_beyond_noise"] for row in rows],
+        "o-",
+    )
+    axes.axhline(0.0, color="0.6", lw=0.8)
+    axes.set_xlabel("wavelength [nm]")
+    axes.set_ylabel("variance beyond noise [% of the noise]")
+    axes.set_title("by wavelength")
+
+
+def _draw_scales(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
+    axes.semilogx([row["scale_px"] for row in rows], [row["power"] for row in rows], "o-")
+    axes.axhline(1.0, color="black", ls="--", lw=1, label="noise")
+    axes.set_xlabel("spatial scale [px]")
+    axes.set_ylabel("power over that of noise [1]")
+    axes.set_title("by scale")
+    axes.legend()
 
 
 def _draw_wavelengths(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
@@ -209,7 +209,7 @@ def _draw_tests(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     if max(-math.log10(value) for value in [*chance, 1.0]) > LARGEST_LINEAR:
         axes.set_xscale("symlog", linthresh=3.0)
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("−log₁₀ of the chance under noise (dashed: 10⁻³) [1]")
+    axes.set_xlabel("−log₁₀ of the chance (dashed: 10⁻³) [1]")
     axes.set_title("tests, each on its own")
 
 

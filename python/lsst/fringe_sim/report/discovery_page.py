@@ -10,22 +10,30 @@ import numpy as np
 from astropy.table import Table
 
 from ..algorithms.discovery import Verdict, probability_text
+from ..algorithms.discovery.verdict import NamedEffect
 from ..algorithms.flat_residual import ResidualPair
-from ..style import finite_range
+from ..products import SensorSection
 from .discovery_figures import candidates_figure, gap_figure, leftover_figure, where_figure
-from .figures import flats_figure, thickness_figure
-from .page import Report
+from .figures import pixel_noise, residuals_figure, thickness_figure
+from .page import Origin, Report
+from .words import amplitude_text, masked_text, measured_text, of_sensor, sigma_text
 
 __all__ = ["discovery_page", "headline"]
 
 PERCENT = 100.0
-GALLERY_PX = 128
-"""Frames of a gallery are averaged to about this size, so that patterns stand out from the noise of pixels."""
+FRACTIONS = {"before", "after", "noise floor", "rms", "residual", "sigma", "cos", "sin"}
+"""Columns with fractions of the counts, which pages show in percent."""
 
 LEAST_CHANCE = 1e-300
 
 
-def discovery_page(verdict: Verdict, residuals: ResidualPair | None = None) -> Report:
+def discovery_page(
+    verdict: Verdict,
+    residuals: ResidualPair | None = None,
+    *,
+    section: SensorSection | None = None,
+    origin: Origin | None = None,
+) -> Report:
     """Page that shows a verdict; ``.write(path)`` puts it on disk.
 
     Parameters
@@ -34,13 +42,18 @@ def discovery_page(verdict: Verdict, residuals: ResidualPair | None = None) -> R
         What the search found.
     residuals : `ResidualPair`, optional
         Images of data minus model; without them the page has curves and tables only.
+    section : `SensorSection`, optional
+        Pixels of the sensor that the data show, where that is known.
+    origin : `Origin`, optional
+        Command that searched, and pages of what it was given.
 
     Returns
     -------
     page : `Report`
         Self-contained: no script, nothing fetched.
     """
-    report = Report(headline(verdict), _lead(verdict))
+    report = Report(headline(verdict), _lead(verdict), origin or Origin())
+    report.summary(_summary(verdict, residuals, section))
     _answer(report, verdict)
     _where(report, verdict)
     if residuals is not None:
@@ -91,26 +104,74 @@ def _lead(verdict: Verdict) -> str:
     )
 
 
-def _answer(report: Report, verdict: Verdict) -> None:
-    chance = _chance(verdict.global_probability)
-    report.section(
-        "Verdict", f"The chance that noise alone disagrees as much with the unchanged model: {chance}."
-    )
+def _summary(
+    verdict: Verdict, residuals: ResidualPair | None, section: SensorSection | None
+) -> list[tuple[str, str]]:
+    """What was found, how large it is, and in what."""
+    gap, rows = verdict.gap, [("verdict", _found(verdict))]
     if not verdict.complete:
-        report.paragraph("The search was stopped before its end: this is the best answer that it had.")
+        rows.append(("complete", "no: the search was stopped, and this is the best answer that it had"))
     if math.isfinite(verdict.size["of_counts"]):
-        text = verdict.size_text()
-        report.paragraph(f"{text[0].upper()}{text[1:]}.")
+        rows.append(("size of the disagreement", verdict.size_text().partition(": ")[2]))
+    rows.append(("chance that noise alone disagrees as much", _chance(verdict.global_probability)))
+    if math.isfinite(gap.heldout_before):
+        held = amplitude_text(gap.heldout_before)
+        if verdict.effects:
+            held += f" → {amplitude_text(gap.heldout_after)}"
+        rows.append(("rms on held-out data", f"{held}; noise floor {amplitude_text(gap.noise_floor)}"))
+    if residuals is not None:
+        best = residuals.after or residuals.before
+        known = best.thickness.mask == 0
+        rows.append(("median σ of the thickness of a pixel", sigma_text(best.thickness.sigma[known])))
+        rows.append(("masked", masked_text(np.isnan(residuals.before.residual))))
+    return [*rows, ("searched part", _searched(verdict, section))]
+
+
+def _found(verdict: Verdict) -> str:
+    """The answer in numbers, under a headline that names it."""
+    if verdict.effects:
+        return "; ".join(
+            f"{effect.name}: {_values(effect)}; probability {probability_text(effect.probability)}"
+            for effect in verdict.effects
+        )
+    if verdict.verdict == "no_discrepancy":
+        return f"Noise alone disagrees as much with a chance of {_chance(verdict.global_probability)}"
+    reason = str(verdict.unexplained.get("reason") or "no known effect explains it")
+    return f"No name: {reason}"
+
+
+def _values(effect: NamedEffect) -> str:
+    texts = {name: measured_text(p.value, p.sigma) for name, p in effect.parameters.items()}
+    return ", ".join(
+        f"{name} = {value} ± {sigma} {effect.parameters[name].unit}".rstrip()
+        for name, (value, sigma) in texts.items()
+    )
+
+
+def _searched(verdict: Verdict, section: SensorSection | None) -> str:
+    if not _was_searched(verdict):
+        return "nothing"
+    cell = int(verdict.data["cell_px"])
+    _, rows, columns = verdict.data["shape"]
+    shape = rows * cell, columns * cell
+    if section is not None and shape != (abs(np.ptp(section.y)) + 1, abs(np.ptp(section.x)) + 1):
+        section = None  # a part of the image, or all but some pixels at its rim
+    return f"{of_sensor(shape, section)}, in {columns} × {rows} cells"
+
+
+def _answer(report: Report, verdict: Verdict) -> None:
+    report.section("Verdict")
     if verdict.unexplained.get("reason"):
         report.paragraph(f"Why there is no name: {verdict.unexplained['reason']}.")
     if not verdict.effects:
+        chance = _chance(verdict.global_probability)
+        report.paragraph(f"The chance that noise alone disagrees as much with the unchanged model: {chance}.")
         return
     rows = [
         (
             effect.name,
             name,
-            f"{value.value:.6g}",
-            f"{value.sigma:.2g}",
+            *measured_text(value.value, value.sigma),
             value.unit or "1",
             probability_text(effect.probability),
             ", ".join(effect.ambiguous_with) or "nothing",
@@ -149,45 +210,33 @@ def _where(report: Report, verdict: Verdict) -> None:
         report.paragraph(f"The excess is largest in patterns with a period of about {where.scale_px:.3g} px.")
     rows = [(row["name"], row["statistic"], row["degrees"], row["probability"]) for row in where.channels]
     table = Table(rows=rows, names=("test", "statistic", "degrees of freedom", "chance under noise"))
-    _format(table, statistic=".4g", **{"degrees of freedom": ".4g"})
     report.table(table, "discovery_tests")
-    report.table(_curve_table(where.wavelength), "discovery_wavelengths")
+    _add_curve(report, where.wavelength, "discovery_wavelengths")
 
 
 def _maps(report: Report, residuals: ResidualPair) -> None:
     report.section(
         "Data minus model",
-        "Each wavelength over its mean, at the thickness that fits best; one colour scale before and after. What is "
-        "seen before and gone after is the effect; what is seen in both is not explained by it.",
+        "Each wavelength over its mean, at the thickness that fits best, averaged until the noise of pixels hides "
+        "nothing, and over the noise that is left. What is seen before and gone after is the effect; what is seen in "
+        "both is not explained by it.",
     )
     before, after = residuals.before, residuals.after
-    shown = PERCENT * before.residual[:, ::3, ::3]
-    limits = finite_range(shown, symmetric=True)
-    pairs = [("unchanged model", before)] + ([("with what was found", after)] if after is not None else [])
-    for title, one in pairs:
-        report.figure(
-            flats_figure(
-                one.residual,
-                np.isnan(one.residual),
-                one.wavelength_nm.tolist(),
-                title=title,
-                unit="data − model [%]",
-                limits=limits,
-                most_px=GALLERY_PX,
-            ),
-            f"Data minus model by wavelength: {title}.",
-        )
+    best = before if after is None else after
+    for title, one in (("unchanged model", before), ("with what was found", after)):
+        if one is not None:
+            made = residuals_figure(one.residual, one.wavelength_nm.tolist(), pixel_noise(best.residual))
+            report.figure(made, f"Data minus model by wavelength: {title}.")
     table = Table({"wavelength": before.wavelength_nm, "before": PERCENT * before.rms})
     table["wavelength"].unit, table["before"].unit = "nm", "percent"
     if after is not None:
         table["after"] = PERCENT * after.rms
         table["after"].unit = "percent"
-    _format(table, wavelength="g", before=".4f", after=".4f")
+    table["wavelength"].info.format = "g"
     report.table(table, "discovery_residual_rms")
-    best = before if after is None else after
     report.figure(
         thickness_figure(best.thickness, residuals.order_um),
-        "Thickness with a contour for each fringe order, its uncertainty, and the chance of a slip.",
+        "Thickness with a contour for each fringe order, and its uncertainty.",
     )
 
 
@@ -200,10 +249,12 @@ def _candidates(report: Report, verdict: Verdict) -> None:
         "their share. The best are then fitted; a score is no verdict, and rivals with large scores are rivals only "
         "until the fit.",
     )
-    report.figure(candidates_figure(verdict), "The most promising effects.")
+    if any(item["score"] > 0.0 for item in verdict.candidates):
+        report.figure(candidates_figure(verdict), "The most promising effects.")
+    else:
+        report.paragraph("None promises anything.")
     rows = [(item["name"], item["score"], item["degrees"]) for item in verdict.candidates]
     table = Table(rows=rows, names=("effect", "fall of χ²", "parameters"))
-    _format(table, **{"fall of χ²": ".4g"})
     report.table(table, "discovery_candidates")
 
 
@@ -227,27 +278,21 @@ def _gap(report: Report, verdict: Verdict) -> None:
         ("held out", gap.heldout_before, gap.heldout_after, gap.noise_floor),
     ]
     table = Table(rows=rows, names=("data", "before", "after", "noise floor"))
-    _format(table, before=".6f", after=".6f", **{"noise floor": ".6f"})
-    report.table(table, "discovery_gap")
+    _add_in_percent(report, table, "discovery_gap")
     if verdict.steps:
-        steps = Table(
-            rows=[
-                (
-                    " + ".join(step.added),
-                    step.delta_chi2,
-                    step.log_evidence,
-                    step.gap_before,
-                    step.gap_after,
-                    "yes" if step.consistent else "no",
-                )
-                for step in verdict.steps
-            ],
-            names=("added", "fall of χ²", "log evidence", "gap before", "gap after", "only noise left"),
-        )
-        _format(
-            steps, **{"fall of χ²": ".5g", "log evidence": ".5g", "gap before": ".6f", "gap after": ".6f"}
-        )
-        report.table(steps, "discovery_steps")
+        steps = [
+            (
+                " + ".join(step.added),
+                step.delta_chi2,
+                step.log_evidence,
+                step.gap_before,
+                step.gap_after,
+                "yes" if step.consistent else "no",
+            )
+            for step in verdict.steps
+        ]
+        names = ("added", "fall of χ²", "log evidence", "before", "after", "only noise left")
+        _add_in_percent(report, Table(rows=steps, names=names), "discovery_steps")
 
 
 def _closed(before: float, after: float, floor: float) -> float:
@@ -275,9 +320,9 @@ def _unexplained(report: Report, verdict: Verdict) -> None:
         )
     if left.get("thickness_phase_waveform"):
         report.figure(leftover_figure(left), "What the best model leaves.")
-        report.table(_curve_table(left["wavelength"]), "discovery_left_by_wavelength")
+        _add_curve(report, left["wavelength"], "discovery_left_by_wavelength")
     if left.get("harmonics"):
-        report.table(_curve_table(left["harmonics"]), "discovery_left_harmonics")
+        _add_curve(report, left["harmonics"], "discovery_left_harmonics")
     modes = left.get("principal_modes")
     if modes:
         listed = ", ".join(f"{value:.3g}" for value in modes)
@@ -342,7 +387,7 @@ def _data(report: Report, verdict: Verdict) -> None:
             {"wavelength": data["wavelength_nm"], "noise over the stated noise": data["noise_factor"]}
         )
         table["wavelength"].unit = "nm"
-        _format(table, wavelength="g", **{"noise over the stated noise": ".3f"})
+        table["wavelength"].info.format = "g"
         report.table(table, "discovery_noise")
         low, high = data["thickness_um"]
         report.paragraph(
@@ -352,16 +397,23 @@ def _data(report: Report, verdict: Verdict) -> None:
     report.remarks([("Note", note) for note in verdict.notes])
 
 
-def _curve_table(rows: Any) -> Table:
-    """Rows of a curve as a table, units taken out of the names of the columns."""
+def _add_curve(report: Report, rows: Any, name: str) -> None:
+    """Add the rows of a curve as a table, units taken out of the names of the columns."""
     table = Table(rows=[dict(row) for row in rows])
-    for name in list(table.colnames):
-        if name.endswith("_nm"):
-            table.rename_column(name, name.removesuffix("_nm"))
-            table[name.removesuffix("_nm")].unit = "nm"
-    for column in table.itercols():
-        column.info.format = ".5g"
-    return table
+    for column in [name for name in table.colnames if name.endswith("_nm")]:
+        plain = column.removesuffix("_nm")
+        table.rename_column(column, plain)
+        table[plain].unit, table[plain].info.format = "nm", "g"
+    _add_in_percent(report, table, name)
+
+
+def _add_in_percent(report: Report, table: Table, name: str) -> None:
+    """Add a table whose fractions of the counts are shown in percent; what it saves keeps them as they are."""
+    shown = table.copy()
+    for column in FRACTIONS.intersection(table.colnames):
+        shown[column] = PERCENT * table[column]
+        shown[column].unit = "percent"
+    report.table(shown, name, download=table)
 
 
 def _place_table(places: Any) -> Table:
@@ -371,12 +423,4 @@ def _place_table(places: Any) -> Table:
         (item["y_px"], item["x_px"], item["diameter_px"], 100.0 * item["excess_share"], item["sigma"])
         for item in places
     ]
-    table = Table(rows=rows, names=names, units=("pix", "pix", "pix", None, None))
-    _format(table, **dict.fromkeys(names[:2], ".0f"), **dict.fromkeys(names[2:], ".3g"))
-    return table
-
-
-def _format(table: Table, **formats: str) -> None:
-    for name, text in formats.items():
-        if name in table.colnames:
-            table[name].info.format = text
+    return Table(rows=rows, names=names, units=("pix", "pix", "pix", None, None))

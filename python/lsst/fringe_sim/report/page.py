@@ -1,21 +1,46 @@
-"""One self-contained HTML page: opens from disk, needs no network and no script."""
+"""One self-contained HTML page: opens from disk, needs no network and no script.
+
+A page begins with a summary, which is read in half a minute. Its figures are cut into their panels, which stand side
+by side as far as the window is wide.
+"""
 
 from __future__ import annotations
 
 import base64
 import html
 import os
+import re
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
+import numpy as np
 from astropy.table import Table
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
+from .. import __version__
 from ..files import table_text, write_whole
-from ..style import to_png
+from ..style import finite_range, map_to_png, pixels_to_png, to_pieces
+from .words import number_text
 
-__all__ = ["Report"]
+__all__ = ["Origin", "Report", "title_of"]
+
+GENERATOR = '<meta name="generator" content="lsst.fringe_sim">'
+HEAD_LENGTH = 1000
+"""What pages of this program say in their beginning, and the length of it."""
+
+PHONE_PX = 380
+"""Pictures that are wider do not fit into the smallest windows, where a click enlarges them."""
+
+MAP_STEP = 5
+"""Pixels between those that decide the colours of a whole map."""
+
+SMALLEST_SCALE = 0.9
+"""Panels are put side by side as long as none is drawn smaller than this."""
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -23,7 +48,14 @@ body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 0 auto; p
 h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
 .lead { color: #444; margin-top: 0; } nav a { display: inline-block; margin-right: 1.1rem; }
 figure { margin: 1rem 0; } figcaption { color: #444; font-size: .92rem; }
-img { box-sizing: border-box; max-width: 100%; height: auto; border: 1px solid #ddd; }
+img { box-sizing: border-box; max-width: 100%; height: auto; }
+.panels { display: grid; gap: .2rem; align-items: start; }
+.summary { border: 1px solid #bbb; border-left: 6px solid #0072b2; padding: .2rem 1rem .6rem; margin: 1rem 0; }
+.summary dl { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 15rem), 1fr)); }
+.summary dl { gap: .1rem 1.4rem; margin: 0; }
+.summary dl > div { margin: .25rem 0; } .summary dl > .all { grid-column: 1 / -1; }
+.summary dt { font-size: .82rem; color: #555; } .summary dd { margin: 0; overflow-wrap: anywhere; }
+.summary .answer dd { font-size: 1.2rem; font-weight: 600; } .summary .made dd { font-size: .88rem; }
 .zoom input { position: absolute; opacity: 0; } .zoom { display: block; overflow-x: auto; cursor: zoom-in; }
 .zoom input:checked + img { max-width: none; cursor: zoom-out; }
 .zoom input:focus-visible + img { outline: 3px solid #0072b2; }
@@ -40,6 +72,22 @@ tr.bad td { background: #fff1e5; } tr.bad td.mark { color: #a03c00; font-weight:
 """
 
 
+@dataclass(frozen=True)
+class Origin:
+    """Where a page comes from, and which others belong to it.
+
+    Parameters
+    ----------
+    command : `str`
+        Line that was typed; empty if none was.
+    pages : `tuple` [`tuple` [`str`, `str`], ...]
+        Title and address of other pages; the address is relative to the folder of this one.
+    """
+
+    command: str = ""
+    pages: tuple[tuple[str, str], ...] = ()
+
+
 @dataclass
 class Report:
     """A page that grows section by section.
@@ -50,12 +98,34 @@ class Report:
         Heading of the page.
     lead : `str`
         One sentence under it.
+    origin : `Origin`
+        Command, and pages that belong to this one.
     """
 
     title: str
     lead: str = ""
+    origin: Origin = field(default_factory=Origin)
+    _summary: str = field(default="", repr=False)
     _body: list[str] = field(default_factory=list, repr=False)
     _sections: list[tuple[str, str]] = field(default_factory=list, repr=False)
+
+    def summary(self, rows: Sequence[tuple[str, str]]) -> None:
+        """State what a reader wants to know first; the version, the date and the command are added.
+
+        ``rows``: what is stated, and the value with its unit, as text. The first is the answer, a sentence. Rows
+        without a value are left out.
+        """
+        made = [
+            ("version", f"lsst.fringe_sim {__version__}"),
+            ("date", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(_now_s()))),
+            ("command", self.origin.command),
+        ]
+        kinds = ["all answer", *[""] * (len(rows) - 1), "made", "made", "all made"]
+        self._summary = "".join(
+            f'<div class="{kind}"><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>'
+            for kind, (name, value) in zip(kinds, [*rows, *made], strict=True)
+            if value
+        )
 
     def section(self, title: str, text: str = "") -> None:
         """Begin a section with a paragraph of plain text."""
@@ -80,16 +150,44 @@ class Report:
         self._body.append(f"<pre>{html.escape(text)}</pre>")
 
     def figure(self, made: Figure, caption: str, file: Path | None = None) -> None:
-        """Add a figure; a click enlarges it. It is also written into a file, if one is named."""
-        picture = to_png(made)
+        """Add a figure, whose panels stand side by side where there is room; it may go into a file as a whole."""
+        whole, pieces = to_pieces(made)
         if file is not None:
-            write_whole(file, picture)
-        data = base64.b64encode(picture).decode("ascii")
+            write_whole(file, pixels_to_png(whole))
         text = html.escape(caption, quote=True)
+        least = int(SMALLEST_SCALE * min(pixels.shape[1] for _, pixels in pieces))
+        shown = "".join(_picture(pixels, f"{caption} {title}".strip()) for title, pixels in pieces)
+        columns = f"repeat(auto-fill, minmax(min(100%, {least}px), 1fr))"
         self._body.append(
-            f'<figure><label class="zoom"><input type="checkbox"><img alt="{text}" '
-            f'src="data:image/png;base64,{data}"></label><figcaption>{text}</figcaption></figure>'
+            f'<figure><div class="panels" style="grid-template-columns: {columns}">{shown}</div>'
+            f"<figcaption>{text}</figcaption></figure>"
         )
+
+    def map(
+        self,
+        file: Path,
+        image: NDArray[np.floating],
+        *,
+        mask: NDArray[Any],
+        unit: str,
+        diverging: bool = False,
+    ) -> None:
+        """Write a map with all its pixels into a file beside the page, and add a link to it.
+
+        ``image``, ``mask`` (ny, nx): the map in ``unit``, and where it is not to be shown. ``diverging``: its zero is
+        the middle of the colours.
+        """
+        some = np.where(mask[::MAP_STEP, ::MAP_STEP] == 0, image[::MAP_STEP, ::MAP_STEP], np.nan)
+        low, high = finite_range(some, symmetric=diverging)
+        write_whole(file, map_to_png(image, (low, high), mask=mask, diverging=diverging))
+        rows, columns = image.shape
+        self.link(
+            file.name, file.name, f": {columns} × {rows} px, colours from {low:.3g} to {high:.3g} {unit}."
+        )
+
+    def link(self, address: str, text: str, after: str = "") -> None:
+        """Add a link to a file in the folder of the page, and what is said of it."""
+        self._body.append(f'<p class="small">{_link(address, text)}{html.escape(after)}</p>')
 
     def table(
         self,
@@ -104,7 +202,7 @@ class Report:
         Parameters
         ----------
         table : `astropy.table.Table`
-            Few rows; numbers are shown as astropy formats them.
+            Few rows. Three digits are shown of numbers for which no format is set.
         name : `str`
             File name of the download, without its ending.
         download : `astropy.table.Table`, optional
@@ -112,10 +210,16 @@ class Report:
         marks : sequence of `str`, optional
             One of ``good``, ``note``, ``bad``, ``void`` for every row: its colour; the last column says the same.
         """
+        plain = (table if download is None else download).copy(copy_data=False)
+        plain.meta.clear()  # the page says it; some readers stumble over it
+        table = table.copy(copy_data=False)
+        for column in table.itercols():
+            if column.dtype.kind == "f" and not column.info.format:
+                column.info.format = number_text
         words = [column.dtype.kind in "US" for column in table.itercols()]
         kinds = [' class="words"' if word else "" for word in words]
         heads = "".join(
-            f"<th{kind}>{html.escape(column.name)}{f' [{column.unit}]' if column.unit else ''}</th>"
+            f"<th{kind}>{html.escape(column.name.replace('_', ' '))}{f' [{column.unit}]' if column.unit else ''}</th>"
             for column, kind in zip(table.itercols(), kinds, strict=True)
         )
         if marks is not None and kinds:
@@ -132,8 +236,6 @@ class Report:
             + "</tr>"
             for row, mark in zip(cells, marks or [""] * len(table), strict=True)
         )
-        plain = (table if download is None else download).copy(copy_data=False)
-        plain.meta.clear()  # the page says it; some readers stumble over it
         data = base64.b64encode(table_text(plain).encode()).decode("ascii")
         self._body.append(
             f'<div class="tables"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
@@ -144,14 +246,55 @@ class Report:
     def to_html(self) -> str:
         """The page as text."""
         links = "".join(f'<a href="#{anchor}">{html.escape(title)}</a>' for anchor, title in self._sections)
+        others = ", ".join(_link(address, title) for title, address in self.origin.pages)
+        if others:
+            others = f'<div class="all"><dt>see also</dt><dd>{others}</dd></div>'
+        summary = self._summary + others
+        if summary:
+            summary = f'<section class="summary" aria-label="Summary"><dl>{summary}</dl></section>'
         return (
             '<!doctype html><html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"{GENERATOR}"
             f"<title>{html.escape(self.title)}</title><style>{_STYLE}</style></head><body>"
             f'<h1>{html.escape(self.title)}</h1><p class="lead">{html.escape(self.lead)}</p>'
-            f"<nav>{links}</nav>{''.join(self._body)}</body></html>\n"
+            f"{summary}<nav>{links}</nav>{''.join(self._body)}</body></html>\n"
         )
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the page; an existing file is replaced when the new one is complete."""
         return write_whole(path, self.to_html())
+
+
+def title_of(path: Path) -> str:
+    """Title of a page that was written here; empty where there is none."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as stream:
+            head = stream.read(HEAD_LENGTH)
+    except OSError:
+        return ""
+    found = re.search(r"<title>(.*?)</title>", head)
+    return html.unescape(found[1]) if found and GENERATOR in head else ""
+
+
+def _picture(pixels: NDArray[np.uint8], text: str) -> str:
+    """A picture in the page; where it may be too wide, a click enlarges it."""
+    height, width, _ = pixels.shape
+    data = base64.b64encode(pixels_to_png(pixels)).decode("ascii")
+    shown = (
+        f'<img alt="{html.escape(text, quote=True)}" width="{width}" height="{height}" '
+        f'src="data:image/png;base64,{data}">'
+    )
+    if width <= PHONE_PX:
+        return shown
+    return f'<label class="zoom"><input type="checkbox">{shown}</label>'
+
+
+def _link(address: str, text: str) -> str:
+    return f'<a href="{quote(address)}">{html.escape(text)}</a>'
+
+
+def _now_s() -> float:
+    """Time of the clock [s], or that of https://reproducible-builds.org/specs/source-date-epoch."""
+    stated = os.environ.get("SOURCE_DATE_EPOCH", "")
+    return float(stated) if stated.isdecimal() else time.time()

@@ -14,8 +14,10 @@ from matplotlib.figure import Figure
 from ..paper.published import Finding
 from ..paper.reproduce import Reproduction, findings_table
 from ..paper.section import Graph, Picture, Section
-from ..style import figure, show_image
-from .page import Report
+from ..style import figure, panels, show_image
+from .figures import CURVE_INCH, MAP_INCH
+from .page import Origin, Report
+from .words import number_text
 
 __all__ = ["section_figures", "write_paper_page"]
 
@@ -32,17 +34,25 @@ STATUS_WORDS = {
 }
 
 
-def write_paper_page(made: Reproduction, path: str | os.PathLike[str], notices: Sequence[str] = ()) -> Path:
+def write_paper_page(
+    made: Reproduction,
+    path: str | os.PathLike[str],
+    notices: Sequence[str] = (),
+    origin: Origin | None = None,
+) -> Path:
     """Write the page.
 
-    ``notices``: what the reader must know first, as that published curves were not at hand.
+    ``notices``: what the reader must know first, as that published curves were not at hand. ``origin``: command.
     """
     report = Report(
         "The paper, recomputed",
         "Guo, Walter, Lage & Lupton, PASP 135, 034503 (doi 10.1088/1538-3873/acbe67): every number that can be "
         "recomputed, beside the published one.",
+        origin or Origin(),
     )
-    report.section("Summary", f"{made.summary()[0].upper()}{made.summary()[1:]}.")
+    open_points = [f for f in made.all_findings if f.status == "differs"]
+    report.summary(_summary(made, open_points))
+    report.section("All numbers")
     report.paragraph(
         '"Paper errs" means that the recomputed number confirms a correction of the paper, for the reason given. '
         '"Amplitude" is not defined in the paper; every line says which of its meanings is used.'
@@ -54,7 +64,6 @@ def write_paper_page(made: Reproduction, path: str | os.PathLike[str], notices: 
     for notice in notices:
         report.paragraph(notice)
     _add_table(report, made.all_findings, "paper_summary", made.table())
-    open_points = [f for f in made.all_findings if f.status == "differs"]
     if open_points:
         report.section(
             "Where they differ", "Neither the paper nor a correction of it is met, within the tolerance."
@@ -70,17 +79,27 @@ def write_paper_page(made: Reproduction, path: str | os.PathLike[str], notices: 
     return report.write(path)
 
 
+def _summary(made: Reproduction, open_points: Sequence[Finding]) -> list[tuple[str, str]]:
+    """How many numbers agree, and how far off the others are."""
+    off = [abs(2.0 * f.value / (f.number.low + f.number.high) - 1.0) for f in open_points]
+    off = [each for each in off if np.isfinite(each)]
+    return [
+        ("result", f"{made.summary()[0].upper()}{made.summary()[1:]}"),
+        ("where they differ", ", ".join(dict.fromkeys(f.number.place for f in open_points)) or "nowhere"),
+        ("largest relative difference of these", f"{number_text(100.0 * max(off), 2)} %" if off else ""),
+    ]
+
+
 def section_figures(section: Section) -> Iterator[Figure]:
     """Panels of a section, in rows."""
     if not section.panels:
         return
-    gallery = len(section.panels) > MANY
     columns = min(PER_ROW, len(section.panels))
     rows = -(-len(section.panels) // columns)
-    width, height = (3.6, 3.1) if gallery else (4.9, 3.9)
+    width, height = MAP_INCH if len(section.panels) > MANY else CURVE_INCH
     with figure(width * columns, height * rows) as made:
-        axes = np.atleast_1d(made.subplots(rows, columns)).ravel()
-        for panel, place in zip(section.panels, axes, strict=False):
+        axes = panels(made, len(section.panels), columns)
+        for panel, place in zip(section.panels, axes, strict=True):
             if isinstance(panel, Picture):
                 show_image(
                     place,
@@ -92,8 +111,6 @@ def section_figures(section: Section) -> Iterator[Figure]:
                 )
             else:
                 _draw_graph(place, panel)
-        for place in axes[len(section.panels) :]:
-            place.set_visible(False)
         yield made
 
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from astropy import units
 from astropy.table import Table
+from numpy.typing import NDArray
 
 from ..algorithms.coadds import Coadds, VisitPlaces, coadds_of_frames
 from ..algorithms.pca import fit_pca
-from ..products import SkyFringe
+from ..products import SensorSection, SkyFringe
 from .figures import coadds_figure, components_figure, sky_figure
-from .page import Report
+from .page import Origin, Report
+from .words import masked_text, of_sensor, span_text
 
 __all__ = ["COADDS_CAPTION", "COADDS_TEXT", "coadd_table", "sky_amplitudes", "write_sky_report"]
 
@@ -28,6 +31,8 @@ COADDS_OF_VISITS_TEXT = (
     "What stays of the fringes in coadds of the given visits, uncorrected and after the subtraction of the one "
     "template that takes most of them, beside the photon noise."
 )
+
+CAPTION_OF_COMPONENTS = "Mean, and the first components with their share of the variance."
 
 COADDS_CAPTION = (
     "Standard deviation of means over squares: of the largest against the number of exposures, and of the deepest "
@@ -60,12 +65,16 @@ def write_sky_report(
     setup: str,
     seed: int,
     places: VisitPlaces | None = None,
+    *,
     picture: Path | None = None,
+    section: SensorSection | None = None,
+    origin: Origin | None = None,
 ) -> Path:
     """Write the page.
 
-    ``seed``: of places and angles of the coadds, where ``places`` are not given. ``picture``: file for its first
-    figure alone, if wanted.
+    ``seed``: of places and angles of the coadds, where ``places`` are not given. ``picture``: file beside the page
+    for the first frame with all its pixels, if wanted. ``section``: pixels of the sensor that the frames show, where
+    that is known. ``origin``: command, and pages of what it was given.
     """
     first = frames[0]
     report = Report(
@@ -73,22 +82,69 @@ def write_sky_report(
         f"Set-up {setup}, filter {first.physical_filter or 'not named'}, "
         f"{len(frames)} exposure{'s' if len(frames) > 1 else ''} of {first.exposure_s:g} s at airmass "
         f"{first.airmass:g}, {'with' if first.seed is not None else 'without'} noise.",
+        origin or Origin(),
     )
+    amplitudes = sky_amplitudes(frames)
+    found = None if first.seed is not None else coadds_of_frames(frames, np.random.default_rng(seed), places)
+    report.summary(_summary(frames, amplitudes, found, section))
     report.section(
         "Fringes", "Departure from the mean sky. Three numbers are called amplitude; all are given."
     )
-    caption = "A frame, the distribution over its pixels, and the strength by time."
-    report.figure(sky_figure(frames), caption, picture)
-    report.table(sky_amplitudes(frames), "sky_fringe_amplitudes")
+    report.figure(
+        sky_figure(frames), f"{_first_of(frames)}, and its distribution over the pixels{_through(frames)}."
+    )
+    if picture is not None:
+        shown = PERCENT * first.fraction()
+        report.map(picture, shown, mask=first.mask, unit="% of the sky", diverging=True)
+    report.table(amplitudes, "sky_fringe_amplitudes")
     if len(frames) > 1:
         report.section("Components", "Principal components of the frames: the templates of a correction.")
-        report.figure(components_figure(fit_pca(frames)), "Mean, first components, explained variance.")
-    found = None if first.seed is not None else coadds_of_frames(frames, np.random.default_rng(seed), places)
+        report.figure(
+            components_figure(fit_pca(frames)),
+            CAPTION_OF_COMPONENTS,
+        )
     if found is not None:
         report.section("Coadds", COADDS_TEXT if places is None else COADDS_OF_VISITS_TEXT)
         report.figure(coadds_figure(found), COADDS_CAPTION)
         report.table(coadd_table(found), "coadds")
     return report.write(path)
+
+
+def _without_noise(frames: Sequence[SkyFringe], keyword: str, measured: NDArray[np.floating]) -> str:
+    """An amplitude as the frames state it, without noise; as it was measured where they do not."""
+    stated = [PERCENT * float(each.metadata[keyword]) for each in frames if keyword in each.metadata]
+    return span_text(stated if len(stated) == len(frames) else measured)
+
+
+def _first_of(frames: Sequence[SkyFringe]) -> str:
+    return "The first frame" if len(frames) > 1 else "The frame"
+
+
+def _through(frames: Sequence[SkyFringe]) -> str:
+    return "; strength of all frames by time" if len(frames) > 1 else ""
+
+
+def _summary(
+    frames: Sequence[SkyFringe], amplitudes: Table, found: Coadds | None, section: SensorSection | None
+) -> list[tuple[str, str]]:
+    first = frames[0]
+    told = first.seed is None or all("FRINGRMS" in each.metadata for each in frames)
+    noise = "" if told else ", noise included"
+    rms = _without_noise(frames, "FRINGRMS", amplitudes["rms"])
+    trimmed = _without_noise(frames, "FRING198", amplitudes["half range 1-99"])
+    deepest = ""
+    if found is not None:
+        ratio = float(found.fringes[-1, -1] / found.noise[-1, -1])
+        deepest = f"{ratio:.2g} times the noise of {found.counts[-1]} exposures, uncorrected"
+    return [
+        ("fringes", f"{rms} % of the sky, rms{noise}"),
+        ("half of the range from 1 to 99 %", f"{trimmed} % of the sky{noise}"),
+        ("sky", f"{span_text(amplitudes['sky'])} electrons in a pixel"),
+        ("photon noise of a pixel", f"{PERCENT / math.sqrt(first.mean_electrons):.2g} % of the sky"),
+        (f"fringes in means of {found.square_px[-1]} px" if found else "coadds", deepest),
+        ("masked", masked_text(first.mask)),
+        ("simulated part", of_sensor(first.image.shape, section)),
+    ]
 
 
 def coadd_table(found: Coadds) -> Table:
@@ -99,7 +155,5 @@ def coadd_table(found: Coadds) -> Table:
     for name, values in kinds.items():
         if values is not None:
             table[name] = PERCENT * values[:, -1] * units.percent
-            table[name].info.format = ".2g"
     table["fringes over noise"] = found.fringes[:, -1] / found.noise[:, -1]
-    table["fringes over noise"].info.format = ".2f"
     return table

@@ -10,58 +10,110 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from ..algorithms.flat_residual import flat_residual, relative_flats
-from ..algorithms.thickness_fit import remarks
+from ..algorithms.thickness_fit import remarks, says_misfit
 from ..model import FringeModel
-from ..products import FlatFit, FringeCube, ThicknessMap
+from ..products import FlatFit, FringeCube, SensorSection, ThicknessMap
 from .figures import contrast_figure, flats_figure, phase_figure, residuals_figure, thickness_figure
-from .page import Report
+from .page import Origin, Report
+from .words import masked_text, of_sensor, sigma_text
 
 __all__ = ["phase_folded", "residual_of_fit", "residual_table", "write_thickness_report"]
 
 PERCENT = 100.0
 PHASE_BINS = 32
+RMS = "rms of flat − model"
 
 
 def write_thickness_report(
-    folder: Path, cube: FringeCube, fitted: ThicknessMap, model: FringeModel, method: str
+    folder: Path,
+    cube: FringeCube,
+    fitted: ThicknessMap,
+    model: FringeModel,
+    method: str,
+    *,
+    section: SensorSection | None = None,
+    origin: Origin | None = None,
 ) -> Path:
-    """One page with the map, the flats and the comparison of both."""
+    """One page with the map, the flats and the comparison of both; the whole map lies beside it.
+
+    ``section``: pixels of the sensor that the flats show, where that is known. ``origin``: command, and pages of
+    what it was given.
+    """
     wavelength = [float(w) for w in cube.wavelength_nm]
     report = Report(
         f"Thickness of {fitted.layer}, {fitted.detector or 'one sensor'}",
         f"Set-up {model.setup.name}, method {method}, {len(wavelength)} flats.",
+        origin or Origin(),
     )
+    left = residual_of_fit(cube, model, fitted)
+    residuals = residual_table(left, cube)
+    report.summary(_summary(cube, fitted, residuals, section))
     said = remarks(fitted.metadata, fitted.flats)
-    if fitted.flats is not None:
-        report.section("What the fit says of itself", ". ".join(said) + ".")
-        report.table(flat_table(fitted.flats), "flats")
-        if fitted.contrast_map is not None and fitted.contrast_map.size > 1:
-            report.figure(
-                contrast_figure(fitted.contrast_map),
-                "Contrast in blocks of the sensor, over that of the whole.",
-            )
+    if said:
+        text = ". ".join(line[0].upper() + line[1:] for line in said)
+        report.section("What the fit says of itself", f"{text}.")
     order_um = float(model.fringe_order_um(960.0))
     report.section("Thickness", "One contour is one fringe order at 960 nm.")
-    report.figure(
-        thickness_figure(fitted, order_um), "Fitted thickness, its uncertainty, and the chance of a slip."
-    )
+    report.figure(thickness_figure(fitted, order_um), "Fitted thickness and its uncertainty.")
+    report.map(folder / "thickness.png", fitted.value, mask=fitted.mask, unit="µm")
     report.section("Flats", "Counts over their mean, minus one.")
     report.figure(
-        flats_figure(relative_flats(cube), cube.mask, wavelength, title="prepared flats"),
-        "All flats on one scale.",
+        flats_figure(relative_flats(cube), cube.mask, wavelength), "Prepared flats on one scale of colours."
     )
     report.section(
         "Data and model", "Folded on the fitted thickness, modulo one fringe order of each wavelength."
     )
     phase, data, modelled = phase_folded(cube, fitted, model)
     report.figure(
-        phase_figure(phase, data, modelled, wavelength), "Mean of all pixels of equal fringe phase."
+        phase_figure(phase, data, modelled, wavelength),
+        "Mean of all pixels of equal fringe phase. Points: flats; line: model at the fitted thickness.",
     )
-    left = residual_of_fit(cube, model, fitted)
-    report.section("Residuals", "Flats minus the model at the fitted thickness, where the fit is good.")
-    report.figure(residuals_figure(left, wavelength), "All wavelengths on one scale.")
-    report.table(residual_table(left, cube), "flat_residuals")
+    report.section(
+        "Residuals",
+        "Flats minus the model at the fitted thickness, where the fit is good, averaged until the noise of pixels "
+        "hides nothing, and over the noise that is left: a model that fits leaves colours without a pattern.",
+    )
+    noise = np.asarray(residuals["noise"], dtype=float) / PERCENT
+    report.figure(residuals_figure(left, wavelength, noise), "All wavelengths on one scale of colours.")
+    report.table(residuals, "flat_residuals")
+    _add_flats(report, fitted)
     return report.write(folder / "report.html")
+
+
+def _summary(
+    cube: FringeCube, fitted: ThicknessMap, residuals: Table, section: SensorSection | None
+) -> list[tuple[str, str]]:
+    good = fitted.mask == 0
+    value = fitted.value[good]
+    low, middle, high = np.percentile(value, [0.0, 50.0, 100.0]) if value.size else [np.nan] * 3
+    rms, noise = (float(np.sqrt(np.nanmean(np.square(residuals[name])))) for name in (RMS, "noise"))
+    wavelength = cube.wavelength_nm
+    fits = "does not describe the flats" if says_misfit(fitted.metadata) else "describes the flats"
+    return [
+        ("result", f"The model {fits}; thickness {middle:.2f} µm (median)"),
+        ("thickness", f"{low:.2f} to {high:.2f} µm"),
+        ("median σ of a pixel", sigma_text(fitted.sigma[good])),
+        ("flats minus model, rms", f"{rms:.3g} %, {rms / noise:.3g} times the noise"),
+        ("pixels a fringe order off, expected", f"{float(fitted.slip_probability[good].sum()):.2g}"),
+        ("masked", masked_text(fitted.mask)),
+        ("fitted part", of_sensor(fitted.shape, section)),
+        ("flats", f"{len(wavelength)} from {min(wavelength):g} to {max(wavelength):g} nm"),
+    ]
+
+
+def _add_flats(report: Report, fitted: ThicknessMap) -> None:
+    """What the fit says of each flat, and of parts of the sensor."""
+    if fitted.flats is None:
+        return
+    report.section(
+        "Flat by flat", "Misfit: mean square of what is left over in small cells, over their variance."
+    )
+    report.table(flat_table(fitted.flats), "flats")
+    if fitted.contrast_map is not None and fitted.contrast_map.size > 1:
+        report.figure(
+            contrast_figure(fitted.contrast_map, fitted.shape[0] / len(fitted.contrast_map)),
+            "Contrast in blocks, over that of the whole.",
+        )
 
 
 def residual_of_fit(cube: FringeCube, model: FringeModel, fitted: ThicknessMap) -> NDArray[np.float32]:
@@ -85,8 +137,7 @@ def flat_table(flats: FlatFit) -> Table:
     )
     for name in ("wavelength", "offset", "σ of offset"):
         table[name].unit = units.nm
-    for name in table.colnames[1:]:
-        table[name].info.format = ".3f"
+    table["wavelength"].info.format = "g"
     return table
 
 
@@ -99,15 +150,10 @@ def residual_table(residual: NDArray[np.float32], cube: FringeCube) -> Table:
         noise = float(np.sqrt(cube.variance[plane][good].mean(dtype=float))) / level if good.any() else np.nan
         rms = float(np.sqrt(np.mean(np.square(left[good], dtype=float)))) if good.any() else np.nan
         rows.append((float(cube.wavelength_nm[plane]), PERCENT * rms, PERCENT * noise, rms / noise))
-    table = Table(rows=rows, names=("wavelength", "rms of flat − model", "noise", "ratio"))
-    for name, unit in (
-        ("wavelength", units.nm),
-        ("rms of flat − model", units.percent),
-        ("noise", units.percent),
-    ):
+    table = Table(rows=rows, names=("wavelength", RMS, "noise", "ratio"))
+    for name, unit in (("wavelength", units.nm), (RMS, units.percent), ("noise", units.percent)):
         table[name].unit = unit
-    for name in table.colnames[1:]:
-        table[name].info.format = ".4f"
+    table["wavelength"].info.format = "g"
     return table
 
 

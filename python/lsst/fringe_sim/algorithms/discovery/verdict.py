@@ -7,14 +7,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from astropy.table import Table
 
 from ...errors import named_units
 from ...files import table_text, write_together
 from ...model.effects_override import effects_override
-from ...notebook import InNotebook
+from ...notebook import InNotebook, axes_or_new
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = [
     "Gap",
@@ -28,6 +31,9 @@ __all__ = [
 
 VERDICTS = ("named", "no_discrepancy", "unexplained")
 
+
+MOST_CANDIDATES = 15
+"""Effects that a picture shows at most."""
 
 _SIZES = ("of_counts", "of_fringes", "of_fringes_at_most")
 
@@ -212,6 +218,38 @@ class Verdict(InNotebook):
             shown[what] = size
         return shown
 
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the fall of χ² that each effect promises, those that were found in another colour.
+
+        Parameters
+        ----------
+        axes : `matplotlib.axes.Axes`, optional
+            Where to draw; new ones of pyplot if not given.
+        """
+        from ...style import LINES
+
+        drawn = axes_or_new(axes)
+        found = {effect.name for effect in self.effects}
+        alike = {other for effect in self.effects for other in effect.ambiguous_with} - found
+        shown = [item for item in self.candidates if item["score"] > 0.0][:MOST_CANDIDATES]
+        kinds = (
+            ("named", LINES[1], "", found),
+            ("in the same class", LINES[5], "//", alike),
+            ("not chosen", LINES[4], "", {item["name"] for item in shown} - found - alike),
+        )
+        for label, color, hatch, names in kinds:
+            chosen = [(place, item["score"]) for place, item in enumerate(shown) if item["name"] in names]
+            if chosen:
+                places, scores = zip(*chosen, strict=True)
+                drawn.barh(places, scores, color=color, hatch=hatch, edgecolor="white", label=label)
+        drawn.set_yticks(range(len(shown)), [item["name"] for item in shown])
+        drawn.invert_yaxis()
+        drawn.set_xlabel("fall of χ² promised by the score test [1]")
+        drawn.set_title("candidates" if shown else "no effect promises anything")
+        if shown:
+            drawn.legend(loc="lower right", fontsize=8, frameon=True)
+        return drawn
+
     @property
     def settings(self) -> dict[str, float]:
         """Effects by ``name.parameter``, as `FringeModel.from_setup` takes them."""
@@ -347,7 +385,8 @@ class Verdict(InNotebook):
                 found += f", at most {100.0 * most:.2g} % of the fringes ({100.0 * CONFIDENCE:g} %)"
             return f"size of the disagreement: {found}"
         return (
-            f"size of the disagreement: {100.0 * fringes:.2g} % of the fringes ({counts:.2g} of the counts)"
+            f"size of the disagreement: {100.0 * fringes:.2g} % of the fringes "
+            f"({100.0 * counts:.2g} % of the counts)"
         )
 
     def summary(self) -> str:
