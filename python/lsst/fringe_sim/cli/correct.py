@@ -58,7 +58,7 @@ OWN_CARD = re.compile(r"FRING(COR|TID|PRB|VER|S[CE]\d+)")
 @click.option(
     "--inject",
     is_flag=True,
-    help="Draw stars and galaxies into a copy of each frame, and tell their fluxes before and after.",
+    help="Draw stars and galaxies into a copy of each frame, and tell their fluxes and shapes before and after.",
 )
 @click.option("--undo", is_flag=True, help="Put the fringes back that an earlier run has subtracted.")
 @output_folder(

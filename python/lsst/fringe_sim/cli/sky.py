@@ -96,6 +96,7 @@ NO_DATE = "1970-01-01T00:00:00"  # of templates of a model: two runs agree to th
     "sky_*_[0-9][0-9].fits",
     "fringe_*.fits",
     "sky.png",
+    "coadd_sources.ecsv",
     "report.html",
 )
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
@@ -175,7 +176,13 @@ def sky(
     if templates:
         _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
     page = write_sky_report(
-        folder / "report.html", made, setup.name, seed, places, picture=folder / "sky.png"
+        folder / "report.html",
+        made,
+        setup.name,
+        seed,
+        places,
+        folder / "sky.png",
+        setup.pixel_scale_arcsec,
     )
     for frame in made:
         click.echo(_describe(frame))

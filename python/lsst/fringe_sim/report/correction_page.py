@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from ..algorithms.observed_frames import FrameRecord, injected_table, summary_table
 from ..products import FringeTemplates
 from ..style import figure, finite_range, show_image
-from .page import Report
+from .page import Report, shortened
+from .source_figure import bias_figure
 
 __all__ = ["frame_figure", "write_correction_report", "write_templates_report"]
 
@@ -59,12 +60,8 @@ def write_correction_report(path: Path, records: Sequence[FrameRecord], refused:
         "that a good template does so badly.",
     )
     if len(table):
-        shown = table.copy()
-        for column in shown.itercols():
-            if column.dtype.kind == "f":
-                column.info.format = ".3g"
         marks = ["good" if each.proof.passed else "bad" for each in records]
-        report.table(shown, "frames", download=table, marks=marks)
+        report.table(shortened(table), "frames", download=table, marks=marks)
     _proofs(report, records)
     report.remarks([(line.partition(": ")[0], line.partition(": ")[2]) for line in refused])
     order = sorted(range(len(records)), key=lambda item: records[item].proof.probability)
@@ -89,14 +86,14 @@ def _proofs(report: Report, records: Sequence[FrameRecord]) -> None:
     if sources is not None:
         report.section(
             "Injected sources",
-            "Stars and exponential discs in copies of the frames: bias and scatter of their fluxes as fractions of "
-            "them, with the fringes and without. Magnitudes are those of counts, without a zero point.",
+            "Stars and exponential discs in copies of the frames: bias and scatter of their fluxes and sizes as "
+            "fractions of them, and of their ellipticities (adaptive moments), with the fringes and without. "
+            "Magnitudes are those of counts, without a zero point.",
         )
-        shown = sources.copy()
-        for column in shown.itercols():
-            if column.dtype.kind == "f":
-                column.info.format = ".3g"
-        report.table(shown, "injected", download=sources)
+        kinds = {kind: sources[sources["kind"] == kind] for kind in np.unique(sources["kind"])}
+        names = {"before": "with fringes", "after": "corrected"}
+        report.figure(bias_figure(names, kinds), "Bias by magnitude; a point for each frame and flux.")
+        report.table(shortened(sources), "injected", download=sources)
 
 
 def _correlation_figure(records: Sequence[FrameRecord]) -> Figure:

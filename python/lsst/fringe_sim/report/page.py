@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from ..files import table_text, write_whole
 from ..style import to_png
 
-__all__ = ["Report"]
+__all__ = ["Report", "shortened"]
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -155,3 +155,12 @@ class Report:
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the page; an existing file is replaced when the new one is complete."""
         return write_whole(path, self.to_html())
+
+
+def shortened(table: Table) -> Table:
+    """A copy of a table whose numbers are shown with three digits."""
+    shown = table.copy()
+    for column in shown.itercols():
+        if column.dtype.kind == "f":
+            column.info.format = ".3g"
+    return shown

@@ -9,15 +9,27 @@ import numpy as np
 from astropy import units
 from astropy.table import Table
 
+from ..algorithms.coadd_sources import sources_in_coadds
 from ..algorithms.coadds import Coadds, VisitPlaces, coadds_of_frames
 from ..algorithms.pca import fit_pca
+from ..files import table_text, write_whole
 from ..products import SkyFringe
 from .figures import coadds_figure, components_figure, sky_figure
-from .page import Report
+from .page import Report, shortened
+from .source_figure import bias_figure
 
-__all__ = ["COADDS_CAPTION", "COADDS_TEXT", "coadd_table", "sky_amplitudes", "write_sky_report"]
+__all__ = [
+    "COADDS_CAPTION",
+    "COADDS_TEXT",
+    "SOURCES_FILE",
+    "coadd_table",
+    "sky_amplitudes",
+    "write_sky_report",
+]
 
 PERCENT = 100.0
+
+SOURCES_FILE = "coadd_sources.ecsv"
 
 COADDS_TEXT = (
     "What stays of the fringes in coadds of randomly placed and rotated pieces of these frames, uncorrected and "
@@ -32,6 +44,13 @@ COADDS_OF_VISITS_TEXT = (
 COADDS_CAPTION = (
     "Standard deviation of means over squares: of the largest against the number of exposures, and of the deepest "
     "coadd against the side. The Dark Energy Survey asks for fringes below a tenth of the noise up to 20 arcsec."
+)
+
+SOURCES_TEXT = (
+    "What the fringes do to stars and exponential discs in single visits and in the coadd of all: bias, its error "
+    "and scatter of fluxes and sizes, as parts of them, and of ellipticities (adaptive moments), beside the scatter "
+    "that the noise makes. Each source is compared with itself in the same noise without fringes. Magnitudes are "
+    "relative to the sky of one square arcsecond."
 )
 
 
@@ -61,11 +80,12 @@ def write_sky_report(
     seed: int,
     places: VisitPlaces | None = None,
     picture: Path | None = None,
+    pixel_arcsec: float = 0.2,
 ) -> Path:
-    """Write the page.
+    """Write the page, and ``coadd_sources.ecsv`` beside it where frames without noise are large enough.
 
     ``seed``: of places and angles of the coadds, where ``places`` are not given. ``picture``: file for its first
-    figure alone, if wanted.
+    figure alone, if wanted. ``pixel_arcsec``: size of a pixel [arcsec].
     """
     first = frames[0]
     report = Report(
@@ -88,7 +108,24 @@ def write_sky_report(
         report.section("Coadds", COADDS_TEXT if places is None else COADDS_OF_VISITS_TEXT)
         report.figure(coadds_figure(found), COADDS_CAPTION)
         report.table(coadd_table(found), "coadds")
+        sources = sources_in_coadds(frames, np.random.default_rng(seed), places, pixel_arcsec=pixel_arcsec)
+        if sources is not None:
+            write_whole(path.with_name(SOURCES_FILE), table_text(sources))
+            _show_sources(report, sources)
     return report.write(path)
+
+
+def _show_sources(report: Report, sources: Table) -> None:
+    names = {"fringes": "with fringes", "corrected": "less one template"}
+    known = {end: name for end, name in names.items() if f"bias_{end}" in sources.colnames}
+    parts = {
+        f"{kind}, visits: {visits}": sources[(sources["kind"] == kind) & (sources["visits"] == visits)]
+        for visits in np.unique(sources["visits"])
+        for kind in np.unique(sources["kind"])
+    }
+    report.section("Sources", SOURCES_TEXT)
+    report.figure(bias_figure(known, parts), "Bias by magnitude, kind and number of visits.")
+    report.table(shortened(sources), Path(SOURCES_FILE).stem, download=sources)
 
 
 def coadd_table(found: Coadds) -> Table:
