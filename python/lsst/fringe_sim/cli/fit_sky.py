@@ -32,6 +32,10 @@ WORTH_ORDERS = 0.02
 """Uncertainty to which a map is wanted, for what the command says of more frames [orders]: 0.13 rad of phase leave a
 hundredth of the power of the fringes."""
 
+LARGE_ERROR = 0.3
+"""Errors of the fringes, over the fringes, with which neighbouring orders were mistaken for each other in trials
+with bright frames of another simulator."""
+
 
 @click.command()
 @click.argument("frames", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
@@ -128,6 +132,11 @@ def said(found: MapOnSky, frames: int, order_um: float) -> list[str]:
         f"whole orders away with a probability of {shift.chance_other_order:.2g}",
         f"fringes of the frames over those of the dark sky: {strength}",
     ]
+    if shift.model_error >= LARGE_ERROR:
+        lines.append(
+            f"the model misses about {shift.model_error:g} of its fringes in all frames alike (lines, films, silicon): "
+            "its order may be wrong whatever these probabilities say; a correction gains by the moved map"
+        )
     wanted = WORTH_ORDERS * order_um
     needed = shift.frames_for(wanted, frames)
     known = f"parts of an eighth of the sensor are known to {shift.alone_um:.4f} µm by the frames alone"
