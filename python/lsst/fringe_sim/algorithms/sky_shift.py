@@ -329,7 +329,7 @@ class _Night:
         gradient = np.zeros(splines.count)
         total = np.zeros(self.layer_um.shape)
         reduced = np.zeros((splines.count, splines.count))
-        error, shared = state.error, 0.0
+        error, shared = state.error, np.zeros(1)
 
         def products(image: FloatArray, terms: FloatArray) -> FloatArray:
             return np.stack([splines.sums(image * each.reshape(image.shape)) for each in terms], axis=1)

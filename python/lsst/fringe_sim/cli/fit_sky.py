@@ -134,8 +134,8 @@ def said(found: MapOnSky, frames: int, order_um: float) -> list[str]:
     ]
     if shift.model_error >= LARGE_ERROR:
         lines.append(
-            f"the model misses about {shift.model_error:g} of its fringes in all frames alike (lines, films, silicon): "
-            "its order may be wrong whatever these probabilities say; a correction gains by the moved map"
+            f"the model misses about {shift.model_error:g} of its fringes in all frames alike (lines, films, "
+            "silicon): its order may be wrong whatever these probabilities say; a correction gains by the moved map"
         )
     wanted = WORTH_ORDERS * order_um
     needed = shift.frames_for(wanted, frames)
