@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import named_units
+
 __all__ = ["Envelope", "ModelError"]
 
 FloatArray = NDArray[np.float64]
@@ -21,6 +23,7 @@ SIZES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Errors of the envelope that compete, over the fringes of the dark sky."""
 
 
+@named_units
 @dataclass(frozen=True, eq=False)
 class Envelope:
     """Errors of the fringes: cosine and sine of their phase times tents over the thickness.
@@ -40,12 +43,14 @@ class Envelope:
     nodes_um: FloatArray
 
     @classmethod
+    @named_units
     def of(cls, size: float, layer_um: FloatArray, order_um: float) -> Envelope:
         """For the thicknesses of a map."""
         low, high = float(layer_um.min()), float(layer_um.max())
         number = 2 + math.ceil((high - low) / (SPACING_ORDERS * order_um))
         return cls(size, order_um, np.linspace(low, high, number))
 
+    @named_units
     def terms(self, thickness_um: FloatArray, bands: FloatArray) -> FloatArray:
         """Functions of the thickness of every pixel, shape ``(J, pixels)``, of the amplitude of the fringes."""
         phase = 2.0 * math.pi / self.order_um * thickness_um.ravel()
