@@ -115,7 +115,9 @@ def fit_sky(
     if not isinstance(thickness, str):
         model = placed_model(setup, sky_settings(effects.settings), sensor)
         _check_frames(loaders, images, None, setup)
-        if not dry_run:
+        if dry_run:
+            click.echo(f"would say how many frames like {len(images)} of {sensor.name} a map takes")
+        else:
             _forecast(thickness, model, loaders, options, out)
         return
     layer = read_map(thickness, setup, sensor)
