@@ -7,6 +7,7 @@ fringes less what was subtracted, beside a smooth background, as a fraction of t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -15,21 +16,33 @@ from scipy.ndimage import binary_dilation
 from lsst.fringe_sim.algorithms.correction import AmplifierGrid, BackgroundTerms, fit_scales
 from lsst.fringe_sim.algorithms.correction.empirical import TemplateOptions
 from lsst.fringe_sim.algorithms.fringe_correction import CorrectionOptions, correct_fringes
+from lsst.fringe_sim.algorithms.laboratory_shift import ADHESIVE_PHASE_SIGMA, template_pair
+from lsst.fringe_sim.algorithms.map_on_sky import map_on_sky, reach_um
 from lsst.fringe_sim.algorithms.observed_frames import make_templates
-from lsst.fringe_sim.products import ObservedFrame
+from lsst.fringe_sim.algorithms.sky_response import sky_response
+from lsst.fringe_sim.instrument.sky import SkySpectrum
+from lsst.fringe_sim.model import FringeModel, Setup
+from lsst.fringe_sim.products import FringeFrame, ObservedFrame, ThicknessMap
 
 from ._table import Row, timed
 
 __all__ = ["aperture_scale", "left_over", "median_template", "pca_fringes", "run"]
 
 Image = np.ndarray
-FRAMES, TRAINING = 16, 12
-SIDE = 256
-FOCAL_RATIOS = (2.25, 1.7)
-"""Of two telescopes: fringes of a quarter, and of a twentieth, of the noise of a pixel."""
+FRAMES, TRAINING = 20, 12
+SIDE, AMPLIFIERS = 256, AmplifierGrid(2, 8)
+NOW = "2026-01-01T00:00:00"
+NIGHTS = ((2.25, 2700.0), (1.7, 2700.0), (2.25, 40000.0))
+"""Focal ratio and electrons of the sky: fringes of a quarter, of a sixth, and of all of the noise of a pixel."""
 
 COMPONENTS = 6
 """Components that fringez keeps."""
+
+EMPCA_ROUNDS = 25
+"""Rounds that empca makes by default."""
+
+MAP_ERROR_UM = 0.02
+"""Rms of a smooth error of the thickness map, 0.06 orders, that no way knows of."""
 
 
 def run() -> list[Row]:
@@ -42,25 +55,75 @@ def run() -> list[Row]:
 
     rows = []
     clutter = ForeignClutter(1.0, 0.05, gradient=0.03, amplifier_steps=0.002, moon=0.2)
-    for ratio in FOCAL_RATIOS:
+    for ratio, electrons in NIGHTS:
         rng = np.random.default_rng(17)
-        night = foreign_night(
-            ForeignSky(f_number=ratio), foreign_map(rng, (SIDE, SIDE), 13.0, 14.6), rng, FRAMES, clutter
-        )
+        layer = foreign_map(rng, (SIDE, SIDE), 13.0, 14.6)
+        night = foreign_night(ForeignSky(f_number=ratio), layer, rng, FRAMES, clutter, electrons=electrons)
         images, fringes = [each.image for each in night], [each.fringes for each in night]
         strength = np.median([each.fringes.std() / np.sqrt(each.sky.mean()) for each in night])
         work = f"fringes of {strength:.2f} of the noise, {TRAINING} frames of {SIDE}², {FRAMES - TRAINING} others"
-        for name, way in WAYS.items():
+        for name, way in {**WAYS, **map_ways(layer, ratio)}.items():
             subtracted, wall, cpu = timed(partial(way, images[:TRAINING], images[TRAINING:]))
             left = [left_over(f, s) for f, s in zip(fringes[TRAINING:], subtracted, strict=True)]
-            note = f"left: {100 * np.median(left):.0f} % of the fringes, at most {100 * max(left):.0f} %"
+            spread = 125.0 * float(np.std(left, ddof=1)) / np.sqrt(len(left))
+            parts = f"{100 * np.median(left):.1f} ± {spread:.1f} %"
+            note = f"left: {parts} of the fringes, at most {100 * max(left):.0f} %"
             rows.append(Row(work, name, wall, cpu=cpu, note=note))
     return rows
 
 
+def map_ways(layer_um: Image, f_number: float) -> dict[str, Callable[..., list[Image]]]:
+    """Ways that begin with a thickness map, which is wrong, and with the lines and silicon of the package."""
+    rng = np.random.default_rng(3)
+    v, u = (np.linspace(-1.0, 1.0, side) for side in layer_um.shape)
+    wave = np.sin(2.5 * u + rng.uniform(0.0, 6.0)) + np.cos(2.0 * v + rng.uniform(0.0, 6.0))[:, None]
+    found_um = layer_um + MAP_ERROR_UM * (wave - wave.mean()) / wave.std()
+    setup = replace(
+        Setup.from_name("lsst_e2v"),
+        beam_kind="cone",
+        f_number=f_number,
+        obscuration=0.61,
+        temperature_k=173.15,
+    )
+    model = FringeModel.from_setup(setup)
+    order_um = float(model.fringe_order_um(960.0))
+    reach = reach_um(order_um)
+    span = float(found_um.min()) - reach, float(found_um.max()) + reach
+    response = sky_response(model, SkySpectrum.dark(), thickness_range_um=span)
+
+    def templates_of(map_um: Image) -> list[FringeFrame]:
+        return template_pair(map_um, model, response, ADHESIVE_PHASE_SIGMA, NOW)
+
+    def by_map(training: Sequence[Image], others: Sequence[Image]) -> list[Image]:
+        return corrected_by(templates_of(found_um), others)
+
+    def by_both(training: Sequence[Image], others: Sequence[Image]) -> list[Image]:
+        return corrected_by(observed_templates(training, templates_of(found_um)), others)
+
+    moved: list[Image] = []
+
+    def by_moved_map(training: Sequence[Image], others: Sequence[Image]) -> list[Image]:
+        zero = np.zeros(found_um.shape)
+        known = ThicknessMap(found_um, zero + 1e-3, zero, zero, zero.astype(int), "adhesive")
+        loaders = [partial(frame_of, image) for image in training]
+        options = CorrectionOptions(amplifiers=AMPLIFIERS)
+        moved.append(map_on_sky(loaders, known, response, order_um, options).moved.value)
+        return corrected_by(templates_of(moved[0]), others)
+
+    def by_moved_and_frames(training: Sequence[Image], others: Sequence[Image]) -> list[Image]:
+        return corrected_by(observed_templates(training, templates_of(moved[0])), others)
+
+    return {
+        "this package, a map that is off": by_map,
+        "this package, that map and the frames": by_both,
+        "this package, that map moved by fit-sky": by_moved_map,
+        "this package, the moved map and the frames": by_moved_and_frames,
+    }
+
+
 def left_over(fringes: Image, subtracted: Image, amplifiers: AmplifierGrid | None = None) -> float:
     """Standard deviation of the fringes that are left over that of all, beside a smooth background."""
-    grid = amplifiers or AmplifierGrid(2, 8)
+    grid = amplifiers or AMPLIFIERS
     background = BackgroundTerms((fringes.shape[0], fringes.shape[1]), amplifiers=grid)
 
     def beside(image: Image) -> float:
@@ -70,16 +133,25 @@ def left_over(fringes: Image, subtracted: Image, amplifiers: AmplifierGrid | Non
     return beside(fringes - subtracted) / beside(fringes)
 
 
-def by_this_package(training: Sequence[Image], others: Sequence[Image]) -> list[Image]:
-    amplifiers = AmplifierGrid(2, 8)
+def frame_of(image: Image) -> ObservedFrame:
+    """The frame without a variance, as of a file that holds an image alone."""
+    return ObservedFrame(image.astype(np.float32), np.zeros(image.shape, dtype=np.int32))
 
-    def frame_of(image: Image) -> ObservedFrame:
-        return ObservedFrame(image.astype(np.float32), np.zeros(image.shape, dtype=np.int32))
 
+def observed_templates(training: Sequence[Image], prior: Sequence[FringeFrame] = ()) -> list[FringeFrame]:
+    """Templates of the training frames."""
     loaders = [partial(frame_of, image) for image in training]
-    made = make_templates(loaders, "2026-01-01T00:00:00", TemplateOptions(amplifiers=amplifiers)).frames()
-    options = CorrectionOptions(amplifiers=amplifiers)
-    return [image - correct_fringes(image, made, options=options).image for image in others]
+    return make_templates(loaders, NOW, TemplateOptions(amplifiers=AMPLIFIERS), prior).frames()
+
+
+def corrected_by(templates: Sequence[FringeFrame], others: Sequence[Image]) -> list[Image]:
+    """What a correction with templates subtracts."""
+    options = CorrectionOptions(amplifiers=AMPLIFIERS)
+    return [image - correct_fringes(image, templates, options=options).image for image in others]
+
+
+def by_this_package(training: Sequence[Image], others: Sequence[Image]) -> list[Image]:
+    return corrected_by(observed_templates(training), others)
 
 
 def clipped_fraction(image: Image) -> tuple[Image, Image]:
@@ -132,6 +204,32 @@ def pca_fringes(
         row, deviation = flat(image)
         made = model.inverse_transform(model.transform(row[None]))[0]
         subtracted.append(deviation * made.reshape(image.shape))
+    return subtracted
+
+
+def empca_fringes(training: Sequence[Image], others: Sequence[Image], components: int = 2) -> list[Image]:
+    """Weighted components by expectation and maximisation (Bailey 2012, PASP 124, 1015), bright pixels left out."""
+    rows, good = (np.array(each) for each in zip(*map(clipped_fraction, training), strict=True))
+    rows, weight = rows.reshape(len(rows), -1), good.reshape(len(good), -1).astype(float)
+    rng = np.random.default_rng(1)
+    vectors = np.linalg.qr(rng.standard_normal((rows.shape[1], components)))[0].T
+
+    def scores_of(row: Image, weights: Image) -> Image:
+        return np.linalg.solve((vectors * weights) @ vectors.T, (vectors * weights) @ row)
+
+    for _ in range(EMPCA_ROUNDS):
+        scores = np.array([scores_of(*each) for each in zip(rows, weight, strict=True)])
+        left = rows.copy()
+        for k in range(components):
+            own = scores[:, k, None]
+            vectors[k] = (weight * own * left).sum(axis=0) / np.maximum((weight * own**2).sum(axis=0), 1e-300)
+            left -= own * vectors[k]
+        vectors = np.linalg.qr(vectors.T)[0].T
+    subtracted = []
+    for image in others:
+        row, used = clipped_fraction(image)
+        scores = scores_of(row.ravel(), used.ravel().astype(float))
+        subtracted.append(np.median(image) * (scores @ vectors).reshape(image.shape))
     return subtracted
 
 
@@ -196,5 +294,6 @@ WAYS: dict[str, Callable[[Sequence[Image], Sequence[Image]], list[Image]]] = {
     "median template, apertures with medians (ip_isr, 3000 places)": by_apertures(np.median, 3000),
     "median template, apertures with means (ip_isr, 3000 places)": by_apertures(np.mean, 3000),
     "principal components of clipped frames (fringez)": pca_fringes,
+    "weighted components with missing pixels (empca, 2)": empca_fringes,
     "nothing": lambda _, others: [np.zeros(image.shape) for image in others],
 }

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import galsim
 import numpy as np
 import pytest
 from observed_night import observed_night
 
-from lsst.fringe_sim.algorithms.correction.injection import InjectionOptions, inject_sources, injection_table
+from lsst.fringe_sim.algorithms.correction.injection import (
+    InjectionOptions,
+    Source,
+    inject_sources,
+    injection_table,
+)
 from lsst.fringe_sim.errors import InputError
 
 PIXEL = 0.4
@@ -49,7 +55,34 @@ def test_bright_sources_keep_their_fluxes(rng):
     image = rng.normal(1000.0, 1.0, (300, 300)).astype(np.float32)
     found = measured(image, np.zeros(image.shape), image > 0.0, number=5, signal_to_noise=(1000.0,))
     for each in found:
-        np.testing.assert_allclose(each.before, each.flux, rtol=2e-3)
+        np.testing.assert_allclose(each.before, 0.0, atol=2e-3)
+
+
+def test_fluxes_sizes_and_ellipticities_are_those_of_the_drawn():
+    """A star that is longer by a known distortion, and one that is wider, on a sky that is not 0."""
+    star, _ = Source.of_all(InjectionOptions(), 0.2)
+    side = star.stamp.shape[0]
+    for shape, size in ((0.0, 1.0), (0.05, 1.0), (0.0, 1.1)):
+        drawn = galsim.Moffat(beta=3.0, fwhm=0.8 * size).shear(e1=shape)
+        image = 40.0 + 500.0 * drawn.drawImage(nx=side, ny=side, scale=0.2).array
+        flux, e1, e2, larger = star.departure(image, 500.0)
+        # The pixel is round and does not grow: it takes a few per cent off both.
+        assert e1 == pytest.approx(shape, rel=0.1, abs=1e-6)
+        assert e2 == pytest.approx(0.0, abs=1e-6)
+        assert larger == pytest.approx(size - 1.0, rel=0.15, abs=2e-3)
+        if size == 1.0:
+            assert flux == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.rng("an image without a source has no shape")
+def test_a_source_without_a_shape_is_counted(rng):
+    image = rng.normal(0.0, 45.0, (300, 300)).astype(np.float32)
+    found = measured(
+        image, np.zeros(image.shape), np.ones(image.shape, dtype=bool), number=20, signal_to_noise=(0.3,)
+    )
+    table = injection_table("one", found)
+    assert (table["shapes"] < table["number"]).any()
+    assert np.isfinite(table["bias_after"]).all()
 
 
 def test_a_frame_without_free_places_is_refused():

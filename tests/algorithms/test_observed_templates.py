@@ -203,3 +203,17 @@ def test_a_night_of_foreign_frames_with_stars(rng):
         assert each.proof.passed
         assert each.proof.structure_after < 0.35 * each.proof.structure_before
         assert each.proof.ubi_after < each.proof.ubi_before
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_a_pixel_whose_frames_do_not_decide_it_has_a_large_variance(number):
+    """Frames in which all patterns have the same proportion; not a number that spoils the median of all pixels."""
+    scores = np.outer([1.0, 2.0, 3.0, 4.0], [0.3, 0.7, 0.2][:number]).astype(np.float32)
+    pairs = [(k, m) for k in range(number) for m in range(k + 1)]
+    normal = {(k, m): np.array([(scores[:, k] * scores[:, m]).sum(dtype=float), 0.0]) for k, m in pairs}
+    moment = np.array([[5.0 * scores[:, k].sum(), 0.0] for k in range(number)])
+    with np.errstate(all="raise"):
+        solution, trace = empirical._solved(normal, moment, number)
+    assert np.isfinite(solution).all()
+    assert 1e4 < trace[0] < 1e12
+    assert trace[1] > 1e100

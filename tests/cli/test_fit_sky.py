@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.products import ThicknessMap
@@ -84,3 +85,20 @@ def test_what_is_refused_before_any_work(
     assert run(command) != 0
     assert reason in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_range_alone_gets_the_number_of_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frames = [write_frame(tmp_path / f"{seed}.fits", seed) for seed in (1, 2)]
+    out = tmp_path / "out"
+    assert (
+        run(["fit-sky", *frames, "--thickness", "13um:17um", "--detector", "R22_S11", "--out", str(out)]) == 0
+    )
+    said = capsys.readouterr().out
+    assert "fringe orders lie within the range" in said
+    row = Table.read(out / "forecast.ecsv")[0]
+    assert row["noise"] == pytest.approx(50.0 / 3e3, rel=0.05)
+    assert ("too few" in said) == (row["frames"] > 2)
+    assert not (out / "thickness.fits").exists()
+    assert run(["fit-sky", *frames, "--thickness", "17:13", "--out", str(tmp_path / "no")]) == 2
+    assert run(["fit-sky", *frames, "--thickness", "1:900", "--out", str(tmp_path / "no")]) == 1
+    assert not (tmp_path / "no").exists()

@@ -16,7 +16,15 @@ from ..errors import InputError, OutOfRangeError, named_units
 from ..products import SkyFringe
 from ..resources import read_user_table
 
-__all__ = ["Coadds", "VisitPlaces", "coadd_visits", "coadds_of_frames"]
+__all__ = [
+    "Coadds",
+    "VisitPlaces",
+    "coadd_visits",
+    "coadds_of_frames",
+    "filled_pattern",
+    "patterns_left",
+    "placed_visits",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -177,18 +185,26 @@ def coadds_of_frames(
     OutOfRangeError
         A visit in which no region lies on the sensor.
     """
-    shape = frames[0].shape
-    if places is None:
-        # A region that is rotated by any angle needs its diagonal, and the spline a few pixels more.
-        region = min(LARGEST_REGION_PX, int((min(shape) - 8) / np.sqrt(2.0)) - 1)
-        if region < SMALLEST_REGION_PX:
-            return None
-        places = VisitPlaces.random(shape, region, VISITS, len(frames), rng)
-    else:
-        region = places.region_px(shape)
-    patterns = [_filled(frame) for frame in frames]
+    placed = placed_visits(frames, rng, places)
+    if placed is None:
+        return None
+    patterns = [filled_pattern(frame) for frame in frames]
     noise = np.sqrt(np.mean([1.0 / frame.mean_electrons for frame in frames]))
-    return coadd_visits(patterns, places, float(noise), region, 1 if len(frames) > 1 else 0)
+    return coadd_visits(patterns, placed[0], float(noise), placed[1], 1 if len(frames) > 1 else 0)
+
+
+def placed_visits(
+    frames: Sequence[SkyFringe], rng: np.random.Generator, places: VisitPlaces | None = None
+) -> tuple[VisitPlaces, int] | None:
+    """Visits, and the side of the region that is coadded [px]; see `coadds_of_frames`."""
+    shape = frames[0].shape
+    if places is not None:
+        return places, places.region_px(shape)
+    # A region that is rotated by any angle needs its diagonal, and the spline a few pixels more.
+    region = min(LARGEST_REGION_PX, int((min(shape) - 8) / np.sqrt(2.0)) - 1)
+    if region < SMALLEST_REGION_PX:
+        return None
+    return VisitPlaces.random(shape, region, VISITS, len(frames), rng), region
 
 
 def coadd_visits(
@@ -221,7 +237,9 @@ def coadd_visits(
     step = max(1, region_px // CELLS)
     cells = region_px // step
     means = np.array([_cell_means(pattern, step) for pattern in patterns])
-    kinds = [means] if templates == 0 else [means, _corrected(means, templates)]
+    kinds = [means]
+    if templates:
+        kinds.append(np.tensordot(_projection(means, templates), means, axes=1))
     splines = [[spline_filter(image, order=3) for image in images] for images in kinds]
     counts = np.array([*(count for count in COUNTS if count < len(places)), len(places)])
     sides = np.unique(np.geomspace(1, max(1, cells // LARGEST_PART), 12).astype(int))
@@ -244,12 +262,22 @@ def _cell_means(pattern: NDArray[np.floating], step: int) -> FloatArray:
     return np.asarray(cells.mean(axis=(1, 3), dtype=float))
 
 
-def _corrected(patterns: FloatArray, templates: int) -> FloatArray:
+def patterns_left(patterns: Sequence[NDArray[np.floating]], templates: int) -> FloatArray:
+    """What a correction leaves of patterns, as sums of all of them: a matrix of shape ``(P, P)``.
+
+    Subtracted are the patterns that take most of the given ones, without errors.
+    """
+    step = max(1, LARGEST_REGION_PX // CELLS)
+    step = step if min(patterns[0].shape) > CELLS * step else 1
+    return _projection(np.array([_cell_means(pattern, step) for pattern in patterns]), templates)
+
+
+def _projection(patterns: FloatArray, templates: int) -> FloatArray:
     """What is left of each pattern after the subtraction of those that take most of all."""
     flat = patterns.reshape(len(patterns), -1)
     _, vectors = np.linalg.eigh(flat @ flat.T)
     taken = vectors[:, vectors.shape[1] - templates :]
-    return np.asarray((flat - taken @ (taken.T @ flat)).reshape(patterns.shape))
+    return np.asarray(np.eye(len(flat)) - taken @ taken.T)
 
 
 def _piece(spline: FloatArray, places: VisitPlaces, number: int, cells: int, step: int) -> FloatArray:
@@ -273,7 +301,7 @@ def _square_variance(image: FloatArray, sides: NDArray[np.int64]) -> FloatArray:
     return np.array([(each / side**2).var() for each, side in zip(sums, sides, strict=True)])
 
 
-def _filled(frame: SkyFringe) -> NDArray[np.float32]:
+def filled_pattern(frame: SkyFringe) -> NDArray[np.float32]:
     """Pattern with the mean sky where it is not known."""
     values = frame.fraction()
     return np.where((frame.mask == 0) & np.isfinite(values), values, np.float32(0))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 
+from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError, named_units, to_number
 from ..products import CORRECTED, FringeFrame, refuse_corrected
 from .correction.background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
@@ -38,6 +39,9 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 
 Templates: TypeAlias = "TemplateSet | Sequence[FringeFrame] | ArrayLike"
+
+_ROWS = 128
+"""Rows that are worked on at a time, which the memory of a processor holds."""
 
 TEMPLATE_ID = "FRINGTID"
 """Keyword of a corrected exposure: which templates were subtracted."""
@@ -430,19 +434,26 @@ def _of_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[A
 def _fringes(known: TemplateSet, scale: FloatArray, exposure: NDArray[Any]) -> NDArray[Any]:
     """What is subtracted, in the floating type of the exposure."""
     kind = _floating(exposure)
-    total = np.zeros(exposure.shape, dtype=kind)
-    for factor, pattern in zip(scale, known.patterns, strict=True):
-        total += kind.type(factor) * pattern
-    total[known.unknown] = 0.0
+    total = np.empty(exposure.shape, dtype=kind)
+
+    def one(band: int) -> None:
+        rows = slice(band * _ROWS, (band + 1) * _ROWS)
+        part = total[rows]
+        part[...] = 0.0
+        for factor, pattern in zip(scale, known.patterns, strict=True):
+            part += kind.type(factor) * pattern[rows]
+        part[known.unknown[rows]] = 0.0
+
+    run_threaded(one, -(-len(total) // _ROWS))
     return total
 
 
 def _subtracted(exposure: NDArray[Any], known: TemplateSet, fit: ScaleFit) -> NDArray[Any]:
     """An exposure without its fringes, if they are seen."""
-    corrected = exposure.astype(_floating(exposure))
-    if fit.seen:
-        corrected -= _fringes(known, fit.scale, exposure)
-    return corrected
+    if not fit.seen:
+        return exposure.astype(_floating(exposure))
+    fringes = _fringes(known, fit.scale, exposure)
+    return np.subtract(exposure, fringes, out=fringes, casting="unsafe")
 
 
 def _floating(exposure: NDArray[Any]) -> np.dtype[Any]:

@@ -21,7 +21,7 @@ from .observed_frames import frame_weight
 from .sky_response import FrameTable, Response
 from .sky_shift import MAP_SIGMA_ORDERS, SkyShift, fit_sky_shift
 
-__all__ = ["MapOnSky", "map_on_sky", "reach_um"]
+__all__ = ["MapOnSky", "fringes_alone", "map_on_sky", "reach_um"]
 
 FloatArray = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def map_on_sky(
     patterns = [_pattern(dark, known + part * order_um) for part in (0.0, 0.25)]
     values, weights = [], []
     for frame in frames:
-        value, weight = _fringes_alone(frame(), patterns, chosen, known.shape)
+        value, weight = fringes_alone(frame(), patterns, chosen, known.shape)
         weight[~good] = 0.0
         values.append(_cell_means(value, weight, cell))
         weights.append(_cell_sums(weight, cell))
@@ -129,13 +129,16 @@ def _pattern(dark: FrameTable, thickness_um: FloatArray) -> NDArray[np.float32]:
     return np.where(good, frame / frame[good].mean() - 1.0, 0.0).astype(np.float32)
 
 
-def _fringes_alone(
+def fringes_alone(
     frame: ObservedFrame,
     patterns: list[NDArray[np.float32]],
     options: CorrectionOptions,
     shape: tuple[int, ...],
 ) -> tuple[FloatArray, FloatArray]:
-    """A frame over its background, minus one, and its inverse variance, 0 in objects."""
+    """A frame over its background, minus one, and its inverse variance, 0 in objects.
+
+    ``patterns``: fringes, which are not taken for objects. ``shape``: a frame of another one is refused.
+    """
     if frame.shape != shape:
         raise InputError("shape of a frame", frame.shape, f"{shape}, that of the thickness map")
     weight = frame_weight(frame)

@@ -19,7 +19,7 @@ from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, r
 from ..products.same_light import refuse_equal_pixels
 from .correction.empirical import TemplateOptions, fit_templates
 from .correction.injection import InjectionOptions, inject_sources, injection_table
-from .correction.objects import square_sums
+from .correction.objects import masked_sums, square_sums
 from .correction.quality import FrameProof, prove
 from .correction.scales import refuse_negative_sky, steady_weight
 from .fringe_correction import CorrectionOptions, FringeCorrection, TemplateSet, correct_fringes
@@ -354,7 +354,7 @@ def _at(values: NDArray[np.float64], number: int) -> float:
 def _block_means(image: NDArray[Any], good: NDArray[np.bool_], side: int) -> NDArray[np.float32]:
     """Means over squares of the good pixels; NaN without any."""
     number = square_sums(good, side)
-    total = square_sums(np.where(good, image, np.float32(0.0)), side)
+    total = masked_sums(image, good, side)
     return np.divide(total, number, out=np.full(number.shape, np.nan, np.float32), where=number > 0)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -14,12 +13,13 @@ from scipy.special import logsumexp
 
 from ..errors import InputError, named_units
 from .correction.objects import square_sums
+from .night_levels import BAND_SIGMA, Predictor, background_terms, levels_of, thinned
+from .sky_model_error import SIZES, Envelope, ModelError
 from .smooth_field import Splines, Spread, nearest_coefficients, prior_covariance
 
 __all__ = ["SkyShift", "fit_sky_shift"]
 
 FloatArray = NDArray[np.float64]
-Predictor = Callable[[FloatArray], FloatArray]
 
 MAP_SIGMA_ORDERS = 0.15
 """What a map may be off by as a whole before the sky is seen [orders]: 1 rad of phase, as much as the adhesive may
@@ -33,10 +33,6 @@ SPANS = (0, 1, 2, 4, 8, 16)
 
 LEAST_PX_OF_SPAN = 8
 """Pixels in a span: fewer would not carry a cubic."""
-
-BAND_SIGMA = 1.0
-"""Fringes of a band in a frame over those of the dark sky are 1, give or take this, and not negative: bands change by
-half and more (Noll et al. 2015, doi 10.5194/acp-15-3647-2015), and a sensor may show less contrast than its model."""
 
 SPREADS = 13
 """Spreads of the shifts over which the evidence is averaged, from a thousandth of an order to one order."""
@@ -73,6 +69,9 @@ class SkyShift:
         Fringes of the frames over those predicted for the dark sky.
     residual : `float`
         Mean square of the residuals over their variance where the map is as it was, over that with the shift.
+    model_error : `float`
+        Size of the errors of the envelope that the frames ask for (`Envelope`); with a third of the fringes or more
+        the order is that of the model, and may be wrong whatever the probabilities say.
     alone_um : `float`
         Median uncertainty that the frames alone give to shifts over an eighth of the sensor [µm].
     """
@@ -86,6 +85,7 @@ class SkyShift:
     strength_sigma: float
     residual: float
     alone_um: float
+    model_error: float = 0.0
 
     @named_units
     def frames_for(self, sigma_um: float, frames: int) -> int:
@@ -132,8 +132,9 @@ def fit_sky_shift(
     The shift is a spline whose coefficients have mean and tilts, normal about zero, and a normal spread about them,
     over which the evidence is averaged. Its number of spans, one shift for all, and none at all compete by evidence
     (Laplace's, about the best point). In each frame the strength of each band and a background of second degree are
-    free, and integrated over. The variance of each frame is that of its residuals, and larger where the frames miss
-    something alike.
+    free, and integrated over; so are errors of the model's envelope (`Envelope`) that all frames share, of the size
+    that has the largest evidence. The variance of each frame is that of its residuals, and larger where the frames
+    miss something alike.
     """
     layer = np.asarray(thickness_um, dtype=float)
     frames = _frames(values, weights, layer)
@@ -193,6 +194,7 @@ class _State(NamedTuple):
     inverses: list[FloatArray]  # (terms, terms) each: covariance of the levels
     residuals: list[FloatArray]  # (ny, nx) each
     strength: FloatArray  # (F,): fringes over those of the dark sky
+    error: ModelError | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +219,7 @@ class _Night:
     predict: Predictor
     order_um: float
     map_sigma_um: float
+    envelope: Envelope | None = None  # what the model may have wrong
 
     def starts(self) -> list[FloatArray]:
         """Common shifts to begin with: all at which the night is likelier than on either side, and none."""
@@ -229,7 +232,7 @@ class _Night:
                 (value[::thin, ::thin], thin**2 * weight[::thin, ::thin]) for value, weight in self.frames
             ],
             layer_um=self.layer_um[::thin, ::thin],
-            predict=_thinned(self.predict, self.layer_um, thin),
+            predict=thinned(self.predict, self.layer_um, thin),
         )
         log = np.array([-some.state(np.full(some.layer_um.shape, step)).half_chi2 for step in steps])
         log -= 0.5 * (steps / self.map_sigma_um) ** 2
@@ -240,23 +243,37 @@ class _Night:
 
     def with_noise_of(self, fit: _Fit) -> _Night:
         """The same with weights of the residuals' own variance, and of what all frames miss alike."""
+        night, residuals = self, fit.state.residuals
+        for _ in range(2):  # what the model has wrong is no noise
+            night = night._scaled_to(residuals).with_likeliest_envelope(fit.shift_um)
+            residuals = night.state(fit.shift_um).residuals
+        night = night._scaled_to(residuals)
+        share = night._noise_share(residuals)
+        return replace(night, frames=[(value, share * weight) for value, weight in night.frames])
+
+    def _scaled_to(self, residuals: Sequence[FloatArray]) -> _Night:
         frames = []
-        for (value, weight), residual in zip(self.frames, fit.state.residuals, strict=True):
+        for (value, weight), residual in zip(self.frames, residuals, strict=True):
             freedom = np.count_nonzero(weight)
             frames.append((value, weight * (freedom / float((weight * residual**2).sum()))))
-        share = self._noise_share([weight for _, weight in frames], fit)
-        return replace(self, frames=[(value, share * weight) for value, weight in frames])
+        return replace(self, frames=frames)
 
-    def _noise_share(self, weights: Sequence[FloatArray], fit: _Fit) -> float:
+    def with_likeliest_envelope(self, shift_um: FloatArray) -> _Night:
+        """The same with the error of the model that has the largest evidence at a shift."""
+        tried = [None, *(Envelope.of(size, self.layer_um, self.order_um) for size in SIZES if size > 0.0)]
+        nights = [replace(self, envelope=envelope) for envelope in tried]
+        states = [night.state(shift_um) for night in nights]
+        return nights[int(np.argmax([state.log_volume - state.half_chi2 for state in states]))]
+
+    def _noise_share(self, residuals: Sequence[FloatArray]) -> float:
         """Part of the variance of the mean residual that is noise, in squares of a quarter of a fringe.
 
         Noise differs from frame to frame; what a model lacks, other lines or layers, is there in all of them and does
         not shrink with their number. Neighbouring pixels share it within a quarter of a fringe.
         """
+        weights = [weight for _, weight in self.frames]
         total = np.sum(weights, axis=0)
-        shared = np.sum(
-            [weight * each for weight, each in zip(weights, fit.state.residuals, strict=True)], axis=0
-        )
+        shared = np.sum([weight * each for weight, each in zip(weights, residuals, strict=True)], axis=0)
         slope = float(np.median(np.hypot(*np.gradient(self.layer_um))))
         side = max(
             1, min(round(0.25 * self.order_um / max(slope, 1e-12)), min(total.shape) // LEAST_PX_OF_SPAN)
@@ -268,7 +285,7 @@ class _Night:
 
     def state(self, shift_um: FloatArray) -> _State:
         """The night at a shift, with the levels that suit it best."""
-        bands, smooth = self.predict(self.layer_um + shift_um), _polynomials(self.layer_um.shape)
+        bands, smooth = self.predict(self.layer_um + shift_um), background_terms(self.layer_um.shape)
         made = _State(shift_um, 0.0, 0.0, [], [], [], [], np.zeros(len(self.frames)))
         half_chi2 = log_volume = 0.0
         for number, (value, weight) in enumerate(self.frames):
@@ -276,7 +293,7 @@ class _Night:
             design = np.concatenate([bands - middle[:, None, None], smooth])
             flat = design.reshape(len(design), -1)
             weighted = flat * weight.ravel()
-            level, inverse, log_det = _levels(weighted @ flat.T, weighted @ value.ravel(), len(bands))
+            level, inverse, log_det = levels_of(weighted @ flat.T, weighted @ value.ravel(), len(bands))
             residual = value - np.tensordot(level, design, axes=1)
             away = (level[: len(bands)] - 1.0) / BAND_SIGMA
             half_chi2 += 0.5 * float((weight * residual**2).sum() + away @ away)
@@ -287,7 +304,22 @@ class _Night:
             made.residuals.append(residual)
             power = (weight * np.square(bands - middle[:, None, None])).sum(axis=(1, 2))
             made.strength[number] = float(level[: len(bands)] @ power / max(power.sum(), 1e-300))
-        return made._replace(half_chi2=half_chi2, log_volume=log_volume)
+        made = made._replace(half_chi2=half_chi2, log_volume=log_volume)
+        return made if self.envelope is None else self._with_error(made, self.envelope, bands)
+
+    def _with_error(self, state: _State, envelope: Envelope, bands: FloatArray) -> _State:
+        """The same where the envelope of the fringes is another than the model's, in all frames alike."""
+        found = ModelError(envelope, envelope.terms(self.layer_um + state.shift_um, bands))
+        for (_, weight), design, strength in zip(self.frames, state.designs, state.strength, strict=True):
+            found.add(weight, design, float(strength))
+        gain, log_volume = found.solve(state.residuals, state.inverses)
+        for number, (inverse, design) in enumerate(zip(state.inverses, state.designs, strict=True)):
+            change, taken = found.taken(number, inverse, design)
+            state.levels[number] = state.levels[number] + change[: len(bands)]
+            state.residuals[number] = state.residuals[number] - taken.reshape(self.layer_um.shape)
+        return state._replace(
+            half_chi2=state.half_chi2 - gain, log_volume=state.log_volume + log_volume, error=found
+        )
 
     def normal(self, splines: Splines, state: _State) -> tuple[FloatArray, FloatArray]:
         """Information on the coefficients, the levels being free, and minus the gradient of half the χ²."""
@@ -297,15 +329,23 @@ class _Night:
         gradient = np.zeros(splines.count)
         total = np.zeros(self.layer_um.shape)
         reduced = np.zeros((splines.count, splines.count))
+        error, shared = state.error, np.zeros(1)
+
+        def products(image: FloatArray, terms: FloatArray) -> FloatArray:
+            return np.stack([splines.sums(image * each.reshape(image.shape)) for each in terms], axis=1)
+
         frames = zip(self.frames, state.levels, state.designs, state.inverses, state.residuals, strict=True)
-        for (_, weight), level, design, inverse, residual in frames:
+        for number, ((_, weight), level, design, inverse, residual) in enumerate(frames):
             slope = np.tensordot(level, change, axes=1)
             total += weight * slope**2
             gradient += splines.sums(weight * slope * residual)
-            cross = np.stack(
-                [splines.sums(weight * slope * each.reshape(weight.shape)) for each in design], axis=1
-            )
+            cross = products(weight * slope, design)
             reduced += cross @ inverse @ cross.T
+            if error is not None:
+                sums = products(weight * slope, error.terms)
+                shared = shared + error.cross(sums, number, cross @ inverse)
+        if error is not None:
+            reduced += shared @ error.inverse @ np.transpose(shared)
         return splines.products(total) - reduced, gradient
 
     def fitted(self, splines: Splines, start_um: FloatArray) -> _Fit:
@@ -349,46 +389,6 @@ class _Night:
         return coefficient, state
 
 
-_POWERS = tuple((y, x) for y, x in itertools.product(range(3), range(3)) if y + x <= 2)
-
-
-def _levels(products: FloatArray, side: FloatArray, bands: int) -> tuple[FloatArray, FloatArray, float]:
-    """Strength of bands and terms of the background, their covariance, and the log of its inverse's determinant.
-
-    A band that would be negative is not there, and has no freedom.
-    """
-    prior = np.where(np.arange(side.size) < bands, BAND_SIGMA**-2.0, 0.0)
-    there = np.ones(side.size, dtype=bool)
-    matrix = products + np.diag(prior)
-    log_det = float(np.linalg.slogdet(matrix)[1])
-    while True:
-        kept = np.flatnonzero(there)
-        inverse = np.zeros_like(matrix)
-        inverse[np.ix_(kept, kept)] = np.linalg.inv(matrix[np.ix_(kept, kept)])
-        level = inverse @ (side + prior)
-        negative = there & (level < 0.0) & (prior > 0.0)
-        if not negative.any():
-            return level, inverse, log_det
-        there &= ~negative
-
-
-def _polynomials(shape: tuple[int, ...]) -> FloatArray:
-    y, x = (np.linspace(-1.0, 1.0, side) for side in shape)
-    return np.stack([np.outer(y**row, x**column) for row, column in _POWERS])
-
-
-def _thinned(predict: Predictor, layer_um: FloatArray, thin: int) -> Predictor:
-    """Predictions of every ``thin``-th pixel, whose places in the field are those of the whole image."""
-    if thin == 1:
-        return predict
-
-    def of_some(thickness_um: FloatArray) -> FloatArray:
-        whole = np.repeat(np.repeat(thickness_um, thin, axis=0), thin, axis=1)
-        return predict(whole[: layer_um.shape[0], : layer_um.shape[1]])[:, ::thin, ::thin]
-
-    return of_some
-
-
 def _averaged(night: _Night, unmoved: _State, fits: Sequence[_Fit], others: Sequence[_Fit]) -> SkyShift:
     """All that compete, by their evidence; ``others`` began elsewhere."""
     logs = np.array([unmoved.log_volume - unmoved.half_chi2, *(fit.log_evidence for fit in fits)])
@@ -415,6 +415,7 @@ def _averaged(night: _Night, unmoved: _State, fits: Sequence[_Fit], others: Sequ
         float(strength.std(ddof=1) / math.sqrt(strength.size)) if strength.size > 1 else math.nan,
         ratio,
         float(np.sqrt(np.median(alone))),
+        0.0 if night.envelope is None else night.envelope.size,
     )
 
 

@@ -59,7 +59,7 @@ OWN_CARD = re.compile(r"FRING(COR|TID|PRB|VER|S[CE]\d+)")
 @click.option(
     "--inject",
     is_flag=True,
-    help="Draw stars and galaxies into a copy of each frame, and tell their fluxes before and after.",
+    help="Draw stars and galaxies into a copy of each frame, and tell their fluxes and shapes before and after.",
 )
 @click.option("--undo", is_flag=True, help="Put the fringes back that an earlier run has subtracted.")
 @output_folder(
@@ -250,6 +250,14 @@ def _describe(record: FrameRecord) -> str:
         return f"{record.name}: left as it is: the fringes of the templates are not seen ({clearest:.1f} σ, {scales})"
     return (
         f"{record.name}: {scales} (fringes at {clearest:.1f} σ); of the fringes "
-        f"{100.0 * proof.part_left:.0f} ± {100.0 * proof.part_left_sigma:.0f} % left; structure beyond the noise "
+        f"{_left(proof.part_left, proof.part_left_sigma)} left; structure beyond the noise "
         f"{proof.structure_before:.2f} before, {proof.structure_after:.2f} after"
     )
+
+
+def _left(part: float, sigma: float) -> str:
+    """The part that is left, or its limit where its square, which is measured, is within two errors of 0."""
+    square, error = part**2, (part + sigma) ** 2 - part**2
+    if square < 2.0 * error:
+        return f"less than {100.0 * (square + 2.0 * error) ** 0.5:.0f} % (2 σ)"
+    return f"{100.0 * part:.0f} ± {100.0 * sigma:.0f} %"

@@ -14,17 +14,20 @@ from ..errors import InputError
 from .bad_files import refuse_bad
 from .observed import background_options, background_path, grid_of, images_of, other_light
 from .output import OutputFolder, origin_of, output_folder
-from .parameters import SKY, ChosenEffects, model_effects
+from .parameters import SKY, THICKNESS_RANGE, ChosenEffects, model_effects
 from .progress import progress
 
 if TYPE_CHECKING:
+    from ..algorithms.fringe_correction import CorrectionOptions
     from ..algorithms.map_on_sky import MapOnSky
+    from ..algorithms.range_forecast import RangeForecast
     from ..algorithms.sky_response import Response
     from ..instrument.detector import Detector
     from ..instrument.setup import Setup
     from ..model import FringeModel
     from ..products import ObservedFrame, SensorSection, ThicknessMap
     from ..products.observed_files import ObservedImage
+    from ..report.page import Origin
 
 __all__ = ["fit_sky"]
 
@@ -33,11 +36,35 @@ WORTH_ORDERS = 0.02
 """Uncertainty to which a map is wanted, for what the command says of more frames [orders]: 0.13 rad of phase leave a
 hundredth of the power of the fringes."""
 
+MOST_FRAMES = 1_000_000
+"""More than these are not counted."""
+
+LARGE_ERROR = 0.3
+"""Errors of the fringes, over the fringes, with which neighbouring orders were mistaken for each other in trials
+with bright frames of another simulator."""
+
+
+class _MapOrRange(click.ParamType):
+    """A file that exists, or a range of thickness."""
+
+    name = "FILE|LOW:HIGH"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> str | tuple[float, float]:
+        if isinstance(value, str) and (":" not in value or Path(value).exists()):
+            file = click.Path(exists=True, dir_okay=False)
+            return str(file.convert(value, param, ctx))
+        return THICKNESS_RANGE.convert(value, param, ctx)
+
 
 @click.command()
 @click.argument("frames", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option(
-    "--thickness", required=True, type=click.Path(exists=True, dir_okay=False), help="Map of the sensor."
+    "--thickness",
+    required=True,
+    type=_MapOrRange(),
+    help="Map of the sensor; or its range alone, as 13um:17um, for how many frames would tell a map.",
 )
 @SKY.option("lsst_e2v", "Set-up with a telescope: name or file.")
 @click.option("--detector", default=None, help="Place in the focal plane; by default as the frames say.")
@@ -49,12 +76,18 @@ hundredth of the power of the fringes."""
 )
 @background_options
 @model_effects("Effect on the sky; may be repeated.")
-@output_folder("Folder for the moved map and the report.", "thickness.fits", "thickness.png", "report.html")
+@output_folder(
+    "Folder for the moved map and the report.",
+    "thickness.fits",
+    "thickness.png",
+    "forecast.ecsv",
+    "report.html",
+)
 @click.option("--skip-bad", is_flag=True, help="Go on without frames that cannot be read.")
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
 def fit_sky(
     frames: tuple[Path, ...],
-    thickness: str,
+    thickness: str | tuple[float, float],
     setup: Setup,
     detector: str | None,
     map_sigma: float | None,
@@ -70,26 +103,35 @@ def fit_sky(
 
     FRAMES are those of one sensor in one filter, after the removal of the instrument's signature and before the
     subtraction of background and fringes. The strength of every OH band is free in every frame, so that nights in
-    which the bands vary tell more. The map that is written holds the shift, and its uncertainty.
+    which the bands vary tell more. The map that is written holds the shift, and its uncertainty. From a range of the
+    thickness alone no map is made: what is stated is how many frames like these a map would take.
 
     \b
     Examples:
       fringe-sim fit-sky night --thickness fit/thickness.fits --detector R22_S11 --out on_sky
+      fringe-sim fit-sky night --thickness 13um:17um --detector R22_S11 --out how_many
     """
     from ..algorithms.fringe_correction import CorrectionOptions
     from ..algorithms.map_on_sky import map_on_sky, reach_um
-    from ..model.provenance import input_cards, software_cards
-    from ..report.map_on_sky_page import write_map_on_sky_report
     from .inputs import placed_model, read_map, read_section, sky_settings
 
     images, unusable = images_of(frames, _refuse_unfit)
     refuse_bad(unusable, skip_bad=skip_bad)
     sensor = _sensor_of(images, setup, detector)
+    options = CorrectionOptions(background_px, grid_of(amplifiers))
+    loaders = [partial(image.read, background_path(background, image)) for image in images]
+    if not isinstance(thickness, str):
+        model = placed_model(setup, sky_settings(effects.settings), sensor)
+        _check_frames(loaders, images, None, setup)
+        if dry_run:
+            click.echo(f"would say how many frames like {len(images)} of {sensor.name} a map takes")
+        else:
+            _forecast(thickness, model, loaders, options, out)
+        return
     layer = read_map(thickness, setup, sensor)
     section = read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
     model = placed_model(setup, sky_settings(effects.settings), sensor)
     order_um = float(model.fringe_order_um(960.0))
-    loaders = [partial(image.read, background_path(background, image)) for image in images]
     _check_frames(loaders, images, layer, setup)
     if dry_run:
         click.echo(f"would hold the map of {sensor.name} against {len(images)} frames")
@@ -102,19 +144,90 @@ def fit_sky(
             layer,
             response,
             order_um,
-            CorrectionOptions(background_px, grid_of(amplifiers)),
+            options,
             map_sigma_um=map_sigma,
             advance=advance,
         )
     given: list[str | Path] = [thickness, *dict.fromkeys(image.path for image in images)]
-    found.moved.write_fits(folder / "thickness.fits", {**software_cards(), **input_cards(given)})
-    lines = said(found, len(images), order_um)
     origin = origin_of(folder, [*given, *effects.files])
+    _write(found, folder, layer, given, said(found, len(images), order_um), len(images), section, origin)
+
+
+def _write(
+    found: MapOnSky,
+    folder: Path,
+    layer: ThicknessMap,
+    given: Sequence[str | Path],
+    lines: list[str],
+    frames: int,
+    section: SensorSection | None,
+    origin: Origin,
+) -> None:
+    """Map, page and what is said."""
+    from ..model.provenance import input_cards, software_cards
+    from ..report.map_on_sky_page import write_map_on_sky_report
+
+    found.moved.write_fits(folder / "thickness.fits", {**software_cards(), **input_cards(list(given))})
     page = write_map_on_sky_report(
-        folder / "report.html", found, layer, lines, frames=len(images), section=section, origin=origin
+        folder / "report.html", found, layer, lines, frames=frames, section=section, origin=origin
     )
     for line in [*lines, str(folder / "thickness.fits"), str(page)]:
         click.echo(line)
+
+
+def _forecast(
+    range_um: tuple[float, float],
+    model: FringeModel,
+    loaders: Sequence[Callable[[], ObservedFrame]],
+    options: CorrectionOptions,
+    out: OutputFolder,
+) -> None:
+    """How many frames would tell a map of which a range is known."""
+    from dataclasses import asdict
+
+    from astropy.table import Table
+
+    from ..algorithms.range_forecast import forecast_of_range, frame_noise
+    from ..algorithms.sky_response import sky_response
+    from ..files import table_text, write_whole
+    from ..instrument.sky import SkySpectrum
+
+    model.checked_thickness_um(range_um)
+    folder, frame = out.prepare(), loaders[0]()
+    noise, pixels = frame_noise(frame, options)
+    order_um = float(model.fringe_order_um(960.0))
+    dark = SkySpectrum.dark(airmass=model.setup.airmass)
+    table = sky_response(model, dark, thickness_range_um=(range_um[0], range_um[1] + 2.0 * order_um)).sky()
+    shape = (frame.shape[0], frame.shape[1])
+    found = forecast_of_range(
+        lambda grid: table.frame(grid[None, :])[0], range_um, order_um, shape, pixels, noise
+    )
+    write_whole(folder / "forecast.ecsv", table_text(Table([{**asdict(found), "frames": found.frames}])))
+    for line in forecast_lines(found, len(loaders)):
+        click.echo(line)
+    click.echo(str(folder / "forecast.ecsv"))
+
+
+def forecast_lines(found: RangeForecast, frames: int) -> list[str]:
+    """What a range of the thickness and the noise of a frame say, line by line."""
+    verdict = (
+        f"there are {frames}: too few for a map from the range alone"
+        if frames < found.frames
+        else f"there are {frames}: the signal may suffice, but no search for a map without one is made here"
+    )
+    return [
+        f"fringes of the dark sky: {100.0 * found.fringe_rms:.2g} % rms; noise of a pixel of the first frame: "
+        f"{100.0 * found.noise:.2g} %",
+        f"{found.orders:.1f} fringe orders lie within the range; the layer is a plane over {found.part_px} px",
+        f"such a part shows its fringes in {_counted(found.to_see)} frames like the first, at the least; "
+        f"one tells the thickness within the order to {found.sigma_um:.3f} µm",
+        f"all pixels tell the order in {_counted(found.to_tell_order)} frames, at the least",
+        f"{verdict}; a map from the laboratory takes fewer",
+    ]
+
+
+def _counted(frames: int) -> str:
+    return str(frames) if frames <= MOST_FRAMES else f"more than {MOST_FRAMES:,}"
 
 
 def said(found: MapOnSky, frames: int, order_um: float) -> list[str]:
@@ -132,6 +245,11 @@ def said(found: MapOnSky, frames: int, order_um: float) -> list[str]:
         f"whole orders away with a probability of {shift.chance_other_order:.2g}",
         f"fringes of the frames over those of the dark sky: {strength}",
     ]
+    if shift.model_error >= LARGE_ERROR:
+        lines.append(
+            f"the model misses about {shift.model_error:g} of its fringes in all frames alike (lines, films, "
+            "silicon): its order may be wrong whatever these probabilities say; a correction gains by the moved map"
+        )
     wanted = WORTH_ORDERS * order_um
     needed = shift.frames_for(wanted, frames)
     known = f"parts of an eighth of the sensor are known to {NM * shift.alone_um:.3g} nm by the frames alone"
@@ -167,7 +285,7 @@ def _sensor_of(images: list[ObservedImage], setup: Setup, chosen: str | None) ->
 def _check_frames(
     loaders: Sequence[Callable[[], ObservedFrame]],
     images: Sequence[ObservedImage],
-    layer: ThicknessMap,
+    layer: ThicknessMap | None,
     setup: Setup,
 ) -> None:
     """Refuse frames that do not belong together, or not to the map or the band of the set-up."""
@@ -175,7 +293,7 @@ def _check_frames(
 
     names = [f"{image.path}[{image.name}]" for image in images]
     first = first_of_alike(loaders, names, "frames of the sky")
-    if first.shape != layer.shape:
+    if layer is not None and first.shape != layer.shape:
         raise InputError("shape of the frames", first.shape, f"{layer.shape}, that of the thickness map")
     if other_light(setup.bandpass, first.physical_filter, is_model=True):
         raise InputError(

@@ -96,6 +96,7 @@ NO_DATE = "1970-01-01T00:00:00"  # of templates of a model: two runs agree to th
     "sky_*_[0-9][0-9].fits",
     "fringe_*.fits",
     "sky.png",
+    "coadd_sources.ecsv",
     "report.html",
 )
 @click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
@@ -181,6 +182,7 @@ def sky(
         seed,
         places,
         picture=folder / "sky.png",
+        pixel_arcsec=setup.pixel_scale_arcsec,
         section=section,
         origin=origin_of(folder, given),
     )

@@ -17,6 +17,7 @@ from ..products import FringeTemplates
 from ..style import figure, finite_range, show_image
 from .figures import CURVE_INCH, map_row
 from .page import Origin, Report
+from .source_figure import bias_figure
 from .words import measured_text, of_sensor, span_text
 
 __all__ = ["frame_figure", "write_correction_report", "write_templates_report"]
@@ -181,9 +182,13 @@ def _proofs(report: Report, records: Sequence[FrameRecord]) -> None:
     if sources is not None:
         report.section(
             "Injected sources",
-            "Stars and exponential discs in copies of the frames: bias and scatter of their fluxes, with the fringes "
-            "and without. Magnitudes are those of counts, without a zero point.",
+            "Stars and exponential discs in copies of the frames: bias and scatter of their fluxes and sizes as "
+            "fractions of them, and of their ellipticities (adaptive moments), with the fringes and without. "
+            "Magnitudes are those of counts, without a zero point.",
         )
+        kinds = {kind: sources[sources["kind"] == kind] for kind in np.unique(sources["kind"])}
+        names = {"before": "with fringes", "after": "corrected"}
+        report.figure(bias_figure(names, kinds), "Bias by magnitude; a point for each frame and flux.")
         report.table(_by_magnitude(sources), "injected", download=sources)
 
 

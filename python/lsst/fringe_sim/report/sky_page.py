@@ -11,16 +11,28 @@ from astropy import units
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from ..algorithms.coadd_sources import sources_in_coadds
 from ..algorithms.coadds import Coadds, VisitPlaces, coadds_of_frames
 from ..algorithms.pca import fit_pca
+from ..files import table_text, write_whole
 from ..products import SensorSection, SkyFringe
 from .figures import coadds_figure, components_figure, sky_figure
 from .page import Origin, Report
+from .source_figure import bias_figure
 from .words import masked_text, of_sensor, span_text
 
-__all__ = ["COADDS_CAPTION", "COADDS_TEXT", "coadd_table", "sky_amplitudes", "write_sky_report"]
+__all__ = [
+    "COADDS_CAPTION",
+    "COADDS_TEXT",
+    "SOURCES_FILE",
+    "coadd_table",
+    "sky_amplitudes",
+    "write_sky_report",
+]
 
 PERCENT = 100.0
+
+SOURCES_FILE = "coadd_sources.ecsv"
 
 COADDS_TEXT = (
     "What stays of the fringes in coadds of randomly placed and rotated pieces of these frames, uncorrected and "
@@ -37,6 +49,13 @@ CAPTION_OF_COMPONENTS = "Mean, and the first components with their share of the 
 COADDS_CAPTION = (
     "Standard deviation of means over squares: of the largest against the number of exposures, and of the deepest "
     "coadd against the side. The Dark Energy Survey asks for fringes below a tenth of the noise up to 20 arcsec."
+)
+
+SOURCES_TEXT = (
+    "What the fringes do to stars and exponential discs in single visits and in the coadd of all: bias, its error "
+    "and scatter of fluxes and sizes, as parts of them, and of ellipticities (adaptive moments), beside the scatter "
+    "that the noise makes. Each source is compared with itself in the same noise without fringes. Magnitudes are "
+    "relative to the sky of one square arcsecond."
 )
 
 
@@ -67,14 +86,15 @@ def write_sky_report(
     places: VisitPlaces | None = None,
     *,
     picture: Path | None = None,
+    pixel_arcsec: float = 0.2,
     section: SensorSection | None = None,
     origin: Origin | None = None,
 ) -> Path:
-    """Write the page.
+    """Write the page, and ``coadd_sources.ecsv`` beside it where frames without noise are large enough.
 
     ``seed``: of places and angles of the coadds, where ``places`` are not given. ``picture``: file beside the page
-    for the first frame with all its pixels, if wanted. ``section``: pixels of the sensor that the frames show, where
-    that is known. ``origin``: command, and pages of what it was given.
+    for the first frame with all its pixels, if wanted. ``pixel_arcsec``: size of a pixel [arcsec]. ``section``:
+    pixels of the sensor that the frames show, where that is known. ``origin``: command, and pages of what it was given.
     """
     first = frames[0]
     report = Report(
@@ -107,6 +127,10 @@ def write_sky_report(
         report.section("Coadds", COADDS_TEXT if places is None else COADDS_OF_VISITS_TEXT)
         report.figure(coadds_figure(found), COADDS_CAPTION)
         report.table(coadd_table(found), "coadds")
+        sources = sources_in_coadds(frames, np.random.default_rng(seed), places, pixel_arcsec=pixel_arcsec)
+        if sources is not None:
+            write_whole(path.with_name(SOURCES_FILE), table_text(sources))
+            _show_sources(report, sources)
     return report.write(path)
 
 
@@ -145,6 +169,19 @@ def _summary(
         ("masked", masked_text(first.mask)),
         ("simulated part", of_sensor(first.image.shape, section)),
     ]
+
+
+def _show_sources(report: Report, sources: Table) -> None:
+    names = {"fringes": "with fringes", "corrected": "less one template"}
+    known = {end: name for end, name in names.items() if f"bias_{end}" in sources.colnames}
+    parts = {
+        f"{kind}, visits: {visits}": sources[(sources["kind"] == kind) & (sources["visits"] == visits)]
+        for visits in np.unique(sources["visits"])
+        for kind in np.unique(sources["kind"])
+    }
+    report.section("Sources", SOURCES_TEXT)
+    report.figure(bias_figure(known, parts), "Bias by magnitude, kind and number of visits.")
+    report.table(sources, Path(SOURCES_FILE).stem, download=sources)
 
 
 def coadd_table(found: Coadds) -> Table:

@@ -40,6 +40,9 @@ LEARNING_STEPS = 2
 MOST_VARIANCE = 20.0
 """Variance of a pixel of a pattern over the usual one beyond which the frames that see it do not decide it."""
 
+ROUNDING = 1e-6
+"""Part of a sum in single precision below which a difference from it is rounding."""
+
 ROWS = 64
 """Rows that are converted to float64 at a time."""
 
@@ -364,7 +367,9 @@ def _solved(
     for k in range(number):
         for m in range(k + 1):
             rest = normal[k, m] - sum(lower[k, i] * lower[m, i] for i in range(m))
-            lower[k, m] = np.sqrt(np.maximum(rest, 1e-300)) if k == m else rest / lower[m, m]
+            # What the frames of a pixel do not decide is rounding: it gets a variance that is too large.
+            least = np.maximum(ROUNDING * normal[k, k], 1e-300)
+            lower[k, m] = np.sqrt(np.maximum(rest, least)) if k == m else rest / lower[m, m]
     forward: list[FloatArray] = []
     for k in range(number):
         forward.append((moment[k] - sum(lower[k, i] * forward[i] for i in range(k))) / lower[k, k])

@@ -1,9 +1,9 @@
-"""Sources drawn into copies of a frame, and what photometry finds of them before and after a correction."""
+"""Sources drawn into copies of a frame, and the fluxes and shapes found before and after a correction."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,17 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 
-__all__ = ["InjectionOptions", "Measured", "inject_sources", "injection_table"]
+__all__ = [
+    "QUANTITIES",
+    "InjectionOptions",
+    "Measured",
+    "Source",
+    "bias_columns",
+    "free_places",
+    "inject_sources",
+    "injection_table",
+    "stamp_side",
+]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -22,6 +32,9 @@ POINT, EXTENDED = "point", "extended"
 
 STAMP_FWHM = 6.0
 """Side of the images of sources, in widths of the image of a star."""
+
+QUANTITIES = ("", "e1_", "e2_", "size_")
+"""What is measured, as columns of tables begin: the flux, two components of the ellipticity, the size."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +72,9 @@ class Measured:
         ``point`` or ``extended``.
     flux : `float`
         What each has, in the unit of the frame.
-    before, after : `numpy.ndarray`, shape ``(N,)``
-        Fluxes that are found in the frame with its fringes and without.
+    before, after : `numpy.ndarray`, shape ``(4, N)``
+        Departures from what the source has, in the frame with its fringes and without: of the flux as a part of it,
+        of the two components of the ellipticity, of the size as a part of it. NaN where no shape is found.
     """
 
     kind: str
@@ -102,39 +116,40 @@ def inject_sources(
     Notes
     -----
     Fluxes are sums over a circle whose radius is the width of a star, less the mean of a ring around it, over the
-    part of the flux that the same measurement finds of the source without noise. Noise of the sources themselves is
-    not added: what scatters is the sky and its fringes.
+    part of the flux that the same measurement finds of the source without noise. Shapes are adaptive moments (``hsm``
+    of GalSim; Hirata & Seljak 2003, MNRAS 343, 459, doi 10.1046/j.1365-8711.2003.06683.x) of the image less the same
+    mean, compared with those of the source without noise. Noise of the sources themselves is not added: what
+    scatters is the sky and its fringes.
     """
     chosen = options or InjectionOptions()
-    stars = {kind: _stamp(kind, chosen, pixel_arcsec) for kind in (POINT, EXTENDED)}
-    aperture = _Aperture.of(stars[POINT].shape[0], chosen.fwhm_arcsec / pixel_arcsec)
-    groups = [(kind, snr) for kind in stars for snr in chosen.signal_to_noise]
-    places = _places(free, aperture.side, len(groups) * chosen.number, np.random.default_rng(chosen.seed))
+    sources = Source.of_all(chosen, pixel_arcsec)
+    groups = [(source, snr) for source in sources for snr in chosen.signal_to_noise]
+    side = stamp_side(chosen, pixel_arcsec)
+    places = free_places(free, side, len(groups) * chosen.number, np.random.default_rng(chosen.seed))
     if len(places) < len(groups):
         raise InputError("free places for sources", len(places), f"{len(groups)} or more")
     crowded = image.copy()
-    fluxes = []
-    for number, (kind, snr) in enumerate(groups):
-        seen = aperture.flux(stars[kind])
-        flux = snr * noise * math.sqrt(aperture.pixels) / seen
-        fluxes.append((flux, seen))
+    fluxes = [source.flux_at(snr, noise) for source, snr in groups]
+    for number, ((source, _), flux) in enumerate(zip(groups, fluxes, strict=True)):
         for y, x in places[number :: len(groups)]:
-            crowded[aperture.around(y, x)] += (flux * stars[kind]).astype(np.float32)
+            crowded[source.around(y, x)] += (flux * source.stamp).astype(np.float32)
     images = correct(crowded)
     found = []
-    for number, ((kind, _), (flux, seen)) in enumerate(zip(groups, fluxes, strict=True)):
+    for number, ((source, _), flux) in enumerate(zip(groups, fluxes, strict=True)):
         own = places[number :: len(groups)]
         before, after = (
-            np.array([aperture.flux(each[aperture.around(y, x)]) / seen for y, x in own]) for each in images
+            np.stack([source.departure(each[source.around(y, x)], flux) for y, x in own], axis=1)
+            for each in images
         )
-        found.append(Measured(kind, flux, before, after))
+        found.append(Measured(source.kind, flux, before, after))
     return found
 
 
 def injection_table(name: str, measured: Sequence[Measured]) -> Table:
-    """Bias and scatter of the fluxes, by kind and magnitude: one row for each.
+    """Bias and scatter of fluxes and shapes, by kind and magnitude: one row for each.
 
-    Magnitudes are ``-2.5 log10`` of the flux in the unit of the frame; bias and scatter are fractions of the flux.
+    Magnitudes are ``-2.5 log10`` of the flux in the unit of the frame; bias and scatter of fluxes and sizes are
+    fractions. Shapes are those of sources that have one before and after.
     """
     rows: list[dict[str, Any]] = []
     for each in measured:
@@ -142,15 +157,95 @@ def injection_table(name: str, measured: Sequence[Measured]) -> Table:
             "name": name,
             "kind": each.kind,
             "magnitude": -2.5 * math.log10(each.flux),
-            "number": each.before.size,
+            "number": each.before.shape[1],
+            "shapes": int(np.isfinite(each.before + each.after).all(axis=0).sum()),
         }
-        for when, values in (("before", each.before), ("after", each.after)):
-            off = values / each.flux - 1.0
-            row[f"bias_{when}"] = float(np.mean(off))
-            row[f"bias_{when}_sigma"] = float(np.std(off) / math.sqrt(off.size))
-            row[f"scatter_{when}"] = float(np.std(off))
-        rows.append(row)
+        rows.append(row | bias_columns({"before": each.before, "after": each.after}))
     return Table(rows)
+
+
+def bias_columns(departures: Mapping[str, FloatArray]) -> dict[str, float]:
+    """Bias with its error, and scatter, of all quantities of the sources that have them in all of several images.
+
+    Parameters
+    ----------
+    departures : mapping of `str` to `numpy.ndarray`, shape ``(4, N)``
+        Departures by the name of the image, which ends the names of the columns.
+    """
+    known = np.logical_and.reduce([np.isfinite(each) for each in departures.values()])
+    row = {}
+    for item, quantity in enumerate(QUANTITIES):
+        for when, values in departures.items():
+            own = values[item, known[item]]
+            scatter = float(np.std(own)) if own.size else math.nan
+            row[f"{quantity}bias_{when}"] = float(np.mean(own)) if own.size else math.nan
+            row[f"{quantity}bias_{when}_sigma"] = scatter / math.sqrt(max(own.size, 1))
+            row[f"{quantity}scatter_{when}"] = scatter
+    return row
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A kind of source: its image of flux 1, and what is found of it without noise.
+
+    Attributes
+    ----------
+    kind : `str`
+        ``point`` or ``extended``.
+    stamp : `numpy.ndarray`, shape ``(S, S)``
+        Image in the middle of a square.
+    """
+
+    kind: str
+    stamp: FloatArray
+    _aperture: _Aperture
+    _seen: FloatArray  # part of the flux in the aperture, two components of the ellipticity, size [px]
+
+    @classmethod
+    def of_all(cls, options: InjectionOptions, pixel_arcsec: float) -> list[Source]:
+        """Point and extended source."""
+        made = []
+        for kind in (POINT, EXTENDED):
+            stamp = _stamp(kind, options, pixel_arcsec)
+            aperture = _Aperture.of(stamp.shape[0], options.fwhm_arcsec / pixel_arcsec)
+            made.append(
+                cls(kind, stamp, aperture, _measured(stamp, aperture, options.fwhm_arcsec / pixel_arcsec))
+            )
+        return made
+
+    def flux_at(self, signal_to_noise: float, noise: float) -> float:
+        """Flux whose part in the aperture is so much of the noise of the sky there."""
+        return signal_to_noise * noise * math.sqrt(self._aperture.pixels) / float(self._seen[0])
+
+    def around(self, y: int, x: int) -> tuple[slice, slice]:
+        """Square about a pixel."""
+        half = self.stamp.shape[0] // 2
+        return slice(y - half, y + half + 1), slice(x - half, x + half + 1)
+
+    def departure(self, image: NDArray[Any], flux: float) -> FloatArray:
+        """Departures of what an image of the source shows from what it has, see `Measured`."""
+        found = _measured(image, self._aperture, float(self._seen[3]))
+        e1, e2 = found[1:3] - self._seen[1:3]
+        return np.array([found[0] / (flux * self._seen[0]) - 1.0, e1, e2, found[3] / self._seen[3] - 1.0])
+
+
+def _measured(image: NDArray[Any], aperture: _Aperture, size_px: float) -> FloatArray:
+    """Flux, ellipticity and size of what is in the middle of a square; NaN for a shape that is not found."""
+    import galsim
+
+    sky = float(np.mean(image[aperture.ring], dtype=np.float64))
+    flux = float(image[aperture.circle].sum(dtype=np.float64)) - aperture.pixels * sky
+    drawn = galsim.Image(np.ascontiguousarray(image - sky, dtype=np.float64))
+    moments = galsim.hsm.FindAdaptiveMom(drawn, guess_sig=size_px, strict=False)
+    if moments.moments_status != 0:
+        return np.array([flux, math.nan, math.nan, math.nan])
+    shape = moments.observed_shape
+    return np.array([flux, shape.e1, shape.e2, moments.moments_sigma])
+
+
+def stamp_side(options: InjectionOptions, pixel_arcsec: float) -> int:
+    """Side of the image of a source [px]."""
+    return 2 * math.ceil(0.5 * STAMP_FWHM * options.fwhm_arcsec / pixel_arcsec) + 1
 
 
 def _stamp(kind: str, options: InjectionOptions, pixel_arcsec: float) -> FloatArray:
@@ -161,8 +256,7 @@ def _stamp(kind: str, options: InjectionOptions, pixel_arcsec: float) -> FloatAr
     profile = star
     if kind == EXTENDED:
         profile = galsim.Convolve(star, galsim.Exponential(half_light_radius=options.half_light_arcsec))
-    half = math.ceil(0.5 * STAMP_FWHM * options.fwhm_arcsec / pixel_arcsec)
-    side = 2 * half + 1
+    side = stamp_side(options, pixel_arcsec)
     drawn = profile.drawImage(nx=side, ny=side, scale=pixel_arcsec)
     return np.asarray(drawn.array, dtype=np.float64)
 
@@ -171,7 +265,6 @@ def _stamp(kind: str, options: InjectionOptions, pixel_arcsec: float) -> FloatAr
 class _Aperture:
     """Circle and ring about the middle of a square."""
 
-    side: int
     circle: BoolArray
     ring: BoolArray
 
@@ -179,22 +272,14 @@ class _Aperture:
     def of(cls, side: int, fwhm_px: float) -> _Aperture:
         half = side // 2
         away = np.hypot(*np.mgrid[-half : half + 1, -half : half + 1])
-        return cls(side, away <= fwhm_px, away > 2.0 * fwhm_px)
+        return cls(away <= fwhm_px, away > 2.0 * fwhm_px)
 
     @property
     def pixels(self) -> int:
         return int(np.count_nonzero(self.circle))
 
-    def around(self, y: int, x: int) -> tuple[slice, slice]:
-        half = self.side // 2
-        return slice(y - half, y + half + 1), slice(x - half, x + half + 1)
 
-    def flux(self, stamp: NDArray[Any]) -> float:
-        sky = float(np.mean(stamp[self.ring], dtype=np.float64))
-        return float(stamp[self.circle].sum(dtype=np.float64)) - self.pixels * sky
-
-
-def _places(free: BoolArray, side: int, most: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+def free_places(free: BoolArray, side: int, most: int, rng: np.random.Generator) -> list[tuple[int, int]]:
     """Middles of squares without a pixel that is not free, one in each cell of a grid, in random order."""
     cell = side + side // 2
     ny, nx = (size // cell for size in free.shape)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
 
+from ...compiled import run_threaded
 from .background import BackgroundTerms
 from .scales import ScaleFit, coefficient_of, rounding_of, scale_fit, settle
 from .sums import FrameSums, Solution
 
-__all__ = ["FrameFit", "find_objects", "fit_frame", "square_sums"]
+__all__ = ["FrameFit", "find_objects", "fit_frame", "masked_sums", "square_sums"]
 
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
@@ -38,6 +39,9 @@ SAMPLE, LEAST_SAMPLE = 200_000, 1000
 
 BINNED_PX = (2, 2, 4)
 """Side of the squares of pixels in which objects of each width are sought."""
+
+_ROWS = 128
+"""Rows that are worked on at a time, which the memory of a processor holds."""
 
 ROUNDS = 4
 """Rounds of fit and detection; fringes and background are those of pixels without the objects found so far."""
@@ -133,29 +137,74 @@ def find_objects(residual: NDArray[np.float32], good: BoolArray, rounding: float
         # What is found already does not reach into the wider kernels.
         left = good & ~objects
         if width == 0.0:
-            single = np.abs(residual) > np.float32(threshold * noise)
-            above = square_sums(single & left, binned) > 0
+            above = _single(residual, left, threshold * noise, binned)
         else:
             above = _above(residual, left, width, threshold, binned, noise)
         _grow_into(objects, above, binned)
     return objects
 
 
+def _single(residual: NDArray[np.float32], good: BoolArray, limit: float, binned: int) -> BoolArray:
+    """Squares of pixels of which one lies off by more than a limit."""
+    above = np.empty([-(-size // binned) for size in good.shape], dtype=bool)
+
+    def one(rows: slice, squares: slice) -> None:
+        single = np.abs(residual[rows]) > np.float32(limit)
+        above[squares] = square_sums(single & good[rows], binned) > 0
+
+    _for_bands(one, len(good), binned)
+    return above
+
+
 def _above(
     residual: NDArray[np.float32], good: BoolArray, width: float, threshold: float, binned: int, noise: float
 ) -> BoolArray:
     """Squares of pixels in which the smoothed residual stands above its own scatter."""
-    values = np.where(good, residual, np.float32(0.0))
-    share = square_sums(good, binned)
-    smooth = gaussian_filter(square_sums(values, binned), width / binned, truncate=3.0)
-    share = gaussian_filter(share, width / binned, truncate=3.0) / np.float32(binned**2)
+    shape = [-(-size // binned) for size in good.shape]
+    smooth, share = (np.empty(shape, dtype=np.float32) for _ in range(2))
+    kernel = {"sigma": width / binned, "radius": round(3.0 * width / binned)}
+
+    def one(rows: slice, squares: slice) -> None:
+        # With so many rows around that the kernel sees all it would.
+        first = max(squares.start - kernel["radius"], 0)
+        last = squares.stop + kernel["radius"]
+        wide, inner = slice(first * binned, last * binned), slice(squares.start - first, squares.stop - first)
+        total = square_sums(np.where(good[wide], residual[wide], np.float32(0.0)), binned)
+        number = square_sums(good[wide], binned)
+        share[squares] = gaussian_filter(number, **kernel)[inner] / np.float32(binned**2)
+        smooth[squares] = gaussian_filter(total, **kernel)[inner]
+        smooth[squares] /= np.maximum(share[squares], 0.25) * np.float32(binned**2)
+
+    _for_bands(one, len(good), binned)
     seen = share > 0.25
-    smooth /= np.maximum(share, 0.25) * np.float32(binned**2)
     # White noise is the least there is: few independent places do not tell less.
     effective = math.sqrt(width**2 + (binned**2 - 1) / 12.0)
     least = noise / (2.0 * math.sqrt(math.pi) * effective)
     scatter = max(_scatter(smooth, seen), least) / np.sqrt(np.maximum(share, 0.25))
     return np.asarray(seen & (smooth > threshold * scatter))
+
+
+def masked_sums(values: NDArray[Any], good: BoolArray, side: int) -> NDArray[np.float32]:
+    """Sums over the good pixels of squares, as `square_sums`, in threads."""
+    made = np.empty([-(-size // side) for size in good.shape], dtype=np.float32)
+
+    def one(rows: slice, squares: slice) -> None:
+        made[squares] = square_sums(np.where(good[rows], values[rows], np.float32(0.0)), side)
+
+    _for_bands(one, len(good), side)
+    return made
+
+
+def _for_bands(work: Callable[[slice, slice], object], rows: int, side: int) -> None:
+    """Call ``work`` with some rows at a time, and the rows of squares that they are, in threads."""
+    squares = max(1, _ROWS // side)
+    step = squares * side
+
+    def one(band: int) -> None:
+        last = min((band + 1) * step, rows)
+        work(slice(band * step, last), slice(band * squares, -(-last // side)))
+
+    run_threaded(one, -(-rows // step))
 
 
 def square_sums(image: NDArray[Any], side: int) -> NDArray[np.float32]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtr
 
-from ...compiled import run_threaded
+from ...compiled import processors, run_threaded
 from ...errors import InputError
 from .objects import FrameFit, find_objects, square_sums
 from .part_left import part_left
@@ -40,6 +41,9 @@ hardly overlap."""
 
 NOISE_ROWS = 512
 """Rows whose differences of neighbours tell the noise of a pixel to 0.1 % where a row has a thousand pixels."""
+
+ROWS = 128
+"""Rows that are worked on at a time, which the memory of a processor holds."""
 
 NOISE_SAMPLE = 200_000
 """Pixels that tell a scatter to 0.2 %."""
@@ -128,9 +132,7 @@ def prove(
     if not fit.seen:
         return _untouched(frame, largest)
     before = sums.residual(sums.solve(templates=False))
-    fringes = np.zeros(used.shape, dtype=np.float32)
-    for scale, pattern in zip(fit.scale, sums.patterns, strict=True):
-        fringes += np.float32(scale) * pattern
+    fringes = _scaled_sum(fit.scale, sums.patterns)
     allowed = [scale**2 * each for scale, each in zip(fit.scale, variances, strict=False)]
     mean = float(fit.scale @ sums.mean_patterns())
     apertures, noise = _Apertures(used, largest), _pixel_variance(frame.residual, used)
@@ -150,7 +152,7 @@ def prove(
     probability, worst = _corrected(found)
     return FrameProof(
         evidence=fit.evidence,
-        fringe_rms=float(fringes[used].std(dtype=np.float64)),
+        fringe_rms=_rms(fringes, used),
         structure_before=structure[0],
         structure_after=structure[1],
         fringes_left=whole * left.value,
@@ -164,15 +166,26 @@ def prove(
     )
 
 
+def _scaled_sum(scale: FloatArray, patterns: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    total = np.empty_like(patterns[0])
+
+    def one(band: int) -> None:
+        part = total[band * ROWS : (band + 1) * ROWS]
+        part[...] = 0.0
+        for factor, pattern in zip(scale, patterns, strict=True):
+            part += np.float32(factor) * pattern[band * ROWS : (band + 1) * ROWS]
+
+    run_threaded(one, -(-len(total) // ROWS))
+    return total
+
+
 def _together(*works: Callable[[], Any]) -> list[Any]:
     """What each of several works returns, done in threads."""
-    results: list[Any] = [None] * len(works)
-
-    def one(item: int) -> None:
-        results[item] = works[item]()
-
-    run_threaded(one, len(works))
-    return results
+    if processors() == 1:
+        return [work() for work in works]
+    # Each begins when a thread is free: they take very different times.
+    with ThreadPoolExecutor(processors()) as pool:
+        return list(pool.map(lambda work: work(), works))
 
 
 def _untouched(frame: FrameFit, largest: int) -> FrameProof:
@@ -221,7 +234,7 @@ class _Apertures:
 
     def power(self, values: NDArray[np.float32]) -> float:
         """Largest mean square of means over apertures, as the variance of a pixel of white noise that had it."""
-        total = np.where(self.good, values, np.float32(0.0))
+        total: NDArray[np.float32] = np.where(self.good, values, np.float32(0.0))
         found = [_power(self.last, _of_apertures(total, self.largest), self.largest)]
         for level, share in enumerate(self.shares):
             found.append(_power(share, _overlapping(total, 1 << level), 2 << level))
@@ -355,6 +368,13 @@ def _rises(
         fringes, weight, moment = coarser, square_sums(weight, 2), square_sums(moment, 2)
         width *= 2
     return looks
+
+
+def _rms(values: NDArray[np.float32], good: NDArray[np.bool_]) -> float:
+    """Standard deviation of the good pixels."""
+    kept, number = np.where(good, values, np.float32(0.0)), max(float(np.count_nonzero(good)), 1.0)
+    mean = float(kept.sum(axis=1).sum(dtype=np.float64)) / number
+    return math.sqrt(max(_dot(kept, kept) / number - mean**2, 0.0))
 
 
 def _dot(one: NDArray[Any], two: NDArray[Any]) -> float:
