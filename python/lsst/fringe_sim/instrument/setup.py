@@ -229,8 +229,12 @@ class Setup(InNotebook):
         """
         path = Path(path)
         content = with_files_beside(read_user_yaml(path, "set-up file"), path)
-        setup = cls.from_mapping(path.stem, content, source_file=str(path))
-        setup.sensor()
+        try:
+            setup = cls.from_mapping(path.stem, content, source_file=str(path))
+            setup.sensor()
+        except InputError as error:
+            named = error.source is not None and Path(error.source).suffix
+            raise (error if named else error.in_source(str(path))) from None
         return replace(setup, files=(str(path), *setup.files))
 
     @classmethod

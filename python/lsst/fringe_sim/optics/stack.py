@@ -133,7 +133,11 @@ class LayerStack(OneLine):
             It names a medium that there is not.
         """
         reader = Description(read_description(path, "stack"), str(path))
-        return cls._of(printable_name("name of the stack", Path(path).stem), reader, media or {})
+        name = printable_name("name of the stack", Path(path).stem)
+        try:
+            return cls._of(name, reader, media or {})
+        except StackError as error:
+            raise error.in_source(str(path)) from None
 
     @classmethod
     def _of(cls, name: str, reader: Description, media: Mapping[str, Medium]) -> LayerStack:
