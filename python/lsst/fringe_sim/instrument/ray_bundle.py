@@ -102,7 +102,7 @@ def gauss_rule(value: ArrayLike, weight: ArrayLike, nodes: int) -> tuple[FloatAr
             break
         basis[step + 1] = vector / off_diagonal[step]
     eigenvalues, eigenvectors = scipy.linalg.eigh_tridiagonal(diagonal[: step + 1], off_diagonal[:step])
-    return centre + half * np.clip(eigenvalues, -1.0, 1.0), total * eigenvectors[0] ** 2
+    return np.clip(centre + half * eigenvalues, points[0], points[-1]), total * eigenvectors[0] ** 2
 
 
 def reduce_beam(beam: Beam, nodes: int) -> Beam:
