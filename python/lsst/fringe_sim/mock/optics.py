@@ -185,7 +185,10 @@ class FlatFieldOptics:
         for name in ("roughness_nm", "spread_nm", "support_spread_um"):
             if not getattr(self, name) >= 0:
                 raise OutOfRangeError(name, getattr(self, name), "zero or a positive number")
-        if self.roughness_nm > 0.0 and self.position(self.rough_face) == 0:
+        # A sensor need not have the layer that is rough by default.
+        if self.rough_face == self.films[0].name or (
+            self.roughness_nm > 0.0 and self.position(self.rough_face) == 0
+        ):
             raise UnknownNameError("rough face", self.rough_face, [film.name for film in self.films[1:]])
         for shape, part in ((self.line_shape, 1.0), *self.other_lines):
             if shape not in LINE_SHAPES:

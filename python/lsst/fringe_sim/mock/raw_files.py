@@ -144,11 +144,11 @@ def _place_in_lsstcam(serial: str) -> Detector | None:
 
 
 def write_frame(
-    path: Path, header: fits.Header, camera: str, sensor: Detector, images: Sequence[NDArray[np.int32]]
+    path: Path, header: fits.Header, sensor: Detector, images: Sequence[NDArray[np.int32]]
 ) -> None:
     """Write one frame; the file appears under its name only when it is complete."""
     hdus = fits.HDUList([fits.PrimaryHDU(header=header)])
-    header_of = _amplifier_header if camera in LSST_LAYOUT else _own_amplifier_header
+    header_of = _amplifier_header if "LSST_NUM" in header else _own_amplifier_header
     for amp, image in zip(sensor.amplifiers, images, strict=True):
         hdus.append(fits.ImageHDU(image, header=header_of(amp, sensor.shape)))
     with all_or_nothing(path) as part, open(part, "wb") as stream:

@@ -330,7 +330,7 @@ def write_mock_flats(
         header = primary_header(camera, sensor, _nominal_celsius(setup), wavelength, number, start, seconds)
         exposure = MockExposure(folder / str(header["FILENAME"]), wavelength, level)
         images = readout.read(truth.expected_electrons(exposure), seconds, active, frame_rng)
-        write_frame(exposure.path, header, camera, sensor, images)
+        write_frame(exposure.path, header, sensor, images)
         written.append(exposure)
         if progress is not None:
             progress(exposure.path)
