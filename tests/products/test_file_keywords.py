@@ -103,7 +103,8 @@ def read_amplifiers(path: Path) -> Any:
 def read_plain(path: Path, bias: bool = True) -> Any:
     light = {"temperature_k": 183.0, "bandwidth_fwhm_nm": 2.0}
     cube = p.read_plain_flats([path, path.parent / "bias" / "b.fits"][: 1 + bias], **light)
-    arrays = (cube.image, cube.variance, cube.mask, cube.wavelength_nm, cube.exposures.temperature_k)
+    rows = cube.exposures
+    arrays = (cube.image, cube.variance, cube.mask, rows.wavelength_nm, rows.temperature_k, rows.dark_time_s)
     return [array.tobytes() for array in arrays]
 
 
@@ -170,7 +171,7 @@ VALUES: dict[tuple[str, str], tuple[int, tuple[Any, ...]]] = {
     ("plain flat", "WAVELNTH"): (0, (940.0,)),
     ("plain flat", "TEMPK"): (0, (170.0,)),
     ("plain flat", "CCDTEMP"): (0, (-100.0,)),
-    ("plain flat", "EXPTIME"): (0, (0.0, -1.0)),
+    ("plain flat", "EXPTIME"): (0, (0.0, -1.0, 7.0)),
     ("plain flat", "FILTER"): (0, ("r_57", "550nm")),
     ("plain flat", "BUNIT"): (0, ("electron", "jansky")),
     ("plain flat", "GAIN"): (0, (0.8, -1.0)),

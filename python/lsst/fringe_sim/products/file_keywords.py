@@ -84,7 +84,9 @@ FILE_KEYWORDS: tuple[FileKeyword, ...] = (
     FileKeyword(
         _PLAIN, "CCDTEMP", _FITS, USED, "temperature in °C where TEMPK is absent; else the same within 5 °C"
     ),
-    FileKeyword(_PLAIN, "EXPTIME", _FITS, CHECKED, "more than 0 s of a flat, 0 of a bias"),
+    FileKeyword(
+        _PLAIN, "EXPTIME", _FITS, USED, "seconds of dark current; more than 0 of a flat, 0 of a bias"
+    ),
     FileKeyword(_PLAIN, "FILTER", _FITS, CHECKED, "of a flat a filter that passes its light"),
     FileKeyword(_PLAIN, "BUNIT", _FITS, USED, "electron, or adu, else refused"),
     FileKeyword(_PLAIN, "GAIN", _FITS, USED, "electrons for each adu"),

@@ -82,6 +82,7 @@ class PlainImage:
     # wavelength_nm, temperature_k: of a flat; `None` where the temperature is not stated
     wavelength_nm: float | None = None
     temperature_k: float | None = None
+    exposure_s: float = 0.0  # 0 where it is not stated
     parts: tuple[Part, ...] = (Part(),)
 
     @classmethod
@@ -129,9 +130,10 @@ class PlainImage:
             return cls(header.source, kind, shape)
         if parts is None:
             _refuse_overscan(header, shape)
-        seconds = header.value("EXPTIME")
-        if seconds is not None and header.seconds_of_light("EXPTIME", seconds, kind) == 0 and kind == "flat":
-            raise header.refuse("EXPTIME", seconds, "more than 0 s for a flat")
+        stated = header.value("EXPTIME")
+        seconds = 0.0 if stated is None else header.seconds_of_light("EXPTIME", stated, kind)
+        if stated is not None and seconds == 0 and kind == "flat":
+            raise header.refuse("EXPTIME", stated, "more than 0 s for a flat")
         if kind == "flat":
             refuse_noiseless({NOISE: header.value(NOISE)}, header.source)
         return cls(
@@ -141,6 +143,7 @@ class PlainImage:
             detector=next(filter(None, map(header.text, SENSOR_NAMES)), ""),
             wavelength_nm=_wavelength(header) if kind == "flat" else None,
             temperature_k=_temperature(header) if kind == "flat" else None,
+            exposure_s=seconds,
             parts=parts or (Part._of(header),),
         )
 
@@ -286,7 +289,7 @@ def stack_plain_flats(
     variance = np.maximum(electrons, np.float32(1.0))
     for flat, own in zip(kept, variance, strict=True):
         own += flat.read_noise_e() ** 2 * np.float32(1.0 + (1.0 / n_bias if n_bias else 0.0))
-    return FringeCube.from_arrays(
+    cube = FringeCube.from_arrays(
         electrons,
         [flat.require_wavelength_nm() for flat in kept],
         variance,
@@ -297,6 +300,8 @@ def stack_plain_flats(
         detector=next((flat.detector for flat in kept if flat.detector), detector),
         metadata={"NBIAS": n_bias},
     )
+    seconds = np.array([flat.exposure_s for flat in kept])
+    return replace(cube, exposures=replace(cube.exposures, dark_time_s=seconds))
 
 
 def refuse_other_sensors(images: Sequence[PlainImage]) -> None:
