@@ -123,7 +123,8 @@ def amplifier_layouts(
     """
     images = [(number, hdu) for number, hdu in enumerate(hdus) if number > 0 and _is_image(hdu)]
     if lsst and len(images) != N_AMPLIFIERS:
-        raise FrameFormatError("number of amplifier HDUs", len(images), str(N_AMPLIFIERS), source=source)
+        allowed = f"{N_AMPLIFIERS} of an LSST sensor; flats of another camera name it in INSTRUME"
+        raise FrameFormatError("number of amplifier HDUs", len(images), allowed, source=source)
     sections = [
         _read_sections(number, hdu, order, source, lsst)
         for order, (number, hdu) in enumerate(images, start=1)
