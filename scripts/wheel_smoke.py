@@ -46,16 +46,18 @@ def speclite() -> None:
 
 
 def xarray() -> None:
-    """A map as netCDF and back."""
+    """A map as netCDF, which xarray reads."""
+    from xarray import load_dataset
+
     from lsst.fringe_sim.products import ThicknessMap
-    from lsst.fringe_sim.products.xarray_export import read_exported, to_xarray, write_netcdf
+    from lsst.fringe_sim.products.xarray_export import to_xarray, write_netcdf
 
     value = np.full((3, 4), 14.0, np.float32)
     thickness = ThicknessMap(value, value, value, 0.0 * value, np.zeros((3, 4), np.int32), layer="adhesive")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.nc"
         write_netcdf(to_xarray(thickness), path)
-        assert np.array_equal(read_exported(path).value, value)
+        assert np.array_equal(load_dataset(path)["thickness"], value)
 
 
 def htcondor() -> None:
@@ -67,7 +69,7 @@ def postgres() -> None:
     """The driver of the registry."""
     from sqlalchemy import create_engine
 
-    create_engine("postgresql://nobody@localhost/nothing")  # imports the driver, connects to nothing
+    create_engine("postgresql+psycopg2://nobody@localhost/nothing")  # imports the driver, connects to nothing
 
 
 EXTRAS: dict[str, Callable[[], None]] = {
