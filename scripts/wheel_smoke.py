@@ -61,8 +61,8 @@ def xarray() -> None:
 
 
 def htcondor() -> None:
-    """The plug-in of bps, and what it runs."""
-    importlib.import_module("lsst.ctrl.bps.htcondor")
+    """The service for bps, with the bindings of HTCondor."""
+    importlib.import_module("lsst.fringe_sim.middleware.bps_htcondor")
 
 
 def postgres() -> None:
