@@ -8,13 +8,14 @@ PYTEST_ARGS ?=
 SHARE ?= 1/1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint types checks unit slow docs wheel-check bench clean
+.PHONY: help demo test test-all lint types checks unit slow docs wheel-check newest bench clean
 
 help:
 	@echo "make demo   install into .venv and run the whole chain on the built-in sensor (a few minutes)"
 	@echo "make test   install into .venv with the test tools; lint, types, wheel and the quick tests"
 	@echo "make test-all  the same, then the slow tests"
 	@echo "make docs   the documentation as HTML in doc/_build, every warning an error"
+	@echo "make newest a smoke run with the newest packages, PYTHONS='python3.11 python3.12 python3.13'"
 	@echo "make bench  speed beside the peers, on the same work, in one run"
 	@echo "make clean  remove .venv, demo output and caches"
 
@@ -62,6 +63,11 @@ checks: types
 
 test-all: test
 	@$(MAKE) slow
+
+# Pythons for `make newest`, which takes the newest packages instead of the pinned ones.
+PYTHONS ?= $(PYTHON)
+newest:
+	bash scripts/check_newest.sh $(PYTHONS)
 
 bench: $(VENV)/.ready-test
 	$(BIN)/python -m benchmarks

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Build sdist and wheel, install the wheel in a clean environment, and run a piece of the chain from there.
+# Build sdist and wheel, install the wheel in a clean environment, and run a piece of the chain from there; then each
+# extra for users in an environment that has nothing but the wheel besides.
 # BIN: directory of the development environment's programs.
 set -euo pipefail
 bin=$(cd "${BIN:-.venv/bin}" && pwd)
@@ -20,5 +21,16 @@ echo "Installing $(basename "$wheel") in a clean environment"
 
 echo "Smoke run from the wheel, outside the checkout"
 mkdir "$work/run" && cd "$work/run"
-export PATH="$work/clean/bin:$PATH"
-"$work/clean/bin/python" "$root/scripts/wheel_smoke.py"
+PATH="$work/clean/bin:$PATH" "$work/clean/bin/python" "$root/scripts/wheel_smoke.py"
+
+# An extra sees the clean environment and adds what it lacks; no extra sees another.
+below=$("$work/clean/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+for extra in $("$work/clean/bin/python" "$root/scripts/wheel_smoke.py" --extras); do
+    echo "The extra $extra"
+    env="$work/extra-$extra"
+    "$bin/python" -m venv "$env"
+    echo "$below" >"$("$env/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/below.pth"
+    "$env/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile -c "$constraints" "$wheel[$extra]"
+    "$env/bin/python" "$root/scripts/wheel_smoke.py" --extra "$extra"
+    rm -rf "$env"
+done

@@ -1,9 +1,16 @@
-"""A piece of the chain, run from an installed wheel outside the checkout."""
+"""A piece of the chain, run from an installed wheel outside the checkout; or what one of its extras is for.
+
+usage: wheel_smoke.py [--extras | --extra NAME]
+"""
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
+import tempfile
+from collections.abc import Callable
+from importlib.metadata import metadata
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +36,49 @@ def run(*command: str) -> str:
     return done.stdout
 
 
+def speclite() -> None:
+    """A filter of speclite."""
+    from lsst.fringe_sim.instrument.bandpass import Bandpass
+
+    ours = Bandpass.from_name("lsst_y")
+    theirs = Bandpass.from_speclite("lsst2023-y", (ours.wavelength_nm, ours.detector), ours.air)
+    assert abs(theirs.transmission(1000.0) / ours.transmission(1000.0) - 1.0) < 0.1
+
+
+def xarray() -> None:
+    """A map as netCDF, which xarray reads."""
+    from xarray import load_dataset
+
+    from lsst.fringe_sim.products import ThicknessMap
+    from lsst.fringe_sim.products.xarray_export import to_xarray, write_netcdf
+
+    value = np.full((3, 4), 14.0, np.float32)
+    thickness = ThicknessMap(value, value, value, 0.0 * value, np.zeros((3, 4), np.int32), layer="adhesive")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.nc"
+        write_netcdf(to_xarray(thickness), path)
+        assert np.array_equal(load_dataset(path)["thickness"], value)
+
+
+def htcondor() -> None:
+    """The service for bps, with the bindings of HTCondor."""
+    importlib.import_module("lsst.fringe_sim.middleware.bps_htcondor")
+
+
+def postgres() -> None:
+    """The driver of the registry."""
+    from sqlalchemy import create_engine
+
+    create_engine("postgresql+psycopg2://nobody@localhost/nothing")  # imports the driver, connects to nothing
+
+
+EXTRAS: dict[str, Callable[[], None]] = {
+    each.__name__: each for each in (speclite, xarray, htcondor, postgres)
+}
+FOR_DEVELOPERS = {"test", "docs", "bench"}
+"""Extras that `make` installs into its own environment, where all tests run with them."""
+
+
 def main() -> None:
     """Raise or exit with a message if anything that the wheel must carry is missing."""
     assert "site-packages" in lsst.fringe_sim.__file__, lsst.fringe_sim.__file__
@@ -51,4 +101,11 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:] == ["--extras"]:
+        stated = set(metadata("lsst-fringe-sim").get_all("Provides-Extra") or ())
+        assert stated == EXTRAS.keys() | FOR_DEVELOPERS, stated
+        print("\n".join(EXTRAS))
+    elif sys.argv[1:2] == ["--extra"]:
+        EXTRAS[sys.argv[2]]()
+    else:
+        main()

@@ -20,6 +20,7 @@ ORDER = (
     "notebook",
     "compiled",
     "resources",
+    "descriptions",
     "optics",
     "instrument",
     "effects",
@@ -28,7 +29,17 @@ ORDER = (
     "algorithms",
 )
 ALLOWED: dict[str, set[str]] = {room: set(ORDER[: i + 1]) for i, room in enumerate(ORDER)}
-ALLOWED["mock"] = {"errors", "deprecation", "files", "compiled", "resources", "instrument", "effects", "mock"}
+ALLOWED["mock"] = {
+    "errors",
+    "deprecation",
+    "files",
+    "compiled",
+    "resources",
+    "descriptions",
+    "instrument",
+    "effects",
+    "mock",
+}
 ALLOWED["middleware"] = {
     "errors",
     "deprecation",
@@ -47,6 +58,7 @@ ALLOWED["report"] = {
     "style",
     "compiled",
     "resources",
+    "descriptions",
     "optics",
     "instrument",
     "products",

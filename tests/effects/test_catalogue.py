@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.cli.main import run
-from lsst.fringe_sim.effects import EFFECTS, effects_from, known_effects
+from lsst.fringe_sim.cli.main import cli, run
+from lsst.fringe_sim.effects import EFFECTS, catalogue, effects_from, known_effects
+from lsst.fringe_sim.effects.catalogue import ENTRY_POINTS
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.model.effects_override import effects_override, read_effects_override
 
 OWN = """
 from dataclasses import replace
@@ -99,6 +102,54 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert run(["effects", "delamination"]) == 1
     assert run(["effects", "--effects-from", str(tmp_path / "none.py")]) == 1
     assert "none.py" in capsys.readouterr().err
+
+
+def test_every_command_with_effects_takes_those_of_ones_own() -> None:
+    """But for the mock, whose catalogue shares no code with the model."""
+    context = click.Context(cli)
+    options = {
+        name: {option for parameter in command.params for option in parameter.opts}
+        for name in cli.list_commands(context)
+        if (command := cli.get_command(context, name)) is not None
+    }
+    with_effects = {name for name, found in options.items() if found & {"--effect", "--effects-file"}}
+    with_own = {name for name, found in options.items() if "--effects-from" in found}
+    assert {"fit", "sky", "discover"} <= with_own
+    assert with_effects - with_own == {"mock-flats", "mock-visits"}
+
+
+def test_an_override_names_the_catalogue_that_it_needs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, override = str(written(tmp_path)), tmp_path / "effects.py"
+    with effects_from(own):
+        text = effects_override({"delamination.gap": 120.0, "bandwidth.fwhm": 2.2}, "ts8_e2v", "named")
+        assert read_effects_override(text) == {"delamination.gap": 120.0, "bandwidth.fwhm": 2.2}
+    override.write_text(text)
+    plan = ["plan-flats", "--wavelengths", "900,960", "--dry-run", "--effects-file", str(override)]
+    assert run(plan) == 1
+    assert f"--effects-from {own}" in capsys.readouterr().err
+    assert run([*plan, "--effects-from", own]) == 0
+    assert "Needs" not in effects_override({"bandwidth.fwhm": 2.2}, "ts8_e2v", "named")
+
+
+def test_an_installed_package_offers_effects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written(tmp_path).rename(tmp_path / "installed_effects.py")
+    info = tmp_path / "installed_effects-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: installed-effects\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(f"[{ENTRY_POINTS}]\nours = installed_effects:EFFECTS\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    catalogue._installed.cache_clear()
+    try:
+        assert known_effects()[-1].name == "delamination"
+        text = effects_override({"delamination.gap": 120.0}, "ts8_e2v", "named")
+    finally:
+        catalogue._installed.cache_clear()
+        monkeypatch.undo()
+    assert known_effects() == EFFECTS
+    with pytest.raises(InputError, match="entry point ours = installed_effects:EFFECTS"):
+        read_effects_override(text)
 
 
 def test_what_acts_on_the_spectrum_is_of_the_sky_alone() -> None:

@@ -82,10 +82,29 @@ class Plain:
         fits.PrimaryHDU(image, fits.Header(self.cards | (cards or {}))).writeto(path)
 
 
-def read_plain(path: Path) -> Any:
+class Amplifiers:
+    """A flat of a sensor with two amplifiers of 3 by 2 pixels and an overscan of one."""
+
+    def write_fits(self, path: Path) -> None:
+        first = fits.PrimaryHDU(header=fits.Header({"INSTRUME": "own", "IMGTYPE": "FLAT", "MONOWL": 950.0}))
+        images = []
+        for number, detsec in enumerate(("[1:2,1:3]", "[4:3,1:3]")):
+            pixels = (np.arange(9, dtype=np.int16) ** 2 + 10 * number).reshape(3, 3) + 800
+            cards = {"DATASEC": "[1:2,1:3]", "DETSEC": detsec, "DETSIZE": "[1:4,1:3]", "BUNIT": "adu"}
+            images.append(fits.ImageHDU(pixels, fits.Header(cards | {"GAIN": 0.7, "RDNOISE": 5.0})))
+            images[-1].header["SATURATE"] = 900.0
+        fits.HDUList([first, *images]).writeto(path)
+
+
+def read_amplifiers(path: Path) -> Any:
+    return read_plain(path, bias=False)
+
+
+def read_plain(path: Path, bias: bool = True) -> Any:
     light = {"temperature_k": 183.0, "bandwidth_fwhm_nm": 2.0}
-    cube = p.read_plain_flats([path, path.parent / "bias" / "b.fits"], **light)
-    arrays = (cube.image, cube.variance, cube.mask, cube.wavelength_nm, cube.exposures.temperature_k)
+    cube = p.read_plain_flats([path, path.parent / "bias" / "b.fits"][: 1 + bias], **light)
+    rows = cube.exposures
+    arrays = (cube.image, cube.variance, cube.mask, rows.wavelength_nm, rows.temperature_k, rows.dark_time_s)
     return [array.tobytes() for array in arrays]
 
 
@@ -120,6 +139,7 @@ FILES: dict[str, tuple[Callable[[], Any], Callable[[Path], Any]]] = {
     "fringe cube": (lambda: make.cube(mask=np.zeros((2, 3, 4), np.int32)), read_cube),
     "sky frame": (lambda: make.sky(mask=GOOD, metadata=MODEL), read_sky),
     "plain flat": (Plain, read_plain),
+    "flat of amplifiers": (Amplifiers, read_amplifiers),
     "observed frame": (Observed, read_observed),
     "any product": (
         lambda: make.thickness(mask=np.eye(3, 4, dtype=np.int32) * p.mask_bits("SLIP")),
@@ -151,7 +171,7 @@ VALUES: dict[tuple[str, str], tuple[int, tuple[Any, ...]]] = {
     ("plain flat", "WAVELNTH"): (0, (940.0,)),
     ("plain flat", "TEMPK"): (0, (170.0,)),
     ("plain flat", "CCDTEMP"): (0, (-100.0,)),
-    ("plain flat", "EXPTIME"): (0, (0.0, -1.0)),
+    ("plain flat", "EXPTIME"): (0, (0.0, -1.0, 7.0)),
     ("plain flat", "FILTER"): (0, ("r_57", "550nm")),
     ("plain flat", "BUNIT"): (0, ("electron", "jansky")),
     ("plain flat", "GAIN"): (0, (0.8, -1.0)),
@@ -161,6 +181,14 @@ VALUES: dict[tuple[str, str], tuple[int, tuple[Any, ...]]] = {
     **{("plain flat", name): (0, ("S1",)) for name in SENSOR_NAMES},
     ("plain flat", "DATASEC"): (0, ("[2:4,1:3]",)),
     ("plain flat", "TRIMSEC"): (0, ("[1:4,1:2]", "words")),
+    ("flat of amplifiers", "INSTRUME"): (0, ("LSST_CAMERA",)),
+    ("flat of amplifiers", "DATASEC"): (1, ("[2:3,1:3]", "[1:3,1:3]")),
+    ("flat of amplifiers", "DETSEC"): (1, ("[2:1,1:3]", "[3:4,1:3]")),
+    ("flat of amplifiers", "DETSIZE"): (1, ("[1:5,1:3]",)),
+    ("flat of amplifiers", "BUNIT"): (1, ("electron",)),
+    ("flat of amplifiers", "GAIN"): (1, (0.8, -1.0)),
+    ("flat of amplifiers", "RDNOISE"): (1, (9.0, -9.0)),
+    ("flat of amplifiers", "SATURATE"): (1, (810.0,)),
     ("observed frame", "BUNIT"): (1, ("adu",)),
     **{("observed frame", name): (1, ("S1",)) for name in (*SENSOR_NAMES, "EXTNAME", *FILTER_NAMES)},
     **{("observed frame", name): (1, (True, "fringe.fits")) for name in CORRECTED_BY},

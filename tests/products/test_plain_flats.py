@@ -214,3 +214,86 @@ def test_a_dry_run_reads_no_pixels(flats: Path, tmp_path: Path, capsys) -> None:
     assert not (tmp_path / "out").exists()
     assert run(words) == 1
     assert ".fits: file is" in capsys.readouterr().err
+
+
+def amplifiers(path: Path, electrons: np.ndarray, **cards: Any) -> Path:
+    """A frame of three amplifiers over each other, read to the left, to the right and downwards, with overscan."""
+    header = fits.Header({"INSTRUME": "MyCam", "DETNAME": "one", "IMGTYPE": "FLAT", "CCDTEMP": -90.0} | cards)
+    hdus = [fits.PrimaryHDU(header=header)]
+    ny, nx = electrons.shape
+    senses = (
+        (slice(None), slice(None)),
+        (slice(None), slice(None, None, -1)),
+        (slice(None, None, -1), slice(None)),
+    )
+    for number, (gain, sense) in enumerate(zip((0.5, 1.0, 2.0), senses, strict=True)):
+        rows = slice(ny // 3 * number, ny // 3 * (number + 1))
+        counts = np.full((ny // 3 + 2, nx + 9), 1000 + 100 * number, np.int32)
+        counts[1:-1, 4:-5] += np.rint(electrons[rows][sense] / gain).astype(np.int32)
+        x, y = (1, nx), (rows.start + 1, rows.stop)
+        x, y = (x[::-1] if number == 1 else x), (y[::-1] if number == 2 else y)
+        own = {
+            "EXTNAME": f"AMP{number}",
+            "DATASEC": f"[5:{nx + 4},2:{ny // 3 + 1}]",
+            "DETSEC": f"[{x[0]}:{x[1]},{y[0]}:{y[1]}]",
+            "BUNIT": "ADU",
+            "GAIN": gain,
+            "RDNOISE": 3.0 + number,
+            "SATURATE": 5000.0,
+        }
+        hdus.append(fits.ImageHDU(counts, fits.Header(own)))
+    fits.HDUList(hdus).writeto(path)
+    return path
+
+
+def test_any_number_of_amplifiers(tmp_path: Path) -> None:
+    truth = 2.0 * np.arange(9 * 7, dtype=float).reshape(9, 7) + 400.0
+    truth[1, 2] = 4000.0  # 8000 counts of the first amplifier, and 4000 of the second
+    truth[4, 2] = 4000.0
+    path = amplifiers(tmp_path / "flat.fits", truth, MONOWL=950.0)
+    cube = read_plain_flats([path], temperature_k=170.0, bandwidth_fwhm_nm=2.0)
+    np.testing.assert_array_equal(cube.image[0], truth)
+    noise = np.repeat([3.0, 4.0, 5.0], 3)[:, np.newaxis]
+    np.testing.assert_allclose(cube.variance[0], truth + noise**2)
+    assert set(zip(*(axis.tolist() for axis in np.nonzero(cube.mask[0])), strict=True)) == {(1, 2), (4, 2)}
+    assert cube.detector == "one"
+    np.testing.assert_allclose(cube.exposures.temperature_k, 183.15)
+
+
+def test_bias_frames_of_amplifiers_are_subtracted(tmp_path: Path) -> None:
+    pattern = np.tile([0.0, 2.0, 4.0, 2.0, 0.0, 4.0, 2.0], (9, 1))
+    truth = np.full((9, 7), 1000.0) + pattern
+    flat = amplifiers(tmp_path / "flat.fits", truth, MONOWL=950.0)
+    bias = amplifiers(tmp_path / "bias.fits", pattern, IMGTYPE="BIAS")
+    cube = read_plain_flats([flat, bias], temperature_k=170.0, bandwidth_fwhm_nm=2.0)
+    np.testing.assert_array_equal(cube.image[0], 1000.0)
+    assert cube.metadata["NBIAS"] == 1
+
+
+@pytest.mark.parametrize(
+    ("cards", "words"),
+    [
+        ({"INSTRUME": None}, "INSTRUME, which names the camera"),
+        ({"INSTRUME": "LSSTCam"}, "INSTRUME, which names the camera"),
+        ({"LSST_NUM": "E2V-CCD250-321"}, "INSTRUME, which names the camera"),
+        ({"MONOWL": None}, "MONOWL"),
+        ({"GAIN": 0.7}, "GAIN"),
+    ],
+)
+def test_frames_of_amplifiers_that_are_none(tmp_path: Path, cards: dict[str, Any], words: str) -> None:
+    path = amplifiers(tmp_path / "flat.fits", np.full((9, 7), 500.0), MONOWL=950.0)
+    with fits.open(path, mode="update") as hdus:
+        for keyword, value in cards.items():
+            if value is None:
+                del hdus[0].header[keyword]
+            else:
+                hdus[0].header[keyword] = value
+    with pytest.raises(InputError, match=words):
+        read_plain_flats([path], temperature_k=170.0, bandwidth_fwhm_nm=2.0)
+
+
+def test_amplifiers_that_leave_a_gap(tmp_path: Path) -> None:
+    path = amplifiers(tmp_path / "flat.fits", np.full((9, 7), 500.0), MONOWL=950.0)
+    fits.setval(path, "DETSIZE", value="[1:7,1:12]", ext=0)
+    with pytest.raises(InputError, match="DETSEC"):
+        read_plain_flats([path], temperature_k=170.0, bandwidth_fwhm_nm=2.0)

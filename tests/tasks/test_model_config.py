@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from lsst.fringe_sim.tasks import (
     SensorConfig,
 )
 from lsst.fringe_sim.tasks.model_config import ModelChoice
+
+OWN = Path(__file__).resolve().parents[2] / "doc" / "tutorials" / "own_sensor"
 
 
 def config(setup: str = "ts8_e2v", **effects: float) -> FringeModelConfig:
@@ -242,3 +245,14 @@ def test_an_override_that_was_changed_is_refused(tmp_path: Path, change: tuple[s
     assert change[0] in text
     with pytest.raises(FieldValidationError, match="written_effects"):
         apply_override(tmp_path, text.replace(*change))
+
+
+def test_a_set_up_may_be_a_file(tmp_path: Path) -> None:
+    shutil.copytree(OWN / "ccd290", tmp_path / "own")
+    config = EpoxyFitConfig()
+    config.setup = str(tmp_path / "own" / "flats.yaml")
+    config.validate()
+    assert config.choice().model().setup.sensor().serial == "CCD290-01"
+    config.setup = str(tmp_path / "own" / "nothing.yaml")
+    with pytest.raises(FieldValidationError, match=r"nothing\.yaml"):
+        config.validate()

@@ -92,7 +92,7 @@ def template_pair(
             ),
             mask=mask,
             variance=np.zeros(mask.shape, np.float32),
-            physical_filter=model.setup.bandpass,
+            physical_filter=model.setup.filter_name,
             creation_datetime=creation_datetime,
             metadata={**cards, "TEMPLATE": number, "TEMPKIND": kind},
             detector=detector,

@@ -295,9 +295,9 @@ def _check_frames(
     first = first_of_alike(loaders, names, "frames of the sky")
     if layer is not None and first.shape != layer.shape:
         raise InputError("shape of the frames", first.shape, f"{layer.shape}, that of the thickness map")
-    if other_light(setup.bandpass, first.physical_filter, is_model=True):
+    if other_light(setup.filter_name, first.physical_filter, is_model=True):
         raise InputError(
-            "filter of the frames", first.physical_filter, f"{setup.bandpass}, that of the set-up"
+            "filter of the frames", first.physical_filter, f"{setup.filter_name}, that of the set-up"
         )
 
 

@@ -35,7 +35,7 @@ from ..products.thickness_map import thickness_span_um
 from ..report.focal_plane_page import write_focal_plane_page
 from .inputs import read_settings, read_thickness, sky_settings
 from .output import OutputFolder, origin_of, output_folder
-from .parameters import effects_file_option
+from .parameters import effects_file_option, effects_from_option
 from .progress import progress
 
 __all__ = ["focal_plane"]
@@ -90,6 +90,7 @@ class _SensorMapType(click.ParamType):
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of stand-ins and nights.")
 @effects_file_option()
+@effects_from_option
 @output_folder(
     "Folder for tables, figure and report.",
     "cells.ecsv",

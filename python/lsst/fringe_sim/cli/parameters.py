@@ -151,8 +151,7 @@ class SetupType(click.ParamType):
         if isinstance(value, Setup):
             return value
         text = str(value)
-        is_file = text.lower().endswith((".yaml", ".yml"))
-        setup = Setup.from_file(text) if is_file else Setup.from_name(text)
+        setup = Setup.from_name(text)
         if self.kind and setup.kind != self.kind:
             raise InputError("set-up", text, self.wanted)
         return setup

@@ -208,6 +208,8 @@ def _compared(name: str, stated: str) -> str:
     from ..resources import revision
 
     folder, _, file = name.rpartition("/")
+    if folder == "own":
+        return "not shipped"
     try:
         return "same" if revision(folder, file) == stated else "differs"
     except (UnknownNameError, OSError):
@@ -280,7 +282,7 @@ def _as_text(record: Mapping[str, Any]) -> str:
         lines.append("  tables:")
         lines += [
             f"    {_short(item['table'])} {_short(item['revision'])}"
-            + ("" if item["here"] == "same" else f" ({item['here']} here)")
+            + ("" if item["here"] in ("same", "not shipped") else f" ({item['here']} here)")
             for item in record["tables"]
         ]
     if record["inputs"]:

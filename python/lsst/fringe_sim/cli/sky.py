@@ -166,7 +166,7 @@ def sky(
         "read_noise_e": 0.0 if noiseless else sensor.read_noise,
         "seed": None if noiseless else seed,
         "detector": sensor.name,
-        "physical_filter": setup.bandpass,
+        "physical_filter": setup.filter_name,
     }
     exposure = Exposure(exptime, airmass or setup.airmass, history, level == "measured", flat)
     layers = Layers(layer, silicon, section, phase_sigma)
@@ -280,8 +280,10 @@ def _frames(
     if night is not None:
         scales = [night.band_scale(time, response.bands) for time in range(len(night))]
     levels = None
-    if exposure.measured:
-        band = Bandpass.from_name(model.setup.bandpass)
+    band = Bandpass.from_name(model.setup.bandpass)
+    if exposure.measured and not band.detector.size:
+        click.echo("no quantum efficiency was measured: the level is what the stack itself detects", err=True)
+    elif exposure.measured:
         levels = [throughput_electrons(dark.with_band_scale(scale), band, model, seconds) for scale in scales]
     if night is not None:
         return simulate_night(layer, model, response, night, mean_electrons=levels, **common), scales
@@ -354,14 +356,17 @@ def map_header(thickness: str) -> Mapping[str, Any]:
 
 
 def laboratory_contrast(header: Mapping[str, Any], source: str) -> tuple[float, float] | None:
-    """Contrast of the laboratory flats over that of the model, and its uncertainty, if the header of a map tells."""
+    """Contrast of the laboratory flats over that of the model, and its uncertainty, if the header of a map tells.
+
+    None of a map whose fit held it at that of the model.
+    """
     if "CONTRAST" not in header or "CONTRSIG" not in header:
         return None
     contrast, sigma = (to_number(name, header[name]) for name in ("CONTRAST", "CONTRSIG"))
     if not (0.0 <= contrast < math.inf and 0.0 <= sigma < math.inf):
         found = (contrast, sigma)
         raise InputError("CONTRAST, CONTRSIG", found, "finite and not negative", source=source)
-    return contrast, sigma
+    return None if (contrast, sigma) == (1.0, 0.0) else (contrast, sigma)  # it was held
 
 
 def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:

@@ -10,7 +10,7 @@ from .active import (
 )
 from .at_telescope import EpoxyTemperature, SensorTemperature
 from .base import Effect, Parameter, Residuals, ResponseContext, SearchHints
-from .catalogue import effects_from, known_effects
+from .catalogue import catalogue_of, effects_from, known_effects
 from .geometry import AMPLIFIERS, ImageGeometry
 from .illumination import ChromaticIllumination, IlluminationPattern, Vignetting
 from .light import (
@@ -77,6 +77,7 @@ __all__ = [
     "apply_to_response",
     "apply_to_sky",
     "apply_to_system",
+    "catalogue_of",
     "effects_from",
     "known_effects",
 ]

@@ -16,14 +16,15 @@ from typing import Any
 from ..errors import InputError
 from .base import Effect
 
-__all__ = ["ENTRY_POINTS", "effects_from", "known_effects"]
+__all__ = ["ENTRY_POINTS", "catalogue_of", "effects_from", "known_effects"]
 
 ENTRY_POINTS = "lsst.fringe_sim.effects"
 """Group of the entry points by which an installed package offers effects: each names a sequence of `Effect`."""
 
 _STATED = ("name", "title", "acts_on", "parameters", "reference")
 
-_own: ContextVar[tuple[Effect, ...]] = ContextVar("_own", default=())
+_own: ContextVar[tuple[tuple[str, Effect], ...]] = ContextVar("_own", default=())
+"""Effects of `effects_from`, each with the file or module that it is from."""
 
 
 def known_effects(given: Iterable[Effect] | None = None) -> tuple[Effect, ...]:
@@ -45,7 +46,17 @@ def known_effects(given: Iterable[Effect] | None = None) -> tuple[Effect, ...]:
     InputError
         An installed package offers something else, or a name that is taken.
     """
-    return (*_installed(), *_own.get()) if given is None else tuple(given)
+    if given is not None:
+        return tuple(given)
+    return tuple(effect for _, effect in (*_installed(), *_own.get()))
+
+
+def catalogue_of(name: str) -> str:
+    """Where an effect is from: a file or module of `effects_from`, an entry point, or "" for the package itself.
+
+    It is "" for a name that is not known here, too.
+    """
+    return next((source for source, effect in (*_installed(), *_own.get()) if effect.name == name), "")
 
 
 @contextmanager
@@ -73,7 +84,7 @@ def effects_from(source: str | Path) -> Iterator[tuple[Effect, ...]]:
     if offered is None:
         raise InputError("EFFECTS", "missing", "a sequence of effects in the module", source=str(source))
     added = _checked(offered, known_effects(), str(source))
-    token = _own.set((*_own.get(), *added))
+    token = _own.set((*_own.get(), *((str(source), effect) for effect in added)))
     try:
         yield added
     finally:
@@ -81,12 +92,14 @@ def effects_from(source: str | Path) -> Iterator[tuple[Effect, ...]]:
 
 
 @functools.cache
-def _installed() -> tuple[Effect, ...]:
+def _installed() -> tuple[tuple[str, Effect], ...]:
     from . import EFFECTS
 
-    found = EFFECTS
+    found = tuple(("", effect) for effect in EFFECTS)
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda item: item.name):
-        found += _checked(entry.load(), found, f"entry point {entry.name} = {entry.value}")
+        source = f"entry point {entry.name} = {entry.value}"
+        known = tuple(effect for _, effect in found)
+        found += tuple((source, effect) for effect in _checked(entry.load(), known, source))
     return found
 
 

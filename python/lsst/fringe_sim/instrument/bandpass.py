@@ -9,13 +9,15 @@ and air are divided out.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..descriptions import is_file_name, read_description, read_table_beside
 from ..errors import (
     InputError,
     MissingPackageError,
@@ -23,9 +25,13 @@ from ..errors import (
     ResourceError,
     UnknownNameError,
     named_units,
+    printable_name,
 )
 from ..notebook import OneLine
-from ..resources import list_resources, read_table, read_yaml
+from ..resources import first_line, list_resources, read_table, read_yaml
+
+if TYPE_CHECKING:
+    from astropy.table import Table
 
 __all__ = ["Atmosphere", "Bandpass", "bandpass_names"]
 
@@ -92,7 +98,7 @@ class Bandpass(OneLine):
     wavelength_nm, optics : `numpy.ndarray`, shape ``(K,)``
         Transmission of mirrors, lenses, window and filter.
     detector : `numpy.ndarray`, shape ``(K,)``
-        The quantum efficiency that was left out; for comparison and for zero points.
+        The quantum efficiency that was left out; for comparison and for zero points. Shape ``(0,)`` if not known.
     air : `Atmosphere`
         The air above the telescope.
     """
@@ -105,26 +111,60 @@ class Bandpass(OneLine):
 
     @classmethod
     def from_name(cls, name: str) -> Bandpass:
-        """Bandpass of ``data/bandpasses/<name>.yaml``.
+        """Bandpass of ``data/bandpasses/<name>.yaml``; a name that ends in ``.yaml`` is that of a file.
 
         Raises
         ------
         UnknownNameError
             There is no such bandpass.
         """
+        if is_file_name(name):
+            return cls.from_file(name)
         if name not in bandpass_names():
             raise UnknownNameError("bandpass", name, bandpass_names())
         content = read_yaml("bandpasses", f"{name}.yaml")
         try:
-            table = read_table("sky", content["table"])
-            wavelength = np.asarray(table["wavelength"], dtype=float)
-            optics = np.prod(
-                [np.asarray(table[factor], dtype=float) for factor in content["factors"]], axis=0
-            )
-            detector = _detector(content["detector"], table, wavelength)
-            air = _atmosphere(wavelength, table, content["atmosphere"])
+            return cls._of(name, content, lambda file: read_table("sky", file))
         except KeyError as error:
             raise ResourceError(f"data/bandpasses/{name}.yaml: wrong or missing entry {error}") from error
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Bandpass:
+        """Bandpass that a YAML file describes, laid out like the shipped ones; it is named after the file.
+
+        Its tables lie beside it, or are shipped ones. Without ``detector`` the quantum efficiency is not known.
+
+        Raises
+        ------
+        InputError
+            There is no such file, or it does not describe a bandpass.
+        """
+        source = str(path)
+        content = read_description(path, "bandpass")
+
+        def read(file: str) -> Table:
+            beside = read_table_beside(path, file)
+            return read_table("sky", file) if beside is None else beside
+
+        try:
+            return cls._of(printable_name("name of the bandpass", Path(path).stem), content, read)
+        except InputError as error:
+            raise (error if error.source else error.in_source(source)) from None
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            allowed = (
+                "every entry and column that lsst_y.yaml and its table have, but for detector and speclite"
+            )
+            raise InputError("bandpass", first_line(error), allowed, source=source) from None
+
+    @classmethod
+    def _of(cls, name: str, content: Mapping[str, Any], read: Callable[[str], Table]) -> Bandpass:
+        table = read(content["table"])
+        wavelength = np.asarray(table["wavelength"].quantity.to_value("nm"), dtype=float)
+        optics = np.prod([np.asarray(table[factor], dtype=float) for factor in content["factors"]], axis=0)
+        detector = np.zeros(0)
+        if "detector" in content:
+            detector = _detector(content["detector"], table, wavelength, read)
+        air = _atmosphere(wavelength, table, content["atmosphere"])
         return cls(content.get("filter", name), wavelength, optics, detector, air)
 
     @classmethod
@@ -181,7 +221,17 @@ class Bandpass(OneLine):
 
     @named_units
     def quantum_efficiency(self, wavelength_nm: ArrayLike) -> FloatArray:
-        """Quantum efficiency that the throughput tables assume; zero outside the table."""
+        """Quantum efficiency that the throughput tables assume; zero outside the table.
+
+        Raises
+        ------
+        InputError
+            The bandpass does not state one.
+        """
+        if not self.detector.size:
+            raise InputError(
+                "quantum efficiency", None, "a bandpass that states its detector", source=self.name
+            )
         return _inside(wavelength_nm, self.wavelength_nm, self.detector)
 
     def support(self, threshold: float = 1e-4) -> tuple[float, float]:
@@ -199,13 +249,14 @@ def bandpass_names() -> tuple[str, ...]:
     return tuple(entry.removesuffix(".yaml") for entry in list_resources("bandpasses"))
 
 
-def _detector(content: Any, table: Mapping[str, Any], wavelength: FloatArray) -> FloatArray:
+def _detector(content: Any, table: Table, wavelength: FloatArray, read: Callable[[str], Table]) -> FloatArray:
     """Quantum efficiency: a column of the table of the optics, or the product of columns of a table of its own."""
     if isinstance(content, str):
         return np.asarray(table[content], dtype=float)
-    own = read_table("sky", content["table"])
+    own = read(content["table"])
     factors = [np.asarray(own[name], dtype=float) for name in content["columns"]]
-    return np.interp(wavelength, np.asarray(own["wavelength"], dtype=float), np.prod(factors, axis=0))
+    nodes = own["wavelength"].quantity.to_value("nm")
+    return np.interp(wavelength, np.asarray(nodes, dtype=float), np.prod(factors, axis=0))
 
 
 def _atmosphere(wavelength: FloatArray, table: Mapping[str, Any], content: Mapping[str, Any]) -> Atmosphere:

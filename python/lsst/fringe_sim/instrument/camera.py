@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ..descriptions import is_file_name
 from ..errors import InputError, OutOfRangeError, UnknownNameError, printable_name
 from ..notebook import OneLine
 from ..resources import first_line, list_resources, read_table, read_user_yaml, read_yaml
@@ -51,14 +52,14 @@ class Camera(OneLine):
 
     @classmethod
     def from_name(cls, name: str) -> Camera:
-        """Return one of the cameras shipped with the package.
+        """Return one of the cameras shipped with the package; a name that ends in ``.yaml`` is that of a file.
 
         Raises
         ------
         UnknownNameError
             There is no such camera; near misses are offered.
         """
-        return _load_camera(name)
+        return cls.from_file(name) if is_file_name(name) else _load_camera(name)
 
     @classmethod
     def from_file(cls, path: str | Path) -> Camera:
@@ -371,8 +372,8 @@ def _from_mapping(name: str, content: Mapping[str, Any]) -> Camera:
 
 
 def _yaml_amplifiers(content: Mapping[str, Any]) -> tuple[tuple[Amplifier, ...], str]:
-    vendor = _vendor(str(content["vendor"]))
     if content.get("readout") == READOUT_FROM_LSSTCAM:
+        vendor = _vendor(str(content["vendor"]))
         source = f"median of the {vendor} science sensors of LSSTCam"
         return _lsst_amplifiers(str(content["layout"]), _median_readout(vendor)), source
     amplifiers = tuple(
@@ -400,21 +401,27 @@ def _yaml_detector(
     return Detector(
         id=int(entry["id"]),
         name=str(entry["name"]),
-        raft=str(entry["raft"]),
-        slot=str(entry["slot"]),
-        vendor=_vendor(str(content["vendor"])),
+        raft=str(entry.get("raft", "")),
+        slot=str(entry.get("slot", "")),
+        vendor=_own_vendor(content),
         kind="science",
-        serial=str(entry["serial"]),
-        raft_serial=str(entry["raft_serial"]),
-        x_mm=float(entry["x_mm"]),
-        y_mm=float(entry["y_mm"]),
-        field_x_deg=float(entry["field_x_deg"]),
-        field_y_deg=float(entry["field_y_deg"]),
+        serial=str(entry.get("serial", "")),
+        raft_serial=str(entry.get("raft_serial", "")),
+        x_mm=float(entry.get("x_mm", 0.0)),
+        y_mm=float(entry.get("y_mm", 0.0)),
+        field_x_deg=float(entry.get("field_x_deg", 0.0)),
+        field_y_deg=float(entry.get("field_y_deg", 0.0)),
         yaw_deg=0.0,
         pixel_um=_positive("pixel_um", content["pixel_um"]),
         amplifiers=amplifiers,
         readout_source=source,
     )
+
+
+def _own_vendor(content: Mapping[str, Any]) -> str:
+    """Vendor of the sensors of a camera, which may be any; known ones as they are spelled here."""
+    name = printable_name("vendor", str(content["vendor"]).strip())
+    return VENDORS.get(name.upper(), name)
 
 
 def _positive(field: str, value: Any) -> float:

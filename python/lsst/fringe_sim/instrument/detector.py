@@ -144,6 +144,11 @@ class Detector(OneLine):
         )
 
     @property
+    def own_layout(self) -> bool:
+        """Whether raw frames of the sensor are not in the LSST layout."""
+        return any(amp.raw is None for amp in self.amplifiers)
+
+    @property
     def gain(self) -> float:
         """Mean gain of the amplifiers, electrons per ADU."""
         return float(np.mean([amp.gain for amp in self.amplifiers]))

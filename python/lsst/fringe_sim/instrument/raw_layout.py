@@ -115,20 +115,25 @@ class _Sections:
 
 
 def amplifier_layouts(
-    hdus: Sequence[Any], source: str
+    hdus: Sequence[Any], source: str, *, lsst: bool = True
 ) -> tuple[tuple[AmplifierLayout, ...], tuple[int, int]]:
-    """Layout of every amplifier, and rows and columns of the assembled CCD."""
+    """Layout of every amplifier, and rows and columns of the assembled CCD.
+
+    ``lsst``: 16 amplifiers, named as those of LSST sensors; else any number of them, with names of their own.
+    """
     images = [(number, hdu) for number, hdu in enumerate(hdus) if number > 0 and _is_image(hdu)]
-    if len(images) != N_AMPLIFIERS:
-        raise FrameFormatError("number of amplifier HDUs", len(images), str(N_AMPLIFIERS), source=source)
+    if lsst and len(images) != N_AMPLIFIERS:
+        allowed = f"{N_AMPLIFIERS} of an LSST sensor; flats of another camera name it in INSTRUME"
+        raise FrameFormatError("number of amplifier HDUs", len(images), allowed, source=source)
     sections = [
-        _read_sections(number, hdu, order, source) for order, (number, hdu) in enumerate(images, start=1)
+        _read_sections(number, hdu, order, source, lsst)
+        for order, (number, hdu) in enumerate(images, start=1)
     ]
     _refuse_repeated([amp.name for amp in sections], source)
     shape = _detector_shape(hdus[0].header, [hdu.header for _, hdu in images], sections, source)
     for amp in sections:
         _refuse_outside(f"{amp.name} DETSEC", amp.detsec, shape, source)
-    mirrored = _detsec_is_mirrored(sections, shape, source)
+    mirrored = lsst and _detsec_is_mirrored(sections, shape, source)
     _refuse_gaps(sections, shape, source)
     return tuple(_layout(amp, shape, mirrored) for amp in sections), shape
 
@@ -145,9 +150,9 @@ def image_shape(hdu: Any, source: str) -> tuple[int, int]:
     return shape[0], shape[1]
 
 
-def _read_sections(number: int, hdu: Any, order: int, source: str) -> _Sections:
-    channel = _channel(hdu.header, order, source)
-    name = _amplifier_name(hdu.name, channel)
+def _read_sections(number: int, hdu: Any, order: int, source: str, lsst: bool) -> _Sections:
+    channel = _channel(hdu.header, order, source) if lsst else order
+    name = _amplifier_name(hdu.name, channel) if lsst else hdu.name or f"A{order}"
     raw_shape = image_shape(hdu, source)
     datasec, detsec = (
         Section.parse(header_value(hdu.header, keyword), keyword=f"{name} {keyword}", source=source)

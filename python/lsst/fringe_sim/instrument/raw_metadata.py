@@ -19,7 +19,7 @@ from .raw_header import DeclaredHeader, header_value
 from .raw_times import DAY_ROLLOVER_H, begin_of_exposure, day_and_sequence, exposure_id, time_scale
 from .stated_facts import NO_READING_C, SAME_SECONDS, refuse_contradictions, refuse_other_filter
 
-__all__ = ["DAY_ROLLOVER_H", "OBSERVATION_TYPES", "RawMetadata", "header_value"]
+__all__ = ["DAY_ROLLOVER_H", "OBSERVATION_TYPES", "RawMetadata", "header_value", "is_of_lsst"]
 
 OBSERVATION_TYPES: Mapping[str, str] = {
     "BIAS": "bias",
@@ -237,6 +237,11 @@ _CAMERAS = {
     "TS8": "ts8",
     "MONOCAM": "monocam",
 }
+
+
+def is_of_lsst(instrument: str) -> bool:
+    """Whether ``INSTRUME`` names a camera or test stand whose frames are in the LSST layout."""
+    return instrument.upper() in _CAMERAS
 
 
 def _camera(header: DeclaredHeader) -> str:

@@ -1,14 +1,15 @@
-"""Set-ups: which sensor, at which temperature, under which light. Each is one YAML file in ``data/setups``."""
+"""Set-ups: which sensor, at which temperature, under which light. Each is one YAML file, shipped or from outside."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, UnknownNameError, named_units, printable_name, to_number
+from ..descriptions import Description, files_of, is_file_name, with_files_beside
+from ..errors import InputError, UnknownNameError, named_units, printable_name
 from ..notebook import InNotebook
 from ..optics.illumination import (
     Beam,
@@ -17,6 +18,7 @@ from ..optics.illumination import (
     SpectralProfile,
     TriangularProfile,
 )
+from ..optics.media import read_media
 from ..optics.stack import LayerStack
 from ..resources import list_resources, read_user_yaml, read_yaml
 
@@ -54,7 +56,7 @@ class Setup(InNotebook):
     name, title, source : `str`
         Name, one line of description, and where the numbers come from.
     camera, detector : `str`
-        Camera and default detector.
+        Camera and default detector. Camera, bandpass and telescope are names of what is shipped, or YAML files.
     stack : `LayerStack`
         The sensor; in a file, ``silicon: Si_green2008`` takes its silicon from another table.
     varying : `str`
@@ -82,6 +84,8 @@ class Setup(InNotebook):
     laboratory_temperature_k : `float`, optional
         Of a sensor at a telescope: temperature at which its thickness was measured, where the map does not state it;
         that of the sensor if not given.
+    files : `tuple` [`str`, ...]
+        Files from outside that describe it, tables too; empty for a set-up that is shipped.
     """
 
     name: str
@@ -108,6 +112,18 @@ class Setup(InNotebook):
     airmass: float
     wavelength_accuracy_nm: float = WAVELENGTH_ACCURACY_NM
     laboratory_temperature_k: float | None = None
+    files: tuple[str, ...] = ()
+
+    @property
+    def filter_name(self) -> str:
+        """Name of the bandpass, also where a file describes it; "" in the laboratory."""
+        return Path(self.bandpass).stem if is_file_name(self.bandpass) else self.bandpass
+
+    @property
+    def amplifier_grid(self) -> tuple[int, int]:
+        """Rows and columns of amplifiers of the set-up's own sensor."""
+        amplifiers = self.sensor().amplifiers
+        return len({each.y0 for each in amplifiers}), len({each.x0 for each in amplifiers})
 
     def sensor(self, name: str | None = None) -> Detector:
         """A sensor of the set-up's camera, by default its own.
@@ -171,26 +187,30 @@ class Setup(InNotebook):
         """Sensor, temperature and light, with units."""
         low, high = self.thickness_range_um
         laboratory = self.kind == "monochromator"
-        light = f"monochromator, {self.bandwidth_fwhm_nm:g} nm" if laboratory else f"sky in {self.bandpass}"
+        light = (
+            f"monochromator, {self.bandwidth_fwhm_nm:g} nm" if laboratory else f"sky in {self.filter_name}"
+        )
         return {
             "name": self.name,
             "title": self.title,
-            "camera": self.camera,
+            "camera": Path(self.camera).stem,
             "stack": " / ".join(self.stack.names),
             "varying layer": f"{self.varying}, {low:g} to {high:g} µm",
             "temperature": f"{self.temperature_k:g} K",
-            "light": f"{light}, {self.telescope or self.beam_kind}",
+            "light": f"{light}, {Path(self.telescope).stem or self.beam_kind}",
         }
 
     @classmethod
     def from_name(cls, name: str) -> Setup:
-        """Set-up shipped with the package.
+        """Set-up shipped with the package; a name that ends in ``.yaml`` is that of a file, as for `from_file`.
 
         Raises
         ------
         UnknownNameError
             There is no such set-up; near misses are offered.
         """
+        if is_file_name(name):
+            return cls.from_file(name)
         if name not in setup_names():
             raise UnknownNameError("set-up", name, setup_names())
         return _shipped(name)
@@ -199,19 +219,28 @@ class Setup(InNotebook):
     def from_file(cls, path: str | Path) -> Setup:
         """Set-up described by a YAML file of the user, laid out like the shipped ones.
 
+        ``camera``, ``stack``, ``illumination.bandpass`` and ``illumination.beam.telescope`` may name a YAML file
+        each, and ``media`` one with further media. Their paths count from the folder of the set-up's file.
+
         Raises
         ------
         InputError
             The file is not such a description; the key at fault is named.
         """
         path = Path(path)
-        content = read_user_yaml(path, "set-up file")
-        return cls.from_mapping(path.stem, content, source_file=str(path))
+        content = with_files_beside(read_user_yaml(path, "set-up file"), path)
+        try:
+            setup = cls.from_mapping(path.stem, content, source_file=str(path))
+            setup.sensor()
+        except InputError as error:
+            named = error.source is not None and Path(error.source).suffix
+            raise (error if named else error.in_source(str(path))) from None
+        return replace(setup, files=(str(path), *setup.files))
 
     @classmethod
     def from_mapping(cls, name: str, content: Any, *, source_file: str | None = None) -> Setup:
         """Set-up from the parsed content of a YAML file; errors as for `from_file`."""
-        reader = _Reader(content, source_file or name)
+        reader = Description(content, source_file or name)
         printable_name("name of the set-up", name, source=source_file)
         light = reader.section("illumination")
         kind = light.choice("kind", ("monochromator", "sky"))
@@ -225,15 +254,14 @@ class Setup(InNotebook):
         laboratory = kind == "monochromator"
         bandwidth = light.number("bandwidth_fwhm_nm", low=0.0, high=200.0) if laboratory else 0.0
         temperature_k = reader.number("temperature_k", low=100.0, high=400.0)
+        named = [reader.text("camera"), reader.text("stack"), reader.optional("media", "")]
         setup = cls(
             name=name,
             title=reader.text("title"),
             source=reader.text("source"),
-            camera=reader.text("camera"),
+            camera=named[0],
             detector=reader.text("detector"),
-            stack=LayerStack.from_resource(reader.text("stack")).with_silicon(
-                reader.optional("silicon", "Si")
-            ),
+            stack=_stack(named[1], named[2], reader.optional("silicon", "Si")),
             varying=reader.text("varying"),
             thickness_range_um=(low, high),
             temperature_k=temperature_k,
@@ -264,7 +292,8 @@ class Setup(InNotebook):
             ),
         )
         setup.stack.position(setup.varying)
-        return setup
+        outside = [text for text in (*named, setup.bandpass, setup.telescope) if is_file_name(text)]
+        return replace(setup, files=tuple(file for text in outside for file in files_of(text)))
 
     @named_units
     def missing_nm(self, found_nm: Iterable[float]) -> tuple[float, ...]:
@@ -316,6 +345,13 @@ class Setup(InNotebook):
         )
 
 
+def _stack(name: str, media: str, silicon: str) -> LayerStack:
+    """Stack by its name or its file; media by their names, or those of a file."""
+    known = read_media(media) if media else {}
+    stack = LayerStack.from_file(name, known) if is_file_name(name) else LayerStack.from_resource(name)
+    return stack.with_silicon(silicon, known)
+
+
 def setup_names() -> tuple[str, ...]:
     """Names of the set-ups shipped with the package."""
     return tuple(name.removesuffix(".yaml") for name in list_resources("setups"))
@@ -331,57 +367,3 @@ def _vendor_of(setup: Setup) -> str:
 @functools.lru_cache(maxsize=32)
 def _shipped(name: str) -> Setup:
     return Setup.from_mapping(name, read_yaml("setups", f"{name}.yaml"), source_file=f"set-up {name}")
-
-
-class _Reader:
-    """Reads typed values from a mapping; every complaint names the key."""
-
-    def __init__(self, content: Any, source: str, prefix: str = "") -> None:
-        if not isinstance(content, Mapping):
-            raise InputError(prefix or "content", content, "a mapping", source=source)
-        self._content = content
-        self._prefix = f"{prefix}." if prefix else ""
-        self.source = source
-
-    def _get(self, key: str) -> Any:
-        if key not in self._content:
-            raise InputError(f"{self._prefix}{key}", None, "a value (the key is missing)", source=self.source)
-        return self._content[key]
-
-    def section(self, key: str) -> _Reader:
-        return _Reader(self._get(key), self.source, f"{self._prefix}{key}")
-
-    def text(self, key: str) -> str:
-        value = self._get(key)
-        if not isinstance(value, str) or not value.strip():
-            raise InputError(f"{self._prefix}{key}", value, "text", source=self.source)
-        if not value.isprintable():
-            allowed = "text in one line, without control characters"
-            raise InputError(f"{self._prefix}{key}", value, allowed, source=self.source)
-        return value
-
-    def optional(self, key: str, default: str) -> str:
-        return self.text(key) if key in self._content else default
-
-    def choice(self, key: str, allowed: tuple[str, ...]) -> str:
-        value = self._get(key)
-        if value not in allowed:
-            raise UnknownNameError(f"{self._prefix}{key}", value, allowed, source=self.source)
-        return str(value)
-
-    def number(self, key: str, *, low: float, high: float, default: float | None = None) -> float:
-        if default is not None and key not in self._content:
-            return default
-        value = self._get(key)
-        good = isinstance(value, int | float) and not isinstance(value, bool)
-        if not good or not low <= value <= high:
-            raise InputError(f"{self._prefix}{key}", value, f"{low:g} to {high:g}", source=self.source)
-        return float(value)
-
-    def numbers(self, key: str, count: int | None = None) -> list[float]:
-        value = self._get(key)
-        good = isinstance(value, list) and all(isinstance(item, int | float) for item in value)
-        if not good or not value or (count is not None and len(value) != count):
-            wanted = f"a list of {count} numbers" if count else "a list of numbers"
-            raise InputError(f"{self._prefix}{key}", value, wanted, source=self.source)
-        return [to_number(f"{self._prefix}{key}", item, source=self.source) for item in value]

@@ -44,6 +44,12 @@ FloatArray = NDArray[np.float64]
 AIRGLOW_HEIGHT_KM = 90.0
 EARTH_RADIUS_KM = 6371.0
 
+OH_NM = (880.0, 1110.0)
+"""Wavelengths between which the list of OH lines is complete [nm]."""
+
+MOST_WITHOUT_LINES = 1e-3
+"""Part of the light of a white source that a bandpass may let through outside `OH_NM`; of the y band it is 2e-5."""
+
 LINES_NM = (300.0, 3000.0)
 """Where the air glows in lines; the same lines in Å or µm lie outside."""
 
@@ -345,7 +351,14 @@ class SkySpectrum(OneLine):
         -------
         components : `list` [`SpectralComponent`]
             OH bands first, then continua; those without any light are left out.
+
+        Raises
+        ------
+        OutOfRangeError
+            The bandpass lets light through where the list of `EmissionLines.oh` has no lines.
         """
+        if self.lines.levels is not None:
+            _refuse_outside_of_oh(bandpass)
         found = [self._band(name, bandpass) for name in self.lines.bands]
         found += [self._continuum(term, bandpass, continuum_step_nm) for term in self.continua]
         return [component for component in found if component.photons.sum() > 0.0]
@@ -368,6 +381,15 @@ class SkySpectrum(OneLine):
         if term.origin == "airglow":
             photons = photons * van_rhijn_factor(self.airmass)
         return SpectralComponent(term.name, wave, photons)
+
+
+def _refuse_outside_of_oh(bandpass: Bandpass) -> None:
+    low, high = OH_NM
+    outside = (bandpass.wavelength_nm < low) | (bandpass.wavelength_nm > high)
+    light = np.gradient(bandpass.wavelength_nm) * bandpass.optics
+    if light[outside].sum() > MOST_WITHOUT_LINES * light.sum():
+        allowed = f"{low:g} to {high:g}, where the OH lines are known"
+        raise OutOfRangeError("bandpass [nm]", bandpass.support(), allowed, source=bandpass.name)
 
 
 def van_rhijn_factor(airmass: float) -> float:

@@ -11,15 +11,24 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import batoid
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OutOfRangeError, ResourceError, UnknownNameError, named_units
+from ..descriptions import is_file_name, read_description
+from ..errors import (
+    InputError,
+    OutOfRangeError,
+    ResourceError,
+    UnknownNameError,
+    named_units,
+    printable_name,
+)
 from ..optics import Beam
-from ..resources import list_resources, read_yaml
+from ..resources import first_line, list_resources, read_yaml
 from .ray_bundle import (
     BEAM_NODES,
     RayBundle,
@@ -185,7 +194,7 @@ class Telescope:
 
     @classmethod
     def from_name(cls, name: str) -> Telescope:
-        """Telescope of ``data/telescopes/<name>.yaml``; capitals do not matter.
+        """Telescope of ``data/telescopes/<name>.yaml``; capitals do not matter; or of a file, by its name.
 
         Raises
         ------
@@ -194,11 +203,29 @@ class Telescope:
         ResourceError
             The file is incomplete.
         """
+        if is_file_name(name):
+            return cls.from_file(name)
         known = [entry.removesuffix(".yaml") for entry in list_resources("telescopes")]
         stem = name.casefold()
         if stem not in known:
             raise UnknownNameError("telescope", name, known)
         return cls.from_mapping(stem, read_yaml("telescopes", f"{stem}.yaml"))
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Telescope:
+        """Telescope that a YAML file describes, laid out like the shipped ones; it is named after the file.
+
+        Raises
+        ------
+        InputError
+            There is no such file, or it does not describe a telescope.
+        """
+        content = read_description(path, "telescope")
+        try:
+            return cls.from_mapping(printable_name("name of the telescope", Path(path).stem), content)
+        except (ResourceError, ValueError) as error:
+            allowed = "every entry that monocam.yaml or lsst.yaml has"
+            raise InputError("telescope", first_line(error), allowed, source=str(path)) from None
 
     @classmethod
     def from_mapping(cls, name: str, content: Mapping[str, Any]) -> Telescope:

@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
+from ..descriptions import read_table_beside
 from ..errors import ConvergenceError, OutOfRangeError, StackError, UnknownNameError
-from ..resources import read_table, read_yaml
+from ..resources import read_table, read_user_yaml, read_yaml
 from .film_fields import add_mode, light_in
 from .line_shapes import LINE_SHAPES, LINE_STEP_NM
 from .signal_table import SignalTable
@@ -65,7 +66,7 @@ class Film:
     name : `str`
         Name in the stack: ``detection``, ``adhesive``...
     medium : `str`
-        Name of its material in ``data/media/media.yaml``.
+        Name of its material in ``data/media/media.yaml``, or in ``media``.
     thickness_um : `float`
         Thickness [µm]; infinite at the two ends.
     index_shift : `float`
@@ -74,6 +75,8 @@ class Film:
         Added dispersion: coefficient of 1 / wavelength², zero at 960 nm [µm²].
     extinction_scale, extinction_shift : `float`
         Factor on the tabulated extinction coefficient, and what is added to it after that.
+    media : `str`
+        File with further materials, laid out like that one; none if empty.
     """
 
     name: str
@@ -83,10 +86,11 @@ class Film:
     cauchy_um2: float = 0.0
     extinction_scale: float = 1.0
     extinction_shift: float = 0.0
+    media: str = ""
 
     def index(self, wavelength_nm: FloatArray, temperature_k: float) -> ComplexArray:
         """Complex index at some wavelengths in vacuum [nm] and one temperature [K]."""
-        table = material_index(self.medium, wavelength_nm, temperature_k)
+        table = material_index(self.medium, wavelength_nm, temperature_k, self.media)
         tilt = (1e3 / wavelength_nm) ** 2 - (1e3 / DISPERSION_PIVOT_NM) ** 2
         n = table.real + self.index_shift + self.cauchy_um2 * tilt
         return n + 1j * (table.imag * self.extinction_scale + self.extinction_shift)
@@ -181,7 +185,10 @@ class FlatFieldOptics:
         for name in ("roughness_nm", "spread_nm", "support_spread_um"):
             if not getattr(self, name) >= 0:
                 raise OutOfRangeError(name, getattr(self, name), "zero or a positive number")
-        if self.position(self.rough_face) == 0:
+        # A sensor need not have the layer that is rough by default.
+        if self.rough_face == self.films[0].name or (
+            self.roughness_nm > 0.0 and self.position(self.rough_face) == 0
+        ):
             raise UnknownNameError("rough face", self.rough_face, [film.name for film in self.films[1:]])
         for shape, part in ((self.line_shape, 1.0), *self.other_lines):
             if shape not in LINE_SHAPES:
@@ -373,17 +380,21 @@ class FlatFieldOptics:
                     yield 0.5 * weight, theta, False, float(height_um)
 
 
-def material_index(medium: str, wavelength_nm: FloatArray, temperature_k: float) -> ComplexArray:
-    """Complex index of a shipped material; ``n`` by cubic spline, ``log k`` by monotone cubic.
+def material_index(
+    medium: str, wavelength_nm: FloatArray, temperature_k: float, media: str = ""
+) -> ComplexArray:
+    """Complex index of a material; ``n`` by cubic spline, ``log k`` by monotone cubic.
 
     Parameters
     ----------
     medium : `str`
-        Name in ``data/media/media.yaml``.
+        Name in ``data/media/media.yaml``, or in a file laid out like it.
     wavelength_nm : `numpy.ndarray`
         Wavelength in vacuum [nm].
     temperature_k : `float`
         Temperature [K].
+    media : `str`, optional
+        That file.
 
     Raises
     ------
@@ -392,7 +403,7 @@ def material_index(medium: str, wavelength_nm: FloatArray, temperature_k: float)
     OutOfRangeError
         A wavelength at which it is not tabulated.
     """
-    curve, low, high = _material(medium)
+    curve, low, high = _material(medium, media)
     if not (np.min(wavelength_nm) >= low and np.max(wavelength_nm) <= high):
         found = (float(np.min(wavelength_nm)), float(np.max(wavelength_nm)))
         raise OutOfRangeError(f"wavelength [nm] in {medium}", found, f"{low:g} to {high:g}")
@@ -403,8 +414,9 @@ _Curve = Callable[[FloatArray, float], ComplexArray]
 
 
 @functools.lru_cache(maxsize=64)
-def _material(medium: str) -> tuple[_Curve, float, float]:
-    entries = read_yaml("media", "media.yaml")
+def _material(medium: str, media: str) -> tuple[_Curve, float, float]:
+    own = read_user_yaml(media, "media file") if media else {}
+    entries = {**read_yaml("media", "media.yaml"), **own}
     if medium not in entries:
         raise UnknownNameError("medium", medium, entries)
     entry = entries[medium]
@@ -412,7 +424,8 @@ def _material(medium: str) -> tuple[_Curve, float, float]:
         constant = complex(*entry["constant"])
         low, high = entry["range_nm"]
         return lambda wavelength, _: np.full(wavelength.shape, constant), float(low), float(high)
-    table = read_table("media", entry["table"])
+    beside = read_table_beside(media, entry["table"]) if medium in own else None
+    table = read_table("media", entry["table"]) if beside is None else beside
     nodes = table["wavelength"].quantity.to_value("nm")
     first, second = entry.get("columns", ("n", "k"))
     n_curve = CubicSpline(nodes, table[first])

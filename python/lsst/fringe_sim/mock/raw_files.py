@@ -1,10 +1,11 @@
-"""Raw files of a mock sensor: times, headers and the LSST layout on disk."""
+"""Raw files of a mock sensor: times, headers and the layout on disk."""
 
 from __future__ import annotations
 
 import datetime
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from ..files import all_or_nothing
-from ..instrument.camera import Amplifier, Camera, Detector
-from .readout import raw_segment
+from ..instrument.camera import Amplifier, Camera, Detector, RawSegment
+from .readout import BIAS_LEVEL_ADU, raw_segment
 
 __all__ = ["Clock", "primary_header", "write_frame"]
 
@@ -48,6 +49,23 @@ def exposure_time(wavelength_nm: float | None) -> float:
     return round(EXPOSURE_BASE_S * math.exp(max(wavelength_nm - 800.0, 0.0) / 120.0), 3)
 
 
+LSST_LAYOUT = frozenset({"lsstCam", "ts8", "monocam"})
+"""Cameras whose raw frames are in the LSST layout."""
+
+OVERSCAN_PX = 32
+"""Columns of overscan of an amplifier whose raw layout is not known."""
+
+
+def with_raw_layout(sensor: Detector) -> Detector:
+    """The sensor with one image for each amplifier, as it lies on the sensor, and overscan to its right."""
+    segments = [
+        RawSegment(number, amp.name, (amp.height, amp.width + OVERSCAN_PX), 0, 0)
+        for number, amp in enumerate(sensor.amplifiers, start=1)
+    ]
+    amplifiers = zip(sensor.amplifiers, segments, strict=True)
+    return replace(sensor, amplifiers=tuple(replace(amp, raw=raw) for amp, raw in amplifiers))
+
+
 def primary_header(
     camera: str,
     sensor: Detector,
@@ -71,12 +89,7 @@ def primary_header(
         ("DATE-OBS", start.isoformat(timespec="milliseconds"), "start of the exposure"),
         ("ORIGIN", "lsst.fringe_sim", "simulated frame"),
         ("RUNNUM", "0001M", "run"),
-        *_camera_cards(camera, sensor),
-        ("CCD_MANU", sensor.vendor.upper(), "maker of the sensor"),
-        ("LSST_NUM", sensor.serial, "serial number of the sensor"),
-        ("RAFTNAME", sensor.raft_serial, "serial number of the raft"),
-        ("SLOTNAME", sensor.slot, "slot within the raft"),
-        ("CCDSLOT", sensor.slot, "slot within the raft"),
+        *(_lsst_cards if camera in LSST_LAYOUT else _own_cards)(camera, sensor),
         ("TESTTYPE", "BIAS" if wavelength_nm is None else "LAMBDA", "kind of acquisition"),
         ("IMGTYPE", "BIAS" if wavelength_nm is None else "FLAT", "kind of image"),
         ("DAYOBS", day, "observing day"),
@@ -86,13 +99,32 @@ def primary_header(
         ("CCDTEMP", celsius, "[degC] measured temperature"),
         ("EXPTIME", exposure_s, "[s] exposure time"),
         ("DARKTIME", exposure_s, "[s] time since the sensor was cleared"),
-        ("FILENAME", f"{sensor.serial}_{kind}_{stamp}.fits", ""),
+        ("FILENAME", f"{sensor.serial or sensor.name}_{kind}_{stamp}.fits", ""),
     ]
     if wavelength_nm is not None:
         cards.append(("MONOWL", wavelength_nm, "[nm] wavelength of the monochromator"))
     for card in cards:
         header.append(card, end=True)
     return header
+
+
+def _own_cards(camera: str, sensor: Detector) -> list[tuple[str, Any, str]]:
+    return [
+        ("INSTRUME", Path(camera).stem, "instrument"),
+        ("DETNAME", sensor.serial or sensor.name, "sensor"),
+        ("VENDOR", sensor.vendor, "maker of the sensor"),
+    ]
+
+
+def _lsst_cards(camera: str, sensor: Detector) -> list[tuple[str, Any, str]]:
+    return [
+        *_camera_cards(camera, sensor),
+        ("CCD_MANU", sensor.vendor.upper(), "maker of the sensor"),
+        ("LSST_NUM", sensor.serial, "serial number of the sensor"),
+        ("RAFTNAME", sensor.raft_serial, "serial number of the raft"),
+        ("SLOTNAME", sensor.slot, "slot within the raft"),
+        ("CCDSLOT", sensor.slot, "slot within the raft"),
+    ]
 
 
 def _camera_cards(camera: str, sensor: Detector) -> list[tuple[str, Any, str]]:
@@ -116,17 +148,34 @@ def write_frame(
 ) -> None:
     """Write one frame; the file appears under its name only when it is complete."""
     hdus = fits.HDUList([fits.PrimaryHDU(header=header)])
+    header_of = _amplifier_header if "LSST_NUM" in header else _own_amplifier_header
     for amp, image in zip(sensor.amplifiers, images, strict=True):
-        hdus.append(fits.ImageHDU(image, header=_amplifier_header(amp, sensor.shape)))
+        hdus.append(fits.ImageHDU(image, header=header_of(amp, sensor.shape)))
     with all_or_nothing(path) as part, open(part, "wb") as stream:
         hdus.writeto(stream)
 
 
 def _amplifier_header(amp: Amplifier, shape: tuple[int, int]) -> fits.Header:
     """Header of one amplifier, with the y sense of DETSEC swapped as in real files (DM-36115)."""
-    segment = raw_segment(amp)
     x = (amp.x0 + 1, amp.x0 + amp.width)
     y = (shape[0] - amp.y0, shape[0] - amp.y0 - amp.height + 1)
+    return _sections(amp, shape, x, y)
+
+
+def _own_amplifier_header(amp: Amplifier, shape: tuple[int, int]) -> fits.Header:
+    """Header of one amplifier of a camera that is not of LSST: no table has its gain and noise, so it states them."""
+    x, y = (amp.x0 + 1, amp.x0 + amp.width), (amp.y0 + 1, amp.y0 + amp.height)
+    header = _sections(amp, shape, x, y)
+    header["BUNIT"] = "adu"
+    header["GAIN"] = (amp.gain, "[electron/adu]")
+    header["RDNOISE"] = (amp.read_noise, "[electron]")
+    level, scatter = BIAS_LEVEL_ADU
+    header["SATURATE"] = (round(level - 5.0 * scatter + amp.saturation), "[adu] with the bias level")
+    return header
+
+
+def _sections(amp: Amplifier, shape: tuple[int, int], x: tuple[int, int], y: tuple[int, int]) -> fits.Header:
+    segment = raw_segment(amp)
     detsec_x = x[::-1] if amp.flip_x else x
     detsec_y = y[::-1] if amp.flip_y else y
     data_x = (segment.data_x0 + 1, segment.data_x0 + amp.width)

@@ -1,7 +1,8 @@
 """Raw laboratory frames of a sensor whose every property is known: bias frames and monochromatic flats.
 
-The frames are in the LSST raw layout, as a test stand would have written them. What made them (thickness, hidden
-effects, true gains) is returned to the caller and stands nowhere in the files, their headers or their names.
+The frames are in the LSST raw layout, as a test stand would have written them; those of another camera have one image
+for each amplifier, with overscan, and state gain and noise. What made them (thickness, hidden effects, true gains) is
+returned to the caller and stands nowhere in the files, their headers or their names.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from ..descriptions import is_file_name, read_description, with_files_beside
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.camera import Amplifier, Camera, Detector
-from ..resources import list_resources, read_yaml
+from ..resources import list_resources, read_user_yaml, read_yaml
 from .hidden_effects import AmplifierState, HiddenEffect, validate_effects, with_hidden_optics
 from .optics import Film, FlatFieldOptics
-from .raw_files import Clock, primary_header, write_frame
+from .raw_files import Clock, primary_header, with_raw_layout, write_frame
 from .readout import Readout
 from .sensor_signal import SensorSignal
 
@@ -228,7 +229,7 @@ def films_of(content: Mapping[str, Any], setup: str, silicon: str | None = None)
     `UnknownNameError`: there is no such stack.
     `InputError`: no table of silicon.
     """
-    own = silicon or str(content.get("silicon", "Si"))
+    own, media = silicon or str(content.get("silicon", "Si")), str(content.get("media", ""))
     if own.partition("_")[0] != "Si":
         raise InputError("silicon", own, "Si or a table that begins with Si_", source=setup)
     return tuple(
@@ -236,8 +237,9 @@ def films_of(content: Mapping[str, Any], setup: str, silicon: str | None = None)
             str(layer["name"]),
             own if layer["medium"] == "Si" else str(layer["medium"]),
             float(layer["thickness_um"]),
+            media=media,
         )
-        for layer in _read_named("stack", "stacks", content["stack"])["layers"]
+        for layer in _stack(str(content["stack"]))["layers"]
     )
 
 
@@ -277,7 +279,7 @@ def write_mock_flats(
     effects : mapping, optional
         Hidden effects, as for `validate_effects`.
     size : `str`, optional
-        ``"NXxNY"`` for a cut-down sensor: 16 amplifiers of NX/8 × NY/2 pixels with the usual overscan.
+        ``"NXxNY"`` for a cut-down sensor: as many amplifiers with fewer pixels each, with the usual overscan.
     n_bias : `int`, optional
         Number of bias frames.
     repeats : `int`, optional
@@ -345,11 +347,15 @@ def _read_named(what: str, folder: str, name: str) -> dict[str, Any]:
     return read_yaml(folder, f"{name}.yaml")
 
 
+def _stack(name: str) -> Mapping[str, Any]:
+    return read_description(name, "stack") if is_file_name(name) else _read_named("stack", "stacks", name)
+
+
 def read_setup_file(setup: str) -> dict[str, Any]:
-    """Content of a shipped set-up, or of a YAML file."""
-    if not setup.lower().endswith((".yaml", ".yml")):
+    """Content of a shipped set-up, or of a YAML file; names of files in it are paths."""
+    if not is_file_name(setup):
         return _read_named("set-up", "setups", setup)
-    content: dict[str, Any] = yaml.safe_load(Path(setup).read_text(encoding="utf-8"))
+    content: dict[str, Any] = with_files_beside(read_user_yaml(setup, "set-up file"), setup)
     return content
 
 
@@ -359,8 +365,10 @@ def _nominal_celsius(setup: str) -> float:
 
 def _sensor(camera: str, detector: int | str, size: str | None) -> Detector:
     sensor = Camera.from_name(camera).detector(detector)
-    if any(amp.raw is None for amp in sensor.amplifiers) or len(sensor.amplifiers) != 16:
-        raise InputError("detector", sensor.name, "a sensor with 16 amplifiers in the LSST raw layout")
+    if sensor.own_layout:
+        sensor = with_raw_layout(sensor)
+    elif len(sensor.amplifiers) != 16:
+        raise InputError("detector", sensor.name, "a whole sensor of 16 amplifiers")
     return sensor if size is None else sensor.cut_down(parse_size(size))
 
 

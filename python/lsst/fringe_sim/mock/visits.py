@@ -25,7 +25,7 @@ from ..instrument.camera import Camera, Detector
 from ..instrument.night import StochasticNight
 from ..instrument.ray_bundle import lagrange_weights
 from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
-from ..instrument.telescope import telescope_beam
+from ..instrument.telescope import ConeOptics, Telescope, telescope_beam
 from .film_fields import add_mode, add_periodic_mode, light_in
 from .hidden_effect import ActiveHiddenEffect
 from .hidden_effects import validate_effects, with_hidden_optics
@@ -91,13 +91,13 @@ def detected_sky(
     ``thickness_um``: thickness of the layer that varies [µm].
     ``effects``: hidden effects of the sensor, as for `validate_effects`.
     ``silicon``: table of its optical constants, as ``Si_franta2017``; by default that of the set-up.
-    `InputError`: a set-up without a telescope and a filter, an effect that does not act on the layers of a
+    `InputError`: a set-up without a sky and a filter, an effect that does not act on the layers of a
         whole sensor, or no table of silicon.
     """
     content = read_setup_file(setup)
     light = content["illumination"]
-    if light["kind"] != "sky" or light["beam"]["kind"] != "telescope":
-        raise InputError("set-up", setup, "one with a sky and a telescope")
+    if light["kind"] != "sky" or light["beam"]["kind"] not in ("cone", "telescope"):
+        raise InputError("set-up", setup, "one with a sky, behind a telescope or in a cone")
     optics = with_hidden_optics(_optics(content, setup, silicon), _of_the_sensor(effects))
     sky = SkySpectrum.dark(airmass=float(light["airmass"]))
     parts = sky.components(Bandpass.from_name(str(light["bandpass"])), CONTINUUM_STEP_NM)
@@ -123,7 +123,11 @@ def detected_sky(
 
 def _angles(beam: Mapping[str, Any], radius_deg: float, nodes: int) -> tuple[FloatArray, FloatArray]:
     """Angles of incidence [rad] and their weights."""
-    found = telescope_beam(str(beam["telescope"]), radius_deg, 0.0, nodes)
+    if beam["kind"] == "cone":
+        cone = ConeOptics(float(beam["f_number"]), float(beam.get("obscuration", 0.0)))
+        found = Telescope("cone", cone, 1.0, 1.0, 1.0, math.inf).beam(nodes=nodes)
+    else:
+        found = telescope_beam(str(beam["telescope"]), radius_deg, 0.0, nodes)
     return found.theta, found.weight
 
 
@@ -280,7 +284,8 @@ def _header(
 ) -> fits.Header:
     header = fits.Header()
     header["DETNAME"] = (sensor.name, "sensor")
-    header["FILTER"] = ("y", "filter")
+    # The last part of its name: y of hsc_y and of hsc_y.yaml.
+    header["FILTER"] = (Path(str(light["bandpass"])).stem.rpartition("_")[2], "filter")
     header["EXPTIME"] = (seconds, "[s] exposure")
     header["TIMESYS"] = "UTC"
     header["DATE-OBS"] = start.replace(tzinfo=None).isoformat(timespec="milliseconds")

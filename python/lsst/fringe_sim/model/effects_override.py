@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Mapping
 
+from ..effects import catalogue_of, known_effects
 from ..errors import InputError
 
 __all__ = ["effects_override", "read_effects_override", "refuse_other_effects", "written_effects"]
@@ -14,6 +15,7 @@ _STATEMENT = re.compile(r"""config\.effects\[(["'])([\w.]+)\1\]\s*=\s*([^#]+?)\s
 
 _WRITTEN = "config.written_effects = "
 _BEGINNING = "# Effects found in data of set-up "
+_NEEDS = "# Needs effects of "
 _END = "# End; SHA-256 of the lines above: "
 
 
@@ -26,6 +28,8 @@ def effects_override(
     detector: str | None = None,
 ) -> str:
     """Text of an override that puts effects into fit, sky simulation and templates.
+
+    Effects that are not those of this package bring a comment that says in which catalogue they are.
 
     Its first line states the names of the effects and a hash of their values, which the configuration of a task
     compares with what it got; its last line the hash of all others. A file that was cut short is not taken for a
@@ -41,10 +45,33 @@ def effects_override(
     if detector is not None:
         lines.append(f"# Sensor {_quoted(detector)}.")
     lines.append("# Use with -C label:effects.py on any task that reads effects.")
+    lines += _needs({**(known or {}), **settings})
     if known:
         lines += ["# Known before the search:", *_statements(known), "# Found by it:"]
     text = "\n".join([*lines, *_statements(settings)]) + "\n"
     return f"{text}{_END}{_hash(text)}\n"
+
+
+def _needs(settings: Mapping[str, float]) -> list[str]:
+    """Comments that name the catalogues of effects which are not those of this package."""
+    names: dict[str, list[str]] = {}
+    for name in dict.fromkeys(key.partition(".")[0] for key in settings):
+        source = catalogue_of(name)
+        if source:
+            names.setdefault(source, []).append(name)
+    return [f"{_NEEDS}{_quoted(source)} for {', '.join(found)}" for source, found in names.items()]
+
+
+def _refuse_unknown(effects: Mapping[str, float], text: str, source: str | None) -> None:
+    """Refuse effects that are not known here, where the override says of which catalogue they are."""
+    known = {effect.name for effect in known_effects()}
+    unknown = {key.partition(".")[0] for key in effects} - known
+    for line in text.splitlines():
+        catalogue, _, names = line.removeprefix(_NEEDS).rpartition(" for ")
+        missing = sorted(unknown & set(names.split(", ")))
+        if line.startswith(_NEEDS) and missing:
+            how = catalogue if catalogue.startswith("entry point") else f"--effects-from {catalogue}"
+            raise InputError("effect", ", ".join(missing), f"known with {how}", source=source)
 
 
 def _statements(settings: Mapping[str, float]) -> list[str]:
@@ -102,7 +129,8 @@ def read_effects_override(text: str, source: str | None = None) -> dict[str, flo
     Raises
     ------
     InputError
-        A line that is anything else; a file that a search has begun and not ended; one written by hand that sets
+        A line that is anything else; an effect of a catalogue that is not there; a file that a search has begun and
+        not ended; one written by hand that sets
         nothing.
     """
     complete = _is_complete(text, source)
@@ -121,6 +149,7 @@ def read_effects_override(text: str, source: str | None = None) -> dict[str, flo
         if statement[2] in found and not complete:  # a search may find another value than was known
             raise InputError("statement", line, f"{statement[2]} once", source=source)
         found[statement[2]] = value
+    _refuse_unknown(found, text, source)
     if not found and not complete:
         raise InputError("override file", "without any effect", "one that sets at least one", source=source)
     return found

@@ -7,7 +7,7 @@ The keywords are the same in every product, so that one reader understands all (
 ``VERSION <package>``     versions of the packages that compute
 ``SETUP``                 name of the set-up
 ``EFFECTn``, ``EFFVALn``  effects by ``name.parameter``, and their values
-``TABLEn``                a shipped table or description and the beginning of its SHA-256
+``TABLEn``                a table or description, shipped or of one's own, and the beginning of its SHA-256
 ``INPUTn``                a file that a command was given, and the beginning of its SHA-256
 ========================  ==============================================================================
 """
@@ -26,12 +26,13 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..descriptions import is_file_name
 from ..effects import activate_effects, apply_to_system, known_effects
 from ..errors import FrameFormatError, InputError, UnknownNameError, to_number
-from ..instrument.setup import Setup, setup_names
+from ..instrument.setup import Setup
 from ..optics.stack import LayerStack
 from ..optics.system import OpticalSystem
-from ..resources import REVISION_LENGTH, read_yaml, revision
+from ..resources import REVISION_LENGTH, read_user_yaml, read_yaml, revision
 
 __all__ = [
     "SKY_TABLES",
@@ -141,24 +142,35 @@ def _printable(name: str) -> str:
 
 
 def tables_of(setup: Setup, stack: LayerStack | None = None) -> tuple[tuple[str, str], ...]:
-    """Shipped files, as (folder, name), that a set-up takes its numbers from.
+    """Shipped files, as (folder, name), that a set-up takes its numbers from; `Setup.files` has the others.
 
     ``stack``: layers with the effects in them, which may bring media of their own; by default those of the
     set-up.
     """
-    shipped = [("setups", f"{setup.name}.yaml")] if setup.name in setup_names() else []
-    shipped += [("stacks", f"{setup.stack.name}.yaml"), ("media", "media.yaml")]
+    own = {Path(file).name for file in setup.files}
+    described = [("setups", f"{setup.name}.yaml"), ("stacks", f"{setup.stack.name}.yaml")]
+    shipped = [item for item in described if item[1] not in own]
+    shipped.append(("media", "media.yaml"))
     shipped += _media(layer.medium.name for layer in (stack or setup.stack).layers)
     if setup.telescope:
         shipped.append(("telescopes", f"{setup.telescope.lower()}.yaml"))
     if setup.bandpass:
-        description = f"{setup.bandpass}.yaml"
-        content = read_yaml("bandpasses", description)
-        shipped += [("bandpasses", description), ("sky", str(content["table"]))]
-        if isinstance(content["detector"], Mapping):
-            shipped.append(("sky", str(content["detector"]["table"])))
-        shipped += SKY_TABLES
+        shipped += [*_of_bandpass(setup.bandpass), *SKY_TABLES]
     return tuple(item for item in shipped if _exists(*item))
+
+
+def _of_bandpass(name: str) -> list[tuple[str, str]]:
+    """Description of a bandpass and its tables."""
+    if is_file_name(name):
+        content, found = read_user_yaml(name, "bandpass file"), []
+    else:
+        content, found = read_yaml("bandpasses", f"{name}.yaml"), [("bandpasses", f"{name}.yaml")]
+    tables = [content["table"], *_table_of(content.get("detector"))]
+    return [*found, *(("sky", str(table)) for table in tables)]
+
+
+def _table_of(detector: Any) -> list[Any]:
+    return [detector["table"]] if isinstance(detector, Mapping) else []
 
 
 def _media(names: Iterable[str]) -> list[tuple[str, str]]:
@@ -182,12 +194,11 @@ def _exists(folder: str, name: str) -> bool:
     return True
 
 
-def table_cards(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Keywords ``TABLEn``: ``folder/name revision``."""
-    return {
-        f"TABLE{number}": f"{folder}/{name} {revision(folder, name)}"
-        for number, (folder, name) in enumerate(tables)
-    }
+def table_cards(tables: Iterable[tuple[str, str]], own: Iterable[str] = ()) -> dict[str, str]:
+    """Keywords ``TABLEn``: ``folder/name revision``; the folder of files from outside is ``own``."""
+    stated = [f"{folder}/{name} {revision(folder, name)}" for folder, name in tables]
+    stated += [f"own/{_printable(Path(file).name)} {_content(file)}" for file in own]
+    return {f"TABLE{number}": text for number, text in enumerate(stated)}
 
 
 def model_cards(setup: str | Setup, effects: Mapping[str, float]) -> dict[str, str | float]:
@@ -197,7 +208,7 @@ def model_cards(setup: str | Setup, effects: Mapping[str, float]) -> dict[str, s
     return {
         "SETUP": _printable(chosen.name),
         **effect_cards(effects),
-        **table_cards(tables_of(chosen, stack)),
+        **table_cards(tables_of(chosen, stack), chosen.files),
     }
 
 

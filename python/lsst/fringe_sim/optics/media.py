@@ -6,21 +6,31 @@ The index is ``n + i k`` with ``k > 0`` for absorption. A medium raises outside 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import OutOfRangeError, ResourceError, UnknownNameError, named_units
+from ..descriptions import Description, read_table_beside
+from ..errors import (
+    InputError,
+    OutOfRangeError,
+    ResourceError,
+    UnknownNameError,
+    named_units,
+    printable_name,
+)
 from ..notebook import OneLine
-from ..resources import read_table, read_yaml
+from ..resources import first_line, read_table, read_user_yaml, read_yaml
 
 if TYPE_CHECKING:
     from astropy.table import Table
     from scipy.interpolate import CubicSpline, PchipInterpolator
 
-__all__ = ["Medium", "check_range", "constant_medium", "get_medium", "medium_names"]
+__all__ = ["Medium", "check_range", "constant_medium", "get_medium", "medium_names", "read_media"]
 
 REFERENCE_TEMPERATURE_K = 300.0
 """Temperature at which Green (2008) tabulates silicon [K]."""
@@ -277,17 +287,52 @@ def get_medium(name: str) -> Medium:
     if name not in entries:
         raise UnknownNameError("medium", name, entries)
     entry: dict[str, Any] = entries[name]
+    return _medium(name, entry, lambda file: read_table("media", file))
+
+
+def read_media(path: str | Path) -> dict[str, Medium]:
+    """Media of a YAML file from outside, laid out like the shipped ``media.yaml``, by name.
+
+    A ``table`` is a file beside it, or one that is shipped.
+
+    Raises
+    ------
+    InputError
+        There is no such file, or it describes no media.
+    """
+    content = read_user_yaml(path, "media file")
+    reader = Description(content, str(path))
+    media = {}
+    for name in content:
+        printable_name("name of a medium", name, source=str(path))
+        reader.section(name)
+        try:
+            media[name] = _medium(name, content[name], lambda file: _table(path, file))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            if isinstance(error, InputError):
+                raise (error if error.source else error.in_source(str(path))) from None
+            allowed = "constant, range_nm and source, or a table with wavelength (in a unit), n and k"
+            raise InputError(name, first_line(error), allowed, source=str(path)) from None
+    return media
+
+
+def _table(description: str | Path, file: str) -> Table:
+    beside = read_table_beside(description, file)
+    return read_table("media", file) if beside is None else beside
+
+
+def _medium(name: str, entry: dict[str, Any], read: Callable[[str], Table]) -> Medium:
     if "constant" in entry:
         n, k = entry["constant"]
         low, high = entry["range_nm"]
         return constant_medium(name, n, k, range_nm=(low, high), source=entry["source"])
-    return _read_tabulated(name, entry)
+    return _read_tabulated(name, entry, read)
 
 
-def _read_tabulated(name: str, entry: dict[str, Any]) -> Medium:
+def _read_tabulated(name: str, entry: dict[str, Any], read: Callable[[str], Table]) -> Medium:
     from scipy.interpolate import CubicSpline, PchipInterpolator
 
-    table = read_table("media", entry["table"])
+    table = read(entry["table"])
     wavelength = _wavelengths(table, entry["table"])
     names = entry.get("columns", ("n", "k"))
     n, k = (np.asarray(table[column], dtype=float) for column in names)
@@ -300,7 +345,7 @@ def _read_tabulated(name: str, entry: dict[str, Any]) -> Medium:
     law: _PowerLaw | _MeasuredLaw | None = None
     match entry.get("temperature"):
         case "green2008":
-            law = _power_law(entry["table"])
+            law = _power_law(table, entry["table"])
         case "franta2017":
             law, cold = _measured_law(float(entry.get("measured_at_k", REFERENCE_TEMPERATURE_K)))
             low, high = max(low, float(cold[0])), min(high, float(cold[-1]))
@@ -315,10 +360,9 @@ def _wavelengths(table: Table, file: str) -> NDArray[np.float64]:
     return wavelength
 
 
-def _power_law(file: str) -> _PowerLaw:
+def _power_law(table: Table, file: str) -> _PowerLaw:
     from scipy.interpolate import PchipInterpolator
 
-    table = read_table("media", file)
     wavelength = _wavelengths(table, file)
     coefficients = (np.asarray(table[name], dtype=float) for name in ("C_n", "C_k"))
     return _PowerLaw(*(PchipInterpolator(wavelength, each, extrapolate=False) for each in coefficients))
@@ -337,7 +381,7 @@ def _measured_law(measured_at_k: float) -> tuple[_MeasuredLaw, NDArray[np.float6
     law = _MeasuredLaw(
         CubicSpline(wavelength, n),
         PchipInterpolator(wavelength, np.log(k), extrapolate=False),
-        _power_law(WARM_TABLE),
+        _power_law(read_table("media", WARM_TABLE), WARM_TABLE),
         measured_at_k,
     )
     return law, wavelength

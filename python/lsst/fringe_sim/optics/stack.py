@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, ResourceError, StackError, UnknownNameError, named_units
+from ..descriptions import Description, read_description
+from ..errors import InputError, ResourceError, StackError, UnknownNameError, named_units, printable_name
 from ..notebook import OneLine
 from ..resources import list_resources, read_yaml
 from .media import Medium, get_medium
@@ -114,16 +117,43 @@ class LayerStack(OneLine):
         for key in ("source", "doi", "licence", "layers"):
             if key not in content:
                 raise ResourceError(f"data/stacks/{name}.yaml does not state its {key}")
-        layers = [
-            Layer(
-                str(entry["name"]),
-                get_medium(str(entry["medium"])),
-                float(entry["thickness_um"]),
-                float(entry.get("roughness_nm", 0.0)),
-                float(entry.get("thickness_spread_um", 0.0)),
+        return cls._of(name, Description(content, f"stack {name}"), {})
+
+    @classmethod
+    def from_file(cls, path: str | Path, media: Mapping[str, Medium] | None = None) -> LayerStack:
+        """Stack that a YAML file describes, laid out like the shipped ones; it is named after the file.
+
+        ``media``: further media by name, as of `read_media`; they come before those that are shipped.
+
+        Raises
+        ------
+        InputError
+            The file is no such description.
+        UnknownNameError
+            It names a medium that there is not.
+        """
+        reader = Description(read_description(path, "stack"), str(path))
+        name = printable_name("name of the stack", Path(path).stem)
+        try:
+            return cls._of(name, reader, media or {})
+        except StackError as error:
+            raise error.in_source(str(path)) from None
+
+    @classmethod
+    def _of(cls, name: str, reader: Description, media: Mapping[str, Medium]) -> LayerStack:
+        layers = []
+        for each in reader.sections("layers"):
+            medium = each.text("medium")
+            try:
+                found = media[medium] if medium in media else get_medium(medium)
+            except UnknownNameError as error:
+                raise error.in_source(reader.source) from None
+            thickness = each.number("thickness_um", low=0.0, high=math.inf)
+            roughness, spread = (
+                each.number(key, low=0.0, high=1e6, default=0.0)
+                for key in ("roughness_nm", "thickness_spread_um")
             )
-            for entry in content["layers"]
-        ]
+            layers.append(Layer(each.text("name"), found, thickness, roughness, spread))
         return cls(tuple(layers), name)
 
     @property
@@ -178,20 +208,22 @@ class LayerStack(OneLine):
         """Stack in which the layer ``name`` is made of something else."""
         return self.replace_layer(name, medium=medium)
 
-    def with_silicon(self, name: str) -> LayerStack:
+    def with_silicon(self, name: str, media: Mapping[str, Medium] | None = None) -> LayerStack:
         """Stack in which all silicon has the optical constants of another table.
 
         Parameters
         ----------
         name : `str`
             ``Si``, ``Si_green2008`` (the constants of the paper), ``Si_schinke2015`` or ``Si_franta2017``.
+        media : mapping, optional
+            Further media by name, as of `read_media`.
 
         Raises
         ------
         InputError
             It is not silicon.
         """
-        medium = get_medium(name)
+        medium = media[name] if media and name in media else get_medium(name)
         if not medium.is_silicon:
             raise InputError("table of silicon", name, "Si or one that begins with Si_", source=self.name)
         layers = tuple(

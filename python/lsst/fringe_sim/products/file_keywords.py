@@ -33,7 +33,7 @@ FILTER_NAMES = ("FILTER", "FILTNAM", "FILTERID")
 """Keywords of the filter; the first that is stated counts."""
 
 _MAP, _CUBE, _SKY, _ANY = "thickness map", "fringe cube", "sky frame", "any product"
-_PLAIN, _OBSERVED = "plain flat", "observed frame"
+_PLAIN, _AMPLIFIERS, _OBSERVED = "plain flat", "flat of amplifiers", "observed frame"
 _SEARCH, _SKY_READERS = "fit, discover, Tasks", "sky, discover, Tasks"
 _FITS, _CORRECTION = "fit, discover", "templates, correct"
 
@@ -84,7 +84,9 @@ FILE_KEYWORDS: tuple[FileKeyword, ...] = (
     FileKeyword(
         _PLAIN, "CCDTEMP", _FITS, USED, "temperature in °C where TEMPK is absent; else the same within 5 °C"
     ),
-    FileKeyword(_PLAIN, "EXPTIME", _FITS, CHECKED, "more than 0 s of a flat, 0 of a bias"),
+    FileKeyword(
+        _PLAIN, "EXPTIME", _FITS, USED, "seconds of dark current; more than 0 of a flat, 0 of a bias"
+    ),
     FileKeyword(_PLAIN, "FILTER", _FITS, CHECKED, "of a flat a filter that passes its light"),
     FileKeyword(_PLAIN, "BUNIT", _FITS, USED, "electron, or adu, else refused"),
     FileKeyword(_PLAIN, "GAIN", _FITS, USED, "electrons for each adu"),
@@ -94,6 +96,16 @@ FILE_KEYWORDS: tuple[FileKeyword, ...] = (
     *(FileKeyword(_PLAIN, name, _FITS, CHECKED, "the same sensor in all images") for name in SENSOR_NAMES),
     FileKeyword(_PLAIN, "DATASEC", _FITS, CHECKED, "as large as the image: no overscan in it"),
     FileKeyword(_PLAIN, "TRIMSEC", _FITS, CHECKED, "as large as the image: no overscan in it"),
+    FileKeyword(_AMPLIFIERS, "INSTRUME", _FITS, CHECKED, "a camera that is not one of LSST"),
+    FileKeyword(
+        _AMPLIFIERS, "DATASEC", _FITS, USED, "pixels of the sensor; what lies right of them is overscan"
+    ),
+    FileKeyword(_AMPLIFIERS, "DETSEC", _FITS, USED, "where they belong"),
+    FileKeyword(_AMPLIFIERS, "DETSIZE", _FITS, CHECKED, "the size that all amplifiers cover once"),
+    FileKeyword(_AMPLIFIERS, "BUNIT", _FITS, CHECKED, "adu"),
+    FileKeyword(_AMPLIFIERS, "GAIN", _FITS, USED, "electrons for each adu, of each amplifier its own"),
+    FileKeyword(_AMPLIFIERS, "RDNOISE", _FITS, USED, "read noise in electrons; none where it is absent"),
+    FileKeyword(_AMPLIFIERS, "SATURATE", _FITS, USED, "counts from which on a pixel is masked SAT"),
     FileKeyword(
         _OBSERVED, "BUNIT", "templates", USED, "one unit in all frames; a correction is in that of its frame"
     ),

@@ -1,4 +1,4 @@
-"""Flats of any sensor, one image in one FITS file each: what there is before a camera has a layout of its own."""
+"""Flats of any sensor, one FITS file each: one image, or one for each of its amplifiers, however many."""
 
 from __future__ import annotations
 
@@ -12,9 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, InputError, named_units
-from ..instrument.raw_header import DeclaredHeader
-from ..instrument.raw_layout import Section
-from ..instrument.raw_metadata import TEMPERATURE_RANGE_C, WAVELENGTH_RANGE_NM, ZERO_CELSIUS_K
+from ..instrument.raw_header import DeclaredHeader, header_value
+from ..instrument.raw_layout import AmplifierLayout, Section, amplifier_layouts
+from ..instrument.raw_metadata import (
+    TEMPERATURE_RANGE_C,
+    WAVELENGTH_RANGE_NM,
+    ZERO_CELSIUS_K,
+    is_of_lsst,
+)
 from ..instrument.stated_facts import SAME_CELSIUS, SETTING_NM, Fact, refuse_other_filter
 from ..notebook import do_nothing
 from ..resources import complete_fits
@@ -35,10 +40,38 @@ ELECTRONS = ("electron", "electrons", "e-", "e")
 ADU = ("adu", "dn", "count", "counts")
 BIASES = ("bias", "zero")
 
+OF_LSST = ("LSST_NUM", "RAFTNAME", "RAFTBAY", "TSTAND")
+"""Keywords of raw frames in the LSST layout."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """What belongs to one amplifier, or to all of an image that has no amplifiers of its own."""
+
+    gain: float = 1.0  # electrons for each count
+    read_noise_e: float = 0.0  # read noise in electrons; 0 where it is not stated
+    full: float = math.inf  # counts at which a pixel is saturated
+    layout: AmplifierLayout | None = None  # where its pixels are, and where they belong; `None` of all pixels
+
+    @classmethod
+    def _of(cls, header: DeclaredHeader, layout: AmplifierLayout | None = None) -> Part:
+        noise, full = header.value("RDNOISE"), header.value("SATURATE")
+        return cls(
+            gain=_gain(header),
+            read_noise_e=header.number("RDNOISE", noise or 0.0, "electrons, 0 or more", lambda e: e >= 0),
+            full=math.inf if full is None else header.number("SATURATE", full, "positive", lambda c: c > 0),
+            layout=layout,
+        )
+
+    @property
+    def place(self) -> tuple[slice, slice]:
+        """Its pixels in the assembled image."""
+        return (slice(None), slice(None)) if self.layout is None else self.layout.destination
+
 
 @dataclass(frozen=True)
 class PlainImage:
-    """What the header of one image says; the pixels are read when they are wanted."""
+    """What the headers of one exposure say; the pixels are read when they are wanted."""
 
     source: str  # the file
     # ``flat``, ``bias``, or else ``IMGTYPE`` in lower case; ``flat`` where it is absent. Of another kind than
@@ -49,13 +82,15 @@ class PlainImage:
     # wavelength_nm, temperature_k: of a flat; `None` where the temperature is not stated
     wavelength_nm: float | None = None
     temperature_k: float | None = None
-    gain: float = 1.0  # electrons for each count
-    read_noise_e: float = 0.0  # read noise in electrons; 0 where it is not stated
-    full: float = math.inf  # counts at which a pixel is saturated
+    exposure_s: float = 0.0  # 0 where it is not stated
+    parts: tuple[Part, ...] = (Part(),)
 
     @classmethod
     def read(cls, path: str | Path) -> PlainImage | None:
-        """Read the headers of one file; `None` if it does not hold exactly one image.
+        """Read the headers of one file; `None` if it is neither one image nor one for each amplifier.
+
+        A file with several images is one of amplifiers if ``INSTRUME`` names a camera that is not one of LSST, whose
+        frames `RawFrame` reads.
 
         Raises
         ------
@@ -64,26 +99,43 @@ class PlainImage:
         """
         with complete_fits(path) as hdus:
             images = _images(hdus)
+            if len(images) > 1 and _is_of_another_camera(hdus[0].header):
+                return cls._of_amplifiers(hdus, str(path))
             if len(images) != 1:
                 return None
             (hdu,) = images
             others = () if hdu is hdus[0] else (hdus[0].header,)
             header = DeclaredHeader(hdu.header, str(path), DECLARED, others)
-            return cls._of(header, tuple(hdu.shape))
+            return cls._of(header, tuple(hdu.shape), None)
 
     @classmethod
-    def _of(cls, header: DeclaredHeader, shape: tuple[int, int]) -> PlainImage:
+    def _of_amplifiers(cls, hdus: Sequence[Any], source: str) -> PlainImage:
+        layouts, shape = amplifier_layouts(hdus, source, lsst=False)
+        own = {layout.hdu: hdus[layout.hdu].header for layout in layouts}
+        # Each amplifier has its own gain and noise, and all have one exposure.
+        parts = [
+            Part._of(DeclaredHeader(own[layout.hdu], source, DECLARED, (hdus[0].header,)), layout)
+            for layout in layouts
+        ]
+        header = DeclaredHeader(hdus[0].header, source, DECLARED, tuple(own.values()))
+        return cls._of(header, shape, tuple(parts))
+
+    @classmethod
+    def _of(
+        cls, header: DeclaredHeader, shape: tuple[int, int], parts: tuple[Part, ...] | None
+    ) -> PlainImage:
         kind = header.text("IMGTYPE").lower() or "flat"
         kind = "bias" if kind in BIASES else "flat" if "flat" in kind else kind
         if kind not in ("bias", "flat"):
             return cls(header.source, kind, shape)
-        _refuse_overscan(header, shape)
-        seconds = header.value("EXPTIME")
-        if seconds is not None and header.seconds_of_light("EXPTIME", seconds, kind) == 0 and kind == "flat":
-            raise header.refuse("EXPTIME", seconds, "more than 0 s for a flat")
+        if parts is None:
+            _refuse_overscan(header, shape)
+        stated = header.value("EXPTIME")
+        seconds = 0.0 if stated is None else header.seconds_of_light("EXPTIME", stated, kind)
+        if stated is not None and seconds == 0 and kind == "flat":
+            raise header.refuse("EXPTIME", stated, "more than 0 s for a flat")
         if kind == "flat":
             refuse_noiseless({NOISE: header.value(NOISE)}, header.source)
-        noise, full = header.value("RDNOISE"), header.value("SATURATE")
         return cls(
             source=header.source,
             kind=kind,
@@ -91,9 +143,8 @@ class PlainImage:
             detector=next(filter(None, map(header.text, SENSOR_NAMES)), ""),
             wavelength_nm=_wavelength(header) if kind == "flat" else None,
             temperature_k=_temperature(header) if kind == "flat" else None,
-            gain=_gain(header),
-            read_noise_e=header.number("RDNOISE", noise or 0.0, "electrons, 0 or more", lambda e: e >= 0),
-            full=math.inf if full is None else header.number("SATURATE", full, "positive", lambda c: c > 0),
+            exposure_s=seconds,
+            parts=parts or (Part._of(header),),
         )
 
     def require_wavelength_nm(self) -> float:
@@ -103,10 +154,44 @@ class PlainImage:
         return self.wavelength_nm
 
     def counts(self) -> NDArray[np.float32]:
-        """Pixels as they stand in the file, after ``BSCALE`` and ``BZERO``; NaN where it has ``BLANK``."""
+        """Pixels as they stand in the file, after ``BSCALE`` and ``BZERO``; NaN where it has ``BLANK``.
+
+        Those of amplifiers are put where they belong, less the median of the overscan at their side, if there is one.
+        """
+        return self._read()[0]
+
+    def _read(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Pixels, and whether they are saturated."""
+        counts = np.empty(self.shape, np.float32)
+        full = np.zeros(self.shape, np.bool_)
         with complete_fits(self.source) as hdus:
-            (hdu,) = _images(hdus)
-            return np.array(hdu.data, dtype=np.float32)
+            for part in self.parts:
+                if part.layout is None:
+                    (hdu,) = _images(hdus)
+                    if tuple(hdu.shape) != self.shape:
+                        raise FrameFormatError(
+                            "shape", tuple(hdu.shape), f"{self.shape}, as before", source=self.source
+                        )
+                    counts[:] = hdu.data
+                    full[:] = counts >= part.full
+                    continue
+                image = np.asarray(hdus[part.layout.hdu].data, dtype=np.float32)
+                counts[part.place], full[part.place] = _of_amplifier(image, part.layout, part.full)
+        return counts, full
+
+    def in_electrons(self, counts: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Counts times the gain of each amplifier."""
+        electrons = np.empty_like(counts)
+        for part in self.parts:
+            electrons[part.place] = np.float32(part.gain) * counts[part.place]
+        return electrons
+
+    def read_noise_e(self) -> NDArray[np.float32]:
+        """Read noise of every pixel [electrons]."""
+        noise = np.empty(self.shape, np.float32)
+        for part in self.parts:
+            noise[part.place] = part.read_noise_e
+        return noise
 
 
 @named_units
@@ -118,12 +203,13 @@ def read_plain_flats(
     f_number: float = math.inf,
     detector: str = "",
 ) -> FringeCube:
-    """Cube of flats that are one image in one file each.
+    """Cube of flats of one file each: one image, or one for each amplifier.
 
     The wavelength is read from ``MONOWL``, ``WAVELEN`` or ``WAVELNTH`` [nm]. ``BUNIT`` says electrons, or ADU with
     the ``GAIN`` in electrons for each. Images with ``IMGTYPE`` ``bias`` are averaged and subtracted; where there are
-    none, the flats are taken as bias-subtracted. ``RDNOISE`` [electrons] adds to the noise of the electrons. A copy
-    of a file counts once.
+    none, the flats are taken as bias-subtracted. Amplifiers, any number of them, have a ``DATASEC`` and a ``DETSEC``
+    each, and ``INSTRUME`` names the camera; the median of the overscan, right of ``DATASEC``, is subtracted.
+    ``RDNOISE`` [electrons] adds to the noise of the electrons. A copy of a file counts once.
 
     Parameters
     ----------
@@ -144,7 +230,7 @@ def read_plain_flats(
     Raises
     ------
     FrameFormatError
-        A file that is not one image, of another shape than the others, without its wavelength or unit; two of one
+        A file that is not one exposure, of another shape than the others, without its wavelength or unit; two of one
         content under different headers.
     InputError
         No flats among them, or flats of several sensors.
@@ -153,7 +239,8 @@ def read_plain_flats(
     for path in paths:
         image = PlainImage.read(path)
         if image is None:
-            raise FrameFormatError("images", "none or several", "one with two axes", source=str(path))
+            allowed = "one with two axes, or one for each amplifier and INSTRUME, which names the camera"
+            raise FrameFormatError("images", "none or several", allowed, source=str(path))
         images.append(image)
     return stack_plain_flats(
         images,
@@ -183,26 +270,26 @@ def stack_plain_flats(
     once = _Once(advance)
     level, n_bias = np.zeros(flats[0].shape, np.float32), 0
     for bias in biases:
-        counts = once.counts(bias)
-        if counts is not None:
-            level, n_bias = level + np.float32(bias.gain) * counts, n_bias + 1
+        read = once.read(bias)
+        if read is not None:
+            level, n_bias = level + bias.in_electrons(read[0]), n_bias + 1
     level /= np.float32(max(n_bias, 1))
     electrons = np.empty((len(flats), *flats[0].shape), np.float32)
     mask = np.zeros(electrons.shape, np.int16)
     kept: list[PlainImage] = []
     for flat in flats:
-        counts = once.counts(flat)
-        if counts is not None:
-            mask[len(kept)][counts >= flat.full] = mask_bits("SAT")
-            electrons[len(kept)] = np.float32(flat.gain) * counts - level
+        read = once.read(flat)
+        if read is not None:
+            mask[len(kept)][read[1]] = mask_bits("SAT")
+            electrons[len(kept)] = flat.in_electrons(read[0]) - level
             kept.append(flat)
     if once.copies:
         note(f"copies of other images, not counted again: {', '.join(once.copies)}")
     electrons, mask = electrons[: len(kept)], mask[: len(kept)]
-    noise = np.array([flat.read_noise_e for flat in kept], np.float32)[:, np.newaxis, np.newaxis]
     variance = np.maximum(electrons, np.float32(1.0))
-    variance += noise**2 * np.float32(1.0 + (1.0 / n_bias if n_bias else 0.0))
-    return FringeCube.from_arrays(
+    for flat, own in zip(kept, variance, strict=True):
+        own += flat.read_noise_e() ** 2 * np.float32(1.0 + (1.0 / n_bias if n_bias else 0.0))
+    cube = FringeCube.from_arrays(
         electrons,
         [flat.require_wavelength_nm() for flat in kept],
         variance,
@@ -213,6 +300,8 @@ def stack_plain_flats(
         detector=next((flat.detector for flat in kept if flat.detector), detector),
         metadata={"NBIAS": n_bias},
     )
+    seconds = np.array([flat.exposure_s for flat in kept])
+    return replace(cube, exposures=replace(cube.exposures, dark_time_s=seconds))
 
 
 def refuse_other_sensors(images: Sequence[PlainImage]) -> None:
@@ -239,24 +328,38 @@ class _Once:
         self._seen: dict[str, PlainImage] = {}
         self.copies: list[str] = []
 
-    def counts(self, image: PlainImage) -> NDArray[np.float32] | None:
-        """Pixels, `None` of a copy; equal pixels under another header are refused.
+    def read(self, image: PlainImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
+        """Pixels and whether they are saturated, `None` of a copy; equal pixels under another header are refused.
 
         Images of one value have no light to tell.
         """
-        counts = image.counts()
+        counts, full = image._read()
         self._advance()
-        if counts.shape != image.shape:
-            raise FrameFormatError("shape", counts.shape, f"{image.shape}, as before", source=image.source)
         first = self._seen.setdefault(pixels_digest(counts), image)
         if first is image or np.nanmin(counts) == np.nanmax(counts):
-            return counts
+            return counts, full
         if replace(first, source=image.source) != image:
             raise FrameFormatError(
                 "pixels", f"those of {first.source}", "light of its own", source=image.source
             )
         self.copies.append(image.source)
         return None
+
+
+def _is_of_another_camera(header: Any) -> bool:
+    """Whether a header names a camera of its own, and nothing in it is of LSST."""
+    named = header_value(header, "INSTRUME")
+    return named is not None and not is_of_lsst(str(named)) and not any(map(header.get, OF_LSST))
+
+
+def _of_amplifier(
+    image: NDArray[np.float32], layout: AmplifierLayout, full: float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Pixels of an amplifier as they lie on the sensor, less its overscan; whether they are saturated."""
+    flip = slice(None, None, -1 if layout.flip_y else 1), slice(None, None, -1 if layout.flip_x else 1)
+    pixels, overscan = image[layout.imaging][flip], image[layout.serial_overscan]
+    level = np.float32(np.median(overscan)) if overscan.size else np.float32(0.0)
+    return pixels - level, pixels >= full
 
 
 def _images(hdus: Sequence[Any]) -> list[Any]:

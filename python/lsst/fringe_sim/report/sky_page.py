@@ -94,7 +94,8 @@ def write_sky_report(
 
     ``seed``: of places and angles of the coadds, where ``places`` are not given. ``picture``: file beside the page
     for the first frame with all its pixels, if wanted. ``pixel_arcsec``: size of a pixel [arcsec]. ``section``:
-    pixels of the sensor that the frames show, where that is known. ``origin``: command, and pages of what it was given.
+    pixels of the sensor that the frames show, where that is known. ``origin``: command, and pages
+    of what it was given.
     """
     first = frames[0]
     report = Report(

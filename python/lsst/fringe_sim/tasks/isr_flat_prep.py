@@ -184,6 +184,7 @@ class IsrFlatPrepTask(PipelineTask):
             flat.level_e,
             describe_mask(flat.mask),
         )
-        tables = table_cards((("setups", f"{setup.name}.yaml"), ("instrument", "lsstcam_amps.ecsv")))
+        shipped = () if setup.files else (("setups", f"{setup.name}.yaml"),)
+        tables = table_cards((*shipped, ("instrument", "lsstcam_amps.ecsv")), setup.files)
         metadata = {**common_header(self.config), "SETUP": setup.name, **tables, **flat.metadata}
         return Struct(flat=dataclasses.replace(flat, detector=detector.name, metadata=metadata))

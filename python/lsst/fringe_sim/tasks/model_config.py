@@ -105,7 +105,9 @@ class FringeModelConfig(CameraConfig):
     """Name of the task; by it a raft's override file finds the file of its camera."""
 
     setup: Field[str] = Field(
-        dtype=str, default="ts8_e2v", doc="Name of the set-up: sensor, temperature and light."
+        dtype=str,
+        default="ts8_e2v",
+        doc="Set-up: sensor, temperature and light; a name, or the path of a YAML file.",
     )
     effects: DictField[str, float] = DictField(
         keytype=str,

@@ -328,7 +328,7 @@ def takes_images(data_id: DataCoordinate) -> bool:
 
 
 def _band(setup: Setup) -> str:
-    return setup.bandpass.rpartition("_")[2]
+    return setup.filter_name.rpartition("_")[2]
 
 
 def _check_map(thickness: ThicknessMap, choice: ModelChoice) -> None:

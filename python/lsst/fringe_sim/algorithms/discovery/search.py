@@ -61,6 +61,17 @@ _METRIC = "rms of data minus model, relative counts"
 Report = Callable[[str], None]
 
 
+def _said_of_left_out(why: Mapping[str, str]) -> list[str]:
+    """Which effects were not looked for, those of one reason together."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in why.items():
+        by_reason.setdefault(reason, []).append(name)
+    return [
+        f"{', '.join(names)} {'were' if len(names) > 1 else 'was'} left out: {reason}"
+        for reason, names in by_reason.items()
+    ]
+
+
 PAIR = 2
 """Effects with which fringe orders are judged again before a third is looked for: what leaves a residual may be one
 effect and a thickness that is wrong in places."""
@@ -615,8 +626,7 @@ class _Search:
         unseen = self.unseen or HeldOut(0.0, 0.0, before, after)
         gap = Gap(_METRIC, before, after, unseen.before_rms, unseen.after_rms, self.cells.noise_rms)
         candidates = tuple({"name": c.name, "score": c.gain, "degrees": c.degrees} for c in self.scores)  # type: tuple[dict[str, Any], ...]
-        for name, why in whole.left_out.items():
-            self.notes.append(f"{name} was left out: {why}")
+        self.notes += _said_of_left_out(whole.left_out)
         data = {
             "shape": list(self.cells.shape),
             "cell_px": self.cells.cell_px,

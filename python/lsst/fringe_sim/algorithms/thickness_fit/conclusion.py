@@ -223,10 +223,12 @@ def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
     """
     if flats is None:
         return []
-    said = [
-        f"contrast {metadata['CONTRAST']:.3g} ± {metadata['CONTRSIG']:.1g} of the model's "
-        f"({flats.contrast.min():.3g} to {flats.contrast.max():.3g} over the wavelengths)"
-    ]
+    said = ["contrast held at that of the model"]
+    if flats.contrast_sigma.any():
+        said = [
+            f"contrast {metadata['CONTRAST']:.3g} ± {metadata['CONTRSIG']:.1g} of the model's "
+            f"({flats.contrast.min():.3g} to {flats.contrast.max():.3g} over the wavelengths)"
+        ]
     if float(metadata["SCALESIG"]) > 0.0:
         said.append(
             f"all thicknesses share an uncertainty of {metadata['SCALESIG']:.1g} of themselves, because the "

@@ -133,6 +133,8 @@ def fit_thickness(
     data = amplitudes_from_cube(cube, noise_correlation_px)
     low, high = range_um or model.setup.thickness_range_um
     templates = make_templates(model, cube.wavelength_nm, (low, high), observable)
+    free = nuisances or Nuisances.automatic(contrast, model.setup.wavelength_accuracy_nm)
+    free = replace(free, grid=model.setup.amplifier_grid)
     flats: FlatFit | None = None
     coarse: NDArray[np.float32] | None = None
     notes: dict[str, Any] = {"METHOD": method, "RANGELO": low, "RANGEHI": high}
@@ -148,7 +150,7 @@ def fit_thickness(
         any_silicon = SiliconModel(seen, exposures.wavelength_nm, exposures.bandwidth_fwhm_nm)
         joint = joint_fit(
             data, templates, any_silicon, silicon, range_um=(low, high), cell_px=cell_px,
-            nuisances=Nuisances.automatic(contrast, model.setup.wavelength_accuracy_nm), threads=workers,
+            nuisances=free, threads=workers,
         )  # fmt: skip
         if joint.found.nuisance.misfit.size:
             flats = flat_fit(joint.found.nuisance, np.asarray(cube.wavelength_nm, dtype=float))
@@ -162,7 +164,7 @@ def fit_thickness(
             templates,
             range_um=(low, high),
             cell_px=cell_px,
-            nuisances=nuisances or Nuisances.automatic(contrast, model.setup.wavelength_accuracy_nm),
+            nuisances=free,
             threads=workers,
         )
         pixels = found.pixels

@@ -22,6 +22,7 @@ from .templates import FringeTemplates
 __all__ = [
     "CONTRASTS",
     "GAIN_ACCURACY",
+    "LSST_GRID",
     "ZONES",
     "NuisanceFit",
     "Nuisances",
@@ -40,6 +41,10 @@ OVERTONES = 4
 """Numbers that describe the overtones at one wavelength."""
 GAIN_ACCURACY = 0.005
 """How well gains of amplifiers are known: a few 1e-3 from iron-55, or from the variance of pairs of flats."""
+LSST_GRID = (2, 8)
+"""Rows and columns of the amplifiers of an LSST sensor."""
+LEAST_ZONE_PX = 16
+"""Pixels along a side of an amplifier below which its level is not told from its fringes."""
 _GAIN_BY_WAVELENGTH = 0.2
 """Standard deviation of the level of a zone at one wavelength, over that of its mean: levels are mostly gains."""
 _LIGHT, _LIGHT_BY_WAVELENGTH = 0.1, 0.02
@@ -65,6 +70,8 @@ class Nuisances:
         infinite by default.
     wavelength_accuracy_nm : `float`, optional
         Standard deviation of the wavelengths about their labels [nm]; 0 if they are taken as they are.
+    grid : `tuple` [`int`, `int`], optional
+        Rows and columns of amplifiers.
 
     Raises
     ------
@@ -78,6 +85,7 @@ class Nuisances:
     contrast: str = "fixed"
     gain_accuracy: float = np.inf
     wavelength_accuracy_nm: float = 0.0
+    grid: tuple[int, int] = LSST_GRID
 
     def __post_init__(self) -> None:
         if self.zones not in ZONES:
@@ -92,9 +100,14 @@ class Nuisances:
             raise OutOfRangeError("accuracy of wavelengths [nm]", self.wavelength_accuracy_nm, "0 to 20")
 
     @classmethod
-    def automatic(cls, contrast: str = "wavelength", wavelength_accuracy_nm: float = 0.0) -> Nuisances:
+    def automatic(
+        cls,
+        contrast: str = "wavelength",
+        wavelength_accuracy_nm: float = 0.0,
+        grid: tuple[int, int] = LSST_GRID,
+    ) -> Nuisances:
         """What is free unless somebody asks otherwise."""
-        return cls(True, "amplifiers", 2, contrast, GAIN_ACCURACY, wavelength_accuracy_nm)
+        return cls(True, "amplifiers", 2, contrast, GAIN_ACCURACY, wavelength_accuracy_nm, grid)
 
     @property
     def any(self) -> bool:
@@ -108,7 +121,9 @@ class Nuisances:
 
     def fitting(self, ny: int, nx: int) -> Nuisances:
         """Levels of amplifiers only where a sensor is large enough for them."""
-        small = self.zones == "amplifiers" and np.isfinite(self.gain_accuracy) and (ny < 32 or nx < 128)
+        rows, columns = self.grid
+        small = ny < LEAST_ZONE_PX * rows or nx < LEAST_ZONE_PX * columns
+        small = small and self.zones == "amplifiers" and bool(np.isfinite(self.gain_accuracy))
         return replace(self, zones="sensor") if small else self
 
     def breaks(self, ny: int, nx: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -121,10 +136,15 @@ class Nuisances:
         """
         if self.zones == "sensor":
             return (), ()
-        if ny < 2 or (self.zones == "amplifiers" and nx < 8):
+        rows, columns = self.grid if self.zones == "amplifiers" else (2, 1)
+        if ny < rows or nx < columns:
             raise InputError("zones", self.zones, f"zones that a sensor of {ny} rows and {nx} columns has")
-        rows = (ny // 2,)
-        return rows, (tuple(nx * k // 8 for k in range(1, 8)) if self.zones == "amplifiers" else ())
+        return _borders(ny, rows), _borders(nx, columns)
+
+
+def _borders(size: int, count: int) -> tuple[int, ...]:
+    """First pixels of all but the first of so many equal parts."""
+    return tuple(size * k // count for k in range(1, count))
 
 
 @dataclass(frozen=True, eq=False)
