@@ -136,7 +136,9 @@ class Coordinate:
 def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -> tuple[Coordinate, ...]:
     """Coordinates of an effect; how it starts is found by trying."""
     nulls, hints = effect.null_values(forward.model.base_system), effect.search
-    repeats = hints.repeats_after if forward.exposures is None else {**hints.repeats_on_sky, **hints.repeats_after}
+    repeats = (
+        hints.repeats_after if forward.exposures is None else {**hints.repeats_on_sky, **hints.repeats_after}
+    )
     found = []
     for parameter in _seen_parameters(effect, forward.geometry.wavelength_nm):
         name = parameter.name
