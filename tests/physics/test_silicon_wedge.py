@@ -65,10 +65,13 @@ def test_every_pixel_sees_the_silicon_of_its_own_thickness(wavelength_nm, fwhm_n
 @pytest.mark.slow
 @pytest.mark.rng("a wedge of the mock")
 def test_flats_of_the_mock_give_both_layers_back(rng) -> None:
-    """Twelve broad flats and six narrow ones; what is fitted shares no optics with what made them."""
+    """Twelve broad flats and six narrow ones; what is fitted shares no optics with what made them.
+
+    Slopes are a tenth of a fringe in a pixel; with twice as much, over which the mock averages, pulls are 1.11.
+    """
     shape, narrow = (96, 104), np.array([925.0, 938.0, 946.0, 957.0, 969.0, 983.0])
     broad, noise = np.arange(880.0, 991.0, 10.0), 0.004
-    truth = random_field(shape, rng, mean=14.0, span=2.0)
+    truth = random_field(shape, rng, mean=14.0, span=1.0)
     rise = {"gradient_x": 0.22, "gradient_y": -0.07}
     flats = np.concatenate(
         [mock_flats(truth, broad, 2.0, **rise), mock_flats(truth, narrow, NARROW_NM, **rise)]
