@@ -156,12 +156,7 @@ def angles(context: Context) -> Section:
             "angle_bins": float(convergence[0].y[BINS.index(50)]),
         },
         (
-            Graph(
-                "light path",
-                "from the axis [m]",
-                "along the axis [m]",
-                tuple(_light_path(field, label) for field, label in FIELDS),
-            ),
+            _paths(),
             Graph("angles of incidence", "angle of incidence [deg]", "density [1/deg]", tuple(curves)),
             Graph(
                 "sum over bins of angle",
@@ -173,6 +168,12 @@ def angles(context: Context) -> Section:
         ),
         "Light path through the LSST, angles of incidence, and the fringe that too few of them leave.",
     )
+
+
+def _paths() -> Graph:
+    """Figure 9."""
+    curves = tuple(_light_path(field, label) for field, label in FIELDS)
+    return Graph("light path", "from the axis [m]", "along the axis [m]", curves)
 
 
 def _light_path(field_deg: float, label: str) -> Curve:
