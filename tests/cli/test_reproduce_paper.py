@@ -11,6 +11,7 @@ from astropy.table import Table
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.paper import published_numbers
+from lsst.fringe_sim.paper.optics import FIELDS, _light_path
 from lsst.fringe_sim.paper.section import Curve, Graph, Picture, Section
 from lsst.fringe_sim.report.paper_page import section_figures
 
@@ -112,6 +113,18 @@ def test_logarithmic_graphs_leave_out_what_cannot_be_drawn() -> None:
     drawn = np.asarray(made.axes[0].lines[0].get_ydata(), dtype=float)
     assert np.array_equal(np.isnan(drawn), [False, True, True, False])
     assert made.axes[0].get_ylim()[1] > 2.2, "the legend has room above the curves"
+
+
+def test_light_path_ends_at_one_place_of_the_focal_plane() -> None:
+    """Figure 9: the tangent of the field angle times 10.31 m away from the axis; mirrors three, lenses, filter."""
+    for field_deg, label in FIELDS:
+        path = _light_path(field_deg, label)
+        rays = np.split(np.stack([path.x, path.y], axis=1), np.flatnonzero(np.isnan(path.x)) + 1)[:-1]
+        ends = np.array([ray[-2] for ray in rays])
+        assert len(rays) > 10
+        np.testing.assert_allclose(ends[:, 0], 10.31 * np.tan(np.deg2rad(field_deg)), atol=3e-3)
+        assert np.ptp(ends[:, 0]) < 2e-4
+        assert all(np.count_nonzero(np.diff(np.sign(np.diff(ray[:-1, 1])))) == 3 for ray in rays)
 
 
 def test_pictures_of_a_thinned_sensor_have_its_pixels_on_their_axes() -> None:

@@ -10,12 +10,13 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 import lsst.fringe_sim
 
-__all__ = ["ForeignClutter", "ForeignFrame", "ForeignSky", "foreign_map", "foreign_night"]
+__all__ = ["ForeignClutter", "ForeignFrame", "ForeignSky", "Media", "foreign_map", "foreign_night"]
 
 DATA = Path(lsst.fringe_sim.__file__).parent / "data"
 
@@ -36,6 +37,15 @@ FAINTEST = 1e-3
 """Lines fainter than so much of the brightest are left out."""
 
 CONTINUUM = "continuum"
+
+
+class Media(NamedTuple):
+    """Layers at one wavelength; those below without an index are of silicon."""
+
+    above: tuple[tuple[complex, float], ...]
+    silicon: complex
+    below: tuple[tuple[complex | None, float], ...]
+    substrate: complex
 
 
 @dataclass(frozen=True)
@@ -124,12 +134,17 @@ class ForeignSky:
         squares = rim * (self.obscuration**2 + (1.0 - self.obscuration**2) * 0.5 * (nodes + 1.0))
         return 0.5 * shares, np.sqrt(squares)
 
+    def media(self, wavelength_nm: float) -> Media:
+        """Indices and thicknesses of the layers but the adhesive."""
+        return Media(ABOVE, _silicon(wavelength_nm, self.kelvin), BELOW, SUBSTRATE)
+
     def absorbed(
         self, wavelength_nm: float, sine: np.ndarray, polarised: str, epoxy_um: np.ndarray
     ) -> np.ndarray:
         """Part of plane waves that the detection layer takes, ``(rays, thicknesses of the adhesive)``."""
-        silicon, waves = _silicon(wavelength_nm, self.kelvin), 1e3 / wavelength_nm
-        away = np.stack([np.ones(sine.size), _admittance(SUBSTRATE, sine, polarised)], axis=1)
+        waves, media = 1e3 / wavelength_nm, self.media(wavelength_nm)
+        silicon = media.silicon
+        away = np.stack([np.ones(sine.size), _admittance(media.substrate, sine, polarised)], axis=1)
         fields = _matrix(silicon, SUPPORT_UM * waves, sine, polarised) @ away[:, :, np.newaxis]
         # The adhesive absorbs nothing and turns the fields by a real angle: all energy flows are p + q cos + r sin of
         # twice that angle, which three angles determine.
@@ -137,12 +152,12 @@ class ForeignSky:
         turns = angle[:, np.newaxis] / (2.0 * np.pi * np.sqrt(EPOXY**2 - sine**2))
         turned = [_matrix(EPOXY, each, sine, polarised) @ fields for each in turns]
         fields = np.concatenate(turned, axis=2)
-        for index, thickness in reversed(BELOW):
+        for index, thickness in reversed(media.below):
             fields = _matrix(index or silicon, thickness * waves, sine, polarised) @ fields
         bottom = _flux(fields)
         fields = _matrix(silicon, self.silicon_um * waves, sine, polarised) @ fields
         top = _flux(fields)
-        for index, thickness in reversed(ABOVE):
+        for index, thickness in reversed(media.above):
             fields = _matrix(index, thickness * waves, sine, polarised) @ fields
         vacuum = _admittance(1.0, sine, polarised).real[:, np.newaxis]
         incident = 0.25 * np.abs(vacuum * fields[:, 0] + fields[:, 1]) ** 2 / vacuum

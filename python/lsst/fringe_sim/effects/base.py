@@ -92,6 +92,8 @@ class SearchHints:
         Parameters that say where the effect is, not how strong: by themselves they change nothing.
     repeats_after : mapping [`str`, `float`]
         Distance after which the fringes look nearly the same again: neighbouring minima of a fit; 0 if they do not.
+    repeats_on_sky : mapping [`str`, `float`]
+        The same for frames of the sky alone: lines of the sky show fringes that the light of flats averages.
     steps : mapping [`str`, `float`]
         Change of a parameter to which the effect is in proportion, if that is less than a thousandth of the prior
         scale; 0 if it is not.
@@ -111,6 +113,7 @@ class SearchHints:
     sought: bool = False
     places: tuple[str, ...] = ()
     repeats_after: Mapping[str, float] = field(default_factory=dict)
+    repeats_on_sky: Mapping[str, float] = field(default_factory=dict)
     steps: Mapping[str, float] = field(default_factory=dict)
     refinements: Mapping[str, int] = field(default_factory=dict)
     natural_bounds: tuple[float, ...] = ()

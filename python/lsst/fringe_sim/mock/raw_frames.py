@@ -135,7 +135,7 @@ class MockTruth:
 
     def light(self, wavelength_nm: float) -> FloatArray:
         """Light that becomes charge, relative to its mean over the sensor: fringes and illumination, no defects."""
-        signal = self.signal.flat(self.signal.tables[0].wavelengths_nm.index(float(wavelength_nm)))
+        signal = self.signal.flat(self.signal.tables.wavelengths_nm.index(float(wavelength_nm)))
         light = signal / signal.mean()
         for effect, values in _active(self.effects):
             if effect.on_light is not None:

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .hidden_effect import RIM_SQUARES
 from .hidden_effects import ActiveHiddenEffect, Island, added_silicon, hidden_islands
-from .optics import FlatFieldOptics, SignalTable
+from .optics import FlatFieldOptics
+from .silicon_tables import SiliconTables
 from .thickness import PixelArea
 
 __all__ = ["SensorSignal"]
 
 FloatArray = NDArray[np.float64]
-
-SILICON_STEP_UM = 0.03
-"""Largest step from one detection layer to the next [µm], a quarter of the period of its own fringes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +24,8 @@ class SensorSignal:
     """Signal of flats at every pixel."""
 
     area: PixelArea  # thickness of the varying layer
-    thicker_um: FloatArray  # [y, x]: what is added to the detection layer
-    added_um: FloatArray  # (N,): the same for the N tables, increasing
-    tables: tuple[SignalTable, ...]  # signal against the thickness of the varying layer
+    thicker: tuple[PixelArea, ...]  # what is added to the detection layer; none if it is even
+    tables: SiliconTables  # signal against both
     # What of the sensor has other optics, and the signal of a sensor that has them everywhere
     islands: tuple[tuple[Island, SensorSignal], ...] = ()
 
@@ -49,20 +44,13 @@ class SensorSignal:
         see other optics.
         """
         area = PixelArea.of(thickness_um)
-        wedge = np.zeros(thickness_um.shape) if thicker_um is None else thicker_um
-        low, high = float(wedge.min()), float(wedge.max())
-        added = np.linspace(low, high, 1 + math.ceil((high - low) / SILICON_STEP_UM))
-        nominal = optics.films[optics.position(optics.detection)].thickness_um
-        tables = tuple(
-            optics.with_film(optics.detection, thickness_um=nominal + more).table(
-                area.range_um, tuple(wavelengths_nm)
-            )
-            for more in added
-        )
+        thicker = () if thicker_um is None else (PixelArea.of(thicker_um),)
+        added_um = thicker[0].range_um if thicker else (0.0, 0.0)
+        tables = SiliconTables.of(optics, area.range_um, added_um, tuple(wavelengths_nm))
         others = tuple(
             (island, cls.of(inside, thickness_um, wavelengths_nm, thicker_um)) for island, inside in islands
         )
-        return cls(area, wedge, added, tables, others)
+        return cls(area, thicker, tables, others)
 
     @classmethod
     def with_effects(
@@ -94,29 +82,9 @@ class SensorSignal:
 
     def _in_squares(self, row: int, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> FloatArray:
         """Signal in the middle of the equal squares of some pixels, without islands."""
-        middle = (np.arange(RIM_SQUARES) + 0.5) / RIM_SQUARES - 0.5
-        rim = rows, columns
-        thickness, slope_y, slope_x = (
-            values[rim][:, np.newaxis, np.newaxis]
-            for values in (self.area.thickness_um, self.area.slope_y, self.area.slope_x)
-        )
-        within = thickness + slope_y * middle[:, np.newaxis] + slope_x * middle
-        added = np.broadcast_to(self.thicker_um[rim][:, np.newaxis, np.newaxis], within.shape)
-        flat = np.zeros(within.shape)
-        points = SensorSignal(PixelArea(within, flat, flat), added, self.added_um, self.tables)
-        return points._of_all(row)
+        places = (area.in_squares(rows, columns, RIM_SQUARES) for area in (self.area, *self.thicker))
+        return self.tables.of_flat(row)(*places)
 
     def _of_all(self, row: int) -> FloatArray:
-        """Signal outside islands, in a straight line between detection layers."""
-        if len(self.tables) == 1:
-            return self.area.average(partial(self.tables[0].evaluate, row))
-        place = (self.thicker_um - self.added_um[0]) / (self.added_um[1] - self.added_um[0])
-        signal = np.zeros(place.shape)
-        for number, table in enumerate(self.tables):
-            share = 1.0 - np.abs(place - number)
-            near = share > 0.0
-            if not near.any():
-                continue
-            part = PixelArea(self.area.thickness_um[near], self.area.slope_y[near], self.area.slope_x[near])
-            signal[near] += share[near] * part.average(partial(table.evaluate, row))
-        return signal
+        """Signal outside islands."""
+        return self.area.average(self.tables.of_flat(row), *self.thicker)

@@ -96,9 +96,23 @@ class PixelArea:
         reach = 0.5 * (np.abs(self.slope_y) + np.abs(self.slope_x))
         return float((self.thickness_um - reach).min()), float((self.thickness_um + reach).max())
 
-    def average(self, signal: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Mean over each pixel of what depends on the thickness, by 3 × 3 nodes of Gauss and Legendre."""
-        return np.asarray(sum(weight * signal(thickness) for thickness, weight in self._nodes()))
+    def average(self, signal: Callable[..., NDArray[np.float64]], *others: PixelArea) -> NDArray[np.float64]:
+        """Mean over each pixel of what depends on its thickness, and on others, by 3 × 3 nodes of Gauss's rule."""
+        total = np.zeros(self.thickness_um.shape)
+        for nodes in zip(*(area._nodes() for area in (self, *others)), strict=True):
+            total += nodes[0][1] * signal(*(thickness for thickness, _ in nodes))
+        return total
+
+    def in_squares(
+        self, rows: NDArray[np.intp], columns: NDArray[np.intp], across: int
+    ) -> NDArray[np.float64]:
+        """Thickness in the middle of equal squares of some pixels, shape ``(N, across, across)``."""
+        middle = (np.arange(across) + 0.5) / across - 0.5
+        thickness, slope_y, slope_x = (
+            values[rows, columns][:, np.newaxis, np.newaxis]
+            for values in (self.thickness_um, self.slope_y, self.slope_x)
+        )
+        return np.asarray(thickness + slope_y * middle[:, np.newaxis] + slope_x * middle)
 
     def _nodes(self) -> Iterator[tuple[NDArray[np.float64], float]]:
         for up, weight_y in GAUSS_NODES:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import batoid
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +13,7 @@ from ..algorithms.photon_migration import photon_migration
 from ..algorithms.sky_frame import is_band
 from ..instrument.bandpass import Bandpass
 from ..instrument.sky import EmissionLines, SkySpectrum
-from ..instrument.telescope import RayBundle, Telescope
+from ..instrument.telescope import RayBundle, Telescope, batoid_optic
 from ..model import FringeModel
 from ..optics import Beam, Illumination
 from ..resources import read_table
@@ -33,8 +36,11 @@ STRONG = 0.01
 """Strength from which lines are compared, relative to the strongest: the figure reads fainter ones badly."""
 
 EDGE_DEG = 1.44
+FIELDS = ((0.0, "LSST, centre"), (EDGE_DEG, f"LSST, {EDGE_DEG}° off axis"))
 BINS = (10, 20, 50, 100)
 BEAM_NODES = 192
+PATH_RAYS = 7
+"""Rays on either side of the axis of which the path through the telescope is drawn."""
 
 FAINTEST = 1e-6
 """Weight below which lines are not drawn."""
@@ -134,7 +140,7 @@ def angles(context: Context) -> Section:
         density, limits = np.histogram(degrees[key], bins=80, range=(0.0, 32.0), density=True)
         curves.append(Curve(0.5 * (limits[1:] + limits[:-1]), density, label))
     convergence = []
-    for rays, label in ((centre, "LSST, centre"), (edge, f"LSST, {EDGE_DEG}° off axis")):
+    for rays, (_, label) in zip((centre, edge), FIELDS, strict=True):
         converged = _rms(context, rays.beam(BEAM_NODES))
         ratio = [_rms(context, _histogram_beam(rays, bins)) / converged for bins in BINS]
         convergence.append(Curve(np.array(BINS, dtype=float), np.array(ratio), label, "o"))
@@ -150,6 +156,7 @@ def angles(context: Context) -> Section:
             "angle_bins": float(convergence[0].y[BINS.index(50)]),
         },
         (
+            _paths(),
             Graph("angles of incidence", "angle of incidence [deg]", "density [1/deg]", tuple(curves)),
             Graph(
                 "sum over bins of angle",
@@ -159,8 +166,36 @@ def angles(context: Context) -> Section:
                 logarithmic=True,
             ),
         ),
-        "Distribution of the angle of incidence, and the fringe that too few of them leave.",
+        "Light path through the LSST, angles of incidence, and the fringe that too few of them leave.",
     )
+
+
+def _paths() -> Graph:
+    """Figure 9."""
+    curves = tuple(_light_path(field, label) for field, label in FIELDS)
+    return Graph("light path", "from the axis [m]", "along the axis [m]", curves)
+
+
+def _light_path(field_deg: float, label: str) -> Curve:
+    """Rays in a plane through the axis of the LSST, from before its mirrors to the sensor, one after the other."""
+    optic = batoid_optic("LSST_y.yaml")
+    radius = 0.5 * optic.pupilSize * np.linspace(optic.pupilObscuration, 1.0, PATH_RAYS + 2)[1:-1]
+    start = np.concatenate([-radius, radius])
+    rays = batoid.RayVector.fromStop(
+        start,
+        np.zeros(start.size),
+        optic=optic,
+        wavelength=960e-9,
+        theta_x=math.radians(field_deg),
+        theta_y=0.0,
+    )
+    ground = batoid.CoordSys()
+    met = [rays.copy(), *(step["out"].copy() for step in optic.traceFull(rays).values())]
+    places = np.stack([each.toCoordSys(ground).r for each in met], axis=1)
+    arrived = ~(met[-1].vignetted | met[-1].failed)
+    # A gap after each ray parts it from the next.
+    drawn = np.pad(places[arrived], ((0, 0), (0, 1), (0, 0)), constant_values=math.nan).reshape(-1, 3)
+    return Curve(drawn[:, 0], drawn[:, 2], label)
 
 
 def _histogram_beam(rays: RayBundle, bins: int) -> Beam:

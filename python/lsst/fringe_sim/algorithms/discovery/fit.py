@@ -136,6 +136,9 @@ class Coordinate:
 def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -> tuple[Coordinate, ...]:
     """Coordinates of an effect; how it starts is found by trying."""
     nulls, hints = effect.null_values(forward.model.base_system), effect.search
+    repeats = (
+        hints.repeats_after if forward.exposures is None else {**hints.repeats_on_sky, **hints.repeats_after}
+    )
     found = []
     for parameter in _seen_parameters(effect, forward.geometry.wavelength_nm):
         name = parameter.name
@@ -145,7 +148,7 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
         found.append(
             Coordinate(
                 effect.name, name, null, low, high, parameter.prior_scale, quadratic, parameter.unit,
-                hints.repeats_after.get(name, 0.0), parameter.wavelength_nm > 0.0, name in hints.places,
+                repeats.get(name, 0.0), parameter.wavelength_nm > 0.0, name in hints.places,
                 hints.steps.get(name, 0.0), hints.refinements.get(name, 0), hints.exchangeable,
             )
         )  # fmt: skip
