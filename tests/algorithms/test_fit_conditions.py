@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -158,3 +159,16 @@ def test_a_pixel_beyond_measure_where_there_are_no_fringes_is_no_traceback(seed:
         warnings.simplefilter("ignore")
         with suppress(InputError):
             assert fit_thickness(cube, model, "global", range_um=(12.5, 13.5)).mask.all()
+
+
+@pytest.mark.rng("fit conditions one wavelength of some pixels is spoiled")
+def test_a_pixel_leaves_out_a_wavelength_that_is_spoiled(model, rng) -> None:
+    """As after a cosmic ray that nobody masked: the other wavelengths tell the thickness."""
+    truth = random_field((96, 128), rng, mean=14.0, span=0.8)
+    cube = relative_flats(truth, model, rng, noise=NOISE)
+    image, (rows, columns) = cube.image.copy(), (np.array([20, 47, 70]), np.array([30, 64, 100]))
+    image[5, rows, columns] *= 1.2
+    fitted = fit_thickness(replace(cube, image=image), model)
+    assert (fitted.mask[rows, columns] == 0).all()
+    assert (fitted.n_wavelengths[rows, columns] == len(cube.wavelength_nm) - 1).all()
+    assert (np.abs(fitted.value - truth)[rows, columns] < 5.0 * fitted.sigma[rows, columns]).all()

@@ -32,6 +32,7 @@ def test_table(capsys, tmp_path) -> None:
     table = QTable.read(path)
     assert table["thickness"].unit == "um"
     assert table["sigma"].unit == "nm"
+    assert table["rival"].unit == "um"
     assert np.all(table["sigma"].value > 0)
 
 

@@ -18,6 +18,8 @@ from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.model import FringeModel, Setup
 from lsst.fringe_sim.optics import Illumination
+from lsst.fringe_sim.paper.section import Context
+from lsst.fringe_sim.paper.sky import lsst as paper_lsst
 
 RANGE = (13.9, 22.5)
 PERCENT = 100.0
@@ -150,3 +152,17 @@ def test_modern_line_strengths_fringe_less_than_those_of_the_paper(paper):
     theirs = fringe_amplitudes(paper.frame(model, paper.thickness))
     ours = fringe_amplitudes(lines_only(model).sky().frame(paper.thickness))
     assert 0.75 < ours.half_peak_to_peak / theirs.half_peak_to_peak < 0.95
+
+
+def test_thicker_silicon_changes_the_pattern_of_the_lsst(shipped_map):
+    """Section 5.3: 0.1 um more of silicon leave a pattern that is alike in part only, by the lines of the test."""
+    found = paper_lsst(Context(shipped_map, shipped_map))
+    setup = Setup.from_name("lsst_e2v").with_silicon("Si_green2008")
+    both = [
+        lines_only(FringeModel.from_setup(setup, {"silicon_thickness.offset": offset}))
+        .sky()
+        .frame(shipped_map)
+        for offset in (0.0, 0.1)
+    ]
+    alike = np.corrcoef(both[0].ravel(), both[1].ravel())[0, 1]
+    assert found.values["silicon_change"] == pytest.approx(alike, abs=0.02)

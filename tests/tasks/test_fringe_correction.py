@@ -18,6 +18,7 @@ from task_commands import Command
 
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.middleware import MonoCamFringe
+from lsst.fringe_sim.middleware.afw import observed_from_exposure
 from lsst.fringe_sim.middleware.night import NightPlan, define_night
 from lsst.fringe_sim.products import MASK_PLANES, FringeTemplates, ObservedFrame
 from lsst.fringe_sim.tasks import (
@@ -103,6 +104,7 @@ def test_an_exposure_stays_one(night: ObservedNight, templates: FringeTemplates)
         config=FringeCorrectionConfig(amplifier_columns=2, frame_storage_class="Exposure")
     )
     given = exposure_of(image)
+    assert observed_from_exposure(given).detector == "S11"
     made = task.run(given, known)
     assert made.corrected is given
     assert list(made.summary["unit"]) == ["electron"]
