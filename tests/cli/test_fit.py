@@ -94,6 +94,14 @@ def test_dry_runs_write_nothing(raws, tmp_path, capsys) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("other", [["--method", "guo2022"], ["--silicon", "plane"]])
+def test_what_a_fit_cannot_learn_is_refused(raws, tmp_path, capsys, other) -> None:
+    out = tmp_path / "fit"
+    assert run(["fit", str(raws), "--out", str(out), "--contrast", "common", *other]) != 0
+    assert "--contrast" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_a_missing_wavelength_is_said(copy, tmp_path, capsys) -> None:
     flat_at(copy, 950).unlink()
     assert run(["fit", str(copy), "--out", str(tmp_path / "fit")]) == 0
