@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..algorithms.discovery import Verdict
 from ..effects import AMPLIFIERS, EFFECTS
 from ..errors import InputError
-from ..instrument.measured_thickness import E2V_SHAPE, e2v_321
+from ..instrument.measured_thickness import e2v_321, fit_to_sensor
 from ..mock.hidden_effects import HIDDEN_EFFECTS
 from .run import is_right
 
@@ -25,6 +25,7 @@ __all__ = [
     "DemoCase",
     "draw_demo_case",
     "found_words",
+    "of_the_layers",
     "thickness_of_demo",
 ]
 
@@ -34,8 +35,8 @@ CONTRAST = 0.13
 CELLS = 4096
 """Cells to which the search averages the flats at most; the few fringes of the demo need a quarter of them."""
 
-MIDDLE_PX = (1536, 896)
-"""Row and column of E2V-CCD250-321 about which its adhesive is flattest: fringes of 400 px, the widest there are."""
+PART_PX, CORNER_PX = (1024, 1024), (1536, 192)
+"""Rows and columns of the part of E2V-CCD250-321, and its first: five fringes, of 175 px where they are narrowest."""
 
 Draw = Callable[[np.random.Generator, tuple[int, int]], dict[str, float]]
 
@@ -61,7 +62,7 @@ def _of_amplifiers(name: str, rng: np.random.Generator, rms: float) -> dict[str,
 def _rings(rng: np.random.Generator, shape: tuple[int, int]) -> dict[str, float]:
     """Rings about a point outside the part, several cells of the search apart."""
     size, phase, away = (
-        _between(rng, 3e-4, 1.5e-3),
+        _between(rng, 3e-4, 1.2e-3),
         rng.uniform(0.0, 2.0 * math.pi),
         rng.uniform(0.0, 2.0 * math.pi),
     )
@@ -71,20 +72,20 @@ def _rings(rng: np.random.Generator, shape: tuple[int, int]) -> dict[str, float]
         "tree_rings.sine": size * math.sin(phase),
         "tree_rings.centre_x": 0.5 * shape[1] + 1.5 * side * math.cos(away),
         "tree_rings.centre_y": 0.5 * shape[0] + 1.5 * side * math.sin(away),
-        "tree_rings.period": side * _between(rng, 0.12, 0.3),
+        "tree_rings.period": side * _between(rng, 0.15, 0.35),
     }
 
 
 SECOND_EFFECTS: Mapping[str, Draw] = MappingProxyType(
     {
         "illumination": lambda r, _: {
-            f"illumination.gradient_{axis}": _signed(r, 1e-3, 5e-3) for axis in ("x", "y")
+            f"illumination.gradient_{axis}": _signed(r, 1e-3, 4e-3) for axis in ("x", "y")
         },
         "chromatic_illumination": lambda r, _: {
-            f"chromatic_illumination.gradient_{axis}": _signed(r, 1e-3, 5e-3) for axis in ("x", "y")
+            f"chromatic_illumination.gradient_{axis}": _signed(r, 1e-3, 4e-3) for axis in ("x", "y")
         },
-        "amplifier_gain": lambda r, _: _of_amplifiers("amplifier_gain", r, _between(r, 5e-4, 2e-3)),
-        "amplifier_offset": lambda r, _: _of_amplifiers("amplifier_offset", r, _between(r, 10.0, 40.0)),
+        "amplifier_gain": lambda r, _: _of_amplifiers("amplifier_gain", r, _between(r, 4e-4, 1.6e-3)),
+        "amplifier_offset": lambda r, _: _of_amplifiers("amplifier_offset", r, _between(r, 8.0, 32.0)),
         "tree_rings": _rings,
     }
 )
@@ -172,12 +173,8 @@ def draw_demo_case(seed: int, shape: tuple[int, int]) -> DemoCase:
 
 
 def thickness_of_demo(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Adhesive of a part of E2V-CCD250-321, pixel by pixel [µm]."""
-    top, left = (
-        min(max(middle - part // 2, 0), whole - part)
-        for whole, middle, part in zip(E2V_SHAPE, MIDDLE_PX, shape, strict=True)
-    )
-    return e2v_321(shape, sampling="window", corner=(top, left))
+    """Adhesive of a part of E2V-CCD250-321, sampled at so many rows and columns [µm]."""
+    return fit_to_sensor(e2v_321(PART_PX, sampling="window", corner=CORNER_PX), shape)
 
 
 def found_words(case: DemoCase, verdict: Verdict) -> str:

@@ -44,8 +44,6 @@ PRODUCTS = (
     *("sky_without", "sky_with", "visits", "corrected"),
 )
 VISITS = 6
-BUDGET_S = 240.0
-"""Time after which the search gives its best answer so far [s]; on an idle core it takes about a fifth of it."""
 
 
 class DemoError(FringeSimError):
@@ -347,7 +345,7 @@ def _discover(run: DemoRun, seed: int) -> None:
         "discover",
         *("fringe-sim", "discover", str(run.folder / "raws"), "--setup", SETUP),
         *("--out", str(run.folder / "discovery"), "--overwrite", "--seed", str(seed)),
-        *("--cells", str(CELLS), "--time-budget", f"{BUDGET_S:g}"),
+        *("--cells", str(CELLS)),
     )
 
 
@@ -370,7 +368,7 @@ def _correct(run: DemoRun) -> None:
     run.program(
         "correct",
         *("fringe-sim", "correct", str(run.folder / "visits"), "--templates", str(template)),
-        *("--out", str(run.folder / "corrected"), "--overwrite"),
+        *("--amplifiers", "8x2", "--out", str(run.folder / "corrected"), "--overwrite"),
         may_refuse=True,
     )
     if not (run.folder / "corrected" / "report.html").is_file():

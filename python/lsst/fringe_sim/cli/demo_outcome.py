@@ -20,9 +20,11 @@ from ..products import SkyFringe, ThicknessMap
 from ..report.discovery_figures import candidates_figure, gap_figure, where_figure
 from ..report.page import Report
 from ..style import figure, finite_range, show_image
-from .demo_truth import DemoTruth
+from .demo_truth import DEEP_S, DemoTruth
 
 __all__ = ["Outcome", "read_verdict"]
+
+FloatArray = NDArray[np.float64]
 
 PERCENT, NM_PER_UM = 100.0, 1000.0
 
@@ -36,17 +38,17 @@ JUDGEMENTS = {
 
 @dataclass(frozen=True, eq=False)
 class VisitFringes:
-    """Fringes of a visit before and after its correction, over the light of its sky."""
+    """True fringes of a visit before and after its correction, over the light of its sky."""
 
     name: str
-    before: NDArray[np.float32]
-    after: NDArray[np.float32]
-    corrected: bool
+    before: FloatArray
+    after: FloatArray
+    corrected: bool  # whether its fringes were seen, and something subtracted
 
     @property
     def rms(self) -> tuple[float, float]:
         """Before and after."""
-        return float(self.before.std(dtype=float)), float(self.after.std(dtype=float))
+        return float(self.before.std()), float(self.after.std())
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +71,7 @@ class Outcome:
             SkyFringe.read_fits(next((folder / name).glob("sky_*.fits")))
             for name in ("sky_without", "sky_with")
         )
-        visits = tuple(_left(folder, name, fringes) for name, fringes in truth.fringes().items())
+        visits = tuple(_left(folder, *each) for each in truth.fringes())
         errors = (_error_nm(maps[0], true_um), _error_nm(maps[1], true_um))
         return cls(truth.case(), read_verdict(folder), errors, (without, found), visits)
 
@@ -82,7 +84,7 @@ class Outcome:
     def lines(self) -> list[tuple[str, str]]:
         """The story in a few lines, each a subject and what is to be said of it."""
         gap, (before, after) = self.verdict.gap, self.rms_of_fringes
-        corrected = sum(visit.corrected for visit in self.visits)
+        seen = sum(visit.corrected for visit in self.visits)
         return [
             ("judgement", JUDGEMENTS[found_words(self.case, self.verdict)]),
             ("hidden", _told(self.case.values)),
@@ -105,7 +107,7 @@ class Outcome:
             (
                 "fringes in the visits",
                 f"{PERCENT * before:.2g} % of the sky (rms) before the correction, {PERCENT * after:.2g} % after; "
-                f"{corrected} of {len(self.visits)} visits corrected, in the others no fringes were seen",
+                f"seen and subtracted in {seen} of {len(self.visits)} visits",
             ),
             ("seed", str(self.case.seed)),
         ]
@@ -170,12 +172,16 @@ class Outcome:
     def _visits(self, report: Report, add: Any) -> None:
         report.section(
             "Visits with stars",
-            "Simulated visits of the same sensor, corrected with the certified template. Their true fringes are "
-            "known; what was subtracted is taken from them. A visit in which no fringes are seen is left as it is. "
-            "The proof for each frame, which does not know the truth, is in corrected/report.html.",
+            f"Simulated visits of the same sensor, of {DEEP_S:g} s each, corrected with the certified template. Their "
+            "true fringes are known; what was subtracted is taken from them. A visit in which no fringes are seen is "
+            "left as it is. The proof, which does not know the truth, is in corrected/report.html.",
         )
         report.table(_visit_table(self.visits), "demo_visits")
-        add("visit", _visit_figure(self.visits[0]), f"True fringes of {self.visits[0].name}.")
+        add(
+            "visit",
+            _visit_figure(self.visits[0]),
+            f"True fringes of {self.visits[0].name}, less a surface of second degree as in all numbers of fringes.",
+        )
 
 
 def read_verdict(folder: Path) -> Verdict:
@@ -240,25 +246,39 @@ def _over(size: float, noise: float) -> str:
 
 
 def _rms_percent(frame: SkyFringe) -> float:
-    return PERCENT * float(frame.fraction()[frame.mask == 0].std(dtype=float))
+    return PERCENT * float(np.nanstd(_fringes(frame)))
+
+
+def _fringes(frame: SkyFringe) -> FloatArray:
+    return _without_background(np.where(frame.mask == 0, frame.fraction(), np.nan))
+
+
+def _without_background(image: NDArray[np.floating]) -> FloatArray:
+    """An image less a surface of second degree, as the removal of a background takes it; NaN stays."""
+    y, x = (np.linspace(-1.0, 1.0, size) for size in image.shape)
+    v, u = np.meshgrid(y, x, indexing="ij")
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    known = np.isfinite(image)
+    found, *_ = np.linalg.lstsq(terms[known], image[known].astype(float), rcond=None)
+    return np.asarray(image - terms @ found)
 
 
 def _error_nm(found: ThicknessMap, true_um: NDArray[np.float64]) -> float:
     return NM_PER_UM * float(np.median(np.abs(found.value - true_um)[found.mask == 0]))
 
 
-def _left(folder: Path, name: str, true: NDArray[np.float32]) -> VisitFringes:
+def _left(folder: Path, name: str, true_e: NDArray[np.float32], level_e: float) -> VisitFringes:
     """Fringes of a visit, and what is left of them; all of them where it was not corrected."""
+    before = _without_background(true_e / level_e)
     path = folder / "corrected" / f"{name}_corrected.fits"
     if not path.is_file():
-        return VisitFringes(name, true, true, False)
+        return VisitFringes(name, before, before, False)
     image, corrected = (
         np.asarray(fits.getdata(each, "IMAGE"), dtype=np.float64)
         for each in (folder / "visits" / f"{name}.fits", path)
     )
     taken = np.where(np.isfinite(image - corrected), image - corrected, 0.0)
-    level = float(np.nanmedian(image))
-    return VisitFringes(name, true, (true - taken / level).astype(np.float32), bool(taken.any()))
+    return VisitFringes(name, before, _without_background((true_e - taken) / level_e), bool(taken.any()))
 
 
 def _visit_table(visits: tuple[VisitFringes, ...]) -> Table:
@@ -274,16 +294,16 @@ def _visit_table(visits: tuple[VisitFringes, ...]) -> Table:
 
 
 def _forecast_figure(frames: tuple[SkyFringe, SkyFringe]) -> Any:
-    images = [PERCENT * frame.fraction().astype(float) for frame in frames]
-    return _beside(images, ("unchanged model", "with what was found"), "sky / mean - 1 [%]")
+    images = [PERCENT * _fringes(frame) for frame in frames]
+    return _beside(images, ("unchanged model", "with what was found"), "fringes / sky [%]")
 
 
 def _visit_figure(visit: VisitFringes) -> Any:
-    images = [PERCENT * image.astype(float) for image in (visit.before, visit.after)]
+    images = [PERCENT * image for image in (visit.before, visit.after)]
     return _beside(images, ("fringes before", "fringes after"), "fringes / sky [%]")
 
 
-def _beside(images: list[NDArray[np.float64]], titles: tuple[str, str], label: str) -> Any:
+def _beside(images: list[FloatArray], titles: tuple[str, str], label: str) -> Any:
     limits = finite_range(images[0], symmetric=True)
     with figure(9.5, 4.2) as made:
         for axes, image, title in zip(made.subplots(1, 2), images, titles, strict=True):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from ..challenge.demo_case import DemoCase, draw_demo_case, thickness_of_demo
@@ -15,11 +15,15 @@ from ..files import all_or_nothing, write_whole
 from ..instrument.setup import Setup
 from ..mock.raw_frames import write_mock_flats
 from ..mock.visits import write_mock_visits
+from ..resources import read_yaml
 
-__all__ = ["DemoTruth"]
+__all__ = ["DEEP_S", "DemoTruth"]
 
 LABORATORY, TELESCOPE, SENSOR = "ts8_e2v", "lsst_e2v", "E2V-CCD250-321"
-CASE, FRINGES = "truth.json", "fringes.npz"
+CASE, FRINGES, DEEP = "truth.json", "fringes.npz", "deep.yaml"
+
+DEEP_S = 300.0
+"""Exposure of the visits [s]: ten of the survey's together. In one of them fringes this weak are not seen."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class DemoTruth:
         made = list(
             write_mock_visits(
                 visits,
-                setup=TELESCOPE,
+                setup=self._deep(),
                 detector=SENSOR,
                 thickness_um=self.thickness_um(),
                 visits=number,
@@ -64,8 +68,18 @@ class DemoTruth:
             )
         )
         with all_or_nothing(self.folder / FRINGES) as path, path.open("wb") as stream:
-            arrays: dict[str, Any] = {visit.path.stem: visit.fringes / visit.level_e for visit in made}
-            np.savez(stream, **arrays)
+            np.savez(
+                stream,
+                name=np.array([visit.path.stem for visit in made]),
+                fringes=np.array([visit.fringes for visit in made]),
+                level=np.array([visit.level_e for visit in made]),
+            )
+
+    def _deep(self) -> str:
+        """The set-up of the telescope with long exposures, as a file."""
+        content = read_yaml("setups", f"{TELESCOPE}.yaml")
+        content["illumination"]["exposure_s"] = DEEP_S
+        return str(write_whole(self.folder / DEEP, yaml.safe_dump(content)))
 
     def case(self) -> DemoCase:
         """What is hidden."""
@@ -75,10 +89,15 @@ class DemoTruth:
         """Thickness of the adhesive [µm]."""
         return thickness_of_demo(self.shape)
 
-    def fringes(self) -> dict[str, NDArray[np.float32]]:
-        """Fringes of every visit over the light of its sky, by the name of its file."""
+    def fringes(self) -> list[tuple[str, NDArray[np.float32], float]]:
+        """Of every visit: name of its file, light of the sky less its mean, and that mean [e⁻]."""
         with np.load(self.folder / FRINGES) as stored:
-            return {name: stored[name] for name in stored.files}
+            return [
+                (str(name), fringes, float(level))
+                for name, fringes, level in zip(
+                    stored["name"], stored["fringes"], stored["level"], strict=True
+                )
+            ]
 
     @property
     def _size(self) -> str:
