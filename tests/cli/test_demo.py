@@ -76,7 +76,7 @@ def test_what_is_hidden_is_found(done) -> None:
 def test_the_truth_is_sealed(done) -> None:
     """No program that looks at the frames was given it, and the frames do not tell."""
     folder = done[0]
-    assert {path.name for path in (folder / "sealed").iterdir()} == {"truth.json", "fringes.npz", "deep.yaml"}
+    assert {path.name for path in (folder / "sealed").iterdir()} == {"truth.json", "fringes.npz"}
     for log in (folder / "logs").glob("*.log"):
         assert str(folder / "sealed") not in log.read_text(encoding="utf-8"), log
     case = DemoCase.from_json((folder / "sealed" / "truth.json").read_text(encoding="utf-8"))

@@ -20,7 +20,7 @@ from ..products import SkyFringe, ThicknessMap
 from ..report.discovery_figures import candidates_figure, gap_figure, where_figure
 from ..report.page import Report
 from ..style import figure, finite_range, show_image
-from .demo_truth import DEEP_S, DemoTruth
+from .demo_truth import DemoTruth
 
 __all__ = ["Outcome", "read_verdict"]
 
@@ -44,6 +44,9 @@ class VisitFringes:
     before: FloatArray
     after: FloatArray
     corrected: bool  # whether its fringes were seen, and something subtracted
+    strength: tuple[
+        float, float
+    ]  # fitted scale of the template over the light of the sky, and its uncertainty
 
     @property
     def rms(self) -> tuple[float, float]:
@@ -71,7 +74,8 @@ class Outcome:
             SkyFringe.read_fits(next((folder / name).glob("sky_*.fits")))
             for name in ("sky_without", "sky_with")
         )
-        visits = tuple(_left(folder, *each) for each in truth.fringes())
+        scales = {row["name"]: row for row in Table.read(folder / "corrected" / "frames.ecsv")}
+        visits = tuple(_left(folder, *each, scales.get(each[0])) for each in truth.fringes())
         errors = (_error_nm(maps[0], true_um), _error_nm(maps[1], true_um))
         return cls(truth.case(), read_verdict(folder), errors, (without, found), visits)
 
@@ -81,10 +85,18 @@ class Outcome:
         squares = np.square([visit.rms for visit in self.visits]).mean(axis=0)
         return float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
 
+    @property
+    def measured(self) -> tuple[float, float]:
+        """Mean strength of the template in the visits, 1 where they have what was found; and its uncertainty."""
+        strength, sigma = np.array([visit.strength for visit in self.visits]).T
+        weight = sigma**-2.0
+        return float((strength * weight).sum() / weight.sum()), float(weight.sum() ** -0.5)
+
     def lines(self) -> list[tuple[str, str]]:
         """The story in a few lines, each a subject and what is to be said of it."""
         gap, (before, after) = self.verdict.gap, self.rms_of_fringes
-        seen = sum(visit.corrected for visit in self.visits)
+        seen, expected = sum(visit.corrected for visit in self.visits), _rms_percent(self.forecast[1])
+        strength, sigma = self.measured
         return [
             ("judgement", JUDGEMENTS[found_words(self.case, self.verdict)]),
             ("hidden", _told(self.case.values)),
@@ -107,7 +119,8 @@ class Outcome:
             (
                 "fringes in the visits",
                 f"{PERCENT * before:.2g} % of the sky (rms) before the correction, {PERCENT * after:.2g} % after; "
-                f"seen and subtracted in {seen} of {len(self.visits)} visits",
+                f"seen and subtracted in {seen} of {len(self.visits)} visits, which together measure "
+                f"{strength * expected:.2g} ± {sigma * expected:.1g} %",
             ),
             ("seed", str(self.case.seed)),
         ]
@@ -172,9 +185,9 @@ class Outcome:
     def _visits(self, report: Report, add: Any) -> None:
         report.section(
             "Visits with stars",
-            f"Simulated visits of the same sensor, of {DEEP_S:g} s each, corrected with the certified template. Their "
-            "true fringes are known; what was subtracted is taken from them. A visit in which no fringes are seen is "
-            "left as it is. The proof, which does not know the truth, is in corrected/report.html.",
+            "Simulated visits of the same sensor, corrected with the certified template. Their true fringes are "
+            "known; what was subtracted is taken from them. A visit in which no fringes are seen is left as it is. "
+            "The proof, which does not know the truth, is in corrected/report.html.",
         )
         report.table(_visit_table(self.visits), "demo_visits")
         add(
@@ -267,18 +280,22 @@ def _error_nm(found: ThicknessMap, true_um: NDArray[np.float64]) -> float:
     return NM_PER_UM * float(np.median(np.abs(found.value - true_um)[found.mask == 0]))
 
 
-def _left(folder: Path, name: str, true_e: NDArray[np.float32], level_e: float) -> VisitFringes:
+def _left(
+    folder: Path, name: str, true_e: NDArray[np.float32], level_e: float, row: Any | None
+) -> VisitFringes:
     """Fringes of a visit, and what is left of them; all of them where it was not corrected."""
     before = _without_background(true_e / level_e)
     path = folder / "corrected" / f"{name}_corrected.fits"
+    fitted = (0.0, math.inf) if row is None else (row["scale 0"] / level_e, row["sigma 0"] / level_e)
     if not path.is_file():
-        return VisitFringes(name, before, before, False)
+        return VisitFringes(name, before, before, False, fitted)
     image, corrected = (
         np.asarray(fits.getdata(each, "IMAGE"), dtype=np.float64)
         for each in (folder / "visits" / f"{name}.fits", path)
     )
     taken = np.where(np.isfinite(image - corrected), image - corrected, 0.0)
-    return VisitFringes(name, before, _without_background((true_e - taken) / level_e), bool(taken.any()))
+    after = _without_background((true_e - taken) / level_e)
+    return VisitFringes(name, before, after, bool(taken.any()), fitted)
 
 
 def _visit_table(visits: tuple[VisitFringes, ...]) -> Table:

@@ -86,7 +86,7 @@ def dataset_path(repo: Path, name: str, collection: str) -> Path:
 def write_demo_report(folder: Path, datasets: DemoDatasets, outcome: Outcome) -> None:
     """Write ``report.html`` and the figures beside it."""
     report = Report(
-        "An effect hidden in the flats of E2V-CCD250-321, and found",
+        "What was hidden in the flats of E2V-CCD250-321, and what was found",
         "Raw laboratory flats with a secret, a search for it, the sky and its templates with what was found.",
     )
     figures = folder / "figures"

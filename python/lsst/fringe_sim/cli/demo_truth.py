@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from ..challenge.demo_case import DemoCase, draw_demo_case, thickness_of_demo
@@ -15,15 +14,11 @@ from ..files import all_or_nothing, write_whole
 from ..instrument.setup import Setup
 from ..mock.raw_frames import write_mock_flats
 from ..mock.visits import write_mock_visits
-from ..resources import read_yaml
 
-__all__ = ["DEEP_S", "DemoTruth"]
+__all__ = ["DemoTruth"]
 
 LABORATORY, TELESCOPE, SENSOR = "ts8_e2v", "lsst_e2v", "E2V-CCD250-321"
-CASE, FRINGES, DEEP = "truth.json", "fringes.npz", "deep.yaml"
-
-DEEP_S = 300.0
-"""Exposure of the visits [s]: ten of the survey's together. In one of them fringes this weak are not seen."""
+CASE, FRINGES = "truth.json", "fringes.npz"
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ class DemoTruth:
         made = list(
             write_mock_visits(
                 visits,
-                setup=self._deep(),
+                setup=TELESCOPE,
                 detector=SENSOR,
                 thickness_um=self.thickness_um(),
                 visits=number,
@@ -74,12 +69,6 @@ class DemoTruth:
                 fringes=np.array([visit.fringes for visit in made]),
                 level=np.array([visit.level_e for visit in made]),
             )
-
-    def _deep(self) -> str:
-        """The set-up of the telescope with long exposures, as a file."""
-        content = read_yaml("setups", f"{TELESCOPE}.yaml")
-        content["illumination"]["exposure_s"] = DEEP_S
-        return str(write_whole(self.folder / DEEP, yaml.safe_dump(content)))
 
     def case(self) -> DemoCase:
         """What is hidden."""
