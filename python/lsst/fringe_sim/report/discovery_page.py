@@ -185,6 +185,9 @@ def _maps(report: Report, residuals: ResidualPair) -> None:
     _format(table, wavelength="g", before=".4f", after=".4f")
     report.table(table, "discovery_residual_rms")
     best = before if after is None else after
+    if not (best.thickness.mask == 0).any():
+        report.paragraph("The thickness is not known in any pixel.")
+        return
     report.figure(
         thickness_figure(best.thickness, residuals.order_um),
         "Thickness with a contour for each fringe order, its uncertainty, and the chance of a slip.",
