@@ -11,7 +11,7 @@ SHARE ?= 1/1
 .PHONY: help demo test test-all lint types checks unit slow docs wheel-check newest bench clean
 
 help:
-	@echo "make demo   install into .venv and run the whole chain on the built-in sensor (a few minutes)"
+	@echo "make demo   install into .venv; an effect hidden in flats, found, and templates with it (a few minutes)"
 	@echo "make test   install into .venv with the test tools; lint, types, wheel and the quick tests"
 	@echo "make test-all  the same, then the slow tests"
 	@echo "make docs   the documentation as HTML in doc/_build, every warning an error"

@@ -10,18 +10,18 @@ from pathlib import Path
 
 from . import _table
 
-PANEL = "panel"
-"""Not among those that run by default: it takes long, has arguments of its own and says whether it failed."""
+ALONE = ("panel", "demo")
+"""Not among those that run by default: they take long, have arguments of their own and say whether they failed."""
 
 
 def main() -> None:
-    if sys.argv[1:2] == [PANEL]:
-        sys.exit(importlib.import_module(f"benchmarks.{PANEL}").main(sys.argv[2:]))
+    if sys.argv[1:] and sys.argv[1] in ALONE:
+        sys.exit(importlib.import_module(f"benchmarks.{sys.argv[1]}").main(sys.argv[2:]))
     here = Path(__file__).parent
     names = [
         module.name
         for module in pkgutil.iter_modules([str(here)])
-        if not module.name.startswith("_") and module.name != PANEL
+        if not module.name.startswith("_") and module.name not in ALONE
     ]
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument(

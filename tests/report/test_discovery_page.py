@@ -14,10 +14,10 @@ from matplotlib import pyplot
 
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Step, Where
-from lsst.fringe_sim.algorithms.flat_residual import residual_pair
+from lsst.fringe_sim.algorithms.flat_residual import FlatResidual, ResidualPair, residual_pair
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import FlatExposures
+from lsst.fringe_sim.products import FlatExposures, ThicknessMap
 from lsst.fringe_sim.report.discovery_figures import candidates_figure, gap_figure, where_figure
 from lsst.fringe_sim.report.discovery_page import discovery_page
 
@@ -259,3 +259,12 @@ def test_what_is_written_is_read() -> None:
     """All of it, the upper limit of the disagreement too."""
     sized = replace(NAMED, size={"of_counts": 0.003, "of_fringes": 0.05, "of_fringes_at_most": 0.06})
     assert asdict(Verdict.from_json(sized.to_json())) == asdict(sized)
+
+
+def test_a_page_says_so_where_no_thickness_is_known() -> None:
+    """As a fit leaves it that cannot decide the order of any pixel; residuals are shown all the same."""
+    image = np.zeros((8, 8), np.float32)
+    unknown = ThicknessMap(image, image, image, image + 1, mask=np.ones((8, 8), np.int32), layer="adhesive")
+    left = FlatResidual(np.array(WAVELENGTHS), np.zeros((12, 8, 8), np.float32), unknown)
+    text = words(discovery_page(NAMED, ResidualPair(left, left, 0.3)).to_html())
+    assert "The thickness is not known in any pixel." in text

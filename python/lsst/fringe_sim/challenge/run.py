@@ -25,7 +25,7 @@ from .oracle import Oracle, visibility
 from .result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
 from .sealed_cases import SealedCase, draw_case
 
-__all__ = ["judge", "run_challenge"]
+__all__ = ["is_right", "judge", "run_challenge"]
 
 
 def run_challenge(
@@ -130,15 +130,10 @@ def judge(
 ) -> CaseResult:
     """Compare a verdict with the truth."""
     found = tuple(effect.name for effect in verdict.effects)
-    classes = [{effect.name, *effect.ambiguous_with} for effect in verdict.effects]
     visible = oracle.visibility.each if oracle else {}
     seen = [name for name in case.names if visible.get(name, 0.0) >= VISIBLE]
     wanted = {case.names} if len(case.names) < 2 else {case.names, tuple(seen)}
-    right = (
-        case.kind in ("one", "two")
-        and verdict.verdict == "named"
-        and any(_matches(order, classes) for names in wanted for order in permutations(names))
-    )
+    right = case.kind in ("one", "two") and any(is_right(names, verdict) for names in wanted)
     exact = right and sorted(found) == sorted(case.names)
     pulls = {}
     if exact:
@@ -173,6 +168,20 @@ def judge(
     )
 
 
-def _matches(names: tuple[str, ...], classes: Sequence[set[str]]) -> bool:
+def is_right(names: Sequence[str], verdict: Verdict) -> bool:
+    """Whether a search named all of these effects, each itself or by its class, and nothing else.
+
+    Parameters
+    ----------
+    names : sequence of `str`
+        Effects that are in the data.
+    verdict : `Verdict`
+        What the search found.
+    """
+    classes = [{effect.name, *effect.ambiguous_with} for effect in verdict.effects]
+    return verdict.verdict == "named" and any(_matches(order, classes) for order in permutations(names))
+
+
+def _matches(names: Sequence[str], classes: Sequence[set[str]]) -> bool:
     """Whether there is one class for each name, in this order, and no other."""
     return len(names) == len(classes) and all(n in group for n, group in zip(names, classes, strict=True))

@@ -1,8 +1,7 @@
-"""``fringe-sim demo``: from raw laboratory frames to certified fringe templates, with the real programs."""
+"""``fringe-sim demo``: an effect hidden in raw flats, found, and taken along to certified fringe templates."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import shutil
@@ -10,9 +9,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -22,6 +22,10 @@ from ..files import write_whole
 from .output import LOCK, OutputFolder, output_folder
 from .parameters import SIZE
 
+if TYPE_CHECKING:
+    from .demo_outcome import Outcome
+    from .demo_report import DemoDatasets
+
 __all__ = ["demo"]
 
 SETUP = "ts8_e2v"
@@ -29,11 +33,17 @@ SENSOR = "E2V-CCD250-321"
 NIGHT = "20260115"
 FIRST_HOUR, LAST_HOUR = 19, 29
 VALID = ("2025-01-01", "2035-01-01")
-LAB_RUN, THICKNESS_RUN, SKY_RUN, CALIBRATIONS = "demo/lab", "demo/thickness", "demo/sky", "demo/calib"
+LAB_RUN, FOUND_RUN, THICKNESS_RUN = "demo/lab", "demo/found", "demo/thickness"
+SKY_RUN, CALIBRATIONS = "demo/sky", "demo/calib"
 PIPELINES = "resource://lsst.fringe_sim/pipelines"
 SEED_CONFIG = "resource://lsst.fringe_sim/configs/butler.yaml"
 STATE = "demo.json"
-PRODUCTS = (STATE, "repo", "raws", "logs", "discovery", "report.html")
+SEALED = "sealed"
+PRODUCTS = (
+    *(STATE, "repo", "raws", "logs", "figures", SEALED, "discovery", "model.py", "report.html"),
+    *("sky_without", "sky_with", "visits", "corrected"),
+)
+VISITS = 6
 
 
 class DemoError(FringeSimError):
@@ -93,8 +103,21 @@ class DemoRun:
         self._done.append(name)
         self._remember()
 
-    def program(self, log: str, *command: str) -> None:
-        """Run a program of this environment; its output goes to ``logs/<log>.log``."""
+    def beside(self, name: str, title: str, action: Callable[[], None]) -> Callable[[], None]:
+        """Begin a step beside those that follow; what is returned waits for its end."""
+        if name in self._done:
+            return lambda: self.step(name, title, action)
+        click.echo(f"  {title}: begun")
+        with_thread = ThreadPoolExecutor(1)
+        future: Future[None] = with_thread.submit(action)
+        with_thread.shutdown(wait=False)
+        return lambda: self.step(name, f"{title}, what was left of it", future.result)
+
+    def program(self, log: str, *command: str, may_refuse: bool = False) -> None:
+        """Run a program of this environment; its output goes to ``logs/<log>.log``.
+
+        ``may_refuse``: whether a run that ended with 1 after it had refused some of its frames is as good.
+        """
         path = self.folder / "logs" / f"{log}.log"
         binary = Path(sys.executable).parent / command[0]
         environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "2")}
@@ -108,7 +131,7 @@ class DemoRun:
                 env=environment,
                 check=False,
             )
-        if done.returncode != 0:
+        if done.returncode not in ((0, 1) if may_refuse else (0,)):
             tail = "\n".join(path.read_text(encoding="utf-8").splitlines()[-15:])
             raise DemoError(f"{command[0]} {command[1]} failed; see {path}\n{tail}")
 
@@ -119,19 +142,30 @@ class DemoRun:
 
 @click.command()
 @output_folder("Folder.", *PRODUCTS, default=Path("demo"), resumes=True)
-@click.option("--size", type=SIZE, default="1024x1000", show_default=True, help="Pixels of the sensor.")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the raw frames.")
+@click.option(
+    "--size", type=SIZE, default="1024x1024", show_default=True, help="Pixels of the part of the sensor."
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=1,
+    show_default=True,
+    help="Of the hidden effect, its size and all noise.",
+)
 @click.option("--fresh", is_flag=True, help="The same as --overwrite.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done.")
 def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool) -> None:
-    """Run the whole chain on the built-in sensor: raw flats, thickness, sky, templates, report.
+    """Hide an effect in raw flats, find it, and make templates with what was found.
 
-    The sensor is E2V-CCD250-321, sampled at fewer pixels. Everything is done by butler and pipetask in a SQLite
-    repository; running it again does only what is missing.
+    The sensor is a part of E2V-CCD250-321. The seed decides which effect is hidden in its flats beside the weak
+    fringes that real sensors show. They are fitted and searched by programs that cannot see the truth, what was
+    found is added to the model, templates are made by butler and pipetask in a SQLite repository, and visits with
+    stars are corrected. The last page shows truth and verdict side by side, whatever they are. Running it again
+    does only what is missing.
 
     \b
     Example:
-      fringe-sim demo --out demo
+      fringe-sim demo --seed 2 --out demo
     """
     from ..instrument.camera import Camera
 
@@ -139,20 +173,35 @@ def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_r
     shape = (size[1], size[0])
     Camera.from_name("ts8").detector(SENSOR).cut_down(shape)
     if dry_run:
-        click.echo(f"would simulate {SENSOR} with {text} pixels and process it in {out}/repo")
+        click.echo(
+            f"would simulate {text} pixels of {SENSOR} with a hidden effect and process them in {out}/repo"
+        )
         return
+    from .demo_outcome import Outcome
     from .demo_report import DemoDatasets, write_demo_report
+    from .demo_truth import DemoTruth
 
     folder = _folder(replace(out, overwrite=True) if fresh else out).prepare()
     run = DemoRun(folder, DemoSettings(__version__, text, seed))
-    click.echo(f"Demo in {folder}: {SENSOR}, {text} pixels")
-    _laboratory(run, shape, text, seed)
+    truth = DemoTruth(folder / SEALED, seed, shape)
+    click.echo(f"Demo in {folder}: {text} pixels of {SENSOR}, seed {seed}")
+    run.step(
+        "raws",
+        "hide an effect, simulate raw bias frames and flats",
+        lambda: truth.write_flats(folder / "raws"),
+    )
+    searched = run.beside("discovery", "search for a missing effect", lambda: _discover(run, seed))
+    _laboratory(run)
+    run.step("visits", "simulate visits with stars", lambda: truth.write_visits(folder / "visits", VISITS))
+    run.step("sky_without", "forecast of the sky, unchanged model", lambda: _forecast(run, "sky_without"))
+    searched()
+    _with_what_was_found(run)
     _sky(run)
-    datasets = DemoDatasets.read(run.repo, LAB_RUN, SKY_RUN, CALIBRATIONS)
-    if importlib.util.find_spec("lsst.fringe_sim.cli.discover") is not None:
-        run.step("discovery", "search for a missing effect", lambda: _discover(run, seed))
-    run.step("report", "figures and report", lambda: write_demo_report(folder, datasets))
-    _closing_words(folder, datasets)
+    run.step("correct", "correct the visits", lambda: _correct(run))
+    datasets = DemoDatasets.read(run.repo, LAB_RUN, FOUND_RUN, SKY_RUN)
+    outcome = Outcome.read(folder, truth, (datasets.first_thickness, datasets.thickness))
+    run.step("report", "figures and report", lambda: write_demo_report(folder, datasets, outcome))
+    _closing_words(folder, datasets, outcome)
 
 
 def _folder(out: OutputFolder) -> OutputFolder:
@@ -166,29 +215,9 @@ def _folder(out: OutputFolder) -> OutputFolder:
     return replace(out, overwrite=(out.path / STATE).is_file())
 
 
-def _laboratory(run: DemoRun, shape: tuple[int, int], size: str, seed: int) -> None:
-    import numpy as np
-
-    from ..instrument.camera import Camera
-    from ..instrument.measured_thickness import e2v_321
-    from ..instrument.setup import Setup
-    from ..middleware.instruments import Ts8Fringe
-    from ..mock.raw_frames import write_mock_flats
-
-    raws = run.folder / "raws"
+def _laboratory(run: DemoRun) -> None:
+    """Raw frames into a repository, and the thickness with the unchanged model."""
     repo = str(run.repo)
-
-    def simulate() -> None:
-        shutil.rmtree(raws, ignore_errors=True)
-        write_mock_flats(
-            raws,
-            setup=SETUP,
-            detector=SENSOR,
-            thickness_um=e2v_321(shape),
-            wavelengths_nm=Setup.from_name(SETUP).wavelengths_nm,
-            rng=np.random.default_rng(seed),
-            size=size,
-        )
 
     def create() -> None:
         shutil.rmtree(run.repo, ignore_errors=True)
@@ -198,20 +227,45 @@ def _laboratory(run: DemoRun, shape: tuple[int, int], size: str, seed: int) -> N
         for instrument in ("Ts8Fringe", "LsstCamFringe"):
             run.program("register", "butler", "register-instrument", repo, f"lsst.fringe_sim.{instrument}")
 
-    run.step("raws", "simulate raw bias frames and flats", simulate)
     run.step("create", "butler create", create)
     run.step("register", "butler register-instrument", register)
     run.step(
         "ingest",
         "butler ingest-fringe-raws",
-        lambda: run.program("ingest", "butler", "ingest-fringe-raws", repo, str(raws)),
+        lambda: run.program("ingest", "butler", "ingest-fringe-raws", repo, str(run.folder / "raws")),
     )
-    detector = Camera.from_name("ts8").detector(SENSOR).id
-    where = f"instrument='{Ts8Fringe.getName()}' AND detector={detector}"
     run.step(
         "lab",
         "pipetask run: biases, flats, thickness",
-        lambda: _pipetask(run, "lab", f"{Ts8Fringe.getName()}/raw/all", LAB_RUN, "ts8/labFlats.yaml", where),
+        lambda: _pipetask(run, "lab", f"{_ts8()}/raw/all", LAB_RUN, "ts8/labFlats.yaml", _in_ts8()),
+    )
+
+
+def _with_what_was_found(run: DemoRun) -> None:
+    """The verdict becomes an override of the model, and the thickness is fitted again with it."""
+    override = run.folder / "model.py"
+
+    def write() -> None:
+        from ..algorithms.discovery import Verdict
+        from ..challenge.demo_case import of_the_layers
+        from ..model.effects_override import effects_override
+
+        verdict = Verdict.from_json((run.folder / "discovery" / "discovery.json").read_text(encoding="utf-8"))
+        text = effects_override(of_the_layers(verdict.settings), verdict.setup, verdict.verdict)
+        write_whole(override, text)
+
+    run.step("model", "add what was found to the model", write)
+    run.step(
+        "found",
+        "pipetask run: thickness with what was found",
+        lambda: _pipetask(
+            run, "found", LAB_RUN, FOUND_RUN, "ts8/labFlats.yaml#epoxyFit", _in_ts8(), f"epoxyFit:{override}"
+        ),
+    )
+    run.step(
+        "sky_with",
+        "forecast of the sky, with it",
+        lambda: _forecast(run, "sky_with", "--effects-file", str(override)),
     )
 
 
@@ -232,15 +286,23 @@ def _sky(run: DemoRun) -> None:
         "adopt",
         "butler adopt-sensor-datasets",
         lambda: run.program(
-            "adopt", "butler", "adopt-sensor-datasets", repo, "epoxyThickness", LAB_RUN, camera, THICKNESS_RUN
+            "adopt",
+            "butler",
+            "adopt-sensor-datasets",
+            repo,
+            "epoxyThickness",
+            FOUND_RUN,
+            camera,
+            THICKNESS_RUN,
         ),
     )
     detector = Camera.from_name("lsstCam").detector(SENSOR).id
     where = f"instrument='{camera}' AND detector={detector}"
+    override = f"skyFringeSim:{run.folder / 'model.py'}"
     run.step(
         "sky",
         "pipetask run: sky frames, templates",
-        lambda: _pipetask(run, "sky", THICKNESS_RUN, SKY_RUN, "lsstCam/skyFringe.yaml", where),
+        lambda: _pipetask(run, "sky", THICKNESS_RUN, SKY_RUN, "lsstCam/skyFringe.yaml", where, override),
     )
     begin, end = VALID
     run.step(
@@ -254,26 +316,73 @@ def _sky(run: DemoRun) -> None:
     )
 
 
-def _pipetask(run: DemoRun, log: str, inputs: str, output: str, pipeline: str, where: str) -> None:
+def _ts8() -> str:
+    from ..middleware.instruments import Ts8Fringe
+
+    return str(Ts8Fringe.getName())
+
+
+def _in_ts8() -> str:
+    from ..instrument.camera import Camera
+
+    return f"instrument='{_ts8()}' AND detector={Camera.from_name('ts8').detector(SENSOR).id}"
+
+
+def _pipetask(
+    run: DemoRun, log: str, inputs: str, output: str, pipeline: str, where: str, *overrides: str
+) -> None:
     options: Sequence[str] = ("-i", inputs, "-o", output, "-p", f"{PIPELINES}/{pipeline}", "-d", where)
-    run.program(log, "pipetask", "run", "-b", str(run.repo), *options, "--register-dataset-types", "-j", "1")
+    given = [word for override in overrides for word in ("-C", override)]
+    run.program(
+        log, "pipetask", "run", "-b", str(run.repo), *options, *given, "--register-dataset-types", "-j", "1"
+    )
 
 
 def _discover(run: DemoRun, seed: int) -> None:
+    from ..challenge.demo_case import CELLS
+
     run.program(
         "discover",
         *("fringe-sim", "discover", str(run.folder / "raws"), "--setup", SETUP),
         *("--out", str(run.folder / "discovery"), "--overwrite", "--seed", str(seed)),
+        *("--cells", str(CELLS)),
     )
 
 
-def _closing_words(folder: Path, datasets: Any) -> None:
+def _forecast(run: DemoRun, name: str, *effects: str) -> None:
+    from .demo_report import dataset_path
+
+    collection = FOUND_RUN if effects else LAB_RUN
+    thickness = dataset_path(run.repo, "epoxyThickness", collection)
+    run.program(
+        name,
+        *("fringe-sim", "sky", "--thickness", str(thickness), "--detector", SENSOR, "--noiseless", *effects),
+        *("--out", str(run.folder / name), "--overwrite"),
+    )
+
+
+def _correct(run: DemoRun) -> None:
+    from .demo_report import dataset_path
+
+    template = dataset_path(run.repo, "fringe", SKY_RUN)
+    run.program(
+        "correct",
+        *("fringe-sim", "correct", str(run.folder / "visits"), "--templates", str(template)),
+        *("--amplifiers", "8x2", "--out", str(run.folder / "corrected"), "--overwrite"),
+        may_refuse=True,
+    )
+    if not (run.folder / "corrected" / "report.html").is_file():
+        raise DemoError(f"fringe-sim correct failed; see {run.folder / 'logs' / 'correct.log'}")
+
+
+def _closing_words(folder: Path, datasets: DemoDatasets, outcome: Outcome) -> None:
+    click.echo("")
+    for what, said in outcome.lines():
+        click.echo(f"{what}: {said}")
     click.echo("")
     click.echo(f"report            {folder / 'report.html'}")
+    click.echo(f"evidence          {folder / 'discovery' / 'report.html'}")
     click.echo(f"fringe frames     {datasets.sky_folder}")
     click.echo(f"fringe template   {datasets.template_path}")
     click.echo(f"thickness map     {datasets.thickness_path}")
-    verdict = folder / "discovery" / "discovery.json"
-    if verdict.is_file():
-        text = json.loads(verdict.read_text(encoding="utf-8"))["verdict"]
-        click.echo(f"discovery verdict {verdict} ({text})")
+    click.echo(f"corrected visits  {folder / 'corrected'}")

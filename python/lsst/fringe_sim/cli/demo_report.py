@@ -7,18 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.table import Table
 
 from lsst.daf.butler import Butler
 
 from ..algorithms.coadds import coadds_of_frames
-from ..algorithms.discovery import Verdict
 from ..algorithms.flat_residual import relative_flats
 from ..algorithms.single_pixel import fit_single_pixel, published_pixel
+from ..challenge.demo_case import of_the_layers
 from ..model import FringeModel
 from ..products import FringeComponents, FringeCube, FringeFrame, SkyFringe, ThicknessMap
-from ..report.discovery_figures import candidates_figure, where_figure
-from ..report.discovery_page import headline
 from ..report.figures import (
     coadds_figure,
     components_figure,
@@ -33,8 +30,9 @@ from ..report.figures import (
 from ..report.page import Report
 from ..report.sky_page import COADDS_CAPTION, COADDS_TEXT, sky_amplitudes
 from ..report.thickness_page import phase_folded, residual_of_fit, residual_table
+from .demo_outcome import Outcome
 
-__all__ = ["DemoDatasets", "write_demo_report"]
+__all__ = ["DemoDatasets", "dataset_path", "write_demo_report"]
 
 PERCENT = 100.0
 COADD_SEED = 16
@@ -46,7 +44,8 @@ class DemoDatasets:
     """Products of the demo with the places of their files."""
 
     cube: FringeCube
-    thickness: ThicknessMap
+    first_thickness: ThicknessMap  # with the unchanged model
+    thickness: ThicknessMap  # with what was found
     sky: tuple[SkyFringe, ...]
     template: FringeFrame
     components: FringeComponents
@@ -55,16 +54,18 @@ class DemoDatasets:
     template_path: Path
 
     @classmethod
-    def read(cls, repo: Path, lab: str, sky: str, calib: str) -> DemoDatasets:
-        """Read everything from the repository."""
-        with Butler.from_config(str(repo), collections=[sky, lab, calib]) as butler:
+    def read(cls, repo: Path, lab: str, found: str, sky: str) -> DemoDatasets:
+        """Read everything from the repository; its runs are named."""
+        with Butler.from_config(str(repo), collections=[sky, found, lab]) as butler:
             flats = _refs(butler, "fringeFlat", lab)
             frames = sorted(_refs(butler, "skyFringe", sky), key=lambda ref: int(ref.dataId["exposure"]))
-            (thickness,) = _refs(butler, "epoxyThickness", lab)
+            (first,) = _refs(butler, "epoxyThickness", lab)
+            (thickness,) = _refs(butler, "epoxyThickness", found)
             (template,) = _refs(butler, "fringe", sky)
             (components,) = _refs(butler, "fringeComponents", sky)
             return cls(
                 cube=FringeCube.from_flats((butler.get(ref) for ref in flats), number=len(flats)),
+                first_thickness=butler.get(first),
                 thickness=butler.get(thickness),
                 sky=tuple(butler.get(ref) for ref in frames),
                 template=butler.get(template),
@@ -75,11 +76,18 @@ class DemoDatasets:
             )
 
 
-def write_demo_report(folder: Path, datasets: DemoDatasets) -> None:
+def dataset_path(repo: Path, name: str, collection: str) -> Path:
+    """File of the one dataset of a type in a collection."""
+    with Butler.from_config(str(repo), collections=[collection]) as butler:
+        (ref,) = _refs(butler, name, collection)
+        return _path(butler, ref)
+
+
+def write_demo_report(folder: Path, datasets: DemoDatasets, outcome: Outcome) -> None:
     """Write ``report.html`` and the figures beside it."""
     report = Report(
-        "Fringing of E2V-CCD250-321",
-        "Raw laboratory flats, thickness of the adhesive, fringes of a night through the LSST optics, templates.",
+        "What was hidden in the flats of E2V-CCD250-321, and what was found",
+        "Raw laboratory flats with a secret, a search for it, the sky and its templates with what was found.",
     )
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
@@ -87,7 +95,8 @@ def write_demo_report(folder: Path, datasets: DemoDatasets) -> None:
     def add(name: str, made: Any, caption: str) -> None:
         report.figure(made, caption, figures / f"{name}.png")
 
-    model = FringeModel.from_setup("ts8_e2v")
+    outcome.tell(report, add)
+    model = FringeModel.from_setup("ts8_e2v", of_the_layers(outcome.verdict.settings))
     wavelength = [float(w) for w in datasets.cube.wavelength_nm]
     report.section(
         "Laboratory flats",
@@ -100,15 +109,20 @@ def write_demo_report(folder: Path, datasets: DemoDatasets) -> None:
     add("flats", gallery, "Fringe amplitude of all flats on one scale.")
     report.section("Thickness of the adhesive", "One contour is one fringe order at 960 nm, 0.3 µm.")
     order = float(model.fringe_order_um(960.0))
-    add("thickness", thickness_figure(datasets.thickness, order), "Thickness, uncertainty, chance of a slip.")
+    add("thickness", thickness_figure(datasets.thickness, order), "Thickness, and its uncertainty.")
     phase, data, modelled = phase_folded(datasets.cube, datasets.thickness, model)
     add("phase", phase_figure(phase, data, modelled, wavelength), "Flats and model folded on fringe phase.")
     left = residual_of_fit(datasets.cube, model, datasets.thickness)
-    add("residuals", residuals_figure(left, wavelength), "What the model leaves of the flats.")
-    report.table(residual_table(left, datasets.cube), "flat_residuals")
+    residuals = residual_table(left, datasets.cube)
+    noise = np.asarray(residuals["noise"], dtype=float) / PERCENT
+    add(
+        "residuals",
+        residuals_figure(left, wavelength, noise),
+        "What the model leaves of the flats, over its noise.",
+    )
+    report.table(residuals, "flat_residuals")
     _sky_section(report, add, datasets)
-    _pixel_section(report, add, model)
-    _discovery_section(report, add, folder)
+    _pixel_section(report, add, FringeModel.from_setup("ts8_e2v"))
     report.write(folder / "report.html")
 
 
@@ -162,30 +176,6 @@ def _pixel_section(report: Report, add: Any, model: FringeModel) -> None:
         single_pixel_figure(wavelength, amplitude, fits),
         "Measured points, three fits, all thicknesses.",
     )
-
-
-def _discovery_section(report: Report, add: Any, folder: Path) -> None:
-    path = folder / "discovery" / "discovery.json"
-    if not path.is_file():
-        return
-    verdict = Verdict.from_json(path.read_text(encoding="utf-8"))
-    report.section(
-        "Search for a missing effect",
-        f"{headline(verdict)}. The whole evidence is in discovery/report.html.",
-    )
-    if verdict.where.channels:
-        add("discovery_where", where_figure(verdict), "Where the flats and the unchanged model disagree.")
-    if verdict.candidates:
-        add("discovery_candidates", candidates_figure(verdict), "What could explain it.")
-    gap = verdict.gap
-    rows = [
-        ("all data", gap.before, gap.after, gap.noise_floor),
-        ("held out", gap.heldout_before, gap.heldout_after, gap.noise_floor),
-    ]
-    table = Table(rows=rows, names=("rms of data minus model", "before", "after", "noise floor"))
-    for name in ("before", "after", "noise floor"):
-        table[name].info.format = ".6f"
-    report.table(table, "discovery_gap")
 
 
 def _refs(butler: Butler, name: str, collection: str) -> list[Any]:

@@ -234,6 +234,9 @@ def _maps(report: Report, residuals: ResidualPair) -> None:
         table["after"].unit = "percent"
     table["wavelength"].info.format = "g"
     report.table(table, "discovery_residual_rms")
+    if not (best.thickness.mask == 0).any():
+        report.paragraph("The thickness is not known in any pixel.")
+        return
     report.figure(
         thickness_figure(best.thickness, residuals.order_um),
         "Thickness with a contour for each fringe order, and its uncertainty.",

@@ -125,7 +125,10 @@ def thickness_figure(thickness: ThicknessMap, order_um: float) -> Figure:
 def _draw_orders(axes: Axes, value_um: NDArray[np.floating], order_um: float) -> None:
     """Contours of whole fringe orders, if they are few enough to be told apart."""
     step = max(1, min(value_um.shape) // 300)
-    low, high = np.nanmin(value_um), np.nanmax(value_um)
+    known = value_um[np.isfinite(value_um)]
+    if known.size == 0:
+        return
+    low, high = known.min(), known.max()
     levels = np.arange(np.ceil(low / order_um), np.floor(high / order_um) + 1) * order_um
     if 0 < len(levels) <= 80:
         axes.contour(
