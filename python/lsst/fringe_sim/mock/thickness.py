@@ -5,6 +5,7 @@ Every map is an array ``[y, x]`` in µm on the assembled, trimmed sensor, lower-
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -97,11 +98,13 @@ class PixelArea:
         return float((self.thickness_um - reach).min()), float((self.thickness_um + reach).max())
 
     def average(self, signal: Callable[..., NDArray[np.float64]], *others: PixelArea) -> NDArray[np.float64]:
-        """Mean over each pixel of what depends on its thickness, and on others, by 3 × 3 nodes of Gauss's rule."""
-        total = np.zeros(self.thickness_um.shape)
-        for nodes in zip(*(area._nodes() for area in (self, *others)), strict=True):
-            total += nodes[0][1] * signal(*(thickness for thickness, _ in nodes))
-        return total
+        """Mean over each pixel of what depends on its thickness, and on others, by 3 × 3 nodes of Gauss's rule.
+
+        The signal may have axes before those of the map.
+        """
+        nodes = zip(*(area._nodes() for area in (self, *others)), strict=True)
+        parts = (each[0][1] * signal(*(thickness for thickness, _ in each)) for each in nodes)
+        return functools.reduce(np.add, parts)
 
     def in_squares(
         self, rows: NDArray[np.intp], columns: NDArray[np.intp], across: int
