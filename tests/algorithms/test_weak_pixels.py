@@ -59,6 +59,35 @@ def test_a_bump_widens_the_prior_and_noise_does_not(rng) -> None:
     assert np.mean(found[:30] > width) < 0.01
 
 
+@pytest.mark.rng("weak pixels of a low bump")
+def test_a_bump_of_three_widths_is_no_surprise(rng) -> None:
+    """Pixels with a noise of 11 nm on a bump of 15 nm: a prior of 5 nm would leave errors of three times its σ."""
+    width, noise, bump = 0.005, 0.011, 0.015
+    seen = bump + noise * rng.standard_normal((64, 64))
+    drawn = width**2 / (width**2 + noise**2)
+    found = local_width(
+        drawn * seen, np.full(seen.shape, np.sqrt(drawn) * noise), np.full(seen.shape, width), 5
+    )
+    drawn = found**2 / (found**2 + noise**2)
+    pull = (drawn * seen - bump) / (np.sqrt(drawn) * noise)
+    inside = np.s_[4:-4, 4:-4]
+    assert np.sqrt(np.mean(pull[inside] ** 2)) < 1.3
+
+
+@pytest.mark.rng("weak pixels of smoothed noise")
+def test_noise_that_neighbours_share_widens_less(rng) -> None:
+    """Noise of a standard deviation of 11 nm that is the same in blocks of 4 by 4 pixels."""
+    width, noise = 0.005, 0.011
+    drawn = width**2 / (width**2 + noise**2)
+    shift = drawn * noise * np.kron(rng.standard_normal((24, 24)), np.ones((4, 4)))
+    sigma, widths = np.full(shift.shape, np.sqrt(drawn) * noise), np.full(shift.shape, width)
+    ignored, known = (
+        np.mean(local_width(shift, sigma, widths, 5, independence) ** 2) for independence in (1.0, 1.0 / 16.0)
+    )
+    assert known < ignored
+    assert np.sqrt(known) < noise
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("contrast", "electrons", "part"), [(0.13, 5_000.0, 0.5), (0.25, 5_000.0, 0.9), (0.13, 20_000.0, 0.9)]

@@ -16,6 +16,7 @@ from scipy.ndimage import binary_dilation, uniform_filter
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, gather_pixels, load_band
+from .cells import effective_number
 from .medians import middle_of
 from .newton import gauss_newton, newton_block
 from .posterior import (
@@ -274,7 +275,8 @@ def _settle(
         np.where(weak & follows, each, np.float32(np.nan)) for each in (pixels.value - begin, pixels.sigma)
     )
     window = 2 * (int(np.diff(surface.y_centre).max(initial=2)) // 2) + 1
-    wider = local_width(shift, sigma, width, window)
+    independence = effective_number(window, window, data.noise_correlation_px) / window**2
+    wider = local_width(shift, sigma, width, window, independence)
     again = weak & follows & (wider > width)
     pixels.value[again] = alone[again]
     _settle_asked(data, templates, pixels, again, begin, wider, prior.apart, order_um, threads)

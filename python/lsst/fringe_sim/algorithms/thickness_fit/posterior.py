@@ -148,13 +148,13 @@ def local_width(
     sigma_um: NDArray[np.floating],
     width_um: NDArray[np.floating],
     window_px: int,
+    independence: float = 1.0,
 ) -> NDArray[np.float32]:
-    """Width of the prior where pixels that lie together are off the surface together, more than chance would have it.
+    """Width of the prior where pixels that lie together are off the surface together.
 
     A structure smaller than the cells is not in their surface. The mean of what a prior leaves of it in a window,
-    undone for how far the prior draws, estimates its square, less that of noise and of an error of the surface. It
-    counts where it is larger than the largest of so many windows of chance alone (universal threshold, Donoho &
-    Johnstone 1994, Biometrika 81, 425).
+    undone for how far the prior draws, has a noise that is known. The width is the most likely one for this mean, but
+    no smaller than that of all pixels.
 
     Parameters
     ----------
@@ -164,6 +164,8 @@ def local_width(
         Width of that prior [µm].
     window_px : `int`
         Side of the window [px].
+    independence : `float`, optional
+        Independent pixels per pixel of a window: below 1 where noise is correlated.
 
     Returns
     -------
@@ -180,10 +182,8 @@ def local_width(
         for each in (np.where(known, shift_um, 0.0).astype(float), free, free * square)
     )
     freedom = np.maximum(freedom, 1e-30)
-    mean, chance = moved / freedom, square + np.maximum(spread, 0.0) / freedom**2
-    largest = 2.0 * np.log(max(known.sum() / window_px**2, 2.0))
-    excess = np.where(mean**2 > largest * chance, mean**2 - chance, 0.0)
-    return np.asarray(np.sqrt(square + excess), np.float32)
+    mean, noise = moved / freedom, np.maximum(spread, 0.0) / (independence * freedom**2)
+    return np.asarray(np.sqrt(np.maximum(square, mean**2 - noise)), np.float32)
 
 
 @kernel(relaxed=True)
