@@ -38,6 +38,9 @@ HALVES = ("C1", "C0")
 
 CHANNELS_PER_HALF = 8
 
+WIDE_PULL = 99.95
+"""From here on a number with a decimal is wider than its amplifier."""
+
 
 def where_figure(verdict: Verdict) -> Figure:
     """Disagreement before anything is added: by wavelength, fringe phase, amplifier and test, as far as there is."""
@@ -185,7 +188,7 @@ def _draw_amplifiers(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
             axes.text(
                 column,
                 row,
-                f"{HALVES[row]}{column}\n{pull:+.1f}",
+                f"{HALVES[row]}{column}\n{pull:+.{1 if abs(pull) < WIDE_PULL else 0}f}",
                 ha="center",
                 va="center",
                 fontsize=7,
