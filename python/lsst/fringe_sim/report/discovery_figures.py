@@ -198,7 +198,7 @@ def _draw_amplifiers(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.set_yticks([0, 1], ["upper half", "lower half"])
     axes.spines[:].set_visible(False)
     axes.figure.colorbar(drawn, ax=axes, label="offset of the amplifier [σ]", shrink=0.85)
-    axes.set_title("by amplifier, as they lie on the sensor")
+    axes.set_title("by sixteenth of the sensor, named as LSST amplifiers")
 
 
 def _draw_tests(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
