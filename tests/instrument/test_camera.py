@@ -226,3 +226,36 @@ def test_a_sensor_of_another_vendor_has_setups_of_its_own() -> None:
     sensor = Camera.from_name("ts8").detector("RTM-014_S11")
     with pytest.raises(InputError, match=r"of ITL.*ts8_itl"):
         Setup.from_name("ts8_e2v").refuse_other_vendor(sensor)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("x0: 512,", "x0: 500,", "shared by A1 and A2"),
+        ("x0: 512,", "x0: 520,", "pixels without an amplifier is 8192"),
+        ("name: A2", "name: A1", "name of an amplifier is 'A1'"),
+        ("width: 500", "width: 0", "width, height of A2"),
+    ],
+)
+def test_amplifiers_that_do_not_fit_the_pixels_are_refused(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    path, rest = tmp_path / "two.yaml", "height: 1024, gain: 1.5, read_noise: 6.0, saturation: 100000}"
+    text = f"""
+title: two outputs of different widths
+source: test
+vendor: any
+pixel_um: 10.0
+amplifiers:
+  - {{name: A1, x0: 0, y0: 0, width: 512, {rest}
+  - {{name: A2, x0: 512, y0: 0, width: 500, {rest}
+detectors:
+  - {{id: 0, name: S00}}
+"""
+    path.write_text(text, encoding="utf-8")
+    sensor = Camera.from_file(path).detector("S00")
+    assert (coverage(sensor) == 1).all()
+    assert (coverage(sensor.cut_down((32, 64))) == 1).all()  # though one is narrower than its place tells
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        Camera.from_file(path)

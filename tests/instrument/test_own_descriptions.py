@@ -118,6 +118,8 @@ def test_the_header_of_a_product_states_every_file(folder: Path) -> None:
         ("media.yaml", "  table", "  tables", "table with wavelength"),
         ("nk_N-BK7.ecsv", "{doi: none}", "{dio: none}", "doi"),
         ("nk_N-BK7.ecsv", "wavelength n k", "wavelength n z", "nk_N-BK7.ecsv"),
+        ("nk_N-BK7.ecsv", "1100.0 1.506167 0.0", "1100.0 0.0 1.506167", "ecsv: n is 0.0; allowed: positive"),
+        ("nk_N-BK7.ecsv", "1.506167 0.0", "1.506167 -0.1", "ecsv: k is -0.1"),
         ("camera.yaml", "vendor: e2v", "vendor: ''", "vendor"),
         ("camera.yaml", "pixel_um: 10.0", "pixel_um: -10.0", "pixel_um"),
     ],

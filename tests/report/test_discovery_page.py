@@ -268,3 +268,12 @@ def test_a_page_says_so_where_no_thickness_is_known() -> None:
     left = FlatResidual(np.array(WAVELENGTHS), np.zeros((12, 8, 8), np.float32), unknown)
     text = words(discovery_page(NAMED, ResidualPair(left, left, 0.3)).to_html())
     assert "The thickness is not known in any pixel." in text
+
+
+def test_many_parameters_are_one_number_in_the_summary_and_all_in_the_table() -> None:
+    gains = {f"C{number:02}": ParameterValue(2e-6 * (-1) ** number, 4e-4, "") for number in range(16)}
+    effect = replace(NAMED.effects[0], name="amplifier_gain", parameters=gains)
+    seen = words(discovery_page(replace(NAMED, effects=(effect,))).to_html())
+    assert "amplifier_gain: 16 parameters, rms 2.0e-06; probability" in seen
+    assert "0.00000" in seen
+    assert "-0.00000" not in seen

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from browser import check_page
@@ -79,3 +81,11 @@ def test_residuals_are_on_the_scale_of_the_noise_of_their_means(rng) -> None:
             difference = (image[:, 1:] - image[:, :-1])[::2, ::2] / np.sqrt(2.0)
             assert difference.std() == pytest.approx(1.0, abs=0.1)
             assert np.abs(image.mean(axis=0)).max() == pytest.approx(0.004 / (sigma / 4.0), abs=0.35)
+
+
+def test_what_a_table_with_noise_shows_is_said(tmp_path) -> None:
+    """The summary has the fringes alone."""
+    quiet, said = night(hours=1), "noise included"
+    assert said not in write_sky_report(tmp_path / "a.html", quiet, "lsst_e2v", 1).read_text("utf-8")
+    noisy = [replace(frame, seed=1, metadata={"FRINGRMS": 0.002, "FRING198": 0.003}) for frame in quiet]
+    assert said in write_sky_report(tmp_path / "b.html", noisy, "lsst_e2v", 1).read_text("utf-8")

@@ -19,6 +19,7 @@ from ..effects import EFFECTS
 from ..products import SkyFringe, ThicknessMap
 from ..report.discovery_figures import candidates_figure, gap_figure, where_figure
 from ..report.page import Report
+from ..report.words import measured_text
 from ..style import figure, finite_range, show_image
 from .demo_truth import DemoTruth
 
@@ -243,7 +244,7 @@ def _comparison(case: DemoCase, verdict: Verdict) -> Table:
             (
                 key,
                 "–" if true is None else f"{true:.4g}",
-                "–" if each is None else f"{each.value:.4g} ± {each.sigma:.1g}",
+                "–" if each is None else " ± ".join(measured_text(each.value, each.sigma)),
                 units[key] or "1",
             )
         )

@@ -21,7 +21,7 @@ from ..descriptions import is_file_name
 from ..errors import InputError, OutOfRangeError, UnknownNameError, printable_name
 from ..notebook import OneLine
 from ..resources import first_line, list_resources, read_table, read_user_yaml, read_yaml
-from .detector import Amplifier, Detector, RawSegment
+from .detector import Amplifier, Detector, RawSegment, refuse_misfits
 
 __all__ = ["Amplifier", "Camera", "Detector", "RawSegment"]
 
@@ -392,6 +392,7 @@ def _yaml_amplifiers(content: Mapping[str, Any]) -> tuple[tuple[Amplifier, ...],
         )
         for channel, amp in enumerate(content["amplifiers"], start=1)
     )
+    refuse_misfits(amplifiers)
     return amplifiers, str(content["source"])
 
 

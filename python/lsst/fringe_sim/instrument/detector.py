@@ -6,14 +6,16 @@ Coordinates are those of the assembled, trimmed CCD: ``[0, 0]`` is the lower-lef
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..errors import InputError, UnknownNameError, named_units
 from ..notebook import OneLine
 
-__all__ = ["Amplifier", "Detector", "RawSegment"]
+__all__ = ["Amplifier", "Detector", "RawSegment", "refuse_misfits"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,8 +194,8 @@ class Detector(OneLine):
         InputError
             The size cannot be divided evenly among the amplifiers.
         """
-        n_columns = len({amp.x0 for amp in self.amplifiers})
-        n_rows = len({amp.y0 for amp in self.amplifiers})
+        first_x, first_y = (sorted({getattr(amp, at) for amp in self.amplifiers}) for at in ("x0", "y0"))
+        n_rows, n_columns = len(first_y), len(first_x)
         height, rest_y = divmod(shape[0], n_rows)
         width, rest_x = divmod(shape[1], n_columns)
         if rest_y or rest_x or height < 1 or width < 1:
@@ -203,20 +205,59 @@ class Detector(OneLine):
                 f"positive multiples of {n_rows} rows and {n_columns} columns",
                 source=self.name,
             )
-        return dataclasses.replace(
-            self, amplifiers=tuple(_resized(amp, height, width) for amp in self.amplifiers)
+        amplifiers = tuple(
+            _resized(amp, first_y.index(amp.y0), first_x.index(amp.x0), height, width)
+            for amp in self.amplifiers
+        )
+        return dataclasses.replace(self, amplifiers=amplifiers)
+
+
+def refuse_misfits(amplifiers: Sequence[Amplifier]) -> None:
+    """Refuse amplifiers that do not share the pixels of a rectangle among them.
+
+    Raises
+    ------
+    InputError
+        Two have one name or one pixel, or a pixel of the smallest sensor that holds them all has none.
+    """
+    if not amplifiers:
+        raise InputError("amplifiers", "none", "one amplifier or more")
+    for one in amplifiers:
+        if min(one.x0, one.y0) < 0 or min(one.width, one.height) < 1:
+            place = [one.x0, one.y0, one.width, one.height]
+            raise InputError(
+                f"x0, y0, width, height of {one.name}", place, "places from 0 and sizes from 1 pixel on"
+            )
+    for one, other in itertools.combinations(amplifiers, 2):
+        if one.name == other.name:
+            raise InputError("name of an amplifier", one.name, "a name of its own for each amplifier")
+        if abs(2 * (one.x0 - other.x0) + one.width - other.width) < one.width + other.width and (
+            abs(2 * (one.y0 - other.y0) + one.height - other.height) < one.height + other.height
+        ):
+            raise InputError(
+                "place of amplifiers", f"shared by {one.name} and {other.name}", "pixels of its own for each"
+            )
+    rows, columns = (
+        max(amp.y0 + amp.height for amp in amplifiers),
+        max(amp.x0 + amp.width for amp in amplifiers),
+    )
+    empty = rows * columns - sum(amp.height * amp.width for amp in amplifiers)
+    if empty:
+        raise InputError(
+            "pixels without an amplifier", empty, f"none in a sensor of {columns} x {rows}, which they span"
         )
 
 
-def _resized(amp: Amplifier, height: int, width: int) -> Amplifier:
+def _resized(amp: Amplifier, row: int, column: int, height: int, width: int) -> Amplifier:
+    """An amplifier of another size, in a row and column of amplifiers."""
     raw = amp.raw
     if raw is not None:
         shape = (raw.shape[0] + height - amp.height, raw.shape[1] + width - amp.width)
         raw = dataclasses.replace(raw, shape=shape)
     return dataclasses.replace(
         amp,
-        y0=amp.y0 // amp.height * height,
-        x0=amp.x0 // amp.width * width,
+        y0=row * height,
+        x0=column * width,
         height=height,
         width=width,
         raw=raw,

@@ -336,6 +336,10 @@ def _read_tabulated(name: str, entry: dict[str, Any], read: Callable[[str], Tabl
     wavelength = _wavelengths(table, entry["table"])
     names = entry.get("columns", ("n", "k"))
     n, k = (np.asarray(table[column], dtype=float) for column in names)
+    if n.min() <= 0.0:
+        raise InputError(names[0], float(n.min()), "positive numbers in all rows", source=entry["table"])
+    if k.min() < 0.0:
+        raise InputError(names[1], float(k.min()), "no negative numbers", source=entry["table"])
     if np.all(k == 0.0):
         log_k = None
     else:

@@ -227,10 +227,14 @@ def _correlation_figure(records: Sequence[FrameRecord]) -> Figure:
 
 
 def frame_figure(record: FrameRecord) -> Figure:
-    """A frame less background and objects before its correction, what was subtracted, and what is left."""
+    """A frame less background and objects before its correction, what was subtracted, and what is left.
+
+    The frame alone where its fringes are not seen, and nothing was subtracted.
+    """
+    titles = ("before", "subtracted", "after") if record.proof.seen else ("as it was, and is",)
     limits = finite_range(record.pictures[0], 1.0, symmetric=True)
-    with map_row(3) as (made, shown):
-        for axes, image, title in zip(shown, record.pictures, ("before", "subtracted", "after"), strict=True):
+    with map_row(len(titles)) as (made, shown):
+        for axes, image, title in zip(shown, record.pictures, titles, strict=False):
             show_image(
                 axes,
                 image,

@@ -38,6 +38,9 @@ HALVES = ("C1", "C0")
 
 CHANNELS_PER_HALF = 8
 
+WIDE_PULL = 99.95
+"""From here on a number with a decimal is wider than its amplifier."""
+
 
 def where_figure(verdict: Verdict) -> Figure:
     """Disagreement before anything is added: by wavelength, fringe phase, amplifier and test, as far as there is."""
@@ -185,7 +188,7 @@ def _draw_amplifiers(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
             axes.text(
                 column,
                 row,
-                f"{HALVES[row]}{column}\n{pull:+.1f}",
+                f"{HALVES[row]}{column}\n{pull:+.{1 if abs(pull) < WIDE_PULL else 0}f}",
                 ha="center",
                 va="center",
                 fontsize=7,
@@ -195,7 +198,7 @@ def _draw_amplifiers(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.set_yticks([0, 1], ["upper half", "lower half"])
     axes.spines[:].set_visible(False)
     axes.figure.colorbar(drawn, ax=axes, label="offset of the amplifier [σ]", shrink=0.85)
-    axes.set_title("by amplifier, as they lie on the sensor")
+    axes.set_title("by sixteenth of the sensor, named as LSST amplifiers")
 
 
 def _draw_tests(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -16,7 +16,7 @@ from ..products import SensorSection
 from .discovery_figures import candidates_figure, gap_figure, leftover_figure, where_figure
 from .figures import pixel_noise, residuals_figure, thickness_figure
 from .page import Origin, Report
-from .words import amplitude_text, masked_text, measured_text, of_sensor, sigma_text
+from .words import amplitude_text, masked_text, measured_text, number_text, of_sensor, sigma_text
 
 __all__ = ["discovery_page", "headline"]
 
@@ -25,6 +25,9 @@ FRACTIONS = {"before", "after", "noise floor", "rms", "residual", "sigma", "cos"
 """Columns with fractions of the counts, which pages show in percent."""
 
 LEAST_CHANCE = 1e-300
+
+MANY = 6
+"""Parameters from which on the summary tells an effect by the rms of their values; the table has them all."""
 
 
 def discovery_page(
@@ -141,6 +144,10 @@ def _found(verdict: Verdict) -> str:
 
 
 def _values(effect: NamedEffect) -> str:
+    if len(effect.parameters) > MANY:
+        each = list(effect.parameters.values())
+        rms = math.sqrt(sum(one.value**2 for one in each) / len(each))
+        return f"{len(each)} parameters, rms {number_text(rms, 2)} {each[0].unit}".rstrip()
     texts = {name: measured_text(p.value, p.sigma) for name, p in effect.parameters.items()}
     return ", ".join(
         f"{name} = {value} ± {sigma} {effect.parameters[name].unit}".rstrip()

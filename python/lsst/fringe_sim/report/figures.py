@@ -106,7 +106,7 @@ def thickness_figure(thickness: ThicknessMap, order_um: float) -> Figure:
             thickness.value,
             mask=thickness.mask,
             label="thickness [µm]",
-            title=f"{thickness.layer}, one contour per order",
+            title=thickness.layer,
         )
         _draw_orders(left, np.where(good, thickness.value, np.nan), order_um)
         show_image(middle, 1e3 * thickness.sigma, mask=thickness.mask, label="σ [nm]", title="uncertainty")

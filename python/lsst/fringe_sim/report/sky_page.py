@@ -108,8 +108,9 @@ def write_sky_report(
     amplitudes = sky_amplitudes(frames)
     found = None if first.seed is not None else coadds_of_frames(frames, np.random.default_rng(seed), places)
     report.summary(_summary(frames, amplitudes, found, section))
+    noise = "" if first.seed is None else " In the table they are those of the frames, noise included."
     report.section(
-        "Fringes", "Departure from the mean sky. Three numbers are called amplitude; all are given."
+        "Fringes", f"Departure from the mean sky. Three numbers are called amplitude; all are given.{noise}"
     )
     report.figure(
         sky_figure(frames), f"{_first_of(frames)}, and its distribution over the pixels{_through(frames)}."

@@ -69,7 +69,7 @@ def measured_text(value: float, sigma: float) -> tuple[str, str]:
     if not (math.isfinite(sigma) and sigma > 0.0):
         return f"{value:.3g}", number_text(sigma)
     decimals = max(0, 1 - math.floor(math.log10(sigma)))
-    return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
+    return f"{value:z.{decimals}f}", f"{sigma:.{decimals}f}"
 
 
 def span_text(values: ArrayLike) -> str:

@@ -76,6 +76,8 @@ def hidden_island(prepared: Prepared, catalogue: Sequence[Effect], found: Hypoth
             continue
         selector = Selector(problem, chosen, smooth.null, smooth.index)
         for effect in local:
+            if effect.name in selector.left_out:  # of a layer that this sensor does not have
+                continue
             beside = selector.at_step(effect.name, base, LEAST_PROMISED * missing)
             if beside is not None and base.chi2 - beside.fit.chi2 > LEAST_EXPLAINED * missing:
                 smooth_um = problem.basis.expand(beside.fit.field)
