@@ -116,7 +116,11 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_a_second_time_changes_nothing(name: str, given: dict[str, str], tmp_path: Path) -> None:
+def test_a_second_time_changes_nothing(
+    name: str, given: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pages state when they were made, so that the time is given."""
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1800000000")
     out = tmp_path / "out"
     out.mkdir()
     words = {"OUT": str(out), **given}

@@ -248,6 +248,8 @@ def origin_of(out: Path, given: Iterable[str | os.PathLike[str]]) -> Origin:
 
     context = click.get_current_context(silent=True)
     words = None if context is None else context.obj
+    if words is not None:  # what replaces an earlier run decides nothing of this one
+        words = [word for word in words if word != "--overwrite"]
     command = "" if words is None else shown(shlex.join(["fringe-sim", *words]), LONGEST_COMMAND)
     folders = dict.fromkeys(path if path.is_dir() else path.parent for path in map(Path, given))
     pages = {}
