@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .errors import InputError, UnknownNameError, to_number
-from .resources import REQUIRED_PROVENANCE, read_user_table, read_user_yaml
+from .resources import REQUIRED_PROVENANCE, first_line, read_table, read_user_table, read_user_yaml
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
 __all__ = [
     "Description",
+    "described",
     "files_of",
     "is_file_name",
     "read_description",
-    "read_table_beside",
+    "read_table_of",
     "with_files_beside",
 ]
 
@@ -59,22 +61,46 @@ def read_description(path: str | Path, what: str) -> Mapping[str, Any]:
     return dict(content)
 
 
-def read_table_beside(description: str | Path, name: str) -> Table | None:
-    """Table that lies beside a description; `None` if there is no such file.
+def read_table_of(description: str | Path, name: str, section: str) -> Table:
+    """Table that a description names: the file beside it, or else that which is shipped in a folder of the data.
 
     Raises
     ------
     InputError
-        It is no ECSV table, or does not state ``source``, ``doi`` and ``licence``.
+        The file is no ECSV table, or does not state ``source``, ``doi`` and ``licence``.
     """
     path = Path(description).parent / name
     if not path.is_file():
-        return None
+        return read_table(section, name)
     table = read_user_table(path, "table")
     for key in REQUIRED_PROVENANCE:
         if not table.meta.get(key):
             raise InputError(key, None, "text in the header of the table", source=str(path))
     return table
+
+
+@contextmanager
+def described(what: str, allowed: str, source: str) -> Iterator[None]:
+    """Report whatever is wrong in a description as an error of the file in which it stands.
+
+    Parameters
+    ----------
+    what, allowed : `str`
+        What is described, and what it must hold, for errors that do not say so themselves.
+    source : `str`
+        The file.
+
+    Raises
+    ------
+    InputError
+        Something in it cannot be used.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise (error if error.source else error.in_source(source)) from None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(what, first_line(error), allowed, source=source) from None
 
 
 def with_files_beside(content: Any, path: str | Path) -> Any:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..descriptions import is_file_name, read_description, read_table_beside
+from ..descriptions import described, is_file_name, read_description, read_table_of
 from ..errors import (
     InputError,
     MissingPackageError,
@@ -28,7 +28,7 @@ from ..errors import (
     printable_name,
 )
 from ..notebook import OneLine
-from ..resources import first_line, list_resources, read_table, read_yaml
+from ..resources import list_resources, read_table, read_yaml
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -139,22 +139,11 @@ class Bandpass(OneLine):
         InputError
             There is no such file, or it does not describe a bandpass.
         """
-        source = str(path)
         content = read_description(path, "bandpass")
-
-        def read(file: str) -> Table:
-            beside = read_table_beside(path, file)
-            return read_table("sky", file) if beside is None else beside
-
-        try:
-            return cls._of(printable_name("name of the bandpass", Path(path).stem), content, read)
-        except InputError as error:
-            raise (error if error.source else error.in_source(source)) from None
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            allowed = (
-                "every entry and column that lsst_y.yaml and its table have, but for detector and speclite"
-            )
-            raise InputError("bandpass", first_line(error), allowed, source=source) from None
+        allowed = "every entry and column that lsst_y.yaml and its table have, but for detector and speclite"
+        with described("bandpass", allowed, str(path)):
+            name = printable_name("name of the bandpass", Path(path).stem)
+            return cls._of(name, content, lambda file: read_table_of(path, file, "sky"))
 
     @classmethod
     def _of(cls, name: str, content: Mapping[str, Any], read: Callable[[str], Table]) -> Bandpass:

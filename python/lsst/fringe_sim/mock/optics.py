@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from ..descriptions import read_table_beside
+from ..descriptions import read_table_of
 from ..errors import ConvergenceError, OutOfRangeError, StackError, UnknownNameError
 from ..resources import read_table, read_user_yaml, read_yaml
 from .film_fields import add_mode, light_in
@@ -424,8 +424,8 @@ def _material(medium: str, media: str) -> tuple[_Curve, float, float]:
         constant = complex(*entry["constant"])
         low, high = entry["range_nm"]
         return lambda wavelength, _: np.full(wavelength.shape, constant), float(low), float(high)
-    beside = read_table_beside(media, entry["table"]) if medium in own else None
-    table = read_table("media", entry["table"]) if beside is None else beside
+    named = entry["table"]
+    table = read_table_of(media, named, "media") if medium in own else read_table("media", named)
     nodes = table["wavelength"].quantity.to_value("nm")
     first, second = entry.get("columns", ("n", "k"))
     n_curve = CubicSpline(nodes, table[first])

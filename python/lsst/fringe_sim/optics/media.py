@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..descriptions import Description, read_table_beside
+from ..descriptions import Description, described, read_table_of
 from ..errors import (
     InputError,
     OutOfRangeError,
@@ -24,7 +24,7 @@ from ..errors import (
     printable_name,
 )
 from ..notebook import OneLine
-from ..resources import first_line, read_table, read_user_yaml, read_yaml
+from ..resources import read_table, read_user_yaml, read_yaml
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -306,19 +306,10 @@ def read_media(path: str | Path) -> dict[str, Medium]:
     for name in content:
         printable_name("name of a medium", name, source=str(path))
         reader.section(name)
-        try:
-            media[name] = _medium(name, content[name], lambda file: _table(path, file))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            if isinstance(error, InputError):
-                raise (error if error.source else error.in_source(str(path))) from None
-            allowed = "constant, range_nm and source, or a table with wavelength (in a unit), n and k"
-            raise InputError(name, first_line(error), allowed, source=str(path)) from None
+        allowed = "constant, range_nm and source, or a table with wavelength (in a unit), n and k"
+        with described(name, allowed, str(path)):
+            media[name] = _medium(name, content[name], lambda file: read_table_of(path, file, "media"))
     return media
-
-
-def _table(description: str | Path, file: str) -> Table:
-    beside = read_table_beside(description, file)
-    return read_table("media", file) if beside is None else beside
 
 
 def _medium(name: str, entry: dict[str, Any], read: Callable[[str], Table]) -> Medium:

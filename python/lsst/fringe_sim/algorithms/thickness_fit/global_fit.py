@@ -21,6 +21,7 @@ from .rescue import rescue_pixels
 from .shared_misfit import doubt_from_shared_misfit
 from .solver import Solver, surface_of
 from .templates import FringeTemplates
+from .weak_pixels import settle_weak_pixels
 
 __all__ = ["GlobalFit", "global_fit"]
 
@@ -125,7 +126,10 @@ def global_fit(
     if state.normalisation == "sensor" and not state.free.any:
         state = replace(state, templates=normalise_to_pixels(data, state.templates, calmed, threads))
     typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
-    pixels = fit_pixels(fringes, state.templates, calmed, order, typical_weight=typical, threads=threads)
+    pixels = fit_pixels(fringes, state.templates, calmed, order, threads=threads)
+    pixels = settle_weak_pixels(
+        fringes, state.templates, calmed, pixels, order, typical_weight=typical, threads=threads
+    )
     rough = spread_to_pixels(cells, ~surface.smooth)
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
     pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)

@@ -15,21 +15,9 @@ from scipy.ndimage import binary_dilation, uniform_filter
 
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
-from .bands import BAND_ROWS, gather_pixels, load_band
-from .cells import effective_number
+from .bands import BAND_ROWS, load_band
 from .medians import middle_of
 from .newton import gauss_newton, newton_block
-from .posterior import (
-    NODES,
-    SHARE,
-    SurfacePrior,
-    chi2_about,
-    learn_prior,
-    local_width,
-    nodes_about,
-    settle_band,
-    widest_parabola,
-)
 from .templates import FringeTemplates
 
 __all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels"]
@@ -43,8 +31,6 @@ _SAME_SURFACE = 0.25
 _LONE_CELL_PENALTY = 12.0
 """Chi-square by which a surface shown by a single cell must be better than one that several show."""
 _BLOCK = 32
-_MOST_ASKED = 32768
-"""Pixels that show how far all lie from their surface: a width of a tenth of the noise of a pixel is then seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +184,6 @@ def fit_pixels(
     surface: CellSurface,
     order_um: float,
     *,
-    typical_weight: NDArray[np.floating],
     threads: int = 2,
 ) -> PixelFit:
     """Refine every pixel.
@@ -213,13 +198,10 @@ def fit_pixels(
         Where to begin.
     order_um : `float`
         Thickness of one fringe order [µm].
-    typical_weight : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Typical inverse variance of each wavelength.
     threads : `int`, optional
         Number of threads; has no influence on the result.
     """
     _, ny, nx = data.shape
-    limit = widest_parabola(templates, typical_weight, order_um)
     value, sigma, chi2 = (np.empty((ny, nx), np.float32) for _ in range(3))
     used = np.zeros((ny, nx), np.int32)
     table = templates.table()
@@ -238,94 +220,7 @@ def fit_pixels(
         )  # fmt: skip
 
     run_threaded(work, -(-ny // BAND_ROWS), threads)
-    return _settle(data, templates, surface, PixelFit(value, sigma, chi2, used), limit, order_um, threads)
-
-
-def _settle(
-    data: Amplitudes,
-    templates: FringeTemplates,
-    surface: CellSurface,
-    pixels: PixelFit,
-    limit: NDArray[np.float32],
-    order_um: float,
-    threads: int,
-) -> PixelFit:
-    """Pixels that do not tell their thickness by themselves: the surface of the cells enters as a prior."""
-    _, ny, nx = data.shape
-    place = (pixels.value - templates.start_um) / templates.step_um
-    inside = (place >= 0.0) & (place <= len(limit) - 1.0)
-    weak = inside & (pixels.sigma / templates.step_um > limit[np.where(inside, place, 0.0).astype(np.intp)])
-    if not weak.any():
-        return pixels
-    rows, columns = (np.arange(length) for length in (ny, nx))
-    nearest = np.ix_(
-        *(
-            np.abs(np.subtract.outer(at, centre)).argmin(axis=1)
-            for at, centre in ((rows, surface.y_centre), (columns, surface.x_centre))
-        )
-    )
-    spread = surface.sigma_um[nearest]
-    follows = (surface.smooth & surface.known)[nearest] & np.isfinite(spread)
-    begin = surface.at(rows, columns)
-    prior = _learned(data, templates, begin, spread, weak & follows, order_um)
-    width = np.where(follows, np.hypot(spread, np.float32(prior.width_um)), np.float32(np.inf))
-    alone = pixels.value.copy()
-    _settle_asked(data, templates, pixels, weak, begin, width, prior.apart, order_um, threads)
-    shift, sigma = (
-        np.where(weak & follows, each, np.float32(np.nan)) for each in (pixels.value - begin, pixels.sigma)
-    )
-    window = 2 * (int(np.diff(surface.y_centre).max(initial=2)) // 2) + 1
-    independence = effective_number(window, window, data.noise_correlation_px) / window**2
-    wider = local_width(shift, sigma, width, window, independence)
-    again = weak & follows & (wider > width)
-    pixels.value[again] = alone[again]
-    _settle_asked(data, templates, pixels, again, begin, wider, prior.apart, order_um, threads)
-    return pixels
-
-
-def _settle_asked(
-    data: Amplitudes,
-    templates: FringeTemplates,
-    pixels: PixelFit,
-    asked: NDArray[np.bool_],
-    surface: NDArray[np.float32],
-    width: NDArray[np.float32],
-    apart: float,
-    order_um: float,
-    threads: int,
-) -> None:
-    """Posterior of some pixels, in place."""
-    table, start, step = templates.table(), templates.start_um, templates.step_um
-    away = nodes_about(order_um / step)
-
-    def work(band: int) -> None:
-        part = slice(band * BAND_ROWS, min((band + 1) * BAND_ROWS, len(asked)))
-        if asked[part].any():
-            amplitude, weight = load_band(data, part.start, part.stop)
-            settle_band(
-                amplitude, weight, table, start, step, asked[part], surface[part], width[part], away, SHARE, apart,
-                pixels.value[part], pixels.sigma[part], pixels.chi2[part], pixels.n_wavelengths[part],
-            )  # fmt: skip
-
-    run_threaded(work, -(-len(asked) // BAND_ROWS), threads)
-
-
-def _learned(
-    data: Amplitudes,
-    templates: FringeTemplates,
-    surface: NDArray[np.float32],
-    spread: NDArray[np.float32],
-    asked: NDArray[np.bool_],
-    order_um: float,
-) -> SurfacePrior:
-    """Prior that some of the pixels in question show."""
-    found = np.flatnonzero(asked)
-    rows, columns = np.unravel_index(found[:: -(-found.size // _MOST_ASKED) or 1], asked.shape)
-    value, weight = gather_pixels(data, rows, columns)
-    place = (surface[rows, columns].astype(float) - templates.start_um) / templates.step_um
-    chi2 = np.empty((rows.size, NODES))
-    chi2_about(value, weight, templates.table(), place, nodes_about(order_um / templates.step_um), chi2)
-    return learn_prior(chi2, spread[rows, columns].astype(float), order_um)
+    return PixelFit(value, sigma, chi2, used)
 
 
 def bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

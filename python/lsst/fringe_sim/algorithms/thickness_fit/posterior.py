@@ -65,9 +65,9 @@ class SurfacePrior:
     apart: float
 
 
-def nodes_about(order_steps: float) -> NDArray[np.float64]:
-    """The nodes in steps of a table that has ``order_steps`` of them in a fringe order."""
-    return AWAY * _REACH * order_steps
+def nodes_about(order: float) -> NDArray[np.float64]:
+    """Distances of the nodes from the surface, in the unit of ``order``, which is one fringe order."""
+    return AWAY * _REACH * order
 
 
 WIDEST = SurfacePrior(0.0, 1.0)
@@ -115,11 +115,12 @@ def learn_prior(
     if len(chi2) == 0:
         return WIDEST
     likelihood = np.exp(-0.5 * (chi2 - chi2.min(axis=1, keepdims=True)))
-    anywhere, away = likelihood @ SHARE, AWAY * _REACH * order_um
+    anywhere, away = likelihood @ SHARE, nodes_about(order_um)
+    narrowest = away[NODES // 2 + 1]
     price, nobody = 0.5 * np.log(len(chi2)), 1.0 / (len(chi2) + 1.0)
     best, found = -np.inf, WIDEST
-    for width in (0.0, *(np.geomspace(AWAY[NODES // 2 + 1], 1.0, _WIDTHS) * _REACH * order_um)):
-        spread = np.maximum(np.hypot(surface_sigma_um, width), away[NODES // 2 + 1])[:, np.newaxis]
+    for width in (0.0, *np.geomspace(narrowest, away[-1], _WIDTHS)):
+        spread = np.maximum(np.hypot(surface_sigma_um, width), narrowest)[:, np.newaxis]
         follow = SHARE * np.exp(-0.5 * (away / spread) ** 2)
         follow = (likelihood * follow).sum(axis=1) / follow.sum(axis=1)
         apart = 0.5
