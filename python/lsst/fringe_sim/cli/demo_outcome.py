@@ -14,6 +14,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from ..algorithms.discovery import Verdict
+from ..algorithms.night_levels import background_terms
 from ..challenge.demo_case import DemoCase, found_words, of_the_layers
 from ..effects import EFFECTS
 from ..products import SkyFringe, ThicknessMap
@@ -269,9 +270,7 @@ def _fringes(frame: SkyFringe) -> FloatArray:
 
 def _without_background(image: NDArray[np.floating]) -> FloatArray:
     """An image less a surface of second degree, as the removal of a background takes it; NaN stays."""
-    y, x = (np.linspace(-1.0, 1.0, size) for size in image.shape)
-    v, u = np.meshgrid(y, x, indexing="ij")
-    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    terms = np.moveaxis(background_terms(image.shape), 0, -1)
     known = np.isfinite(image)
     found, *_ = np.linalg.lstsq(terms[known], image[known].astype(float), rcond=None)
     return np.asarray(image - terms @ found)
