@@ -309,13 +309,7 @@ def refuse_uncorrected(header: Mapping[str, Any], source: str | None = None) -> 
 
 
 def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
-    """Scales of all templates by a header of ours; 0 if they were not seen, and nothing was subtracted.
-
-    Raises
-    ------
-    InputError
-        It states none, or of another number of templates.
-    """
+    """Scales of all templates by a header of ours; 0 if they were not seen, and nothing was subtracted."""
     if header[CORRECTED] == 0:
         return np.zeros(len(patterns))
     if header[CORRECTED] != len(patterns):

@@ -22,13 +22,6 @@ def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[st
     """Value of a keyword; `None` if it is absent, undefined or blank.
 
     ``declared``: those that may be asked for; by default those of raw frames.
-
-    Raises
-    ------
-    FrameFormatError
-        The card is not FITS (other cards of the header may be), or there are several with different values.
-    LookupError
-        The keyword is not declared: a fault of the program.
     """
     if keyword not in (_DECLARED if declared is None else declared):
         raise LookupError(f"{keyword} is not declared")
@@ -60,23 +53,12 @@ def _refuse_different(header: fits.Header, keyword: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class DeclaredHeader:
-    """Header of a file, asked for values of a certain kind.
-
-    Attributes
-    ----------
-    cards : mapping
-        The header.
-    source : `str`
-        The file.
-    declared : `frozenset` [`str`], optional
-        Keywords that may be asked for; by default those of raw frames.
-    others : `tuple` of mappings
-        Headers of other HDUs, which may state a keyword too, but not differently.
-    """
+    """Header of a file, asked for values of a certain kind."""
 
     cards: Mapping[str, Any]
     source: str
-    declared: frozenset[str] | None = None
+    declared: frozenset[str] | None = None  # Keywords that may be asked for; by default those of raw frames
+    # Headers of other HDUs, which may state a keyword too, but not differently
     others: tuple[Mapping[str, Any], ...] = ()
 
     def value(self, keyword: str) -> Any:

@@ -35,13 +35,7 @@ class Section:
 
     @classmethod
     def parse(cls, text: object, *, keyword: str = "section", source: str | None = None) -> Section:
-        """Read a section from a header value.
-
-        Raises
-        ------
-        FrameFormatError
-            The value is not ``[x1:x2,y1:y2]`` with integers from 1 on.
-        """
+        """Read a section from a header value."""
         match = _SECTION.fullmatch(text) if isinstance(text, str) else None
         bounds = [int(group) for group in match.groups()] if match else []
         if not bounds or min(bounds) < 1:

@@ -132,17 +132,7 @@ def reproduce(
     sections: Sequence[Callable[[Context], Section]] | None = None,
     advance: Callable[[], None] = do_nothing,
 ) -> Reproduction:
-    """Recompute the paper.
-
-    Parameters
-    ----------
-    context : `Context`
-        Thickness maps, sizes, and where published curves are.
-    sections : sequence of callables, optional
-        Recomputations; `SECTIONS` by default.
-    advance : callable, optional
-        Called after each section.
-    """
+    """Recompute the paper; ``advance`` is called after each section."""
     made, findings = [], []
     cold_context = replace(context, silicon=COLD_SILICON)
     for compute in SECTIONS if sections is None else sections:

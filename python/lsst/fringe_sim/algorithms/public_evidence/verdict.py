@@ -199,17 +199,7 @@ def compare(
     kinds: Sequence[Kind] | None = None,
     advance: Callable[[], None] = do_nothing,
 ) -> Comparison:
-    """Compare sets of effects, and none at all, on all public data.
-
-    Parameters
-    ----------
-    sets : sequence of sequences of `str`, optional
-        Effects, or single parameters as ``effect.parameter``; `RIVALS` by default.
-    kinds : sequence of `Kind`, optional
-        Data; `public_kinds` by default.
-    advance : callable, optional
-        Called after each set.
-    """
+    """Compare sets of effects or of single parameters (`RIVALS`), and none at all, on all public data."""
     wanted = [parse_set(names) for names in ((), *(RIVALS if sets is None else sets))]
     predictor = Predictor(public_kinds() if kinds is None else kinds)
     _refuse_unfelt({axis.key: axis for axes in wanted for axis in axes}, predictor)
