@@ -40,30 +40,7 @@ def run_challenge(
     jobs: int = 1,
     progress: Callable[[CaseResult], None] | None = None,
 ) -> ChallengeResult:
-    """Draw cases, search each, and judge the answers.
-
-    Parameters
-    ----------
-    counts : mapping
-        How many cases of each of `CASE_KINDS`.
-    seed : `int`
-        Seed of the whole challenge. Every case has a stream of its own, whatever else is asked for.
-    size : `tuple` [`int`, `int`], optional
-        Rows and columns of the sensors.
-    options : `SearchOptions`, optional
-        Thresholds of the search.
-    only : sequence of `str`, optional
-        Effects from which to draw.
-    setup : `str`, optional
-        Laboratory set-up.
-    known : sequence of `CaseResult`, optional
-        Results of cases that ran before with the same seed, size, options, effects and set-up; they are not run
-        again.
-    jobs : `int`, optional
-        Cases that run at the same time, each in a process of its own.
-    progress : callable, optional
-        Called with each result that is new.
-    """
+    """Draw cases, each with a stream of its own, search, and judge; ``known`` results are not made again."""
     ready = {(result.kind, result.number): result for result in known}
     wanted = [(kind, number) for number in range(max(counts.values(), default=0)) for kind in CASE_KINDS
               if number < counts.get(kind, 0)]  # fmt: skip
@@ -169,15 +146,7 @@ def judge(
 
 
 def is_right(names: Sequence[str], verdict: Verdict) -> bool:
-    """Whether a search named all of these effects, each itself or by its class, and nothing else.
-
-    Parameters
-    ----------
-    names : sequence of `str`
-        Effects that are in the data.
-    verdict : `Verdict`
-        What the search found.
-    """
+    """Whether a search named all of these effects, each itself or by its class, and nothing else."""
     classes = [{effect.name, *effect.ambiguous_with} for effect in verdict.effects]
     return verdict.verdict == "named" and any(_matches(order, classes) for order in permutations(names))
 

@@ -66,7 +66,7 @@ class FlatSpectrum:
 
     @classmethod
     def from_name(cls, name: str) -> FlatSpectrum:
-        """``white``, ``gaussian:MEAN:FWHM`` [nm], or an ECSV file with columns ``wavelength`` [nm] and ``photons``."""
+        """``white``, ``gaussian:MEAN:FWHM`` [nm], or an ECSV table of ``wavelength`` [nm] and ``photons``."""
         if name == "white":
             return cls()
         if name.startswith("gaussian:"):
