@@ -19,6 +19,7 @@ ORDER = (
     "style",
     "notebook",
     "compiled",
+    "fits_gate",
     "resources",
     "descriptions",
     "optics",
