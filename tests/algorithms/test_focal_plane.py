@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from residual_fringe import fit_patterns, residual_fringe
+from residual_fringe import residual_fringe
 from sky_frames import bright_sky
 
 from lsst.fringe_sim.algorithms.field_response import (
@@ -22,7 +22,7 @@ from lsst.fringe_sim.algorithms.focal_plane import (
     pattern_moments,
     summary_table,
 )
-from lsst.fringe_sim.algorithms.pca import fit_pca, fringe_templates
+from lsst.fringe_sim.algorithms.pca import fit_pca, fringe_templates, project
 from lsst.fringe_sim.algorithms.sky_frame import simulate_night, simulate_sky_frame
 from lsst.fringe_sim.algorithms.thickness_stand_in import stand_in_thickness
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
@@ -100,8 +100,8 @@ def test_residuals_are_those_of_real_templates(moments, thickness, model, respon
     for count in (1, 2):
         basis = np.stack([template.image for template in templates[:count]])
         for number, frame in enumerate(simulate_night(thickness, model, response, observed)):
-            fitted, level = fit_patterns(frame.image, basis)
-            left = frame.image - level - np.tensordot(fitted, basis, axes=1)
+            fit = project(frame.image, basis, variance=1.0)
+            left = frame.image - fit.background - np.tensordot(fit.coefficient, basis, axes=1)
             expected = moments.rms(predicted[count - 1], factors[1])[0, number]
             assert expected == pytest.approx(left.std() / frame.mean_electrons, rel=0.05)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from product_makers import sky
-from residual_fringe import fit_patterns, residual_fringe
+from residual_fringe import residual_fringe
 from scipy.ndimage import gaussian_filter
 from slow_cases import first_is_quick
 
@@ -17,7 +17,7 @@ from lsst.fringe_sim.algorithms.fringe_correction import (
     correct_fringes,
     undo_correction,
 )
-from lsst.fringe_sim.algorithms.pca import fit_pca, fit_pca_from_thickness, fringe_templates
+from lsst.fringe_sim.algorithms.pca import fit_pca, fit_pca_from_thickness, fringe_templates, project
 from lsst.fringe_sim.algorithms.sky_frame import simulate_sky_frame, sky_response
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UndeterminedError
 from lsst.fringe_sim.instrument.night import NightHistory, StochasticNight
@@ -351,8 +351,8 @@ def test_night_not_used_for_training_is_corrected_below_a_tenth_of_the_shot_nois
             seed=time,
         )
         before = residual_fringe(clean.image, level, arcsec20)
-        fitted, _ = fit_patterns(noisy.image, basis, level + 576.0)
-        residual = clean.image - np.tensordot(fitted, basis, axes=1)
+        fitted = project(noisy.image, basis, level + 576.0)
+        residual = clean.image - np.tensordot(fitted.coefficient, basis, axes=1)
         assert before.ratio > 1.5
         assert residual_fringe(residual, level, arcsec20).ratio < 0.1
         applied = correct_fringes(noisy.image, templates, options=options)
@@ -386,8 +386,8 @@ def test_physical_patterns_hold_every_night_but_two_components_are_found_better(
         )
         for name, basis in bases.items():
             for noise in (False, True):
-                fitted, _ = fit_patterns(noisy if noise else clean, basis)
-                residual = clean - np.tensordot(fitted, basis, axes=1)
+                fitted = project(noisy if noise else clean, basis, level)
+                residual = clean - np.tensordot(fitted.coefficient, basis, axes=1)
                 left[name, noise].append(residual_fringe(residual, level, arcsec20).ratio)
     mean = {key: np.mean(values) for key, values in left.items()}
     assert mean["physics", False] < 1e-3

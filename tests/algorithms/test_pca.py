@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from residual_fringe import fit_patterns
 from sklearn.decomposition import PCA
 
 from lsst.fringe_sim.algorithms.pca import (
@@ -15,6 +14,7 @@ from lsst.fringe_sim.algorithms.pca import (
     fit_pca_from_thickness,
     fringe_templates,
     noise_eigenvalue,
+    project,
     significant_components,
 )
 from lsst.fringe_sim.algorithms.sky_frame import simulate_night, sky_response
@@ -298,8 +298,8 @@ def test_templates_describe_every_frame_of_the_night(night):
     basis = np.stack([template.image for template in templates])
     for frame in night:
         fraction = frame.fraction()
-        fitted, level = fit_patterns(fraction, basis)
-        rest = fraction - level - np.tensordot(fitted, basis, axes=1)
+        fitted = project(fraction, basis, 1.0)
+        rest = fraction - fitted.background - np.tensordot(fitted.coefficient, basis, axes=1)
         assert rest.std() < 0.01 * fraction.std()
 
 
@@ -307,6 +307,25 @@ def test_faint_templates_are_left_out(night):
     components = fit_pca(night)
     assert len(fringe_templates(components, NOW, least_rms=1.0)) == 1
     assert len(fringe_templates(components, NOW, least_rms=1e-7, most=2)) == 2
+
+
+@pytest.mark.rng("projection recovers coefficients with their covariance")
+def test_projection_recovers_coefficients_with_their_covariance(rng):
+    basis = rng.standard_normal((2, 30, 40))
+    basis[1] += 0.7 * basis[0]
+    mask = np.zeros((30, 40), dtype=int)
+    mask[:, :5] = 1
+    pulls = []
+    for _ in range(300):
+        frame = 2.0 * basis[0] - 0.5 * basis[1] + 7.0 + 0.3 * rng.standard_normal((30, 40))
+        frame[:, :5] = 1e9
+        found = project(frame, basis, 0.09, mask)
+        pulls.append(np.linalg.solve(np.linalg.cholesky(found.covariance), found.coefficient - [2.0, -0.5]))
+    pulls = np.array(pulls)
+    assert np.abs(pulls.mean(axis=0)).max() < 4 / np.sqrt(300)
+    np.testing.assert_allclose(np.cov(pulls.T), np.eye(2), atol=0.25)
+    assert found.background == pytest.approx(7.0, abs=0.05)
+    assert found.chi2_per_pixel == pytest.approx(1.0, abs=0.15)
 
 
 @pytest.mark.rng("bad input is named")
@@ -329,6 +348,12 @@ def test_bad_input_is_named(frames, response, thickness):
         fit_pca_from_thickness(thickness, response, [{}])
     with pytest.raises(InputError, match="frames that vary"):
         fit_pca_from_thickness(thickness, response, [{}, {}])
+    with pytest.raises(InputError, match="shape of the basis"):
+        project(frames[0], frames[0], 1.0)
+    with pytest.raises(InputError, match="independent"):
+        project(frames[0], np.stack([frames[1], frames[1]]), 1.0)
+    with pytest.raises(InputError, match="good pixels"):
+        project(frames[0], frames[1:3], 1.0, np.ones((60, 47)))
 
 
 @pytest.mark.rng("rank")

@@ -6,21 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
-__all__ = ["fit_patterns", "residual_fringe"]
-
-
-def fit_patterns(
-    frame: ArrayLike, patterns: NDArray[np.floating], variance: ArrayLike = 1.0
-) -> tuple[NDArray[np.float64], float]:
-    """Least-squares coefficients of patterns in a frame, and the constant beside them."""
-    image = np.asarray(frame, dtype=float)
-    weight = np.broadcast_to(np.asarray(variance, dtype=float) ** -0.5, image.shape).ravel()
-    design = np.vstack([np.ones(image.size), patterns.reshape(len(patterns), -1)]) * weight
-    found, *_ = np.linalg.lstsq(design.T, image.ravel() * weight, rcond=None)
-    return found[1:], float(found[0])
+__all__ = ["residual_fringe"]
 
 
 @dataclass(frozen=True)

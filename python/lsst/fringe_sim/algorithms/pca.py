@@ -21,15 +21,18 @@ from ..errors import InputError, OutOfRangeError, named_units
 from ..model import ResponseTable
 from ..products import FringeComponents, FringeFrame, SkyFringe, mask_bits, refuse_corrected
 from .frame_stack import TILE_BYTES, FrameStack
+from .projection import Projection, project
 from .sky_frame import SkyResponse
 
 __all__ = [
+    "Projection",
     "ThicknessComponents",
     "decompose_thickness",
     "fit_pca",
     "fit_pca_from_thickness",
     "fringe_templates",
     "noise_eigenvalue",
+    "project",
     "significant_components",
 ]
 
@@ -164,14 +167,7 @@ class ThicknessComponents:
     unit: float
 
     @named_units
-    def images(
-        self,
-        thickness_um: ArrayLike,
-        *,
-        metadata: Mapping[str, Any] | None = None,
-        detector: str = "",
-        physical_filter: str = "",
-    ) -> FringeComponents:
+    def images(self, thickness_um: ArrayLike) -> FringeComponents:
         """Components of the pixels of a thickness map [µm], shape ``(ny, nx)``; NaN is masked.
 
         Raises
@@ -196,14 +192,7 @@ class ThicknessComponents:
             explained_variance_ratio=self.explained_variance_ratio,
             scores=self.scores,
             mask=mask,
-            metadata={
-                **(metadata or {}),
-                "NFRAMES": len(self.scores),
-                "NOISEVAR": 0.0,
-                "MEANSKY": self.unit,
-            },
-            detector=detector,
-            physical_filter=physical_filter,
+            metadata={"NFRAMES": len(self.scores), "NOISEVAR": 0.0, "MEANSKY": self.unit},
         )
 
 
@@ -280,17 +269,13 @@ def fit_pca_from_thickness(
     scales: Sequence[Mapping[str, float]],
     *,
     n_components: int | None = None,
-    metadata: Mapping[str, Any] | None = None,
-    detector: str = "",
-    physical_filter: str = "",
 ) -> FringeComponents:
     """Principal components of noiseless model frames, without making the frames: those of `fit_pca`, in pixels.
 
     The decomposition is that of `decompose_thickness`, which see for the arguments and for what is refused; nearly
     all of the time goes into the images of the components.
     """
-    found = decompose_thickness(thickness_um, response, scales, n_components=n_components)
-    return found.images(thickness_um, metadata=metadata, detector=detector, physical_filter=physical_filter)
+    return decompose_thickness(thickness_um, response, scales, n_components=n_components).images(thickness_um)
 
 
 def noise_eigenvalue(frames: int, pixels: int, noise_variance: float) -> float:

@@ -196,12 +196,7 @@ class EmissionLines(OneLine):
         )
 
     def with_rotation(self, change: Callable[[RotationalLevels], RotationalLevels]) -> EmissionLines:
-        """Lines of other rotational populations.
-
-        Parameters
-        ----------
-        change : callable
-            Changes the populations of the levels.
+        """Lines of other rotational populations, which ``change`` makes of those of their levels.
 
         Raises
         ------
