@@ -24,9 +24,6 @@ from .bad_files import refuse_bad
 
 __all__ = ["LabSeries", "PlainSeries", "announced_series", "find_series", "of_vendor", "read_cube"]
 
-LEAST_SIZE = (16, 64)
-"""Rows and columns below which a frame is no sensor."""
-
 
 class FrameHeader(Protocol):
     """What a series asks of a frame."""

@@ -36,10 +36,6 @@ def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[st
     return value.strip() if isinstance(value, str) else value
 
 
-def _is_no_time(seconds: float) -> bool:
-    return 0.0 <= seconds <= SAME_SECONDS
-
-
 def _differ(values: Sequence[Any]) -> bool:
     """Whether values are not all the same; one that is no number is like itself."""
     return any(value != values[0] and not (value != value and values[0] != values[0]) for value in values)
@@ -90,7 +86,8 @@ class DeclaredHeader:
     def seconds_of_light(self, keyword: str, value: Any, kind: str) -> float:
         """An exposure time [s]; 0 of a bias, as in all seven headers of biases that obs_lsst has."""
         if kind == "bias":
-            return self.number(keyword, value, "0 s for a bias, which sees no light", _is_no_time)
+            allowed = "0 s for a bias, which sees no light"
+            return self.number(keyword, value, allowed, lambda s: 0.0 <= s <= SAME_SECONDS)
         return self.number(keyword, value, "seconds, 0 or more", lambda s: s >= 0)
 
     def refuse(self, keyword: str, value: Any, allowed: str) -> FrameFormatError:

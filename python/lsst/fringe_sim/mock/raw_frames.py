@@ -105,7 +105,7 @@ class MockTruth:
         """Light that becomes charge, relative to its mean over the sensor: fringes and illumination, no defects."""
         signal = self.signal.flat(self.signal.tables.wavelengths_nm.index(float(wavelength_nm)))
         light = signal / signal.mean()
-        for effect, values in _active(self.effects):
+        for effect, values in validate_effects(self.effects):
             if effect.on_light is not None:
                 light = effect.on_light(light, wavelength_nm, effect.complete(values))
         return light / light.mean()
@@ -365,10 +365,6 @@ def _check_wavelengths(wavelengths_nm: Sequence[float]) -> tuple[float, ...]:
 
 
 _ActiveEffects = tuple[tuple[HiddenEffect, dict[str, float]], ...]
-
-
-def _active(effects: Mapping[str, Mapping[str, float]]) -> _ActiveEffects:
-    return validate_effects(effects)
 
 
 def _make_truth(

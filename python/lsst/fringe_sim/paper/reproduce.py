@@ -38,20 +38,15 @@ SECTIONS: tuple[Callable[[Context], Section], ...] = (
 )
 """Recomputations in the order of the paper."""
 
-WITH_COLD_SILICON = (
-    stack.layers,
-    stack.bandwidth,
-    stack.other_vendor,
-    stack.absorption_depth,
-    laboratory.one_pixel,
-    laboratory.flat_contrast,
-    optics.photon_walk,
-    sky.monocam,
-    sky.hsc,
-    sky.lsst,
-    sky.surface_brightness,
-    coadds.components,
+_OF_ONE_SILICON = (
+    laboratory.row_3000,
+    laboratory.thickness_fit,
+    laboratory.raft,
+    optics.oh_lines,
+    optics.angles,
+    coadds.coadd,
 )
+WITH_COLD_SILICON = tuple(section for section in SECTIONS if section not in _OF_ONE_SILICON)
 """Those that are computed a second time, with silicon as it was measured in the cold."""
 
 NOT_AT_HAND = "needs curves or maps read off the published figures"
