@@ -112,10 +112,8 @@ def write_sky_report(
     report.section(
         "Fringes", f"Departure from the mean sky. Three numbers are called amplitude; all are given.{noise}"
     )
-    report.figure(
-        sky_figure(frames),
-        f"{'The first frame' if len(frames) > 1 else 'The frame'}, and its distribution over the pixels{_through(frames)}.",
-    )
+    which = "The first frame" if len(frames) > 1 else "The frame"
+    report.figure(sky_figure(frames), f"{which}, and its distribution over the pixels{_through(frames)}.")
     if picture is not None:
         shown = PERCENT * first.fraction()
         report.map(picture, shown, mask=first.mask, unit="% of the sky", diverging=True)
