@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping
 from typing import Any, Self
 
@@ -16,14 +17,15 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..errors import InputError, OutOfRangeError
+from ..errors import FrameFormatError, InputError, OutOfRangeError
 from ..instrument.detector import Detector
-from ..instrument.raw_layout import Section
 
 __all__ = ["SECTION_KEYWORDS", "SensorSection", "section_pixels"]
 
 SECTION_KEYWORDS = ("DETSEC", "CCDSEC")
 """Keywords in which the header of an image says what it shows: ``[x1:x2,y1:y2]``, from 1, both ends included."""
+
+_SECTION = re.compile(r"\s*\[\s*(\d+)\s*:\s*(\d+)\s*,\s*(\d+)\s*:\s*(\d+)\s*\]\s*")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,8 +178,11 @@ def section_pixels(
 
 def _ends(keyword: str, text: object) -> tuple[tuple[int, int], tuple[int, int]]:
     """First and last column, first and last row, from 0."""
-    found = Section.parse(str(text), keyword=keyword)
-    return (found.x1 - 1, found.x2 - 1), (found.y1 - 1, found.y2 - 1)
+    match = _SECTION.fullmatch(str(text))
+    if match is None:
+        raise FrameFormatError(keyword, text, "[x1:x2,y1:y2], from 1")
+    x1, x2, y1, y2 = (int(group) - 1 for group in match.groups())
+    return (x1, x2), (y1, y2)
 
 
 def _step(ends: tuple[int, int], size: int) -> float:
