@@ -97,10 +97,8 @@ def series_on_grid(
             for each in (*coefficients, weight)
         )
         part_weight[-1, part_weight.shape[1] - spare :] = 0.0
-        summed = series_on_grid(
-            tuple(parts), part_weight, spread_um, start_um, step_um, count, order, tolerance
-        )
-        return np.asarray(summed.sum(axis=0, keepdims=True))
+        whole = (spread_um, start_um, step_um, count, order, tolerance)
+        return np.asarray(series_on_grid(tuple(parts), part_weight, *whole).sum(axis=0, keepdims=True))
     rule = _Gridding.of(tolerance)
     slow = float(np.max(coefficients[-1].imag))
     if slow == 0.0:

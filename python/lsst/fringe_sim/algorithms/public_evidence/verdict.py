@@ -18,19 +18,16 @@ from ...notebook import do_nothing
 from ..discovery.options import SearchOptions
 from .joint import Axis, JointFit, Predictor, parse_set
 from .kinds import (
-    LAB,
     SHIFT_UM,
     FlatPhase,
     Kind,
-    Models,
     PixelFlats,
     PublishedMap,
     harmonics,
-    models_with,
     public_kinds,
     sky_amplitude,
-    without_bench,
 )
+from .models import LAB, Models, models_with, without_bench
 
 __all__ = ["DECIDING", "RIVALS", "Comparison", "KindRow", "Measurement", "compare"]
 
