@@ -101,13 +101,7 @@ def _data() -> Traversable:
 
 
 def resource_path(folder: str, name: str) -> Traversable:
-    """Path of ``data/<folder>/<name>`` inside the installed package.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such file; the ones that exist are named.
-    """
+    """Path of ``data/<folder>/<name>`` inside the installed package."""
     base = _data()
     # A header from outside names them: nothing but a name of the package itself is looked up.
     if not all(map(_SHIPPED.fullmatch, [*folder.split("/"), name])):
@@ -133,13 +127,7 @@ def list_resources(folder: str, suffix: str = ".yaml") -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=256)
 def revision(folder: str, name: str) -> str:
-    """Beginning of the SHA-256 of a shipped file: what a header states about the numbers it was made with.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such file.
-    """
+    """Beginning of the SHA-256 of a shipped file: what a header states about the numbers it was made with."""
     return hashlib.sha256(resource_path(folder, name).read_bytes()).hexdigest()[:REVISION_LENGTH]
 
 
@@ -157,38 +145,12 @@ def _read_table(folder: str, name: str) -> Table:
 
 
 def read_table(folder: str, name: str) -> Table:
-    """Read a shipped ECSV table.
-
-    Parameters
-    ----------
-    folder, name : `str`
-        ``data/<folder>/<name>`` inside the package.
-
-    Returns
-    -------
-    table : `astropy.table.Table`
-        A copy, with units on its columns and ``source``, ``doi`` and ``licence`` in ``meta``.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such table.
-    ResourceError
-        The table does not state where its numbers come from.
-    """
+    """A copy of ``data/<folder>/<name>`` in ECSV, which must state its ``source``, ``doi`` and ``licence``."""
     return _read_table(folder, name).copy()
 
 
 def read_yaml(folder: str, name: str) -> dict[str, Any]:
-    """Read a shipped YAML mapping with the safe loader.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such file.
-    ResourceError
-        The file is not a mapping.
-    """
+    """The mapping in ``data/<folder>/<name>``, read with the safe loader."""
     content = yaml.safe_load(resource_path(folder, name).read_text(encoding="utf-8"))
     if not isinstance(content, dict):
         raise ResourceError(f"data/{folder}/{name} must hold a mapping")
@@ -196,45 +158,12 @@ def read_yaml(folder: str, name: str) -> dict[str, Any]:
 
 
 def read_user_yaml(path: str | os.PathLike[str], what: str) -> Any:
-    """Read a YAML file that a user gives, and which may be anything.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    what : `str`
-        What it should be, for the message: ``settings file``.
-
-    Returns
-    -------
-    content : `object`
-        Plain mappings, lists, text, numbers.
-
-    Raises
-    ------
-    InputError
-        There is no such file, or `parse_user_yaml` refuses it.
-    """
+    """Content of a YAML file from outside; ``what`` it should be is for the message, as ``settings file``."""
     return parse_user_yaml(read_user_text(path, what, 4 * LONGEST_USER_FILE), what, source=str(path))
 
 
 def read_user_text(path: str | os.PathLike[str], what: str, most: int = LARGEST_USER_TABLE) -> str:
-    """Text of a file from outside, which may be anything.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    what : `str`
-        What it should be, for the message.
-    most : `int`, optional
-        Bytes that it may have.
-
-    Raises
-    ------
-    InputError
-        There is no such file, or it is no regular one, too large, or not in UTF-8.
-    """
+    """Text of a file from outside, which may be anything; refused unless regular, UTF-8, of ``most`` bytes."""
     file = Path(path)
     if not file.is_file():
         raise InputError(what, str(path), "an existing file")
@@ -250,11 +179,6 @@ def read_user_table(path: str | os.PathLike[str], what: str) -> Table:
     """Read an ECSV table that a user gives, and which may be anything.
 
     Its header is YAML, and may be no more than `parse_user_yaml` allows.
-
-    Raises
-    ------
-    InputError
-        No such file, or not such a table.
     """
     from astropy.table import Table
 
@@ -272,11 +196,6 @@ def parse_user_yaml(text: str, what: str, *, source: str | None = None) -> Any:
 
     A key that stands twice is refused, as nothing says which of its values is meant.
     References are refused because a text of a few lines can stand for more values than there is memory.
-
-    Raises
-    ------
-    InputError
-        Not YAML, a reference, too long, or too deep.
     """
     _check_length(text, what, source)
     try:
@@ -332,23 +251,10 @@ def open_user_fits(
     warning: Literal["ignored", "truncated", "error"] = "ignored",
     **options: Any,
 ) -> Iterator[fits.HDUList]:
-    """Open a FITS file from outside, which may be anything.
+    """Open a FITS file from outside, which may be anything; see `check_axes`, else one of `DAMAGE`.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    warning : {"ignored", "truncated", "error"}, optional
-        Which warnings of astropy are errors: none, that the file is too short, or all. Elsewhere they stay silent.
-    **options
-        For `astropy.io.fits.open`.
-
-    Raises
-    ------
-    FrameFormatError
-        See `check_axes`.
-    Exception
-        One of `DAMAGE`.
+    ``warning``: which warnings of astropy are errors: none, that the file is too short, or all. ``options`` are
+    those of `astropy.io.fits.open`.
     """
     from astropy.io import fits
 
@@ -366,13 +272,7 @@ def open_user_fits(
 
 @contextmanager
 def complete_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
-    """Open a FITS file from outside, headers first; one that is damaged or cut short is refused by its name.
-
-    Raises
-    ------
-    FrameFormatError
-        The file is not FITS, or damaged.
-    """
+    """Open a FITS file from outside, headers first; one that is damaged or cut short is refused by its name."""
     with (
         refuse_damage("file", "a complete FITS file", str(path)),
         open_user_fits(path, warning="truncated", memmap=False) as hdus,
@@ -382,15 +282,7 @@ def complete_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
 
 @contextmanager
 def refuse_damage(field: str, allowed: str, source: str) -> Iterator[None]:
-    """Turn what astropy raises over a damaged file into one error that names it.
-
-    Raises
-    ------
-    FrameFormatError
-        In place of any of `DAMAGE`.
-    InputError
-        As it is, with the file.
-    """
+    """Turn what astropy raises over a damaged file (`DAMAGE`) into one error that names it."""
     try:
         yield
     except InputError as error:
