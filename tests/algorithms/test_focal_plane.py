@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from residual_fringe import residual_fringe
 from sky_frames import bright_sky
 
 from lsst.fringe_sim.algorithms.field_response import (
@@ -21,7 +22,6 @@ from lsst.fringe_sim.algorithms.focal_plane import (
     pattern_moments,
     summary_table,
 )
-from lsst.fringe_sim.algorithms.fringe_correction import residual_fringe
 from lsst.fringe_sim.algorithms.pca import fit_pca, fringe_templates, project
 from lsst.fringe_sim.algorithms.sky_frame import simulate_night, simulate_sky_frame
 from lsst.fringe_sim.algorithms.thickness_stand_in import stand_in_thickness

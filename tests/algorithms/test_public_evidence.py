@@ -15,9 +15,9 @@ from lsst.fringe_sim.algorithms.public_evidence.kinds import (
     FlatShape,
     PixelFlats,
     PublishedMap,
-    models_with,
     sky_amplitude,
 )
+from lsst.fringe_sim.algorithms.public_evidence.models import models_with
 from lsst.fringe_sim.algorithms.public_evidence.verdict import compare
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 

@@ -39,18 +39,11 @@ IN_A_ROW = 4
 
 @dataclass(frozen=True)
 class Way:
-    """What is run, and how it is resumed.
+    """What is run, and how it is resumed."""
 
-    Attributes
-    ----------
-    extend : `bool`
-        Resume in the run that was cut off (``--extend-run``), else in a new one (``--skip-existing-in``).
-    whole : `bool`
-        The whole chain, else biases and flats, which write more files in a shorter time.
-    """
-
+    # Resume in the run that was cut off (``--extend-run``), else in a new one (``--skip-existing-in``)
     extend: bool
-    whole: bool
+    whole: bool  # The whole chain, else biases and flats, which write more files in a shorter time
 
     @property
     def quanta(self) -> int:
@@ -84,28 +77,7 @@ def kill_and_resume(
     rng: np.random.Generator,
     say: Callable[[str], None] = lambda line: None,
 ) -> Report:
-    """Kill runs at random moments, up to so many times, and let each chain come to its end.
-
-    Parameters
-    ----------
-    new_chain : callable
-        Makes a chain on which nothing has run.
-    reference : `dict`
-        `Chain.results` of an undisturbed run.
-    seconds : mapping
-        Time that an undisturbed run takes, of the whole chain (`True`) and of a part (`False`).
-    kills : `int`
-        Number of kills.
-    rng : `numpy.random.Generator`
-        Draws the moments and the way to resume.
-    say : callable, optional
-        Takes one line for each kill.
-
-    Raises
-    ------
-    AssertionError
-        A dataset that is shown cannot be read, an earlier one has changed, work was repeated, or the end differs.
-    """
+    """Kill runs at random moments, up to so many times, and let each chain come to its end."""
     report = Report()
     while report.kills < kills:
         chain = new_chain()

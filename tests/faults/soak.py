@@ -43,54 +43,18 @@ PRODUCTS = ("skyFringe", "fringe", "fringeComponents")
 
 @dataclass(frozen=True)
 class Night:
-    """What was there after a night.
+    """What was there after a night."""
 
-    Attributes
-    ----------
-    quanta : `int`
-        Quanta that ran.
-    resident_bytes : `int`
-        Memory of the process.
-    open_files : `int`
-        Its open files.
-    seconds : `float`
-        How long the night took.
-    """
-
-    quanta: int
-    resident_bytes: int
-    open_files: int
-    seconds: float
+    quanta: int  # Quanta that ran
+    resident_bytes: int  # Memory of the process
+    open_files: int  # Its open files
+    seconds: float  # How long the night took
 
 
 def soak(
     root: Path, nights: int, hours: str, sensors: int, say: Callable[[str], None] = lambda line: None
 ) -> list[Night]:
-    """Simulate the same night so many times.
-
-    Parameters
-    ----------
-    root : `pathlib.Path`
-        Folder for a new repository.
-    nights : `int`
-        How often.
-    hours : `str`
-        Hours of the exposures, ``FIRST:LAST``.
-    sensors : `int`
-        Number of sensors of the raft.
-    say : callable, optional
-        Takes one line for each night.
-
-    Returns
-    -------
-    nights : `list` [`Night`]
-
-    Raises
-    ------
-    AssertionError
-        A night made other products than the first one, or changed those of an earlier one, or the repository shows
-        other datasets than those that were made.
-    """
+    """Simulate the same night so many times."""
     repo = str(root / "repo")
     Butler.makeRepo(repo, config=Config("resource://lsst.fringe_sim/configs/butler.yaml"))
     with Butler.from_config(repo, writeable=True) as butler:

@@ -39,15 +39,7 @@ ARTIFACTS = Path(__file__).resolve().parents[2] / "ci-artifacts"
 
 
 class Chromium:
-    """A running browser.
-
-    Parameters
-    ----------
-    program : `str`
-        Path of the browser.
-    profile : `pathlib.Path`
-        An empty folder for what it wants to keep.
-    """
+    """A running browser."""
 
     def __init__(self, program: str, profile: Path) -> None:
         read_theirs, self._write = os.pipe()

@@ -91,15 +91,7 @@ class Undisturbed:
 
 
 class Chain:
-    """One repository and what is done to it.
-
-    Parameters
-    ----------
-    template : `pathlib.Path`
-        What `make_template` returned.
-    root : `pathlib.Path`
-        New folder for the copy.
-    """
+    """One repository and what is done to it."""
 
     journals = 0
     """Kills that hit the registry in the middle of a transaction."""
@@ -125,21 +117,7 @@ class Chain:
         environment: Mapping[str, str] | None = None,
         prepare: Callable[[], None] | None = None,
     ) -> Ended:
-        """Run an installed command in a process group of its own.
-
-        Parameters
-        ----------
-        program, *arguments
-            The command.
-        kill_after : `float`, optional
-            Seconds after which the whole group gets SIGKILL.
-        kill_at_file : `int`, optional
-            Wait for so many new files in the repository before these seconds begin.
-        environment : mapping, optional
-            Changes of the environment.
-        prepare : callable, optional
-            Called in the child before the command starts.
-        """
+        """Run an installed command in a process group of its own."""
         started = time.monotonic()
         with tempfile.TemporaryFile(dir=self.root) as said:
             child = subprocess.Popen(
@@ -172,21 +150,7 @@ class Chain:
     def run(
         self, *extra: object, out: str = OUT, resume: bool = True, subset: str = "", **kwargs: Any
     ) -> Ended:
-        """``pipetask run`` of the chain; what collection ``out`` has already is not made again.
-
-        Parameters
-        ----------
-        *extra
-            Further arguments.
-        out : `str`, optional
-            Output collection.
-        resume : `bool`, optional
-            Whether to leave out what is there.
-        subset : `str`, optional
-            ``#label,label``: a part of the pipeline.
-        **kwargs
-            As of `command`.
-        """
+        """``pipetask run`` of the chain; what collection ``out`` has already is not made again."""
         again = ("--skip-existing-in", out) if resume and self.has_collection(out) else ()
         fit = () if subset else ("-c", "epoxyFit:min_wavelengths=4")
         return self.command(
@@ -222,11 +186,6 @@ class Chain:
 
         Only those of finished quanta are returned: what a quantum stored that was cut off before it stored its
         metadata is made again, and replaced where a run is extended.
-
-        Raises
-        ------
-        AssertionError
-            A dataset that is shown has no file, or cannot be read.
         """
         found: dict[DatasetRef, str] = {}
         with Butler.from_config(str(self.repo)) as butler:

@@ -40,22 +40,13 @@ Wave = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Stain:
-    """A rectangle on the sensor that is not as the rest; lengths are parts of the side of the sensor.
+    """A rectangle on the sensor that is not as the rest; lengths are parts of the side of the sensor."""
 
-    Attributes
-    ----------
-    centre, half : `tuple` [`float`, `float`]
-        Middle and half sides along y and x.
-    film : `tuple` [`complex`, `float`], optional
-        Index and thickness [µm] of a film between insulation and adhesive.
-    absorbed : `float`
-        Part of the light that does not come in.
-    """
-
-    centre: tuple[float, float]
+    centre: tuple[float, float]  # Middle and half sides along y and x
     half: tuple[float, float]
+    # Index and thickness [µm] of a film between insulation and adhesive
     film: tuple[complex, float] | None = None
-    absorbed: float = 0.0
+    absorbed: float = 0.0  # Part of the light that does not come in
 
     def covers(self, shape: tuple[int, ...]) -> np.ndarray:
         """Places of a map that lie on it."""
@@ -66,22 +57,12 @@ class Stain:
 
 @dataclass(frozen=True)
 class Window:
-    """A plate before the sensor, in which light goes to and fro once.
+    """A plate before the sensor, in which light goes to and fro once."""
 
-    Attributes
-    ----------
-    amplitude : `float`
-        Of its fringes, in a line without width.
-    thickness_um, wedge_um : `float`
-        Thickness in the middle, and rise along the columns over the sensor [µm].
-    index : `float`
-        Index of the plate.
-    """
-
-    amplitude: float
-    thickness_um: float
+    amplitude: float  # Of its fringes, in a line without width
+    thickness_um: float  # Thickness in the middle, and rise along the columns over the sensor [µm]
     wedge_um: float
-    index: float = 1.45
+    index: float = 1.45  # Index of the plate
 
     def passed(self, wavelength_nm: np.ndarray, share: np.ndarray, columns: int) -> np.ndarray:
         """Light behind it in every column, averaged over the wavelengths with weights whose sum is 1."""
@@ -92,60 +73,28 @@ class Window:
 
 @dataclass(frozen=True)
 class ForeignSensor:
-    """A sensor in its light that may differ from those of the set-up.
+    """A sensor in its light that may differ from those of the set-up."""
 
-    Attributes
-    ----------
-    line : `float`
-        Factor on the width of the line.
-    satellite : `tuple` [`float`, `float`]
-        Part of the light in a second line, and how far that lies away [nm].
-    offset_nm : `float`
-        True minus nominal wavelength.
-    jitter_nm : `tuple` [`float`, ...]
-        The same of each exposure, besides.
-    aperture : `float`
-        Sine of the largest angle of a cone of light whose brightness is the same in all directions.
-    epoxy_k : `float`
-        Absorption of the adhesive.
-    thicker_um : mapping
-        What is added to the thickness of a layer, by its number [µm].
-    film : `tuple` [`complex`, `float`], optional
-        Index and thickness [µm] of a film between insulation and adhesive.
-    roughness_nm : `float`
-        Rms height of the upper face of the support.
-    warming_k : `float`
-        How much warmer than the first the last exposure is; the mean is as stated.
-    contrast : `float`
-        Part of the light that meets the fringes; the rest sees the mean over one order.
-    pedestal : `float`
-        Level added to every flat, relative to its mean.
-    gradient : `tuple` [`float`, `float`]
-        Relative rise of the light along y and x over the sensor.
-    gains : `tuple` [`float`, ...]
-        Relative errors of the amplifiers, two rows of eight.
-    stain : `Stain`, optional
-        See there.
-    window : `Window`, optional
-        See there.
-    """
-
-    line: float = 1.0
+    line: float = 1.0  # Factor on the width of the line
+    # Part of the light in a second line, and how far that lies away [nm]
     satellite: tuple[float, float] = (0.0, 0.0)
-    offset_nm: float = 0.0
-    jitter_nm: tuple[float, ...] = ()
+    offset_nm: float = 0.0  # True minus nominal wavelength
+    jitter_nm: tuple[float, ...] = ()  # The same of each exposure, besides
+    # Sine of the largest angle of a cone of light whose brightness is the same in all directions
     aperture: float = 0.0
-    epoxy_k: float = 0.0
+    epoxy_k: float = 0.0  # Absorption of the adhesive
+    # What is added to the thickness of a layer, by its number [µm]
     thicker_um: Mapping[int, float] = field(default_factory=dict)
+    # Index and thickness [µm] of a film between insulation and adhesive
     film: tuple[complex, float] | None = None
-    roughness_nm: float = 0.0
-    warming_k: float = 0.0
-    contrast: float = 1.0
-    pedestal: float = 0.0
-    gradient: tuple[float, float] = (0.0, 0.0)
-    gains: tuple[float, ...] = ()
-    stain: Stain | None = None
-    window: Window | None = None
+    roughness_nm: float = 0.0  # Rms height of the upper face of the support
+    warming_k: float = 0.0  # How much warmer than the first the last exposure is; the mean is as stated
+    contrast: float = 1.0  # Part of the light that meets the fringes; the rest sees the mean over one order
+    pedestal: float = 0.0  # Level added to every flat, relative to its mean
+    gradient: tuple[float, float] = (0.0, 0.0)  # Relative rise of the light along y and x over the sensor
+    gains: tuple[float, ...] = ()  # Relative errors of the amplifiers, two rows of eight
+    stain: Stain | None = None  # See there
+    window: Window | None = None  # See there
 
     # Optics -------------------------------------------------------------------------------------------------
 

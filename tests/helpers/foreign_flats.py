@@ -19,27 +19,14 @@ PLACES = 5
 
 @dataclass(frozen=True)
 class ForeignCharge:
-    """What becomes of the light after it has come in.
+    """What becomes of the light after it has come in."""
 
-    Attributes
-    ----------
-    electrons : `float`
-        Mean charge of a pixel.
-    level_rms : `float`
-        Relative error of the level of each flat.
-    response_rms : `float`
-        Relative scatter of the response of the pixels.
-    trailing : `float`
-        Part of the charge that every pixel leaves for the next one along y when it is read.
-    noise : `float`
-        True over stated standard deviation.
-    """
-
-    electrons: float = 30_000.0
-    level_rms: float = 0.02
-    response_rms: float = 0.003
+    electrons: float = 30_000.0  # Mean charge of a pixel
+    level_rms: float = 0.02  # Relative error of the level of each flat
+    response_rms: float = 0.003  # Relative scatter of the response of the pixels
+    # Part of the charge that every pixel leaves for the next one along y when it is read
     trailing: float = 0.0
-    noise: float = 1.0
+    noise: float = 1.0  # True over stated standard deviation
 
 
 def smooth_map(

@@ -50,29 +50,17 @@ class Media(NamedTuple):
 
 @dataclass(frozen=True)
 class ForeignSky:
-    """Sky, telescope and sensor.
+    """Sky, telescope and sensor."""
 
-    Attributes
-    ----------
-    silicon_um, kelvin : `float`
-        Thickness [µm] and temperature [K] of the detection layer.
-    f_number, obscuration : `float`
-        Of the telescope; the obscuration is that of the radius.
-    edges_nm : `tuple` [`float`, `float`]
-        Wavelengths at which the filter lets half of the light through.
-    continuum : `float`
-        Photons per second, square metre, square arcsecond and nanometre that are in no line.
-    coherence : `float`
-        Part of the fringes that is left, by whatever the back side does to them.
-    """
-
-    silicon_um: float = 100.0
+    silicon_um: float = 100.0  # Thickness [µm] and temperature [K] of the detection layer
     kelvin: float = 173.15
-    f_number: float = 1.234
+    f_number: float = 1.234  # Of the telescope; the obscuration is that of the radius
     obscuration: float = 0.61
+    # Wavelengths at which the filter lets half of the light through
     edges_nm: tuple[float, float] = (923.0, 1083.0)
+    # Photons per second, square metre, square arcsecond and nanometre that are in no line
     continuum: float = 0.3
-    coherence: float = 1.0
+    coherence: float = 1.0  # Part of the fringes that is left, by whatever the back side does to them
 
     def detected(self, thickness_um: np.ndarray) -> dict[str, np.ndarray]:
         """Light of every group of lines and of the continuum that is detected, relative to all of it together.
@@ -172,61 +160,31 @@ class ForeignSky:
 
 @dataclass(frozen=True)
 class ForeignClutter:
-    """What else is in a frame; all zero is the sky alone.
+    """What else is in a frame; all zero is the sky alone."""
 
-    Attributes
-    ----------
-    stars : `float`
-        Stars per thousand pixels; a tenth of them is brighter than 5e3 electrons.
-    cosmic_rays : `float`
-        Tracks per thousand pixels.
-    gradient : `float`
-        Rms of the relative rise of the sky along either side, another in every frame.
-    amplifier_steps : `float`
-        Rms of the relative errors of the gain of sixteen amplifiers, two rows of eight, the same in all frames.
-    moon : `float`
-        Smooth light of another source, relative to the dark sky; in every frame a random part of it.
-    fwhm_px : `float`
-        Of the image of a star.
-    """
-
-    stars: float = 0.0
-    cosmic_rays: float = 0.0
-    gradient: float = 0.0
+    stars: float = 0.0  # Stars per thousand pixels; a tenth of them is brighter than 5e3 electrons
+    cosmic_rays: float = 0.0  # Tracks per thousand pixels
+    gradient: float = 0.0  # Rms of the relative rise of the sky along either side, another in every frame
+    # Rms of the relative errors of the gain of sixteen amplifiers, two rows of eight, the same in all
+    # frames
     amplifier_steps: float = 0.0
+    # Smooth light of another source, relative to the dark sky; in every frame a random part of it
     moon: float = 0.0
-    fwhm_px: float = 3.5
+    fwhm_px: float = 3.5  # Of the image of a star
 
 
 @dataclass(frozen=True)
 class ForeignFrame:
-    """One frame in electrons, and what it is made of.
+    """One frame in electrons, and what it is made of."""
 
-    Attributes
-    ----------
-    image, variance : `numpy.ndarray`, shape ``(ny, nx)``
-        What is measured, with its variance.
-    sky : `numpy.ndarray`
-        Smooth light of the sky without its fringes.
-    fringes : `numpy.ndarray`
-        Light of the fringes: their mean over all phases is zero.
-    objects : `numpy.ndarray`
-        Light of the stars.
-    hit : `numpy.ndarray` of `bool`
-        Pixels of cosmic rays.
-    gain : `numpy.ndarray`
-        Relative gain, by which all light is multiplied.
-    group : `dict` [`str`, `float`]
-        Brightness of the groups of lines relative to their mean.
-    """
-
-    image: np.ndarray
+    image: np.ndarray  # (ny, nx): what is measured, with its variance
     variance: np.ndarray
-    sky: np.ndarray
-    fringes: np.ndarray
-    objects: np.ndarray
-    hit: np.ndarray
-    gain: np.ndarray
+    sky: np.ndarray  # Smooth light of the sky without its fringes
+    fringes: np.ndarray  # Light of the fringes: their mean over all phases is zero
+    objects: np.ndarray  # Light of the stars
+    hit: np.ndarray  # Pixels of cosmic rays
+    gain: np.ndarray  # Relative gain, by which all light is multiplied
+    # Brightness of the groups of lines relative to their mean
     group: dict[str, float] = field(default_factory=dict)
 
 
@@ -255,17 +213,7 @@ def foreign_night(
     places: int = 1,
     steady: bool = False,
 ) -> list[ForeignFrame]:
-    """Frames of one sensor in one night, with Poisson and read noise.
-
-    Parameters
-    ----------
-    thickness_um : `numpy.ndarray`, shape ``(ny * places, nx * places)``
-        Map of the adhesive; a pixel is the mean over ``places`` by ``places``.
-    electrons : `float`
-        Mean sky of the night.
-    steady : `bool`
-        Whether lines and level are the same in all frames.
-    """
+    """Frames of one sensor in one night, with Poisson and read noise."""
     own = clutter or ForeignClutter()
     parts = {name: _binned(image, places) for name, image in sky.detected(thickness_um).items()}
     shape = next(iter(parts.values())).shape

@@ -32,38 +32,18 @@ READ_NOISE_E = 7.0
 
 @dataclass(frozen=True)
 class Laboratory:
-    """What differs from the model.
+    """What differs from the model."""
 
-    Attributes
-    ----------
-    contrast : `float`
-        Factor on the fringes.
-    roughness_nm : `float`
-        Rms of the layer inside a pixel.
-    line, epoxy_k : `float`
-        As of `ForeignSensor`.
-    gradient, bowl : `float`
-        Illumination from edge to edge along a random direction, and from middle to edge.
-    gains : `float`
-        Rms of the gains of 8 by 2 amplifiers.
-    offsets_nm : `float`
-        Rms of what the wavelengths miss their labels by.
-    mislabelled_nm : `float`
-        What one flat misses its label by.
-    electrons : `float`
-        Level of the flats.
-    """
-
-    contrast: float = 1.0
-    roughness_nm: float = 0.0
-    line: float = 1.0
+    contrast: float = 1.0  # Factor on the fringes
+    roughness_nm: float = 0.0  # Rms of the layer inside a pixel
+    line: float = 1.0  # As of `ForeignSensor`
     epoxy_k: float = 0.0
-    gradient: float = 0.0
+    gradient: float = 0.0  # Illumination from edge to edge along a random direction, and from middle to edge
     bowl: float = 0.0
-    gains: float = 0.0
-    offsets_nm: float = 0.0
-    mislabelled_nm: float = 0.0
-    electrons: float = 20_000.0
+    gains: float = 0.0  # Rms of the gains of 8 by 2 amplifiers
+    offsets_nm: float = 0.0  # Rms of what the wavelengths miss their labels by
+    mislabelled_nm: float = 0.0  # What one flat misses its label by
+    electrons: float = 20_000.0  # Level of the flats
 
 
 ROWS: dict[str, Laboratory] = {

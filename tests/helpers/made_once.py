@@ -14,17 +14,7 @@ __all__ = ["made_once"]
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """Folder that the first worker fills and that the others wait for; not to be changed.
-
-    Parameters
-    ----------
-    factory : `pytest.TempPathFactory`
-        Of the worker.
-    name : `str`
-        Name of the folder, one for each thing that is made.
-    make : callable
-        Fills the folder, which is empty and there.
-    """
+    """Folder that the first worker fills and that the others wait for; not to be changed."""
     base = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent

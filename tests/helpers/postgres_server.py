@@ -39,18 +39,7 @@ class UnavailableError(Exception):
 
 
 class PostgresServer:
-    """One cluster of databases.
-
-    Parameters
-    ----------
-    folder : `pathlib.Path`
-        New folder for data, socket and log. Its name must be short: it becomes that of a socket.
-
-    Raises
-    ------
-    UnavailableError
-        There is no server program, no driver, or no user who may run it.
-    """
+    """One cluster of databases."""
 
     def __init__(self, folder: Path) -> None:
         self.programs = _programs()
@@ -179,13 +168,7 @@ def _server_user() -> str | None:
 
 @contextlib.contextmanager
 def postgres_server() -> Iterator[PostgresServer]:
-    """A running server, removed with all that is in it.
-
-    Raises
-    ------
-    UnavailableError
-        No server can be had here.
-    """
+    """A running server, removed with all that is in it."""
     # Not below the folder of pytest, which other users cannot enter and whose name is too long for a socket.
     folder = Path(tempfile.mkdtemp(prefix="fringe-pg-", dir="/tmp"))
     try:

@@ -140,16 +140,9 @@ def test_a_simulated_night_through_the_pipelines(command: Command, empty_repo: P
         "-d",
         "instrument = 'MonoCam'",
     )
+    pipeline = f"{PIPELINES}/monocam/skyFringe.yaml#skyFringeSim"
     done = command(
-        *(
-            *common,
-            "-i",
-            "MonoCam/raw/all",
-            "-o",
-            "u/sky",
-            "-p",
-            f"{PIPELINES}/monocam/skyFringe.yaml#skyFringeSim",
-        ),
+        *(*common, "-i", "MonoCam/raw/all", "-o", "u/sky", "-p", pipeline),
         *("-c", "skyFringeSim:stand_in_shape=[160, 120]", "-c", "skyFringeSim:noise=True"),
     )
     assert done.code == 0, done.text

@@ -42,19 +42,8 @@ def test_sky_of_the_smaller_cameras(
     """Half peak-to-peak as in Table 2 of the paper: about 1.5 % with MonoCam, 0.2 to 0.6 % with HSC."""
     instrument = {"monocam": "MonoCam", "hsc": "HSC"}[camera]
     done = command(
-        *(
-            "pipetask",
-            "run",
-            "-b",
-            repo,
-            "-i",
-            f"{instrument}/raw/all",
-            "-o",
-            f"u/{camera}",
-            "--register-dataset-types",
-            "-j",
-            "1",
-        ),
+        *("pipetask", "run", "-b", repo, "-i", f"{instrument}/raw/all", "-o", f"u/{camera}"),
+        *("--register-dataset-types", "-j", "1"),
         *("-p", f"{PIPELINES}/{camera}/skyFringe.yaml", "-d", f"instrument = '{instrument}'"),
         *("-c", "skyFringeSim:stand_in_shape=[160, 120]"),
     )
@@ -73,19 +62,8 @@ def test_focal_plane_of_the_lsst_camera(command: Command, repo: Path) -> None:
     """Forecast and frames of an e2v sensor, which has no map, from one graph; guide sensors are left out."""
     guider = next(d for d in Camera.from_name("lsstCam").detectors if d.kind == "guider")
     done = command(
-        *(
-            "pipetask",
-            "run",
-            "-b",
-            repo,
-            "-i",
-            "LSSTCam/raw/all",
-            "-o",
-            "u/plane",
-            "--register-dataset-types",
-            "-j",
-            "1",
-        ),
+        *("pipetask", "run", "-b", repo, "-i", "LSSTCam/raw/all", "-o", "u/plane"),
+        *("--register-dataset-types", "-j", "1"),
         *("-p", f"{PIPELINES}/lsstCam/focalPlane.yaml"),
         *("-d", f"instrument = 'LSSTCam' AND detector IN (94, {guider.id})"),
         *("-c", "skyFringeSim:stand_in_shape=[200, 204]", "-c", "fringeForecast:stand_in_shape=[801, 819]"),

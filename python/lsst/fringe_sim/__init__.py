@@ -1,6 +1,6 @@
 """CCD fringing for the LSST Camera and its relatives.
 
-Thin-film optics, epoxy-thickness fits, night-sky fringe frames, fringe templates, and a search for the
+Thin-film optics, adhesive-thickness fits, night-sky fringe frames, fringe templates, and a search for the
 effects that a model still lacks. The heavy parts are imported on first use.
 """
 

@@ -40,20 +40,7 @@ def is_file_name(text: str) -> bool:
 
 
 def read_description(path: str | Path, what: str) -> Mapping[str, Any]:
-    """Mapping of a YAML file from outside, which states where its numbers come from.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    what : `str`
-        What it should describe, for messages: ``stack``.
-
-    Raises
-    ------
-    InputError
-        There is no such file, it is no mapping in YAML, or does not state ``source``, ``doi`` and ``licence``.
-    """
+    """Mapping of a YAML file from outside, which states where its numbers come from."""
     content = read_user_yaml(path, f"{what} file")
     reader = Description(content, str(path))
     for key in REQUIRED_PROVENANCE:
@@ -62,13 +49,7 @@ def read_description(path: str | Path, what: str) -> Mapping[str, Any]:
 
 
 def read_table_of(description: str | Path, name: str, section: str) -> Table:
-    """Table that a description names: the file beside it, or else that which is shipped in a folder of the data.
-
-    Raises
-    ------
-    InputError
-        The file is no ECSV table, or does not state ``source``, ``doi`` and ``licence``.
-    """
+    """Table that a description names: the file beside it, or else that which is shipped in a folder of the data."""
     path = Path(description).parent / name
     if not path.is_file():
         return read_table(section, name)
@@ -81,20 +62,7 @@ def read_table_of(description: str | Path, name: str, section: str) -> Table:
 
 @contextmanager
 def described(what: str, allowed: str, source: str) -> Iterator[None]:
-    """Report whatever is wrong in a description as an error of the file in which it stands.
-
-    Parameters
-    ----------
-    what, allowed : `str`
-        What is described, and what it must hold, for errors that do not say so themselves.
-    source : `str`
-        The file.
-
-    Raises
-    ------
-    InputError
-        Something in it cannot be used.
-    """
+    """Report whatever is wrong in a description as an error of the file in which it stands."""
     try:
         yield
     except InputError as error:

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import bz2
 import functools
-import gzip
 import hashlib
 import itertools
-import lzma
-import math
 import os
 import re
 import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 
 from .errors import FrameFormatError, InputError, ResourceError, UnknownNameError
+from .fits_gate import check_axes
 
 __all__ = [
     "DAMAGE",
@@ -84,31 +81,6 @@ _SHIPPED = re.compile(r"\w[\w.+-]*")
 LARGEST_USER_TABLE = 1 << 26
 """Bytes of a table or document that a user gives; a line list of a whole night sky has a million."""
 
-_EXPANSION, _SMALL = 100, 1 << 30
-"""A file may stand for so many bytes, and beyond them for so many times what it takes on the disk. No frame of
-a detector is compressed more than tenfold."""
-
-_CARD, _CHUNK = 80, 1 << 22
-_BLOCK, _LONGEST_HEADER, _MOST_BYTES = 2880, 1 << 20, 1 << 40
-_HEADER_END = re.compile(rb"END {77}(?: {80})*$")
-_SIZE_KEYWORD = re.compile(rb"BITPIX|NAXIS\d*|[PG]COUNT|GROUPS")
-_PLAIN_NUMBER = re.compile(rb"\w+ *= +([-+]?\d{1,18}) *(?:/.*)?", re.DOTALL)
-_COUNTS = (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT")
-_PIXEL_BYTES = 4
-_COMPRESSED_AXIS = re.compile(rb"ZNAXIS(\d[\d ])= +(\d{1,30}) ")
-_ENDLESS = re.compile(
-    rb"(?:NAXIS  |TFIELDS) = *[-+]?0*[1-9]\d{3}|(?:NAXIS[1-9 ][\d ]{2}|TFIELDS |[PG]COUNT  )= *-"
-)
-
-
-def _zipped(stream: IO[bytes]) -> IO[bytes]:
-    archive = zipfile.ZipFile(stream)
-    return archive.open(archive.namelist()[0])
-
-
-_COMPRESSED = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open, b"PK": _zipped}
-_LZW = b"\x1f\x9d"
-
 
 def __getattr__(name: str) -> Any:
     """`DAMAGE`, one kind of which is astropy's: its import takes longer than most of what else is read here."""
@@ -129,13 +101,7 @@ def _data() -> Traversable:
 
 
 def resource_path(folder: str, name: str) -> Traversable:
-    """Path of ``data/<folder>/<name>`` inside the installed package.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such file; the ones that exist are named.
-    """
+    """Path of ``data/<folder>/<name>`` inside the installed package."""
     base = _data()
     # A header from outside names them: nothing but a name of the package itself is looked up.
     if not all(map(_SHIPPED.fullmatch, [*folder.split("/"), name])):
@@ -161,13 +127,7 @@ def list_resources(folder: str, suffix: str = ".yaml") -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=256)
 def revision(folder: str, name: str) -> str:
-    """Beginning of the SHA-256 of a shipped file: what a header states about the numbers it was made with.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such file.
-    """
+    """Beginning of the SHA-256 of a shipped file: what a header states about the numbers it was made with."""
     return hashlib.sha256(resource_path(folder, name).read_bytes()).hexdigest()[:REVISION_LENGTH]
 
 
@@ -185,38 +145,12 @@ def _read_table(folder: str, name: str) -> Table:
 
 
 def read_table(folder: str, name: str) -> Table:
-    """Read a shipped ECSV table.
-
-    Parameters
-    ----------
-    folder, name : `str`
-        ``data/<folder>/<name>`` inside the package.
-
-    Returns
-    -------
-    table : `astropy.table.Table`
-        A copy, with units on its columns and ``source``, ``doi`` and ``licence`` in ``meta``.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such table.
-    ResourceError
-        The table does not state where its numbers come from.
-    """
+    """A copy of ``data/<folder>/<name>`` in ECSV, which must state its ``source``, ``doi`` and ``licence``."""
     return _read_table(folder, name).copy()
 
 
 def read_yaml(folder: str, name: str) -> dict[str, Any]:
-    """Read a shipped YAML mapping with the safe loader.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such file.
-    ResourceError
-        The file is not a mapping.
-    """
+    """The mapping in ``data/<folder>/<name>``, read with the safe loader."""
     content = yaml.safe_load(resource_path(folder, name).read_text(encoding="utf-8"))
     if not isinstance(content, dict):
         raise ResourceError(f"data/{folder}/{name} must hold a mapping")
@@ -224,45 +158,12 @@ def read_yaml(folder: str, name: str) -> dict[str, Any]:
 
 
 def read_user_yaml(path: str | os.PathLike[str], what: str) -> Any:
-    """Read a YAML file that a user gives, and which may be anything.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    what : `str`
-        What it should be, for the message: ``settings file``.
-
-    Returns
-    -------
-    content : `object`
-        Plain mappings, lists, text, numbers.
-
-    Raises
-    ------
-    InputError
-        There is no such file, or `parse_user_yaml` refuses it.
-    """
+    """Content of a YAML file from outside; ``what`` it should be is for the message, as ``settings file``."""
     return parse_user_yaml(read_user_text(path, what, 4 * LONGEST_USER_FILE), what, source=str(path))
 
 
 def read_user_text(path: str | os.PathLike[str], what: str, most: int = LARGEST_USER_TABLE) -> str:
-    """Text of a file from outside, which may be anything.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    what : `str`
-        What it should be, for the message.
-    most : `int`, optional
-        Bytes that it may have.
-
-    Raises
-    ------
-    InputError
-        There is no such file, or it is no regular one, too large, or not in UTF-8.
-    """
+    """Text of a file from outside, which may be anything; refused unless regular, UTF-8, of ``most`` bytes."""
     file = Path(path)
     if not file.is_file():
         raise InputError(what, str(path), "an existing file")
@@ -278,11 +179,6 @@ def read_user_table(path: str | os.PathLike[str], what: str) -> Table:
     """Read an ECSV table that a user gives, and which may be anything.
 
     Its header is YAML, and may be no more than `parse_user_yaml` allows.
-
-    Raises
-    ------
-    InputError
-        No such file, or not such a table.
     """
     from astropy.table import Table
 
@@ -300,11 +196,6 @@ def parse_user_yaml(text: str, what: str, *, source: str | None = None) -> Any:
 
     A key that stands twice is refused, as nothing says which of its values is meant.
     References are refused because a text of a few lines can stand for more values than there is memory.
-
-    Raises
-    ------
-    InputError
-        Not YAML, a reference, too long, or too deep.
     """
     _check_length(text, what, source)
     try:
@@ -360,23 +251,10 @@ def open_user_fits(
     warning: Literal["ignored", "truncated", "error"] = "ignored",
     **options: Any,
 ) -> Iterator[fits.HDUList]:
-    """Open a FITS file from outside, which may be anything.
+    """Open a FITS file from outside, which may be anything; see `check_axes`, else one of `DAMAGE`.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    warning : {"ignored", "truncated", "error"}, optional
-        Which warnings of astropy are errors: none, that the file is too short, or all. Elsewhere they stay silent.
-    **options
-        For `astropy.io.fits.open`.
-
-    Raises
-    ------
-    FrameFormatError
-        See `check_axes`.
-    Exception
-        One of `DAMAGE`.
+    ``warning``: which warnings of astropy are errors: none, that the file is too short, or all. ``options`` are
+    those of `astropy.io.fits.open`.
     """
     from astropy.io import fits
 
@@ -394,13 +272,7 @@ def open_user_fits(
 
 @contextmanager
 def complete_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
-    """Open a FITS file from outside, headers first; one that is damaged or cut short is refused by its name.
-
-    Raises
-    ------
-    FrameFormatError
-        The file is not FITS, or damaged.
-    """
+    """Open a FITS file from outside, headers first; one that is damaged or cut short is refused by its name."""
     with (
         refuse_damage("file", "a complete FITS file", str(path)),
         open_user_fits(path, warning="truncated", memmap=False) as hdus,
@@ -410,143 +282,10 @@ def complete_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
 
 @contextmanager
 def refuse_damage(field: str, allowed: str, source: str) -> Iterator[None]:
-    """Turn what astropy raises over a damaged file into one error that names it.
-
-    Raises
-    ------
-    FrameFormatError
-        In place of any of `DAMAGE`.
-    InputError
-        As it is, with the file.
-    """
+    """Turn what astropy raises over a damaged file (`DAMAGE`) into one error that names it."""
     try:
         yield
     except InputError as error:
         raise (error if error.source else error.in_source(source)) from None
     except _damage() as error:
         raise FrameFormatError(field, first_line(error), allowed, source=source) from error
-
-
-def check_axes(stream: IO[bytes], source: str) -> None:
-    """Refuse a FITS file over which astropy would be busy for hours, or for ever, or need more memory than there is.
-
-    It asks a header for each of the axes and columns that it claims; the format has at most 999. And behind data of a
-    negative size it looks for the next header further in front, again and again. A file of a few megabytes,
-    compressed or with holes, may stand for any number of bytes.
-
-    Parameters
-    ----------
-    stream : binary file
-        The file, compressed or not. It is read, and stands at its beginning afterwards.
-    source : `str`
-        Its name.
-
-    Raises
-    ------
-    FrameFormatError
-        There is such a header, or the file stands for far more than it is.
-    OSError, EOFError
-        The file cannot be read, or cannot be decompressed.
-    """
-    most = _most_bytes(stream, source)
-    stream.seek(0)
-    beginning = stream.read(2)
-    if beginning == _LZW:
-        raise FrameFormatError(
-            "compression", "that of compress (.Z)", "gzip, bzip2, xz or zip", source=source
-        )
-    opener = _COMPRESSED.get(beginning)
-    stream.seek(0)
-    content: IO[bytes] = opener(stream) if opener else stream  # type: ignore[operator]
-    rest = _after_plain_units(content, most, source)
-    # Cards begin at multiples of their length, and so do pieces of the file.
-    while piece := content.read(_CHUNK):
-        _refuse_expansion(content.tell(), most, source)
-        piece = rest + piece
-        _refuse_endless(piece, source)
-        _refuse_compressed(piece, most, source)
-        rest = piece[len(piece) // _CARD * _CARD - _CARD :] if len(piece) >= _CARD else piece
-    stream.seek(0)
-
-
-def _after_plain_units(content: IO[bytes], most: int, source: str) -> bytes:
-    """Pass over headers and data of a file as long as they are what the standard asks for.
-
-    Returns the first header whose data may be anywhere, where astropy may look for the next one in what seems
-    to be data: from there on all has to be looked at. Nothing at the end of the file.
-    """
-    while True:
-        header = b""
-        while not _HEADER_END.search(header[-_BLOCK:]):
-            block = content.read(_BLOCK)
-            header += block
-            if len(block) < _BLOCK or len(header) > _LONGEST_HEADER:
-                _refuse_endless(header, source)
-                _refuse_compressed(header, most, source)
-                return header
-        _refuse_endless(header, source)
-        _refuse_compressed(header, most, source)
-        size = _data_size(header)
-        if size is None:
-            return header
-        _refuse_expansion(content.tell() + size, most, source)
-        content.seek(size, os.SEEK_CUR)
-
-
-def _data_size(header: bytes) -> int | None:
-    """Bytes between a header and the next one; nothing where that is open to interpretation."""
-    if not header.startswith((b"SIMPLE  =                    T", b"XTENSION= ")):
-        return None
-    values: dict[bytes, int] = {}
-    for place in range(0, len(header), _CARD):
-        card = header[place : place + _CARD]
-        keyword = card[:8].strip().upper()
-        if not _SIZE_KEYWORD.fullmatch(keyword):
-            continue
-        number = _PLAIN_NUMBER.fullmatch(card)
-        if number is None or keyword in values:
-            return None
-        values[keyword] = int(number[1])
-    axes = [values.get(b"NAXIS%d" % (axis + 1), -1) for axis in range(values.get(b"NAXIS", -1))]
-    if b"BITPIX" not in values or b"NAXIS" not in values or min(axes, default=0) < 0:
-        return None
-    bits = abs(values[b"BITPIX"]) * values.get(b"GCOUNT", 1)
-    size = bits // 8 * (values.get(b"PCOUNT", 0) + (math.prod(axes) if axes else 0))
-    return size + -size % _BLOCK if 0 <= size < _MOST_BYTES else None
-
-
-def _refuse_compressed(header: bytes, most: int, source: str) -> None:
-    """Refuse tile-compressed images that claim to be far larger than the file; astropy makes room for them first."""
-    pixels = 0
-    for match in _COMPRESSED_AXIS.finditer(header):
-        if match.start() % _CARD == 0:
-            pixels = (pixels if match[1].strip() not in (b"", b"1") else 1) * int(match[2])
-            _refuse_expansion(pixels * _PIXEL_BYTES, most, source)
-
-
-def _refuse_endless(piece: bytes, source: str) -> None:
-    for keyword in _COUNTS:
-        place = piece.find(keyword)
-        while place >= 0:
-            if place % _CARD == 0 and _ENDLESS.match(piece, place):
-                claimed = " ".join(piece[place : place + 30].decode("ascii", "replace").split())
-                allowed = "at most 999 axes or columns, and no negative size"
-                raise FrameFormatError("header", claimed, allowed, source=source)
-            place = piece.find(keyword, place + 1)
-
-
-def _most_bytes(stream: IO[bytes], source: str) -> int:
-    """Bytes for which a file may stand by what it takes on the disk; one with holes is refused at once."""
-    size = stored = stream.seek(0, os.SEEK_END)
-    with suppress(OSError):  # it may be in memory
-        # Some file systems do not tell their blocks.
-        stored = 512 * os.fstat(stream.fileno()).st_blocks or size
-    most = max(_SMALL, _EXPANSION * stored)
-    _refuse_expansion(size, most, source)
-    return most
-
-
-def _refuse_expansion(size: int, most: int, source: str) -> None:
-    if size > most:
-        allowed = f"up to {most}, by what the file takes on the disk"
-        raise FrameFormatError("bytes in the file", f"{size} or more", allowed, source=source)

@@ -37,36 +37,12 @@ def sources_in_coadds(
 ) -> Table | None:
     """Bias of fluxes and shapes in single visits and in their coadd, with fringes and after a correction.
 
-    Parameters
-    ----------
-    frames : sequence of `SkyFringe`
-        Frames of one sensor without noise.
-    rng : `numpy.random.Generator`
-        Source of noise, places and angles.
-    places : `VisitPlaces`, optional
-        Where a region of the sky lies on the sensor; at random by default, as in `coadds_of_frames`.
-    options : `InjectionOptions`, optional
-        Sources; fluxes are over the noise of the visit or of the coadd.
-    pixel_arcsec : `float`, optional
-        Size of a pixel on the sky [arcsec].
-
-    Returns
-    -------
-    table : `~astropy.table.Table` or `None`
-        One row for each number of visits, kind and flux. ``magnitude`` is that of the source less that of one
-        square arcsecond of the sky. ``bias`` and ``scatter`` are those of the difference from the same source in the
-        same noise without fringes, ``scatter_noise`` is that of the noise. `None` for frames that are too small.
-
-    Raises
-    ------
-    OutOfRangeError
-        A visit in which no region lies on the sensor.
-
-    Notes
-    -----
     Single exposures get the photon noise of their sky, a coadd that of its mean. The correction subtracts the one
     pattern that takes most of the frames; a single frame has none. Fringes are interpolated linearly, which
-    takes 3 % of those of 10 px and 0.4 % of those of 30 px.
+    takes 3 % of those of 10 px and 0.4 % of those of 30 px. One row for each number of visits, kind and flux:
+    ``bias`` and ``scatter`` are of the difference from the same source in the same noise without fringes,
+    ``magnitude`` is that of the source less that of one square arcsecond of the sky. `None` for frames that are
+    too small.
     """
     placed = placed_visits(frames, rng, places)
     chosen = options or InjectionOptions()

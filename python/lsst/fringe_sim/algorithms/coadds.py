@@ -49,22 +49,12 @@ LARGEST_PART = 4
 @named_units
 @dataclass(frozen=True, eq=False)
 class VisitPlaces:
-    """Where one region of the sky lies on a sensor, visit by visit.
+    """Where one region of the sky lies on a sensor, visit by visit."""
 
-    Attributes
-    ----------
-    x_px, y_px : `numpy.ndarray`, shape ``(V,)``
-        Centre of the region [px, from 0].
-    rotation_deg : `numpy.ndarray`, shape ``(V,)``
-        Angle between the axes of the sky and of the sensor [deg].
-    frame : `numpy.ndarray` of `int`, shape ``(V,)``
-        Which of the frames has the fringes of the visit.
-    """
-
-    x_px: FloatArray
+    x_px: FloatArray  # (V,): centre of the region [px, from 0]
     y_px: FloatArray
-    rotation_deg: FloatArray
-    frame: NDArray[np.int64]
+    rotation_deg: FloatArray  # (V,): angle between the axes of the sky and of the sensor [deg]
+    frame: NDArray[np.int64]  # (V,): which of the frames has the fringes of the visit
 
     def __len__(self) -> int:
         return int(self.x_px.size)
@@ -83,11 +73,6 @@ class VisitPlaces:
         """Read an ECSV table with columns ``x``, ``y`` [px], ``rotation`` [deg], and perhaps ``frame``.
 
         Without the last the visits go through the frames in turn.
-
-        Raises
-        ------
-        InputError
-            No such table, fewer than two visits, values that are not finite, or a frame that does not exist.
         """
         table, source = read_user_table(path, "visits"), str(path)
         missing = [name for name in ("x", "y", "rotation") if name not in table.colnames]
@@ -102,13 +87,7 @@ class VisitPlaces:
         return cls(x, y, rotation, frame.astype(int))
 
     def region_px(self, shape: tuple[int, ...]) -> int:
-        """Side of the largest region that lies on the sensor in every visit, but at most `LARGEST_REGION_PX`.
-
-        Raises
-        ------
-        OutOfRangeError
-            There is none; a visit is named in which the region is not on the sensor.
-        """
+        """Side of the largest region that lies on the sensor in every visit, but at most `LARGEST_REGION_PX`."""
         angle = np.radians(self.rotation_deg)
         inside = [
             np.minimum(at, size - 1.0 - at) for at, size in zip((self.y_px, self.x_px), shape, strict=True)
@@ -136,27 +115,14 @@ def _numbers(table: Any, name: str, source: str) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Coadds:
-    """Standard deviation of means over squares in coadds of more and more visits, as fractions of the sky.
+    """Standard deviation of means over squares in coadds of more and more visits, as fractions of the sky."""
 
-    Attributes
-    ----------
-    counts : `numpy.ndarray` of `int`, shape ``(N,)``
-        Visits in the coadds.
-    square_px : `numpy.ndarray` of `int`, shape ``(S,)``
-        Sides of the squares [px].
-    fringes : `numpy.ndarray`, shape ``(N, S)``
-        Of the fringes: the mean over as many coadds as the visits give, one after the other.
-    corrected : `numpy.ndarray`, shape ``(N, S)``, or `None`
-        Of what a correction leaves of them.
-    noise : `numpy.ndarray`, shape ``(N, S)``
-        Of white noise, as expected.
-    """
-
-    counts: NDArray[np.int64]
-    square_px: NDArray[np.int64]
+    counts: NDArray[np.int64]  # (N,): visits in the coadds
+    square_px: NDArray[np.int64]  # (S,): sides of the squares [px]
+    # (N, S): of the fringes: the mean over as many coadds as the visits give, one after the other
     fringes: FloatArray
-    corrected: FloatArray | None
-    noise: FloatArray
+    corrected: FloatArray | None  # (N, S): of what a correction leaves of them
+    noise: FloatArray  # (N, S): of white noise, as expected
 
 
 def coadds_of_frames(
@@ -165,25 +131,7 @@ def coadds_of_frames(
     """Fringes left in coadds of pieces of the frames, before a correction and after one with one template.
 
     The template is the one pattern that takes most of the frames, so that a single frame has no correction.
-
-    Parameters
-    ----------
-    frames : sequence of `SkyFringe`
-        Frames of one sensor without noise.
-    rng : `numpy.random.Generator`
-        Source of places and angles, where none are given.
-    places : `VisitPlaces`, optional
-        Where a region of the sky lies on the sensor; `VISITS` at random by default.
-
-    Returns
-    -------
-    coadds : `Coadds` or `None`
-        `None` for frames that are too small to be rotated.
-
-    Raises
-    ------
-    OutOfRangeError
-        A visit in which no region lies on the sensor.
+    Visits are at random places and angles by default; `None` for frames that are too small to be rotated.
     """
     placed = placed_visits(frames, rng, places)
     if placed is None:
@@ -216,21 +164,6 @@ def coadd_visits(
 ) -> Coadds:
     """Fringes left in coadds of a region of the sky.
 
-    Parameters
-    ----------
-    patterns : sequence of array_like, shape ``(ny, nx)``
-        Fringe patterns of the sensor as fractions of the sky; 0 where they are not known.
-    places : `VisitPlaces`
-        Place, angle and pattern of each visit.
-    noise_rms : `float`
-        White noise of a pixel of one visit, as a fraction of the sky.
-    region_px : `int`
-        Side of the region [px].
-    templates : `int`, optional
-        Templates of the correction: the patterns that take most of the given ones, subtracted without errors.
-
-    Notes
-    -----
     Patterns are averaged over cells, `CELLS` in a side of the region, and interpolated with cubic splines. The mean
     of the region is subtracted from every visit.
     """

@@ -72,11 +72,6 @@ class FlatSeries:
         """Model under the nominal conditions of the series.
 
         Effects whose null is stated by the set-up (width of the line, temperature) keep their ratio to it.
-
-        Raises
-        ------
-        InputError
-            Another width of a line whose shape has none.
         """
         system = model.base_system
         if self.bandwidth_fwhm_nm is not None:

@@ -7,14 +7,12 @@ amplifiers beside them; objects are found where both are subtracted. Inputs are 
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import uniform_filter
 
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError, named_units, to_number
@@ -27,12 +25,10 @@ from .sky_frame import SkyResponse
 __all__ = [
     "CorrectionOptions",
     "FringeCorrection",
-    "ResidualFringe",
     "TemplateSet",
     "component_patterns",
     "correct_fringes",
     "refuse_uncorrected",
-    "residual_fringe",
     "undo_correction",
 ]
 
@@ -182,30 +178,6 @@ class FringeCorrection:
         return {CORRECTED: subtracted.size, TEMPLATE_ID: self.template_id, **scales, **sigmas}
 
 
-@dataclass(frozen=True)
-class ResidualFringe:
-    """What a correction leaves.
-
-    Attributes
-    ----------
-    rms : `float`
-        Standard deviation of the residual fringe, as a fraction of the sky.
-    smoothed_rms : `float`
-        The same after averaging over a square aperture.
-    shot_noise : `float`
-        Noise of the sky in that aperture, as a fraction of the sky.
-    """
-
-    rms: float
-    smoothed_rms: float
-    shot_noise: float
-
-    @property
-    def ratio(self) -> float:
-        """Residual over shot noise on the scale of the aperture; the DES criterion asks for less than 0.1."""
-        return self.smoothed_rms / self.shot_noise
-
-
 def correct_fringes(
     image: ArrayLike,
     templates: Templates,
@@ -309,13 +281,7 @@ def refuse_uncorrected(header: Mapping[str, Any], source: str | None = None) -> 
 
 
 def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
-    """Scales of all templates by a header of ours; 0 if they were not seen, and nothing was subtracted.
-
-    Raises
-    ------
-    InputError
-        It states none, or of another number of templates.
-    """
+    """Scales of all templates by a header of ours; 0 if they were not seen, and nothing was subtracted."""
     if header[CORRECTED] == 0:
         return np.zeros(len(patterns))
     if header[CORRECTED] != len(patterns):
@@ -326,58 +292,6 @@ def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) 
         if not abs(value) < np.finfo(np.float32).max:
             raise OutOfRangeError(name, float(value), "a finite number of electrons")
     return scale
-
-
-def residual_fringe(
-    residual: ArrayLike,
-    sky_electrons: float,
-    aperture_px: int,
-    mask: ArrayLike | None = None,
-    read_noise_e: float = 0.0,
-) -> ResidualFringe:
-    """Compare a noiseless residual with the shot noise of the sky on one angular scale.
-
-    Parameters
-    ----------
-    residual : array_like, shape ``(ny, nx)``
-        Fringe less its correction [e⁻]; its mean is subtracted.
-    sky_electrons : `float`
-        Sky per pixel [e⁻].
-    aperture_px : `int`
-        Side of the square aperture [px]; 100 is 20 arcsec for LSST.
-    mask : array_like, optional
-        Non-zero where the residual is not known.
-    read_noise_e : `float`, optional
-        Read noise per pixel [e⁻].
-
-    Raises
-    ------
-    InputError
-        No good pixel, or a mask that does not fit.
-    OutOfRangeError
-        A sky or an aperture that is not positive.
-    """
-    values = np.asarray(residual, dtype=float)
-    good = np.isfinite(values)
-    if mask is not None:
-        if np.shape(mask) != values.shape:
-            raise InputError("shape of the mask", np.shape(mask), f"{values.shape}")
-        good &= np.asarray(mask) == 0
-    if not good.any():
-        raise InputError("good pixels", 0, "at least one")
-    if not 0.0 < sky_electrons < math.inf or aperture_px < 1:
-        raise OutOfRangeError("sky [e] and aperture [px]", (sky_electrons, aperture_px), "positive")
-    centred = np.where(good, values - values[good].mean(), 0.0)
-    share = uniform_filter(good.astype(float), aperture_px, mode="constant")
-    smooth = uniform_filter(centred, aperture_px, mode="constant")
-    full = share > 0.9
-    averaged = smooth[full] / share[full] if full.any() else np.zeros(1)
-    noise = math.sqrt(sky_electrons + read_noise_e**2) / aperture_px
-    return ResidualFringe(
-        float(centred[good].std() / sky_electrons),
-        float(averaged.std() / sky_electrons),
-        noise / sky_electrons,
-    )
 
 
 @named_units

@@ -19,28 +19,9 @@ _BAND_ROWS = 64
 def add_exposure_noise(
     electrons: ArrayLike, rng: np.random.Generator, read_noise_e: float = 0.0
 ) -> NDArray[np.float32]:
-    """Poisson noise of the photoelectrons and Gaussian read noise.
+    """Poisson noise of the photoelectrons and Gaussian read noise [e⁻], exact up to 2²⁴ electrons.
 
-    Parameters
-    ----------
-    electrons : array_like, shape ``(ny, nx)``
-        Expected electrons per pixel, none negative.
-    rng : `numpy.random.Generator`
-        Source of randomness, from which one stream is spawned for every 64 rows.
-    read_noise_e : `float`, optional
-        Read noise [e⁻ rms].
-
-    Returns
-    -------
-    noisy : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Whole numbers of electrons without read noise, exact up to 2²⁴ electrons.
-
-    Raises
-    ------
-    InputError
-        An image that is not two-dimensional, or has pixels that are negative or not finite.
-    OutOfRangeError
-        A negative read noise.
+    From ``rng`` one stream is spawned for every 64 rows.
     """
     image = np.asarray(electrons)
     if image.ndim != 2:

@@ -7,7 +7,6 @@ a correction may fit it as a template beside the sky itself.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -69,9 +68,7 @@ def template_pair(
     sigma: float,
     creation_datetime: str,
     *,
-    scale: Mapping[str, float] | None = None,
     detector: str = "",
-    metadata: Mapping[str, Any] | None = None,
 ) -> list[FringeFrame]:
     """Templates for fringe correction: the sky of a map, and how the phase of the adhesive changes it.
 
@@ -79,12 +76,11 @@ def template_pair(
     where `phase_change` is `None`.
     """
     thickness = np.asarray(thickness_um)
-    table = response.sky(scale)
+    table = response.sky()
     frame = table.frame(thickness)
     change = phase_change(table, thickness, model, sigma)
     patterns: list[NDArray[Any]] = [_over_mean(frame), *([] if change is None else [change])]
     mask = np.where(np.isfinite(frame), np.int32(0), np.int32(mask_bits("NO_DATA")))
-    cards = {**(metadata or {}), "PHASESIG": sigma}
     return [
         FringeFrame(
             image=np.where(mask, 0.0, pattern - pattern.mean(dtype=np.float64, where=mask == 0)).astype(
@@ -94,7 +90,7 @@ def template_pair(
             variance=np.zeros(mask.shape, np.float32),
             physical_filter=model.setup.filter_name,
             creation_datetime=creation_datetime,
-            metadata={**cards, "TEMPLATE": number, "TEMPKIND": kind},
+            metadata={"PHASESIG": sigma, "TEMPLATE": number, "TEMPKIND": kind},
             detector=detector,
         )
         for number, (kind, pattern) in enumerate(zip(("sky", "phase"), patterns, strict=False))

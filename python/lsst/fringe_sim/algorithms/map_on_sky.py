@@ -58,30 +58,7 @@ def map_on_sky(
     map_sigma_um: float | None = None,
     advance: Callable[[], None] = do_nothing,
 ) -> MapOnSky:
-    """Say where the sky and a thickness map disagree, and move the map there.
-
-    Parameters
-    ----------
-    frames : sequence of callables
-        Each returns a frame with its fringes and its background; they are asked one at a time.
-    thickness : `ThicknessMap`
-        The map, on the pixels of the frames.
-    response : `Response`
-        Of the sensor to the dark sky, at least `reach_um` beyond the thicknesses of the map.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    options : `CorrectionOptions`, optional
-        Background, amplifiers, objects.
-    map_sigma_um : `float`, optional
-        See `fit_sky_shift`.
-    advance : callable, optional
-        Called after each frame.
-
-    Raises
-    ------
-    InputError
-        Frames of another size than the map, or without pixels that both know.
-    """
+    """Say where sky and map disagree, and move the map there; ``frames`` are loaders, asked one at a time."""
     chosen = options or CorrectionOptions()
     known = thickness.known_um().astype(float)
     good = np.isfinite(known)

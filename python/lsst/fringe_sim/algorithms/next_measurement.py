@@ -60,49 +60,29 @@ DECISIVE_SIGMA = 5.0
 
 @dataclass(frozen=True)
 class Measurement:
-    """Data that could be taken in addition.
+    """Data that could be taken in addition."""
 
-    Attributes
-    ----------
-    name, title : `str`
-        Key, and what to take, for people.
-    """
-
-    name: str
+    name: str  # Key, and what to take, for people
     title: str
 
 
 @dataclass(frozen=True)
 class FlatMeasurement(Measurement):
-    """Flats that could be taken in addition.
-
-    Attributes
-    ----------
-    series : `FlatSeries`
-        The flats.
-    """
+    """Flats that could be taken in addition."""
 
     series: FlatSeries
 
 
 @dataclass(frozen=True)
 class PairForecast:
-    """How well the effect that was found is told from another one.
-
-    Attributes
-    ----------
-    effect, other : `str`
-        Names.
-    likeness_now, likeness_after : `float`
-        Cosine between the signatures, 0 to 1, with the present flats and with the further ones.
-    separation_now, separation_after : `float`
-        Expected difference of the two fits in standard deviations, the square root of Δχ².
-    """
+    """How well the effect that was found is told from another one."""
 
     effect: str
     other: str
+    # Cosine between the signatures, 0 to 1, with the present flats and with the further ones
     likeness_now: float
     likeness_after: float
+    # Expected difference of the two fits in standard deviations, the square root of Δχ²
     separation_now: float
     separation_after: float
 
@@ -117,18 +97,10 @@ class PairForecast:
 
 @dataclass(frozen=True)
 class RankedMeasurement:
-    """A measurement and what it would tell.
+    """A measurement and what it would tell."""
 
-    Attributes
-    ----------
-    measurement : `Measurement`
-        What to take.
-    pairs : `tuple` [`PairForecast`, ...]
-        The effect that was found against each of the others, hardest first.
-    """
-
-    measurement: Measurement
-    pairs: tuple[PairForecast, ...]
+    measurement: Measurement  # What to take
+    pairs: tuple[PairForecast, ...]  # The effect that was found against each of the others, hardest first
 
     @property
     def separation(self) -> float:
@@ -159,19 +131,7 @@ def candidate_measurements(
     level_e: float = LEVEL_E,
     dark_time_s: Sequence[float] = (),
 ) -> tuple[FlatMeasurement, ...]:
-    """Measurements that a test stand can make besides its usual flats.
-
-    Parameters
-    ----------
-    model : `FringeModel`
-        Laboratory set-up.
-    wavelength_nm : sequence of `float`, optional
-        Wavelengths of the present flats [nm]; by default those of the set-up.
-    level_e : `float`, optional
-        Their mean level [electrons].
-    dark_time_s : sequence of `float`, optional
-        Time in which each of them gathers charge [s], where it is known.
-    """
+    """Measurements that a test stand can make besides its usual flats."""
     present = _present(model, wavelength_nm, level_e, dark_time_s)
     waves, setup = present.wavelength_nm, model.setup
     n = f"{len(waves)} flats"
@@ -218,43 +178,16 @@ def rank_measurements(
 ) -> tuple[RankedMeasurement, ...]:
     """Rank further measurements by how well they tell apart effects that the present flats cannot.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        Laboratory set-up with the effects that are beyond doubt, without those of the class.
-    effects : mapping
-        The class, the effect that was found first: fitted values by effect and parameter. Where nothing is known
-        (an empty mapping) an effect departs from null by its prior scale if it can do so to one side only, and
-        otherwise by little.
-    wavelength_nm, level_e, dark_time_s
-        Wavelengths [nm] and mean level [electrons] of the present flats, by default those of the set-up, and the
-        time in which each gathers charge [s], where it is known.
-    thickness_um : `tuple` [`float`, `float`], optional
-        Smallest and largest thickness of the varying layer on the sensor [µm]; by default within 1.5 of the stack's.
-    significance : `float`, optional
-        Standard deviations by which the present data ask for the effect (root of Δχ²). Without it, that of a whole
-        sensor with photon noise and nothing else unknown, which is far too good: only ratios are to be trusted.
-    measurements : sequence of `Measurement`, optional
-        Those to compare; by default `candidate_measurements`.
-    nuisance_effects : sequence of `str`, optional
-        Effects known within their prior scale only; they are projected out, too.
-    catalogue : sequence of `Effect`, optional
-        Where the effects are.
-    report : callable, optional
-        Called with a line of text for each measurement.
+    ``model`` has the effects that are beyond doubt, without those of the class: ``effects``, fitted values by effect
+    and parameter, that which was found first. Where nothing is known (an empty mapping) an effect departs from null
+    by its prior scale if it can do so to one side only, and otherwise by little. ``wavelength_nm``, ``level_e`` and
+    ``dark_time_s`` are of the present flats, by default those of the set-up; ``thickness_um`` is by default within
+    1.5 of the stack's. ``significance``: standard deviations by which the present data ask for the effect; without
+    it, that of a whole sensor with photon noise and nothing else unknown, which is far too good: only ratios are to
+    be trusted. ``nuisance_effects`` are known within their prior scale only, and projected out, too.
 
-    Returns
-    -------
-    ranked : `tuple` [`RankedMeasurement`, ...]
-        Largest separation of the hardest pair first. Empty if fewer than two of the effects can be forecast: those
-        that couple neighbouring pixels, or are in a part of the sensor only, cannot.
-
-    Raises
-    ------
-    UnknownNameError, OutOfRangeError
-        Effects or parameters that do not exist, values out of bounds.
-    InputError
-        The set-up is not one of a laboratory.
+    The largest separation of the hardest pair comes first. Empty if fewer than two of the effects can be forecast:
+    those that couple neighbouring pixels, or are in a part of the sensor only, cannot.
     """
     if model.setup.kind != "monochromator":
         raise InputError("set-up", model.setup.name, "a laboratory set-up with a monochromator")

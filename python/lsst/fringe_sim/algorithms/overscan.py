@@ -24,20 +24,11 @@ NEARBY_ROWS = 25
 
 @dataclass(frozen=True, eq=False)
 class OverscanCorrected:
-    """One amplifier without its electronic level.
+    """One amplifier without its electronic level."""
 
-    Attributes
-    ----------
-    image : `numpy.ndarray` [y, x], float32
-        Imaging section, read-out order [ADU].
-    level_adu : `float`
-        Median level that was taken off [ADU].
-    noise_adu : `float`
-        Standard deviation of the overscan pixels about their rows, without outliers: the read noise [ADU].
-    """
-
-    image: Image
-    level_adu: float
+    image: Image  # Imaging section, read-out order [ADU]
+    level_adu: float  # Median level that was taken off [ADU]
+    # Standard deviation of the overscan pixels about their rows, without outliers: the read noise [ADU]
     noise_adu: float
 
 
@@ -49,23 +40,7 @@ def correct_overscan(
     Row by row with the serial overscan, which follows the drift of the electronics; then what columns differ from
     each other in the parallel overscan. Outliers (cosmic rays, bleeding, deferred charge) are rejected, and rows
     whose whole overscan holds charge get the level of the rows around.
-
-    Parameters
-    ----------
-    amp : `RawAmplifier`
-        Amplifier as read.
-    options : `FlatPrepOptions`, optional
-        Choices.
-
-    Returns
-    -------
-    corrected : `OverscanCorrected` or `None`
-        `None` for an amplifier that is switched off: one value in all pixels.
-
-    Raises
-    ------
-    FrameFormatError
-        The frame has too little serial overscan.
+    `None` for an amplifier that is switched off: one value in all pixels.
     """
     if amp.data.min() == amp.data.max():
         return None

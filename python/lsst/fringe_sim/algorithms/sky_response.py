@@ -114,15 +114,7 @@ class SkyResponse:
         return tuple(name for name in self.component if is_band(name))
 
     def factors(self, scale: Mapping[str, float] | None = None) -> FloatArray:
-        """Factor on every component, 1 unless named.
-
-        Raises
-        ------
-        UnknownNameError
-            A component that this sky does not have.
-        OutOfRangeError
-            A factor that is negative or not finite, or no light left.
-        """
+        """Factor on every component, 1 unless named."""
         return component_factors(self.component, self.photons, scale)
 
     def sky(self, scale: Mapping[str, float] | None = None) -> ResponseTable:
@@ -165,32 +157,7 @@ def sky_response(
     thickness_range_um: tuple[float, float] | None = None,
     quadrature: SkyQuadrature | None = None,
 ) -> SkyResponse:
-    """Tabulate the response of a sensor to a sky.
-
-    Parameters
-    ----------
-    model : `FringeModel`
-        Sensor behind a telescope, with effects.
-    sky : `SkySpectrum`
-        Lines and continua.
-    bandpass : `Bandpass`, optional
-        By default that of the set-up.
-    thickness_range_um : `tuple` [`float`, `float`], optional
-        Thicknesses to cover [µm]; by default those of the set-up.
-    quadrature : `SkyQuadrature`, optional
-        How finely the sums are made.
-
-    Returns
-    -------
-    response : `SkyResponse`
-
-    Raises
-    ------
-    InputError
-        The set-up is not one of the sky and no bandpass is given, or no light passes.
-    OutOfRangeError
-        An empty range of thickness, or a wavelength for which a medium is not known.
-    """
+    """Tabulate the response of a sensor to a sky; band-pass and thicknesses [µm] are by default the set-up's."""
     fineness = SkyQuadrature() if quadrature is None else quadrature
     band = bandpass_of(model) if bandpass is None else bandpass
     sky = sky_with_effects(model, sky)

@@ -53,38 +53,25 @@ DERIVATIVE_ORDERS = 1e-2
 @named_units
 @dataclass(frozen=True, eq=False)
 class SkyShift:
-    """How far a map is from what the sky shows.
+    """How far a map is from what the sky shows."""
 
-    Attributes
-    ----------
-    shift_um, sigma_um : `numpy.ndarray`, shape ``(ny, nx)``
-        What is to be added to the map, and its uncertainty [µm], averaged over all that compete by their evidence.
-    chance_unmoved : `float`
-        Probability that the map is right as it is.
-    chance_other_order : `float`
-        Probability that all of it is whole fringe orders away from the shift that is stated.
-    spans : `int`
-        Spans along a side of the likeliest splines; -1 if the map is likeliest as it is, 0 for one shift.
-    strength, strength_sigma : `float`
-        Fringes of the frames over those predicted for the dark sky.
-    residual : `float`
-        Mean square of the residuals over their variance where the map is as it was, over that with the shift.
-    model_error : `float`
-        Size of the errors of the envelope that the frames ask for (`Envelope`); with a third of the fringes or more
-        the order is that of the model, and may be wrong whatever the probabilities say.
-    alone_um : `float`
-        Median uncertainty that the frames alone give to shifts over an eighth of the sensor [µm].
-    """
-
+    # (ny, nx): what is to be added to the map, and its uncertainty [µm], averaged over all that compete by
+    # their evidence
     shift_um: FloatArray
     sigma_um: FloatArray
-    chance_unmoved: float
+    chance_unmoved: float  # Probability that the map is right as it is
+    # Probability that all of it is whole fringe orders away from the shift that is stated
     chance_other_order: float
+    # Spans along a side of the likeliest splines; -1 if the map is likeliest as it is, 0 for one shift
     spans: int
-    strength: float
+    strength: float  # Fringes of the frames over those predicted for the dark sky
     strength_sigma: float
+    # Mean square of the residuals over their variance where the map is as it was, over that with the shift
     residual: float
+    # Median uncertainty that the frames alone give to shifts over an eighth of the sensor [µm]
     alone_um: float
+    # Size of the errors of the envelope that the frames ask for (`Envelope`); with a third of the fringes
+    # or more the order is that of the model, and may be wrong whatever the probabilities say
     model_error: float = 0.0
 
     @named_units
@@ -105,30 +92,10 @@ def fit_sky_shift(
 ) -> SkyShift:
     """How a thickness map must move for the fringes of sky frames.
 
-    Parameters
-    ----------
-    values, weights : sequence of array_like, F of shape ``(ny, nx)``
-        Frames over their mean, minus one, and inverse variances in any unit; 0 leaves a pixel out.
-    thickness_um : array_like, shape ``(ny, nx)``
-        The map [µm]; NaN where it is not known.
-    predict : callable
-        ``thickness_um -> (B, ny, nx)``: light of the OH bands of the dark sky, over the mean of that sky.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    map_sigma_um : `float`, optional
-        What all of the map may be off by, one standard deviation [µm]; by default 0.15 orders.
+    ``values`` are frames over their mean, minus one; ``weights`` inverse variances in any unit, 0 for a pixel that is
+    left out; ``thickness_um`` is NaN where it is not known. ``predict`` takes thicknesses [µm] and returns the light
+    of the OH bands of the dark sky, over the mean of that sky, first axis.
 
-    Returns
-    -------
-    shift : `SkyShift`
-
-    Raises
-    ------
-    InputError
-        No frames, frames of another shape than the map, or too few pixels that both know.
-
-    Notes
-    -----
     The shift is a spline whose coefficients have mean and tilts, normal about zero, and a normal spread about them,
     over which the evidence is averaged. Its number of spans, one shift for all, and none at all compete by evidence
     (Laplace's, about the best point). In each frame the strength of each band and a background of second degree are

@@ -94,21 +94,11 @@ SECOND_EFFECTS: Mapping[str, Draw] = MappingProxyType(
 
 @dataclass(frozen=True)
 class DemoCase:
-    """What is hidden in the flats of the demo. Nothing that analyses them may see it.
+    """What is hidden in the flats of the demo. Nothing that analyses them may see it."""
 
-    Attributes
-    ----------
-    seed : `int`
-        Decides the effect, its size and all noise.
-    shape : `tuple` [`int`, `int`]
-        Rows and columns.
-    values : `dict` [`str`, `float`]
-        Sizes by ``effect.parameter``.
-    """
-
-    seed: int
+    seed: int  # Decides the effect, its size and all noise
     shape: tuple[int, int]
-    values: dict[str, float]
+    values: dict[str, float]  # Sizes by ``effect.parameter``
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -142,13 +132,7 @@ class DemoCase:
 
     @classmethod
     def from_json(cls, text: str) -> DemoCase:
-        """Read back what `to_json` wrote.
-
-        Raises
-        ------
-        InputError
-            It is something else.
-        """
+        """Read back what `to_json` wrote."""
         try:
             content = json.loads(text)
             return cls(content["seed"], tuple(content["shape"]), dict(content["values"]))
@@ -157,15 +141,7 @@ class DemoCase:
 
 
 def draw_demo_case(seed: int, shape: tuple[int, int]) -> DemoCase:
-    """Draw what is hidden: the weak contrast of real sensors, and one effect of `SECOND_EFFECTS`.
-
-    Parameters
-    ----------
-    seed : `int`
-        Decides the effect and its size.
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of the part of the sensor.
-    """
+    """Draw what is hidden: the weak contrast of real sensors, and one effect of `SECOND_EFFECTS`."""
     rng = np.random.default_rng([seed, 0])
     name = str(rng.choice(list(SECOND_EFFECTS)))
     second = SECOND_EFFECTS[name](rng, shape)
@@ -178,15 +154,7 @@ def thickness_of_demo(shape: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def found_words(case: DemoCase, verdict: Verdict) -> str:
-    """How truth and verdict compare: ``right``, ``right class``, ``wrong`` or ``no name``.
-
-    Parameters
-    ----------
-    case : `DemoCase`
-        The truth.
-    verdict : `Verdict`
-        What the search found.
-    """
+    """How truth and verdict compare: ``right``, ``right class``, ``wrong`` or ``no name``."""
     if verdict.verdict != "named":
         return "no name"
     if not is_right(case.names, verdict):

@@ -31,34 +31,18 @@ VALLEYS = 8
 
 @dataclass(frozen=True)
 class Visibility:
-    """How clearly the effects of a case are in its data.
+    """How clearly the effects of a case are in its data."""
 
-    Attributes
-    ----------
-    all : `float`
-        Signal to noise of all effects together.
-    each : `dict` [`str`, `float`]
-        That of each beside the others.
-    """
-
-    all: float
-    each: dict[str, float]
+    all: float  # Signal to noise of all effects together
+    each: dict[str, float]  # That of each beside the others
 
 
 @dataclass(frozen=True)
 class Oracle:
-    """What could be reached on a case.
+    """What could be reached on a case."""
 
-    Attributes
-    ----------
-    visibility : `Visibility`
-        How clearly its effects are seen.
-    verdict : `Verdict`
-        Of the search, told which effects can be in.
-    """
-
-    visibility: Visibility
-    verdict: Verdict
+    visibility: Visibility  # How clearly its effects are seen
+    verdict: Verdict  # Of the search, told which effects can be in
 
 
 def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
@@ -66,13 +50,6 @@ def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
 
     A search may miss a minimum that is there, and would call faint what it has missed. What is in a part of the
     sensor only may look like a thickness that steps there: it is as clear as it is beside a thickness of each cell.
-
-    Parameters
-    ----------
-    case : `SealedCase`
-        With one effect of the catalogue or more.
-    most_cells : `int`, optional
-        Cells that the data are averaged to, as in the search.
     """
     keys = {f"{effect.name}.{parameter.name}" for effect in EFFECTS for parameter in effect.parameters}
     # Gains of amplifiers, say, are drawn: the case knows their spread alone.

@@ -32,17 +32,7 @@ DECISIVE = ("one_right_class", "one_exact_where_separable", "two_right_class", "
 
 
 def write_challenge_report(path: str | Path, result: ChallengeResult, origin: Origin | None = None) -> Path:
-    """Write the page of a challenge; a section without cases says so.
-
-    Parameters
-    ----------
-    path : `str` or `pathlib.Path`
-        The page.
-    result : `ChallengeResult`
-        Results of all cases.
-    origin : `Origin`, optional
-        Command.
-    """
+    """Write the page of a challenge; a section without cases says so."""
     kinds = ", ".join(
         f"{sum(case.kind == kind for case in result.cases)} {name}" for kind, name in _KINDS.items()
     )

@@ -35,48 +35,26 @@ PROBABILITY_EDGES = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
 
 @dataclass(frozen=True)
 class CaseResult:
-    """What became of a case.
+    """What became of a case."""
 
-    Attributes
-    ----------
-    number, kind : `int`, `str`
-        Which case of which of `CASE_KINDS`.
-    truth, found : `tuple` [`str`, ...]
-        Effects that were in, and those that were named.
-    right_class : `bool`
-        Every effect that is in was named or is in the class of a named one, and nothing else was named. A second
-        effect below `VISIBLE` need not be named.
-    exact : `bool`
-        The named effects are those that are in.
-    signal_to_noise : `float`
-        Square root of what the true effects take off χ².
-    weakest : `float`
-        Signal to noise of the weakest of several effects beside the others, at their true sizes.
-    probability : `float`
-        Smallest probability that was stated for a class; 0 if nothing was named.
-    name_probability : `float`
-        Probability, as stated, that every name itself is right and not only its class; 0 if nothing was named.
-    pulls : `dict`
-        (found - true) / σ by ``name.parameter``, for exact names.
-    shrinkage : `float`
-        Part of the oracle's fall of the variance on held-out data that the search reached.
-    """
-
-    number: int
+    number: int  # Which case of which of `CASE_KINDS`
     kind: str
-    truth: tuple[str, ...]
+    truth: tuple[str, ...]  # Effects that were in, and those that were named
     values: dict[str, float]
     verdict: str
     found: tuple[str, ...]
     ambiguous: tuple[tuple[str, ...], ...]
+    # Every effect that is in was named or is in the class of a named one, and nothing else was named. A
+    # second effect below `VISIBLE` need not be named
     right_class: bool
-    exact: bool
-    signal_to_noise: float
-    weakest: float
-    probability: float
+    exact: bool  # The named effects are those that are in
+    signal_to_noise: float  # Square root of what the true effects take off χ²
+    weakest: float  # Signal to noise of the weakest of several effects beside the others, at their true sizes
+    probability: float  # Smallest probability that was stated for a class; 0 if nothing was named
+    # Probability, as stated, that every name itself is right and not only its class; 0 if nothing was named
     name_probability: float
-    pulls: dict[str, float]
-    shrinkage: float
+    pulls: dict[str, float]  # (found - true) / σ by ``name.parameter``, for exact names
+    shrinkage: float  # Part of the oracle's fall of the variance on held-out data that the search reached
     seconds: float
 
     def to_json(self) -> str:
@@ -85,13 +63,7 @@ class CaseResult:
 
     @classmethod
     def from_json(cls, text: str) -> CaseResult:
-        """Result from a line that `to_json` wrote.
-
-        Raises
-        ------
-        InputError
-            The line is not one of a case.
-        """
+        """Result from a line that `to_json` wrote."""
         wanted = [item.name for item in fields(cls)]
         try:
             values = json.loads(text)

@@ -33,47 +33,23 @@ def run_challenge(
     seed: int,
     *,
     size: tuple[int, int] = (96, 96),
-    options: SearchOptions | None = None,
     only: Sequence[str] = (),
     setup: str = "ts8_e2v",
     known: Sequence[CaseResult] = (),
     jobs: int = 1,
     progress: Callable[[CaseResult], None] | None = None,
 ) -> ChallengeResult:
-    """Draw cases, search each, and judge the answers.
-
-    Parameters
-    ----------
-    counts : mapping
-        How many cases of each of `CASE_KINDS`.
-    seed : `int`
-        Seed of the whole challenge. Every case has a stream of its own, whatever else is asked for.
-    size : `tuple` [`int`, `int`], optional
-        Rows and columns of the sensors.
-    options : `SearchOptions`, optional
-        Thresholds of the search.
-    only : sequence of `str`, optional
-        Effects from which to draw.
-    setup : `str`, optional
-        Laboratory set-up.
-    known : sequence of `CaseResult`, optional
-        Results of cases that ran before with the same seed, size, options, effects and set-up; they are not run
-        again.
-    jobs : `int`, optional
-        Cases that run at the same time, each in a process of its own.
-    progress : callable, optional
-        Called with each result that is new.
-    """
+    """Draw cases, each with a stream of its own, search, and judge; ``known`` results are not made again."""
     ready = {(result.kind, result.number): result for result in known}
     wanted = [(kind, number) for number in range(max(counts.values(), default=0)) for kind in CASE_KINDS
               if number < counts.get(kind, 0)]  # fmt: skip
-    work = partial(_run_case, seed=seed, size=size, options=options, only=tuple(only), setup=setup)
+    work = partial(_run_case, seed=seed, size=size, only=tuple(only), setup=setup)
     for result in _results(work, [case for case in wanted if case not in ready], jobs):
         ready[result.kind, result.number] = result
         if progress is not None:
             progress(result)
     results = sorted((ready[case] for case in wanted), key=lambda r: (CASE_KINDS.index(r.kind), r.number))
-    return ChallengeResult(seed, tuple(results), asdict(options or SearchOptions()))
+    return ChallengeResult(seed, tuple(results), asdict(SearchOptions()))
 
 
 def _results(
@@ -98,7 +74,6 @@ def _run_case(
     *,
     seed: int,
     size: tuple[int, int],
-    options: SearchOptions | None,
     only: Sequence[str],
     setup: str,
 ) -> CaseResult:
@@ -107,12 +82,12 @@ def _run_case(
     case = draw_case(kind, streams[0], size=size, only=effects, setup=setup)
     same_blocks = copy.deepcopy(streams[1])
     began = time.process_time()
-    verdict = discover(case.cube, case.setup, rng=streams[1], options=options)
+    verdict = discover(case.cube, case.setup, rng=streams[1])
     seconds = time.process_time() - began
-    return judge(case, verdict, number, seconds, _ask_oracle(case, options, same_blocks))
+    return judge(case, verdict, number, seconds, _ask_oracle(case, same_blocks))
 
 
-def _ask_oracle(case: SealedCase, options: SearchOptions | None, rng: np.random.Generator) -> Oracle | None:
+def _ask_oracle(case: SealedCase, rng: np.random.Generator) -> Oracle | None:
     """What is seen of the effects of a case, and the verdict of a search that is told which can be in.
 
     With the generator of the search it holds out the same blocks: in others the gap is another.
@@ -120,7 +95,7 @@ def _ask_oracle(case: SealedCase, options: SearchOptions | None, rng: np.random.
     known = [effect for effect in EFFECTS if effect.name in case.names]
     if not known:
         return None
-    trusting = replace(options or SearchOptions(), significance=1.0, least_evidence=-math.inf)
+    trusting = replace(SearchOptions(), significance=1.0, least_evidence=-math.inf)
     verdict = discover(case.cube, case.setup, known, rng=rng, options=trusting)
     return Oracle(visibility(case, most_cells=trusting.most_cells), verdict)
 
@@ -169,15 +144,7 @@ def judge(
 
 
 def is_right(names: Sequence[str], verdict: Verdict) -> bool:
-    """Whether a search named all of these effects, each itself or by its class, and nothing else.
-
-    Parameters
-    ----------
-    names : sequence of `str`
-        Effects that are in the data.
-    verdict : `Verdict`
-        What the search found.
-    """
+    """Whether a search named all of these effects, each itself or by its class, and nothing else."""
     classes = [{effect.name, *effect.ambiguous_with} for effect in verdict.effects]
     return verdict.verdict == "named" and any(_matches(order, classes) for order in permutations(names))
 

@@ -196,33 +196,15 @@ OUTSIDERS: Mapping[str, tuple[Callable[..., FloatArray], float, float]] = Mappin
 
 @dataclass(frozen=True, eq=False)
 class SealedCase:
-    """One case: what the search gets, and the truth.
+    """One case: what the search gets, and the truth."""
 
-    Attributes
-    ----------
-    cube : `FringeCube`
-        Flats, masks, stated noise.
-    setup : `str`
-        What the search is told of sensor and light.
-    kind : `str`
-        One of `CASE_KINDS`.
-    names : `tuple` [`str`, ...]
-        Effects that are in, by their name in the catalogue; the name of an outsider.
-    values : `dict`
-        Their sizes by ``name.parameter``.
-    thickness_um : `numpy.ndarray`
-        True thickness [µm].
-    noise_factor : `float`
-        True over stated noise variance.
-    """
-
-    cube: FringeCube
-    setup: str
-    kind: str
-    names: tuple[str, ...]
-    values: dict[str, float]
-    thickness_um: FloatArray
-    noise_factor: float
+    cube: FringeCube  # Flats, masks, stated noise
+    setup: str  # What the search is told of sensor and light
+    kind: str  # One of `CASE_KINDS`
+    names: tuple[str, ...]  # Effects that are in, by their name in the catalogue; the name of an outsider
+    values: dict[str, float]  # Their sizes by ``name.parameter``
+    thickness_um: FloatArray  # True thickness [µm]
+    noise_factor: float  # True over stated noise variance
 
 
 def draw_case(
@@ -233,28 +215,7 @@ def draw_case(
     only: Sequence[str] = (),
     setup: str = "ts8_e2v",
 ) -> SealedCase:
-    """Draw a sensor, its effects and its noise.
-
-    Parameters
-    ----------
-    kind : `str`
-        One of `CASE_KINDS`.
-    rng : `numpy.random.Generator`
-        Decides everything.
-    size : `tuple` [`int`, `int`], optional
-        Rows and columns.
-    only : sequence of `str`, optional
-        Effects of `SIZES` (or of `OUTSIDERS`) from which to draw; all by default.
-    setup : `str`, optional
-        Laboratory set-up.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such kind of case, or no such set-up.
-    InputError
-        It is not illuminated by a monochromator, or another layer than adhesive or silicon varies.
-    """
+    """Draw a sensor, its effects and its noise."""
     if kind not in CASE_KINDS:
         raise UnknownNameError("kind of case", kind, CASE_KINDS)
     optics, _ = setup_optics(setup)
@@ -296,35 +257,7 @@ def expose(
     noise_factor: float = 1.0,
     setup: str = "ts8_e2v",
 ) -> tuple[FringeCube, dict[str, float]]:
-    """Expose one sensor in a run of flats.
-
-    Parameters
-    ----------
-    thickness : `numpy.ndarray`, shape (ny, nx)
-        Thickness of the layer that varies [µm].
-    values : mapping [`str`, `float`]
-        Parameters of hidden effects, by ``effect.parameter``.
-    rng : `numpy.random.Generator`
-        Decides noise, exposures that are lost, bad pixels and the size of an outsider.
-    outsider : `str`, optional
-        Name of a cause of `OUTSIDERS`.
-    noise_factor : `float`, optional
-        True over stated variance.
-    setup : `str`, optional
-        Laboratory set-up.
-
-    Returns
-    -------
-    cube : `FringeCube`
-        Exposures, in electrons.
-    sizes : `dict` [`str`, `float`]
-        Size of the outsider, by ``outsider.size``.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such outsider, effect or set-up.
-    """
+    """Expose one sensor in a run of flats, and the size of the outsider by ``outsider.size``."""
     if outsider and outsider not in OUTSIDERS:
         raise UnknownNameError("outsider", outsider, OUTSIDERS)
     stated, _ = setup_optics(setup)

@@ -181,7 +181,7 @@ def _read(
 ) -> FringeCube | None:
     """Cube of one sensor, or `None` after a dry run."""
     from ..algorithms.flat_prep_options import FlatPrepOptions
-    from .lab_frames import find_series, of_vendor, read_cube
+    from .lab_frames import announced_series, of_vendor, read_cube
 
     if len(paths) == 1 and (Path(paths[0]) / "butler.yaml").is_file():
         stored = _from_repository(paths[0], collections, detector)
@@ -192,13 +192,7 @@ def _read(
         if dry_run:
             click.echo(f"would search {cube.shape[0]} flats of {cube.shape[1]} x {cube.shape[2]} pixels")
         return None if dry_run else cube
-    series = find_series(paths, skip_bad=skip_bad)
-    listed = ", ".join(f"{w:g}" for w in series.wavelengths_nm)
-    click.echo(
-        f"{series.serial or 'sensor'}: {len(series.biases)} bias frames, {len(series.flats)} flats at {listed} nm",
-        err=True,
-    )
-    series.check(setup)
+    series = announced_series(paths, setup, skip_bad=skip_bad)
     if dry_run:
         click.echo(f"would prepare {series.steps} frames and search them")
         return None

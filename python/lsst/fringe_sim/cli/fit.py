@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -10,7 +9,7 @@ import click
 from ..algorithms.thickness_fit_options import CONTRASTS, FIT_METHODS, SILICON_FIELDS, ZONES
 from ..errors import InputError, UnknownNameError
 from .output import OutputFolder, origin_of, output_folder
-from .parameters import EFFECT, LABORATORY, effect_settings, effects_from_option
+from .parameters import LABORATORY, ChosenEffects, model_effects
 from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
@@ -74,9 +73,7 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
     show_default="wavelength",
     help="Contrast of the fringes: a free factor at each wavelength, or one for all, or that of the model.",
 )
-@click.option("--effect", "effects", type=EFFECT, multiple=True, help="Effect in the model; may be repeated.")
-@effects_from_option
-@click.option("--effects-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML.")
+@model_effects()
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
 @click.option("--strict", is_flag=True, help="Exit with 1 where model and flats do not go together.")
 @click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
@@ -90,8 +87,7 @@ def fit(
     zones: str | None,
     illumination_degree: int | None,
     contrast: str | None,
-    effects: tuple[tuple[str, float], ...],
-    effects_file: Path | None,
+    effects: ChosenEffects,
     skip_bad: bool,
     strict: bool,
     dry_run: bool,
@@ -111,12 +107,10 @@ def fit(
     from ..model import LABORATORY_TEMPERATURE, FringeModel
     from ..model.provenance import input_cards
     from ..report.thickness_page import write_thickness_report
-    from .inputs import effect_cards, read_settings
+    from .inputs import effect_cards
     from .lab_frames import read_cube
 
-    settings = dict(read_settings(effects_file)) if effects_file else {}
-    settings.update(effect_settings(effects))
-    model = FringeModel.from_setup(setup, settings)
+    model = FringeModel.from_setup(setup, effects.settings)
     search = None if silicon == "fixed" else SiliconSearch(SILICON_FIELDS[silicon])
     if search is not None and method != "global":
         raise InputError("--silicon", silicon, "fixed with method guo2022")
@@ -143,7 +137,7 @@ def fit(
     folder = out.prepare()
     cards = {
         **effect_cards(model),
-        **input_cards([*used, *([effects_file] if effects_file else [])]),
+        **input_cards([*used, *effects.files]),
         LABORATORY_TEMPERATURE: model.system.temperature_k,
     }
     click.echo("fitting the thickness", err=True)
@@ -157,7 +151,7 @@ def fit(
     of_silicon = silicon_map(fitted, model)
     if of_silicon is not None:
         of_silicon.write_fits(folder / "silicon.fits", about, section=section)
-    origin = origin_of(folder, [*paths, *([effects_file] if effects_file else [])])
+    origin = origin_of(folder, [*paths, *effects.files])
     write_thickness_report(folder, cube, fitted, model, method, section=section, origin=origin)
     low, high = np.percentile(fitted.value[good], [1.0, 99.0])
     click.echo(
@@ -213,15 +207,9 @@ def _prepare(
 ) -> tuple[FringeCube | None, tuple[str, ...]]:
     """The cube, `None` in a dry run, and the files that it is made of."""
     from ..algorithms.flat_prep_options import FlatPrepOptions
-    from .lab_frames import find_series
+    from .lab_frames import announced_series
 
-    series = find_series(paths, skip_bad=skip_bad)
-    found = ", ".join(f"{w:g}" for w in series.wavelengths_nm)
-    click.echo(
-        f"{series.serial or 'sensor'}: {len(series.biases)} bias frames, {len(series.flats)} flats at {found} nm",
-        err=True,
-    )
-    series.check(setup)
+    series = announced_series(paths, setup, skip_bad=skip_bad)
     missing = series.missing_nm(setup)
     if missing:
         listed = ", ".join(f"{w:g}" for w in missing)

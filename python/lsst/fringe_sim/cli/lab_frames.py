@@ -22,10 +22,7 @@ from ..products.plain_flats import PlainImage, refuse_other_sensors, stack_plain
 from ..resources import complete_fits
 from .bad_files import refuse_bad
 
-__all__ = ["LabSeries", "PlainSeries", "find_series", "of_vendor", "read_cube"]
-
-LEAST_SIZE = (16, 64)
-"""Rows and columns below which a frame is no sensor."""
+__all__ = ["LabSeries", "PlainSeries", "announced_series", "find_series", "of_vendor", "read_cube"]
 
 
 class FrameHeader(Protocol):
@@ -172,6 +169,18 @@ def find_series(paths: Sequence[str], *, skip_bad: bool = False) -> LabSeries | 
             bad.append(error)
     refuse_bad([*refused, *bad], skip_bad=skip_bad, others=bool(frames))
     return _raw_series(_each_once(frames), paths)
+
+
+def announced_series(paths: Sequence[str], setup: Setup, *, skip_bad: bool) -> LabSeries | PlainSeries:
+    """What `find_series` finds, named; a set-up of another vendor's sensors is refused."""
+    series = find_series(paths, skip_bad=skip_bad)
+    found = ", ".join(f"{w:g}" for w in series.wavelengths_nm)
+    click.echo(
+        f"{series.serial or 'sensor'}: {len(series.biases)} bias frames, {len(series.flats)} flats at {found} nm",
+        err=True,
+    )
+    series.check(setup)
+    return series
 
 
 def _plain_images(files: Sequence[str]) -> tuple[list[PlainImage], list[FringeSimError]] | None:

@@ -252,8 +252,6 @@ def _keyword(path: Path, keyword: str) -> str:
 
 def latest_date(headers: Sequence[Mapping[str, Any]]) -> str:
     """Date of the last frame, ``YYYY-MM-DDThh:mm:ss``: two runs on the same frames agree to the byte."""
-    import re
-
     dates = [str(header.get("DATE-OBS", header.get("OBSDATE", ""))) for header in headers]
     found = [match[0] for date in dates if (match := re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d", date))]
     return max(found, default="1970-01-01T00:00:00")

@@ -130,13 +130,7 @@ def _check_bounds(effect: Described, name: str, value: float) -> None:
 
 
 def flat_settings(settings: Mapping[str, Any], source: str | None = None) -> dict[str, Any]:
-    """Values by ``name.parameter`` of settings that may be nested.
-
-    Raises
-    ------
-    InputError
-        A setting without a parameter, or one that stands in both forms.
-    """
+    """Values by ``name.parameter`` of settings that may be nested."""
     flat: dict[str, Any] = {}
     try:
         for effect, parameter, value in _flatten(settings):

@@ -35,21 +35,11 @@ SIDE_CELLS = 100
 
 @dataclass(frozen=True)
 class Rings:
-    """A wave in the radius.
+    """A wave in the radius."""
 
-    Attributes
-    ----------
-    centre : `tuple` [`float`, `float`]
-        Row and column of the centre [px].
-    period : `float`
-        Distance of rings [px].
-    amplitude : `complex`
-        Of cosine and sine of the phase, which is 0 in the middle of the sensor.
-    """
-
-    centre: tuple[float, float]
-    period: float
-    amplitude: complex
+    centre: tuple[float, float]  # Row and column of the centre [px]
+    period: float  # Distance of rings [px]
+    amplitude: complex  # Of cosine and sine of the phase, which is 0 in the middle of the sensor
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,49 +50,20 @@ class BeamField:
     What is interpolated is each ray: ``sin²θ`` on the sensor and the squared radius at which the ray meets every
     clear aperture are smooth functions of the field radius, although the beam, with its moving edges and vignetting,
     is not. A polynomial through eight radii gives them to 1e-10, so that the beams are those of a full trace.
-
-    Attributes
-    ----------
-    nodes_deg : `numpy.ndarray`, shape ``(K,)``
-        Traced field radii [deg], Chebyshev points of the field.
-    largest_deg : `float`
-        Largest field radius [deg].
-    sin_squared : `numpy.ndarray`, shape ``(K, N)``
-        ``sin²θ`` of every ray.
-    edge_ray : `numpy.ndarray`, int32, shape ``(E,)``
-        Rays that an aperture cuts off at some field radii, one aperture after the other.
-    edge_squared : `numpy.ndarray`, shape ``(K, E)``
-        Squared radius at which each of them meets that aperture [m²].
-    inner_squared, outer_squared : `numpy.ndarray`, shape ``(E,)``
-        Squared limits of that aperture [m²].
     """
 
-    nodes_deg: FloatArray
-    largest_deg: float
-    sin_squared: FloatArray
+    nodes_deg: FloatArray  # (K,): traced field radii [deg], Chebyshev points of the field
+    largest_deg: float  # Largest field radius [deg]
+    sin_squared: FloatArray  # (K, N): ``sin²θ`` of every ray
+    # (E,): rays that an aperture cuts off at some field radii, one aperture after the other
     edge_ray: NDArray[np.int32]
-    edge_squared: FloatArray
-    inner_squared: FloatArray
+    edge_squared: FloatArray  # (K, E): squared radius at which each of them meets that aperture [m²]
+    inner_squared: FloatArray  # (E,): squared limits of that aperture [m²]
     outer_squared: FloatArray
 
     @classmethod
     def trace(cls, telescope: Telescope, nodes: int = TRACED_RADII) -> BeamField:
-        """Trace a telescope at a few radii of its field.
-
-        Parameters
-        ----------
-        telescope : `Telescope`
-            An axisymmetric, traced telescope.
-        nodes : `int`, optional
-            Number of radii, five or more.
-
-        Raises
-        ------
-        InputError
-            The telescope is not axisymmetric, or is a mere cone; ask it for the beam of every position instead.
-        OutOfRangeError
-            Too few radii.
-        """
+        """Trace an axisymmetric telescope at a few radii of its field, five or more."""
         if nodes < _FEWEST_RADII:
             raise OutOfRangeError("number of traced radii", nodes, f"{_FEWEST_RADII} or more")
         optics = telescope.optics
@@ -123,13 +94,7 @@ class BeamField:
 
     @named_units
     def sin_squared_at(self, field_x_deg: float, field_y_deg: float = 0.0) -> tuple[FloatArray, float]:
-        """``sin²θ`` of the rays that arrive at a field position, and the unvignetted share of the pupil.
-
-        Raises
-        ------
-        OutOfRangeError
-            The position lies outside the field, or no light arrives.
-        """
+        """``sin²θ`` of the rays that arrive at a field position, and the unvignetted share of the pupil."""
         radius = math.hypot(field_x_deg, field_y_deg)
         if not radius <= self.largest_deg:
             raise OutOfRangeError("field angle [deg]", radius, f"0 to {self.largest_deg:g}")

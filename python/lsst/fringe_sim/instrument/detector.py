@@ -20,65 +20,33 @@ __all__ = ["Amplifier", "Detector", "RawSegment", "refuse_misfits"]
 
 @dataclasses.dataclass(frozen=True)
 class RawSegment:
-    """Where the pixels of one amplifier stand in its raw image, read-out order.
+    """Where the pixels of one amplifier stand in its raw image, read-out order."""
 
-    Attributes
-    ----------
-    hdu : `int`
-        Number of the FITS HDU; 0 is the primary header.
-    extname : `str`
-        Name of the HDU, ``Segment10``.
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of the raw image.
-    data_y0, data_x0 : `int`
-        First imaging row and column, counted from 0. Columns before ``data_x0`` are serial prescan; columns
-        right of the imaging section are serial overscan, rows above it parallel overscan.
-    """
-
-    hdu: int
-    extname: str
-    shape: tuple[int, int]
+    hdu: int  # Number of the FITS HDU; 0 is the primary header
+    extname: str  # ``Segment10``
+    shape: tuple[int, int]  # Rows and columns of the raw image
+    # First imaging row and column, counted from 0. Columns before ``data_x0`` are serial prescan; columns
+    # right of the imaging section are serial overscan, rows above it parallel overscan
     data_y0: int
     data_x0: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Amplifier:
-    """One output of a CCD.
+    """One output of a CCD."""
 
-    Attributes
-    ----------
-    name : `str`
-        Name, ``C00`` … ``C17`` for LSST sensors.
-    channel : `int`
-        Number, from 1, in the order of the raw file.
-    y0, x0 : `int`
-        Lower-left pixel of the amplifier in the assembled, trimmed CCD.
-    height, width : `int`
-        Imaging rows and columns.
-    flip_y, flip_x : `bool`
-        Whether the raw image is reversed along that axis when the CCD is assembled.
-    gain : `float`
-        Gain, electrons per ADU.
-    read_noise : `float`
-        Read noise, electrons rms.
-    saturation : `float`
-        Saturation level, ADU above bias.
-    raw : `RawSegment` or `None`
-        Layout of the raw image; `None` for cameras whose raw files are not in the LSST layout.
-    """
-
-    name: str
-    channel: int
-    y0: int
+    name: str  # ``C00`` … ``C17`` for LSST sensors
+    channel: int  # Number, from 1, in the order of the raw file
+    y0: int  # Lower-left pixel of the amplifier in the assembled, trimmed CCD
     x0: int
-    height: int
+    height: int  # Imaging rows and columns
     width: int
-    flip_y: bool
+    flip_y: bool  # Whether the raw image is reversed along that axis when the CCD is assembled
     flip_x: bool
-    gain: float
-    read_noise: float
-    saturation: float
+    gain: float  # Electrons per ADU
+    read_noise: float  # Electrons rms
+    saturation: float  # ADU above bias
+    # Layout of the raw image; `None` for cameras whose raw files are not in the LSST layout
     raw: RawSegment | None = None
 
     @property
@@ -90,52 +58,24 @@ class Amplifier:
 @named_units
 @dataclasses.dataclass(frozen=True, repr=False)
 class Detector(OneLine):
-    """One sensor.
+    """One sensor."""
 
-    Attributes
-    ----------
-    id : `int`
-        Number within the camera.
-    name : `str`
-        ``R11_S01`` in LSSTCam, ``RTM-020_S01`` on TS8.
-    raft, slot : `str`
-        The two parts of the name.
-    vendor : `str`
-        ``e2v``, ``ITL`` or ``Hamamatsu``.
-    kind : `str`
-        ``science``, ``guider`` or ``wavefront``.
-    serial, raft_serial : `str`
-        Serial numbers of the sensor and of its raft; empty where not known.
-    x_mm, y_mm : `float`
-        Centre of the sensor in the focal plane, mm.
-    field_x_deg, field_y_deg : `float`
-        Field angle of the centre, degrees; nan on a test stand, which has no telescope.
-    yaw_deg : `float`
-        Rotation of the sensor in the focal plane, degrees.
-    pixel_um : `float`
-        Pixel pitch, µm.
-    amplifiers : `tuple` [`Amplifier`, ...]
-        Outputs, in the order of the raw file.
-    readout_source : `str`
-        Where gains and read noises come from.
-    """
-
-    id: int
-    name: str
-    raft: str
+    id: int  # Number within the camera
+    name: str  # ``R11_S01`` in LSSTCam, ``RTM-020_S01`` on TS8
+    raft: str  # The two parts of the name
     slot: str
-    vendor: str
-    kind: str
-    serial: str
+    vendor: str  # ``e2v``, ``ITL`` or ``Hamamatsu``
+    kind: str  # ``science``, ``guider`` or ``wavefront``
+    serial: str  # Serial numbers of the sensor and of its raft; empty where not known
     raft_serial: str
-    x_mm: float
+    x_mm: float  # Centre of the sensor in the focal plane, mm
     y_mm: float
-    field_x_deg: float
+    field_x_deg: float  # Field angle of the centre, degrees; nan on a test stand, which has no telescope
     field_y_deg: float
-    yaw_deg: float
-    pixel_um: float
-    amplifiers: tuple[Amplifier, ...]
-    readout_source: str
+    yaw_deg: float  # Rotation of the sensor in the focal plane, degrees
+    pixel_um: float  # Pixel pitch, µm
+    amplifiers: tuple[Amplifier, ...]  # Outputs, in the order of the raw file
+    readout_source: str  # Where gains and read noises come from
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -166,13 +106,7 @@ class Detector(OneLine):
         return math.hypot(self.field_x_deg, self.field_y_deg)
 
     def amplifier(self, name: str) -> Amplifier:
-        """Return one amplifier by name.
-
-        Raises
-        ------
-        UnknownNameError
-            The sensor has no such amplifier.
-        """
+        """Return one amplifier by name."""
         for amp in self.amplifiers:
             if amp.name == name:
                 return amp
@@ -183,16 +117,6 @@ class Detector(OneLine):
 
         Names, order, gains, flips and the widths of prescan and overscan stay; what changes is the number of
         imaging rows and columns.
-
-        Parameters
-        ----------
-        shape : `tuple` [`int`, `int`]
-            Rows and columns of the assembled CCD; divisible by the rows and columns of amplifiers.
-
-        Raises
-        ------
-        InputError
-            The size cannot be divided evenly among the amplifiers.
         """
         first_x, first_y = (sorted({getattr(amp, at) for amp in self.amplifiers}) for at in ("x0", "y0"))
         n_rows, n_columns = len(first_y), len(first_x)
@@ -213,13 +137,7 @@ class Detector(OneLine):
 
 
 def refuse_misfits(amplifiers: Sequence[Amplifier]) -> None:
-    """Refuse amplifiers that do not share the pixels of a rectangle among them.
-
-    Raises
-    ------
-    InputError
-        Two have one name or one pixel, or a pixel of the smallest sensor that holds them all has none.
-    """
+    """Refuse amplifiers that do not share the pixels of a rectangle among them."""
     if not amplifiers:
         raise InputError("amplifiers", "none", "one amplifier or more")
     for one in amplifiers:

@@ -56,15 +56,7 @@ class FlatSpectrum:
     @classmethod
     @named_units
     def gaussian(cls, mean_nm: float, fwhm_nm: float, share: float = 1.0) -> FlatSpectrum:
-        """A lamp, LED or laser with a Gaussian line.
-
-        Parameters
-        ----------
-        mean_nm, fwhm_nm : `float`
-            Mean and full width at half maximum [nm]; data sheets of LEDs state both.
-        share : `float`, optional
-            Part of the light that is the lamp's.
-        """
+        """A lamp, LED or laser with a Gaussian line; ``share`` is its part of the light."""
         if not (100.0 < mean_nm < 3000.0 and 0.0 < fwhm_nm < 1000.0):
             allowed = "mean from 100 to 3000, width from 0 to 1000, exclusive"
             raise OutOfRangeError("mean and width of the flat field [nm]", (mean_nm, fwhm_nm), allowed)
@@ -74,19 +66,7 @@ class FlatSpectrum:
 
     @classmethod
     def from_name(cls, name: str) -> FlatSpectrum:
-        """Spectrum by name.
-
-        Parameters
-        ----------
-        name : `str`
-            ``white``, ``gaussian:MEAN:FWHM`` [nm], or a file in ECSV with columns ``wavelength`` [nm] and
-            ``photons``.
-
-        Raises
-        ------
-        InputError
-            None of these.
-        """
+        """``white``, ``gaussian:MEAN:FWHM`` [nm], or an ECSV table of ``wavelength`` [nm] and ``photons``."""
         if name == "white":
             return cls()
         if name.startswith("gaussian:"):
@@ -107,13 +87,7 @@ class FlatSpectrum:
         return cls(Path(name).name, wave, photons, 1.0)
 
     def component(self, bandpass: Bandpass) -> SpectralComponent:
-        """The light behind the filter, 1 in all.
-
-        Raises
-        ------
-        InputError
-            The filter lets nothing of the lamp through.
-        """
+        """The light behind the filter, 1 in all."""
         low, high = bandpass.support()
         wave, photons = [], []
         if self.share < 1.0:

@@ -21,24 +21,13 @@ READERS = ("fit, discover", "ingest", "Tasks")
 
 @dataclasses.dataclass(frozen=True)
 class HeaderKeyword:
-    """A keyword, and what becomes of it.
+    """A keyword, and what becomes of it."""
 
-    Attributes
-    ----------
-    name : `str`
-        The keyword, without HIERARCH; ``n`` stands for a number.
-    place : `str`
-        HDU of a raw frame.
-    treatment : mapping of `str` to `str`
-        By reader: used, checked or refused. A reader that is not named does not depend on it.
-    what : `str`
-        What it decides, or what is allowed.
-    """
-
-    name: str
-    place: str
+    name: str  # The keyword, without HIERARCH; ``n`` stands for a number
+    place: str  # HDU of a raw frame
+    # By reader: used, checked or refused. A reader that is not named does not depend on it
     treatment: Mapping[str, str]
-    what: str
+    what: str  # What it decides, or what is allowed
 
 
 _LETTERS = {"u": USED, "c": CHECKED, "r": REFUSED}

@@ -21,7 +21,7 @@ E2V_SHAPE = (4004, 4096)
 """Rows and columns of an assembled, trimmed E2V-CCD250."""
 
 Sampling = Literal["resample", "window"]
-"""How a large map becomes a small one: the whole of it on fewer pixels, or a part of it pixel by pixel."""
+"""How a large map becomes a small one: the whole of it on fewer pixels, or the pixels from a ``corner`` on."""
 
 
 def e2v_321(
@@ -34,25 +34,6 @@ def e2v_321(
 
     A bicubic spline of 24 × 24 coefficients. It differs from the published map by 9.5 nm rms, which is the
     quantisation of that map. Range 14.03 to 22.01 µm.
-
-    Parameters
-    ----------
-    shape : `tuple` [`int`, `int`], optional
-        Rows and columns wanted.
-    sampling : `str`, optional
-        ``"resample"`` spreads the whole sensor over ``shape``; ``"window"`` takes the pixels from ``corner`` on.
-    corner : `tuple` [`int`, `int`], optional
-        First row and column of the window on the full sensor.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, ``shape``
-        Thickness [µm].
-
-    Raises
-    ------
-    InputError
-        The window reaches over the edge of the sensor, or the shape is not positive.
     """
     table = read_table("laboratory", "thickness_e2v_321.ecsv")
     count, degree = int(table.meta["coefficients_per_axis"]), int(table.meta["degree"])
@@ -73,27 +54,7 @@ def fit_to_sensor(
     sampling: Sampling = "resample",
     corner: tuple[int, int] = (0, 0),
 ) -> NDArray[np.float64]:
-    """Bring any map to the shape of a sensor.
-
-    Parameters
-    ----------
-    thickness_um : `numpy.ndarray`, (rows, columns)
-        Thickness [µm].
-    shape : `tuple` [`int`, `int`]
-        Rows and columns wanted.
-    sampling, corner
-        As for `e2v_321`. Resampling is bicubic, from pixel centres to pixel centres.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, ``shape``
-        Thickness [µm].
-
-    Raises
-    ------
-    InputError
-        The map is not two-dimensional, or the window reaches over its edge.
-    """
+    """Bring any map to the shape of a sensor; resampling is bicubic, from pixel centres to pixel centres."""
     thickness = np.asarray(thickness_um, dtype=float)
     if thickness.ndim != 2:
         raise InputError("thickness map dimensions", thickness.ndim, "2")

@@ -44,22 +44,7 @@ MOST_DAYS = 1
 
 
 def refuse_other_instrument(text: Mapping[str, str], camera: str, source: str) -> None:
-    """Refuse frames of another camera that calls itself by the same name, and those of other simulators.
-
-    Parameters
-    ----------
-    text : mapping
-        ``OBSID``, ``CAMCODE``, ``TESTTYPE``, ``CREATOR`` and ``CONTRLLR``, empty where the header has none.
-    camera : `str`
-        What the frame is taken for.
-    source : `str`
-        File, for the message.
-
-    Raises
-    ------
-    FrameFormatError
-        It is something else.
-    """
+    """Refuse frames of another camera that calls itself by the same name, and those of other simulators."""
     match = re.fullmatch(r"([A-Z]{2})_[A-Z]_\d{8}_\d+", text["OBSID"])
     wanted = OBSERVATION_PREFIX.get(camera)
     if match and wanted and match.group(1) != wanted:
@@ -77,13 +62,7 @@ def refuse_other_instrument(text: Mapping[str, str], camera: str, source: str) -
 
 
 def refuse_other_day(stated: int, begin: datetime.datetime, derived: int, source: str) -> None:
-    """Refuse a ``DAYOBS`` that is not the day of the exposure.
-
-    Raises
-    ------
-    FrameFormatError
-        More than a day lies between them.
-    """
+    """Refuse a ``DAYOBS`` that is not the day of the exposure."""
     days = [datetime.datetime.strptime(str(day), "%Y%m%d") for day in (stated, derived)]
     if abs((days[0] - days[1]).days) > MOST_DAYS:
         allowed = f"{derived} or a day from it: the exposure began {begin.isoformat(timespec='seconds')}"
@@ -91,50 +70,26 @@ def refuse_other_day(stated: int, begin: datetime.datetime, derived: int, source
 
 
 def refuse_binning(header: Mapping[str, Any], source: str) -> None:
-    """Refuse ``BINX`` and ``BINY`` other than 1.
-
-    Raises
-    ------
-    FrameFormatError
-        Pixels are binned.
-    """
+    """Refuse ``BINX`` and ``BINY`` other than 1."""
     for keyword in ("BINX", "BINY"):
         if header[keyword] not in (None, 1):
             raise FrameFormatError(keyword, header[keyword], "1: pixels that are not binned", source=source)
 
 
 def refuse_other_unit(unit: Any, where: str, source: str) -> None:
-    """Refuse a ``BUNIT`` that is not that of numbers of the converter.
-
-    Raises
-    ------
-    FrameFormatError
-        It is another one.
-    """
+    """Refuse a ``BUNIT`` that is not that of numbers of the converter."""
     if str(unit or "").strip().lower() not in COUNTS:
         raise FrameFormatError(f"{where}BUNIT", unit, "adu", source=source)
 
 
 def refuse_stutter(rows: Any, observation_type: str, source: str) -> None:
-    """Refuse charge that was moved during an exposure which does not say so.
-
-    Raises
-    ------
-    FrameFormatError
-        ``STUTTER ROWS`` is more than 0 and the type is not stuttered.
-    """
+    """Refuse charge that was moved during an exposure which does not say so."""
     if rows not in (None, 0) and observation_type != "stuttered":
         raise FrameFormatError("STUTTER ROWS", rows, f"0 in a {observation_type} frame", source=source)
 
 
 def refuse_no_flat(test_type: str, exposure_time_s: float, source: str) -> None:
-    """Refuse a monochromatic flat of a test that takes none, and one without light.
-
-    Raises
-    ------
-    FrameFormatError
-        ``TESTTYPE`` is one of `WITHOUT_FLATS`, or the shutter was never open.
-    """
+    """Refuse a monochromatic flat of a test that takes none, and one without light."""
     if test_type.upper() in WITHOUT_FLATS:
         allowed = f"a test with flats in it, as IMGTYPE says that this is one; {test_type} takes none"
         raise FrameFormatError("TESTTYPE", test_type, allowed, source=source)
@@ -146,11 +101,6 @@ def refuse_other_sensor(table: Camera, place: str, serial: str, source: str) -> 
     """Refuse a serial number that the table of the camera has at another place.
 
     One that it does not have is no contradiction: early frames of the LSST Camera are of other sensors.
-
-    Raises
-    ------
-    FrameFormatError
-        Place and serial number are two sensors of the camera.
     """
     try:
         at_place, of_serial = table.detector(place), table.detector(serial)
@@ -164,24 +114,7 @@ def refuse_other_sensor(table: Camera, place: str, serial: str, source: str) -> 
 def refuse_other_vendor(
     maker: Any, model: Any, sensor: Detector, shape: tuple[int, int], source: str
 ) -> None:
-    """Refuse a sensor of one vendor in a place where the table has one of the other.
-
-    Parameters
-    ----------
-    maker, model : `object`
-        ``CCD_MANU`` and ``CCD_TYPE``, `None` if absent.
-    sensor : `Detector`
-        What the table has there.
-    shape : `tuple` [`int`, `int`]
-        Rows and columns of the frame; a cut-down sensor has no size of its own.
-    source : `str`
-        File, for the message.
-
-    Raises
-    ------
-    FrameFormatError
-        The vendors differ.
-    """
+    """Refuse a sensor of one vendor in a place where the table has one of the other."""
     vendor = sensor.vendor.lower()
     stated = str(maker).strip().lower()
     where = f"of {sensor.name}, {sensor.vendor}"

@@ -24,20 +24,10 @@ _LIKE_FITS = re.compile(r"[^.].*\.(fits|fit|fts)(\.(gz|fz|bz2|xz|zip|z))?", re.I
 
 
 def find_raw_files(paths: Iterable[str]) -> tuple[list[str], list[InputError]]:
-    """Find the files that are meant.
+    """Find the files that are meant by files, directories (with everything below them) and patterns.
 
-    Parameters
-    ----------
-    paths : iterable of `str`
-        Files, directories (searched with everything below them) and patterns with ``*``, ``?`` and ``[]``.
-
-    Returns
-    -------
-    files : `list` [`str`]
-        Absolute paths, sorted, each once.
-    refused : `list` [`InputError`]
-        One for each path that leads to no file, and for each file of a directory that is named like a FITS
-        file, but not as those that are taken from one.
+    Absolute paths, sorted, each once; and an error for each path that leads to no file, and for each file of a
+    directory that is named like a FITS file, but not as those that are taken from one.
     """
     files: set[str] = set()
     refused: list[InputError] = []

@@ -24,7 +24,7 @@ from .camera import Camera
 from .header_keywords import is_unknown
 from .raw_checks import refuse_binning, refuse_other_unit, refuse_other_vendor
 from .raw_header import header_value
-from .raw_layout import N_AMPLIFIERS, Section, amplifier_layouts, image_shape
+from .raw_layout import N_AMPLIFIERS, AmplifierLayout, Section, amplifier_layouts, image_shape
 from .raw_metadata import OBSERVATION_TYPES, RawMetadata
 from .stated_facts import NO_READING_C, refuse_contradictions
 
@@ -44,44 +44,16 @@ MOST_SHOWN = 12
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class RawAmplifier:
-    """One amplifier of a raw frame, and where its pixels belong.
+class RawAmplifier(AmplifierLayout):
+    """One amplifier of a raw frame, and where its pixels belong; see `AmplifierLayout`.
 
     Attributes
     ----------
-    name : `str`
-        ``C00`` … ``C17``.
-    channel : `int`
-        Number, from 1, in the order of the file.
-    hdu : `int`
-        Number of the FITS HDU.
     data : `numpy.ndarray` [y, x]
         The whole raw image, ADU, integer, in read-out order: prescan, imaging section and overscan.
-    datasec, detsec : `Section`
-        ``DATASEC`` and ``DETSEC`` as the header has them.
-    imaging, serial_prescan, serial_overscan, parallel_overscan : `tuple` [`slice`, `slice`]
-        Regions of ``data``. Serial prescan lies left of the imaging section, serial overscan right of it, both
-        over the imaging rows; parallel overscan lies above it over the imaging columns. A region that the frame
-        does not have is empty.
-    destination : `tuple` [`slice`, `slice`]
-        Where the imaging section belongs in the assembled CCD, after the flips.
-    flip_y, flip_x : `bool`
-        Whether the imaging section is reversed along that axis when the CCD is assembled.
     """
 
-    name: str
-    channel: int
-    hdu: int
     data: npt.NDArray[np.integer[Any]]
-    datasec: Section
-    detsec: Section
-    imaging: tuple[slice, slice]
-    serial_prescan: tuple[slice, slice]
-    serial_overscan: tuple[slice, slice]
-    parallel_overscan: tuple[slice, slice]
-    destination: tuple[slice, slice]
-    flip_y: bool
-    flip_x: bool
 
     def oriented(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return an image of the imaging section as it lies in the assembled CCD.

@@ -22,13 +22,6 @@ def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[st
     """Value of a keyword; `None` if it is absent, undefined or blank.
 
     ``declared``: those that may be asked for; by default those of raw frames.
-
-    Raises
-    ------
-    FrameFormatError
-        The card is not FITS (other cards of the header may be), or there are several with different values.
-    LookupError
-        The keyword is not declared: a fault of the program.
     """
     if keyword not in (_DECLARED if declared is None else declared):
         raise LookupError(f"{keyword} is not declared")
@@ -41,10 +34,6 @@ def header_value(header: Mapping[str, Any], keyword: str, declared: frozenset[st
     if isinstance(value, fits.card.Undefined) or (isinstance(value, str) and not value.strip()):
         return None
     return value.strip() if isinstance(value, str) else value
-
-
-def _is_no_time(seconds: float) -> bool:
-    return 0.0 <= seconds <= SAME_SECONDS
 
 
 def _differ(values: Sequence[Any]) -> bool:
@@ -60,23 +49,12 @@ def _refuse_different(header: fits.Header, keyword: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class DeclaredHeader:
-    """Header of a file, asked for values of a certain kind.
-
-    Attributes
-    ----------
-    cards : mapping
-        The header.
-    source : `str`
-        The file.
-    declared : `frozenset` [`str`], optional
-        Keywords that may be asked for; by default those of raw frames.
-    others : `tuple` of mappings
-        Headers of other HDUs, which may state a keyword too, but not differently.
-    """
+    """Header of a file, asked for values of a certain kind."""
 
     cards: Mapping[str, Any]
     source: str
-    declared: frozenset[str] | None = None
+    declared: frozenset[str] | None = None  # Keywords that may be asked for; by default those of raw frames
+    # Headers of other HDUs, which may state a keyword too, but not differently
     others: tuple[Mapping[str, Any], ...] = ()
 
     def value(self, keyword: str) -> Any:
@@ -108,7 +86,8 @@ class DeclaredHeader:
     def seconds_of_light(self, keyword: str, value: Any, kind: str) -> float:
         """An exposure time [s]; 0 of a bias, as in all seven headers of biases that obs_lsst has."""
         if kind == "bias":
-            return self.number(keyword, value, "0 s for a bias, which sees no light", _is_no_time)
+            allowed = "0 s for a bias, which sees no light"
+            return self.number(keyword, value, allowed, lambda s: 0.0 <= s <= SAME_SECONDS)
         return self.number(keyword, value, "seconds, 0 or more", lambda s: s >= 0)
 
     def refuse(self, keyword: str, value: Any, allowed: str) -> FrameFormatError:

@@ -35,13 +35,7 @@ class Section:
 
     @classmethod
     def parse(cls, text: object, *, keyword: str = "section", source: str | None = None) -> Section:
-        """Read a section from a header value.
-
-        Raises
-        ------
-        FrameFormatError
-            The value is not ``[x1:x2,y1:y2]`` with integers from 1 on.
-        """
+        """Read a section from a header value."""
         match = _SECTION.fullmatch(text) if isinstance(text, str) else None
         bounds = [int(group) for group in match.groups()] if match else []
         if not bounds or min(bounds) < 1:
@@ -86,19 +80,23 @@ _SECTION = re.compile(r"\s*\[\s*(\d{1,9})\s*:\s*(\d{1,9})\s*,\s*(\d{1,9})\s*:\s*
 
 @dataclasses.dataclass(frozen=True)
 class AmplifierLayout:
-    """Everything of a `RawAmplifier` but its pixels."""
+    """Everything of a `RawAmplifier` but its pixels.
 
-    name: str
-    channel: int
-    hdu: int
-    datasec: Section
+    Serial prescan lies left of the imaging section, serial overscan right of it, both over the imaging rows; parallel
+    overscan lies above it over the imaging columns. A region that the frame does not have is empty.
+    """
+
+    name: str  # ``C00`` … ``C17``
+    channel: int  # from 1, in the order of the file
+    hdu: int  # number of the FITS HDU
+    datasec: Section  # as the header has it
     detsec: Section
-    imaging: tuple[slice, slice]
+    imaging: tuple[slice, slice]  # region of the raw image, as the following ones
     serial_prescan: tuple[slice, slice]
     serial_overscan: tuple[slice, slice]
     parallel_overscan: tuple[slice, slice]
-    destination: tuple[slice, slice]
-    flip_y: bool
+    destination: tuple[slice, slice]  # of the imaging section in the assembled CCD, after the flips
+    flip_y: bool  # whether the imaging section is reversed when the CCD is assembled
     flip_x: bool
 
 

@@ -60,13 +60,7 @@ class Fact:
     meaning: Callable[[Any], Any] = lambda value: value
 
     def refuse_different(self, statements: Iterable[Statement], source: str) -> None:
-        """Refuse statements that are not all the same; those without a value say nothing.
-
-        Raises
-        ------
-        FrameFormatError
-            Two differ, or one that should be a number is none.
-        """
+        """Refuse statements that are not all the same; those without a value say nothing."""
         stated = [(said, value) for said, value in statements if value is not None]
         if len(stated) < 2:  # whoever uses it says what is wrong with it
             return
@@ -145,24 +139,7 @@ def refuse_contradictions(
     source: str,
     facts: Sequence[Fact] = RAW_FACTS,
 ) -> None:
-    """Compare all that headers of one file say of each fact.
-
-    Parameters
-    ----------
-    headers : sequence of `tuple`
-        Name of each HDU, empty for the first, and its header.
-    value : callable
-        Value of a keyword of a header, `None` where there is none.
-    source : `str`
-        The file, for messages.
-    facts : sequence of `Fact`
-        What is compared.
-
-    Raises
-    ------
-    FrameFormatError
-        Two statements of one fact differ; file, both keywords and values are named.
-    """
+    """Compare all that headers of one file say of each fact."""
     for fact in facts:
         statements = [
             (f"{keyword} of {name}" if name else keyword, found)
@@ -201,13 +178,7 @@ def _passed(name: str) -> tuple[float, float] | None:
 
 
 def refuse_other_filter(name: str, wavelength_nm: float | None, source: str) -> None:
-    """Refuse a monochromatic flat whose light its filter would not have passed.
-
-    Raises
-    ------
-    FrameFormatError
-        The wavelength lies outside of the filter.
-    """
+    """Refuse a monochromatic flat whose light its filter would not have passed."""
     passed = _passed(name)
     if passed is None or wavelength_nm is None or passed[0] <= wavelength_nm <= passed[1]:
         return

@@ -67,7 +67,7 @@ def adopt_datasets(
         raise UnknownNameError("instrument", instrument, by_name)
     kind = _dataset_type(butler, dataset_type)
     found = _find(butler, kind, collections, where)
-    homes = _homes(by_name[instrument])
+    homes = {each.serial: each for each in by_name[instrument].camera().detectors if each.serial}
     wanted: list[tuple[DatasetRef, DatasetRef]] = []
     present: list[DatasetRef] = []
     homeless: list[str] = []
@@ -117,10 +117,6 @@ def _find(butler: Butler, kind: DatasetType, collections: Sequence[str], where: 
         return sorted(set(refs))
     except (ButlerUserError, LookupError) as error:
         raise InputError("collections and condition", (*collections, where), str(error)) from error
-
-
-def _homes(cls: type[FringeInstrument]) -> dict[str, Detector]:
-    return {detector.serial: detector for detector in cls.camera().detectors if detector.serial}
 
 
 def _sensor(data_id: DataCoordinate, by_name: Mapping[str, type[FringeInstrument]]) -> Detector | None:

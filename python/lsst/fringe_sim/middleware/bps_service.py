@@ -37,29 +37,12 @@ class FringeParslService(ParslService):
         super().__init__(config)
 
     def submit(self, workflow: Any, **kwargs: Any) -> None:
-        """Run the workflow to its end.
-
-        Raises
-        ------
-        click.ClickException
-            Jobs failed. What the others made is in the repository.
-        """
+        """Run the workflow to its end."""
         super().submit(workflow, **kwargs)
         _complain_of_failures(workflow)
 
     def restart(self, out_prefix: str) -> tuple[str, str, str]:
-        """Run what is left of a workflow that was interrupted, or of which jobs failed.
-
-        Parameters
-        ----------
-        out_prefix : `str`
-            The submit directory of the workflow.
-
-        Raises
-        ------
-        click.ClickException
-            Jobs failed again.
-        """
+        """Run what is left of a workflow, by its submit directory, that was interrupted or of which jobs failed."""
         workflow = ParslWorkflow.read(out_prefix)
         workflow.restart()
         workflow.run()

@@ -99,8 +99,6 @@ def isr_override(filters: Sequence[str]) -> str:
 
     ``filters``: physical filters to be corrected; ip_isr corrects none unless it is told.
 
-    Notes
-    -----
     The default statistic of an aperture is the median, which is another function of the fringe for a template without
     noise than for a noisy exposure; with it the scales of such templates were several times too large. Means agree.
     """

@@ -51,26 +51,12 @@ COMPARED_BLOCKS, COMPARED_BYTES = 64, 8192
 
 @dataclasses.dataclass(frozen=True)
 class RawExposure:
-    """One raw file that can be ingested.
-
-    Attributes
-    ----------
-    path : `str`
-        The file.
-    info : `astro_metadata_translator.ObservationInfo`
-        What its header says.
-    instrument : `str`
-        Name of the instrument.
-    notes : `tuple` [`str`, ...]
-        What was taken for granted because the header does not state it.
-    data_id : `dict`
-        Its instrument, exposure and detector.
-    """
+    """One raw file that can be ingested."""
 
     path: str
-    info: ObservationInfo
+    info: ObservationInfo  # What its header says
     instrument: str
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # What was taken for granted because the header does not state it
 
     @property
     def data_id(self) -> dict[str, Any]:

@@ -106,13 +106,38 @@ def added_silicon(shape: tuple[int, int], active: Iterable[ActiveHiddenEffect]) 
 # Optics ---------------------------------------------------------------------------------------------------
 
 
+def _named(values: Values, fields: Mapping[str, str]) -> dict[str, Any]:
+    """Parameters by the fields that they are."""
+    return {field: values[name] for field, name in fields.items()}
+
+
+def _sets(**fields: str) -> Callable[[FlatFieldOptics, Values], FlatFieldOptics]:
+    """The effect that replaces fields of the optics by its parameters."""
+    return lambda optics, values: replace(optics, **_named(values, fields))
+
+
+def _adds(**fields: str) -> Callable[..., Any]:
+    """The effect that adds its parameters to fields of the optics or of an amplifier."""
+    return lambda state, values, *_: replace(
+        state, **{field: getattr(state, field) + more for field, more in _named(values, fields).items()}
+    )
+
+
+def _changes(film: str, **fields: str) -> Callable[[FlatFieldOptics, Values], FlatFieldOptics]:
+    """The effect whose parameters are what one film is changed by."""
+    return lambda optics, values: optics.with_film(film, **_named(values, fields))
+
+
+def _other_line(shape: str) -> Callable[[FlatFieldOptics, Values], FlatFieldOptics]:
+    """The effect that gives a part of the light to a line of another shape."""
+    return lambda optics, values: replace(
+        optics, other_lines=(*optics.other_lines, (shape, values["fraction"]))
+    )
+
+
 def _bandwidth(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     fwhm = values["fwhm"]
     return optics if math.isnan(fwhm) else replace(optics, bandwidth_fwhm_nm=fwhm)
-
-
-def _wavelength_offset(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return replace(optics, wavelength_offset_nm=optics.wavelength_offset_nm + values["offset"])
 
 
 def _wavelength_jitter(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
@@ -124,21 +149,9 @@ def _wavelength_jitter(optics: FlatFieldOptics, values: Values) -> FlatFieldOpti
     )
 
 
-def _wavelength_scale(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return replace(optics, wavelength_stretch=optics.wavelength_stretch + values["stretch"])
-
-
 def _temperature(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     kelvin = values["kelvin"]
     return optics if math.isnan(kelvin) else replace(optics, temperature_k=kelvin)
-
-
-def _epoxy_index(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return optics.with_film("adhesive", index_shift=values["offset"], cauchy_um2=values["cauchy"])
-
-
-def _epoxy_absorption(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return optics.with_film("adhesive", extinction_shift=values["k"])
 
 
 def _silicon_absorption(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
@@ -153,10 +166,6 @@ def _ar_coating(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
         film = optics.films[optics.position(name)]
         optics = optics.with_film(name, thickness_um=film.thickness_um * values["scale"])
     return optics
-
-
-def _support_index(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return optics.with_film("support", index_shift=values["offset"])
 
 
 def _thicker_film(name: str) -> Callable[[FlatFieldOptics, Values], FlatFieldOptics]:
@@ -192,18 +201,6 @@ def _inserted(optics: FlatFieldOptics, film: Film, before: str) -> FlatFieldOpti
     return replace(optics, films=(*optics.films[:place], film, *optics.films[place:]))
 
 
-def _support_coherence(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return replace(optics, support_spread_um=values["spread"])
-
-
-def _line_wing(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return replace(optics, other_lines=(*optics.other_lines, ("lorentzian", values["fraction"])))
-
-
-def _line_triangle(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return replace(optics, other_lines=(*optics.other_lines, ("triangular", values["fraction"])))
-
-
 def _lamp_lines(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     table = read_table("laboratory", "xenon_lines.ecsv")
     xenon = {float(row["wavelength"]): float(row["intensity"]) for row in table}
@@ -214,14 +211,6 @@ def _lamp_lines(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
 
 def _tilt(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
     return replace(optics, theta=tuple(theta + math.radians(values["angle"]) for theta in optics.theta))
-
-
-def _roughness(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return replace(optics, rough_face="support", roughness_nm=values["sigma"])
-
-
-def _thickness_spread(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
-    return replace(optics, spread_nm=values["sigma"])
 
 
 def _converging_beam(optics: FlatFieldOptics, values: Values) -> FlatFieldOptics:
@@ -355,14 +344,6 @@ def _crosstalk(electrons: FloatArray, values: Values) -> FloatArray:
     return result
 
 
-def _dark_pedestal(state: AmplifierState, values: Values, deviate: float) -> AmplifierState:
-    return replace(state, dark_e=state.dark_e + values["electrons"])
-
-
-def _dark_current(state: AmplifierState, values: Values, deviate: float) -> AmplifierState:
-    return replace(state, dark_rate_e=state.dark_rate_e + values["rate"])
-
-
 def _amplifier_gain(state: AmplifierState, values: Values, deviate: float) -> AmplifierState:
     return replace(state, gain=state.gain * (1.0 + values[state.name] + values["rms"] * deviate))
 
@@ -400,30 +381,30 @@ def _hidden(
 
 HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _hidden("bandwidth", on_optics=_bandwidth),
-    _hidden("wavelength_offset", on_optics=_wavelength_offset),
-    _hidden("wavelength_scale", on_optics=_wavelength_scale),
+    _hidden("wavelength_offset", on_optics=_adds(wavelength_offset_nm="offset")),
+    _hidden("wavelength_scale", on_optics=_adds(wavelength_stretch="stretch")),
     _hidden("wavelength_jitter", on_optics=_wavelength_jitter),
     _hidden("temperature", on_optics=_temperature),
-    _hidden("epoxy_index", on_optics=_epoxy_index),
-    _hidden("epoxy_absorption", on_optics=_epoxy_absorption),
+    _hidden("epoxy_index", on_optics=_changes("adhesive", index_shift="offset", cauchy_um2="cauchy")),
+    _hidden("epoxy_absorption", on_optics=_changes("adhesive", extinction_shift="k")),
     _hidden("silicon_thickness", on_optics=_thicker_film("")),
     _hidden("silicon_gradient", on_silicon=_silicon_gradient),
     _hidden("silicon_absorption", on_optics=_silicon_absorption),
     _hidden("ar_coating", on_optics=_ar_coating),
-    _hidden("support_index", on_optics=_support_index),
+    _hidden("support_index", on_optics=_changes("support", index_shift="offset")),
     _hidden("gate_oxide", on_optics=_thicker_film("gate_oxide")),
     _hidden("insulation", on_optics=_thicker_film("insulation")),
     _hidden("gate_thickness", on_optics=_thicker_film("gates")),
     _hidden("black_coating", on_optics=_black_coating),
     _hidden("air_gap", on_optics=_air_gap),
     _hidden("void", on_optics=_air_gap, on_island=_disc),
-    _hidden("support_coherence", on_optics=_support_coherence),
-    _hidden("line_wing", on_optics=_line_wing),
-    _hidden("line_triangle", on_optics=_line_triangle),
+    _hidden("support_coherence", on_optics=_sets(support_spread_um="spread")),
+    _hidden("line_wing", on_optics=_other_line("lorentzian")),
+    _hidden("line_triangle", on_optics=_other_line("triangular")),
     _hidden("lamp_lines", on_optics=_lamp_lines),
     _hidden("tilt", on_optics=_tilt),
-    _hidden("roughness", on_optics=_roughness),
-    _hidden("thickness_spread", on_optics=_thickness_spread),
+    _hidden("roughness", on_optics=_sets(roughness_nm="sigma")),
+    _hidden("thickness_spread", on_optics=_sets(spread_nm="sigma")),
     _hidden("converging_beam", on_optics=_converging_beam),
     _hidden("ghost_pedestal", on_light=_ghost_pedestal),
     _hidden("contrast_loss", on_optics=_contrast_loss),
@@ -433,8 +414,8 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _hidden("midline_step", on_light=_midline_step),
     _hidden("tree_rings", on_light=_tree_rings),
     _hidden("charge_diffusion", on_light=_charge_diffusion),
-    _hidden("dark_pedestal", positive=True, on_amplifier=_dark_pedestal),
-    _hidden("dark_current", positive=True, on_amplifier=_dark_current),
+    _hidden("dark_pedestal", positive=True, on_amplifier=_adds(dark_e="electrons")),
+    _hidden("dark_current", positive=True, on_amplifier=_adds(dark_rate_e="rate")),
     _hidden("brighter_fatter", on_charge=_brighter_fatter),
     _hidden("non_linearity", on_charge=_non_linearity),
     _hidden("crosstalk", on_charge=_crosstalk),

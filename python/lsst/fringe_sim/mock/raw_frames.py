@@ -21,6 +21,7 @@ from ..descriptions import is_file_name, read_description, with_files_beside
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.camera import Amplifier, Camera, Detector
 from ..resources import list_resources, read_user_yaml, read_yaml
+from .defects import Defects, draw_defects
 from .hidden_effects import AmplifierState, HiddenEffect, validate_effects, with_hidden_optics
 from .optics import Film, FlatFieldOptics
 from .raw_files import Clock, primary_header, with_raw_layout, write_frame
@@ -46,39 +47,6 @@ LEVEL_SCATTER = 0.01
 """Rms scatter of the level of the flats."""
 
 FIRST_EXPOSURE = datetime.datetime(2018, 7, 24, 10, 0, 0)
-
-BRIGHT_COLUMN_E = 2_000.0
-"""Charge that a bright column adds to a flat [electrons]."""
-
-DEAD_COLUMN_RESPONSE = 0.4
-"""Response of a dead column."""
-
-HOT_PIXEL_E = (4_000.0, 30_000.0)
-"""Range of the charge that a hot pixel adds to a flat [electrons]."""
-
-
-@dataclass(frozen=True)
-class Defects:
-    """Blemishes of the sensor.
-
-    Attributes
-    ----------
-    bad_columns : `int`
-        Columns of an amplifier that are dead or bright from some row on; half of either kind.
-    hot_pixels : `int`
-        Single pixels with 4000 to 30 000 electrons too many in every flat.
-    prnu_rms : `float`
-        Rms of the pixel-to-pixel response.
-    """
-
-    bad_columns: int = 0
-    hot_pixels: int = 0
-    prnu_rms: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("bad_columns", "hot_pixels", "prnu_rms"):
-            if not getattr(self, name) >= 0:
-                raise OutOfRangeError(name, getattr(self, name), "zero or more")
 
 
 @dataclass(frozen=True)
@@ -137,7 +105,7 @@ class MockTruth:
         """Light that becomes charge, relative to its mean over the sensor: fringes and illumination, no defects."""
         signal = self.signal.flat(self.signal.tables.wavelengths_nm.index(float(wavelength_nm)))
         light = signal / signal.mean()
-        for effect, values in _active(self.effects):
+        for effect, values in validate_effects(self.effects):
             if effect.on_light is not None:
                 light = effect.on_light(light, wavelength_nm, effect.complete(values))
         return light / light.mean()
@@ -399,10 +367,6 @@ def _check_wavelengths(wavelengths_nm: Sequence[float]) -> tuple[float, ...]:
 _ActiveEffects = tuple[tuple[HiddenEffect, dict[str, float]], ...]
 
 
-def _active(effects: Mapping[str, Mapping[str, float]]) -> _ActiveEffects:
-    return validate_effects(effects)
-
-
 def _make_truth(
     optics: FlatFieldOptics,
     sensor: Detector,
@@ -414,7 +378,7 @@ def _make_truth(
     amplifier_rng: np.random.Generator,
 ) -> MockTruth:
     optics = with_hidden_optics(optics, active)
-    response, excess, defective = _make_defects(sensor, defects, sensor_rng)
+    response, excess, defective = draw_defects(sensor, defects, sensor_rng)
     return MockTruth(
         thickness_um=thickness,
         effects={effect.name: dict(values) for effect, values in active},
@@ -433,32 +397,3 @@ def _amplifier_state(amp: Amplifier, active: _ActiveEffects, rng: np.random.Gene
         if effect.on_amplifier is not None:
             state = effect.on_amplifier(state, effect.complete(values), float(rng.standard_normal()))
     return state
-
-
-def _make_defects(
-    sensor: Detector, defects: Defects, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    shape = sensor.shape
-    response = np.ones(shape, dtype=np.float32)
-    if defects.prnu_rms > 0:
-        response += np.float32(defects.prnu_rms) * rng.standard_normal(shape, dtype=np.float32)
-    excess = np.zeros(shape, dtype=np.float32)
-    defective = np.zeros(shape, dtype=bool)
-    for number in range(defects.bad_columns):
-        amp = sensor.amplifiers[rng.integers(len(sensor.amplifiers))]
-        column = amp.x0 + int(rng.integers(amp.width))
-        # A column is bad from the defect away from the register, which lies at the outer edge.
-        first = int(rng.integers(amp.height // 2))
-        rows = slice(amp.y0, amp.y0 + amp.height - first)
-        if not amp.flip_y:
-            rows = slice(amp.y0 + first, amp.y0 + amp.height)
-        if number % 2:
-            excess[rows, column] += BRIGHT_COLUMN_E
-        else:
-            response[rows, column] *= DEAD_COLUMN_RESPONSE
-        defective[rows, column] = True
-    for _ in range(defects.hot_pixels):
-        y, x = int(rng.integers(shape[0])), int(rng.integers(shape[1]))
-        excess[y, x] += rng.uniform(*HOT_PIXEL_E)
-        defective[y, x] = True
-    return response, excess, defective

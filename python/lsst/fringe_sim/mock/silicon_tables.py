@@ -43,20 +43,13 @@ _SHARE /= math.factorial(STENCIL - 1)
 
 @dataclass(frozen=True, eq=False)
 class SiliconTables:
-    """Signal of flats on a grid of two thicknesses.
+    """Signal of flats on a grid of two thicknesses."""
 
-    Attributes
-    ----------
-    added_um : `numpy.ndarray`, shape ``(N,)``
-        What is added to the detection layer in each table, evenly spaced [µm]; one if it is the same everywhere.
-    tables : `tuple` [`SignalTable`, ...]
-        Signal against the thickness of the varying layer.
-    relative_error : `float`
-        Largest relative difference found to a direct calculation, of the tables or between them.
-    """
-
+    # (N,): what is added to the detection layer in each table, evenly spaced [µm]; one if it is the same
+    # everywhere
     added_um: FloatArray
-    tables: tuple[SignalTable, ...]
+    tables: tuple[SignalTable, ...]  # Signal against the thickness of the varying layer
+    # Largest relative difference found to a direct calculation, of the tables or between them
     relative_error: float = math.nan
 
     @classmethod
@@ -67,13 +60,7 @@ class SiliconTables:
         added_range_um: tuple[float, float],
         wavelengths_nm: tuple[float, ...],
     ) -> SiliconTables:
-        """Tabulate as many detection layers as are needed.
-
-        Raises
-        ------
-        ConvergenceError
-            The error exceeds 1e-5 of the signal with a hundred detection layers in one fringe.
-        """
+        """Tabulate as many detection layers as are needed."""
         low, high = added_range_um
         if high == low:
             table = _thicker(optics, low).table(thickness_range_um, wavelengths_nm)
@@ -106,14 +93,7 @@ class SiliconTables:
         return self.tables[0].wavelengths_nm
 
     def of_flat(self, row: int) -> Seen:
-        """Signal of one flat as a function of both thicknesses.
-
-        Returns
-        -------
-        seen : callable
-            ``(thickness of the varying layer, what is added to the detection layer) -> signal`` [µm], arrays of one
-            shape; the second is needed where it is not the same everywhere.
-        """
+        """Signal of one flat as a function of both thicknesses."""
         if len(self.tables) == 1:
             return lambda thickness_um, *_: self.tables[0].evaluate(row, thickness_um)
         grid = self.tables[0].grid_um

@@ -112,26 +112,10 @@ def _hash(text: str) -> str:
 
 
 def read_effects_override(text: str, source: str | None = None) -> dict[str, float]:
-    """Effects in the text of an override file; nothing is executed.
+    """Values by ``effect.parameter`` in the text of an override file; nothing is executed.
 
-    Parameters
-    ----------
-    text : `str`
-        Lines that each set one effect to a number; empty lines and comments are passed over.
-    source : `str`, optional
-        File that the text is from, for the error.
-
-    Returns
-    -------
-    effects : `dict` [`str`, `float`]
-        Values by ``effect.parameter``.
-
-    Raises
-    ------
-    InputError
-        A line that is anything else; an effect of a catalogue that is not there; a file that a search has begun and
-        not ended; one written by hand that sets
-        nothing.
+    Lines set one effect to a number each. Refused are other lines, effects of a catalogue that is not there, a file
+    that a search has begun and not ended, and one written by hand that sets nothing.
     """
     complete = _is_complete(text, source)
     found: dict[str, float] = {}

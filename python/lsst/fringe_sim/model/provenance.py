@@ -175,14 +175,10 @@ def _table_of(detector: Any) -> list[Any]:
 
 def _media(names: Iterable[str]) -> list[tuple[str, str]]:
     entries = read_yaml("media", "media.yaml")
-    known = [entries[name] for name in sorted(set(names)) if _has_table(entries, name)]
+    known = [entries[name] for name in sorted(set(names)) if "table" in entries.get(name, ())]
     files = [str(entry["table"]) for entry in known]
     files += [SILICON_LAWS[entry["temperature"]] for entry in known if "temperature" in entry]
     return [("media", file) for file in dict.fromkeys(files)]
-
-
-def _has_table(entries: Mapping[str, Any], name: str) -> bool:
-    return name in entries and "table" in entries[name]
 
 
 def _exists(folder: str, name: str) -> bool:

@@ -97,31 +97,20 @@ def series_on_grid(
             for each in (*coefficients, weight)
         )
         part_weight[-1, part_weight.shape[1] - spare :] = 0.0
-        summed = series_on_grid(
-            tuple(parts), part_weight, spread_um, start_um, step_um, count, order, tolerance
-        )
-        return np.asarray(summed.sum(axis=0, keepdims=True))
+        whole = (spread_um, start_um, step_um, count, order, tolerance)
+        return np.asarray(series_on_grid(tuple(parts), part_weight, *whole).sum(axis=0, keepdims=True))
     rule = _Gridding.of(tolerance)
     slow = float(np.max(coefficients[-1].imag))
     if slow == 0.0:
-        return _segment(rule, coefficients, weight, spread_um, start_um, step_um, count, order, 1)
+        return _segment(rule, (*coefficients, weight), spread_um, (start_um, step_um, count), order, 1)
     decay = -math.log(min(max(float(np.abs(coefficients[4]).max()), 0.1), MOST_RATIO))
     pieces = max(1, math.ceil(0.5 * slow * step_um * count / (_SLOW_RANGE * decay)))
     edges = np.linspace(0, count, pieces + 1).astype(int)
+    grids = [(start_um + step_um * low, step_um, high - low) for low, high in itertools.pairwise(edges)]
     parts = [
-        _segment(
-            rule,
-            coefficients,
-            weight,
-            spread_um,
-            start_um + step_um * low,
-            step_um,
-            high - low,
-            order,
-            _POWERS,
-        )
-        for low, high in itertools.pairwise(edges)
-        if high > low
+        _segment(rule, (*coefficients, weight), spread_um, grid, order, _POWERS)
+        for grid in grids
+        if grid[2] > 0
     ]
     return np.concatenate(parts, axis=1)
 
@@ -143,15 +132,14 @@ class _Gridding(NamedTuple):
 
 def _segment(
     rule: _Gridding,
-    coefficients: tuple[np.ndarray, ...],
-    weight: FloatArray,
+    nodes: tuple[np.ndarray, ...],
     spread_um: float,
-    start_um: float,
-    step_um: float,
-    count: int,
+    grid_um: tuple[float, float, int],
     order: int,
     powers: int,
 ) -> FloatArray:
+    """The sum on one segment; ``nodes`` are coefficients and weight, ``grid_um`` its start, step and number."""
+    start_um, step_um, count = grid_um
     middle = count // 2
     size = scipy.fft.next_fast_len(max(2 * count, 4 * rule.reach))
     offset = np.arange(count) - middle
@@ -160,16 +148,16 @@ def _segment(
         * np.exp(-rule.width * (2.0 * math.pi * offset / size) ** 2)
         / size
     )
-    out = np.empty((len(weight), count))
+    out = np.empty((len(nodes[0]), count))
     # Few groups at a time: their grids then stay in the cache of the processor.
-    many = max(1, min(len(weight), _CACHED // (powers * size)))
+    many = max(1, min(len(out), _CACHED // (powers * size)))
     grid, fringe = np.empty((many, powers, size), dtype=complex), np.empty((powers, count))
     constant = np.empty((many, powers))
-    for first in range(0, len(weight), many):
+    for first in range(0, len(out), many):
         part = slice(first, first + many)
-        groups = len(weight[part])
-        nodes = (*(each[part] for each in coefficients), weight[part])
-        _fill_grids(rule, nodes, spread_um, start_um + step_um * middle, step_um, order, grid, constant)
+        groups = len(out[part])
+        own = tuple(each[part] for each in nodes)
+        _fill_grids(rule, own, spread_um, start_um + step_um * middle, step_um, order, grid, constant)
         wave = scipy.fft.ifft(grid[:groups], axis=-1, workers=processors())
         for group in range(groups):
             fringe[:, middle:] = wave[group, :, : count - middle].real

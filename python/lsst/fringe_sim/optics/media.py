@@ -294,11 +294,6 @@ def read_media(path: str | Path) -> dict[str, Medium]:
     """Media of a YAML file from outside, laid out like the shipped ``media.yaml``, by name.
 
     A ``table`` is a file beside it, or one that is shipped.
-
-    Raises
-    ------
-    InputError
-        There is no such file, or it describes no media.
     """
     content = read_user_yaml(path, "media file")
     reader = Description(content, str(path))

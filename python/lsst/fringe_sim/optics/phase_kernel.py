@@ -15,8 +15,7 @@ __all__ = ["reduce_nodes"]
 def reduce_nodes(
     index: NDArray,
     thickness: NDArray,
-    wavelength: NDArray,
-    theta: NDArray,
+    light: tuple[NDArray, NDArray],
     p_polarized: bool,
     varying: int,
     layers: NDArray,
@@ -25,9 +24,9 @@ def reduce_nodes(
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:
     """Coefficients ``a, b, e, c, g, kappa`` of every node for one polarisation.
 
-    ``index`` (L, N). ``thickness`` (L,): thickness, in the unit of ``wavelength``; not used of the ends and of
-    the varying layer. ``wavelength``, ``theta`` (N,). ``layers``: positions of the layers whose absorption is
-    wanted. ``roughness`` (L-1,). ``phase`` (L,): extra complex round-trip phase of every layer [rad].
+    ``index`` (L, N). ``thickness`` (L,): thickness, in the unit of the wavelength; not used of the ends and of the
+    varying layer. ``light``: wavelength and angle [rad], (N,) each. ``layers``: positions of the layers whose
+    absorption is wanted. ``roughness`` (L-1,). ``phase`` (L,): extra complex round-trip phase of every layer [rad].
     """
     layer_count, nodes = index.shape
     real, mixed = np.zeros((3, nodes)), np.zeros((3, nodes), dtype=np.complex128)
@@ -35,7 +34,7 @@ def reduce_nodes(
     arrays = tuple(
         contiguous(each, kind)
         for each, kind in (
-            (index.T, complex), (thickness, float), (wavelength, float), (theta, float),
+            (index.T, complex), (thickness, float), (light[0], float), (light[1], float),
             (layers, np.int64), (roughness, float), (phase, complex),
         )
     )  # fmt: skip

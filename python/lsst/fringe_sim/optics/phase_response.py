@@ -327,7 +327,7 @@ def reduce_to_phase(
     spreads = np.zeros(count) if spread is None else np.asarray(spread, dtype=float)
     polarizations = pure_polarizations(polarization, angle)
     shifted = [layer for layer in range(1, count - 1) if layer != varying and spreads[layer] > 0.0]
-    nodes = [np.ascontiguousarray(each).reshape(-1) for each in (wave, angle)]
+    nodes = np.ascontiguousarray(wave).reshape(-1), np.ascontiguousarray(angle).reshape(-1)
     flat = np.ascontiguousarray(index).reshape(count, -1)
     rough = np.zeros(count - 1) if heights is None else np.broadcast_to(heights, count - 1).copy()
     parts, shares = [], []
@@ -338,8 +338,7 @@ def reduce_to_phase(
             reduced = reduce_nodes(
                 flat,
                 thickness,
-                nodes[0],
-                nodes[1],
+                nodes,
                 each == "p",
                 varying,
                 np.array(layers, dtype=np.int64),

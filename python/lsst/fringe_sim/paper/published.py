@@ -33,13 +33,7 @@ class PublishedNumber:
 
     @classmethod
     def from_mapping(cls, content: Mapping[str, Any]) -> PublishedNumber:
-        """Number from an entry of the table.
-
-        Raises
-        ------
-        ResourceError
-            Neither a published nor a corrected number, a range upside down, or a correction without a reason.
-        """
+        """Number from an entry of the table."""
         stated = content["published"]
         low, high = stated if isinstance(stated, list) else (stated, stated)
         number = cls(

@@ -38,20 +38,15 @@ SECTIONS: tuple[Callable[[Context], Section], ...] = (
 )
 """Recomputations in the order of the paper."""
 
-WITH_COLD_SILICON = (
-    stack.layers,
-    stack.bandwidth,
-    stack.other_vendor,
-    stack.absorption_depth,
-    laboratory.one_pixel,
-    laboratory.flat_contrast,
-    optics.photon_walk,
-    sky.monocam,
-    sky.hsc,
-    sky.lsst,
-    sky.surface_brightness,
-    coadds.components,
+_OF_ONE_SILICON = (
+    laboratory.row_3000,
+    laboratory.thickness_fit,
+    laboratory.raft,
+    optics.oh_lines,
+    optics.angles,
+    coadds.coadd,
 )
+WITH_COLD_SILICON = tuple(section for section in SECTIONS if section not in _OF_ONE_SILICON)
 """Those that are computed a second time, with silicon as it was measured in the cold."""
 
 NOT_AT_HAND = "needs curves or maps read off the published figures"
@@ -132,17 +127,7 @@ def reproduce(
     sections: Sequence[Callable[[Context], Section]] | None = None,
     advance: Callable[[], None] = do_nothing,
 ) -> Reproduction:
-    """Recompute the paper.
-
-    Parameters
-    ----------
-    context : `Context`
-        Thickness maps, sizes, and where published curves are.
-    sections : sequence of callables, optional
-        Recomputations; `SECTIONS` by default.
-    advance : callable, optional
-        Called after each section.
-    """
+    """Recompute the paper; ``advance`` is called after each section."""
     made, findings = [], []
     cold_context = replace(context, silicon=COLD_SILICON)
     for compute in SECTIONS if sections is None else sections:

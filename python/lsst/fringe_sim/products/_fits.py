@@ -342,13 +342,7 @@ def in_unit(
 
 
 def refuse_other_unit(field: str, found: object, unit: str, *, source: str) -> None:
-    """Refuse a unit that is not the one wanted, however its power is written; a file may state none.
-
-    Raises
-    ------
-    FrameFormatError
-        It is another one.
-    """
+    """Refuse a unit that is not the one wanted, however its power is written; a file may state none."""
     if re.sub(r"[*^() ]", "", str(found or "")) not in ("", re.sub(r"[*^() ]", "", unit)):
         raise FrameFormatError(f"unit of {field}", found, unit or "no unit", source=source)
 

@@ -114,13 +114,7 @@ NOTED = (
 
 
 def check_noted(metadata: Mapping[str, Any]) -> None:
-    """Refuse metadata with a value that a number of `NOTED` cannot have.
-
-    Raises
-    ------
-    InputError
-        No number, or one outside its bounds; the keyword is named.
-    """
+    """Refuse metadata with a value that a number of `NOTED` cannot have."""
     for card in NOTED:
         if metadata.get(card.keyword) is not None:
             card.check(metadata[card.keyword])

@@ -59,7 +59,7 @@ class FringeCube(FitsProduct):
     thickness, thickness_sigma : `numpy.ndarray`, float32, shape ``(ny, nx)``, optional
         Known thickness of ``layer`` and its uncertainty, in µm; not a number where not known.
     layer : `str`
-        Layer whose thickness that is, as ``epoxy``; needed when ``thickness`` is given.
+        Layer whose thickness that is, as ``adhesive``; needed when ``thickness`` is given.
     detector : `str`
         Name of the sensor; empty if not known.
     metadata : `Mapping`
@@ -301,10 +301,11 @@ class FringeCube(FitsProduct):
         image, mask = values["image"], values["mask"]
         if mask.ndim == 2 and image.ndim == 3 and mask.shape == image.shape[1:]:
             mask = np.broadcast_to(mask, image.shape)
+        of_map = str(hdus["THICKNESS"].header.get("LAYER", "")) if "THICKNESS" in hdus else ""
         return values | {
             "mask": _mask_what_is_no_number(image, values["variance"], mask),
             "unit": io.read_keyword(hdus["IMAGE"].header, "BUNIT", source=source),
-            "layer": values["layer"] or _layer_of_map(hdus),
+            "layer": values["layer"] or of_map,
         }
 
 
@@ -408,8 +409,3 @@ def _mask_what_is_no_number(image: NDArray[Any], variance: NDArray[Any], mask: N
                 result = np.array(mask, dtype=CUBE_MASK)
             result[plane][wrong] |= mask_bits("NO_DATA")
     return result
-
-
-def _layer_of_map(hdus: fits.HDUList) -> str:
-    """Name of the layer where the primary header does not have it."""
-    return str(hdus["THICKNESS"].header.get("LAYER", "")) if "THICKNESS" in hdus else ""

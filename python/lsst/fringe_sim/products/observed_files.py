@@ -69,35 +69,14 @@ _HARMLESS = ("NOT_DEBLENDED", "INEXACT_PSF", "SENSOR_EDGE", "INJECTED", "INJECTE
 
 @dataclass(frozen=True)
 class ObservedImage:
-    """One image of a file, read when it is wanted.
-
-    Attributes
-    ----------
-    path : `pathlib.Path`
-        The file.
-    index : `int`
-        Number of the HDU.
-    name : `str`
-        Name of the HDU, or the stem of the file.
-    """
+    """One image of a file, read when it is wanted."""
 
     path: Path
-    index: int
-    name: str
+    index: int  # Number of the HDU
+    name: str  # Name of the HDU, or the stem of the file
 
     def read(self, background: Path | None = None) -> ObservedFrame:
-        """Read image, mask and variance.
-
-        Parameters
-        ----------
-        background : `pathlib.Path`, optional
-            File with the background that was subtracted, of the same layout; it is added again.
-
-        Raises
-        ------
-        InputError
-            A damaged file, or companions of another size.
-        """
+        """Image, mask and variance; ``background``: file with what was subtracted, which is added again."""
         image = self.pixels(background).astype(np.float32, copy=False)
         with complete_fits(self.path) as hdus:
             header = _merged(hdus, self.index)
@@ -129,11 +108,6 @@ class ObservedImage:
         """The image in the floating type of the file, whole numbers in single precision.
 
         ``background``: see `read`.
-
-        Raises
-        ------
-        InputError
-            A damaged file, or a background of another size.
         """
         with complete_fits(self.path) as hdus:
             stored = hdus[self.index].data
@@ -152,14 +126,7 @@ class ObservedImage:
 
 
 def observed_images(path: Path) -> list[ObservedImage]:
-    """The images of the sky in a file: all of two axes that are no mask, variance or weight.
-
-    Raises
-    ------
-    InputError
-        No FITS file, a damaged one, one without images, or with two images of one sensor; or a name that is not
-        printable.
-    """
+    """The images of the sky in a file: all of two axes that are no mask, variance or weight."""
     printable_name("name of a file", path.name)
     with complete_fits(path) as hdus:
         found = [
@@ -196,23 +163,9 @@ def write_images(
 ) -> None:
     """Write a file again with other pixels; all else in it stays, and no image is compressed with loss.
 
-    Parameters
-    ----------
-    source, target : `pathlib.Path`
-        The file, and the one to be written.
-    images : mapping of `int` to `numpy.ndarray`
-        New pixels by number of the HDU.
-    cards : mapping of `int` to mapping
-        Keywords of each of these HDUs, values alone or with comments; those with the value `None` are removed.
-    uncorrected : mapping of `int` to `numpy.ndarray` of `bool`
-        Pixels that are as they were; named in an extension of their own, which is absent where there are none.
-    primary : mapping
-        Keywords of the primary header; those with the value `None` are removed.
-
-    Raises
-    ------
-    OSError
-        The folder does not exist or cannot be written, or the disk is full.
+    ``images``, ``cards`` and ``uncorrected`` are by number of the HDU: new pixels, keywords (values alone or with
+    comments; `None` removes one), and the pixels that are as they were, named in an extension of their own.
+    ``primary``: keywords of the primary header.
     """
     with complete_fits(source) as hdus, _as_stored(source) as stored:
         made, flags = [], []

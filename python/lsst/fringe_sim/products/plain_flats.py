@@ -91,11 +91,6 @@ class PlainImage:
 
         A file with several images is one of amplifiers if ``INSTRUME`` names a camera that is not one of LSST, whose
         frames `RawFrame` reads.
-
-        Raises
-        ------
-        FrameFormatError
-            No complete FITS file, a header that contradicts itself, or counts in a unit that is not known.
         """
         with complete_fits(path) as hdus:
             images = _images(hdus)

@@ -67,7 +67,7 @@ class ThicknessMap(SensorProduct):
     mask : `numpy.ndarray`, int32, shape ``(ny, nx)``
         Planes of `MASK_PLANES`; 0 is good. Masked pixels may hold no number.
     layer : `str`
-        Name of the layer, as ``epoxy``.
+        Name of the layer, as ``adhesive``.
     metadata : `Mapping`
         Further header keywords.
     n_wavelengths : `numpy.ndarray`, int32, shape ``(ny, nx)``, optional

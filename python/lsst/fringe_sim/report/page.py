@@ -74,15 +74,7 @@ tr.bad td { background: #fff1e5; } tr.bad td.mark { color: #a03c00; font-weight:
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a page comes from, and which others belong to it.
-
-    Parameters
-    ----------
-    command : `str`
-        Line that was typed; empty if none was.
-    pages : `tuple` [`tuple` [`str`, `str`], ...]
-        Title and address of other pages; the address is relative to the folder of this one.
-    """
+    """Line that was typed (empty if none was), and title and relative address of other pages."""
 
     command: str = ""
     pages: tuple[tuple[str, str], ...] = ()

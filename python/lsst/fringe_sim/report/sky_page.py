@@ -112,9 +112,8 @@ def write_sky_report(
     report.section(
         "Fringes", f"Departure from the mean sky. Three numbers are called amplitude; all are given.{noise}"
     )
-    report.figure(
-        sky_figure(frames), f"{_first_of(frames)}, and its distribution over the pixels{_through(frames)}."
-    )
+    which = "The first frame" if len(frames) > 1 else "The frame"
+    report.figure(sky_figure(frames), f"{which}, and its distribution over the pixels{_through(frames)}.")
     if picture is not None:
         shown = PERCENT * first.fraction()
         report.map(picture, shown, mask=first.mask, unit="% of the sky", diverging=True)
@@ -140,10 +139,6 @@ def _without_noise(frames: Sequence[SkyFringe], keyword: str, measured: NDArray[
     """An amplitude as the frames state it, without noise; as it was measured where they do not."""
     stated = [PERCENT * float(each.metadata[keyword]) for each in frames if keyword in each.metadata]
     return span_text(stated if len(stated) == len(frames) else measured)
-
-
-def _first_of(frames: Sequence[SkyFringe]) -> str:
-    return "The first frame" if len(frames) > 1 else "The frame"
 
 
 def _through(frames: Sequence[SkyFringe]) -> str:

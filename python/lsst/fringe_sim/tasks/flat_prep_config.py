@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 from lsst.pex.config import ChoiceField, Config, Field, FieldValidationError
 
@@ -15,6 +16,11 @@ _DEFAULT = FlatPrepOptions()
 _OVERSCAN = ("overscan_method", "overscan_knots", "overscan_skip", "parallel_overscan")
 
 
+def _choice(default: Any, doc: str) -> Any:
+    """Field with the type of its default."""
+    return Field(dtype=type(default), default=default, doc=doc)
+
+
 class FlatPrepConfig(Config):
     """Every choice of `FlatPrepOptions`, by the same name."""
 
@@ -24,56 +30,38 @@ class FlatPrepConfig(Config):
         doc="Level of the serial overscan.",
         allowed={"median": "the median of each row", "spline": "a smooth curve through the rows"},
     )
-    overscan_knots: Field[int] = Field(
-        dtype=int, default=_DEFAULT.overscan_knots, doc="Intervals of that curve."
+    overscan_knots: Field[int] = _choice(_DEFAULT.overscan_knots, "Intervals of that curve.")
+    overscan_skip: Field[int] = _choice(
+        _DEFAULT.overscan_skip, "Overscan columns and rows next to the imaging section that are left out."
     )
-    overscan_skip: Field[int] = Field(
-        dtype=int,
-        default=_DEFAULT.overscan_skip,
-        doc="Overscan columns and rows next to the imaging section that are left out.",
+    parallel_overscan: Field[bool] = _choice(
+        _DEFAULT.parallel_overscan, "Whether the parallel overscan is taken off every column."
     )
-    parallel_overscan: Field[bool] = Field(
-        dtype=bool,
-        default=_DEFAULT.parallel_overscan,
-        doc="Whether the parallel overscan is taken off every column.",
+    clip_sigma: Field[float] = _choice(
+        _DEFAULT.clip_sigma, "Rejection in overscan and biases, standard deviations."
     )
-    clip_sigma: Field[float] = Field(
-        dtype=float, default=_DEFAULT.clip_sigma, doc="Rejection in overscan and biases, standard deviations."
+    saturation_fraction: Field[float] = _choice(
+        _DEFAULT.saturation_fraction, "Part of the saturation level above which a pixel counts as saturated."
     )
-    saturation_fraction: Field[float] = Field(
-        dtype=float,
-        default=_DEFAULT.saturation_fraction,
-        doc="Part of the saturation level above which a pixel counts as saturated.",
+    max_saturated: Field[float] = _choice(
+        _DEFAULT.max_saturated, "Largest part of saturated pixels with which a flat is still used."
     )
-    max_saturated: Field[float] = Field(
-        dtype=float,
-        default=_DEFAULT.max_saturated,
-        doc="Largest part of saturated pixels with which a flat is still used.",
+    defect_sigma: Field[float] = _choice(_DEFAULT.defect_sigma, "Departure of a defect, standard deviations.")
+    defect_fraction: Field[float] = _choice(
+        _DEFAULT.defect_fraction, "Least such departure, relative to the signal."
     )
-    defect_sigma: Field[float] = Field(
-        dtype=float, default=_DEFAULT.defect_sigma, doc="Departure of a defect, standard deviations."
+    column_sigma: Field[float] = _choice(
+        _DEFAULT.column_sigma, "Departure of a bad column, standard deviations between columns."
     )
-    defect_fraction: Field[float] = Field(
-        dtype=float, default=_DEFAULT.defect_fraction, doc="Least such departure, relative to the signal."
+    column_fraction: Field[float] = _choice(
+        _DEFAULT.column_fraction, "Least such departure, relative to the signal."
     )
-    column_sigma: Field[float] = Field(
-        dtype=float,
-        default=_DEFAULT.column_sigma,
-        doc="Departure of a bad column, standard deviations between columns.",
+    edge_px: Field[int] = _choice(_DEFAULT.edge_px, "Border of the sensor that is masked, px.")
+    midline_px: Field[int] = _choice(
+        _DEFAULT.midline_px, "Rows on either side of the middle that are masked, px."
     )
-    column_fraction: Field[float] = Field(
-        dtype=float, default=_DEFAULT.column_fraction, doc="Least such departure, relative to the signal."
-    )
-    edge_px: Field[int] = Field(
-        dtype=int, default=_DEFAULT.edge_px, doc="Border of the sensor that is masked, px."
-    )
-    midline_px: Field[int] = Field(
-        dtype=int, default=_DEFAULT.midline_px, doc="Rows on either side of the middle that are masked, px."
-    )
-    smoothing_sigma_px: Field[float] = Field(
-        dtype=float,
-        default=_DEFAULT.smoothing_sigma_px,
-        doc="Standard deviation of the smoothing kernel, px; 0 for none.",
+    smoothing_sigma_px: Field[float] = _choice(
+        _DEFAULT.smoothing_sigma_px, "Standard deviation of the smoothing kernel, px; 0 for none."
     )
 
     raws_limit_graph: Field[bool] = Field(

@@ -19,7 +19,8 @@ from scipy.special import gammainc, gammaln, logsumexp
 from ...effects import Effect, Parameter, known_effects
 from ...errors import InputError, UnknownNameError
 from ...model import FringeModel
-from .kinds import LAB, SHIFT_UM, Kind, PixelFlats, models_with, without_bench
+from .kinds import SHIFT_UM, Kind, PixelFlats
+from .models import LAB, models_with, without_bench
 
 __all__ = ["Axis", "JointFit", "Predictor", "parse_set"]
 

@@ -8,18 +8,15 @@ computed on a few values and interpolated.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...effects import known_effects
 from ...errors import InputError
 from ...instrument.bandpass import Bandpass
 from ...instrument.measured_thickness import e2v_321
-from ...instrument.setup import Setup
 from ...instrument.sky import SkySpectrum, blend_components
 from ...instrument.telescope import reduce_beam
 from ...model import FringeModel
@@ -28,35 +25,26 @@ from ...optics.illumination import GaussianProfile
 from ...resources import read_table
 from ..single_pixel import published_pixel
 from ..sky_response import is_band
+from .models import LAB, Models
 
 __all__ = [
-    "EVERY_SENSOR",
-    "LAB",
     "SHIFT_UM",
     "FlatContrast",
     "Kind",
-    "Models",
     "PixelFlats",
     "harmonics",
-    "models_with",
     "public_kinds",
     "sky_amplitude",
-    "without_bench",
 ]
 
 FloatArray = NDArray[np.float64]
 
-LAB = "ts8_e2v"
 SHIFT_UM = np.linspace(-1.5, 1.5, 601)
 """Shifts of the published map that are allowed [µm]: five fringe orders either way."""
 
 PIXEL = (2115, 2148)
 """Row and column on the full sensor of pixel (2100, 2100) of the frame trimmed by 15 rows and 48 columns."""
 
-EVERY_SENSOR = ("silicon_absorption", "silicon_constants", "diffuse_gate_side")
-"""Effects of silicon and gates, which sensors of other vendors have, too; all others are of this stack."""
-
-OTHER_VENDORS = ("hsc", "ts8_itl")
 
 PIXEL_NOISE = 7e-4
 """Photon noise of the pixel, 0.7 % smoothed by a Gaussian of 3 px; the scale of all misfits is free."""
@@ -96,13 +84,6 @@ SKY_UM = {"monocam": (14.0, 22.0), "hsc": (199.0, 201.0), "lsst_e2v": (14.0, 22.
 SKY_SAMPLES = 801
 TREND = 3
 """Degree of the run of the level with thickness, which is no fringe: an adhesive that absorbs has one."""
-
-
-class Models(Protocol):
-    """What makes the model of a set-up with the effects under test in it."""
-
-    def __call__(self, setup: str, *, observable: str | None = None) -> FringeModel:
-        """The model; the observable is that of the hypothesis if not given."""
 
 
 class Kind(Protocol):
@@ -433,32 +414,3 @@ def _efficiency(model: FringeModel, beam: Beam, setup: str) -> tuple[FloatArray,
     step = (last - first) / (SKY_SAMPLES - 1)
     response = model.respond_on_grid(light, first, step, SKY_SAMPLES, tolerance=1e-5)
     return wavelength, np.asarray(response.mean(axis=1))
-
-
-def without_bench(settings: Mapping[str, float]) -> dict[str, float]:
-    """Settings less those of effects of the bench, which a sensor does not take along."""
-    bench = {effect.name for effect in known_effects() if effect.laboratory_only}
-    return {key: value for key, value in settings.items() if key.partition(".")[0] not in bench}
-
-
-def models_with(
-    settings: Mapping[str, float], silicon: str | None = None, of_flats: str = "detection"
-) -> Models:
-    """Models with effects, each in the sensors that have it; ``of_flats``: observable of the laboratory."""
-
-    def made(setup: str, *, observable: str | None = None) -> FringeModel:
-        own = dict(settings) if setup == LAB else without_bench(settings)
-        if setup in OTHER_VENDORS:
-            own = {key: value for key, value in own.items() if key.partition(".")[0] in EVERY_SENSOR}
-        seen = observable or (of_flats if setup == LAB else "detection")
-        return _plane_layers(setup, silicon, seen).with_effects(own)
-
-    return made
-
-
-@functools.cache
-def _plane_layers(setup: str, silicon: str | None, observable: str) -> FringeModel:
-    """Model without effects; the beam of a telescope takes long to reduce."""
-    chosen = Setup.from_name(setup)
-    chosen = chosen if silicon is None else chosen.with_silicon(silicon)
-    return FringeModel.from_setup(chosen, observable=observable)

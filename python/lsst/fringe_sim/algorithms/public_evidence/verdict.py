@@ -18,19 +18,16 @@ from ...notebook import do_nothing
 from ..discovery.options import SearchOptions
 from .joint import Axis, JointFit, Predictor, parse_set
 from .kinds import (
-    LAB,
     SHIFT_UM,
     FlatPhase,
     Kind,
-    Models,
     PixelFlats,
     PublishedMap,
     harmonics,
-    models_with,
     public_kinds,
     sky_amplitude,
-    without_bench,
 )
+from .models import LAB, Models, models_with, without_bench
 
 __all__ = ["DECIDING", "RIVALS", "Comparison", "KindRow", "Measurement", "compare"]
 
@@ -199,17 +196,7 @@ def compare(
     kinds: Sequence[Kind] | None = None,
     advance: Callable[[], None] = do_nothing,
 ) -> Comparison:
-    """Compare sets of effects, and none at all, on all public data.
-
-    Parameters
-    ----------
-    sets : sequence of sequences of `str`, optional
-        Effects, or single parameters as ``effect.parameter``; `RIVALS` by default.
-    kinds : sequence of `Kind`, optional
-        Data; `public_kinds` by default.
-    advance : callable, optional
-        Called after each set.
-    """
+    """Compare sets of effects or of single parameters (`RIVALS`), and none at all, on all public data."""
     wanted = [parse_set(names) for names in ((), *(RIVALS if sets is None else sets))]
     predictor = Predictor(public_kinds() if kinds is None else kinds)
     _refuse_unfelt({axis.key: axis for axes in wanted for axis in axes}, predictor)
