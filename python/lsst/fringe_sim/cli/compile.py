@@ -29,8 +29,8 @@ def compile(cpu: str) -> None:
     """Compile what simulated flats, a fit, a sky and a search need, and keep it.
 
     The first command in a new environment compiles for half a minute; afterwards none does. The compiled functions
-    lie beside the package, or in the folder that NUMBA_CACHE_DIR names; others may use that folder without writing it. A
-    command finds those for a generic processor if NUMBA_CPU_NAME=generic is set where it runs.
+    lie beside the package, or in the folder that NUMBA_CACHE_DIR names; others may use that folder without writing
+    it. A command finds those for a generic processor if NUMBA_CPU_NAME=generic is set where it runs.
 
     \b
     Examples:
