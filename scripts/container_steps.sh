@@ -18,7 +18,7 @@ version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 timed() {
     local start=$EPOCHREALTIME
     "$@" >"$work/log" 2>&1 || { echo "failed: $*" >&2; tail -n 20 "$work/log" >&2; exit 1; }
-    awk -v a="$start" -v b="$EPOCHREALTIME" -v what="${*:0-1}" 'BEGIN { printf "%6.1f s  %s\n", b - a, what }'
+    awk -v a="$start" -v b="$EPOCHREALTIME" -v what="$(printf '%s ' "$@" | tail -c 90)" 'BEGIN { printf "%6.1f s  %s\n", b - a, what }'
 }
 # What the stage `wheel` and the line `pip install` do.
 timed "$python" -m venv "$work/env"
