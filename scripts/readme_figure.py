@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from lsst.fringe_sim.algorithms.sky_frame import simulate_sky_frame
+from lsst.fringe_sim.files import write_whole
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.style import figure, save_figure, show_image
+from lsst.fringe_sim.style import figure, show_image, to_png
 
 TARGET = Path(__file__).resolve().parents[1] / "doc" / "_static" / "readme.png"
 
@@ -35,7 +36,7 @@ def main() -> None:
             title="y-band sky, centre of the LSST field",
         )
         TARGET.parent.mkdir(parents=True, exist_ok=True)
-        save_figure(made, TARGET)
+        write_whole(TARGET, to_png(made))
 
 
 if __name__ == "__main__":

@@ -183,7 +183,8 @@ def test_other_settings_do_not_mix_with_it(done) -> None:
 
 def test_a_folder_with_other_things_is_left_alone(tmp_path, capsys) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
-    assert run(["demo", "--out", str(tmp_path)]) == 1
+    for dry in ([], ["--dry-run"]):
+        assert run(["demo", "--out", str(tmp_path), *dry]) == 1
     assert "an empty folder" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     assert run(["demo", "--out", str(tmp_path), "--fresh"]) == 1

@@ -50,8 +50,9 @@ def test_frames_of_a_camera_are_never_cleared(used: Path, capsys: pytest.Capture
     (real,) = used.glob("*_lambda_flat_*.fits")
     real.write_bytes(real.read_bytes().replace(b"'lsst.fringe_sim'", b"'SLAC           '"))
     before = sorted(used.iterdir())
-    assert run(["mock-flats", str(used), *FRAMES, "--overwrite"]) == 1
-    assert real.name in capsys.readouterr().err
+    for dry in ([], ["--dry-run"]):
+        assert run(["mock-flats", str(used), *FRAMES, "--overwrite", *dry]) == 1
+        assert real.name in capsys.readouterr().err
     assert sorted(used.iterdir()) == before
 
 
@@ -74,13 +75,20 @@ def test_two_writers_at_once(tmp_path: Path) -> None:
     assert folder(tmp_path).prepare() == tmp_path
 
 
-def test_nothing_of_the_lock_is_left(tmp_path: Path) -> None:
+@pytest.mark.parametrize("code", [0, 1])
+def test_nothing_of_the_lock_is_left(tmp_path: Path, code: int) -> None:
+    """Nor of folders that were made for the run, where nothing was written into them."""
+    (tmp_path / "old").mkdir()
+
     @click.command()
     def command() -> None:
-        folder(tmp_path / "out").prepare()
+        for name in ("old", "new/inner", "filled/inner"):
+            folder(tmp_path / name).prepare()
+        (tmp_path / "filled" / "notes.txt").write_text("mine")
+        raise click.exceptions.Exit(code)
 
-    assert CliRunner().invoke(command).exit_code == 0
-    assert list((tmp_path / "out").iterdir()) == []
+    assert CliRunner().invoke(command).exit_code == code
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["filled", "notes.txt", "old"]
 
 
 def test_what_a_killed_writer_left_is_cleared(tmp_path: Path) -> None:

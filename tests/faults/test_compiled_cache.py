@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -68,3 +69,29 @@ def test_what_is_damaged_is_made_again(tmp_path: Path, kind: str, left: bytes) -
     path.write_bytes(left)
     assert "cannot be read" in added(tmp_path, str(cache))
     assert not added(tmp_path, str(cache))
+
+
+def test_a_folder_that_is_only_read_is_used(tmp_path: Path) -> None:
+    """As that of an image, by whoever may not write it; numba by itself passes over it."""
+    cache = tmp_path / "cache"
+    assert not added(tmp_path, str(cache))
+    folders = [cache, *(path for path in cache.rglob("*") if path.is_dir())]
+    program = tmp_path / "program.py"
+    check = f"import runpy; print(runpy.run_path({str(program)!r})['add'].stats.cache_hits)"
+    powerless = ["setpriv", "--bounding-set", "-dac_override"] if os.geteuid() == 0 else []
+    if powerless and shutil.which(powerless[0]) is None:
+        pytest.skip("root may write everything")
+    try:
+        for folder in folders:
+            folder.chmod(0o555)
+        done = subprocess.run(
+            [*powerless, sys.executable, "-c", check, "0"],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
+        )
+    finally:
+        for folder in folders:
+            folder.chmod(0o755)
+    assert done.stdout == "3.0\nCounter({(float64, float64): 1})\n", done.stderr

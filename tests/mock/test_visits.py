@@ -106,10 +106,27 @@ def test_visits_are_read_and_tell_nothing(tmp_path, rng) -> None:
 
 @pytest.mark.parametrize("effect", ["bandwidth.fwhm=3", "illumination.gradient_x=0.1", "void.thickness=100"])
 def test_what_the_sky_does_not_see_is_refused(effect, tmp_path, capsys) -> None:
-    size = ["--size", "64x64", "--seed", "1", "--visits", "1"]
+    size = ["--size", "64x64", "--seed", "1", "--visits", "1", "--dry-run"]
     assert run(["mock-visits", str(tmp_path / "night"), "--effect", effect, *size]) == 1
     assert "layers of the whole sensor" in capsys.readouterr().err
-    assert not list((tmp_path / "night").glob("*.fits"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "more", "said"),
+    [
+        ("pixel_scale_arcsec: 0.2", "pixel_scale_arcsec: 60.0", (), "width of a star"),
+        ("air", "air", ("--stars", "1e5"), "fewer stars"),
+        ("kind: telescope, telescope: LSST", "kind: collimated", (), "in a cone"),
+    ],
+)
+def test_a_night_that_cannot_be_drawn_is_refused_before_work(old, new, more, said, tmp_path, capsys) -> None:
+    own = files("lsst.fringe_sim").joinpath("data/setups/lsst_e2v.yaml").read_text()
+    assert old in own
+    (tmp_path / "own.yaml").write_text(own.replace(old, new))
+    night = ["mock-visits", str(tmp_path / "night"), "--setup", str(tmp_path / "own.yaml"), "--seed", "1"]
+    assert run([*night, *(more or ("--size", "64x64")), "--dry-run"]) == 1
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "night").exists()
 
 
 def test_a_laboratory_has_no_sky() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from lsst.fringe_sim.report.correction_page import frame_figure
 from lsst.fringe_sim.report.discovery_figures import where_figure
+from lsst.fringe_sim.style import figure, panels, show_image, to_png
 
 
 @pytest.mark.parametrize(
@@ -31,3 +32,17 @@ def test_large_offsets_of_amplifiers_stay_inside_their_boxes() -> None:
     said = [text.get_text().partition("\n")[2] for text in axes.texts]
     assert "sixteenth" in axes.get_title()  # a sensor may have other amplifiers than these
     assert said == ["+0.3", "-34.5", "+601"]
+
+
+@pytest.mark.parametrize("layout", ["constrained", None])
+def test_a_color_bar_is_as_high_as_its_map(layout) -> None:
+    with figure(6.0, 3.0, layout) as made:
+        places = panels(made, 2, 2, None if layout else (0.6, 0.5, 0.5, 0.3))
+        for axes, shape in zip(places, ((20, 160), (160, 20)), strict=True):
+            show_image(axes, np.zeros(shape), label="nothing")
+        to_png(made)  # only then the axes have their place
+        assert len(made.axes) == 4
+        for part in made.subfigs:
+            image, bar = (axes.get_window_extent() for axes in part.axes)
+            assert (bar.y0, bar.y1) == pytest.approx((image.y0, image.y1), abs=1.0)
+            assert bar.width > 5.0

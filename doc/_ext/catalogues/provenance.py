@@ -92,16 +92,19 @@ def _constant(entry: dict[str, Any]) -> str:
     return f"constant index {n:g} + {k:g} i"
 
 
+def _note(text: str) -> str:
+    """One item; what is a list already, perhaps below a line that names a group, stays as it is."""
+    return text.strip() if text.startswith("- ") or "\n\n- " in text else f"- {' '.join(text.split())}"
+
+
 def changes() -> str:
     """The changelog, below notes that no version has yet."""
     parts = []
-    notes = [path for path in sorted(CHANGES.iterdir()) if path.name != "README.md"]
+    notes = [path for path in sorted(CHANGES.glob("*.md")) if path.name != "README.md"]
     for kind, heading in KINDS.items():
-        of_kind = [
-            path.read_text(encoding="utf-8").split() for path in notes if path.name.endswith(f".{kind}.md")
-        ]
+        of_kind = [path.read_text(encoding="utf-8") for path in notes if path.name.endswith(f".{kind}.md")]
         if of_kind:
-            parts += [f"### {heading}", "\n".join(f"- {' '.join(note)}" for note in of_kind)]
+            parts += [f"### {heading}", *map(_note, of_kind)]
     if any(not path.name.endswith(tuple(f".{kind}.md" for kind in KINDS)) for path in notes):
         raise ValueError(f"a note in {CHANGES} is not named <name>.<{'|'.join(KINDS)}>.md")
     _, _, released = CHANGELOG.read_text(encoding="utf-8").partition("<!-- towncrier release notes start -->")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from .lazy import on_first_use
 
-__version__ = "0.2.0"
+__version__ = "1.0.0"
 
 _LAZY = {
     "LsstCamFringe": ".middleware",

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -21,6 +22,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numba
 import numpy as np
+from numba.core import caching
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from threadpoolctl import threadpool_limits
 
@@ -91,7 +93,7 @@ def _compiled(function: Callable[..., Any] | None, **options: Any) -> Any:
                 error,
             )
             return decorate(inner)
-        _work_without_cache(made)
+        _work_without_cache(made, _kept_for_all(inner))
         return made
 
     return decorate if function is None else decorate(function)
@@ -100,10 +102,45 @@ def _compiled(function: Callable[..., Any] | None, **options: Any) -> Any:
 _keep = [True]
 
 
-def _work_without_cache(dispatcher: Any) -> None:
+def _kept_for_all(function: Callable[..., Any]) -> Any:
+    """What ``NUMBA_CACHE_DIR`` keeps of a function, where it can be read and not written, as in an image.
+
+    Numba itself looks only into folders that it can write. `None`: it does so here, or there is nothing.
+    """
+    folder = numba.config.CACHE_DIR
+    if not folder or os.access(folder, os.W_OK):
+        return None
+    try:
+        return _cache_for_all()(function)
+    except RuntimeError:  # nothing of the package of this function
+        return None
+
+
+@functools.cache
+def _cache_for_all() -> type:
+    # Since 0.61 the name has no underscore.
+    names = "UserProvidedCacheLocator", "_UserProvidedCacheLocator"
+    provided = next(getattr(caching, name) for name in names if hasattr(caching, name))
+
+    class Locator(provided):  # type: ignore[misc,valid-type]
+        def ensure_cache_path(self) -> None:
+            if not os.path.isdir(self.get_cache_path()):
+                raise FileNotFoundError(self.get_cache_path())
+
+    class Implementation(caching.CompileResultCacheImpl):
+        _locator_classes = (Locator,)
+
+    class Cache(caching.FunctionCache):
+        _impl_class = Implementation
+
+    return Cache
+
+
+def _work_without_cache(dispatcher: Any, for_all: Any) -> None:
     """Let a function be compiled where what is kept of it cannot be written, on a full disk, or is damaged.
 
     Numba passes both errors on, and they would end the command that calls the function.
+    ``for_all``: what is looked into first, and never written.
     """
     cache = getattr(dispatcher, "_cache", None)
     if cache is None:  # compilation is switched off
@@ -118,7 +155,8 @@ def _work_without_cache(dispatcher: Any) -> None:
 
     def load_if_possible(signature: Any, context: Any) -> Any:
         try:
-            return load(signature, context)
+            found = None if for_all is None else for_all.load_overload(signature, context)
+            return load(signature, context) if found is None else found
         except Exception as error:  # whatever unpickling half a file raises
             _say_once("a compiled function that was kept cannot be read", error)
             with suppress(OSError):

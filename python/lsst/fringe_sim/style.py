@@ -14,8 +14,11 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from mpl_toolkits.axes_grid1 import make_axes_locatable
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -26,6 +29,7 @@ __all__ = [
     "SEQUENTIAL",
     "TITLE_PLACE",
     "block_mean",
+    "color_bar",
     "figure",
     "finite_range",
     "map_to_png",
@@ -46,6 +50,9 @@ BAD_COLOR, BAD_GREY = 255, 0.75
 
 TITLE_PLACE = 1.0
 """Height of titles in axes without ticks above. Where it is not given, matplotlib looks at every tick for it."""
+
+BAR_INCH, BAR_GAP_INCH = 0.1, 0.08
+"""Width of a colour bar, and its distance from what it belongs to."""
 
 MOST_PIXELS = 600
 """Images are averaged down to about this many pixels a side before drawing."""
@@ -151,8 +158,15 @@ def show_image(
     axes.set_xlabel("column [px]")
     axes.set_ylabel("row [px]")
     if colorbar:
-        axes.figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
+        color_bar(axes, drawn, label)
     return drawn
+
+
+def color_bar(axes: Axes, drawn: ScalarMappable, label: str) -> Colorbar:
+    """Colour bar beside axes, as high as they are drawn."""
+    place = make_axes_locatable(axes).append_axes("right", BAR_INCH, pad=BAR_GAP_INCH)
+    bar: Colorbar = axes.figure.colorbar(drawn, cax=place, label=label)
+    return bar
 
 
 def to_png(made: Figure) -> bytes:

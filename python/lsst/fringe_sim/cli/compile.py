@@ -14,6 +14,7 @@ from .progress import progress
 __all__ = ["compile"]
 
 PROCESSES = 2
+SIMULATED = "simulated flats"
 
 
 @click.command()
@@ -25,11 +26,11 @@ PROCESSES = 2
     help="Processor to compile for; 'generic' runs on any, somewhat slower.",
 )
 def compile(cpu: str) -> None:
-    """Compile what a fit, a sky and a search need, and keep it.
+    """Compile what simulated flats, a fit, a sky and a search need, and keep it.
 
     The first command in a new environment compiles for half a minute; afterwards none does. The compiled functions
-    lie beside the package, or in the folder that NUMBA_CACHE_DIR names. A command finds those for a generic processor
-    if NUMBA_CPU_NAME=generic is set where it runs.
+    lie beside the package, or in the folder that NUMBA_CACHE_DIR names; others may use that folder without writing
+    it. A command finds those for a generic processor if NUMBA_CPU_NAME=generic is set where it runs.
 
     \b
     Examples:
@@ -55,7 +56,7 @@ def stages() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of what is compiled at the same time, first and then."""
     from ..algorithms.warm_up import FIRST, THEN
 
-    return tuple(FIRST), tuple(THEN)
+    return (*FIRST, SIMULATED), tuple(THEN)
 
 
 def _do(name: str) -> None:
@@ -66,4 +67,26 @@ def _do(name: str) -> None:
 
     logging.getLogger().setLevel(logging.ERROR)
     warnings.simplefilter("ignore")
-    {**FIRST, **THEN}[name]()
+    {**FIRST, **THEN, SIMULATED: _simulated}[name]()
+
+
+def _simulated() -> None:
+    """Flats of `mock-flats`."""
+    from tempfile import TemporaryDirectory
+
+    import numpy as np
+
+    from ..mock.raw_frames import write_mock_flats
+
+    thickness = 15.0 + np.linspace(0.0, 1.0, 64 * 64).reshape(64, 64)
+    with TemporaryDirectory() as folder:
+        write_mock_flats(
+            folder,
+            setup="ts8_e2v",
+            detector="E2V-CCD250-321",
+            thickness_um=thickness,
+            wavelengths_nm=[950.0],
+            rng=np.random.default_rng(1),
+            size="64x64",
+            n_bias=1,
+        )

@@ -257,7 +257,9 @@ def _describe(record: FrameRecord) -> str:
 
 def _left(part: float, sigma: float) -> str:
     """The part that is left, or its limit where its square, which is measured, is within two errors of 0."""
+    from ..report.words import measured_text, number_text
+
     square, error = part**2, (part + sigma) ** 2 - part**2
     if square < 2.0 * error:
-        return f"less than {100.0 * (square + 2.0 * error) ** 0.5:.0f} % (2 σ)"
-    return f"{100.0 * part:.0f} ± {100.0 * sigma:.0f} %"
+        return f"less than {number_text(100.0 * (square + 2.0 * error) ** 0.5, 2)} % (2 σ)"
+    return f"{' ± '.join(measured_text(100.0 * part, 100.0 * sigma))} %"

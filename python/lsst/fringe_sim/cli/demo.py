@@ -68,18 +68,7 @@ class DemoRun:
 
     def __post_init__(self) -> None:
         self._state = self.folder / STATE
-        self._done: list[str] = []
-        if self._state.is_file():
-            former = json.loads(self._state.read_text(encoding="utf-8"))
-            if former["settings"] != asdict(self.settings):
-                raise InputError(
-                    "demo folder",
-                    str(self.folder),
-                    f"an empty folder, or one made with the same settings ({former['settings']})",
-                )
-            self._done = list(former["done"])
-        elif any(entry.name != LOCK for entry in self.folder.iterdir()):
-            raise InputError("demo folder", str(self.folder), "an empty folder, or one that a demo has made")
+        self._done = _steps_done(self.folder, self.settings)
         (self.folder / "logs").mkdir(exist_ok=True)
 
     @property
@@ -172,7 +161,13 @@ def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_r
     text = f"{size[0]}x{size[1]}"
     shape = (size[1], size[0])
     Camera.from_name("ts8").detector(SENSOR).cut_down(shape)
+    settings, out = (
+        DemoSettings(__version__, text, seed),
+        _folder(replace(out, overwrite=True) if fresh else out),
+    )
     if dry_run:
+        if not out.overwrite:
+            _steps_done(out.path, settings)
         click.echo(
             f"would simulate {text} pixels of {SENSOR} with a hidden effect and process them in {out}/repo"
         )
@@ -181,8 +176,8 @@ def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_r
     from .demo_report import DemoDatasets, write_demo_report
     from .demo_truth import DemoTruth
 
-    folder = _folder(replace(out, overwrite=True) if fresh else out).prepare()
-    run = DemoRun(folder, DemoSettings(__version__, text, seed))
+    folder = out.prepare()
+    run = DemoRun(folder, settings)
     truth = DemoTruth(folder / SEALED, seed, shape)
     click.echo(f"Demo in {folder}: {text} pixels of {SENSOR}, seed {seed}")
     run.step(
@@ -202,6 +197,20 @@ def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_r
     outcome = Outcome.read(folder, truth, (datasets.first_thickness, datasets.thickness))
     run.step("report", "figures and report", lambda: write_demo_report(folder, datasets, outcome))
     _closing_words(folder, datasets, outcome)
+
+
+def _steps_done(folder: Path, settings: DemoSettings) -> list[str]:
+    """Steps that a former run with these settings has done in the folder; another folder is refused."""
+    state = folder / STATE
+    if state.is_file():
+        former = json.loads(state.read_text(encoding="utf-8"))
+        if former["settings"] != asdict(settings):
+            allowed = f"an empty folder, or one made with the same settings ({former['settings']})"
+            raise InputError("demo folder", str(folder), allowed)
+        return list(former["done"])
+    if folder.is_dir() and any(entry.name != LOCK for entry in folder.iterdir()):
+        raise InputError("demo folder", str(folder), "an empty folder, or one that a demo has made")
+    return []
 
 
 def _folder(out: OutputFolder) -> OutputFolder:

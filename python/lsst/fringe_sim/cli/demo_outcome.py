@@ -151,8 +151,9 @@ class Outcome:
         report.section(
             "Truth beside verdict",
             "The search was given the raw frames and the name of the set-up. The truth lay in sealed/, and was read "
-            "for this page only. The whole evidence is in discovery/report.html.",
+            "for this page only.",
         )
+        report.link("discovery/report.html", "discovery/report.html", ".", "The whole evidence is in ")
         report.table(_comparison(self.case, self.verdict), "demo_truth_and_verdict")
         if self.verdict.where.channels:
             add(

@@ -81,8 +81,7 @@ def mock_visits(
     """
     import numpy as np
 
-    from ..mock.hidden_effects import validate_effects
-    from ..mock.visits import VisitConditions, write_mock_visits
+    from ..mock.visits import VisitConditions, check_visits, write_mock_visits
 
     chosen = SKY.convert(setup, None, None)
     if silicon is not None:
@@ -90,7 +89,8 @@ def mock_visits(
     sensor = chosen.sensor(detector)
     shape = shape_of(size, sensor.shape)
     rng = np.random.default_rng(seed)
-    validate_effects(effects.settings)
+    conditions = VisitConditions(stars_per_arcmin2=stars, moon=moon)
+    sources = check_visits(setup, shape, effects.settings, conditions)
     layer = thickness_map(thickness, chosen, shape, rng)
     aside = None if truth is None else _truth_folder(truth, out)
     if dry_run:
@@ -99,6 +99,7 @@ def mock_visits(
     folder = out.prepare()
     if aside is not None:
         aside.prepare()
+    click.echo(f"summing the light of the sky; then {visits} visits of about {sources:.0f} sources", err=True)
     with progress("writing visits", visits) as advance:
         written = write_mock_visits(
             folder,
@@ -109,7 +110,7 @@ def mock_visits(
             rng=rng,
             effects=effects.settings,
             size=f"{shape[1]}x{shape[0]}" if size else None,
-            conditions=VisitConditions(stars_per_arcmin2=stars, moon=moon),
+            conditions=conditions,
             silicon=silicon,
         )
         for visit in written:

@@ -7,7 +7,7 @@ import os
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from glob import escape, has_magic, iglob
@@ -65,13 +65,16 @@ class OutputFolder(os.PathLike[str]):
     def refuse_used(self) -> None:
         """Refuse a folder with products of an earlier run, before long work.
 
-        `InputError`: there are some, and neither are they to be cleared nor to be gone on with; or the path
-            is a file.
+        `InputError`: there are some, and neither are they to be cleared nor to be gone on with; or some that are
+            to be cleared are of another program; or the path is a file.
         """
         if self.path.exists() and not self.path.is_dir():
             raise InputError("output folder", str(self), "a folder, not a file")
+        if self.overwrite:
+            self._refuse_foreign()
+            return
         left = [file.name for file in self._left()]
-        if left and not self.overwrite and not self.resumes:
+        if left and not self.resumes:
             more = f" and {len(left) - 1} more" if len(left) > 1 else ""
             raise InputError(
                 "output folder",
@@ -82,12 +85,15 @@ class OutputFolder(os.PathLike[str]):
     def prepare(self) -> Path:
         """Make the folder, keep other writers out until the command ends, clear what is to be replaced.
 
+        A folder that was not there, and into which nothing was written, is taken away when the command ends.
+
         Raises
         ------
         InputError
             It cannot be made or written, another run writes into it, or it is used (`refuse_used`).
         """
         self.refuse_used()
+        new = [path for path in (self.path, *self.path.parents) if not path.exists()]
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -95,7 +101,7 @@ class OutputFolder(os.PathLike[str]):
             raise InputError("output folder", str(self), allowed) from None
         if not os.access(self.path, os.W_OK):
             raise InputError("output folder", str(self), "a folder that can be written")
-        self._lock()
+        self._lock(new)
         self.refuse_used()
         for part in self._matching(f".{name}.*.part" for name in self.products):
             part.unlink(missing_ok=True)
@@ -112,10 +118,9 @@ class OutputFolder(os.PathLike[str]):
     def _matching(self, patterns: Any) -> list[Path]:
         return sorted({file for pattern in patterns for file in self.path.glob(pattern)})
 
-    def _clear(self) -> None:
-        left = self._left()
+    def _refuse_foreign(self) -> None:
         # A link is taken away itself, and not what it points to.
-        whole = [file for file in left if file.suffix == ".fits" and not file.is_symlink()]
+        whole = [file for file in self._left() if file.suffix == ".fits" and not file.is_symlink()]
         foreign = [file.name for file in whole if not _is_ours(file)]
         if foreign:
             raise InputError(
@@ -123,15 +128,18 @@ class OutputFolder(os.PathLike[str]):
                 str(self),
                 f"one in which {foreign[0]} was written by this program; nothing is cleared",
             )
-        for file in left:
+
+    def _clear(self) -> None:
+        for file in self._left():
             if file.is_dir() and not file.is_symlink():
                 shutil.rmtree(file)
             else:
                 file.unlink(missing_ok=True)
 
-    def _lock(self) -> None:
+    def _lock(self, new: Sequence[Path]) -> None:
         """Lock that the system releases when the process ends, however it does.
 
+        ``new``: folders that were made for this run, the innermost first.
         Its file stays beside the products of a run that did not come to its end, which are not all there.
         """
         descriptor = _locked(self.path / LOCK)
@@ -139,14 +147,17 @@ class OutputFolder(os.PathLike[str]):
             raise InputError("output folder", str(self), "one into which no other run is writing just now")
         context = click.get_current_context(silent=True)
         if context is not None:
-            context.call_on_close(functools.partial(self._release, context.meta, descriptor))
+            context.call_on_close(functools.partial(self._release, context.meta, descriptor, new))
 
-    def _release(self, meta: dict[str, Any], descriptor: int) -> None:
+    def _release(self, meta: dict[str, Any], descriptor: int, new: Sequence[Path]) -> None:
         lock = self.path / LOCK
         with suppress(OSError):  # the folder may be another one by now, with a lock that is not ours
             if _is_same(lock, descriptor) and not (AT_WORK in meta and self._left()):
                 lock.unlink()
         os.close(descriptor)
+        with suppress(OSError):  # of a folder that is not empty
+            for folder in new:
+                folder.rmdir()
 
 
 def _locked(path: Path) -> int | None:

@@ -12,11 +12,12 @@ import numpy as np
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
 from ..instrument.readout import zero_point
 
-__all__ = ["MASK_PLANES", "Pointing", "Scene", "VisitConditions", "VisitImage"]
+__all__ = ["MASK_PLANES", "Pointing", "Scene", "VisitConditions", "VisitImage", "expected_sources"]
 
 FloatArray = NDArray[np.float64]
 
@@ -38,8 +39,12 @@ BLUR_OF_A_RAY_PX = 0.4
 RAY_E_PER_UM = 80.0
 """Charge that a minimum ionising particle leaves in silicon [e⁻ / µm]."""
 
-STAMP_PX = 513
-"""Largest side of the image of a source."""
+STAMP_PX, STAMP_ARCSEC = 513, 102.6
+"""Largest side of the image of a source, and of that of a bright star: GalSim's Fourier transform of a star over many
+arcminutes does not fit into memory."""
+
+MOST_SOURCES = 100_000
+"""In a visit: some twenty seconds. A whole sensor of the LSST has 18,000."""
 
 DTYPE = [("x", float), ("y", float), ("magnitude", float), ("electrons", float), ("galaxy", bool)]
 
@@ -120,7 +125,7 @@ class Scene:
         """Sources on a patch that is large enough for all pointings."""
         scale = float(light["pixel_scale_arcsec"])
         bandpass, area_m2 = Bandpass.from_name(str(light["bandpass"])), float(light["effective_area_m2"])
-        half = 0.5 * scale * math.hypot(*shape) + 4.0 * conditions.dither_arcsec + 10.0
+        half = _half_arcsec(scale, conditions, shape)
         area = (2.0 * half / 60.0) ** 2
         stars = _magnitudes(conditions.stars_per_arcmin2 * area, STAR_SLOPE, rng)
         galaxies = _magnitudes(conditions.galaxies_per_arcmin2 * area, GALAXY_SLOPE, rng)
@@ -185,9 +190,43 @@ class VisitImage:
         return cls(charge, mask, variance, pointing, sources)
 
 
+def expected_sources(light: Mapping[str, Any], conditions: VisitConditions, shape: tuple[int, int]) -> float:
+    """Mean number of the sources that a night draws; `InputError` if they cannot be drawn in a reasonable time."""
+    scale, widest = float(light["pixel_scale_arcsec"]), max(conditions.seeing_arcsec)
+    if scale > widest:
+        raise InputError(
+            "pixel_scale_arcsec", scale, f"at most {widest:g}, the width of a star in bad seeing"
+        )
+    area = (2.0 * _half_arcsec(scale, conditions, shape) / 60.0) ** 2
+    number = 0.0
+    for density, slope in (
+        (conditions.stars_per_arcmin2, STAR_SLOPE),
+        (conditions.galaxies_per_arcmin2, GALAXY_SLOPE),
+    ):
+        low, high = _counts(slope)
+        number += density * area * (high - low)
+    if number > MOST_SOURCES:
+        allowed = (
+            f"at most {MOST_SOURCES}; {shape[1]} x {shape[0]} pixels of {scale:g} arcsec see "
+            f"{area:.3g} square arcminutes: take fewer or smaller pixels, or fewer stars"
+        )
+        raise InputError("sources in a visit", round(number), allowed)
+    return number
+
+
+def _half_arcsec(scale_arcsec: float, conditions: VisitConditions, shape: tuple[int, int]) -> float:
+    """Half of the side of a patch of the sky that holds all pointings."""
+    return 0.5 * scale_arcsec * math.hypot(*shape) + 4.0 * conditions.dither_arcsec + 10.0
+
+
+def _counts(slope: float) -> tuple[float, float]:
+    """Sources up to the brightest and the faintest magnitude, relative to those up to `COUNTED`."""
+    return 10.0 ** (slope * (BRIGHTEST - COUNTED)), 10.0 ** (slope * (FAINTEST - COUNTED))
+
+
 def _magnitudes(bright: float, slope: float, rng: np.random.Generator) -> FloatArray:
     """Magnitudes of sources of which so many are brighter than `COUNTED`."""
-    low, high = (10.0 ** (slope * (limit - COUNTED)) for limit in (BRIGHTEST, FAINTEST))
+    low, high = _counts(slope)
     number = rng.poisson(bright * (high - low))
     return np.asarray(COUNTED + np.log10(rng.uniform(low, high, number)) / slope)
 
@@ -241,7 +280,7 @@ def _source(psf: galsim.GSObject, radius_arcsec: float, shear: complex) -> galsi
 def _draw(source: galsim.GSObject, image: galsim.Image, x: float, y: float, scale_arcsec: float) -> None:
     side = min(source.getGoodImageSize(scale_arcsec), STAMP_PX)
     if source.flux > 1e5:  # the wings of a bright star stand above the noise
-        side = STAMP_PX
+        side = max(side, min(STAMP_PX, math.ceil(STAMP_ARCSEC / scale_arcsec)))
     left, low = round(x) - side // 2, round(y) - side // 2
     bounds = galsim.BoundsI(left, left + side - 1, low, low + side - 1)
     shared = bounds & image.bounds

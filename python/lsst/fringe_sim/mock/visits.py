@@ -32,9 +32,9 @@ from .hidden_effects import validate_effects, with_hidden_optics
 from .optics import FlatFieldOptics, heights_and_weights
 from .raw_frames import checked_thickness, films_of, parse_size, read_setup_file
 from .signal_table import SignalTable
-from .visit_sources import MASK_PLANES, Pointing, Scene, VisitConditions, VisitImage
+from .visit_sources import MASK_PLANES, Pointing, Scene, VisitConditions, VisitImage, expected_sources
 
-__all__ = ["MockVisit", "VisitConditions", "detected_sky", "write_mock_visits"]
+__all__ = ["MockVisit", "VisitConditions", "check_visits", "detected_sky", "write_mock_visits"]
 
 FloatArray = NDArray[np.float64]
 
@@ -94,10 +94,8 @@ def detected_sky(
     `InputError`: a set-up without a sky and a filter, an effect that does not act on the layers of a
         whole sensor, or no table of silicon.
     """
-    content = read_setup_file(setup)
+    content = _of_the_sky(setup)
     light = content["illumination"]
-    if light["kind"] != "sky" or light["beam"]["kind"] not in ("cone", "telescope"):
-        raise InputError("set-up", setup, "one with a sky, behind a telescope or in a cone")
     optics = with_hidden_optics(_optics(content, setup, silicon), _of_the_sensor(effects))
     sky = SkySpectrum.dark(airmass=float(light["airmass"]))
     parts = sky.components(Bandpass.from_name(str(light["bandpass"])), CONTINUUM_STEP_NM)
@@ -119,6 +117,32 @@ def detected_sky(
     total *= np.float32(light["effective_area_m2"] * light["pixel_scale_arcsec"] ** 2)
     names = tuple(part.name for part in parts)
     return DetectedSky(names, sum(name in lines for name in names), total)
+
+
+def check_visits(
+    setup: str,
+    shape: tuple[int, int],
+    effects: Mapping[str, Any] | None = None,
+    conditions: VisitConditions | None = None,
+) -> float:
+    """Refuse before long work what `write_mock_visits` cannot simulate.
+
+    ``shape``: rows and columns of the sensor; the other arguments are those of `write_mock_visits`.
+    Returns the number of sources to be expected in a visit.
+    `InputError`: as for `detected_sky`, or too many sources.
+    """
+    light = _of_the_sky(setup)["illumination"]
+    _of_the_sensor(effects)
+    return expected_sources(light, conditions or VisitConditions(), shape)
+
+
+def _of_the_sky(setup: str) -> dict[str, Any]:
+    """Content of a set-up that sees the sky through a beam."""
+    content = read_setup_file(setup)
+    light = content["illumination"]
+    if light["kind"] != "sky" or light["beam"]["kind"] not in ("cone", "telescope"):
+        raise InputError("set-up", setup, "one with a sky, behind a telescope or in a cone")
+    return content
 
 
 def _angles(beam: Mapping[str, Any], radius_deg: float, nodes: int) -> tuple[FloatArray, FloatArray]:
@@ -243,6 +267,7 @@ def write_mock_visits(
     content = read_setup_file(setup)
     whole = Camera.from_name(str(content["camera"])).detector(detector)
     sensor = whole if size is None else whole.cut_down(parse_size(size))
+    check_visits(setup, sensor.shape, effects, night)
     thickness = checked_thickness(thickness_um, sensor.shape)
     sky = detected_sky(setup, whole, thickness, effects, silicon)
     scene_rng, band_rng, *visit_rngs = rng.spawn(2 + visits)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from ..algorithms.discovery import Verdict
 from ..algorithms.discovery.verdict import MOST_CANDIDATES
-from ..style import DIVERGING, LINES, figure, panels
+from ..style import DIVERGING, LINES, color_bar, figure, panels
 from .figures import CURVE_INCH
 
 __all__ = ["candidates_figure", "gap_figure", "leftover_figure", "where_figure"]
@@ -197,7 +197,7 @@ def _draw_amplifiers(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.set_xticks([])
     axes.set_yticks([0, 1], ["upper half", "lower half"])
     axes.spines[:].set_visible(False)
-    axes.figure.colorbar(drawn, ax=axes, label="offset of the amplifier [σ]", shrink=0.85)
+    color_bar(axes, drawn, "offset of the amplifier [σ]")
     axes.set_title("by sixteenth of the sensor, named as LSST amplifiers")
 
 

@@ -177,9 +177,10 @@ class Report:
             file.name, file.name, f": {columns} × {rows} px, colours from {low:.3g} to {high:.3g} {unit}."
         )
 
-    def link(self, address: str, text: str, after: str = "") -> None:
-        """Add a link to a file in the folder of the page, and what is said of it."""
-        self._body.append(f'<p class="small">{_link(address, text)}{html.escape(after)}</p>')
+    def link(self, address: str, text: str, after: str = "", before: str = "") -> None:
+        """Add a link to a file beside or below the page, and what is said of it."""
+        words = f"{html.escape(before)}{_link(address, text)}{html.escape(after)}"
+        self._body.append(f'<p class="small">{words}</p>')
 
     def table(
         self,

@@ -216,11 +216,18 @@ def _degrees(problem: Problem, fit: Fit) -> int:
 
 
 def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
-    """Size of what a fit leaves beyond noise, as `Verdict.size` states it."""
+    """Size of what a fit leaves beyond noise, as `Verdict.size` states it.
+
+    Noise that happens to be small gives no limit below that of mean noise: power-constrained limits of Cowan et al.
+    2011.
+    """
     noise, degrees = problem.cells.noise_rms, _degrees(problem, fit)
     counts, most = (
-        noise * math.sqrt(max(fit.chi2 / expected - 1.0, 0.0))
-        for expected in (degrees, float(chdtri(degrees, CONFIDENCE)))
+        noise * math.sqrt(max(chi2 / expected - 1.0, 0.0))
+        for chi2, expected in (
+            (fit.chi2, degrees),
+            (max(fit.chi2, float(degrees)), float(chdtri(degrees, CONFIDENCE))),
+        )
     )
     level, _ = problem.amplitudes(fit.levels)
     pattern = (problem.expected_of(fit) / level - 1.0)[:, problem.cells.seen]

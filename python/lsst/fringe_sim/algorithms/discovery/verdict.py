@@ -182,7 +182,7 @@ class Verdict(InNotebook):
     size : `dict`
         How large the disagreement with the unchanged model is: ``of_counts``, rms relative to the mean counts without
         what noise adds, ``of_fringes``, the same relative to the rms of the fringes, and ``of_fringes_at_most``, its
-        upper limit at 95 % confidence.
+        upper limit at 95 % confidence, which is never below that of data with a mean noise.
     """
 
     verdict: str
