@@ -11,6 +11,7 @@ from astropy.table import Table
 
 from ..algorithms.discovery import Verdict, probability_text
 from ..algorithms.discovery.verdict import NamedEffect
+from ..algorithms.discovery.verdict_words import accuracy_text, learned_text
 from ..algorithms.flat_residual import ResidualPair
 from ..products import SensorSection
 from .discovery_figures import candidates_figure, gap_figure, leftover_figure, where_figure
@@ -121,10 +122,8 @@ def _summary(
     rows.append(("verdict", _found(verdict)))
     if not verdict.complete:
         rows.append(("complete", "no: the search was stopped, and this is the best answer that it had"))
-    if verdict.accuracy_text():
-        rows.append(("beside the accuracy of the model", verdict.accuracy_text()))
-    if verdict.has_learned:
-        rows.append(("learned", verdict.learned_text()))
+    told = (("beside the accuracy of the model", accuracy_text(verdict)), ("learned", learned_text(verdict)))
+    rows += [(what, text) for what, text in told if text]
     rows.append(("chance that noise alone disagrees as much", _chance(verdict.global_probability)))
     if math.isfinite(gap.heldout_before):
         held = amplitude_text(gap.heldout_before)

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from ..algorithms.discovery import Verdict
 from ..algorithms.discovery.skeleton import PHASES, patterns_of, wave_form
+from ..algorithms.discovery.verdict_words import learned_text
 from ..style import DIVERGING, figure, panels
 from .figures import CURVE_INCH
 from .page import Report
@@ -66,7 +67,7 @@ def add_learned(report: Report, verdict: Verdict) -> None:
         "A correction without a cause: no physics. It was learned from a part of the cells, and judged by others "
         "that took no part in learning.",
     )
-    text = verdict.learned_text()
+    text = learned_text(verdict)
     report.paragraph(f"{text[0].upper()}{text[1:]}.")
     report.figure(learned_figure(told), "The correction, in percent of the counts.")
     rows = [
@@ -79,8 +80,9 @@ def add_learned(report: Report, verdict: Verdict) -> None:
     )
     report.paragraph(
         f"χ² of the cells that judge falls by {told['heldout_gain']:.0f}, and by {told['unseen_gain']:.0f} in those "
-        f"of them that no choice of effects has seen. Noise alone does as well with a chance of {told['chance']:.2g}, "
-        f"counted on noise drawn on the fitted model; more than {told['false_alarms']:g} is not believed."
+        "of them that no choice of effects has seen. Noise alone does as well with a chance of "
+        f"{told['chance']:.2g}, counted on noise drawn on the fitted model; more than {told['false_alarms']:g} is "
+        "not believed."
     )
     report.paragraph(
         "learned.py beside this page puts it into any task (-C label:learned.py); patterns of the light stay in the "

@@ -509,7 +509,8 @@ class _Search:
         )
         if reasons:
             return self._unexplained(whole, final, chance, steps, "; ".join(reasons), partial=named)
-        self.notes.extend(self._what_may_be_form(sets, chosen))
+        form = self._what_may_be_form(sets, chosen)
+        self.notes.extend(form)
         decided, self.next_measurements = with_next_measurements(
             named,
             {name: group.values for name, group in classes.items()},
@@ -517,7 +518,8 @@ class _Search:
             self.say,
         )
         found = self._verdict("named", whole, final, chance, decided, {}, steps)
-        return replace(found, accuracy=self._accuracy(whole, chance))
+        learned = self._learned(whole, final) if form else {}
+        return replace(found, learned=learned, accuracy=self._accuracy(whole, chance))
 
     def _spots_instead(self, whole: Selector, final: Hypothesis) -> float:
         """Log evidence of a few spots in the place of an effect of image or island, over that of the effect.

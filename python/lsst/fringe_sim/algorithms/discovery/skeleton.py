@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from ...effects import LEARNED, ImageGeometry
 from ...effects.learned import LEARNED_HARMONICS, LEARNED_NODES_NM
+from ...model.effects_override import effects_override
 
 if TYPE_CHECKING:
     from .verdict import Verdict
 
-__all__ = ["effect_skeleton", "patterns_of", "wave_form"]
+__all__ = ["effect_skeleton", "learned_files", "patterns_of", "wave_form"]
 
 FloatArray = NDArray[np.float64]
 
@@ -86,6 +87,16 @@ def patterns_of(name: str, own: Mapping[str, float], side: int) -> tuple[list[in
     values |= {key.partition(".")[2]: value for key, value in own.items()}
     geometry = ImageGeometry.of_pixels((side, side), np.array(nodes, dtype=float))
     return nodes, effect.change_image(np.ones((len(nodes), side, side)), values, geometry) - 1.0
+
+
+def learned_files(verdict: Verdict) -> dict[str, str]:
+    """Texts by file name: an override with a correction, and the beginning of an effect; none without."""
+    if not verdict.has_learned:
+        return {}
+    beside, own = verdict.learned["beside"], {key: x for key, x in verdict.learned["own"].items() if x}
+    told = f"{verdict.verdict}; learned from what no effect explains, not physics"
+    override = effects_override({**beside, **own}, verdict.setup, told)
+    return {"learned.py": override, "learned_effect.py": effect_skeleton(verdict)}
 
 
 def effect_skeleton(verdict: Verdict) -> str:

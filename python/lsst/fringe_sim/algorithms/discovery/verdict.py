@@ -15,7 +15,8 @@ from ...errors import named_units
 from ...files import table_text, write_together
 from ...model.effects_override import effects_override
 from ...notebook import InNotebook, axes_or_new
-from .skeleton import effect_skeleton
+from .skeleton import learned_files
+from .verdict_words import accuracy_text, learned_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,23 +31,10 @@ __all__ = [
     "probability_text",
 ]
 
-VERDICTS = ("named", "no_discrepancy", "within_accuracy", "unexplained")
-
-
 MOST_CANDIDATES = 15
 """Effects that a picture shows at most."""
 
 _SIZES = ("of_counts", "of_fringes", "of_fringes_at_most")
-
-NOT_PHYSICS = "learned from what no effect explains, not physics"
-
-LEARNED_WORDS = {
-    "learned_response": "a wave form over the fringe phase",
-    "learned_map": "a pattern over the sensor",
-    "learned_light": "a pattern over the sensor in each exposure",
-    "learned_amplifiers": "factors of the amplifiers",
-}
-"""What a correction is, by its effect."""
 
 CONFIDENCE = 0.95
 """Of the upper limit of a disagreement: a convention of how limits are stated, which decides nothing."""
@@ -195,8 +183,8 @@ class Verdict(InNotebook):
         what noise adds, ``of_fringes``, the same relative to the rms of the fringes, and ``of_fringes_at_most``, its
         upper limit at 95 % confidence.
     learned : `dict`
-        A correction that was learned from what no effect explains, and what cells say of it that took no part; empty
-        where there is none. Its settings are ``own``, those of the effects beside it ``beside``.
+        A correction learned from what no effect explains, and what cells say of it that took no part; empty without.
+        Its settings are ``own``, those of the effects beside it ``beside``.
     accuracy : `dict`
         What the model may be wrong by: ``assumed``, a part of the fringes, its ``source``, and the ``chance`` that
         noise and such errors together disagree as much with the unchanged model; empty where that was not asked.
@@ -351,10 +339,9 @@ class Verdict(InNotebook):
             tuple(content["next_measurements"]),
             tuple(content["notes"]),
             content["data"],
-            content.get("complete", True),
-            {key: _number(content.get("size", {}).get(key)) for key in _SIZES},
-            content.get("learned", {}),
-            content.get("accuracy", {}),
+            complete=content.get("complete", True),
+            size={key: _number(content.get("size", {}).get(key)) for key in _SIZES},
+            **{key: content.get(key, {}) for key in ("learned", "accuracy")},
         )
 
     def table(self) -> Table:
@@ -387,11 +374,6 @@ class Verdict(InNotebook):
         """Whether a correction was learned that noise alone would hardly give."""
         return bool(self.learned.get("believed"))
 
-    def learned_override(self) -> str:
-        """Text of a config override that puts the correction, and the effects beside it, into every stage."""
-        beside, own = self.learned["beside"], {k: x for k, x in self.learned["own"].items() if x}
-        return effects_override({**beside, **own}, self.setup, f"{self.verdict}; {NOT_PHYSICS}")
-
     def write(self, out_dir: str | Path) -> Path:
         """Write ``effects.py``, ``discovery.ecsv`` and ``discovery.json``; returns the path of the last.
 
@@ -403,38 +385,10 @@ class Verdict(InNotebook):
         contents = {
             "effects.py": self.override(),
             "discovery.ecsv": table_text(self.table()),
-            **self._learned_files(),
+            **learned_files(self),
             "discovery.json": self.to_json(str(folder / "effects.py")),
         }
         return write_together(folder, contents)
-
-    def _learned_files(self) -> dict[str, str]:
-        if not self.has_learned:
-            return {}
-        return {"learned.py": self.learned_override(), "learned_effect.py": effect_skeleton(self)}
-
-    def accuracy_text(self) -> str:
-        """The disagreement beside the accuracy of the model, for people; empty where it was not asked for."""
-        chance = self.accuracy.get("chance")
-        if chance is None:
-            return ""
-        beyond = "within" if self.verdict == "within_accuracy" else "beside"
-        return (
-            f"{beyond} the accuracy of the model, {100.0 * self.accuracy['assumed']:.2g} % of the fringes "
-            f"({self.accuracy['source']}): chance {chance:.2g} with it, {self.global_probability:.2g} of noise alone"
-        )
-
-    def learned_text(self) -> str:
-        """What was learned, for people; empty where nothing was."""
-        if not self.has_learned:
-            return ""
-        told, alike = self.learned, ", ".join(self.unexplained.get("like", ()))
-        first = f"like {alike}, and not quite: " if alike else ""
-        return (
-            f"{first}{LEARNED_WORDS[told['name']]} ({told['words']}; no physics) takes data that it has not seen "
-            f"from {told['before_rms']:.6g} to {told['after_rms']:.6g}, noise floor {told['noise_floor']:.6g} "
-            f"(chance of noise {told['chance']:.2g})"
-        )
 
     def size_text(self) -> str:
         """How large the disagreement is, for people."""
@@ -464,7 +418,7 @@ class Verdict(InNotebook):
             if effect.ambiguous_with:
                 lines.append(f"    these data cannot tell it from: {', '.join(effect.ambiguous_with)}")
                 lines.append(f"    what would decide: {effect.break_ambiguity}")
-        lines += [f"  {text}" for text in (self.accuracy_text(), self.learned_text()) if text]
+        lines += [f"  {text}" for text in (accuracy_text(self), learned_text(self)) if text]
         if self.unexplained.get("reason"):
             lines.append(f"  {self.unexplained['reason']}")
         gap = self.gap
