@@ -103,13 +103,17 @@ def with_learned(problem: Problem) -> Problem:
     return replace(problem, forward=replace(problem.forward, catalogue=[*problem.forward.catalogue, *added]))
 
 
-def families(problem: Problem, fit: Fit, state: State) -> list[Family]:
-    """All kinds of corrections at a fit."""
+def families(problem: Problem, fit: Fit, state: State, only: str = "") -> list[Family]:
+    """All kinds of corrections at a fit, or the one of a name."""
     geometry = problem.cells.geometry
-    found = [_of_phase(problem, fit, state), _of_map(geometry, state), _of_light(geometry, state)]
+    makers = {
+        "learned_response": lambda: _of_phase(problem, fit, state),
+        "learned_map": lambda: _of_map(geometry, state),
+        "learned_light": lambda: _of_light(geometry, state),
+    }
     if len(np.unique(geometry.amplifier)) > 1:
-        found.append(_of_amplifiers(geometry, state))
-    return found
+        makers["learned_amplifiers"] = lambda: _of_amplifiers(geometry, state)
+    return [make() for name, make in makers.items() if only in ("", name)]
 
 
 def _used_nodes(wavelength_nm: FloatArray) -> tuple[list[int], FloatArray]:
@@ -139,7 +143,8 @@ def _of_phase(problem: Problem, fit: Fit, state: State) -> Family:
     _, level = problem.amplitudes(fit.levels)
     amplitude, step = [], 1e-3
     for wave in waves:
-        setting = {f"learned_response.{wave}_{node}": step for node in LEARNED_NODES_NM}
+        names = [f"learned_response.{wave}_{node}" for node in LEARNED_NODES_NM]
+        setting = {name: fit.settings.get(name, 0.0) + step for name in names}
         change = problem.forward.change(fit.settings, {**fit.settings, **setting}, state.thickness_um)
         amplitude.append(state.whiten.root * level * change / step)
     planes = np.tile(np.arange(len(shares)), len(waves))

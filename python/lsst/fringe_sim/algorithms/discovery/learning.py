@@ -33,6 +33,9 @@ DRAWS = 199
 """Draws of noise. The rank of the data among them is an exact chance for any number (Phipson & Smyth 2010, doi
 10.2202/1544-6115.1585); with this many, one draw that is as good is still an alarm of one in a hundred."""
 
+ROUNDS = 1
+"""Rounds in which a correction is learned again about itself."""
+
 AT_ONCE = 20
 """Draws that are in memory together."""
 
@@ -114,12 +117,12 @@ class _Side:
     information: list[FloatArray]
 
     @classmethod
-    def of(cls, problem: Problem, fit: Fit) -> _Side:
+    def of(cls, problem: Problem, fit: Fit, only: str = "") -> _Side:
         design, residual, prediction, thickness, whiten = linearise_at(problem, fit)
         value = problem.expected(fit.levels, prediction.value)
         raw = np.where(problem.cells.weight > 0, problem.cells.value - value, 0.0)
         state = State(design, residual, raw, value, thickness, whiten)
-        kinds = families(problem, fit, state)
+        kinds = families(problem, fit, state, only)
         both = [design.projection(family.columns) for family in kinds]
         return cls(state, kinds, [each[0] for each in both], [each[1] for each in both])
 
@@ -216,7 +219,8 @@ def learn(
     problem = with_learned(problem)
     inside = problem.without_cells(judged)
     outside = problem.with_cells(problem.cells.restricted(judged))
-    fitted = fit_model(inside, best.coordinates, best.position, best.field, best.levels, best.settings)
+    free = fit_model(inside, best.coordinates, best.position, best.field, best.levels, best.settings)
+    fitted = free.held()  # beside the effects as they are: free ones would take a part of the correction back
     before = _beyond(problem, outside, null, fitted, judged, fitted.settings)
     seen, unseen = _Side.of(inside, fitted), _Side.of(outside, before)
     scores = [side.scores([side.state.residual]) for side in (seen, unseen)]
@@ -224,7 +228,7 @@ def learn(
     if taught.evidence[0] <= least:
         return None
     family = seen.families[taught.family[0]]
-    own = dict(zip(family.keys, taught.parameters[0].tolist(), strict=True))
+    fitted, own = _again(inside, fitted, family, taught)
     after = _beyond(problem, outside, null, fitted, judged, {**fitted.settings, **own})
     gain, drawn = before.chi2 - after.chi2, _of_noise(seen, unseen, rng, least)
     strict = judged & held_out
@@ -232,7 +236,7 @@ def learn(
         name=family.name,
         words=family.priors[taught.prior[0]][0],
         size=float(taught.size[0]),
-        beside=dict(fitted.settings),
+        beside={key: x for key, x in fitted.settings.items() if key not in own},
         own=own,
         log_evidence=float(taught.evidence[0]),
         heldout_gain=gain,
@@ -242,6 +246,22 @@ def learn(
         after_rms=misfit_rms(outside, after),
         noise_floor=problem.cells.noise_rms,
     )
+
+
+def _again(inside: Problem, fitted: Fit, family: Family, taught: _Taught) -> tuple[Fit, dict[str, float]]:
+    """The correction once more about itself, with thickness and levels that follow it.
+
+    Where it is large, what it does is not in proportion to it.
+    """
+    known = taught.parameters[0]
+    for _ in range(ROUNDS):
+        own = dict(zip(family.keys, known.tolist(), strict=True))
+        fixed = {**fitted.settings, **own}
+        fitted = fit_model(inside, (), np.zeros(0), fitted.field, fitted.levels, fixed)
+        side = _Side.of(inside, fitted, family.name)
+        score = side.scores([side.state.residual])[0] + side.information[0] @ known
+        known = side.priors[0][taught.prior[0]].parameters(score, taught.size)[0]
+    return fitted, dict(zip(family.keys, known.tolist(), strict=True))
 
 
 def _chi2_of(problem: Problem, fit: Fit, cells: NDArray[np.bool_]) -> float:
