@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.cli.main import cli, run
-from lsst.fringe_sim.effects import EFFECTS, catalogue, effects_from, known_effects
+from lsst.fringe_sim.effects import EFFECTS, LEARNED, catalogue, effects_from, known_effects
 from lsst.fringe_sim.effects.catalogue import ENTRY_POINTS
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.model import FringeModel
@@ -45,14 +45,14 @@ def written(folder: Path, text: str = OWN.format(name="delamination")) -> Path:
 
 
 def test_the_catalogue_of_the_package_alone() -> None:
-    assert known_effects() == EFFECTS
+    assert known_effects() == (*EFFECTS, *LEARNED)
 
 
 def test_an_effect_of_ones_own_acts_like_any_other(tmp_path: Path) -> None:
     thickness = np.linspace(14.0, 14.3, 31)
     plain = FringeModel.from_setup("ts8_e2v").response(thickness, [960.0])
     with effects_from(written(tmp_path)) as (own,):
-        assert known_effects() == (*EFFECTS, own)
+        assert known_effects() == (*EFFECTS, *LEARNED, own)
         model = FringeModel.from_setup("ts8_e2v", {"delamination.gap": 240.0})
         again = plain_model = FringeModel.from_setup("ts8_e2v", {"delamination.gap": 0.0})
         assert np.abs(model.response(thickness, [960.0]) - plain).max() > 0.01
@@ -60,7 +60,7 @@ def test_an_effect_of_ones_own_acts_like_any_other(tmp_path: Path) -> None:
         assert plain_model.with_effects({"delamination.gap": 240.0}).effect_settings == {
             "delamination.gap": 240.0
         }
-    assert known_effects() == EFFECTS
+    assert known_effects() == (*EFFECTS, *LEARNED)
     with pytest.raises(UnknownNameError, match="delamination"):
         FringeModel.from_setup("ts8_e2v", {"delamination.gap": 240.0})
 
@@ -90,7 +90,7 @@ def test_a_module_on_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_what_is_no_catalogue_is_refused(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(InputError, match=words), effects_from(written(tmp_path, text)):
         pass
-    assert known_effects() == EFFECTS
+    assert known_effects() == (*EFFECTS, *LEARNED)
 
 
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -147,7 +147,7 @@ def test_an_installed_package_offers_effects(tmp_path: Path, monkeypatch: pytest
     finally:
         catalogue._installed.cache_clear()
         monkeypatch.undo()
-    assert known_effects() == EFFECTS
+    assert known_effects() == (*EFFECTS, *LEARNED)
     with pytest.raises(InputError, match="entry point ours = installed_effects:EFFECTS"):
         read_effects_override(text)
 

@@ -6,6 +6,7 @@ import base64
 import math
 import re
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, Param
 from lsst.fringe_sim.algorithms.flat_residual import FlatResidual, ResidualPair, residual_pair
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.model.effects_override import read_effects_override
 from lsst.fringe_sim.products import FlatExposures, ThicknessMap
 from lsst.fringe_sim.report.discovery_figures import candidates_figure, gap_figure, where_figure
 from lsst.fringe_sim.report.discovery_page import discovery_page
@@ -106,6 +108,32 @@ UNEXPLAINED = replace(
     },
 )
 
+LEARNED = replace(
+    UNEXPLAINED,
+    size={"of_counts": 2e-3, "of_fringes": 0.03, "of_fringes_at_most": 0.04},
+    unexplained={**UNEXPLAINED.unexplained, "like": ["roughness"]},
+    accuracy={"assumed": 0.014, "source": "a table", "chance": 1e-5},
+    learned={
+        "name": "learned_response",
+        "words": "length 30 nm",
+        "beside": {"roughness.sigma": 20.0},
+        "own": {
+            f"learned_response.{wave}{harmonic}_{node}": 0.01 / harmonic
+            for wave in ("cos", "sin")
+            for harmonic in (1, 2, 3)
+            for node in (950, 960, 970)
+        },
+        "heldout_gain": 812.0,
+        "unseen_gain": 95.0,
+        "chance": 0.005,
+        "false_alarms": 0.01,
+        "before_rms": 0.0078,
+        "after_rms": 0.0071,
+        "noise_floor": 0.0070,
+        "believed": True,
+    },
+)
+
 AGREES = replace(
     NAMED, verdict="no_discrepancy", effects=(), steps=(), next_measurements=(), global_probability=0.43
 )
@@ -132,7 +160,7 @@ def words(text: str) -> str:
     return re.sub(r"<[^>]+>", " ", re.sub(r"<style>.*?</style>|base64,[^\"]+", "", text, flags=re.DOTALL))
 
 
-@pytest.mark.parametrize("verdict", [NAMED, UNEXPLAINED, AGREES, TOO_POOR], ids=lambda v: v.verdict)
+@pytest.mark.parametrize("verdict", [NAMED, UNEXPLAINED, LEARNED, AGREES, TOO_POOR], ids=lambda v: v.verdict)
 def test_every_page_is_whole_and_fetches_nothing(verdict: Verdict, tmp_path) -> None:
     page = discovery_page(verdict)
     text = page.write(tmp_path / "report.html").read_text(encoding="utf-8")
@@ -277,3 +305,40 @@ def test_many_parameters_are_one_number_in_the_summary_and_all_in_the_table() ->
     assert "amplifier_gain: 16 parameters, rms 2.0e-06; probability" in seen
     assert "0.00000" in seen
     assert "-0.00000" not in seen
+
+
+@pytest.mark.parametrize("name", ["response", "map", "light", "amplifiers"])
+def test_what_was_learned_is_told_and_shown(name: str) -> None:
+    """Size first, then the shape, the gap before and after, and which effect it is like."""
+    keys = {"map": "y1x2", "light": "at_960_y1x2", "amplifiers": "C00"}
+    own = {f"learned_{name}.{keys[name]}": 0.01} if name in keys else LEARNED.learned["own"]
+    verdict = replace(LEARNED, learned={**LEARNED.learned, "name": f"learned_{name}", "own": own})
+    text = discovery_page(verdict).to_html()
+    told = words(text)
+    assert "like roughness, and not quite" in told
+    assert "no physics" in told
+    assert "812" in told
+    assert told.index("3 % of the fringes") < told.index("No name")
+    assert list(downloads(text)["discovery_learned"]["rms"]) == pytest.approx([0.78, 0.71, 0.70])
+
+
+def test_a_disagreement_within_the_accuracy_is_said_to_be_so(tmp_path: Path) -> None:
+    accuracy = {**LEARNED.accuracy, "chance": 0.3}
+    verdict = replace(LEARNED, verdict="within_accuracy", accuracy=accuracy, learned={})
+    told = words(discovery_page(verdict).to_html())
+    assert "within the accuracy of the model" in told
+    assert "chance 0.3 with it" in told
+    assert "What was learned" not in told
+    verdict.write(tmp_path)
+    assert not (tmp_path / "learned.py").exists()
+
+
+def test_files_of_what_was_learned(tmp_path: Path) -> None:
+    again = Verdict.from_json(LEARNED.write(tmp_path).read_text())
+    assert again.learned == LEARNED.learned
+    assert again.accuracy == LEARNED.accuracy
+    text = (tmp_path / "learned.py").read_text()
+    assert "not physics" in text
+    assert read_effects_override(text) == {**LEARNED.learned["beside"], **LEARNED.learned["own"]}
+    assert read_effects_override((tmp_path / "effects.py").read_text()) == {}
+    assert "0.375" in (tmp_path / "learned_effect.py").read_text()  # a phase of the wave form

@@ -62,12 +62,12 @@ def setups(as_json: bool) -> None:
 
 
 def _named(known: Sequence[Effect], names: Sequence[str]) -> list[Effect]:
-    """The effects of some names; all if there are none."""
+    """The effects of some names; all that are physics if there are none."""
     by_name = {effect.name: effect for effect in known}
     for name in names:
         if name not in by_name:
             raise UnknownNameError("effect", name, by_name)
-    return [by_name[name] for name in names] or list(known)
+    return [by_name[name] for name in names] or [effect for effect in known if not effect.learned]
 
 
 @click.command()

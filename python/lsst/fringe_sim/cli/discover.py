@@ -26,11 +26,15 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
 
 __all__ = ["discover"]
 
+PRODUCTS = ("discovery.json", "discovery.ecsv", "effects.py", "report.html")
+OF_WHAT_WAS_LEARNED = ("learned.py", "learned_effect.py")
+"""Files that are there where a correction was learned from what no effect explains."""
+
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...")
 @ANY_LIGHT.option("ts8_e2v", "Set-up of flats, or of frames of the sky: name or file.")
-@output_folder("Folder for the verdict.", "discovery.json", "discovery.ecsv", "effects.py", "report.html")
+@output_folder("Folder for the verdict.", *PRODUCTS, *OF_WHAT_WAS_LEARNED)
 @click.option(
     "--seed", type=int, default=1, show_default=True, help="Which parts of the sensor are held out."
 )
@@ -52,6 +56,14 @@ __all__ = ["discover"]
     metavar="SECONDS",
     help="Stop after so long with the best answer so far, which says that it is not complete.",
 )
+@click.option(
+    "--model-accuracy",
+    type=click.FloatRange(0.0, 1.0, max_open=True),
+    default=None,
+    metavar="PART",
+    help="Part of the fringes by which the model may be wrong, by default as the tables of silicon (0.014); 0 for a "
+    "model without error.",
+)
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
 @click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
 def discover(
@@ -65,6 +77,7 @@ def discover(
     detector: str | None,
     cells: int,
     time_budget: float | None,
+    model_accuracy: float | None,
     skip_bad: bool,
     dry_run: bool,
 ) -> None:
@@ -92,6 +105,8 @@ def discover(
 
     most_s = math.inf if time_budget is None else time_budget
     limits: dict[str, Any] = {"most_cells": cells, "time_budget_s": most_s}
+    if model_accuracy is not None:
+        limits["model_accuracy"] = model_accuracy
     given: list[str | Path] = [*paths, *([thickness] if thickness else []), *effects.files]
     if setup.kind == "sky":
         data = read_sky_frames(paths, setup, thickness)
@@ -157,11 +172,11 @@ def _write(
 ) -> None:
     from ..report.discovery_page import discovery_page
 
-    path = verdict.write(folder)
+    verdict.write(folder)
     page = discovery_page(verdict, residuals, section=section, origin=origin_of(folder, given))
     page.write(folder / "report.html")
     _say(verdict)
-    for name in (path.name, "discovery.ecsv", "effects.py", "report.html"):
+    for name in (*PRODUCTS, *(OF_WHAT_WAS_LEARNED if verdict.has_learned else ())):
         click.echo(str(folder / name))
 
 

@@ -13,6 +13,7 @@ from .base import Effect, Parameter, Residuals, ResponseContext, SearchHints
 from .catalogue import catalogue_of, effects_from, known_effects
 from .geometry import AMPLIFIERS, ImageGeometry
 from .illumination import ChromaticIllumination, IlluminationPattern, Vignetting
+from .learned import LearnedAmplifiers, LearnedLight, LearnedMap, LearnedResponse
 from .light import (
     Bandwidth,
     ConvergingBeam,
@@ -65,6 +66,7 @@ from .void import Void
 __all__ = [
     "AMPLIFIERS",
     "EFFECTS",
+    "LEARNED",
     "ActiveEffect",
     "Effect",
     "ImageGeometry",
@@ -142,3 +144,6 @@ EFFECTS: tuple[Effect, ...] = (
     FlatFringes(),
 )
 """Every effect of this package, in the order in which they are applied; `known_effects` has those of others, too."""
+
+LEARNED: tuple[Effect, ...] = (LearnedResponse(), LearnedMap(), LearnedLight(), LearnedAmplifiers())
+"""Corrections without a cause, which a search learns: they can be set as effects, and nothing looks for them."""

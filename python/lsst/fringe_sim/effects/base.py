@@ -193,6 +193,8 @@ class Effect(Described, ABC):
     sky_only: ClassVar[bool] = False
     """Whether it belongs to the sensor at the telescope, or to its sky: neither flats nor maps made from them know of
     it. So is all that acts on the spectrum."""
+    learned: ClassVar[bool] = False
+    """Whether it is no physics but what a search learned: no search looks for it, and no forecast counts on it."""
     reference: ClassVar[str]
     search: ClassVar[SearchHints] = SearchHints()
     """What a search must know of it."""

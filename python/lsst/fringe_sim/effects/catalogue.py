@@ -38,8 +38,8 @@ def known_effects(given: Iterable[Effect] | None = None) -> tuple[Effect, ...]:
     Returns
     -------
     effects : `tuple` [`Effect`, ...]
-        `EFFECTS`, then those that installed packages offer as entry points of the group ``lsst.fringe_sim.effects``,
-        then those of `effects_from`.
+        `EFFECTS` and `LEARNED`, then those that installed packages offer as entry points of the group
+        ``lsst.fringe_sim.effects``, then those of `effects_from`.
 
     Raises
     ------
@@ -93,9 +93,9 @@ def effects_from(source: str | Path) -> Iterator[tuple[Effect, ...]]:
 
 @functools.cache
 def _installed() -> tuple[tuple[str, Effect], ...]:
-    from . import EFFECTS
+    from . import EFFECTS, LEARNED
 
-    found = tuple(("", effect) for effect in EFFECTS)
+    found = tuple(("", effect) for effect in (*EFFECTS, *LEARNED))
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda item: item.name):
         source = f"entry point {entry.name} = {entry.value}"
         known = tuple(effect for _, effect in found)

@@ -101,6 +101,38 @@ class PhaseResponse:
         shares = [(1.0 - part) * np.asarray(self.share), part * np.asarray(other.share)]
         return replace(self, **arrays, share=np.concatenate(shares))
 
+    def with_harmonic(self, multiple: int, cosine: ArrayLike, sine: ArrayLike) -> PhaseResponse:
+        """Response with a further wave in a multiple of the phase, parts of the mean over all phases.
+
+        It is one more state, whose phase runs so many times as fast. In a layer that absorbs, waves fade with
+        thickness, and the mean is the response of one from whose far side nothing comes back.
+
+        Parameters
+        ----------
+        multiple : `int`
+            Waves per fringe.
+        cosine, sine : array_like
+            Amplitudes at every node, relative to the mean response.
+        """
+        clear = self.a + self.b + self.e - 2.0 * (self.c.conj() * self.g).real
+        states = np.where(self.kappa.imag > 0.0, self.a, clear / (1.0 - np.abs(self.g) ** 2))
+        mean = (np.asarray(self.share) * states).sum(axis=0)
+        wave = 0.5 * mean * (np.asarray(cosine) - 1j * np.asarray(sine))
+        nothing = np.zeros((1, *self.node_shape))
+        added: dict[str, Any] = {
+            "a": nothing,
+            "b": nothing,
+            "e": nothing,
+            "g": nothing.astype(complex),
+            "c": wave[np.newaxis],
+        }
+        added["kappa"] = multiple * self.kappa[:1]
+        added["share"] = np.ones((1, *self.node_shape))
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), own]) for name, own in added.items()
+        }
+        return replace(self, **arrays)
+
     @named_units
     def evaluate(self, thickness_um: ArrayLike) -> FloatArray:
         """Response at every node.

@@ -69,6 +69,9 @@ class OpticalSystem(OneLine):
         Part of every pixel in which a layer is thicker; none if not given.
     laboratory_temperature_k : `float`, optional
         Temperature at which thicknesses were measured, for a sensor at a telescope [K].
+    added_harmonics : `tuple`
+        What is added to the response of the stack: a multiple of the fringe phase, and its nodes of wavelength [nm],
+        cosine and sine, parts of the mean response; in a straight line between nodes and constant beyond.
     """
 
     stack: LayerStack
@@ -87,6 +90,7 @@ class OpticalSystem(OneLine):
     diffuse: DiffuseReturn | None = None
     structure: Structure | None = None
     laboratory_temperature_k: float | None = None
+    added_harmonics: tuple[tuple[int, tuple[tuple[float, float, float], ...]], ...] = ()
 
     def __post_init__(self) -> None:
         self.stack.position(self.varying)
@@ -119,6 +123,13 @@ class OpticalSystem(OneLine):
 
     def reduce(self, illumination: Illumination) -> PhaseResponse:
         """Closed form of the response in the thickness of the varying layer, one set per node."""
+        if self.added_harmonics:
+            bare = replace(self, added_harmonics=()).reduce(illumination)
+            for harmonic, nodes in self.added_harmonics:
+                place, cosine, sine = np.transpose(nodes)
+                parts = [np.interp(illumination.wavelength_nm, place, each) for each in (cosine, sine)]
+                bare = bare.with_harmonic(harmonic, *parts)
+            return bare
         if self.structure is not None:
             here = replace(self, structure=None)
             layer = self.stack.layers[self.stack.position(self.structure.layer)]

@@ -11,10 +11,12 @@ from astropy.table import Table
 
 from ..algorithms.discovery import Verdict, probability_text
 from ..algorithms.discovery.verdict import NamedEffect
+from ..algorithms.discovery.verdict_words import accuracy_text, learned_text
 from ..algorithms.flat_residual import ResidualPair
 from ..products import SensorSection
 from .discovery_figures import candidates_figure, gap_figure, leftover_figure, where_figure
 from .figures import pixel_noise, residuals_figure, thickness_figure
+from .learned_part import add_learned
 from .page import Origin, Report
 from .words import amplitude_text, masked_text, measured_text, number_text, of_sensor, sigma_text
 
@@ -64,6 +66,7 @@ def discovery_page(
     _candidates(report, verdict)
     _gap(report, verdict)
     _unexplained(report, verdict)
+    add_learned(report, verdict)
     _next(report, verdict)
     _use(report, verdict)
     _data(report, verdict)
@@ -78,6 +81,8 @@ def headline(verdict: Verdict) -> str:
         return "Model and data agree within the noise"
     if verdict.unexplained.get("too_poor"):
         return "These data are too poor to be searched"
+    if verdict.verdict == "within_accuracy":
+        return "Model and data disagree within the accuracy of the model"
     if verdict.verdict == "unexplained":
         return "Model and data disagree, and no known effect explains it"
     names = " and ".join(
@@ -111,11 +116,14 @@ def _summary(
     verdict: Verdict, residuals: ResidualPair | None, section: SensorSection | None
 ) -> list[tuple[str, str]]:
     """What was found, how large it is, and in what."""
-    gap, rows = verdict.gap, [("verdict", _found(verdict))]
-    if not verdict.complete:
-        rows.append(("complete", "no: the search was stopped, and this is the best answer that it had"))
+    gap, rows = verdict.gap, []
     if math.isfinite(verdict.size["of_counts"]):
         rows.append(("size of the disagreement", verdict.size_text().partition(": ")[2]))
+    rows.append(("verdict", _found(verdict)))
+    if not verdict.complete:
+        rows.append(("complete", "no: the search was stopped, and this is the best answer that it had"))
+    told = (("beside the accuracy of the model", accuracy_text(verdict)), ("learned", learned_text(verdict)))
+    rows += [(what, text) for what, text in told if text]
     rows.append(("chance that noise alone disagrees as much", _chance(verdict.global_probability)))
     if math.isfinite(gap.heldout_before):
         held = amplitude_text(gap.heldout_before)
@@ -349,6 +357,7 @@ def _next(report: Report, verdict: Verdict) -> None:
         words = {
             "no_discrepancy": "None is needed for this question.",
             "named": "The data decide between the effects of the catalogue; none is needed for this question.",
+            "within_accuracy": "None with this model: better constants of its layers come first.",
             "unexplained": "Write the missing effect from the description above, then search again.",
         }
         report.section("Next measurement", words[verdict.verdict])

@@ -84,11 +84,21 @@ class SearchConfig(Config):
         doc="Time for one sensor [s], after which the best answer so far is given; by default as long as it takes.",
     )
 
+    model_accuracy: Field[float] = Field(
+        dtype=float,
+        default=SearchOptions().model_accuracy,
+        doc="Part of the fringes by which the model may be wrong; by default as the tables of silicon.",
+    )
+
     def options(self, usual: SearchOptions) -> SearchOptions:
         """The same for the algorithm, which has its usual ones."""
         budget = math.inf if self.time_budget_s is None else self.time_budget_s
         return replace(
-            usual, most_cells=self.most_cells, significance=self.significance, time_budget_s=budget
+            usual,
+            most_cells=self.most_cells,
+            significance=self.significance,
+            time_budget_s=budget,
+            model_accuracy=self.model_accuracy,
         )
 
     def rng(self, detector: Detector) -> np.random.Generator:

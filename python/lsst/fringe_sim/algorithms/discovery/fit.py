@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -293,8 +294,25 @@ class PlaneColumns:
         return np.asarray(self.basis.T @ planes @ levels.basis)
 
 
-Columns = FullColumns | PlaneColumns
-"""Whitened derivatives, written out or not."""
+class Columns(Protocol):
+    """Whitened derivatives, written out or not; see `FullColumns`."""
+
+    @property
+    def gram(self) -> FloatArray:
+        """Products with one another, shape ``(L, L)``."""
+
+    def dot(self, values: FloatArray) -> FloatArray:
+        """Products with whitened ``(..., W, ny, nx)``, shape ``(..., L)``."""
+
+    def along(self, slope: FloatArray) -> FloatArray:
+        """Products cell by cell with a whitened slope ``(W, ny, nx)``, shape ``(L, ny, nx)``."""
+
+    def against(self, levels: PlaneColumns) -> FloatArray:
+        """Products with other columns, shape ``(L, their L)``."""
+
+
+Projected = Callable[[FloatArray, tuple[FloatArray, FloatArray]], FloatArray]
+"""Score of columns for a whitened residual and the scores of the nuisances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -477,16 +495,26 @@ class Design:
 
         ``residual`` (W, ny, nx): whitened residual at the minimum of this design. Returns (F,) and (F, F).
         """
+        score, information = self.projection(columns)
+        return score(residual, self.own_scores(residual)), information
+
+    def own_scores(self, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scores of the nuisances: of the field, and of levels and effects with the field profiled out."""
+        field_side = self._field_score(residual)
+        own = self._products(residual) - self._coupling.T @ self.normal.solve(field_side[:, np.newaxis])[:, 0]
+        return field_side, own
+
+    def projection(self, columns: Columns) -> tuple[Projected, FloatArray]:
+        """What `project` does, for one residual after the other; the scores of the nuisances are `own_scores`."""
         coupling = _against_field(self.basis, (columns,), self.slope, self.slope_changes)
         solved = self.normal.solve(coupling)
         cross = np.concatenate([columns.against(self.levels).T, columns.dot(self.effects.values)])
         cross = cross - self._coupling.T @ solved
-        field_side = self._field_score(residual)
-        own_score = (
-            self._products(residual) - self._coupling.T @ self.normal.solve(field_side[:, np.newaxis])[:, 0]
-        )
         within = self._inverse_curvature @ cross
-        score = columns.dot(residual) - solved.T @ field_side - within.T @ own_score
+
+        def score(residual: FloatArray, own: tuple[FloatArray, FloatArray]) -> FloatArray:
+            return columns.dot(residual) - solved.T @ own[0] - within.T @ own[1]
+
         return score, columns.gram - coupling.T @ solved - cross.T @ within
 
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from ...errors import OutOfRangeError, named_units
+from .accuracy import MODEL_ACCURACY
 from .selection import Hypothesis
 
 __all__ = ["SearchOptions"]
@@ -46,6 +47,9 @@ class SearchOptions:
     time_budget_s : `float`
         Time on the clock [s] after which the best answer so far is given; as long as it takes by default. A fifth of
         it is kept for the judgement of that answer on the data held out.
+    model_accuracy : `float`
+        Error of the fringes of the model at a wavelength, as a part of their amplitude and in radians of their phase;
+        a disagreement that such errors may make is within the accuracy of the model. 0 for a model without error.
     """
 
     most_cells: int = 20_000
@@ -61,10 +65,13 @@ class SearchOptions:
     heldout_fraction: float = 0.25
     outsider_prior: float = 0.15
     time_budget_s: float = math.inf
+    model_accuracy: float = MODEL_ACCURACY
 
     def __post_init__(self) -> None:
         if not self.time_budget_s > 0.0:
             raise OutOfRangeError("time budget [s]", self.time_budget_s, "a positive number")
+        if not 0.0 <= self.model_accuracy < 1.0:
+            raise OutOfRangeError("model accuracy", self.model_accuracy, "0 or more, below 1")
 
     def is_noise(self, found: Hypothesis) -> bool:
         """Whether a set leaves what noise may be."""

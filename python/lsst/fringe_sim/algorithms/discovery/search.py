@@ -16,6 +16,7 @@ from ...effects import Effect, known_effects
 from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
 from ...products.sky_frame import refuse_noiseless
+from .accuracy import ACCURACY_SOURCE, MODEL_ACCURACY, chance_within_accuracy
 from .channels import Channel, in_looks
 from .classes import EffectClass, classes_in_all_data, outsider_probability
 from .describe import describe_residual, disagreement
@@ -23,6 +24,7 @@ from .evaluations import OutOfTimeError, time_limit
 from .fit import Fit, fit_model
 from .forward import Exposures
 from .hidden_islands import hidden_island
+from .learning import learn
 from .next_frames import FrameForecast
 from .next_step import Ranking, flats_ranked, with_next_measurements
 from .options import SearchOptions
@@ -43,6 +45,7 @@ from .selection import IMPRECISION, Candidate, Hypothesis, Selector, chance_of
 from .set_search import SetSearch
 from .validation import (
     HeldOut,
+    degrees_of_freedom,
     disagreement_size,
     held_out_blocks,
     misfit_rms,
@@ -80,6 +83,13 @@ effect and a thickness that is wrong in places."""
 FEW_MENDED = 0.01
 """Part of the cells that may change their fringe order without moving where effects alone are by more than a fit that
 starts there finds."""
+
+MOST = 0.5
+"""Part of a disagreement that is most of it."""
+
+WITHIN_ACCURACY = (
+    "model and data differ beyond noise, and by no more than the tables of the model may be wrong"
+)
 
 FOR_JUDGEMENT = 0.2
 """Part of a time budget that is kept for the judgement of the best answer on the data held out."""
@@ -126,7 +136,11 @@ def discover(
     check_setup(cube, model)
     known = {item.effect.name for item in model.effects}
     # Flats do not see the spectrum of the night sky, nor the sensor at the telescope.
-    own = [effect for effect in known_effects(effects) if not effect.sky_only or effect.name in known]
+    own = [
+        effect
+        for effect in known_effects(effects)
+        if not (effect.sky_only or effect.learned) or effect.name in known
+    ]
     return search_exposures(cube, model, own, rng, options, report)
 
 
@@ -202,6 +216,7 @@ class _Search:
         self.unseen: HeldOut | None = None
         self.scores: Sequence[Candidate] = ()
         self.reached: _Reached | None = None
+        self.until = math.inf
         self._may_judge_orders = self._may_take_areas = self._may_look_for_islands = True
         self._take_other_cells(prepared)
 
@@ -352,7 +367,7 @@ class _Search:
         """Verdict of a search that was stopped; the data held out are asked about it until an instant [s]."""
         if self.reached is None:
             return None
-        found = self.reached
+        found, self.until = self.reached, until
         self.heldout = found.heldout
         self._take(found.prepared)
         chosen, steps = (found.whole.null, []) if found.sets is None else found.sets.best_so_far()
@@ -494,14 +509,17 @@ class _Search:
         )
         if reasons:
             return self._unexplained(whole, final, chance, steps, "; ".join(reasons), partial=named)
-        self.notes.extend(self._what_may_be_form(sets, chosen))
+        form = self._what_may_be_form(sets, chosen)
+        self.notes.extend(form)
         decided, self.next_measurements = with_next_measurements(
             named,
             {name: group.values for name, group in classes.items()},
             self._ranking(whole, final, named),
             self.say,
         )
-        return self._verdict("named", whole, final, chance, decided, {}, steps)
+        found = self._verdict("named", whole, final, chance, decided, {}, steps)
+        learned = self._learned(whole, final) if form else {}
+        return replace(found, learned=learned, accuracy=self._accuracy(whole, chance))
 
     def _spots_instead(self, whole: Selector, final: Hypothesis) -> float:
         """Log evidence of a few spots in the place of an effect of image or island, over that of the effect.
@@ -599,9 +617,14 @@ class _Search:
     ) -> Verdict:
         state = whole.state(hypothesis.fit)
         channels: tuple[Channel, ...] = hypothesis.channels or whole.criticise(hypothesis.fit)
+        within = self._accuracy(whole, chance)
+        verdict = "unexplained"
+        if within.get("chance", 0.0) > self.options.significance:
+            verdict, reason = "within_accuracy", f"{WITHIN_ACCURACY}; {reason}"
         description: dict[str, Any] = {
             "reason": reason,
             "too_poor": False,
+            "like": list(self._alike(whole, hypothesis)) if verdict == "unexplained" else [],
             "partial": [
                 {"name": e.name, "probability": e.probability, "significance": e.significance,
                  "parameters": {k: [p.value, p.sigma] for k, p in e.parameters.items()}}
@@ -609,7 +632,58 @@ class _Search:
             ],
             **describe_residual(state, self.cells.geometry, self.prepared.index, self.cells.cell_px, channels),
         }  # fmt: skip
-        return self._verdict("unexplained", whole, hypothesis, chance, (), description, steps)
+        learned = self._learned(whole, hypothesis) if verdict == "unexplained" else {}
+        found = self._verdict(verdict, whole, hypothesis, chance, (), description, steps)
+        return replace(found, learned=learned, accuracy=within)
+
+    @staticmethod
+    def _alike(whole: Selector, found: Hypothesis) -> tuple[str, ...]:
+        """Effects of a set that is not the cause, and yet most of the disagreement."""
+        before, after = whole.null.fit.chi2, found.fit.chi2
+        beyond = before - degrees_of_freedom(whole.problem, whole.null.fit)
+        return found.names if found.names and before - after > MOST * beyond else ()
+
+    def _learned(self, whole: Selector, found: Hypothesis) -> dict[str, Any]:
+        """A correction, judged by cells that it has not seen; nothing where there is none.
+
+        It stands beside the effects of a set that is most of the disagreement, and of no other.
+        """
+        found = found if self._alike(whole, found) else whole.null
+        if not self.prepared.rich or self.cells_are_of_sky:
+            return {}
+        self.say("learning a correction from what is left")
+        try:
+            with time_limit(self.until):
+                learned = learn(
+                    whole.problem,
+                    whole.null.fit,
+                    found.fit,
+                    self.heldout,
+                    self.rng,
+                    self.options.least_evidence,
+                )
+        except OutOfTimeError:
+            return {}
+        return {} if learned is None else learned.as_mapping(found.names)
+
+    def _accuracy(self, whole: Selector, chance: float) -> dict[str, Any]:
+        """The disagreement beside what the model may be wrong by."""
+        assumed = self.options.model_accuracy
+        if not self.prepared.rich or self.cells_are_of_sky or assumed == 0.0:
+            return {}
+        source = ACCURACY_SOURCE if assumed == MODEL_ACCURACY else "as asked for"
+        told: dict[str, Any] = {"assumed": assumed, "source": source}
+        try:
+            with time_limit(self.until):
+                told["chance"] = max(chance, chance_within_accuracy(whole, whole.null.fit, assumed))
+        except OutOfTimeError:
+            return told
+        return told
+
+    @property
+    def cells_are_of_sky(self) -> bool:
+        """Whether the light is that of the sky, where the errors of the tables are those of the map too."""
+        return self.prepared.problem.forward.exposures is not None
 
     def _verdict(
         self,

@@ -315,9 +315,9 @@ class Selector:
         features = self._features_if_any(state, fit, name)
         if features is None:
             return None, np.zeros(0)
-        return self._along(state, name, features), features
+        return self.along(state, name, features), features
 
-    def _along(self, state: State, name: str, features: FloatArray) -> Candidate:
+    def along(self, state: State, name: str, features: FloatArray) -> Candidate:
         """Score test of an effect whose derivatives are known."""
         score, information = state.design.project(FullColumns(features), state.residual)
         start, gain, degrees = bounded_minimum(score, information, self.coordinates[name])
@@ -340,7 +340,7 @@ class Selector:
                 if features is None:
                     own += self.score(base.fit, [name])
                 else:
-                    own.append(self._along(state, name, features))
+                    own.append(self.along(state, name, features))
         return found
 
     def _features_if_any(self, state: State, fit: Fit, name: str) -> FloatArray | None:

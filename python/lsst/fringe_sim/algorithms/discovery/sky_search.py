@@ -410,7 +410,11 @@ def discover_sky(
     light = replace(light, scales=tuple(light.scales[number] for number in order))
     cube = _as_cube(_images_of(frames).in_order(order), light, model, thickness_um, thickness_sigma_um)
     known = {item.effect.name for item in model.effects}
-    own = [effect for effect in known_effects(effects) if not effect.laboratory_only or effect.name in known]
+    own = [
+        effect
+        for effect in known_effects(effects)
+        if not (effect.laboratory_only or effect.learned) or effect.name in known
+    ]
     return search_exposures(cube, model, own, rng, options or SKY_SEARCH, report, light)
 
 

@@ -18,6 +18,7 @@ from .verdict import CONFIDENCE
 __all__ = [
     "HeldOut",
     "continued_thickness",
+    "degrees_of_freedom",
     "held_out_blocks",
     "misfit_rms",
     "thickness_starts",
@@ -206,10 +207,10 @@ def _without_single_wavelengths(problem: Problem, null: Fit, final: Fit) -> Held
 
 def misfit_rms(problem: Problem, fit: Fit) -> float:
     """Rms of data minus model, corrected for the freedom of the nuisances."""
-    return problem.cells.noise_rms * math.sqrt(fit.chi2 / _degrees(problem, fit))
+    return problem.cells.noise_rms * math.sqrt(fit.chi2 / degrees_of_freedom(problem, fit))
 
 
-def _degrees(problem: Problem, fit: Fit) -> int:
+def degrees_of_freedom(problem: Problem, fit: Fit) -> int:
     """Values that are left when the nuisances are fitted."""
     free = _field_freedom(problem) + problem.level_basis.shape[1] + len(fit.coordinates)
     return max(problem.cells.n_values - free, 1)
@@ -221,7 +222,7 @@ def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
     Noise that happens to be small gives no limit below that of mean noise: power-constrained limits of Cowan et al.
     2011.
     """
-    noise, degrees = problem.cells.noise_rms, _degrees(problem, fit)
+    noise, degrees = problem.cells.noise_rms, degrees_of_freedom(problem, fit)
     counts, most = (
         noise * math.sqrt(max(chi2 / expected - 1.0, 0.0))
         for chi2, expected in (

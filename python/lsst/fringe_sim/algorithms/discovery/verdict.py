@@ -15,6 +15,8 @@ from ...errors import named_units
 from ...files import table_text, write_together
 from ...model.effects_override import effects_override
 from ...notebook import InNotebook, axes_or_new
+from .skeleton import learned_files
+from .verdict_words import accuracy_text, learned_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,9 +30,6 @@ __all__ = [
     "Where",
     "probability_text",
 ]
-
-VERDICTS = ("named", "no_discrepancy", "unexplained")
-
 
 MOST_CANDIDATES = 15
 """Effects that a picture shows at most."""
@@ -159,8 +158,8 @@ class Verdict(InNotebook):
 
     Attributes
     ----------
-    verdict : {"named", "no_discrepancy", "unexplained"}
-        What was found.
+    verdict : {"named", "no_discrepancy", "within_accuracy", "unexplained"}
+        What was found; within the accuracy of the model is a disagreement beyond noise that its tables may make.
     effects : `tuple` [`NamedEffect`, ...]
         Effects, strongest first; empty unless named.
     where : `Where`
@@ -183,6 +182,12 @@ class Verdict(InNotebook):
         How large the disagreement with the unchanged model is: ``of_counts``, rms relative to the mean counts without
         what noise adds, ``of_fringes``, the same relative to the rms of the fringes, and ``of_fringes_at_most``, its
         upper limit at 95 % confidence, which is never below that of data with a mean noise.
+    learned : `dict`
+        A correction learned from what no effect explains, and what cells say of it that took no part; empty without.
+        Its settings are ``own``, those of the effects beside it ``beside``.
+    accuracy : `dict`
+        What the model may be wrong by: ``assumed``, a part of the fringes, its ``source``, and the ``chance`` that
+        noise and such errors together disagree as much with the unchanged model; empty where that was not asked.
     """
 
     verdict: str
@@ -199,6 +204,8 @@ class Verdict(InNotebook):
     data: dict[str, Any] = field(default_factory=dict)
     complete: bool = True
     size: dict[str, float] = field(default_factory=lambda: dict.fromkeys(_SIZES, math.nan))
+    learned: dict[str, Any] = field(default_factory=dict)
+    accuracy: dict[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         """What was found, and with which set-up."""
@@ -282,6 +289,8 @@ class Verdict(InNotebook):
             "next_measurements": list(self.next_measurements),
             "notes": list(self.notes),
             "data": self.data,
+            "learned": self.learned,
+            "accuracy": self.accuracy,
         }
         cleaned: dict[str, Any] = _plain(content)
         return cleaned
@@ -330,8 +339,9 @@ class Verdict(InNotebook):
             tuple(content["next_measurements"]),
             tuple(content["notes"]),
             content["data"],
-            content.get("complete", True),
-            {key: _number(content.get("size", {}).get(key)) for key in _SIZES},
+            complete=content.get("complete", True),
+            size={key: _number(content.get("size", {}).get(key)) for key in _SIZES},
+            **{key: content.get(key, {}) for key in ("learned", "accuracy")},
         )
 
     def table(self) -> Table:
@@ -359,16 +369,23 @@ class Verdict(InNotebook):
         """Text of a config override that puts the effects into fit, sky simulation and templates."""
         return effects_override(self.settings, self.setup, self.verdict)
 
+    @property
+    def has_learned(self) -> bool:
+        """Whether a correction was learned that noise alone would hardly give."""
+        return bool(self.learned.get("believed"))
+
     def write(self, out_dir: str | Path) -> Path:
         """Write ``effects.py``, ``discovery.ecsv`` and ``discovery.json``; returns the path of the last.
 
-        While there is a ``discovery.json``, all three are of one verdict.
+        While there is a ``discovery.json``, all are of one verdict. A correction that was learned is in
+        ``learned.py``, and ``learned_effect.py`` is an effect for a person to finish.
         """
         folder = Path(out_dir)
         folder.mkdir(parents=True, exist_ok=True)
         contents = {
             "effects.py": self.override(),
             "discovery.ecsv": table_text(self.table()),
+            **learned_files(self),
             "discovery.json": self.to_json(str(folder / "effects.py")),
         }
         return write_together(folder, contents)
@@ -401,6 +418,7 @@ class Verdict(InNotebook):
             if effect.ambiguous_with:
                 lines.append(f"    these data cannot tell it from: {', '.join(effect.ambiguous_with)}")
                 lines.append(f"    what would decide: {effect.break_ambiguity}")
+        lines += [f"  {text}" for text in (accuracy_text(self), learned_text(self)) if text]
         if self.unexplained.get("reason"):
             lines.append(f"  {self.unexplained['reason']}")
         gap = self.gap
