@@ -107,8 +107,6 @@ def judge(
         What a cause outside the catalogue is said to resemble.
     """
     hidden = tuple(truth)
-    if verdict == "within_accuracy":  # no name, as before the search knew how accurate the model is
-        verdict = "unexplained"
     if verdict in ("timed out", "ended"):
         return "timed out"
     if verdict == "failed":

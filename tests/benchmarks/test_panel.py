@@ -75,7 +75,6 @@ def test_foreign_cases_hide_what_they_say() -> None:
     [
         ("null", (), "no_discrepancy", [], "right"),
         ("null", (), "unexplained", [], "unexplained"),
-        ("null", (), "within_accuracy", [], "unexplained"),
         ("null", (), "named", [["tilt"]], "wrong"),
         ("single", ("tilt",), "named", [["tilt", "roughness"]], "right"),
         ("single", ("tilt",), "named", [["roughness", "tilt"]], "class"),

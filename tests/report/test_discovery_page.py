@@ -323,8 +323,8 @@ def test_what_was_learned_is_told_and_shown(name: str) -> None:
 
 
 def test_a_disagreement_within_the_accuracy_is_said_to_be_so(tmp_path: Path) -> None:
-    accuracy = {**LEARNED.accuracy, "chance": 0.3}
-    verdict = replace(LEARNED, verdict="within_accuracy", accuracy=accuracy, learned={})
+    accuracy = {**LEARNED.accuracy, "chance": 0.3, "within": True}
+    verdict = replace(LEARNED, verdict="no_discrepancy", accuracy=accuracy, learned={})
     told = words(discovery_page(verdict).to_html())
     assert "within the accuracy of the model" in told
     assert "chance 0.3 with it" in told

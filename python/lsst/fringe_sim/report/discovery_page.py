@@ -77,12 +77,12 @@ def headline(verdict: Verdict) -> str:
     """The verdict in one line."""
     if not verdict.complete and verdict.verdict == "unexplained":
         return "The search was stopped before it had an answer"
+    if verdict.within_accuracy:
+        return "Model and data disagree within the accuracy of the model"
     if verdict.verdict == "no_discrepancy":
         return "Model and data agree within the noise"
     if verdict.unexplained.get("too_poor"):
         return "These data are too poor to be searched"
-    if verdict.verdict == "within_accuracy":
-        return "Model and data disagree within the accuracy of the model"
     if verdict.verdict == "unexplained":
         return "Model and data disagree, and no known effect explains it"
     names = " and ".join(
@@ -145,6 +145,9 @@ def _found(verdict: Verdict) -> str:
             f"{effect.name}: {_values(effect)}; probability {probability_text(effect.probability)}"
             for effect in verdict.effects
         )
+    if verdict.within_accuracy:
+        chance = _chance(verdict.accuracy["chance"])
+        return f"Noise and errors of the model's tables together disagree as much with a chance of {chance}"
     if verdict.verdict == "no_discrepancy":
         return f"Noise alone disagrees as much with a chance of {_chance(verdict.global_probability)}"
     reason = str(verdict.unexplained.get("reason") or "no known effect explains it")
@@ -357,10 +360,10 @@ def _next(report: Report, verdict: Verdict) -> None:
         words = {
             "no_discrepancy": "None is needed for this question.",
             "named": "The data decide between the effects of the catalogue; none is needed for this question.",
-            "within_accuracy": "None with this model: better constants of its layers come first.",
             "unexplained": "Write the missing effect from the description above, then search again.",
         }
-        report.section("Next measurement", words[verdict.verdict])
+        better = "None with this model: better constants of its layers come first."
+        report.section("Next measurement", better if verdict.within_accuracy else words[verdict.verdict])
         return
     report.section("Next measurement", "What would tell the members of a class apart, best first.")
     report.remarks([(effect.name, effect.break_ambiguity) for effect in undecided if effect.break_ambiguity])

@@ -617,14 +617,16 @@ class _Search:
     ) -> Verdict:
         state = whole.state(hypothesis.fit)
         channels: tuple[Channel, ...] = hypothesis.channels or whole.criticise(hypothesis.fit)
-        within = self._accuracy(whole, chance)
-        verdict = "unexplained"
-        if within.get("chance", 0.0) > self.options.significance:
-            verdict, reason = "within_accuracy", f"{WITHIN_ACCURACY}; {reason}"
+        accuracy = self._accuracy(whole, chance)
+        # A search that was stopped says nothing of what it did not try.
+        within = math.isinf(self.until) and accuracy.get("chance", 0.0) > self.options.significance
+        verdict, accuracy = ("no_discrepancy" if within else "unexplained"), {**accuracy, "within": within}
+        if within:
+            reason = f"{WITHIN_ACCURACY}; {reason}"
         description: dict[str, Any] = {
             "reason": reason,
             "too_poor": False,
-            "like": list(self._alike(whole, hypothesis)) if verdict == "unexplained" else [],
+            "like": list(self._alike(whole, hypothesis)) if not within else [],
             "partial": [
                 {"name": e.name, "probability": e.probability, "significance": e.significance,
                  "parameters": {k: [p.value, p.sigma] for k, p in e.parameters.items()}}
@@ -632,9 +634,9 @@ class _Search:
             ],
             **describe_residual(state, self.cells.geometry, self.prepared.index, self.cells.cell_px, channels),
         }  # fmt: skip
-        learned = self._learned(whole, hypothesis) if verdict == "unexplained" else {}
+        learned = {} if within else self._learned(whole, hypothesis)
         found = self._verdict(verdict, whole, hypothesis, chance, (), description, steps)
-        return replace(found, learned=learned, accuracy=within)
+        return replace(found, learned=learned, accuracy=accuracy)
 
     @staticmethod
     def _alike(whole: Selector, found: Hypothesis) -> tuple[str, ...]:

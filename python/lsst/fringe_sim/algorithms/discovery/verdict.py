@@ -158,8 +158,8 @@ class Verdict(InNotebook):
 
     Attributes
     ----------
-    verdict : {"named", "no_discrepancy", "within_accuracy", "unexplained"}
-        What was found; within the accuracy of the model is a disagreement beyond noise that its tables may make.
+    verdict : {"named", "no_discrepancy", "unexplained"}
+        What was found. There is no discrepancy either where `within_accuracy`.
     effects : `tuple` [`NamedEffect`, ...]
         Effects, strongest first; empty unless named.
     where : `Where`
@@ -187,7 +187,8 @@ class Verdict(InNotebook):
         Its settings are ``own``, those of the effects beside it ``beside``.
     accuracy : `dict`
         What the model may be wrong by: ``assumed``, a part of the fringes, its ``source``, and the ``chance`` that
-        noise and such errors together disagree as much with the unchanged model; empty where that was not asked.
+        noise and such errors together disagree as much with the unchanged model, and ``within``, whether that is why
+        there is no discrepancy; empty where that was not asked.
     """
 
     verdict: str
@@ -289,7 +290,8 @@ class Verdict(InNotebook):
             "next_measurements": list(self.next_measurements),
             "notes": list(self.notes),
             "data": self.data,
-            "learned": self.learned,
+            "learned": self.learned or None,
+            "like": list(self.unexplained.get("like", ())),
             "accuracy": self.accuracy,
         }
         cleaned: dict[str, Any] = _plain(content)
@@ -341,7 +343,7 @@ class Verdict(InNotebook):
             content["data"],
             complete=content.get("complete", True),
             size={key: _number(content.get("size", {}).get(key)) for key in _SIZES},
-            **{key: content.get(key, {}) for key in ("learned", "accuracy")},
+            **{key: content.get(key) or {} for key in ("learned", "accuracy")},
         )
 
     def table(self) -> Table:
@@ -368,6 +370,11 @@ class Verdict(InNotebook):
     def override(self) -> str:
         """Text of a config override that puts the effects into fit, sky simulation and templates."""
         return effects_override(self.settings, self.setup, self.verdict)
+
+    @property
+    def within_accuracy(self) -> bool:
+        """Whether data and model disagree beyond noise, but by no more than the tables of the model may be wrong."""
+        return bool(self.accuracy.get("within"))
 
     @property
     def has_learned(self) -> bool:

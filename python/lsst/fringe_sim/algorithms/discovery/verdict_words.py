@@ -23,7 +23,7 @@ def accuracy_text(verdict: Verdict) -> str:
     told = verdict.accuracy
     if told.get("chance") is None:
         return ""
-    beyond = "within" if verdict.verdict == "within_accuracy" else "beside"
+    beyond = "within" if verdict.within_accuracy else "beside"
     return (
         f"{beyond} the accuracy of the model, {100.0 * told['assumed']:.2g} % of the fringes ({told['source']}): "
         f"chance {told['chance']:.2g} with it, {verdict.global_probability:.2g} of noise alone"
