@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
 from ...compiled import kernel
 from .newton import score
@@ -26,8 +25,9 @@ _MOST_CELLS = 4096
 """Cells that show the distribution of widths of all."""
 _ROUNDS, _ROUNDS_AROUND = 400, 4
 """Steps of expectation and maximisation for all cells, and of what the cells around one add."""
-_AROUND = 5
-"""Side of the square of cells around one."""
+_REACH = 2
+"""Cells on each side of one that are around it."""
+_SQUARE = range(2 * _REACH + 1)
 _WEIGHTS = np.geomspace(0.5, 512.0, 11).astype(np.float32)
 """Cells around one that all cells together may count for."""
 
@@ -102,19 +102,23 @@ def _with_neighbours(
     likely: NDArray[np.float32], share: NDArray[np.float32], known: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """What is expected of each ``known`` cell before it is asked: ``share``, and what those around it show."""
-
-    def around(each: NDArray[np.float32]) -> NDArray[np.float32]:
-        total = uniform_filter(each, (_AROUND, _AROUND, 1), mode="constant") * np.float32(_AROUND**2)
-        return np.asarray(np.maximum(total - each, 0.0)[known], np.float32)
-
-    count, expected = around(known[..., None].astype(np.float32)), np.broadcast_to(share, likely.shape)
-    shown = np.zeros((*known.shape, share.size), np.float32)
+    place = np.full(np.add(known.shape, 2 * _REACH), len(likely))
+    place[_REACH:-_REACH, _REACH:-_REACH][known] = np.arange(len(likely))
+    rows, columns = np.nonzero(known)
+    neighbours = [
+        place[rows + b, columns + a] for b in _SQUARE for a in _SQUARE if (a, b) != (_REACH, _REACH)
+    ]
+    count = np.sum([near < len(likely) for near in neighbours], axis=0, dtype=np.float32)[:, None]
+    shown = np.zeros((len(likely) + 1, share.size), np.float32)
+    expected: NDArray[np.float32] = np.broadcast_to(share, likely.shape)
     for _ in range(_ROUNDS_AROUND):
-        shown[known] = _responsibility(likely, expected)
-        beside, best = around(shown), -np.inf
+        shown[:-1] = _responsibility(likely, expected)
+        beside, best = np.zeros_like(likely), -np.inf
+        for near in neighbours:
+            beside += shown[near]
         for weight in _WEIGHTS:
             tried = (weight * share + beside) / (weight + count)
-            total = float(np.log((tried * likely).sum(axis=1), dtype=float).sum())
+            total = float(np.log(np.einsum("cw,cw->c", tried, likely), dtype=float).sum())
             if total > best:
                 best, expected = total, tried
     return expected
