@@ -108,7 +108,7 @@ def _with_neighbours(
     neighbours = [
         place[rows + b, columns + a] for b in _SQUARE for a in _SQUARE if (a, b) != (_REACH, _REACH)
     ]
-    count = np.sum([near < len(likely) for near in neighbours], axis=0, dtype=np.float32)[:, None]
+    count = (np.stack(neighbours, axis=1) < len(likely)).sum(axis=1, keepdims=True, dtype=np.float32)
     shown = np.zeros((len(likely) + 1, share.size), np.float32)
     expected: NDArray[np.float32] = np.broadcast_to(share, likely.shape)
     for _ in range(_ROUNDS_AROUND):

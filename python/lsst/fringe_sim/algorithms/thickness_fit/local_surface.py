@@ -26,6 +26,8 @@ FloatArray = NDArray[np.float64]
 
 _SIDE = np.arange(-2, 3)
 """Cells about one that show its surface."""
+_FAR = 2
+"""Cells that are so many away have others between them and the one in the middle."""
 _TAIL = 4.0
 """Degrees of freedom of Student's distribution of cells about a surface (Lange, Little & Taylor 1989, J. Am. Stat.
 Assoc. 84, 881)."""
@@ -48,7 +50,7 @@ class LocalSurface:
     sigma_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
         Standard uncertainty of the first from the noise of the cells [µm]; infinite where nobody asked.
     holds : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
-        Whether the cell and its eight neighbours lie on their surfaces.
+        Whether the cell and its eight neighbours lie on their surfaces, and more cells show it than it has terms.
     """
 
     terms: NDArray[np.float32]
@@ -78,9 +80,8 @@ def local_surface(
     order_um : `float`
         Thickness of one fringe order [µm].
     """
-    found = LocalSurface(
-        np.zeros((*asked.shape, 6), np.float32), np.full(asked.shape, np.inf, np.float32), asked
-    )
+    terms, sigma = np.zeros((*asked.shape, 6), np.float32), np.full(asked.shape, np.inf, np.float32)
+    found = LocalSurface(terms, sigma, np.zeros(asked.shape, bool))
     found.terms[..., 0] = surface.thickness_um
     step = templates.step_um
     value, weight = (part.reshape(-1, part.shape[-1]) for part in (cells.value, cells.weight))
@@ -93,7 +94,7 @@ def local_surface(
     ask(own)
     seen, usable = surface.thickness_um.astype(float), surface.known
     for _ in range(_TURNS):
-        _fit(surface, seen, np.where(usable, known, 0.0) / step**2, order_um, found)
+        _fit(surface, seen, np.where(usable, known, 0.0) / step**2, asked, order_um, found)
         ask(chi2)
         # A cell is not on a surface that is half an order away, nor if it likes its own place so much better.
         away = np.abs(found.terms[..., 0] - surface.thickness_um)
@@ -102,32 +103,33 @@ def local_surface(
             step * gain / np.maximum(known, 1e-30), *(order_um * _LONGEST_STEP * np.array([-1, 1]))
         )
         seen = found.terms[..., 0] + move
-    holds = asked & surface.known & ~binary_dilation(surface.known & ~usable, np.ones((3, 3), bool))
-    return LocalSurface(found.terms, found.sigma_um, holds)
+    found.holds[:] &= surface.known & ~binary_dilation(surface.known & ~usable, np.ones((3, 3), bool))
+    return found
 
 
 def _fit(
-    surface: CellSurface, seen: FloatArray, precision: FloatArray, order_um: float, found: LocalSurface
+    surface: CellSurface,
+    seen: FloatArray,
+    precision: FloatArray,
+    asked: NDArray[np.bool_],
+    order_um: float,
+    found: LocalSurface,
 ) -> None:
     """Surfaces through what was ``seen`` of the cells [µm], known to a ``precision`` [1/µm²], in place."""
-    size = [
-        max(float(np.diff(each).mean()) if len(each) > 1 else 1.0, 1.0)
-        for each in (surface.y_centre, surface.x_centre)
-    ]
+    centres = (surface.y_centre, surface.x_centre)
+    size = [max(float(np.diff(each).mean()) if len(each) > 1 else 1.0, 1.0) for each in centres]
     scale = np.array([1.0, size[0], size[1], size[0] ** 2, size[0] * size[1], size[1] ** 2])
     # Neighbours that turn by an order from cell to cell, or bend by what breaks a surface, are not on one.
     prior = np.diag((order_um * np.array([1.0, 1.0, 1.0, *(SAME_SURFACE,) * 3])) ** -2.0)
-    every = np.nonzero(found.holds)
-    for part in np.array_split(np.arange(every[0].size), -(-every[0].size // _AT_ONCE)):
+    every = np.nonzero(asked)
+    for part in np.array_split(np.arange(every[0].size), max(-(-every[0].size // _AT_ONCE), 1)):
         y, x = (index[part] for index in every)
-        b = np.repeat(y[:, None] + _SIDE, _SIDE.size, axis=1)
-        a = np.tile(x[:, None] + _SIDE, (1, _SIDE.size))
-        inside = (b >= 0) & (b < len(surface.y_centre)) & (a >= 0) & (a < len(surface.x_centre))
-        b, a = np.where(inside, b, y[:, None]), np.where(inside, a, x[:, None])
-        up = (surface.y_centre[b] - surface.y_centre[y][:, None]) / size[0]
-        over = (surface.x_centre[a] - surface.x_centre[x][:, None]) / size[1]
+        b, a, known = _around(precision, y, x)
+        up, over = (
+            (each[at] - each[own][:, None]) / one
+            for each, at, own, one in zip(centres, (b, a), (y, x), size, strict=True)
+        )
         design = np.stack([np.ones_like(up), up, over, up * up, up * over, over * over], axis=-1)
-        known = np.where(inside, precision[b, a], 0.0)
         away, trust = seen[b, a] - seen[y, x][:, None], np.ones_like(known)
         for _ in range(_ROUNDS):
             turned = (design * (known * trust)[..., None]).swapaxes(1, 2)
@@ -137,6 +139,20 @@ def _fit(
         found.terms[y, x] = terms[..., 0] / scale
         normal = (design * known[..., None]).swapaxes(1, 2) @ design + prior
         found.sigma_um[y, x] = np.sqrt(np.linalg.inv(normal)[:, 0, 0])
+        found.holds[y, x] = np.count_nonzero(known, axis=1) > scale.size
+
+
+def _around(
+    precision: FloatArray, y: NDArray[np.intp], x: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+    """Rows and columns of the cells around some, one row each, and to which precision they show their surface."""
+    b, a = np.repeat(y[:, None] + _SIDE, _SIDE.size, axis=1), np.tile(x[:, None] + _SIDE, (1, _SIDE.size))
+    inside = (b >= 0) & (b < precision.shape[0]) & (a >= 0) & (a < precision.shape[1])
+    b, a = np.where(inside, b, y[:, None]), np.where(inside, a, x[:, None])
+    # What lies behind a cell that shows no surface does not show this one.
+    between = [own[:, None] + np.fix(0.5 * (at - own[:, None])).astype(int) for at, own in ((b, y), (a, x))]
+    beside = (np.abs(b - y[:, None]) < _FAR) & (np.abs(a - x[:, None]) < _FAR)
+    return b, a, np.where(inside & (beside | (precision[tuple(between)] > 0.0)), precision[b, a], 0.0)
 
 
 @kernel(relaxed=True)
