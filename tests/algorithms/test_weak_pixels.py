@@ -9,7 +9,12 @@ import pytest
 from laboratory_flats import ROWS, judge, make_flats
 
 from lsst.fringe_sim.algorithms import fit_thickness
-from lsst.fringe_sim.algorithms.thickness_fit.posterior import learn_prior, local_width, nodes_about
+from lsst.fringe_sim.algorithms.thickness_fit import FringeTemplates
+from lsst.fringe_sim.algorithms.thickness_fit.cells import Cells
+from lsst.fringe_sim.algorithms.thickness_fit.leaning import Leanings, local_variance
+from lsst.fringe_sim.algorithms.thickness_fit.local_surface import local_surface
+from lsst.fringe_sim.algorithms.thickness_fit.pixels import CellSurface
+from lsst.fringe_sim.algorithms.thickness_fit.posterior import nodes_about, share_apart
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 
@@ -21,71 +26,112 @@ def chi2_of(measured_um: np.ndarray, noise_um: float) -> np.ndarray:
     return ((nodes_about(ORDER_UM) - measured_um[:, np.newaxis]) / noise_um) ** 2
 
 
-@pytest.mark.parametrize("width_um", [0.004, 0.02])
-@pytest.mark.rng("weak pixels width of the scatter about a surface")
-def test_scatter_about_the_surface_is_learned(width_um, rng) -> None:
-    """It is that beyond the noise of pixel and surface."""
-    number, noise, surface = 40_000, 0.02, 0.003
-    away = np.hypot(width_um, surface) * rng.standard_normal(number)
-    chi2 = chi2_of(away + noise * rng.standard_normal(number), noise)
-    found = learn_prior(chi2, np.full(number, surface), ORDER_UM)
-    assert found.width_um == pytest.approx(width_um, rel=0.3)
-    assert found.apart < 1e-3
-
-
 @pytest.mark.rng("weak pixels that lie apart")
 def test_share_of_pixels_that_lie_apart_is_learned(rng) -> None:
-    number, noise = 20_000, 0.01
+    number, noise, width = 20_000, 0.01, 0.004
     away = np.where(
-        rng.random(number) < 0.1, rng.uniform(-0.15, 0.15, number), 0.004 * rng.standard_normal(number)
+        rng.random(number) < 0.1, rng.uniform(-0.15, 0.15, number), width * rng.standard_normal(number)
     )
-    found = learn_prior(
-        chi2_of(away + noise * rng.standard_normal(number), noise), np.zeros(number), ORDER_UM
+    seen = away + noise * rng.standard_normal(number)
+    found = share_apart(chi2_of(seen, noise), np.full(number, width), ORDER_UM)
+    assert found == pytest.approx(0.1, abs=0.02)
+    on_it = width * rng.standard_normal(number) + noise * rng.standard_normal(number)
+    assert share_apart(chi2_of(on_it, noise), np.full(number, width), ORDER_UM) < 1e-3
+
+
+def leanings(away: np.ndarray, noise: float) -> Leanings:
+    """Sums over cells of 8 by 8 pixels that were measured ``away`` from the surface, with that noise."""
+    shape = (away.shape[0] // 8, 8, away.shape[1] // 8, 8)
+    number, known = np.full(shape[::2], 64.0), np.full(shape[::2], 64.0 / noise**2)
+    blocks = away.reshape(shape)
+    return Leanings(
+        number, blocks.sum(axis=(1, 3)) / noise**2, known, (blocks**2).sum(axis=(1, 3)) / noise**2
     )
-    assert found.apart == pytest.approx(0.1, abs=0.02)
 
 
-@pytest.mark.rng("weak pixels of a bump")
-def test_a_bump_widens_the_prior_and_noise_does_not(rng) -> None:
-    """What a prior of 4 nm leaves of pixels with a noise of 11 nm, in a field with a bump of 40 nm."""
-    width, noise = 0.004, 0.011
-    bump = np.zeros((96, 96))
-    bump[40:50, 40:50] = 0.04
-    drawn = width**2 / (width**2 + noise**2)
-    shift = drawn * (bump + noise * rng.standard_normal(bump.shape))
-    sigma = np.full(bump.shape, np.sqrt(drawn) * noise)
-    found = local_width(shift, sigma, np.full(bump.shape, width), 9)
-    assert found[43:47, 43:47].min() > 0.025
-    assert np.mean(found[:30] > width) < 0.01
-
-
-@pytest.mark.rng("weak pixels of a low bump")
-def test_a_bump_of_three_widths_is_no_surprise(rng) -> None:
-    """Pixels with a noise of 11 nm on a bump of 15 nm: a prior of 5 nm would leave errors of three times its σ."""
-    width, noise, bump = 0.005, 0.011, 0.015
-    seen = bump + noise * rng.standard_normal((64, 64))
-    drawn = width**2 / (width**2 + noise**2)
-    found = local_width(
-        drawn * seen, np.full(seen.shape, np.sqrt(drawn) * noise), np.full(seen.shape, width), 5
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.rng("weak pixels that leave the surface in one place")
+def test_width_is_that_of_the_place(together, rng) -> None:
+    """A quarter of the sensor leaves the surface by 12, its cells or its pixels by themselves; noise is 11."""
+    noise, width = 11.0, 12.0
+    each = (
+        np.kron(rng.standard_normal((16, 16)), np.ones((8, 8)))
+        if together
+        else rng.standard_normal((128, 128))
     )
-    drawn = found**2 / (found**2 + noise**2)
-    pull = (drawn * seen - bump) / (np.sqrt(drawn) * noise)
-    inside = np.s_[4:-4, 4:-4]
-    assert np.sqrt(np.mean(pull[inside] ** 2)) < 1.3
+    layer = np.zeros((128, 128))
+    layer[:64, :64] = width * each[:64, :64]
+    seen = leanings(layer + noise * rng.standard_normal(layer.shape), noise)
+    found = np.sqrt(local_variance(seen, np.zeros((16, 16)), (0.7, 150.0)))
+    assert np.sqrt(np.mean(found[:8, :8] ** 2)) == pytest.approx(width, rel=0.25)
+    assert np.sqrt(np.mean(found[9:, 9:] ** 2)) < 1.5
+
+
+@pytest.mark.rng("weak pixels noise of the surface")
+def test_noise_of_the_surface_is_no_width(rng) -> None:
+    """Cells are off by as much as the noise of their surface says."""
+    noise, surface = 11.0, 4.0
+    away = np.kron(surface * rng.standard_normal((32, 32)), np.ones((8, 8))) + noise * rng.standard_normal(
+        (256, 256)
+    )
+    told, untold = (
+        np.sqrt(np.mean(local_variance(leanings(away, noise), np.full((32, 32), known**2), (0.7, 150.0))))
+        for known in (surface, 0.0)
+    )
+    assert told < 1.5
+    assert untold == pytest.approx(surface, rel=0.2)
 
 
 @pytest.mark.rng("weak pixels of smoothed noise")
-def test_noise_that_neighbours_share_widens_less(rng) -> None:
-    """Noise of a standard deviation of 11 nm that is the same in blocks of 4 by 4 pixels."""
-    width, noise = 0.005, 0.011
-    drawn = width**2 / (width**2 + noise**2)
-    shift = drawn * noise * np.kron(rng.standard_normal((24, 24)), np.ones((4, 4)))
-    sigma, widths = np.full(shift.shape, np.sqrt(drawn) * noise), np.full(shift.shape, width)
+def test_noise_that_neighbours_share_is_no_width(rng) -> None:
+    """Noise that is the same in blocks of 4 by 4 pixels."""
+    noise = 11.0
+    away = noise * np.kron(rng.standard_normal((64, 64)), np.ones((4, 4)))
     ignored, known = (
-        np.mean(local_width(shift, sigma, widths, 5, independence) ** 2) for independence in (1.0, 1.0 / 16.0)
+        np.sqrt(
+            np.mean(local_variance(leanings(away, noise), np.zeros((32, 32)), (0.7, 150.0), independence))
+        )
+        for independence in (1.0, 1.0 / 16.0)
     )
-    assert known < ignored
-    assert np.sqrt(known) < noise
+    assert known < 2.0
+    assert ignored > 1.5 * known
+
+
+@pytest.mark.rng("weak pixels cells beyond a crest")
+def test_cells_beyond_a_crest_come_back(rng) -> None:
+    """Cells whose mean amplitudes are alike at two thicknesses, a chain of them solved on the other side."""
+    step, order, noise = 0.001, 0.3, 0.02
+    grid = 14.0 + step * np.arange(1500)
+    wavelength = np.array([930.0, 931.0, 932.0])
+    fringes = 0.1 * np.cos(2.0 * np.pi * np.outer(grid, 930.0 / wavelength) / order)
+    templates = FringeTemplates(1.0 + fringes, grid[0], step, wavelength)
+    y, x = np.indices((16, 16))
+    truth = 14.6 + 0.02 * (x - 7.5) + 0.004 * y
+    crest = order * np.rint(truth / order)
+    solved = np.where(np.abs(truth - crest) < 0.02, 2.0 * crest - truth, truth)
+    edges = 8 * np.arange(17)
+    value, weight = (np.zeros((16, 16, 8), np.float32) for _ in range(2))
+    sigma = noise / 8.0
+    amplitude = templates.amplitude_at(truth.ravel()).T.reshape(16, 16, 3)
+    value[..., :3] = amplitude + sigma * rng.standard_normal(amplitude.shape)
+    weight[..., :3] = sigma**-2.0
+    cells = Cells(value, weight, np.zeros_like(value), np.zeros_like(value), edges, edges)
+    flat, every = np.zeros((16, 16), np.float32), np.ones((16, 16), bool)
+    surface = CellSurface(
+        solved.astype(np.float32),
+        flat,
+        flat,
+        cells.y_centre,
+        cells.x_centre,
+        every,
+        every,
+        flat + np.float32(0.002),
+    )
+    found = local_surface(surface, cells, templates, every, order)
+    assert np.abs(solved - truth).max() > 0.03
+    assert np.abs(found.terms[..., 0] - truth).max() < 0.006
+    pull = (found.terms[..., 0] - truth) / found.sigma_um
+    assert 0.5 < np.sqrt(np.mean(pull**2)) < 1.5
 
 
 @pytest.mark.slow

@@ -125,12 +125,11 @@ def global_fit(
     fringes = replace(data, offset=light, y_edges=cells.y_edges, x_edges=cells.x_edges)
     if state.normalisation == "sensor" and not state.free.any:
         state = replace(state, templates=normalise_to_pixels(data, state.templates, calmed, threads))
-    typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
     pixels = fit_pixels(fringes, state.templates, calmed, order, threads=threads)
-    pixels = settle_weak_pixels(
-        fringes, state.templates, calmed, pixels, order, typical_weight=typical, threads=threads
+    pixels, leaning = settle_weak_pixels(
+        fringes, state.templates, surface, state.cells, pixels, order, threads=threads
     )
-    rough = spread_to_pixels(cells, ~surface.smooth)
+    rough = spread_to_pixels(cells, ~surface.smooth) & ~leaning
     independent = effective_number(64, 64, data.noise_correlation_px) / 64**2
     pixels, border_slip = settle_borders(fringes, state.templates, pixels, rough, order, independent)
     pixels = rescue_pixels(

@@ -48,6 +48,7 @@ def learn(
     free: Nuisances,
     start: NuisanceFit,
     rounds: int = _ROUNDS,
+    final: bool = False,
 ) -> tuple[NDArray[np.float32], NuisanceFit]:
     """Fit light, contrast, wavelengths and the thickness of the cells together, the orders being known.
 
@@ -63,6 +64,8 @@ def learn(
         Where to begin.
     rounds : `int`, optional
         Most steps.
+    final : `bool`, optional
+        Say how uncertain the thickness is from what was learned, which nobody asks of an order that is compared.
 
     Returns
     -------
@@ -85,7 +88,7 @@ def learn(
         fit = fit if free.patterned else problem.normalised(fit, thickness)
         if _change(before, fit) < _TOLERANCE:
             break
-    return problem.conclude(fit, thickness)
+    return problem.conclude(fit, thickness, final)
 
 
 def _is_finite(fit: NuisanceFit) -> bool:
@@ -314,7 +317,7 @@ class _Problem:
         )  # fmt: skip
 
     def conclude(
-        self, fit: NuisanceFit, thickness: NDArray[np.float32]
+        self, fit: NuisanceFit, thickness: NDArray[np.float32], final: bool
     ) -> tuple[NDArray[np.float32], NuisanceFit]:
         """Uncertainties, misfit of each flat, and the chi-square with that of the prior."""
         thickness, model, slope, rest = self.residual(fit, thickness)
@@ -347,7 +350,7 @@ class _Problem:
             contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale,
             misfit=misfit.scale * squares, chi2=self.cells.temper * misfit.cost(each), prior=self._prior_chi2(fit),
             shared=float(shared_variances(standard, thickness, self.cells.order_um)[-1]),
-            learned_sigma_um=self._learned_sigma(fit, thickness, model, slope, variance),
+            learned_sigma_um=self._learned_sigma(fit, thickness, model, slope, variance) if final else 0.0,
         )  # fmt: skip
 
     def _learned_sigma(

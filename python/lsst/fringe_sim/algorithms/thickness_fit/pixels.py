@@ -26,9 +26,9 @@ _STEPS = 5
 """Most Gauss-Newton steps; two are usual."""
 _LONGEST_STEP = 0.1
 """Longest Gauss-Newton step, in fringe orders."""
-_SAME_SURFACE = 0.25
+SAME_SURFACE = 0.25
 """Cells whose thickness agrees within this many orders, slopes allowed for, lie on one surface."""
-_LONE_CELL_PENALTY = 12.0
+LONE_CELL_PENALTY = 12.0
 """Chi-square by which a surface shown by a single cell must be better than one that several show."""
 _BLOCK = 32
 
@@ -96,10 +96,10 @@ class CellSurface:
         rise = np.diff(y_centre)[:, None] * 0.5 * (slope_y[1:] + slope_y[:-1])
         run = np.diff(x_centre)[None, :] * 0.5 * (slope_x[:, 1:] + slope_x[:, :-1])
         broken = np.zeros(thickness_um.shape, bool)
-        breaks = np.abs(np.diff(thickness_um, axis=0) - rise) > _SAME_SURFACE * order_um
+        breaks = np.abs(np.diff(thickness_um, axis=0) - rise) > SAME_SURFACE * order_um
         broken[1:] |= breaks
         broken[:-1] |= breaks
-        breaks = np.abs(np.diff(thickness_um, axis=1) - run) > _SAME_SURFACE * order_um
+        breaks = np.abs(np.diff(thickness_um, axis=1) - run) > SAME_SURFACE * order_um
         broken[:, 1:] |= breaks
         broken[:, :-1] |= breaks
         broken = binary_dilation(broken, np.ones((3, 3), bool))
@@ -338,7 +338,7 @@ def _try_surfaces(  # type: ignore[no-untyped-def]
             )
             seen = False
             for k in range(number):
-                if abs(guess[k] - at) < _SAME_SURFACE * order:
+                if abs(guess[k] - at) < SAME_SURFACE * order:
                     votes[k] += 1
                     seen = True
                     break
@@ -349,7 +349,7 @@ def _try_surfaces(  # type: ignore[no-untyped-def]
     for k in range(number):
         place = min(max((guess[k] - start) / step, 0.0), table.shape[0] - 1.0)
         place, information, chi2 = gauss_newton(table, place, y, w, item, np.int64(2 * _STEPS), longest)
-        cost = chi2 + (_LONE_CELL_PENALTY if votes[k] == 1 else 0.0)
+        cost = chi2 + (LONE_CELL_PENALTY if votes[k] == 1 else 0.0)
         if cost < best_cost:
             best, best_information, best_chi2, best_cost = place, information, chi2, cost
     return best, best_information, best_chi2

@@ -328,7 +328,7 @@ class Solver:
         if sample.thickness_um.size == 0:
             return state
         base = self.base or model
-        fit = learn(sample, base, state.free, state.nuisance)[1]
+        fit = learn(sample, base, state.free, state.nuisance, final=True)[1]
         return replace(state, templates=fit.applied_to(base), nuisance=fit)
 
 

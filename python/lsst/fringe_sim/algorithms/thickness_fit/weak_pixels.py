@@ -8,37 +8,29 @@ from numpy.typing import NDArray
 from ...compiled import run_threaded
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, gather_pixels, load_band
-from .cells import effective_number
-from .pixels import CellSurface, PixelFit, bracket
-from .posterior import (
-    NODES,
-    SHARE,
-    SurfacePrior,
-    chi2_about,
-    learn_prior,
-    local_width,
-    nodes_about,
-    settle_band,
-    widest_parabola,
-)
+from .cells import Cells, cell_independence, effective_number
+from .leaning import Leanings, lean_strip, local_variance
+from .local_surface import LocalSurface, local_surface
+from .pixels import CellSurface, PixelFit
+from .posterior import NODES, SHARE, chi2_about, nodes_about, settle_band, share_apart, widest_parabola
 from .templates import FringeTemplates
 
 __all__ = ["settle_weak_pixels"]
 
-_MOST_ASKED = 32768
-"""Pixels that show how far all lie from their surface: a width of a tenth of the noise of a pixel is then seen."""
+_MOST_ASKED = 8192
+"""Pixels that show how many lie apart from their surface."""
 
 
 def settle_weak_pixels(
     data: Amplitudes,
     templates: FringeTemplates,
     surface: CellSurface,
+    cells: Cells,
     pixels: PixelFit,
     order_um: float,
     *,
-    typical_weight: NDArray[np.floating],
     threads: int = 2,
-) -> PixelFit:
+) -> tuple[PixelFit, NDArray[np.bool_]]:
     """Give pixels that do not tell their thickness by themselves the surface of the cells as a prior.
 
     Parameters
@@ -48,39 +40,79 @@ def settle_weak_pixels(
     templates : `FringeTemplates`
         The model, normalised to the sensor.
     surface : `CellSurface`
-        The cells.
+        The cells as they were solved.
+    cells : `Cells`
+        Their mean amplitudes.
     pixels : `PixelFit`
         What the pixels found by themselves; its arrays are revised in place.
     order_um : `float`
         Thickness of one fringe order [µm].
-    typical_weight : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Typical inverse variance of each wavelength.
     threads : `int`, optional
         Number of threads; has no influence on the result.
+
+    Returns
+    -------
+    pixels : `PixelFit`
+        The revised fit.
+    leaning : `numpy.ndarray`, bool, shape ``(ny, nx)``
+        Pixels that have a surface as their prior.
     """
-    limit = widest_parabola(templates, typical_weight, order_um)
-    _, ny, nx = data.shape
+    typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
+    weak = _weak(templates, pixels, widest_parabola(templates, typical, order_um))
+    if not weak.any():
+        return pixels, weak
+    cell_of = [
+        np.repeat(np.arange(len(edges) - 1), np.diff(edges)) for edges in (cells.y_edges, cells.x_edges)
+    ]
+    asked = np.zeros(cells.shape, bool)
+    asked[tuple(of[index] for of, index in zip(cell_of, np.nonzero(weak), strict=True))] = True
+    local = local_surface(surface, cells, templates, asked & surface.known, order_um)
+    begin, seen = _leanings(data, templates, cells, local, cell_of[1], threads)
+    rows, columns = (int(np.diff(edges).max()) for edges in (cells.y_edges, cells.x_edges))
+    independence = effective_number(rows, columns, data.noise_correlation_px) / (rows * columns)
+    variance = local.sigma_um.astype(float) ** 2 / cell_independence(rows, data.noise_correlation_px)
+    away, step = nodes_about(order_um), templates.step_um
+    widths = (away[NODES // 2 + 1] / step, away[-1] / step)
+    moved = local_variance(seen, np.where(local.holds, variance, 0.0) / step**2, widths, independence)
+    width = np.sqrt(np.where(local.holds, variance + step**2 * moved, np.inf)).astype(np.float32)
+    width = width[np.ix_(*cell_of)]
+    apart = _share_apart(data, templates, begin, width, order_um)
+    _settle_asked(data, templates, pixels, weak, begin, width, apart, order_um, threads)
+    return pixels, weak & np.isfinite(width)
+
+
+def _weak(templates: FringeTemplates, pixels: PixelFit, limit: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Pixels whose likelihood is no parabola over their uncertainty."""
     place = (pixels.value - templates.start_um) / templates.step_um
     inside = (place >= 0.0) & (place <= len(limit) - 1.0)
-    weak = inside & (pixels.sigma / templates.step_um > limit[np.where(inside, place, 0.0).astype(np.intp)])
-    if not weak.any():
-        return pixels
-    nearest = np.ix_(*(_nearest(*sides) for sides in ((surface.y_centre, ny), (surface.x_centre, nx))))
-    spread = surface.sigma_um[nearest]
-    follows = (surface.smooth & surface.known)[nearest] & np.isfinite(spread)
-    begin = surface.at(np.arange(ny), np.arange(nx))
-    prior = _learned(data, templates, begin, spread, weak & follows, order_um)
-    width = np.where(follows, np.hypot(spread, np.float32(prior.width_um)), np.float32(np.inf))
-    _settle_asked(data, templates, pixels, weak, begin, width, prior.apart, order_um, threads)
-    shift, sigma = (
-        np.where(weak & follows, each, np.float32(np.nan)) for each in (pixels.value - begin, pixels.sigma)
-    )
-    window = 2 * (int(np.diff(surface.y_centre).max(initial=2)) // 2) + 1
-    independence = effective_number(window, window, data.noise_correlation_px) / window**2
-    wider = local_width(shift, sigma, width, window, independence)
-    again = weak & follows & (wider > width)
-    _settle_asked(data, templates, pixels, again, begin, wider, prior.apart, order_um, threads)
-    return pixels
+    own = limit[np.where(inside, place, 0.0).astype(np.intp)]
+    return np.asarray(inside & (pixels.sigma / templates.step_um > own))
+
+
+def _leanings(
+    data: Amplitudes,
+    templates: FringeTemplates,
+    cells: Cells,
+    local: LocalSurface,
+    cell_of_column: NDArray[np.int64],
+    threads: int,
+) -> tuple[NDArray[np.float32], Leanings]:
+    """The surface at each pixel [µm], and what the pixels of each cell show about it."""
+    begin, sums = np.zeros(data.shape[1:], np.float32), np.zeros((4, *cells.shape))
+    table, start, step = templates.table(), templates.start_um, templates.step_um
+    away_x = np.arange(data.shape[2]) - cells.x_centre[cell_of_column]
+
+    def work(strip: int) -> None:
+        if local.holds[strip].any():
+            low, high = int(cells.y_edges[strip]), int(cells.y_edges[strip + 1])
+            amplitude, weight = load_band(data, low, high)
+            lean_strip(
+                amplitude, weight, table, start, step, local.holds[strip], local.terms[strip], cell_of_column,
+                np.arange(low, high) - cells.y_centre[strip], away_x, begin[low:high], *sums[:, strip],
+            )  # fmt: skip
+
+    run_threaded(work, cells.shape[0], threads)
+    return begin, Leanings(*sums)
 
 
 def _settle_asked(
@@ -110,25 +142,18 @@ def _settle_asked(
     run_threaded(work, -(-len(asked) // BAND_ROWS), threads)
 
 
-def _learned(
+def _share_apart(
     data: Amplitudes,
     templates: FringeTemplates,
     surface: NDArray[np.float32],
-    spread: NDArray[np.float32],
-    asked: NDArray[np.bool_],
+    width: NDArray[np.float32],
     order_um: float,
-) -> SurfacePrior:
-    """Prior that some of the pixels in question show."""
-    found = np.flatnonzero(asked)
-    rows, columns = np.unravel_index(found[:: -(-found.size // _MOST_ASKED) or 1], asked.shape)
+) -> float:
+    """Share of pixels apart from their surface that some of those with a surface show."""
+    found = np.flatnonzero(np.isfinite(width))
+    rows, columns = np.unravel_index(found[:: -(-found.size // _MOST_ASKED) or 1], width.shape)
     value, weight = gather_pixels(data, rows, columns)
     place = (surface[rows, columns].astype(float) - templates.start_um) / templates.step_um
     chi2 = np.empty((rows.size, NODES))
     chi2_about(value, weight, templates.table(), place, nodes_about(order_um / templates.step_um), chi2)
-    return learn_prior(chi2, spread[rows, columns].astype(float), order_um)
-
-
-def _nearest(centre: NDArray[np.float64], length: int) -> NDArray[np.int64]:
-    """Cell to which each pixel is nearest."""
-    below, share = bracket(centre, length)
-    return np.minimum(below + (share >= 0.5), len(centre) - 1)
+    return share_apart(chi2, width[rows, columns].astype(float), order_um)

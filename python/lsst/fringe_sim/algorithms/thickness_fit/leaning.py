@@ -1,0 +1,174 @@
+"""How far pixels lie from the surface of the cells, which differs from place to place.
+
+In each cell two numbers tell: how far its pixels are off the surface together, and how far they scatter about their
+mean beyond their noise. Both are noisy, so what other cells show is the prior of each (empirical Bayes, of a
+distribution that is free on a grid: Laird 1978, J. Am. Stat. Assoc. 73, 805).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...compiled import kernel
+from .newton import score
+
+__all__ = ["Leanings", "lean_strip", "local_variance"]
+
+FloatArray = NDArray[np.float64]
+
+_WIDTHS = 8
+"""Widths that are tried of each kind: none, and others in equal ratios."""
+_MOST_CELLS = 4096
+"""Cells that show the distribution of widths of all."""
+_ROUNDS, _ROUNDS_AROUND = 400, 4
+"""Steps of expectation and maximisation for all cells, and of what the cells around one add."""
+_REACH = 2
+"""Cells on each side of one that are around it."""
+_SQUARE = range(2 * _REACH + 1)
+_WEIGHTS = np.geomspace(0.5, 512.0, 11).astype(np.float32)
+"""Cells around one that all cells together may count for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Leanings:
+    """What the pixels of each cell show about the surface.
+
+    Attributes
+    ----------
+    number, score, information, squares : `numpy.ndarray`, shape ``(ncy, ncx)``
+        Pixels; sums of their scores and of their information on the surface, and of the squares of the scores over
+        the information. Distances are in steps of the table.
+    """
+
+    number: FloatArray
+    score: FloatArray
+    information: FloatArray
+    squares: FloatArray
+
+
+def local_variance(
+    seen: Leanings,
+    surface_variance: FloatArray,
+    widths: tuple[float, float],
+    independence: float = 1.0,
+) -> FloatArray:
+    """Expected square of the distance of the pixels of each cell from their surface, beyond all noise.
+
+    The distribution of how far pixels move together and how far they scatter is first that of all cells. Then the
+    cells around each are believed besides, as far as they foretell it: how many of them all cells together count
+    for is the most likely number.
+
+    Parameters
+    ----------
+    seen : `Leanings`
+        The cells.
+    surface_variance : `numpy.ndarray`, shape ``(ncy, ncx)``
+        Variance of the surface in each, from the noise of the cells.
+    widths : `tuple` [`float`, `float`]
+        Least and largest width that is tried.
+    independence : `float`, optional
+        Independent pixels per pixel of a cell: below 1 where noise is correlated.
+
+    Returns
+    -------
+    variance : `numpy.ndarray`, shape ``(ncy, ncx)``
+        0 where there are no pixels.
+    """
+    squares = np.concatenate([[0.0], np.geomspace(*widths, _WIDTHS - 1) ** 2])
+    together, alone = (each.ravel() for each in np.meshgrid(squares, squares, indexing="ij"))
+    known, out = seen.number > 0, np.zeros(seen.number.shape)
+    if not known.any():
+        return out
+    likely = _likelihood(seen, surface_variance, together, alone, independence)
+    some = likely[:: -(-len(likely) // _MOST_CELLS)].astype(float)
+    share = np.full(together.size, 1.0 / together.size)
+    for _ in range(_ROUNDS):
+        share = _responsibility(some, share).mean(axis=0)
+    foretold = _with_neighbours(likely, share.astype(np.float32), known)
+    out[known] = _responsibility(likely, foretold) @ (together + alone)
+    return out
+
+
+def _responsibility(likely: NDArray[np.floating], share: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Probability of each pair of widths."""
+    mixed = likely * share
+    return np.asarray(mixed / mixed.sum(axis=1, keepdims=True))
+
+
+def _with_neighbours(
+    likely: NDArray[np.float32], share: NDArray[np.float32], known: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """What is expected of each ``known`` cell before it is asked: ``share``, and what those around it show."""
+    place = np.full(np.add(known.shape, 2 * _REACH), len(likely))
+    place[_REACH:-_REACH, _REACH:-_REACH][known] = np.arange(len(likely))
+    rows, columns = np.nonzero(known)
+    neighbours = [
+        place[rows + b, columns + a] for b in _SQUARE for a in _SQUARE if (a, b) != (_REACH, _REACH)
+    ]
+    count = (np.stack(neighbours, axis=1) < len(likely)).sum(axis=1, keepdims=True, dtype=np.float32)
+    shown = np.zeros((len(likely) + 1, share.size), np.float32)
+    expected: NDArray[np.float32] = np.broadcast_to(share, likely.shape)
+    for _ in range(_ROUNDS_AROUND):
+        shown[:-1] = _responsibility(likely, expected)
+        beside, best = np.zeros_like(likely), -np.inf
+        for near in neighbours:
+            beside += shown[near]
+        for weight in _WEIGHTS:
+            tried = (weight * share + beside) / (weight + count)
+            total = float(np.log(np.einsum("cw,cw->c", tried, likely), dtype=float).sum())
+            if total > best:
+                best, expected = total, tried
+    return expected
+
+
+def _likelihood(
+    seen: Leanings,
+    surface_variance: FloatArray,
+    together: FloatArray,
+    alone: FloatArray,
+    independence: float,
+) -> NDArray[np.float32]:
+    """Likelihood of each pair of squared widths in each cell that has pixels, relative to the largest."""
+    known = seen.number > 0
+    n, total, information, squares, surface = (
+        each[known][:, None]
+        for each in (seen.number, seen.score, seen.information, seen.squares, surface_variance)
+    )
+    spread = 1.0 / (independence * information) + surface + together + alone / (independence * n)
+    growth = 1.0 + alone * information / n
+    freedom = np.maximum(n - 1.0 / independence, 0.0)
+    scatter = np.maximum(squares - total**2 / information, 0.0)
+    log = -0.5 * (np.log(spread) + (total / information) ** 2 / spread)
+    log -= 0.5 * independence * (freedom * np.log(growth) + scatter / growth)
+    return np.asarray(np.exp(log - log.max(axis=1, keepdims=True)), np.float32)
+
+
+@kernel(relaxed=True)
+def lean_strip(  # type: ignore[no-untyped-def]
+    amplitude, weight, table, start, step, holds, terms, cell_of, away_y, away_x, begin, number, total, known, squares
+):  # fmt: skip
+    """One row of cells: the surface at each pixel [µm], and the sums of `Leanings`."""
+    bands, top = amplitude.shape[0], table.shape[0] - 1.0
+    value, inverse = np.zeros((1, table.shape[1]), np.float32), np.zeros((1, table.shape[1]), np.float32)
+    for r in range(begin.shape[0]):
+        y = away_y[r]
+        for c in range(begin.shape[1]):
+            cell, x = cell_of[c], away_x[c]
+            if not holds[cell]:
+                continue
+            term = terms[cell]
+            begin[r, c] = (
+                term[0] + term[1] * y + term[2] * x + term[3] * y * y + term[4] * y * x + term[5] * x * x
+            )
+            for band in range(bands):
+                value[0, band], inverse[0, band] = amplitude[band, r, c], weight[band, r, c]
+            place = min(max((begin[r, c] - start) / step, 0.0), top)
+            gain, information, _ = score(table, place, value, inverse, np.int64(0))
+            if information > np.float32(0.0):
+                number[cell] += 1.0
+                total[cell] += gain
+                known[cell] += information
+                squares[cell] += gain * gain / information

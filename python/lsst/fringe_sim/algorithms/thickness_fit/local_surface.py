@@ -1,0 +1,164 @@
+"""Surfaces of second degree through cells: what they say of the pixels in their middle.
+
+A cell at a crest may be taken for its mirror image on the other side, and all along a crest at that. So each cell is
+asked on the surface that its neighbours show and not where it was found: there it says how far it would move the
+surface, and how surely. Surfaces and cells are settled in turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from ...compiled import kernel
+from .cells import Cells
+from .newton import score
+from .pixels import LONE_CELL_PENALTY, SAME_SURFACE, CellSurface
+from .posterior import REACH
+from .templates import FringeTemplates
+
+__all__ = ["LocalSurface", "local_surface"]
+
+FloatArray = NDArray[np.float64]
+
+_SIDE = np.arange(-2, 3)
+"""Cells about one that show its surface."""
+_FAR = 2
+"""Cells that are so many away have others between them and the one in the middle."""
+_TAIL = 4.0
+"""Degrees of freedom of Student's distribution of cells about a surface (Lange, Little & Taylor 1989, J. Am. Stat.
+Assoc. 84, 881)."""
+_TURNS = 12
+"""Steps by which a chain of cells on the wrong side of a crest comes back."""
+_ROUNDS = 3
+_LONGEST_STEP = 0.1
+"""Longest way, in orders, by which a cell asks to move a surface at once."""
+_AT_ONCE = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class LocalSurface:
+    """Surface about each cell.
+
+    Attributes
+    ----------
+    terms : `numpy.ndarray`, float32, shape ``(ncy, ncx, 6)``
+        Of 1, y, x, y², xy, x², with y and x in pixels from the centre of the cell [µm].
+    sigma_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        Standard uncertainty of the first from the noise of the cells [µm]; infinite where nobody asked.
+    holds : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
+        Whether the cell and its eight neighbours lie on their surfaces, and more cells show it than it has terms.
+    """
+
+    terms: NDArray[np.float32]
+    sigma_um: NDArray[np.float32]
+    holds: NDArray[np.bool_]
+
+
+def local_surface(
+    surface: CellSurface,
+    cells: Cells,
+    templates: FringeTemplates,
+    asked: NDArray[np.bool_],
+    order_um: float,
+) -> LocalSurface:
+    """The most likely surfaces about the cells that are asked.
+
+    Parameters
+    ----------
+    surface : `CellSurface`
+        Cells as they were solved.
+    cells : `Cells`
+        Their mean amplitudes.
+    templates : `FringeTemplates`
+        The model, normalised to the sensor.
+    asked : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
+        Cells whose surface is wanted.
+    order_um : `float`
+        Thickness of one fringe order [µm].
+    """
+    terms, sigma = np.zeros((*asked.shape, 6), np.float32), np.full(asked.shape, np.inf, np.float32)
+    found = LocalSurface(terms, sigma, np.zeros(asked.shape, bool))
+    found.terms[..., 0] = surface.thickness_um
+    step = templates.step_um
+    value, weight = (part.reshape(-1, part.shape[-1]) for part in (cells.value, cells.weight))
+    gain, known, chi2, own = np.empty((4, *asked.shape))
+
+    def ask(chi2: FloatArray) -> None:
+        place = (found.terms[..., 0].astype(float).ravel() - templates.start_um) / step
+        _scores_at(value, weight, templates.table(), place, gain.ravel(), known.ravel(), chi2.ravel())
+
+    ask(own)
+    seen, usable = surface.thickness_um.astype(float), surface.known
+    for _ in range(_TURNS):
+        _fit(surface, seen, np.where(usable, known, 0.0) / step**2, asked, order_um, found)
+        ask(chi2)
+        # A cell is not on a surface that is half an order away, nor if it likes its own place so much better.
+        away = np.abs(found.terms[..., 0] - surface.thickness_um)
+        usable = surface.known & (away < REACH * order_um) & (chi2 - own < LONE_CELL_PENALTY)
+        move = np.clip(
+            step * gain / np.maximum(known, 1e-30), *(order_um * _LONGEST_STEP * np.array([-1, 1]))
+        )
+        seen = found.terms[..., 0] + move
+    found.holds[:] &= surface.known & ~binary_dilation(surface.known & ~usable, np.ones((3, 3), bool))
+    return found
+
+
+def _fit(
+    surface: CellSurface,
+    seen: FloatArray,
+    precision: FloatArray,
+    asked: NDArray[np.bool_],
+    order_um: float,
+    found: LocalSurface,
+) -> None:
+    """Surfaces through what was ``seen`` of the cells [µm], known to a ``precision`` [1/µm²], in place."""
+    centres = (surface.y_centre, surface.x_centre)
+    size = [max(float(np.diff(each).mean()) if len(each) > 1 else 1.0, 1.0) for each in centres]
+    scale = np.array([1.0, size[0], size[1], size[0] ** 2, size[0] * size[1], size[1] ** 2])
+    # Neighbours that turn by an order from cell to cell, or bend by what breaks a surface, are not on one.
+    prior = np.diag((order_um * np.array([1.0, 1.0, 1.0, *(SAME_SURFACE,) * 3])) ** -2.0)
+    every = np.nonzero(asked)
+    for part in np.array_split(np.arange(every[0].size), max(-(-every[0].size // _AT_ONCE), 1)):
+        y, x = (index[part] for index in every)
+        b, a, known = _around(precision, y, x)
+        up, over = (
+            (each[at] - each[own][:, None]) / one
+            for each, at, own, one in zip(centres, (b, a), (y, x), size, strict=True)
+        )
+        design = np.stack([np.ones_like(up), up, over, up * up, up * over, over * over], axis=-1)
+        away, trust = seen[b, a] - seen[y, x][:, None], np.ones_like(known)
+        for _ in range(_ROUNDS):
+            turned = (design * (known * trust)[..., None]).swapaxes(1, 2)
+            terms = np.linalg.solve(turned @ design + prior, turned @ away[..., None])
+            trust = (_TAIL + 1.0) / (_TAIL + known * (away - (design @ terms)[..., 0]) ** 2)
+        terms[:, 0, 0] += seen[y, x]
+        found.terms[y, x] = terms[..., 0] / scale
+        normal = (design * known[..., None]).swapaxes(1, 2) @ design + prior
+        found.sigma_um[y, x] = np.sqrt(np.linalg.inv(normal)[:, 0, 0])
+        found.holds[y, x] = np.count_nonzero(known, axis=1) > scale.size
+
+
+def _around(
+    precision: FloatArray, y: NDArray[np.intp], x: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+    """Rows and columns of the cells around some, one row each, and to which precision they show their surface."""
+    b, a = np.repeat(y[:, None] + _SIDE, _SIDE.size, axis=1), np.tile(x[:, None] + _SIDE, (1, _SIDE.size))
+    inside = (b >= 0) & (b < precision.shape[0]) & (a >= 0) & (a < precision.shape[1])
+    b, a = np.where(inside, b, y[:, None]), np.where(inside, a, x[:, None])
+    # What lies behind a cell that shows no surface does not show this one.
+    between = [own[:, None] + np.fix(0.5 * (at - own[:, None])).astype(int) for at, own in ((b, y), (a, x))]
+    beside = (np.abs(b - y[:, None]) < _FAR) & (np.abs(a - x[:, None]) < _FAR)
+    return b, a, np.where(inside & (beside | (precision[tuple(between)] > 0.0)), precision[b, a], 0.0)
+
+
+@kernel(relaxed=True)
+def _scores_at(value, weight, table, place, gain, information, chi2):  # type: ignore[no-untyped-def]
+    """Score, information and chi-square of each row at its place of the table."""
+    top = table.shape[0] - 1.0
+    for item in range(place.shape[0]):
+        at = min(max(place[item], 0.0), top)
+        gain[item], information[item], chi2[item] = score(table, at, value, weight, item)
