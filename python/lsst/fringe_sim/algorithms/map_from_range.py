@@ -181,7 +181,11 @@ class _Polynomial(NamedTuple):
 
     @classmethod
     def of(cls, shape: tuple[int, ...]) -> _Polynomial:
-        return cls(*(legvander((np.arange(side) + 0.5) * 2.0 / side - 1.0, DEGREE) for side in shape))
+        rows, columns = (
+            np.asarray(legvander((np.arange(side) + 0.5) * 2.0 / side - 1.0, DEGREE), dtype=np.float64)
+            for side in shape
+        )
+        return cls(rows, columns)
 
     def value(self, coefficient: FloatArray) -> FloatArray:
         square = np.zeros((DEGREE + 1, DEGREE + 1))
@@ -286,7 +290,7 @@ class _Problem:
             ),
             terms=terms.reshape(-1, degree.size),
             background=beside.reshape(weights.size, -1),
-            prior=1.0 / spread**2,
+            prior=np.asarray(1.0 / spread**2, dtype=np.float64),
             middle=np.where(degree == 0, 0.5 * (low + high), 0.0),
             range_um=range_um,
             order_um=order_um,
@@ -480,7 +484,7 @@ def _step(
     gradient = (rise.T * weight) @ left - mixed.T @ np.linalg.solve(normal, (beside.T * weight) @ left)
     covariance = np.linalg.inv(hessian / noise + np.diag(problem.prior))
     step = covariance @ (gradient / noise - problem.prior * (coefficient - problem.middle))
-    return step, covariance
+    return np.asarray(step, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
 
 
 def _left(
@@ -491,7 +495,8 @@ def _left(
     normal = (beside[used].T * problem.weight[used]) @ beside[used]
     normal[np.diag_indices_from(normal)] *= 1.0 + 1e-9
     level = np.linalg.solve(normal, (beside[used].T * problem.weight[used]) @ problem.value[used])
-    return problem.weight * np.square(problem.value - beside @ level), level
+    residual2 = problem.weight * np.square(problem.value - beside @ level)
+    return residual2, np.asarray(level, dtype=np.float64)
 
 
 def _beside(problem: _Problem, thickness: FloatArray | None) -> FloatArray:

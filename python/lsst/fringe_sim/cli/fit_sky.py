@@ -233,12 +233,14 @@ def _search(
 
     first = loaders[0]()
     with progress("finding fringes", len(loaders)) as advance:
-        frames = []
+        values, weights = [], []
         for loader in loaders:
-            frames.append(fringes_alone(loader(), [], options, first.shape))
+            value, weight = fringes_alone(loader(), [], options, first.shape)
+            values.append(value)
+            weights.append(weight)
             advance()
     try:
-        found = map_from_range(*zip(*frames, strict=True), range_um, predict, order_um)
+        found = map_from_range(values, weights, range_um, predict, order_um)
     except UndeterminedError as error:
         click.echo(f"no map was found: {error}")
         return
