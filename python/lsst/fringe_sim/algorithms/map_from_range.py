@@ -5,29 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtr
 
 from ..errors import InputError, OutOfRangeError, UndeterminedError, named_units
 from ..products import ThicknessMap, mask_bits
 from .night_levels import BAND_SIGMA
+from .range_cells import PARTS, FittedMap, Polynomial, RangeCells, Seed, across_degrees, down_degrees
 
 __all__ = ["RangeMap", "map_from_range"]
 
 FloatArray = NDArray[np.float64]
 
-DEGREE, BACKGROUND_DEGREE = 8, 1
-"""Degrees of the polynomials of the map and, along either side, of a background beside the fringes."""
-
-STEPS_PER_ORDER, TABLE_STEPS = 12, 48
-"""Thicknesses in an order that planes are tried at, and those at which the sky is tabulated."""
-
-PLANE_ORDERS = 0.125
-"""What a layer may depart from a plane over a window [orders]: 45 degrees of phase."""
+STEPS_PER_ORDER = 12
+"""Thicknesses in an order that planes are tried at."""
 
 CELL_ORDERS = 0.3
 """What a layer of mean slope may change over a cell [orders]: its mean has 0.86 of the fringes of its middle."""
@@ -45,14 +38,11 @@ CENTRES = (-0.5, 0.0, 0.5)
 ROUNDS, STEPS, FINISHED_ORDERS = 20, 3, 1e-3
 """Most rounds in which cells are added, steps in each, and the change at which they end [orders]."""
 
-PARTS, COMPARED_PARTS = 16, 8
-"""Parts along a side, in each of which the fringes must be seen, and those by which maps are compared."""
+COMPARED_PARTS = 8
+"""Parts along a side by which maps are compared."""
 
 SHIFTS = 4
 """Shifts of a part of the sensor up to half an order, above and below, that must not be likelier than none."""
-
-LARGEST_TABLE = 2
-"""Orders beyond the range that the sky is asked for."""
 
 
 @named_units
@@ -143,7 +133,7 @@ def map_from_range(
         raise OutOfRangeError("range of the thickness [um]", range_um, "two increasing, positive numbers")
     image, weight = _one_image(values, weights)
     cell = _cell_px(image.shape, (high - low) / order_um)
-    problem = _Problem.of(image, weight, cell, range_um, predict, order_um)
+    problem = RangeCells.of(image, weight, cell, range_um, predict, order_um)
     begun = _beginnings(problem)
     if not begun:
         raise UndeterminedError("planes that windows of the frames show", 0, "one or more: more frames")
@@ -158,7 +148,7 @@ def map_from_range(
         )  # fmt: skip
     others = [each for each in [*begun, *tried] if problem.differ(each, best)]
     odds = 1.0 + sum(_odds(problem, each, best) for each in others)
-    across = _Polynomial.of(image.shape)
+    across = Polynomial.of(image.shape)
     whole = np.zeros(image.shape, dtype=bool)
     wide = known.reshape(problem.shape).repeat(cell, axis=0).repeat(cell, axis=1)
     whole[: wide.shape[0], : wide.shape[1]] = wide
@@ -171,150 +161,6 @@ def map_from_range(
         best.misfit,
         math.sqrt(max(best.misfit - 1.0, 0.0) / max(_structure(problem, best), 1e-300)),
     )
-
-
-class _Polynomial(NamedTuple):
-    """Polynomials over a sensor, from -1 to 1 along each side."""
-
-    rows: FloatArray
-    columns: FloatArray
-
-    @classmethod
-    def of(cls, shape: tuple[int, ...]) -> _Polynomial:
-        rows, columns = (
-            np.asarray(legvander((np.arange(side) + 0.5) * 2.0 / side - 1.0, DEGREE), dtype=np.float64)
-            for side in shape
-        )
-        return cls(rows, columns)
-
-    def value(self, coefficient: FloatArray) -> FloatArray:
-        square = np.zeros((DEGREE + 1, DEGREE + 1))
-        square[_down(), _across()] = coefficient
-        return np.asarray(self.rows @ square @ self.columns.T)
-
-    def sigma(self, covariance: FloatArray) -> FloatArray:
-        found = np.empty((len(self.rows), len(self.columns)))
-        across = self.columns[:, _across()]
-        for number, row in enumerate(self.rows):
-            terms = row[_down()] * across
-            found[number] = np.sqrt(np.maximum(np.einsum("pi,ij,pj->p", terms, covariance, terms), 0.0))
-        return found
-
-
-def _down() -> NDArray[np.int64]:
-    return np.array([i for i in range(DEGREE + 1) for _ in range(DEGREE + 1 - i)])
-
-
-def _across() -> NDArray[np.int64]:
-    return np.array([j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)])
-
-
-class _Seed(NamedTuple):
-    """A plane in a window."""
-
-    gain: float
-    centre: tuple[float, float]
-    thickness_um: float
-    slope: tuple[float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class _Map:
-    """A map that was fitted."""
-
-    coefficient: FloatArray
-    covariance: FloatArray
-    thickness_um: FloatArray
-    residual2: FloatArray  # squared pulls of all cells
-    followed: NDArray[np.bool_]
-    level: FloatArray  # strength of the fringes, and the background
-
-    @property
-    def cost(self) -> float:
-        return float(self.residual2.sum())
-
-    @property
-    def misfit(self) -> float:
-        return float(np.mean(self.residual2[self.followed]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Cells of the image, and what is expected of them."""
-
-    shape: tuple[int, int]
-    value: FloatArray
-    weight: FloatArray
-    place: FloatArray  # (cells, 2), from -1 to 1
-    terms: FloatArray  # (cells, T) of the map
-    background: FloatArray
-    prior: FloatArray  # inverse variances of the coefficients
-    middle: FloatArray
-    range_um: tuple[float, float]
-    order_um: float
-    grid: FloatArray
-    light: FloatArray
-    slope: FloatArray
-    radius: float  # of a window
-
-    @classmethod
-    def of(
-        cls,
-        image: FloatArray,
-        weight: FloatArray,
-        cell: int,
-        range_um: tuple[float, float],
-        predict: Callable[[FloatArray], ArrayLike],
-        order_um: float,
-    ) -> _Problem:
-        low, high = range_um
-        weights = _sums(weight, cell)
-        value = _sums(np.where(weight > 0.0, image, 0.0) * weight, cell) / np.maximum(weights, 1e-300)
-        across = _Polynomial.of(weights.shape)
-        terms = np.einsum("yi,xj->yxij", across.rows, across.columns)[..., _down(), _across()]
-        some = BACKGROUND_DEGREE + 1
-        beside = np.einsum("yi,xj->yxij", across.rows[:, :some], across.columns[:, :some])
-        degree = _down() + _across()
-        # A layer that goes through its range, of which finer structure has less.
-        spread = (high - low) / (1.0 + degree) ** 2
-        margin = LARGEST_TABLE * order_um
-        grid = np.arange(max(low - margin, 0.5 * low), high + margin, order_um / TABLE_STEPS)
-        light = np.asarray(predict(grid), dtype=float)
-        light = light / light.mean() - 1.0
-        return cls(
-            shape=(weights.shape[0], weights.shape[1]),
-            value=value.ravel(),
-            weight=weights.ravel(),
-            place=np.stack(np.broadcast_arrays(across.rows[:, 1][:, None], across.columns[:, 1]), -1).reshape(
-                -1, 2
-            ),
-            terms=terms.reshape(-1, degree.size),
-            background=beside.reshape(weights.size, -1),
-            prior=np.asarray(1.0 / spread**2, dtype=np.float64),
-            middle=np.where(degree == 0, 0.5 * (low + high), 0.0),
-            range_um=range_um,
-            order_um=order_um,
-            grid=grid,
-            light=light,
-            slope=np.gradient(light, grid),
-            radius=1.2 * math.sqrt(PLANE_ORDERS * order_um / (high - low)),
-        )
-
-    def fringes(self, thickness_um: FloatArray) -> FloatArray:
-        return np.asarray(np.interp(thickness_um, self.grid, self.light))
-
-    def slopes(self, thickness_um: FloatArray) -> FloatArray:
-        return np.asarray(np.interp(thickness_um, self.grid, self.slope))
-
-    def differ(self, one: _Map, other: _Map) -> bool:
-        """Whether two maps are a quarter of an order or more apart."""
-        apart = (one.thickness_um - other.thickness_um)[other.followed]
-        return bool(np.sqrt(np.mean(np.square(apart))) > 0.25 * self.order_um)
-
-    def parts(self, along: int = PARTS) -> NDArray[np.int64]:
-        """Part of the sensor of each cell."""
-        row, column = (0.5 * (self.place + 1.0) * along).astype(int).T
-        return np.asarray(row * along + column)
 
 
 def _one_image(values: Sequence[ArrayLike], weights: Sequence[ArrayLike]) -> tuple[FloatArray, FloatArray]:
@@ -351,16 +197,9 @@ def _cell_px(shape: tuple[int, ...], orders: float) -> int:
     return cell
 
 
-def _sums(image: FloatArray, cell: int) -> FloatArray:
-    rows, columns = (side // cell for side in image.shape)
-    return np.asarray(
-        image[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).sum(axis=(1, 3))
-    )
-
-
-def _seeds(problem: _Problem) -> list[list[_Seed]]:
+def _seeds(problem: RangeCells) -> list[list[Seed]]:
     """Likeliest planes of all windows, in both directions."""
-    found: list[list[_Seed]] = []
+    found: list[list[Seed]] = []
     for centre in [(y, x) for y in CENTRES for x in CENTRES]:
         mine = sorted(_planes(problem, centre), reverse=True)
         if mine:
@@ -369,9 +208,9 @@ def _seeds(problem: _Problem) -> list[list[_Seed]]:
     return sorted(found, reverse=True)
 
 
-def _beginnings(problem: _Problem) -> list[_Map]:
+def _beginnings(problem: RangeCells) -> list[FittedMap]:
     """The two best maps that begin in the windows, up to one that all parts show."""
-    found: list[_Map] = []
+    found: list[FittedMap] = []
     for pair in _seeds(problem):
         grown = [each for each in (_grown(problem, seed) for seed in pair) if each is not None]
         found.extend(grown)
@@ -380,7 +219,7 @@ def _beginnings(problem: _Problem) -> list[_Map]:
     return sorted(found, key=lambda each: each.cost)[:2]
 
 
-def _planes(problem: _Problem, centre: tuple[float, float]) -> list[_Seed]:
+def _planes(problem: RangeCells, centre: tuple[float, float]) -> list[Seed]:
     low, high = problem.range_um
     away = problem.place - np.array(centre)
     window = (np.square(away).sum(axis=1) < (2.0 * problem.radius) ** 2) & (problem.weight > 0.0)
@@ -400,21 +239,21 @@ def _planes(problem: _Problem, centre: tuple[float, float]) -> list[_Seed]:
             product, power = light @ (weight * value), np.square(light) @ weight
             gain = np.where(product > 0.0, product**2 / np.maximum(power, 1e-300), 0.0)
             best = int(np.argmax(gain))
-            found.append(_Seed(float(gain[best]), centre, float(thickness[best]), (down, along)))
+            found.append(Seed(float(gain[best]), centre, float(thickness[best]), (down, along)))
     return found
 
 
-def _grown(problem: _Problem, seed: _Seed) -> _Map | None:
+def _grown(problem: RangeCells, seed: Seed) -> FittedMap | None:
     """A map that begins at a plane; `None` if it leaves the table of the sky."""
     start = np.zeros(problem.middle.size)
-    down, across = _down(), _across()
+    down, across = down_degrees(), across_degrees()
     start[(down == 0) & (across == 0)] = seed.thickness_um - float(np.dot(seed.slope, seed.centre))
     start[(down == 1) & (across == 0)], start[(down == 0) & (across == 1)] = seed.slope
     near = np.square(problem.place - np.array(seed.centre)).sum(axis=1) < (1.5 * problem.radius) ** 2
     return _followed(problem, start, near & (problem.weight > 0.0))
 
 
-def _followed(problem: _Problem, start: FloatArray, used: NDArray[np.bool_]) -> _Map | None:
+def _followed(problem: RangeCells, start: FloatArray, used: NDArray[np.bool_]) -> FittedMap | None:
     """Fit cells, and then those that they tell."""
     coefficient = start
     limit = FOLLOWED_ORDERS * problem.order_um
@@ -439,11 +278,11 @@ def _followed(problem: _Problem, start: FloatArray, used: NDArray[np.bool_]) -> 
         return None
     residual2, level = _left(problem, thickness, used)
     wide = _widened(problem, covariance, thickness, used, level)
-    return _Map(coefficient, wide, thickness, residual2, used, level)
+    return FittedMap(coefficient, wide, thickness, residual2, used, level)
 
 
 def _widened(
-    problem: _Problem,
+    problem: RangeCells,
     covariance: FloatArray,
     thickness: FloatArray,
     used: NDArray[np.bool_],
@@ -461,7 +300,7 @@ def _widened(
 
 
 def _step(
-    problem: _Problem, coefficient: FloatArray, used: NDArray[np.bool_]
+    problem: RangeCells, coefficient: FloatArray, used: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
     """Step of Gauss and Newton, and covariance of the map; strength of the fringes and background are free."""
     terms, weight = problem.terms[used], problem.weight[used]
@@ -488,7 +327,7 @@ def _step(
 
 
 def _left(
-    problem: _Problem, thickness: FloatArray | None, used: NDArray[np.bool_]
+    problem: RangeCells, thickness: FloatArray | None, used: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
     """Squared pulls of all cells, and what some cells tell: the strength of the fringes, if any, and a background."""
     beside = _beside(problem, thickness)
@@ -499,13 +338,13 @@ def _left(
     return residual2, np.asarray(level, dtype=np.float64)
 
 
-def _beside(problem: _Problem, thickness: FloatArray | None) -> FloatArray:
+def _beside(problem: RangeCells, thickness: FloatArray | None) -> FloatArray:
     """Fringes of a map, if any, and terms of the background."""
     light = np.zeros((problem.value.size, 0)) if thickness is None else problem.fringes(thickness)[:, None]
     return np.column_stack([light, problem.background])
 
 
-def _other_orders(problem: _Problem, first: _Map) -> list[_Map]:
+def _other_orders(problem: RangeCells, first: FittedMap) -> list[FittedMap]:
     """The same map in other orders of the range, and turned upside down."""
     low, high = problem.range_um
     middle = float(np.median(first.thickness_um))
@@ -523,7 +362,7 @@ def _other_orders(problem: _Problem, first: _Map) -> list[_Map]:
     return [each for each in found if each is not None]
 
 
-def _seen(problem: _Problem, best: _Map) -> NDArray[np.bool_]:
+def _seen(problem: RangeCells, best: FittedMap) -> NDArray[np.bool_]:
     """Cells of parts that are likelier with the fringes of a map than without them or with shifted ones."""
     part = problem.parts()
     without, _ = _left(problem, None, best.followed)
@@ -532,13 +371,13 @@ def _seen(problem: _Problem, best: _Map) -> NDArray[np.bool_]:
     return np.asarray(((gain > _price(problem, best)) & (_shifts(problem, best) < 0.0))[part])
 
 
-def _structure(problem: _Problem, best: _Map) -> float:
+def _structure(problem: RangeCells, best: FittedMap) -> float:
     """Mean squared pull beyond the noise, of cells less their background."""
     without, _ = _left(problem, None, best.followed)
     return max(float(np.mean(without[best.followed])) - 1.0, 0.0)
 
 
-def _shifts(problem: _Problem, best: _Map) -> FloatArray:
+def _shifts(problem: RangeCells, best: FittedMap) -> FloatArray:
     """What a shift of its own gains in each part, less its price; below 0 the map is likelier as it is."""
     part = problem.parts()
     left = np.bincount(part, best.residual2, PARTS**2)
@@ -550,13 +389,13 @@ def _shifts(problem: _Problem, best: _Map) -> FloatArray:
     return np.asarray(np.maximum(left - np.min(shifted, axis=0), 0.0) - _price(problem, best))
 
 
-def _price(problem: _Problem, best: _Map) -> FloatArray:
+def _price(problem: RangeCells, best: FittedMap) -> FloatArray:
     """Of a free number in each part (Schwarz 1978, Annals of Statistics 6, 461)."""
     cells = np.bincount(problem.parts(), problem.weight > 0.0, PARTS**2)
     return np.asarray(np.log(np.maximum(cells, 2.0)) * max(best.misfit, 1.0))
 
 
-def _odds(problem: _Problem, other: _Map, best: _Map) -> float:
+def _odds(problem: RangeCells, other: FittedMap, best: FittedMap) -> float:
     """Of another map against the best."""
     rise = other.residual2 - best.residual2
     by_part = np.bincount(problem.parts(COMPARED_PARTS), rise, COMPARED_PARTS**2)
