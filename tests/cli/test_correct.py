@@ -240,3 +240,25 @@ def test_dry_run_writes_nothing(night: Path, made: Path, tmp_path: Path) -> None
 def test_bands_of_a_model_and_of_a_frame_must_agree(template, frame, refused) -> None:
     assert other_light(template, frame, True) is refused
     assert other_light(template, frame, False)
+
+
+@pytest.mark.parametrize(
+    "cards",
+    [
+        {"FRINGE": "c4d_fringe_y.fits", "FRGSCALE": 0.8},
+        {"FRGFLAG": "Y", "SKYFSUB": "sky.fits"},
+        {"FRNGMDL": "c01"},
+    ],
+    ids=["DECam", "Mosaic-3", "ZTF"],
+)
+def test_a_primary_header_that_tells_of_a_correction_is_believed(
+    night: Path, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], cards: dict[str, str | float]
+) -> None:
+    """The image is in an extension of its own, as those pipelines write it, and its header says nothing."""
+    image, header = fits.getdata(night / "visit_0.fits"), fits.getheader(night / "visit_0.fits")
+    path = tmp_path / "c4d_ooi_y_v1.fits"
+    parts = [fits.PrimaryHDU(header=fits.Header(cards)), fits.ImageHDU(image, header, name="S11")]
+    fits.HDUList(parts).writeto(path)
+    assert correct(made, tmp_path / "out", path) == 1
+    assert f"{next(iter(cards))} is" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError, named_units, to_number
 from ..products import CORRECTED, FringeFrame, refuse_corrected
-from .correction.background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
+from .correction.background import AMPLIFIERS_UNKNOWN, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .correction.objects import ROUNDS, FrameFit, fit_frame
 from .correction.scales import ScaleFit, refuse_negative_sky, steady_weight
 from .sky_frame import SkyResponse
@@ -52,13 +52,13 @@ class CorrectionOptions:
     spacing_px : `float`
         Distance between the knots of the background [px].
     amplifiers : `AmplifierGrid`
-        Amplifiers with levels of their own.
+        Amplifiers with levels of their own; by default the frame tells whether levels differ (`LevelSpread`).
     find_objects : `bool`
         Whether objects are looked for; otherwise the mask names all of them.
     """
 
     spacing_px: float = SPACING_PX
-    amplifiers: AmplifierGrid = ONE_AMPLIFIER
+    amplifiers: AmplifierGrid = AMPLIFIERS_UNKNOWN
     find_objects: bool = True
 
 

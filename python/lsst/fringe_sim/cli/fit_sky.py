@@ -18,6 +18,8 @@ from .parameters import SKY, THICKNESS_RANGE, ChosenEffects, model_effects
 from .progress import progress
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from ..algorithms.fringe_correction import CorrectionOptions
     from ..algorithms.map_on_sky import MapOnSky
     from ..algorithms.range_forecast import RangeForecast
@@ -104,7 +106,8 @@ def fit_sky(
     FRAMES are those of one sensor in one filter, after the removal of the instrument's signature and before the
     subtraction of background and fringes. The strength of every OH band is free in every frame, so that nights in
     which the bands vary tell more. The map that is written holds the shift, and its uncertainty. From a range of the
-    thickness alone no map is made: what is stated is how many frames like these a map would take.
+    thickness alone it is stated how many frames like these a map would take; where there are as many, one is searched
+    for.
 
     \b
     Examples:
@@ -197,15 +200,66 @@ def _forecast(
     noise, pixels = frame_noise(frame, options)
     order_um = float(model.fringe_order_um(960.0))
     dark = SkySpectrum.dark(airmass=model.setup.airmass)
-    table = sky_response(model, dark, thickness_range_um=(range_um[0], range_um[1] + 2.0 * order_um)).sky()
+    span = max(range_um[0] - 2.0 * order_um, 0.5 * range_um[0]), range_um[1] + 2.0 * order_um
+    table = sky_response(model, dark, thickness_range_um=span).sky()
     shape = (frame.shape[0], frame.shape[1])
-    found = forecast_of_range(
-        lambda grid: table.frame(grid[None, :])[0], range_um, order_um, shape, pixels, noise
-    )
+
+    def predict(grid: NDArray[np.float64]) -> NDArray[np.float32]:
+        return table.frame(grid[None, :])[0]
+
+    found = forecast_of_range(predict, range_um, order_um, shape, pixels, noise)
     write_whole(folder / "forecast.ecsv", table_text(Table([{**asdict(found), "frames": found.frames}])))
     for line in forecast_lines(found, len(loaders)):
         click.echo(line)
     click.echo(str(folder / "forecast.ecsv"))
+    if len(loaders) >= found.frames:
+        _search(range_um, predict, order_um, loaders, options, model.setup.varying, folder)
+
+
+def _search(
+    range_um: tuple[float, float],
+    predict: Callable[[NDArray[np.float64]], NDArray[np.float32]],
+    order_um: float,
+    loaders: Sequence[Callable[[], ObservedFrame]],
+    options: CorrectionOptions,
+    layer: str,
+    folder: Path,
+) -> None:
+    """Write the map that the frames tell, or say that they tell none."""
+    from ..algorithms.map_from_range import map_from_range
+    from ..algorithms.map_on_sky import fringes_alone
+    from ..errors import UndeterminedError
+    from ..model.provenance import software_cards
+
+    first = loaders[0]()
+    with progress("finding fringes", len(loaders)) as advance:
+        values, weights = [], []
+        for loader in loaders:
+            value, weight = fringes_alone(loader(), [], options, first.shape)
+            values.append(value)
+            weights.append(weight)
+            advance()
+    try:
+        found = map_from_range(values, weights, range_um, predict, order_um)
+    except UndeterminedError as error:
+        click.echo(f"no map was found: {error}")
+        return
+    if found.order_probability < 0.5:
+        click.echo(f"no map was found: the likeliest one has a probability of {found.order_probability:.2g}")
+        return
+    if found.model_error >= LARGE_ERROR:
+        click.echo(
+            f"no map was found: the likeliest one leaves {found.model_error:.2g} of the fringes "
+            "(lines, films, silicon)"
+        )
+        return
+    found.thickness_map(layer, first.detector).write_fits(folder / "thickness.fits", software_cards())
+    click.echo(
+        f"{100.0 * float(found.known.mean()):.0f} % of the pixels are known, with a median σ of "
+        f"{NM * float(np.median(found.sigma_um[found.known])):.3g} nm within their order; the order of all and the "
+        f"direction are right with a probability of {found.order_probability:.2g}, if the model is"
+    )
+    click.echo(str(folder / "thickness.fits"))
 
 
 def forecast_lines(found: RangeForecast, frames: int) -> list[str]:
@@ -213,7 +267,7 @@ def forecast_lines(found: RangeForecast, frames: int) -> list[str]:
     verdict = (
         f"there are {frames}: too few for a map from the range alone"
         if frames < found.frames
-        else f"there are {frames}: the signal may suffice, but no search for a map without one is made here"
+        else f"there are {frames}: the signal may suffice, and a map is searched for"
     )
     return [
         f"fringes of the dark sky: {100.0 * found.fringe_rms:.2g} % rms; noise of a pixel of the first frame: "

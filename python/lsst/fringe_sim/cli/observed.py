@@ -56,7 +56,8 @@ def background_options(command: Callable[..., None]) -> Callable[..., None]:
             "--amplifiers",
             type=SIZE,
             default=None,
-            help="Amplifiers beside and on top of each other, such as 8x2, each with a level of its own.",
+            help="Amplifiers beside and on top of each other, such as 3x1, each with a level of its own, or 1x1. By "
+            "default a frame tells whether the levels of 8x2, 4x1, 2x1 or 2x2 differ.",
         ),
     ):
         command = option(command)
@@ -64,11 +65,10 @@ def background_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def grid_of(amplifiers: tuple[int, int] | None) -> AmplifierGrid:
-    """Amplifiers of columns x rows."""
-    from ..algorithms.correction import AmplifierGrid
+    """Amplifiers of columns x rows; where nobody states them the frame tells whether levels differ."""
+    from ..algorithms.correction import AMPLIFIERS_UNKNOWN, AmplifierGrid
 
-    columns, rows = amplifiers or (1, 1)
-    return AmplifierGrid(rows, columns)
+    return AMPLIFIERS_UNKNOWN if amplifiers is None else AmplifierGrid(amplifiers[1], amplifiers[0])
 
 
 def images_of(

@@ -16,7 +16,7 @@ from lsst.pipe.base import (
 )
 from lsst.pipe.base.connectionTypes import Input, Output
 
-from ..algorithms.correction import AmplifierGrid
+from ..algorithms.correction import AMPLIFIERS_UNKNOWN, AmplifierGrid
 from ..algorithms.correction.empirical import TemplateOptions
 from ..algorithms.observed_frames import make_templates
 from ..products import ObservedFrame
@@ -66,16 +66,22 @@ class BackgroundConfig(Config):
         check=lambda value: value >= 8.0,
     )
     amplifier_columns: Field[int] = Field(
-        dtype=int, default=1, doc="Amplifiers beside each other.", check=lambda n: n > 0
+        dtype=int,
+        optional=True,
+        doc="Amplifiers beside each other; where neither number is given, a frame tells whether their levels differ.",
+        check=lambda n: n > 0,
     )
     amplifier_rows: Field[int] = Field(
-        dtype=int, default=1, doc="Amplifiers on top of each other.", check=lambda n: n > 0
+        dtype=int, optional=True, doc="Amplifiers on top of each other.", check=lambda n: n > 0
     )
 
     @property
     def grid(self) -> AmplifierGrid:
         """Amplifiers with levels of their own."""
-        return AmplifierGrid(self.amplifier_rows, self.amplifier_columns)
+        rows, columns = self.amplifier_rows, self.amplifier_columns
+        if rows is None and columns is None:
+            return AMPLIFIERS_UNKNOWN
+        return AmplifierGrid(rows or 1, columns or 1)
 
 
 class ObservedFringeConfig(

@@ -43,10 +43,13 @@ class AmplifierGrid:
     ----------
     rows, columns : `int`
         Amplifiers on top of and beside each other.
+    learned : `bool`
+        Whether a frame tells how much the levels differ (`LevelSpread`); otherwise they are free.
     """
 
     rows: int = 1
     columns: int = 1
+    learned: bool = False
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
@@ -54,6 +57,10 @@ class AmplifierGrid:
 
 
 ONE_AMPLIFIER = AmplifierGrid()
+
+AMPLIFIERS_UNKNOWN = AmplifierGrid(2, 8, learned=True)
+"""Where nobody says which amplifiers there are: those of the LSST Camera, whose lines are also those of the two of
+DECam, the four of HSC, and the four quadrants of others."""
 
 
 class BackgroundTerms:
@@ -83,17 +90,33 @@ class BackgroundTerms:
             raise OutOfRangeError("spacing of the background [px]", spacing_px, "positive")
         grid = amplifiers or ONE_AMPLIFIER
         self.shape = shape
-        self.rows = Side.of(shape[0], spacing_px, grid.rows)
-        self.columns = Side.of(shape[1], spacing_px, grid.columns)
+        self.rows = Side.of(shape[0], spacing_px, grid.rows, halved=grid.learned)
+        self.columns = Side.of(shape[1], spacing_px, grid.columns, halved=grid.learned)
         self._grid = (self.rows.splines.shape[1], self.columns.splines.shape[1])
         self._levels = (grid.rows, grid.columns) if grid.rows * grid.columns > 1 else (0, 0)
+        self.learned = grid.learned and self._levels[0] > 0
 
     def __len__(self) -> int:
         """Number of terms."""
         return int(np.prod(self._grid)) + int(np.prod(self._levels))
 
-    def local(self) -> tuple[FloatArray, IntArray]:
+    @property
+    def levels(self) -> slice:
+        """Which of the terms are levels of amplifiers."""
+        return slice(int(np.prod(self._grid)), len(self))
+
+    @property
+    def amplifiers(self) -> tuple[int, int]:
+        """Amplifiers with levels, on top of and beside each other."""
+        return self._levels
+
+    def local(self, *, quarters: bool = False) -> tuple[FloatArray, IntArray]:
         """What each cell has of the terms.
+
+        Parameters
+        ----------
+        quarters : `bool`, optional
+            Whether every quarter of an amplifier has a level, where they are learned.
 
         Returns
         -------
@@ -109,7 +132,9 @@ class BackgroundTerms:
         term = (span[0][:, None, :, None] * self._grid[1] + span[1][:, None, :]).reshape(*size[:2], -1)
         if self._levels[0]:
             one = np.einsum("yp,xq->yxpq", rows.one, columns.one).reshape(*size[:3], 1)
-            level = rows.part[:, None] * self._levels[1] + columns.part + int(np.prod(self._grid))
+            parts = (rows.half, columns.half) if quarters else (rows.part, columns.part)
+            beside = self._levels[1] * (2 if quarters else 1)
+            level = parts[0][:, None] * beside + parts[1] + self.levels.start
             coefficient = np.concatenate([coefficient, one], axis=3)
             term = np.concatenate([term, level[..., None]], axis=2)
         return coefficient, term
@@ -167,8 +192,8 @@ class Side:
         Coefficients of the four splines of a piece.
     one : `numpy.ndarray`, shape ``(N, 4)``
         Coefficients of the constant 1.
-    span, part, block : `numpy.ndarray` of `int`, shape ``(N,)``
-        First spline, amplifier and block of each piece.
+    span, part, half, block : `numpy.ndarray` of `int`, shape ``(N,)``
+        First spline, amplifier, half of an amplifier, and block of each piece.
     """
 
     splines: FloatArray
@@ -180,6 +205,7 @@ class Side:
     one: FloatArray
     span: IntArray
     part: IntArray
+    half: IntArray
     block: IntArray
 
     def __len__(self) -> int:
@@ -187,12 +213,13 @@ class Side:
         return len(self.basis)
 
     @classmethod
-    def of(cls, side: int, spacing_px: float, amplifiers: int) -> Side:
+    def of(cls, side: int, spacing_px: float, amplifiers: int, *, halved: bool = False) -> Side:
         """Cut a side."""
         spans = max(1, round(side / spacing_px))
         blocks = max(1, min(MOST_BLOCKS_A_SIDE, side // SMALLEST_BLOCK_PX))
-        span, part, block = (_parts(side, number) for number in (spans, amplifiers, blocks))
-        cuts = np.flatnonzero(np.diff(span) + np.diff(part) + np.diff(block)) + 1
+        halves = amplifiers * (2 if halved else 1)
+        span, part, half, block = (_parts(side, number) for number in (spans, amplifiers, halves, blocks))
+        cuts = np.flatnonzero(np.diff(span) + np.diff(part) + np.diff(half) + np.diff(block)) + 1
         edges = np.concatenate([[0], cuts, [side]])
         splines = _splines(side, spans)
         pieces = [slice(start, stop) for start, stop in itertools.pairwise(edges)]
@@ -216,6 +243,7 @@ class Side:
             one=np.stack([each.sum(axis=0) for each in cubics]),
             span=span[first],
             part=part[first],
+            half=half[first],
             block=block[first],
         )
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError, UndeterminedError
 from ...notebook import do_nothing
-from .background import ONE_AMPLIFIER, SPACING_PX, AmplifierGrid, BackgroundTerms
+from .background import AMPLIFIERS_UNKNOWN, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .denoise import shrink_noise
 from .objects import fit_frame
 from .sums import four_digits
@@ -74,14 +74,14 @@ class TemplateOptions:
     spacing_px : `float`
         Distance between the knots of the background [px].
     amplifiers : `AmplifierGrid`
-        Amplifiers with levels of their own.
+        Amplifiers with levels of their own; by default the frame tells whether levels differ (`LevelSpread`).
     """
 
     components: int | None = None
     most: int = 4
     least_frames: int = 3
     spacing_px: float = SPACING_PX
-    amplifiers: AmplifierGrid = ONE_AMPLIFIER
+    amplifiers: AmplifierGrid = AMPLIFIERS_UNKNOWN
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,12 +43,13 @@ def scale_covariance(sums: FrameSums, solution: Solution) -> FloatArray:
 
 
 def _changes(sums: FrameSums, solution: Solution) -> FloatArray:
-    """What the noise of each block adds to the scales, shape ``(blocks, K)``."""
+    """What the noise of each block, and the level of each amplifier, add to the scales; K columns."""
     terms, (normal, score, term) = len(sums.background), sums.by_cell(solution)
     whole = np.zeros((terms + solution.scale.size,) * 2)
     np.add.at(whole, (term[..., :, None], term[..., None, :]), normal)
     splines = np.arange(terms)
     whole[splines, splines] += RIDGE * np.trace(whole[:terms, :terms]) / terms
+    sums.spread.add_to(whole, sums.background.levels)
     inverse = scipy.linalg.cho_solve(scipy.linalg.cho_factor(whole), np.eye(len(whole)))
     cells = _cells_of_blocks(sums)
     here = [np.unique(term[cell]) for cell in cells]
@@ -62,7 +63,9 @@ def _changes(sums: FrameSums, solution: Solution) -> FloatArray:
         np.add.at(own[block], (place[..., :, None], place[..., None, :]), normal[cell])
         np.add.at(along[block], place, score[cell])
     widened = _without_leverage(own, along, inverse[places[:, :, None], places[:, None, :]])
-    return np.asarray((inverse[terms:, places] * widened).sum(axis=2).T)
+    blocks = (inverse[terms:, places] * widened).sum(axis=2).T
+    levels = sums.spread.scatter * inverse[sums.background.levels, terms:]
+    return np.concatenate([blocks, levels])
 
 
 def _cells_of_blocks(sums: FrameSums) -> list[tuple[NDArray[np.int64], ...]]:
@@ -96,7 +99,9 @@ def _correlated(residual: FloatArray, weight: FloatArray) -> FloatArray:
     distance = np.rint(np.hypot(rows[:, np.newaxis], columns)).astype(int)
     flat = distance.ravel()
     total, number = np.bincount(flat, products.ravel()), np.bincount(flat, np.maximum(pairs, 0.0).ravel())
-    mean = np.divide(total, number, out=np.zeros_like(total), where=number > 0.0)[distance]
+    # Lags that no pair of blocks has are rounding of the transforms.
+    rounding = np.finfo(float).eps * products.size * float(number[0])
+    mean = np.divide(total, number, out=np.zeros_like(total), where=number > rounding)[distance]
     mean[0, 0] = 0.0
     return np.asarray(mean)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ...compiled import run_threaded
 from ...errors import UndeterminedError
 from .background import CUBIC, BackgroundTerms
+from .levels import FREE_LEVELS, LevelSpread
 
 __all__ = ["FrameSums", "Solution", "four_digits"]
 
@@ -90,6 +91,8 @@ class FrameSums:
         size = TERMS + len(self.patterns) + 1
         self.matrix = np.zeros((*self.pixels.shape, size, size))
         self._local, self._term = background.local()
+        self.spread = FREE_LEVELS
+        """How much the levels of amplifiers differ, by the last solution from all cells."""
 
     def use(self, used: BoolArray) -> None:
         """Take these pixels into the sums, and all others out of them."""
@@ -107,13 +110,16 @@ class FrameSums:
         matrix = self.matrix if cells is None else self.matrix * cells[..., None, None]
         number = len(self.patterns) if templates else 0
         chosen = [*range(number), len(self.patterns)]
-        normal = self._scattered(self._local.swapaxes(2, 3) @ matrix[..., :TERMS, :TERMS] @ self._local)
+        normal = _assembled(self._local, self._term, matrix[..., :TERMS, :TERMS], len(self.background))
         normal[np.diag_indices_from(normal)] += RIDGE * np.trace(normal) / len(normal)
-        factor = scipy.linalg.cho_factor(normal)
         beside = np.zeros((len(self.background), len(chosen)))
         moments = self._local.swapaxes(2, 3) @ matrix[..., :TERMS, TERMS:][..., chosen]
         np.add.at(beside, self._term, moments)
         gram = matrix[..., TERMS:, TERMS:].sum(axis=(0, 1))[np.ix_(chosen, chosen)]
+        if self.background.learned and cells is None:
+            self.spread = self._spread(chosen, gram)
+        self.spread.add_to(normal, self.background.levels)
+        factor = scipy.linalg.cho_factor(normal)
         mixed, along = beside[:, :number], beside[:, number]
         leakage = scipy.linalg.cho_solve(factor, mixed)
         schur = gram[:number, :number] - mixed.T @ leakage
@@ -210,14 +216,19 @@ class FrameSums:
         rest = np.broadcast_to(np.append(-scale, 1.0), (*self.pixels.shape, scale.size + 1))
         return np.concatenate([-self._on_cells(solution.coefficient), rest], axis=2)
 
+    def _spread(self, chosen: list[int], gram: FloatArray) -> LevelSpread:
+        """How much the levels of amplifiers differ, beside the background and the chosen templates."""
+        rows, columns = self.background.amplifiers
+        start = self.background.levels.start
+        local, term = self.background.local(quarters=True)
+        normal = _assembled(local, term, self.matrix[..., :TERMS, :TERMS], start + 4 * rows * columns)
+        moments = local.swapaxes(2, 3) @ self.matrix[..., :TERMS, TERMS:][..., chosen]
+        beside = np.zeros((len(normal), len(chosen)))
+        np.add.at(beside, term, moments)
+        return LevelSpread.of(normal, beside, gram, (rows, columns), int(self.pixels.sum()))
+
     def _on_cells(self, coefficient: FloatArray) -> FloatArray:
         return np.asarray((self._local @ coefficient[self._term][..., None])[..., 0])
-
-    def _scattered(self, blocks: FloatArray) -> FloatArray:
-        size = len(self.background)
-        flat = (self._term[..., :, None] * size + self._term[..., None, :]).ravel()
-        sums = np.bincount(flat, weights=blocks.ravel(), minlength=size * size)
-        return np.asarray(sums, dtype=np.float64).reshape(size, size)
 
     def _use_row(self, row: int, used: BoolArray) -> None:
         edges = self.background.rows.edges, self.background.columns.edges
@@ -272,6 +283,14 @@ class FrameSums:
         made[:TERMS, TERMS:] = made[TERMS:, :TERMS].T
         made[TERMS:, TERMS:] = gram
         return made
+
+
+def _assembled(local: FloatArray, term: NDArray[np.int64], matrix: FloatArray, size: int) -> FloatArray:
+    """Normal matrix of all terms from the sums over each cell."""
+    blocks = local.swapaxes(2, 3) @ matrix @ local
+    flat = (term[..., :, None] * size + term[..., None, :]).ravel()
+    sums = np.bincount(flat, weights=blocks.ravel(), minlength=size * size)
+    return np.asarray(sums, dtype=np.float64).reshape(size, size)
 
 
 def _middle(image: NDArray[Any], usable: BoolArray) -> float:
