@@ -209,15 +209,16 @@ class Copy:
             shutil.copy2(ROOT / name, self.root / name, follow_symlinks=False)
 
     def digests(self) -> dict[str, str]:
-        """What the files of package and tests hold."""
-        kept = [name for name in self.files if name.suffix == ".py" and name.parts[0] in ("python", "tests")]
+        """What the files of the package and those of the tests hold; helpers of the tests may change."""
+        kept = [name for name in self.files if name.suffix == ".py" and name.is_relative_to(PACKAGE)]
+        kept += [name for name in self.files if name.parts[0] == "tests" and name.match("test_*.py")]
         return {str(name): hashlib.sha256((self.root / name).read_bytes()).hexdigest() for name in kept}
 
     def record(self) -> None:
         """Write down which tests execute which lines: of all tests, or of changed files of tests alone."""
         known, now = self._recorded(), self.digests()
         changed = [name for name in now if known.get(name) != now[name]]
-        if not known or not all(Path(name).name.startswith("test_") for name in changed):
+        if not known or any(name.startswith(str(PACKAGE)) for name in changed):
             shutil.rmtree(self.map, ignore_errors=True)
             changed = ["tests"]
         if changed:
@@ -226,7 +227,8 @@ class Copy:
 
     def touched(self) -> Touched | None:
         """The map, if it is of these files."""
-        return Touched(self.map) if self._recorded() == self.digests() else None
+        known, now = self._recorded(), self.digests()
+        return Touched(self.map) if all(known.get(name) == now[name] for name in now) else None
 
     def _recorded(self) -> dict[str, str]:
         file = self.map / "digests.json"
@@ -391,7 +393,13 @@ def main() -> int:
             print(f"with nothing broken: {failed}", file=sys.stderr)
             return 2
         noticing = Noticing(touched, of_package, options.most_seconds)
-        survivors = [item for item in drawn if not _try(copy, item, noticing)]
+        noticed = [_try(copy, item, noticing) for item in drawn]
+        idle = {
+            test for test in map(test_of, noticed) if test and touched and copy.notices([test], copy.cache)
+        }
+    for test in sorted(idle):
+        print(f"fails with nothing broken, so that what it alone noticed has survived: {test}")
+    survivors = [item for item, said in zip(drawn, noticed, strict=True) if not said or test_of(said) in idle]
     for item in survivors:
         print("\n" + difference(item))
     caught = len(drawn) - len(survivors)
@@ -407,6 +415,12 @@ def _try(copy: Copy, item: Breakage, noticing: Noticing) -> str:
     said = "caught" if noticed else "SURVIVED"
     print(f"{said}  {item.path}:{item.line}  {taken:.0f} s, {asked} tests  {noticed}", flush=True)
     return noticed
+
+
+def test_of(said: str) -> str:
+    """Name of the test that failed, in a line of pytest."""
+    found = re.match(r"(?:FAILED|ERROR) (tests/\S+\.py::.+?)(?: - |$)", said)
+    return found[1] if found else ""
 
 
 def _arguments() -> argparse.Namespace:

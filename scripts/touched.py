@@ -32,7 +32,8 @@ def settings(folder: Path, package: Path) -> dict[str, str]:
     (folder / "data").mkdir(parents=True, exist_ok=True)
     file = folder / "settings.ini"
     file.write_text(SETTINGS.format(folder=folder, package=package.as_posix()))
-    return {"COVERAGE_PROCESS_START": str(file), "TOUCHED_INTO": str(folder / "data")}
+    into = folder / "data" / f"tests-{time.time_ns()}"
+    return {"COVERAGE_PROCESS_START": str(file), "TOUCHED_INTO": str(into)}
 
 
 class _Clock:
@@ -102,7 +103,7 @@ def pytest_sessionfinish() -> None:
     if _clock.fixtures:
         _clock.switch("")
         told = {"seconds": _clock.seconds, "fixtures": _clock.fixtures, "passed": sorted(_clock.passed)}
-        (Path(os.environ["TOUCHED_INTO"]) / f"tests-{time.time_ns()}.json").write_text(json.dumps(told))
+        Path(f"{os.environ['TOUCHED_INTO']}-{os.getpid()}.json").write_text(json.dumps(told))
 
 
 class Touched:
@@ -119,13 +120,16 @@ class Touched:
         self.data = self._all(folder)
         self.seconds: dict[str, float] = {}
         self.fixtures: dict[str, list[str]] = {}
-        passed: set[str] = set()
+        runs: dict[str, list[dict[str, Any]]] = defaultdict(list)
         for file in sorted(folder.glob("data/tests-*.json")):
-            told = json.loads(file.read_text())
-            self.seconds |= told["seconds"]
-            self.fixtures |= told["fixtures"]
-            passed = passed - told["fixtures"].keys() | set(told["passed"])
-        self.fixtures = {test: made for test, made in self.fixtures.items() if test in passed}
+            runs[file.stem.split("-")[1]].append(json.loads(file.read_text()))
+        for told in runs.values():
+            new = {test.partition("::")[0] for part in told for test in part["fixtures"]}
+            kept = {test: made for test, made in self.fixtures.items() if test.partition("::")[0] not in new}
+            for part in told:
+                self.seconds |= part["seconds"]
+                kept |= {test: part["fixtures"][test] for test in part["passed"]}
+            self.fixtures = kept
 
     @staticmethod
     def _all(folder: Path) -> Any:

@@ -9,6 +9,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from observed_night import observed_night
+from recorded_numbers import Record
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.cli.observed import other_light
@@ -240,3 +241,10 @@ def test_dry_run_writes_nothing(night: Path, made: Path, tmp_path: Path) -> None
 def test_bands_of_a_model_and_of_a_frame_must_agree(template, frame, refused) -> None:
     assert other_light(template, frame, True) is refused
     assert other_light(template, frame, False)
+
+
+def test_templates_and_corrected_frames_are_as_recorded(
+    made: Path, corrected: Path, recorded: Record
+) -> None:
+    """A record of what is written today, for edits that are not meant to change it."""
+    recorded({"templates": made, "corrected": corrected})
