@@ -146,8 +146,8 @@ def _same(name: str, found: Any, known: Any) -> bool:
         return False
     if name.endswith("~"):
         return found[:2] == known[:2] and bool(np.all(np.abs(np.subtract(found, known)) <= GREY))
-    scale = known[2] if name.endswith("#") else known
-    return np.allclose(found, known, rtol=RELATIVE, atol=RELATIVE * abs(scale) + 1e-12, equal_nan=True)
+    scale = abs(np.nan_to_num(known[2] if name.endswith("#") else known, posinf=0.0, neginf=0.0))
+    return np.allclose(found, known, rtol=RELATIVE, atol=RELATIVE * scale + 1e-12, equal_nan=True)
 
 
 def _same_text(found: str, known: str) -> bool:
