@@ -150,8 +150,8 @@ def test_bad_contexts_are_named(tmp_path) -> None:
         Context(small, small, shared=tmp_path)
 
 
-SLOW_SECTIONS = ("thickness_fit", "hsc")
-"""What they call is called by quick tests, and by other sections, too."""
+SLOW_SECTIONS = ("thickness_fit", "angles", "hsc")
+"""Seconds each; what they call is called by quick tests, too."""
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms.discovery import discover
@@ -12,6 +13,7 @@ from lsst.fringe_sim.effects import EFFECTS
 CATALOGUE = [one for one in EFFECTS if one.name in ("ghost_pedestal", "roughness", "vignetting")]
 
 
+@pytest.mark.slow
 def test_the_verdict_on_a_pedestal_is_as_recorded(recorded: Record) -> None:
     """Few effects and cells; other tests say whether verdicts are right."""
     case = draw_case("one", np.random.default_rng(31), size=(48, 64), only=["ghost_pedestal"])
