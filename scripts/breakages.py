@@ -1,19 +1,26 @@
 """Break the package in small ways, one at a time, and count how many of them the quick tests notice.
 
-usage: python scripts/breakages.py [--number 40] [--seed 1] [--room-only] [--workers 2] [--least 0.9]
+usage: python scripts/breakages.py [--number 40] [--seed 1] [--workers 2] [--least 0.9] [--keep FOLDER --record]
 
 A breakage is one operator, constant or comparison inside the body of a function. They are drawn over all rooms of the
 package in turn, so that a small room counts as much as a large one. Work is done in a copy of the files of the
 checkout that git knows; the checkout itself is only read. The tests of the broken room run first, then the others.
 The status is 1 if a smaller part than ``--least`` was noticed, and 2 if the tests fail with nothing broken.
+
+All quick tests run for every breakage, unless ``--record`` has written down which tests execute which lines (with the
+package coverage) into a folder that ``--keep`` names. Then only those run that execute the broken statement, the
+cheapest first and no more than ``--most-seconds`` of them; what no test executes has survived.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import difflib
+import hashlib
 import itertools
+import json
 import os
 import random
 import re
@@ -23,15 +30,22 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+
+from touched import Touched, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path("python/lsst/fringe_sim")
 ROOMS_OF_THEIR_OWN = ("algorithms/discovery", "algorithms/thickness_fit")
 MOST_SECONDS = 3600
 """A run of the tests that takes longer has noticed something: it hangs."""
+
+NOTHING: Mapping[str, str] = MappingProxyType({})
+UNSEEN = re.compile(r"\b(kernel|subkernel|njit|cache|lru_cache|cached_property)\b")
+"""Decorators of functions whose lines are not seen, or only the first time."""
 
 OPERATORS: dict[type[ast.AST], tuple[str, str]] = {
     ast.Add: (r"\+", "-"),
@@ -183,32 +197,68 @@ def draw(number: int, seed: int, files: list[Path]) -> list[Breakage]:
 
 
 class Copy:
-    """A copy of the checkout that may be broken."""
+    """A copy of the checkout that may be broken, with compiled functions and, once recorded, the map of its tests."""
 
     def __init__(self, root: Path, workers: int) -> None:
         self.root, self.workers = root / "checkout", workers
-        self.cache = root / "numba"
+        self.cache, self.map = root / "numba", root / "map"
         listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
         self.files = [Path(name) for name in listed.decode().split("\0") if name]
         for name in self.files:
             (self.root / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, self.root / name, follow_symlinks=False)
 
-    def notices(self, tests: list[str], cache: Path) -> str:
+    def digests(self) -> dict[str, str]:
+        """What the files of the package and those of the tests hold; helpers of the tests may change."""
+        kept = [name for name in self.files if name.suffix == ".py" and name.is_relative_to(PACKAGE)]
+        kept += [name for name in self.files if name.parts[0] == "tests" and name.match("test_*.py")]
+        return {str(name): hashlib.sha256((self.root / name).read_bytes()).hexdigest() for name in kept}
+
+    def record(self) -> None:
+        """Write down which tests execute which lines: of all tests, or of changed files of tests alone."""
+        known, now = self._recorded(), self.digests()
+        changed = [name for name in now if known.get(name) != now[name]]
+        if not known or any(name.startswith(str(PACKAGE)) for name in changed):
+            shutil.rmtree(self.map, ignore_errors=True)
+            changed = ["tests"]
+        if changed:
+            self.notices(changed, self.cache, ["-p", "touched"], settings(self.map, PACKAGE))
+            (self.map / "digests.json").write_text(json.dumps(now))
+
+    def touched(self) -> Touched | None:
+        """The map, if it is of these files."""
+        known, now = self._recorded(), self.digests()
+        return Touched(self.map) if all(known.get(name) == now[name] for name in now) else None
+
+    def _recorded(self) -> dict[str, str]:
+        file = self.map / "digests.json"
+        return dict(json.loads(file.read_text())) if file.exists() else {}
+
+    def notices(
+        self,
+        tests: list[str],
+        cache: Path,
+        options: Sequence[str] = ("-x",),
+        also: Mapping[str, str] = NOTHING,
+    ) -> str:
         """The first line that says what failed; empty if all passed."""
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow"]
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *options]
+        if self.workers > 1:
+            command += ["-n", str(self.workers), "--dist", "worksteal"]
         environment = {
-            "PYTHONPATH": str(self.root / "python"),
+            "PYTHONPATH": f"{self.root / 'python'}:{self.root / 'scripts'}",
             "NUMBA_CACHE_DIR": str(cache),
             "OMP_WAIT_POLICY": "passive",
             "OPENBLAS_NUM_THREADS": "1",
             "FRINGE_SIM_SHARED": os.environ.get("FRINGE_SIM_SHARED", str(ROOT.parent / "shared")),
         }
+        asked = self.root.parent / "tests.txt"
+        asked.write_text("\n".join(tests))
         try:
             done = subprocess.run(
-                [*command, "-n", str(self.workers), *tests],
+                [*command, f"@{asked}"],
                 cwd=self.root,
-                env={**os.environ, **environment},
+                env={**os.environ, **environment, **also},
                 capture_output=True,
                 text=True,
                 check=False,
@@ -221,25 +271,100 @@ class Copy:
         said = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
         return said[0] if said else (done.stdout + done.stderr).strip().splitlines()[-1]
 
-    def trial(self, breakage: Breakage, room_only: bool) -> str:
-        """What notices a breakage; empty if nothing does."""
+    def trial(self, breakage: Breakage, runs: list[list[str]], users: list[Function]) -> str:
+        """What notices a breakage, of several runs of tests in turn; empty if nothing does.
+
+        ``users``: functions whose compiled code may have taken in the broken one, and would hide the fault if kept.
+        """
         path = self.root / breakage.path
         written = path.stat()
         path.write_bytes(breakage.broken)
-        # A compiled function in another module keeps what it took in of this one: such a cache would hide the fault.
-        compiled = re.search(rb"\b(njit|numba|kernel|subkernel|compiled)\b", breakage.source) is not None
-        cache = Path(tempfile.mkdtemp(dir=self.root.parent)) if compiled else self.cache
-        own = tests_of(room_of(breakage.path), self.root)
+        cache = self.root.parent / "numba of the broken"
+        shutil.rmtree(cache, ignore_errors=True)
+        shutil.copytree(self.cache, cache)
+        for function in users:
+            for kept in cache.glob(f"*/{function.path.stem}.*{function.name}-*"):
+                kept.unlink()
         try:
-            noticed = self.notices(own, cache)
-            if not noticed and not room_only:
-                noticed = self.notices(["tests", *(f"--ignore={part}" for part in own)], cache)
+            return next(filter(None, (self.notices(tests, cache) for tests in runs if tests)), "")
         finally:
             path.write_bytes(breakage.source)
             os.utime(path, ns=(written.st_atime_ns, written.st_mtime_ns))  # the cache stays good
-            if compiled:
-                shutil.rmtree(cache)
-        return noticed
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of the package, the names that its body uses, and whether its lines are seen whenever it is used."""
+
+    path: Path
+    name: str
+    first: int
+    last: int
+    names: frozenset[str]
+    unseen: bool
+
+
+def functions_of(path: Path) -> Iterator[Function]:
+    """All functions of a file, methods and inner functions among them."""
+    for node in ast.walk(ast.parse((ROOT / path).read_bytes())):
+        if isinstance(node, ast.FunctionDef):
+            used = [part for statement in node.body for part in ast.walk(statement)]
+            names = {part.id if isinstance(part, ast.Name) else part.attr for part in used if _is_name(part)}
+            unseen = any(UNSEEN.search(ast.unparse(one)) for one in node.decorator_list)
+            yield Function(
+                path, node.name, node.lineno, node.end_lineno or node.lineno, frozenset(names), unseen
+            )
+
+
+def _is_name(node: ast.AST) -> bool:
+    return isinstance(node, ast.Name | ast.Attribute)
+
+
+class Noticing:
+    """Which tests can notice a breakage: those that execute it, if a map says which, and otherwise all."""
+
+    def __init__(self, touched: Touched | None, files: list[Path], most_seconds: float) -> None:
+        self.touched, self.most_seconds = touched, most_seconds
+        self.functions = [function for path in files for function in functions_of(path)]
+
+    def runs(self, breakage: Breakage) -> list[list[str]]:
+        """Tests of the broken room and then the others; with a map each in the order of their cost."""
+        own = tests_of(room_of(breakage.path), ROOT)
+        if self.touched is None:
+            return [own, ["tests", *(f"--ignore={part}" for part in own)]]
+        tests = self._of_lines(breakage.path, *statement_of(breakage))
+        for function in self.users(breakage):
+            tests |= self._of_lines(function.path, function.first, function.last)
+        near = {test for test in tests if test.startswith(tuple(own))}
+        return [self.touched.in_order(part, self.most_seconds) for part in (near, tests - near)]
+
+    def users(self, breakage: Breakage) -> list[Function]:
+        """What uses the broken function without a trace, as one of both is compiled or remembers results."""
+        around = [f for f in self.functions if f.path == breakage.path and f.first <= breakage.line <= f.last]
+        found, left = [], [max(around, key=lambda function: function.first)]
+        while left:
+            used = left.pop()
+            for function in self.functions:
+                if used.name in function.names and (used.unseen or function.unseen) and function not in found:
+                    found.append(function)
+                    left.append(function)
+        return found
+
+    def _of_lines(self, path: Path, first: int, last: int) -> set[str]:
+        known = self.touched.lines(path) if self.touched else {}
+        return {test for line, tests in known.items() if first <= line <= last for test in tests}
+
+
+def statement_of(breakage: Breakage) -> tuple[int, int]:
+    """First and last line of the innermost statement around a breakage, without the statements inside it."""
+    spans = []
+    for node in ast.walk(ast.parse(breakage.source)):
+        if isinstance(node, ast.stmt) and node.lineno <= breakage.line <= (node.end_lineno or node.lineno):
+            inside = [part.lineno for part in getattr(node, "body", [])]
+            spans.append(
+                (node.lineno, max(node.lineno, min([node.end_lineno or 0, *(i - 1 for i in inside)])))
+            )
+    return max(spans)
 
 
 def difference(breakage: Breakage) -> str:
@@ -251,41 +376,73 @@ def difference(breakage: Breakage) -> str:
 
 def main() -> int:
     """Draw, try, and say what was not noticed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--number", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=2, help="processes of pytest")
-    parser.add_argument("--room-only", action="store_true", help="only the tests of the broken room")
-    parser.add_argument("--least", type=float, default=0.9, help="smallest part that must be noticed")
-    parser.add_argument("--list", action="store_true", help="only show what would be broken")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="breakages-") as work:
-        copy = Copy(Path(work), options.workers)
+    options = _arguments()
+    with contextlib.ExitStack() as stack:
+        work = options.keep or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="breakages-")))
+        copy = Copy(work.resolve(), options.workers)
+        if options.record:
+            copy.record()
         of_package = [name for name in copy.files if name.suffix == ".py" and name.is_relative_to(PACKAGE)]
         drawn = draw(options.number, options.seed, of_package)
         if options.list:
             print("\n".join(map(difference, drawn)))
             return 0
-        rooms = {part for item in drawn for part in tests_of(room_of(item.path), copy.root)}
-        failed = copy.notices(sorted(rooms) if options.room_only else ["tests"], copy.cache)
+        touched = copy.touched()
+        failed = "" if touched else copy.notices(["tests"], copy.cache)
         if failed:
             print(f"with nothing broken: {failed}", file=sys.stderr)
             return 2
-        survivors = []
-        for item in drawn:
-            started, noticed = time.monotonic(), copy.trial(item, options.room_only)
-            if not noticed:
-                survivors.append(item)
-            taken = time.monotonic() - started
-            print(
-                f"{'caught' if noticed else 'SURVIVED'}  {item.path}:{item.line}  {taken:.0f} s  {noticed}",
-                flush=True,
-            )
+        noticing = Noticing(touched, of_package, options.most_seconds)
+        noticed = [_try(copy, item, noticing) for item in drawn]
+        idle = {
+            test for test in map(test_of, noticed) if test and touched and copy.notices([test], copy.cache)
+        }
+    for test in sorted(idle):
+        print(f"fails with nothing broken, so that what it alone noticed has survived: {test}")
+    survivors = [item for item, said in zip(drawn, noticed, strict=True) if not said or test_of(said) in idle]
     for item in survivors:
         print("\n" + difference(item))
     caught = len(drawn) - len(survivors)
     print(f"{caught} of {len(drawn)} breakages of seed {options.seed} were noticed")
     return 0 if caught >= options.least * len(drawn) else 1
+
+
+def _try(copy: Copy, item: Breakage, noticing: Noticing) -> str:
+    """What notices a breakage, which is printed."""
+    started, runs = time.monotonic(), noticing.runs(item)
+    noticed = copy.trial(item, runs, noticing.users(item))
+    taken, asked = time.monotonic() - started, sum(map(len, runs)) if noticing.touched else "all"
+    said = "caught" if noticed else "SURVIVED"
+    print(f"{said}  {item.path}:{item.line}  {taken:.0f} s, {asked} tests  {noticed}", flush=True)
+    return noticed
+
+
+def test_of(said: str) -> str:
+    """Name of the test that failed, in a line of pytest."""
+    found = re.match(r"(?:FAILED|ERROR) (tests/\S+\.py::.+?)(?: - |$)", said)
+    return found[1] if found else ""
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--number", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=2, help="processes of pytest")
+    parser.add_argument("--least", type=float, default=0.9, help="smallest part that must be noticed")
+    parser.add_argument("--list", action="store_true", help="only show what would be broken")
+    parser.add_argument(
+        "--keep", type=Path, help="folder of the copy, of its compiled functions and of the map"
+    )
+    parser.add_argument(
+        "--record", action="store_true", help="record the map, or what has changed of it, first"
+    )
+    parser.add_argument(
+        "--most-seconds",
+        type=float,
+        default=60,
+        help="of the tests of the room, and of the others, with a map",
+    )
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import settings
+from recorded_numbers import Record
 from suite_shares import Share, group_of
 
 # A busy machine is no failure: examples are bounded in number, not in time.
@@ -25,6 +27,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="K/N",
         help="run the K-th of N parts of the suite",
     )
+    parser.addoption("--record-numbers", action="store_true", help="write tests/records anew")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -60,3 +63,11 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
         pytest.fail('a test that draws numbers names its draw: @pytest.mark.rng("a name")')
     case = request.node.callspec.id if hasattr(request.node, "callspec") else ""
     return np.random.default_rng(list(f"{marker.args[0]} {case}".encode()))
+
+
+@pytest.fixture
+def recorded(request: pytest.FixtureRequest) -> Record:
+    """Compare all numbers of a result, a file or a folder with those that were recorded of this test."""
+    name = re.sub(r"\W+", "_", request.node.name).strip("_")
+    file = CHECKOUT / "tests" / "records" / request.path.stem / f"{name}.json"
+    return Record(file, request.config.getoption("--record-numbers"))

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from flat_cubes import TEN_NM, relative_flats
+from hard_maps import two_halves
+from recorded_numbers import Record
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms import fit_thickness
@@ -172,3 +174,28 @@ def test_a_pixel_leaves_out_a_wavelength_that_is_spoiled(model, rng) -> None:
     assert (fitted.mask[rows, columns] == 0).all()
     assert (fitted.n_wavelengths[rows, columns] == len(cube.wavelength_nm) - 1).all()
     assert (np.abs(fitted.value - truth)[rows, columns] < 5.0 * fitted.sigma[rows, columns]).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"method": "guo2022"},
+        {"nuisances": Nuisances(zones="halves", illumination_degree=2)},
+        {"nuisances": Nuisances(contrast="common"), "cell_px": 2},
+    ],
+    ids=["usual", "walk", "free light", "free contrast"],
+)
+@pytest.mark.rng("a record of fits")
+def test_fits_of_two_halves_are_as_recorded(model, rng, options, recorded: Record) -> None:
+    """A record of all products of a map with a step, weak fringes and spots, beside the truth of the other tests."""
+    truth = two_halves((48, 56))
+    truth[10:13, 20:23] += 0.4
+    light = np.where(np.arange(48) < 24, 1.0, 0.99)[:, np.newaxis] * np.ones(56)
+    weak = model.with_effects({"contrast_loss.factor": 0.5})
+    cube = relative_flats(truth, weak, rng, light=light)
+    image, mask = cube.image.copy(), cube.mask.copy()
+    mask[:, 5, 5] = mask[3:, 6, 30] = mask_bits("BAD")
+    image[4, 30:33, 40] += 0.05
+    spoiled = FringeCube(image, cube.variance, mask, cube.exposures, "relative")
+    recorded(fit_thickness(spoiled, weak, **options))

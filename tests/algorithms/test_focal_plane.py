@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from recorded_numbers import Record
 from residual_fringe import residual_fringe
 from sky_frames import bright_sky
 
@@ -161,3 +162,8 @@ def test_what_is_refused(thickness, response, level, observed):
     wrong = SkyLevel(level.electrons[:2], 5.0, 0.2, 100.0)
     with pytest.raises(InputError, match="components of the level"):
         forecast_sensor(thickness, response, DETECTOR, wrong, NightHistory.guo2022(), observed)
+
+
+def test_moments_and_level_are_as_recorded(moments, level, response, observed, recorded: Record) -> None:
+    """A record, beside the frames that the tests above compare with."""
+    recorded({"moments": moments, "level": level, "response": response, "night": observed})

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from recorded_numbers import Record
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
@@ -236,7 +237,8 @@ def test_further_unknowns_never_help(model: FringeModel, few_samples: None) -> N
     assert among.pairs[0].separation_now < alone.pairs[0].separation_now
 
 
-def test_ranking_is_by_the_hardest_pair(model: FringeModel, few_samples: None) -> None:
+def test_ranking_is_by_the_hardest_pair(model: FringeModel, few_samples: None, recorded: Record) -> None:
+    """And its numbers are those of a record."""
     lines: list[str] = []
     effects = {"ghost_pedestal": {"fraction": 0.02}, "non_linearity": {}, "dark_pedestal": {}}
     ranked = rank_measurements(
@@ -251,6 +253,7 @@ def test_ranking_is_by_the_hardest_pair(model: FringeModel, few_samples: None) -
     assert ranked[0].decides
     assert not ranked[-1].decides
     assert len(lines) == 3
+    recorded(ranked)
     assert break_ambiguity(ranked) == ranked[0].text
     assert break_ambiguity(ranked[-1:]).startswith("no measurement that was tried decides")
 

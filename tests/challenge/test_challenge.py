@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms.discovery import Verdict
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, Where
 from lsst.fringe_sim.challenge.oracle import Oracle, Visibility
-from lsst.fringe_sim.challenge.result import VISIBLE, CaseResult
+from lsst.fringe_sim.challenge.result import CASE_KINDS, VISIBLE, CaseResult
 from lsst.fringe_sim.challenge.run import judge, run_challenge
 from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.errors import InputError, UnknownNameError
@@ -145,3 +146,10 @@ def test_a_challenge_of_this_very_moment() -> None:
     assert right >= visible - 1, told
     named_right, named = summary["named_right"]
     assert named_right >= named - 1, told
+
+
+@pytest.mark.parametrize("kind", CASE_KINDS)
+def test_drawn_cases_are_as_recorded(kind: str, recorded: Record) -> None:
+    """A record: the cases of published challenges stay what they were."""
+    case = draw_case(kind, np.random.default_rng(8), size=(16, 16))
+    recorded({"names": case.names, "values": case.values, "map": case.thickness_um, "flats": case.cube})

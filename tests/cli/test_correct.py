@@ -9,6 +9,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from observed_night import observed_night
+from recorded_numbers import Record
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.cli.observed import other_light
@@ -262,3 +263,10 @@ def test_a_primary_header_that_tells_of_a_correction_is_believed(
     assert correct(made, tmp_path / "out", path) == 1
     assert f"{next(iter(cards))} is" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_templates_and_corrected_frames_are_as_recorded(
+    made: Path, corrected: Path, recorded: Record
+) -> None:
+    """A record of what is written today, for edits that are not meant to change it."""
+    recorded({"templates": made, "corrected": corrected})

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from recorded_numbers import Record
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.mock.thickness import random_field
@@ -89,3 +90,12 @@ def test_a_dry_run_writes_nothing(
     assert run([*given, "--dry-run"]) == 0
     assert "11 frames of 72 x 64" in capsys.readouterr().out
     assert not (tmp_path / "a").exists()
+
+
+def test_a_night_and_its_map_on_the_sky_are_as_recorded(
+    sky: tuple[Path, str], tmp_path: Path, recorded: Record
+) -> None:
+    """A record of what is written today, for edits that are not meant to change it."""
+    out = tmp_path / "on_sky"
+    assert run(["fit-sky", str(sky[0]), "--setup", "monocam", "--thickness", sky[1], "--out", str(out)]) == 0
+    recorded({"night": sky[0], "on_sky": out})

@@ -13,6 +13,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from raw_frame_maker import write_raw
+from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms.flat_prep_options import FlatPrepOptions
 from lsst.fringe_sim.cli.lab_frames import find_series
@@ -44,8 +45,8 @@ def flat_at(folder: Path, wavelength: int) -> Path:
     return path
 
 
-def test_thickness_is_recovered(raws, tmp_path, capsys) -> None:
-    """Median error below 3 nm and no slipped order, against the map that made the frames."""
+def test_thickness_is_recovered(raws, tmp_path, capsys, recorded: Record) -> None:
+    """Median error below 3 nm and no slipped order, against the map that made the frames; pages as recorded."""
     assert run(["fit", str(raws), "--out", str(tmp_path / "fit")]) == 0
     fitted = ThicknessMap.read_fits(tmp_path / "fit" / "thickness.fits")
     error = fitted.value - e2v_321(SIZE)
@@ -60,6 +61,7 @@ def test_thickness_is_recovered(raws, tmp_path, capsys) -> None:
     residuals = Table.read(base64.b64decode(data.group(1)).decode(), format="ascii.ecsv")
     assert len(residuals) == 12
     assert np.all(np.abs(residuals["ratio"] - 1.0) < 0.1), "what is left is the noise"
+    recorded(tmp_path / "fit")
 
 
 @pytest.mark.slow

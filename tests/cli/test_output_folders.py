@@ -38,7 +38,9 @@ def test_frames_of_two_runs_do_not_mix(used: Path, capsys: pytest.CaptureFixture
     before = {path.name: path.read_bytes() for path in used.iterdir()}
     other = ("mock-flats", str(used), "--detector", "R11_S02", *FRAMES)
     assert run(other) == 1
-    assert "--overwrite" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "--overwrite" in said
+    assert f"and {len(before) - 2} more" in said, "one is named, and the notes are no product"
     assert {path.name: path.read_bytes() for path in used.iterdir()} == before
     assert run([*other, "--overwrite"]) == 0
     left = {path.name for path in used.iterdir()}

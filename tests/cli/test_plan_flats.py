@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from astropy.table import QTable
+from recorded_numbers import Record
 
 from lsst.fringe_sim.cli.main import run
 
@@ -22,7 +23,8 @@ SHORT = [
 ]
 
 
-def test_table(capsys, tmp_path) -> None:
+def test_table(capsys, tmp_path, recorded: Record) -> None:
+    """Its numbers are those of a record."""
     path = tmp_path / "plan.ecsv"
     assert run(["plan-flats", *SHORT, "--ecsv", str(path)]) == 0
     text = capsys.readouterr().out
@@ -34,9 +36,11 @@ def test_table(capsys, tmp_path) -> None:
     assert table["sigma"].unit == "nm"
     assert table["rival"].unit == "um"
     assert np.all(table["sigma"].value > 0)
+    recorded({"table": path, "said": text.splitlines()})
 
 
-def test_json_and_units(capsys) -> None:
+def test_json_and_units(capsys, recorded: Record) -> None:
+    """The same in other units, and as recorded."""
     assert run(["plan-flats", *SHORT, "--json", "--electrons", "20000"]) == 0
     plain = json.loads(capsys.readouterr().out)
     other = ["--thickness", "9000nm:10000nm", "--search", "8:11um", "--wavelengths", "0.88um:0.99um:22nm"]
@@ -45,6 +49,7 @@ def test_json_and_units(capsys) -> None:
         plain["forecast"]["worst"]
     )
     assert len(plain["next"]) == 6
+    recorded(plain)
     assert plain["forecast"]["region_px"] == 64
 
 

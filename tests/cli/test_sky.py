@@ -9,6 +9,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
+from recorded_numbers import Record
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.cli.observed import TemplateFolder
@@ -250,3 +251,8 @@ def test_a_map_with_a_card_that_cannot_be_read_is_refused(tmp_path, capsys, comm
     setup = ["--setup", "lsst_e2v", "--thickness", str(path), "--out", str(tmp_path / "o"), "--dry-run"]
     assert run([command, *given, *setup]) == 1
     assert "map.fits" in capsys.readouterr().err
+
+
+def test_files_of_one_frame_are_as_recorded(usual: Path, recorded: Record) -> None:
+    """A record of what is written today, for edits that are not meant to change it."""
+    recorded(usual)

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from recorded_numbers import Record
 
 from lsst.fringe_sim.effects import (
     AMPLIFIERS,
@@ -281,3 +282,14 @@ def test_what_is_done_to_an_image_leaves_its_mean(effect, parameter, base) -> No
     assert np.abs(after - image).max() > 1e-6
     # Noise correlates a little with the pattern, and the ends of 80 samples are not those of the sensor.
     np.testing.assert_allclose(after.mean(axis=(1, 2)), 1.0, atol=0.03 * np.abs(after - image).max())
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
+def test_flats_and_sky_with_an_effect_are_as_recorded(effect, base, thickness, recorded: Record) -> None:
+    """At three eighths of the bounds of every parameter; a record, beside the closed forms of the other tests."""
+    values = {
+        item.name: item.bounds[0] + 0.375 * (item.bounds[1] - item.bounds[0]) for item in effect.parameters
+    }
+    recorded(
+        {"seen": observe(base.with_effects({effect.name: values}), thickness), "described": effect.parameters}
+    )

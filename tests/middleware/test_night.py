@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lsst.daf.butler import Butler
+from recorded_numbers import Record
 from toy_repository import Invoke
 
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.middleware
 DATE = datetime.date(2026, 11, 21)
 
 
-def test_night_of_the_paper(butler: Butler) -> None:
+def test_night_of_the_paper(butler: Butler, recorded: Record) -> None:
     define_night(butler, "LSSTCam", [NightPlan(DATE, parse_hours("19:29"))])
     records = sorted(
         butler.query_dimension_records(
@@ -33,6 +34,7 @@ def test_night_of_the_paper(butler: Butler) -> None:
     assert all(r.has_simulated and r.can_see_sky for r in records)
     assert [airmass_of(r) for r in records] == pytest.approx([1.2] * 11)
     assert len({r.id for r in records}) == 11
+    recorded([record.toDict() for record in records])
 
 
 @pytest.mark.parametrize(

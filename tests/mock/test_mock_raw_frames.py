@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
+from recorded_numbers import Record
 
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.instrument.camera import Camera
@@ -276,3 +277,8 @@ def test_bad_input_is_refused_before_anything_is_written(
 def test_defects_cannot_be_negative() -> None:
     with pytest.raises(OutOfRangeError, match="hot_pixels"):
         Defects(hot_pixels=-1)
+
+
+def test_frames_are_as_recorded(run: MockRun, recorded: Record) -> None:
+    """A record of what the seed gives today, for edits that are not meant to change it."""
+    recorded({"files": run.paths, "headers": [RawFrame.read(path).metadata for path in run.paths]})

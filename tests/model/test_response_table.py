@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from recorded_numbers import Record
 
 from lsst.fringe_sim.compiled import limit_threads
 from lsst.fringe_sim.errors import ConvergenceError, InputError, OutOfRangeError
@@ -152,3 +153,11 @@ def test_table_of_a_model_is_its_response(effects: dict[str, float], rng: np.ran
     difference = np.abs(table.lookup(thickness) - model.response(thickness, WAVELENGTHS)).max()
     assert difference <= table.interpolation_error <= 1e-7
     np.testing.assert_array_equal(table.wavelength_nm, WAVELENGTHS)
+
+
+def test_tables_are_as_recorded(table: ResponseTable, recorded: Record) -> None:
+    """A record of nodes, values and stated errors, for edits that are not meant to change them."""
+    optics = system("hsc_hamamatsu", "detection")
+    coarse = response_table(optics, optics.flat_fields(WAVELENGTHS, 0.5), (199.8, 200.2), tolerance=1e-3)
+    image = np.linspace(14.1, 15.9, 60).reshape(6, 10)
+    recorded({"usual": table, "coarse": coarse, "frame": table.frame(image), "rows": table.lookup(image[0])})

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from recorded_numbers import Record
 
 from lsst.fringe_sim.errors import InputError, ResourceError, UnknownNameError
 from lsst.fringe_sim.mock.thickness import e2v_321
@@ -13,6 +14,7 @@ from lsst.fringe_sim.paper import published_numbers, reproduce
 from lsst.fringe_sim.paper import stack as of_the_stack
 from lsst.fringe_sim.paper.laboratory import row_jumps
 from lsst.fringe_sim.paper.published import PublishedNumber, published_number
+from lsst.fringe_sim.paper.reproduce import SECTIONS
 from lsst.fringe_sim.paper.section import Context
 
 ENTRY = {"item": "x", "place": "Eq. 1", "quantity": "a length", "unit": "nm", "tolerance": 1}
@@ -146,3 +148,22 @@ def test_bad_contexts_are_named(tmp_path) -> None:
         Context(small, small, coadds=1)
     with pytest.raises(InputError, match="published curves"):
         Context(small, small, shared=tmp_path)
+
+
+SLOW_SECTIONS = ("thickness_fit", "angles", "hsc")
+"""Seconds each; what they call is called by quick tests, too."""
+
+
+@pytest.mark.parametrize(
+    "compute",
+    [
+        pytest.param(one, id=one.__name__, marks=[pytest.mark.slow] * (one.__name__ in SLOW_SECTIONS))
+        for one in SECTIONS
+        if one.__name__ != "coadd"  # needs a region of 240 pixels
+    ],
+)
+def test_a_section_of_a_small_sensor_is_as_recorded(
+    compute, without_curves: Context, recorded: Record
+) -> None:
+    """A record of numbers and curves; the published numbers need the whole sensor and are judged by slow tests."""
+    recorded(compute(without_curves))

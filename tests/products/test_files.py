@@ -16,6 +16,7 @@ from astropy.table import Table
 from hypothesis import given
 from hypothesis import strategies as st
 from product_makers import MAKERS, METADATA, NAMES, SHAPES, cube, flat, frame, thickness
+from recorded_numbers import Record
 
 from lsst.fringe_sim.errors import FrameFormatError, InputError, UnknownNameError
 from lsst.fringe_sim.products import FringeCube, ThicknessMap, mask_bits
@@ -54,6 +55,11 @@ def test_bit_for_bit(
 
 @pytest.mark.parametrize("kind", sorted(MAKERS))
 class TestEveryProduct:
+    def test_a_file_is_as_recorded(self, kind: str, tmp_path: Path, recorded: Record) -> None:
+        """A record of layout and header, for edits that are not meant to change them."""
+        MAKERS[kind](metadata={"NOTE": "x"}).write_fits(tmp_path / "a.fits")
+        recorded(tmp_path / "a.fits")
+
     def test_two_writes_agree_to_the_byte(self, kind: str, tmp_path: Path, monkeypatch: Any) -> None:
         product = MAKERS[kind](metadata={"NOTE": "x"})
         product.write_fits(tmp_path / "a.fits")

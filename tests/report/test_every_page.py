@@ -12,6 +12,7 @@ import pytest
 from browser import check_page
 from matplotlib import colormaps
 from PIL import Image
+from recorded_numbers import Record
 from small_pages import SMALL_PAGES
 
 from lsst.fringe_sim import __version__
@@ -70,7 +71,8 @@ def page(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:All-NaN")
-def test_every_page_begins_with_a_summary_and_its_links_resolve(page: Path) -> None:
+def test_every_page_begins_with_a_summary_and_its_links_resolve(page: Path, recorded: Record) -> None:
+    """Its numbers and pictures are as recorded: nothing else draws the same pages."""
     seen = read(page)
     after_heading = seen.elements[seen.elements.index("h1") :]
     assert after_heading[:3] == ["h1", "p.lead", "section.summary"]
@@ -84,6 +86,7 @@ def test_every_page_begins_with_a_summary_and_its_links_resolve(page: Path) -> N
     files = [link for link in seen.links if not link.startswith(("data:", "#"))]
     assert "../other%20folder/report.html" in files
     assert all((page.parent / unquote(link)).is_file() for link in files)
+    recorded(page.parent)
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lsst.daf.butler import DataCoordinate, DimensionUniverse
+from recorded_numbers import Record
 
 from lsst.fringe_sim.errors import FrameFormatError, FringeSimError, InputError, UnknownNameError
 from lsst.fringe_sim.instrument.camera import Camera
@@ -162,3 +163,11 @@ def test_date_of_a_run_comes_from_its_name() -> None:
     otherwise = datetime.datetime(2026, 1, 2, 3, 4, 5)
     assert run_datetime("u/me/sky/20261121T034340Z", otherwise) == "2026-11-21T03:43:40"
     assert run_datetime("u/me/sky", otherwise) == "2026-01-02T03:04:05"
+
+
+def test_bias_flats_and_maps_are_as_recorded(
+    bias: CombinedBias, flats: list[FringeFlat], recorded: Record
+) -> None:
+    """A record, beside the truth that the tests above compare with."""
+    maps = {method: fit(flats, method=method) for method in ("global", "guo2022")}
+    recorded({"bias": bias, "flats": flats[::5], "maps": maps})

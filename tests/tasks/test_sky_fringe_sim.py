@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lsst.pex.config import FieldValidationError
+from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms.sky_frame import simulate_sky_frame
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
@@ -261,3 +262,8 @@ def test_templates_need_a_map_unless_a_stand_in_is_wanted() -> None:
     task = MapTemplatesTask(config=MapTemplatesConfig(beams="centre"))
     with pytest.raises(InputError, match="thickness map"):
         task.run(None, DETECTOR, "y_10", MADE)
+
+
+def test_frame_and_templates_are_as_recorded(recorded: Record) -> None:
+    """A record, beside the algorithm that the tests above compare with."""
+    recorded({"usual": usual(), "other": run(night="steady", level="model", noise=True)})
