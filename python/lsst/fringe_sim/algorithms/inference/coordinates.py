@@ -119,17 +119,20 @@ def log_evidence_of_parameters(
     away = values - [item.null for item in items]
     density = np.array([_log_prior(item, x) for item, x in zip(items, away, strict=True)])
     precision = np.array([_precision(item, x) for item, x in zip(items, away, strict=True)])
-    widths = 0.0
+    widths, pull = 0.0, np.zeros(len(items))
     for name in sorted({item.effect for item in items if item.exchangeable}):
         group = np.array([index for index, item in enumerate(items) if item.effect == name])
         best, gain = _best_width(information, away, group, items[group[0]].scale)
         precision[group] = best**-2
         density[group] = -0.5 * (away[group] / best) ** 2 - math.log(best) - 0.5 * math.log(2.0 * math.pi)
+        pull[group] = precision[group] * away[group]
         widths += gain
     total = information + np.diag(precision)
     volume = 0.5 * len(items) * math.log(2.0 * math.pi) - 0.5 * float(np.linalg.slogdet(total)[1])
+    # The prior of exchangeable parameters may draw them far from where they fit best.
+    drawn = 0.5 * float(pull @ np.linalg.solve(total, pull))
     refined = _without_refinements(items, away, total, density)
-    return float(density.sum()) + volume + widths + refined
+    return float(density.sum()) + volume + drawn + widths + refined
 
 
 def _log_prior(item: Coordinate, away: float) -> float:

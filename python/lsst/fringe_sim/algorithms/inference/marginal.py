@@ -225,6 +225,21 @@ class Point:
         cells = self._back_solved(self._forward_solved(self._along(values)))
         return np.asarray(values - self.response * cells[..., :1, :] - self.steep * cells[..., 1:, :])
 
+    @cached_property
+    def noise_share(self) -> FloatArray:
+        """Part of the variance of unit noise that the projection leaves, ``(W, N)``."""
+        solved = self._forward_solved(np.stack([self.response, self.steep], axis=-2))
+        return np.asarray(1.0 - (solved**2).sum(axis=-2))
+
+    @cached_property
+    def thickness_sigma_um(self) -> FloatArray:
+        """Error of the thickness of every cell, ``(N,)`` [µm]."""
+        return np.asarray(1.0 / self._root[2])
+
+    def problem_with(self, data: Data) -> Point:
+        """The same point of a problem with other data."""
+        return replace(self, problem=replace(self.problem, data=data))
+
     def moved(
         self, levels: FloatArray, thickness_um: FloatArray, settings: Mapping[str, float] | None = None
     ) -> Point:
@@ -239,8 +254,3 @@ def joined(first: Columns, second: Columns) -> Columns:
         np.concatenate([first.cells, second.cells]),
         np.concatenate([first.log_det, second.log_det]),
     )
-
-
-def with_data(problem: Problem, data: Data) -> Problem:
-    """The same problem with other data."""
-    return replace(problem, data=data)

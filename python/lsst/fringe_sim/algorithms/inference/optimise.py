@@ -193,10 +193,11 @@ def _hypothesis(effects: Sequence[str], items: Sequence[Coordinate], point: Poin
     levels = information[:waves, :waves]
     across = information[:waves, waves:]
     own = information[waves:, waves:] - across.T @ np.linalg.solve(levels, across)
-    own = np.asarray(0.5 * (own + own.T))
+    own = np.asarray(0.5 * (own + own.T), dtype=float)
     values = np.array([point.settings[item.key] for item in items])
     evidence = -point.cost - 0.5 * float(np.linalg.slogdet(levels)[1])
     evidence += log_evidence_of_parameters(items, values, own)
-    return Hypothesis(
-        tuple(effects), tuple(items), point, evidence, np.linalg.pinv(own, hermitian=True) if items else own
-    )
+    covariance = np.zeros((len(items), len(items)))
+    if items:
+        covariance[:] = np.linalg.pinv(own, hermitian=True)
+    return Hypothesis(tuple(effects), tuple(items), point, evidence, covariance)
