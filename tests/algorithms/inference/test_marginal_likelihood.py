@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,16 +55,25 @@ def point_of(rng: np.random.Generator, settings: dict[str, float], response: flo
 
 
 @pytest.mark.rng("evidence of cells")
-def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("accuracy", [0.0, 0.01])
+def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator, accuracy: float) -> None:
     point = point_of(rng, {})
+    point = replace(point, problem=replace(point.problem, accuracy=accuracy))
     problem, waves, cells = point.problem, *point.value.shape
     columns = point.level_columns
     information, score = point.information(columns, columns), point.score(columns)
     ours = -point.linear_cost + 0.5 * score @ np.linalg.solve(information, score)
     ours -= 0.5 * np.linalg.slogdet(information)[1]
     # All levels, responses and thicknesses in one matrix.
-    dense = np.zeros((waves * cells, waves + 2 * cells))
-    prior, pull = np.zeros(waves + 2 * cells), np.zeros(waves + 2 * cells)
+    wrong = 2 if accuracy else 0
+    dense = np.zeros((waves * cells, waves + 2 * cells + wrong))
+    prior, pull = np.zeros(dense.shape[1]), np.zeros(dense.shape[1])
+    if accuracy:
+        fringes = point.value - point.value.mean(axis=1, keepdims=True)
+        fringes *= point.levels[:, np.newaxis] * np.sqrt(problem.data.weight)
+        colour = 2.0 * (WAVELENGTHS - WAVELENGTHS.mean()) / np.ptp(WAVELENGTHS)
+        dense[:, -2], dense[:, -1] = fringes.ravel(), (colour[:, np.newaxis] * fringes).ravel()
+        prior[-2:] = accuracy**-2
     for w in range(waves):
         for c in range(cells):
             row = w * cells + c
@@ -71,16 +82,17 @@ def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator) -> No
             dense[row, waves + c] = root * point.levels[w] * point.value[w, c]
             dense[row, waves + cells + c] = root * point.levels[w] * point.slope[w, c]
     prior[waves : waves + cells] = problem.response_sigma**-2
-    prior[waves + cells :] = problem.thickness_sigma_um**-2
+    prior[waves + cells : waves + 2 * cells] = problem.thickness_sigma_um**-2
     away = problem.thickness_um - point.thickness_um
-    pull[waves + cells :] = prior[waves + cells :] * away
+    pull[waves + cells : waves + 2 * cells] = problem.thickness_sigma_um**-2 * away
     residual = point.residual.ravel()
     precision = dense.T @ dense + np.diag(prior)
     gradient = dense.T @ residual + pull
-    energy = 0.5 * (residual @ residual + prior[waves + cells :] @ away**2)
+    energy = 0.5 * (residual @ residual + (away**2).sum() / problem.thickness_sigma_um**2)
     expected = -energy + 0.5 * gradient @ np.linalg.solve(precision, gradient)
     expected -= 0.5 * np.linalg.slogdet(precision)[1]
     expected -= cells * np.log(problem.response_sigma * problem.thickness_sigma_um)
+    expected -= wrong * np.log(accuracy or 1.0)
     assert ours == pytest.approx(expected, rel=1e-8)
 
 

@@ -52,6 +52,13 @@ __all__ = ["discover"]
     metavar="SECONDS",
     help="Stop after so long with the best answer so far, which says that it is not complete.",
 )
+@click.option(
+    "--core",
+    type=click.Choice(["present", "marginal"]),
+    default="present",
+    show_default=True,
+    help="Which search of flats: the present one, or that on one likelihood, which cannot do everything yet.",
+)
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
 @click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
 def discover(
@@ -65,6 +72,7 @@ def discover(
     detector: str | None,
     cells: int,
     time_budget: float | None,
+    core: str,
     skip_bad: bool,
     dry_run: bool,
 ) -> None:
@@ -115,7 +123,7 @@ def discover(
         cube,
         model,
         rng=np.random.default_rng(seed),
-        options=SearchOptions(**limits),
+        options=SearchOptions(core=core, **limits),
         report=lambda line: click.echo(line, err=True),
     )
     _write(verdict, folder, residual_pair(cube, model, verdict), section_of_cube(cube, setup), given)

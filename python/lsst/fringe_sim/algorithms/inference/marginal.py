@@ -41,6 +41,9 @@ class Problem:
     thickness_um: FloatArray  # (N,): the first thickness, about which that of a cell is Gaussian
     response_sigma: float  # prior of the response of a cell
     thickness_sigma_um: float = 1.0  # some fringe orders, which pulls no cell
+    accuracy: float = (
+        0.0  # prior of the part in which the model's contrast is wrong, and of its trend in wavelength
+    )
 
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""
@@ -155,14 +158,38 @@ class Point:
     @cached_property
     def cost(self) -> float:
         """Minus the log likelihood with the cells integrated, but for the constant of the noise."""
-        return float(self.cell_energy.sum()) + self.log_det
+        return float(self.cell_energy.sum()) + self.log_det + self._accuracy_cost
 
     @property
     def linear_cost(self) -> float:
         """The same with the thickness of every cell at the best of the linear model, not where it is."""
         away = (self.thickness_um - self.problem.thickness_um) / self.problem.thickness_sigma_um
         energy = 0.5 * float((self.residual**2).sum() + (away**2).sum() - (self.residual_cells**2).sum())
-        return energy + self.log_det
+        return energy + self.log_det + self._accuracy_cost
+
+    # Accuracy of the model --------------------------------------------------------------------------------------
+
+    @cached_property
+    def accuracy_columns(self) -> Columns:
+        """Fringes stronger or weaker than the model's by the prior, alike and in proportion to wavelength."""
+        fringes = self.response - self.root * (self.levels * self.value.mean(axis=1))[:, np.newaxis]
+        wavelength = self.problem.forward.geometry.wavelength_nm
+        colour = (wavelength - wavelength.mean()) / max(float(np.ptp(wavelength)), 1e-9)
+        values = self.problem.accuracy * np.stack([fringes, 2.0 * colour[:, np.newaxis] * fringes])
+        return Columns(values, self._forward_solved(self._along(values)), np.zeros(2))
+
+    @cached_property
+    def _accuracy(self) -> tuple[FloatArray, FloatArray]:
+        """Precision of those two beside the cells, and their score."""
+        columns = self.accuracy_columns
+        return np.eye(2) + self._raw_information(columns, columns), self._raw_score(columns)
+
+    @cached_property
+    def _accuracy_cost(self) -> float:
+        if self.problem.accuracy == 0.0:
+            return 0.0
+        matrix, score = self._accuracy
+        return 0.5 * float(np.linalg.slogdet(matrix)[1] - score @ np.linalg.solve(matrix, score))
 
     # Dense parameters -----------------------------------------------------------------------------------------
 
@@ -206,12 +233,28 @@ class Point:
         )
 
     def information(self, first: Columns, second: Columns) -> FloatArray:
-        """Fisher matrix of dense columns with the cells integrated."""
-        whole = np.tensordot(first.value, second.value, axes=([1, 2], [1, 2]))
-        return np.asarray(whole - np.tensordot(first.cells, second.cells, axes=([1, 2], [1, 2])))
+        """Fisher matrix of dense columns with cells and accuracy integrated."""
+        plain = self._raw_information(first, second)
+        if self.problem.accuracy == 0.0:
+            return plain
+        own = self.accuracy_columns
+        solved = np.linalg.solve(self._accuracy[0], self._raw_information(own, second))
+        return np.asarray(plain - self._raw_information(first, own) @ solved)
 
     def score(self, columns: Columns) -> FloatArray:
         """Derivative of the log likelihood with respect to dense parameters, without that of the determinant."""
+        plain = self._raw_score(columns)
+        if self.problem.accuracy == 0.0:
+            return plain
+        matrix, score = self._accuracy
+        across = self._raw_information(columns, self.accuracy_columns)
+        return np.asarray(plain - across @ np.linalg.solve(matrix, score))
+
+    def _raw_information(self, first: Columns, second: Columns) -> FloatArray:
+        whole = np.tensordot(first.value, second.value, axes=([1, 2], [1, 2]))
+        return np.asarray(whole - np.tensordot(first.cells, second.cells, axes=([1, 2], [1, 2])))
+
+    def _raw_score(self, columns: Columns) -> FloatArray:
         whole = np.tensordot(columns.value, self.residual, axes=([1, 2], [0, 1]))
         return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
 

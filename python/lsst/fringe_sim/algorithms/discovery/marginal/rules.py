@@ -43,6 +43,9 @@ class Rules:
     cell_phase : `float`
         Largest phase across a cell [rad] for which they are: three places describe it to 1e-3 of the fringes,
         which are weak then.
+    least_of_promise : `float`
+        Part of what an effect brings that derivatives promise; sets that cannot come near the best are not fitted.
+        Seen in the fits of four cases of the panel, where all but a few kept within it.
     sizes : `tuple` [`float`, ...]
         Departures, in prior scales, at which an effect of one parameter is tried beside its linear step.
     """
@@ -61,4 +64,5 @@ class Rules:
     precision: float = 1e-4
     phase_error: float = 0.1
     cell_phase: float = 3.5
+    least_of_promise: float = 0.8
     sizes: tuple[float, ...] = (0.3, 1.0, 3.0)

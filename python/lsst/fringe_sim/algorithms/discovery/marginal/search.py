@@ -106,10 +106,10 @@ class SetSearch:
         """Log evidence less the price of the effects."""
         return found.log_evidence - self.catalogue.price * len(found.effects)
 
-    def run(self) -> Hypothesis:
-        """The best set."""
+    def run(self, most: int) -> Hypothesis:
+        """The best set of so many effects at most."""
         best, beam = self.null, [self.null]
-        for size in range(1, self.rules.most_effects + 1):
+        for size in range(1, most + 1):
             self._grow(beam[0])
             if size > 1 and self._is_enough(beam[0]):
                 break
@@ -121,11 +121,29 @@ class SetSearch:
             top = self._settled(grown[0]) if size > 1 else grown[0]
             gained = top.log_evidence - self.null.log_evidence
             self.say(f"best of {size}: {', '.join(top.effects)} (log evidence {gained:.1f})")
-            if self.posterior(top) <= self.posterior(best):
+            if not self._is_surely_better(top, best):
                 break
-            best = max(self.pool.values(), key=self.posterior)
+            best = top
             beam = self._of_size(size)[: self.rules.beam]
         return best
+
+    def on(self, null: Hypothesis) -> SetSearch:
+        """The same search of a problem that was judged again; the best sets are fitted from where they are."""
+        again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise)
+        known = sorted(self.pool.values(), key=self.posterior, reverse=True)
+        for one in known[: 2 * self.rules.refits]:
+            if one.effects:
+                at = one.point
+                start = null.point.problem.at(at.settings, at.levels, at.thickness_um)
+                again._keep(fit(one.effects, one.items, start))
+                if len(one.effects) == 1:
+                    again._added_before.add((frozenset(), one.effects[0]))
+        return again
+
+    def _is_surely_better(self, larger: Hypothesis, smaller: Hypothesis) -> bool:
+        """Whether a larger set is as probable beside a smaller one as what is named has to be."""
+        odds = self.rules.least_probability / (1.0 - self.rules.least_probability)
+        return self.posterior(larger) - self.posterior(smaller) > math.log(odds)
 
     def _is_enough(self, found: Hypothesis) -> bool:
         """Whether a set leaves noise, and no effect promises to be worth its price beside it."""
@@ -186,7 +204,10 @@ class SetSearch:
         scored = self.scores(base)
         groups = self._groups(scored)
         worth = [group for group in groups if group[0].gain > self.catalogue.price]
-        number = max(self.rules.fewest_refits, min(len(worth), most or self.rules.refits))
+        if base.effects and not missing:
+            worth = [group for group in worth if self._may_lead(base, group[0])]
+        fewest = self.rules.fewest_refits if most is None else 0
+        number = max(fewest, min(len(worth), most or self.rules.refits))
         if missing:
             number = min(number, self.rules.fewest_refits)
         found = {}
@@ -194,13 +215,20 @@ class SetSearch:
             found[group[0].name] = self._added(base, group[0])
         if not found:
             return
-        winner = max(found, key=lambda name: self.posterior(found[name]))
+        top = max(self.posterior(one) for one in found.values())
+        alike = {name for name, one in found.items() if self.posterior(one) > top - self.rules.class_width}
         for group in groups:
-            names = [one.name for one in group]
-            if winner in names or missing in names:
+            names = {one.name for one in group}
+            if alike & names or missing in names:
                 for one in group[: self.rules.refits]:
                     if one.name != missing:
                         self._added(base, one)
+
+    def _may_lead(self, base: Hypothesis, one: Scored) -> bool:
+        """Whether a set with one effect more comes near the best, if derivatives promise all but a part."""
+        best = max(self.posterior(known) for known in self.pool.values())
+        hoped = self.posterior(base) + one.gain / self.rules.least_of_promise - self.catalogue.price
+        return hoped > best - self.rules.class_width
 
     def _groups(self, scored: Sequence[Scored]) -> list[list[Scored]]:
         """Twins together, the best first."""

@@ -21,7 +21,7 @@ from ..describe import describe_residual, disagreement
 from ..verdict import CONFIDENCE, Gap, NamedEffect, ParameterValue, Step, Verdict, probability_text
 from .critics import judge, state_of, total_chance
 from .heldout import Unseen, judge_unseen
-from .preparation import Prepared, prepare
+from .preparation import Prepared, prepare, prepare_again
 from .rules import Rules
 from .search import Catalogue, SetSearch
 
@@ -78,7 +78,12 @@ class _Judgement:
         null = self.prepared.null
         before = self._channels(null)
         self.report(f"chance that noise alone disagrees as much: {total_chance(before):.3g}")
-        best = self.sets.run()
+        best = self.sets.run(1)
+        if best.effects:
+            self.report(f"noise and cells are judged again with {best.effects[0]}")
+            self.prepared = prepare_again(self.prepared, best)
+            self.sets = self.sets.on(self.prepared.null)
+            best = self.sets.run(self.rules.most_effects)
         if not best.effects:
             if total_chance(before) > self.rules.significance:
                 return self._told("no_discrepancy", null, before, (), {}, None)
