@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,15 @@ class CellShape:
         ``blur_px``: rms radius along one axis of a Gaussian blur. The three have the second, third and fourth moment
         of the thickness: of an even slope those of Gauss and Legendre.
         """
+        if blur_px == 0.0:
+            return self._unblurred
+        return self._nodes(blur_px)
+
+    @cached_property
+    def _unblurred(self) -> tuple[FloatArray, FloatArray]:
+        return self._nodes(0.0)
+
+    def _nodes(self, blur_px: float) -> tuple[FloatArray, FloatArray]:
         shift, second, third, fourth = self._moments(blur_px)
         some = second > LEAST_SPREAD_UM2
         safe = np.where(some, second, 1.0)
