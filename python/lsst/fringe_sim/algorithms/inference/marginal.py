@@ -175,14 +175,16 @@ class Point:
         fringes = self.response - self.root * (self.levels * self.value.mean(axis=1))[:, np.newaxis]
         wavelength = self.problem.forward.geometry.wavelength_nm
         colour = (wavelength - wavelength.mean()) / max(float(np.ptp(wavelength)), 1e-9)
-        values = self.problem.accuracy * np.stack([fringes, 2.0 * colour[:, np.newaxis] * fringes])
-        return Columns(values, self._forward_solved(self._along(values)), np.zeros(2))
+        trend = np.stack([np.ones(len(colour)), 2.0 * colour])[..., np.newaxis] * self.problem.accuracy
+        # What noise makes of the thickness strengthens the fringes; the log determinant takes that back.
+        return self.columns(trend * fringes, trend * self.steep)
 
     @cached_property
     def _accuracy(self) -> tuple[FloatArray, FloatArray]:
         """Precision of those two beside the cells, and their score."""
         columns = self.accuracy_columns
-        return np.eye(2) + self._raw_information(columns, columns), self._raw_score(columns)
+        score = self._raw_score(columns) - columns.log_det
+        return np.eye(2) + self._raw_information(columns, columns), score
 
     @cached_property
     def _accuracy_cost(self) -> float:
