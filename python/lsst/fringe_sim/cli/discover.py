@@ -64,6 +64,13 @@ OF_WHAT_WAS_LEARNED = ("learned.py", "learned_effect.py")
     help="Part of the fringes by which the model may be wrong, by default as the tables of silicon (0.014); 0 for a "
     "model without error.",
 )
+@click.option(
+    "--core",
+    type=click.Choice(["present", "marginal"]),
+    default="present",
+    show_default=True,
+    help="Which search of flats: the present one, or that on one likelihood, which cannot do everything yet.",
+)
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
 @click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
 def discover(
@@ -78,6 +85,7 @@ def discover(
     cells: int,
     time_budget: float | None,
     model_accuracy: float | None,
+    core: str,
     skip_bad: bool,
     dry_run: bool,
 ) -> None:
@@ -130,7 +138,7 @@ def discover(
         cube,
         model,
         rng=np.random.default_rng(seed),
-        options=SearchOptions(**limits),
+        options=SearchOptions(core=core, **limits),
         report=lambda line: click.echo(line, err=True),
     )
     _write(verdict, folder, residual_pair(cube, model, verdict), section_of_cube(cube, setup), given)

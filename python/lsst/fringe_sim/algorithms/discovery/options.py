@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ...errors import OutOfRangeError, named_units
+from ...errors import OutOfRangeError, UnknownNameError, named_units
 from .accuracy import MODEL_ACCURACY
 from .selection import Hypothesis
 
-__all__ = ["SearchOptions"]
+__all__ = ["CORES", "SearchOptions"]
+
+CORES = ("present", "marginal")
+"""Searches that there are."""
 
 
 @named_units
@@ -44,6 +47,8 @@ class SearchOptions:
         Part of the sensor that no selection sees.
     outsider_prior : `float`
         Prior probability of a cause that is not in the catalogue.
+    core : {"present", "marginal"}
+        Which search: the present one, or that on one likelihood, which is to replace it and cannot do everything yet.
     time_budget_s : `float`
         Time on the clock [s] after which the best answer so far is given; as long as it takes by default. A fifth of
         it is kept for the judgement of that answer on the data held out.
@@ -66,12 +71,16 @@ class SearchOptions:
     outsider_prior: float = 0.15
     time_budget_s: float = math.inf
     model_accuracy: float = MODEL_ACCURACY
+    core: str = "present"
 
     def __post_init__(self) -> None:
         if not self.time_budget_s > 0.0:
             raise OutOfRangeError("time budget [s]", self.time_budget_s, "a positive number")
         if not 0.0 <= self.model_accuracy < 1.0:
             raise OutOfRangeError("model accuracy", self.model_accuracy, "0 or more, below 1")
+
+        if self.core not in CORES:
+            raise UnknownNameError("core", self.core, CORES)
 
     def is_noise(self, found: Hypothesis) -> bool:
         """Whether a set leaves what noise may be."""

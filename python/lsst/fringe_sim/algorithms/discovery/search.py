@@ -165,6 +165,10 @@ def search_exposures(
         search = None
         try:
             with time_limit(begun + (1.0 - FOR_JUDGEMENT) * budget):
+                if chosen.core == "marginal" and exposures is None and _suits_marginal(cube):
+                    from .marginal import search_marginal  # is made of parts of this package
+
+                    return search_marginal(cube, model, effects, rng, chosen.most_cells, say)
                 say("fitting the thickness with the unchanged model")
                 prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
                 search = _Search(cube, prepared, model, effects, chosen, rng, say)
@@ -174,6 +178,16 @@ def search_exposures(
             stopped = search.best_so_far(begun + budget) if search is not None else None
             reason = f"{budget:g} s did not suffice to fit the unchanged model"
             return stopped or replace(_no_answer(model, reason, cube, too_poor=False), complete=False)
+
+
+MARGINAL_ROWS = 24
+"""Rows and columns of pixels from which on the search on one likelihood can split data into a part that is searched
+and one that is held out, and measure the noise of both."""
+
+
+def _suits_marginal(cube: FringeCube) -> bool:
+    """Whether the search on one likelihood can search such data."""
+    return cube.thickness is None and min(cube.shape[1:]) >= MARGINAL_ROWS
 
 
 def _no_answer(model: FringeModel, reason: str, cube: FringeCube, *, too_poor: bool = True) -> Verdict:

@@ -1,0 +1,147 @@
+"""Critics: what a hypothesis leaves, and the chance of that under noise. The list of them is an argument."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....effects import ImageGeometry
+from ...inference import Columns, Hypothesis, Point, effect_columns, joined
+from ..channels import (
+    BANDS,
+    Channel,
+    State,
+    amplifier_features,
+    chance_beyond,
+    echo_channel,
+    in_looks,
+    phase_features,
+    spatial_features,
+    texture_channels,
+)
+from ..fit import PlaneColumns, Whitener
+from .rules import Rules
+
+__all__ = ["CRITICS", "Judged", "judge", "state_of", "total_chance"]
+
+FloatArray = NDArray[np.float64]
+
+RANK = 1e-7
+"""Relative eigenvalue of what nothing else has left."""
+
+FEWEST_ROWS = {"phase": 1, "place": 8, "texture": BANDS * 3}
+"""Rows and columns of cells from which on a critic says something."""
+
+
+class Judged:
+    """A hypothesis with what all critics need: the state, and the dense columns that are free."""
+
+    def __init__(self, found: Hypothesis, index: FloatArray, noncentral: float) -> None:
+        point = found.point
+        self.found, self.index, self.noncentral = found, index, noncentral
+        self.geometry: ImageGeometry = point.problem.forward.geometry
+        columns = point.level_columns
+        if found.items:
+            columns = joined(columns, effect_columns(point, found.items))
+        self.columns: Columns = columns
+        self.state = state_of(point, columns)
+
+    @property
+    def rows(self) -> int:
+        """Fewest cells along a side."""
+        return min(self.geometry.sample_shape)
+
+    def family(self, values: FloatArray) -> tuple[float, int]:
+        """Score statistic of further columns ``(L, W, N)``, all else free, and its degrees of freedom."""
+        point = self.found.point
+        own = Columns(values, point._forward_solved(point._along(values)), np.zeros(len(values)))
+        base = point.information(self.columns, self.columns)
+        across = np.linalg.solve(base, point.information(self.columns, own))
+        matrix = point.information(own, own) - point.information(own, self.columns) @ across
+        score = point.score(own) - across.T @ point.score(self.columns)
+        scale = np.sqrt(np.maximum((values**2).sum(axis=(1, 2)), 1e-300))
+        size, axes = np.linalg.eigh(matrix / np.outer(scale, scale))
+        keep = size > RANK
+        along = axes[:, keep].T @ (score / scale)
+        return float((along**2 / size[keep]).sum()), int(keep.sum())
+
+
+def state_of(point: Point, columns: Columns) -> State:
+    """A point in the layout in which residuals are described and drawn."""
+    shape = (len(point.levels), *point.problem.forward.geometry.sample_shape)
+    base = point.information(columns, columns)
+    step = np.linalg.solve(base, point.score(columns))
+    left = point.projected(point.residual - np.tensordot(step, columns.value, axes=1))
+    left = left / np.sqrt(np.maximum(point.noise_share, 0.05))
+    root = point.root.reshape(shape)
+    flat = Whitener(root, np.zeros(shape), np.zeros(shape[1:]))
+    value = (point.value * point.levels[:, np.newaxis]).reshape(shape)
+    raw = np.where(root > 0.0, point.problem.data.value.reshape(shape) - value, 0.0)
+    design = cast(Any, SimpleNamespace(slope=point.steep.reshape(shape)))
+    return State(design, left.reshape(shape), raw, value, point.thickness_um.reshape(shape[1:]), flat)
+
+
+Critic = Callable[[Judged], Sequence[Channel]]
+
+
+def _phase(judged: Judged) -> list[Channel]:
+    """Harmonics of the fringes at every wavelength."""
+    features: PlaneColumns = phase_features(judged.state, judged.geometry, judged.index)
+    values = np.zeros((len(features.plane), len(judged.index), judged.state.thickness_um.size))
+    values[np.arange(len(values)), features.plane] = features.amplitude.reshape(len(values), -1)
+    statistic, degrees = judged.family(values)
+    chance = chance_beyond(statistic, max(degrees, 1), judged.noncentral)
+    return [Channel("thickness phase", statistic, degrees, chance)]
+
+
+def _place(judged: Judged) -> list[Channel]:
+    """Patterns over the sensor, and amplifiers."""
+    if judged.rows < FEWEST_ROWS["place"]:
+        return []
+    found = []
+    for name, features in (("large scales", spatial_features), ("amplifiers", amplifier_features)):
+        columns = features(judged.state, judged.geometry).values
+        statistic, degrees = judged.family(columns.reshape(*columns.shape[:2], -1))
+        found.append(Channel(name, statistic, degrees, chance_beyond(statistic, max(degrees, 1))))
+    return found
+
+
+def _texture(judged: Judged) -> list[Channel]:
+    """Power at all scales against that at the finest, single waves, and copies of the image."""
+    if judged.rows < FEWEST_ROWS["texture"]:
+        return []
+    settings = judged.found.point.settings
+    correlation = sum(
+        effect.noise_correlation(effect.null_values(judged.found.point.problem.forward.model.base_system)
+                                 | _own(settings, effect.name), judged.geometry)
+        for effect in judged.found.point.problem.forward.catalogue if effect.name in judged.found.effects
+    )  # fmt: skip
+    return [*texture_channels(judged.state, correlation), echo_channel(judged.state)]
+
+
+def _own(settings: dict[str, float], name: str) -> dict[str, float]:
+    return {key.partition(".")[2]: value for key, value in settings.items() if key.partition(".")[0] == name}
+
+
+CRITICS: tuple[Critic, ...] = (_phase, _place, _texture)
+
+
+def judge(
+    found: Hypothesis, null: Hypothesis, index: FloatArray, rules: Rules, critics: Sequence[Critic] = CRITICS
+) -> tuple[Channel, ...]:
+    """What all critics say of a hypothesis; fringes are described only so well, and effects in their form."""
+    point = found.point
+    fringes = point.response - point.response.mean(axis=1, keepdims=True)
+    explained = max(null.chi2 - found.chi2, 0.0)
+    noncentral = rules.precision**2 * float((fringes**2).sum()) + rules.imprecision**2 * explained
+    judged = Judged(found, index, noncentral)
+    return tuple(channel for critic in critics for channel in critic(judged))
+
+
+def total_chance(channels: Sequence[Channel]) -> float:
+    """Chance that noise alone gives so small a smallest chance."""
+    return in_looks(min((channel.probability for channel in channels), default=1.0), len(channels))

@@ -1,0 +1,69 @@
+"""Noise of the cells, from what neighbouring cells do not share beside response and thickness of their own."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...inference import Point
+
+__all__ = ["measured_noise"]
+
+FloatArray = NDArray[np.float64]
+
+FEWEST = 60
+"""Second differences from which a noise level is taken; with fewer the stated one is believed, as before."""
+
+
+def measured_noise(point: Point, shape: tuple[int, int, int]) -> tuple[FloatArray, float]:
+    """Measured over stated standard deviation of the noise ``(W,)``, and the scatter of the response of the cells.
+
+    The projected residual of a cell has the variance that its projector says; second differences of neighbours remove
+    what is smooth. What exceeds that along the response, beside the thickness, is scatter of the response.
+    """
+    seen = np.asarray((point.problem.data.weight > 0.0).all(axis=0))
+    good = _nine(seen.reshape(shape[1:])[np.newaxis])[0]
+    if min(shape[1:]) < 3 or good.sum() < FEWEST:
+        return np.ones(shape[0]), point.problem.response_sigma
+    left = point.projected(point.residual).reshape(shape)
+    share = _mean_of_nine(point.noise_share.reshape(shape))
+    factor = np.sqrt((_second(left)[:, good] ** 2).mean(axis=1) / share[:, good].mean(axis=1))
+    factor = _shrunk(factor, int(good.sum()))
+    beside = point.steep * (
+        (point.steep * point.response).sum(axis=0) / (point.steep**2).sum(axis=0).clip(1e-12)
+    )
+    common = point.response - beside
+    length = np.sqrt((common**2).sum(axis=0)).clip(1e-12)
+    along = ((common * point.residual).sum(axis=0) / length).reshape(1, *shape[1:])
+    excess = (_second(along)[0, good] ** 2).mean() - float(np.mean(factor**2))
+    scatter2 = excess / _mean_of_nine((length**2).reshape(1, *shape[1:]))[0, good].mean()
+    return factor, float(np.sqrt(max(scatter2, 0.0)))
+
+
+OVERLAP = 3.78
+"""Sum of the squared correlations of second differences of independent noise: how many of them are worth one."""
+
+
+def _shrunk(factor: FloatArray, number: int) -> FloatArray:
+    """Factors drawn to their mean by as much of their scatter as their own errors explain."""
+    error2 = OVERLAP / (2.0 * number)
+    middle = float(factor.mean())
+    scatter2 = float(factor.var()) / middle**2
+    return middle + (factor - middle) * float(np.sqrt(max(1.0 - error2 / max(scatter2, 1e-300), 0.0)))
+
+
+def _second(image: FloatArray) -> FloatArray:
+    """Second difference along both axes with unit noise gain, ``(W, ny-2, nx-2)``."""
+    rows = image[:, :-2] - 2.0 * image[:, 1:-1] + image[:, 2:]
+    return np.asarray((rows[:, :, :-2] - 2.0 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 6.0)
+
+
+def _mean_of_nine(image: FloatArray) -> FloatArray:
+    """Variance of that for cells of such variances."""
+    rows = image[:, :-2] + 4.0 * image[:, 1:-1] + image[:, 2:]
+    return np.asarray((rows[:, :, :-2] + 4.0 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 36.0)
+
+
+def _nine(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    rows = good[:, :-2] & good[:, 1:-1] & good[:, 2:]
+    return np.asarray(rows[:, :, :-2] & rows[:, :, 1:-1] & rows[:, :, 2:])

@@ -1,0 +1,188 @@
+"""From a cube to a problem: the part held out, cells, first thickness, noise, fit of the unchanged model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....effects import Effect, ImageGeometry
+from ....model import FringeModel
+from ....products.fringe_cube import FringeCube
+from ....products.mask import mask_bits
+from ...inference import CellShape, Data, Forward, Hypothesis, Point, Problem, fit, relaxed
+from ..cells import CellData, bin_cube, finest_useful_cell
+from ..continuation import continued
+from ..outliers import spoiled_cells
+from ..start import starting_thickness
+from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
+from .noise import measured_noise
+from .rules import Rules
+
+__all__ = ["Prepared", "prepare", "prepare_again"]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MARGIN_UM = 0.8
+"""Thickness beyond the first one that tables cover [µm]: effects may move it by some fringe orders."""
+
+FIRST_ERROR_UM = 0.004
+"""Error of the first thickness [µm]: it is one of steps of 0.01."""
+
+ACCURACY = 1e-3
+"""Part in which the contrast of the model is believed to be wrong without any effect: assumed, not measured."""
+
+NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
+"""Response scatter that is none, and what it is before it is measured (the prototype's)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A part of the data to search, and a part that nothing has seen."""
+
+    cells: CellData  # the part searched, with measured noise
+    unseen: CellData  # the part held out
+    problem: Problem
+    null: Hypothesis
+    noise_factor: FloatArray  # (W,): measured over stated standard deviation
+
+    @property
+    def point(self) -> Point:
+        """The unchanged model at its best."""
+        return self.null.point
+
+
+def prepare(
+    cube: FringeCube,
+    model: FringeModel,
+    effects: Sequence[Effect],
+    most_cells: int,
+    rules: Rules,
+    rng: np.random.Generator,
+) -> Prepared:
+    """Split a cube, average what is searched to cells, find thickness and noise, fit the unchanged model.
+
+    Cells are made larger while the thickness of one is not known well enough and fringes stay wider than a cell.
+    """
+    held = _held_out(cube.shape[1:], rules.heldout_fraction, rng)
+    size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
+    prepared = _in_cells(cube, held, size, model, effects)
+    while min(prepared.cells.shape[1:]) >= 2 * FEWEST_ROWS:
+        order = float(model.fringe_order_um(np.median(prepared.cells.wavelength_nm)))
+        turn = 2.0 * np.pi / order
+        error = turn * _thickness_error_um(prepared.point)
+        slope = turn * np.quantile(np.hypot(*prepared.problem.forward.shape.gradient), 0.95)
+        if error < rules.phase_error or 2.0 * size * slope > rules.cell_phase:
+            break
+        size *= 2
+        prepared = _in_cells(cube, held, size, model, effects)
+    return prepared
+
+
+def _held_out(shape: tuple[int, ...], fraction: float, rng: np.random.Generator) -> BoolArray:
+    """Pixels that no selection sees, in blocks."""
+    rows, columns = shape
+    side = min(BLOCKS_ACROSS, max(min(shape) // FEWEST_ROWS, 3))
+    blocks = rng.permutation(side * side).reshape(side, side) < round(fraction * side * side)
+    return np.asarray(blocks[np.ix_(np.arange(rows) * side // rows, np.arange(columns) * side // columns)])
+
+
+def _masked(cube: FringeCube, out: BoolArray) -> FringeCube:
+    """The cube without data where ``out`` is true."""
+    mask = np.array(cube.mask)
+    mask[:, out] |= mask_bits("NO_DATA")
+    return replace(cube, mask=mask)
+
+
+def _in_cells(
+    cube: FringeCube, held: BoolArray, size: int, model: FringeModel, effects: Sequence[Effect]
+) -> Prepared:
+    """The same in cells of so many pixels."""
+    cells = bin_cube(_masked(cube, held), size)
+    unseen = (
+        bin_cube(_masked(cube, ~held), size) if held.any() else cells.restricted(np.zeros(cells.shape, bool))
+    )
+    first = continued(starting_thickness(model, cells), cells.seen)
+    problem = _problem(cells, model, effects, first, FIRST_ERROR_UM, FIRST_SCATTER, cells.geometry)
+    point = relaxed(problem.at({}, np.ones(cells.shape[0]), problem.thickness_um), rounds=8)
+    factor = np.ones(cells.shape[0])
+    for _ in range(2):
+        spoiled = spoiled_cells(_left(point, cells), cells.weight > 0.0)
+        cells, noise, problem = _judged(cells.restricted(~spoiled), point)
+        factor = factor * noise
+        point = relaxed(problem.at({}, point.levels, problem.thickness_um), rounds=4)
+    unseen = unseen.scaled_noise(factor, cells.response_scatter)
+    return Prepared(cells, unseen, problem, fit((), (), point), factor)
+
+
+def prepare_again(prepared: Prepared, found: Hypothesis) -> Prepared:
+    """Noise, and what the thickness does within cells, as judged with effects in the model."""
+    cells, noise, problem = _judged(prepared.cells, found.point)
+    null = problem.at({}, prepared.point.levels, prepared.point.thickness_um)
+    return replace(
+        prepared,
+        cells=cells,
+        unseen=prepared.unseen.scaled_noise(noise, cells.response_scatter),
+        problem=problem,
+        null=fit((), (), relaxed(null, rounds=4)),
+        noise_factor=prepared.noise_factor * noise,
+    )
+
+
+def _judged(cells: CellData, point: Point) -> tuple[CellData, FloatArray, Problem]:
+    """Cells with the noise that a fit leaves, its measured over stated deviation, and the problem about the fit."""
+    expected = (point.levels[:, np.newaxis] * point.value).reshape(cells.shape)
+    cells = cells.with_noise_of(expected)
+    point = point.problem_with(_data(cells))
+    noise, scatter = measured_noise(point, cells.shape)
+    cells = cells.scaled_noise(noise, scatter)
+    old, thickness = point.problem.forward, _whole(point, cells)
+    # Levels tell how many electrons a mean of one is; they are known from the first fit on.
+    geometry = old.geometry
+    if geometry is cells.geometry:
+        geometry = replace(geometry, level_e=geometry.level_e * point.levels)
+    error, known = _thickness_error_um(point), (old.model, old.catalogue)
+    return cells, noise, _problem(cells, *known, thickness, error, max(scatter, NO_SCATTER), geometry)
+
+
+def _left(point: Point, cells: CellData) -> FloatArray:
+    """Data minus model."""
+    return np.asarray(
+        (point.problem.data.value - point.levels[:, np.newaxis] * point.value).reshape(cells.shape)
+    )
+
+
+def _whole(point: Point, cells: CellData) -> FloatArray:
+    """Thickness of all cells, ``(ny, nx)``; where there are no data, continued from where there are."""
+    return continued(point.thickness_um.reshape(cells.shape[1:]), cells.seen)
+
+
+def _data(cells: CellData) -> Data:
+    return Data(cells.value.reshape(cells.shape[0], -1), cells.weight.reshape(cells.shape[0], -1))
+
+
+def _problem(
+    cells: CellData,
+    model: FringeModel,
+    effects: Sequence[Effect],
+    thickness_um: FloatArray,
+    error_um: float,
+    scatter: float,
+    geometry: ImageGeometry,
+) -> Problem:
+    """Problem about a first thickness ``(ny, nx)``."""
+    shape = CellShape.of_field(thickness_um, cells.cell_px, error_um)
+    limits = (max(float(thickness_um.min()) - MARGIN_UM, 0.05), float(thickness_um.max()) + MARGIN_UM)
+    centroid = None
+    if cells.centroid is not None:
+        centroid = cells.cell_px * cells.centroid.reshape(2, cells.shape[0], -1)
+    forward = Forward(model, effects, geometry, shape, limits, centroid)
+    return Problem(_data(cells), forward, thickness_um.ravel(), scatter, accuracy=ACCURACY)
+
+
+def _thickness_error_um(point: Point) -> float:
+    """Typical error of the thickness of a cell [µm]."""
+    return float(np.median(point.thickness_sigma_um[point.problem.data.seen]))

@@ -1,0 +1,68 @@
+"""The constants that decide, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["Rules"]
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Constants of the search on one likelihood, with where they come from.
+
+    Attributes
+    ----------
+    refits : `int`
+        Groups of effects that are refitted in each round, best scores first; the prototype had eight effects.
+    fewest_refits : `int`
+        The same where no score reaches the price of an effect: what derivatives at null do not see.
+    beam : `int`
+        Sets of each size that are enlarged.
+    twin_cosine : `float`
+        Cosine of projected scores from which on two effects are of one group: one explains 0.95² of the other.
+    class_width : `float`
+        Difference in log evidence within which sets are one class: odds of 150.
+    least_probability : `float`
+        Probability of a class with which it is named, as in the present search.
+    most_effects : `int`
+        Largest set that is named, as in the present search.
+    significance : `float`
+        Chance of noise of all critics together below which what is left is no noise, as in the present search.
+    outsider_prior : `float`
+        Prior probability of a cause that is not in the catalogue, as in the present search.
+    heldout_fraction : `float`
+        Part of the sensor that no selection sees, as in the present search.
+    imprecision : `float`
+        Part of what effects explain in which their form may be wrong, as in the present search.
+    precision : `float`
+        Part of the fringes to which cells are described, as the test against pixels shows.
+    phase_error : `float`
+        Error of the thickness of a cell [rad of fringe phase] above which cells are made larger: half of its square
+        is lost of the fringes, and half of that is not in the linear model.
+    cell_phase : `float`
+        Largest phase across a cell [rad] for which they are: three places describe it to 1e-3 of the fringes,
+        which are weak then.
+    least_of_promise : `float`
+        Part of what an effect brings that derivatives promise; sets that cannot come near the best are not fitted.
+        Seen in the fits of four cases of the panel, where all but a few kept within it.
+    sizes : `tuple` [`float`, ...]
+        Departures, in prior scales, at which an effect of one parameter is tried beside its linear step.
+    """
+
+    refits: int = 6
+    fewest_refits: int = 2
+    beam: int = 3
+    twin_cosine: float = 0.95
+    class_width: float = 5.0
+    least_probability: float = 0.95
+    most_effects: int = 3
+    significance: float = 1e-3
+    outsider_prior: float = 0.15
+    heldout_fraction: float = 0.25
+    imprecision: float = 0.01
+    precision: float = 1e-4
+    phase_error: float = 0.1
+    cell_phase: float = 3.5
+    least_of_promise: float = 0.8
+    sizes: tuple[float, ...] = (0.3, 1.0, 3.0)

@@ -1,0 +1,378 @@
+"""Beam search over sets of effects: score all, refit the best of each group of twins, grow, prune, swap."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....effects import Effect, Residuals
+from ....errors import InputError, OutOfRangeError
+from ...inference import (
+    Columns,
+    Coordinate,
+    Forward,
+    Hypothesis,
+    coordinates_of,
+    effect_columns,
+    fit,
+    joined,
+    jumped,
+)
+from ...inference.coordinates import SECANT
+from ...inference.marginal import Point
+from .rules import Rules
+
+__all__ = ["Catalogue", "Scored", "SetSearch"]
+
+FloatArray = NDArray[np.float64]
+
+WIDTHS = np.geomspace(0.03, 30.0, 13)
+"""Widths of the prior, in its scales, over which a score is the best: departures may be of any size."""
+
+
+@dataclass(frozen=True, eq=False)
+class Catalogue:
+    """Effects that can be looked for, and why others are left out."""
+
+    items: dict[str, tuple[Coordinate, ...]]
+    effects: dict[str, Effect]
+    left_out: dict[str, str]
+
+    @classmethod
+    def of(cls, effects: Sequence[Effect], forward: Forward) -> Catalogue:
+        """Coordinates of all effects of a catalogue that these exposures can see."""
+        items: dict[str, tuple[Coordinate, ...]] = {}
+        left_out: dict[str, str] = {}
+        for effect in effects:
+            try:
+                own = coordinates_of(effect, forward)
+                _try(own, forward)
+            except InputError as error:
+                left_out[effect.name] = str(error)
+                continue
+            if effect.local:
+                left_out[effect.name] = (
+                    "a place that no derivative leads to, and the new core has no starts for it yet"
+                )
+            else:
+                items[effect.name] = own
+        return cls(items, {effect.name: effect for effect in effects}, left_out)
+
+    @property
+    def price(self) -> float:
+        """Log of the odds against any one effect before the data are seen."""
+        return math.log(max(len(self.items), 2))
+
+
+def _try(items: tuple[Coordinate, ...], forward: Forward) -> None:
+    """Raise what an effect raises on these data."""
+    middle = np.full(forward.shape.gradient.shape[1], 0.5 * sum(forward.range_um))
+    forward.predict({item.key: item.null + item.difference(item.null) for item in items[:1]}, middle)
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """An effect that could be added, by one derivative."""
+
+    name: str
+    gain: float  # of log evidence
+    degrees: int
+    step: FloatArray  # linear step of its parameters from null
+    signature: FloatArray  # (W * N,): what that step does beside all that is free, of unit length
+    start: Point | None = None  # what the effect itself proposes
+
+
+@dataclass(eq=False)
+class SetSearch:
+    """Hypotheses of one problem; each is fitted once from its best parent."""
+
+    catalogue: Catalogue
+    null: Hypothesis
+    rules: Rules
+    say: Callable[[str], None]
+    leaves_noise: Callable[[Hypothesis], bool]  # what the critics say
+    pool: dict[frozenset[str], Hypothesis] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.pool[frozenset()] = self.null
+        self._scores: dict[frozenset[str], list[Scored]] = {}
+        self._added_before: set[tuple[frozenset[str], str]] = set()
+
+    def posterior(self, found: Hypothesis) -> float:
+        """Log evidence less the price of the effects."""
+        return found.log_evidence - self.catalogue.price * len(found.effects)
+
+    def run(self, most: int) -> Hypothesis:
+        """The best set of so many effects at most."""
+        best, beam = self.null, [self.null]
+        for size in range(1, most + 1):
+            self._grow(beam[0])
+            if size > 1 and self._is_enough(beam[0]):
+                break
+            for parent in beam[1:]:
+                self._grow(parent, most=self.rules.refits // 2)
+            grown = self._of_size(size)
+            if not grown:
+                break
+            top = self._settled(grown[0]) if size > 1 else grown[0]
+            gained = top.log_evidence - self.null.log_evidence
+            self.say(f"best of {size}: {', '.join(top.effects)} (log evidence {gained:.1f})")
+            if not self._is_surely_better(top, best):
+                break
+            best = top
+            beam = self._of_size(size)[: self.rules.beam]
+        return best
+
+    def on(self, null: Hypothesis) -> SetSearch:
+        """The same search of a problem that was judged again; the best sets are fitted from where they are."""
+        again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise)
+        known = sorted(self.pool.values(), key=self.posterior, reverse=True)
+        for one in known[: 2 * self.rules.refits]:
+            if one.effects:
+                at = one.point
+                start = null.point.problem.at(at.settings, at.levels, at.thickness_um)
+                again._keep(fit(one.effects, one.items, start))
+                if len(one.effects) == 1:
+                    again._added_before.add((frozenset(), one.effects[0]))
+        return again
+
+    def _is_surely_better(self, larger: Hypothesis, smaller: Hypothesis) -> bool:
+        """Whether a larger set is as probable beside a smaller one as what is named has to be."""
+        odds = self.rules.least_probability / (1.0 - self.rules.least_probability)
+        return self.posterior(larger) - self.posterior(smaller) > math.log(odds)
+
+    def _is_enough(self, found: Hypothesis) -> bool:
+        """Whether a set leaves noise, and no effect promises to be worth its price beside it."""
+        promised = max((one.gain for one in self.scores(found)), default=0.0)
+        return promised < self.catalogue.price and self.leaves_noise(found)
+
+    def _of_size(self, size: int) -> list[Hypothesis]:
+        """All sets of so many effects, best first."""
+        found = [one for one in self.pool.values() if len(one.effects) == size]
+        return sorted(found, key=self.posterior, reverse=True)
+
+    def _settled(self, found: Hypothesis) -> Hypothesis:
+        """The best set after members were left out and exchanged, as long as that helps."""
+        while True:
+            for name in found.effects:
+                base = self.without(found, name)
+                self._grow(base, missing=name)
+            best = max(
+                (one for one in self.pool.values() if len(one.effects) <= len(found.effects)),
+                key=self.posterior,
+            )
+            if self.posterior(best) <= self.posterior(found) or len(best.effects) < len(found.effects):
+                return max(best, found, key=self.posterior)
+            found = best
+
+    def without(self, found: Hypothesis, name: str) -> Hypothesis:
+        """The set without one member, fitted from where it is, or the better one that is known."""
+        names = tuple(one for one in found.effects if one != name)
+        known = self.pool.get(frozenset(names))
+        if known is not None:
+            return known
+        items = tuple(item for item in found.items if item.effect != name)
+        own = {item.key: item.null for item in found.items if item.effect == name}
+        start = jumped(found.point, [i for i in found.items if i.effect == name], list(own.values()))
+        return self._keep(fit(names, items, self._without_keys(start, set(own))))
+
+    @staticmethod
+    def _without_keys(point: Point, keys: set[str]) -> Point:
+        settings = {key: value for key, value in point.settings.items() if key not in keys}
+        return point.moved(point.levels, point.thickness_um, settings)
+
+    def _keep(self, found: Hypothesis) -> Hypothesis:
+        """The better of a fit and what is known of its set."""
+        key = frozenset(found.effects)
+        known = self.pool.get(key)
+        if known is None or found.log_evidence > known.log_evidence:
+            self.pool[key] = found
+            self._scores.pop(key, None)
+        return self.pool[key]
+
+    # Growth -----------------------------------------------------------------------------------------------------
+
+    def _grow(self, base: Hypothesis, missing: str = "", most: int | None = None) -> None:
+        """Refit the best of each group of twins beside a set, and all of the group that wins.
+
+        ``missing``: a member of a larger set that was taken out here; its twins are refitted in any case.
+        """
+        scored = self.scores(base)
+        groups = self._groups(scored)
+        worth = [group for group in groups if group[0].gain > self.catalogue.price]
+        if base.effects and not missing:
+            worth = [group for group in worth if self._may_lead(base, group[0])]
+        fewest = self.rules.fewest_refits if most is None else 0
+        number = max(fewest, min(len(worth), most or self.rules.refits))
+        if missing:
+            number = min(number, self.rules.fewest_refits)
+        found = {}
+        for group in groups[:number]:
+            found[group[0].name] = self._added(base, group[0])
+        if not found:
+            return
+        top = max(self.posterior(one) for one in found.values())
+        alike = {name for name, one in found.items() if self.posterior(one) > top - self.rules.class_width}
+        for group in groups:
+            names = {one.name for one in group}
+            if alike & names or missing in names:
+                for one in group[: self.rules.refits]:
+                    if one.name != missing:
+                        self._added(base, one)
+
+    def _may_lead(self, base: Hypothesis, one: Scored) -> bool:
+        """Whether a set with one effect more comes near the best, if derivatives promise all but a part."""
+        best = max(self.posterior(known) for known in self.pool.values())
+        hoped = self.posterior(base) + one.gain / self.rules.least_of_promise - self.catalogue.price
+        return hoped > best - self.rules.class_width
+
+    def _groups(self, scored: Sequence[Scored]) -> list[list[Scored]]:
+        """Twins together, the best first."""
+        groups: list[list[Scored]] = []
+        for one in scored:
+            if one.gain <= 0.0 and len(groups) >= self.rules.fewest_refits:
+                break
+            for group in groups:
+                if abs(float(group[0].signature @ one.signature)) > self.rules.twin_cosine:
+                    group.append(one)
+                    break
+            else:
+                groups.append([one])
+        return groups
+
+    def scores(self, base: Hypothesis) -> list[Scored]:
+        """All effects that a set lacks, by what one derivative promises; best first."""
+        key = frozenset(base.effects)
+        if key not in self._scores:
+            point = base.point
+            columns = point.level_columns
+            if base.items:
+                columns = joined(columns, effect_columns(point, base.items))
+            scorer = _Scorer(point, columns)
+            found = []
+            for name, items in self.catalogue.items.items():
+                if name in base.effects:
+                    continue
+                effect = self.catalogue.effects[name]
+                one = _proposed(effect, items, base) if effect.search.sought else scorer.score(name, items)
+                if one is not None:
+                    found.append(one)
+            self._scores[key] = sorted(found, key=lambda one: -one.gain)
+        return self._scores[key]
+
+    def _added(self, base: Hypothesis, one: Scored) -> Hypothesis:
+        """The set with one effect more."""
+        names = (*base.effects, one.name)
+        step = frozenset(base.effects), one.name
+        if step in self._added_before:
+            return self.pool[frozenset(names)]
+        items = self.catalogue.items[one.name]
+        starts = [one.start] if one.start is not None else self._starts(base, one, items)
+        found = None
+        for start in starts:
+            if start is not None:
+                new = fit(names, (*base.items, *items), start)
+                found = new if found is None or new.log_evidence > found.log_evidence else found
+        if found is None:
+            return base
+        self._added_before.add(step)
+        self.say(
+            f"  {'+'.join(names)}: promised {one.gain:.1f}, brings {found.log_evidence - base.log_evidence:.1f}"
+        )
+        return self._keep(found)
+
+    def _starts(self, base: Hypothesis, one: Scored, items: tuple[Coordinate, ...]) -> list[Point]:
+        """The best of the linear step, other sizes, and what lies a repetition away."""
+        parts = (1.0,) if len(items) == 1 else (1.0, 0.3)
+        tried = [
+            [item.null + part * step for item, step in zip(items, one.step, strict=True)] for part in parts
+        ]
+        if len(items) == 1:
+            (item,) = items
+            sides = (item.side,) if item.side else (1.0, -1.0)
+            tried += [[item.null + side * size * item.scale] for side in sides for size in self.rules.sizes]
+            if item.side:  # its signature may grow with its square
+                square = abs(one.step[0]) * SECANT * item.scale
+                tried.append([item.null + item.side * math.sqrt(square)])
+            if item.repeat:
+                tried += [[tried[0][0] + turn * item.repeat] for turn in (-1.0, 1.0)]
+        found = [base.point]
+        for values in tried:
+            try:
+                found.append(jumped(base.point, items, values))
+            except OutOfRangeError:  # no layer is thinner than nothing
+                continue
+        return sorted(found, key=lambda point: point.cost)[: 2 if len(items) == 1 else 1]
+
+
+class _Scorer:
+    """Scores of effects beside what is free at a point."""
+
+    def __init__(self, point: Point, columns: Columns) -> None:
+        self.point, self.columns = point, columns
+        self.base = point.information(columns, columns)
+        self.gradient = point.score(columns) - columns.log_det
+
+    def score(self, name: str, items: tuple[Coordinate, ...]) -> Scored | None:
+        """What the derivatives of an effect promise."""
+        try:
+            own = effect_columns(self.point, items)
+        except OutOfRangeError:
+            return None
+        across = np.linalg.solve(self.base, self.point.information(self.columns, own))
+        matrix = self.point.information(own, own) - self.point.information(own, self.columns) @ across
+        gradient = self.point.score(own) - own.log_det - across.T @ self.gradient
+        scale = np.array([item.scale for item in items])
+        best, step, degrees = -math.inf, np.zeros(len(items)), 0
+        for highest in sorted({item.refinement for item in items}):
+            few = np.array([item.refinement <= highest for item in items])
+            gain, part = _best_gain(matrix[np.ix_(few, few)], gradient[few], scale[few])
+            if gain > best:
+                best, step = gain, np.zeros(len(items))
+                step[few] = part
+                degrees = int(few.sum())
+        if len(items) == 1 and items[0].side * step[0] < 0.0:
+            best, step = -1.0, -step
+        signature = np.tensordot(step, own.value - np.tensordot(across.T, self.columns.value, axes=1), axes=1)
+        flat = self.point.projected(signature).ravel()
+        return Scored(name, best, degrees, step, flat / max(float(np.linalg.norm(flat)), 1e-300))
+
+
+def _best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tuple[float, FloatArray]:
+    """Largest gain of log evidence over the width of the prior, and its step."""
+    best, step = -math.inf, scale * 0.0
+    for width in WIDTHS:
+        prior = np.diag((width * scale) ** -2.0)
+        part = np.linalg.solve(matrix + prior, gradient)
+        inflated = np.eye(len(scale)) + matrix * (width * scale) ** 2
+        gain = 0.5 * float(gradient @ part) - 0.5 * float(np.linalg.slogdet(inflated)[1])
+        if gain > best:
+            best, step = gain, np.asarray(part, dtype=float)
+    return best, step
+
+
+def _proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) -> Scored | None:
+    """What an effect that is sought proposes itself, or nothing."""
+    point = base.point
+    geometry = point.problem.forward.geometry
+    shape = (len(point.levels), *geometry.sample_shape)
+    left = (point.problem.data.value - point.value * point.levels[:, np.newaxis]).reshape(shape)
+    weight = point.problem.data.weight.reshape(shape)
+    best = None
+    for values in effect.propose(Residuals(np.where(weight > 0.0, left, 0.0), weight, geometry)):
+        try:
+            start = jumped(point, items, [values[item.parameter] for item in items])
+        except OutOfRangeError:
+            continue
+        if best is None or start.cost < best.cost:
+            best = start
+    if best is None:
+        return None
+    step = np.array([best.settings[item.key] - item.null for item in items])
+    change = point.projected(best.whitened(best.value) - point.whitened(point.value)).ravel()
+    unit = change / max(float(np.linalg.norm(change)), 1e-300)
+    return Scored(effect.name, point.cost - best.cost, len(items), step, unit, best)

@@ -1,0 +1,261 @@
+"""The search on one likelihood from a cube to a verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from ....effects import Effect
+from ....model import FringeModel
+from ....products.fringe_cube import FringeCube
+from ...inference import Hypothesis
+from ..channels import Channel
+from ..classes import outsider_probability
+from ..describe import describe_residual, disagreement
+from ..verdict import CONFIDENCE, Gap, NamedEffect, ParameterValue, Step, Verdict, probability_text
+from .critics import judge, state_of, total_chance
+from .heldout import Unseen, judge_unseen
+from .preparation import Prepared, prepare, prepare_again
+from .rules import Rules
+from .search import Catalogue, SetSearch
+
+__all__ = ["search_marginal"]
+
+FloatArray = NDArray[np.float64]
+
+_METRIC = "rms of data minus model, relative counts"
+
+
+def search_marginal(
+    cube: FringeCube,
+    model: FringeModel,
+    effects: Sequence[Effect],
+    rng: np.random.Generator,
+    most_cells: int,
+    report: Callable[[str], None],
+) -> Verdict:
+    """Search flats by one log marginal likelihood; parameters and result are those of `discover`."""
+    rules = Rules()
+    report("fitting the thickness with the unchanged model")
+    prepared = prepare(cube, model, effects, most_cells, rules, rng)
+    return _Judgement(prepared, model, effects, rules, report).verdict()
+
+
+class _Judgement:
+    """One search, and how its answer is put."""
+
+    def __init__(
+        self,
+        prepared: Prepared,
+        model: FringeModel,
+        effects: Sequence[Effect],
+        rules: Rules,
+        report: Callable[[str], None],
+    ) -> None:
+        self.prepared, self.model, self.rules, self.report = prepared, model, rules, report
+        stack = model.system.stack
+        medium = stack.layers[stack.position(model.system.varying)].medium
+        wavelength = prepared.cells.wavelength_nm
+        self.index = np.real(medium.index(wavelength, model.system.temperature_k))
+        self.order_um = float(model.fringe_order_um(np.median(wavelength)))
+        self.catalogue = Catalogue.of(effects, prepared.problem.forward)
+        self.sets = SetSearch(self.catalogue, prepared.null, rules, report, self._leaves_noise)
+
+    def _leaves_noise(self, found: Hypothesis) -> bool:
+        return total_chance(self._channels(found)) > self.rules.significance
+
+    def _channels(self, found: Hypothesis) -> tuple[Channel, ...]:
+        return judge(found, self.prepared.null, self.index, self.rules)
+
+    def verdict(self) -> Verdict:
+        """The answer."""
+        null = self.prepared.null
+        before = self._channels(null)
+        self.report(f"chance that noise alone disagrees as much: {total_chance(before):.3g}")
+        best = self.sets.run(1)
+        if best.effects:
+            self.report(f"noise and cells are judged again with {best.effects[0]}")
+            self.prepared = prepare_again(self.prepared, best)
+            self.sets = self.sets.on(self.prepared.null)
+            best = self.sets.run(self.rules.most_effects)
+        if not best.effects:
+            if total_chance(before) > self.rules.significance:
+                return self._told("no_discrepancy", null, before, (), {}, None)
+            return self._unexplained(null, before, ["no effect of the catalogue explains it"], (), None)
+        after = self._channels(best)
+        unseen = judge_unseen(self.prepared, best, self.order_um)
+        named, doubts = self._named(best, total_chance(after))
+        reasons = []
+        if total_chance(after) < self.rules.significance:
+            worst, names = min(after, key=lambda channel: channel.probability), ", ".join(best.effects)
+            reasons.append(
+                f"with {names} a residual remains in '{worst.name}' (chance {worst.probability:.2g})"
+            )
+        reasons += [*self._at_ends(best), *doubts]
+        if unseen is not None and not unseen.better:
+            reasons.append("data held out are not predicted better")
+        if reasons:
+            return self._unexplained(best, before, reasons, named, unseen)
+        return self._told("named", best, before, named, {}, unseen)
+
+    def _at_ends(self, best: Hypothesis) -> list[str]:
+        """Parameters at an end of their range that nature does not have."""
+        found = []
+        for item, value in zip(best.items, best.values, strict=True):
+            natural = self.catalogue.effects[item.effect].search.natural_bounds
+            if not item.place and value in (item.low, item.high) and value not in (item.null, *natural):
+                found.append(f"{item.key} is at the end of its range ({value:g})")
+        return found
+
+    # Classes --------------------------------------------------------------------------------------------------
+
+    def _named(self, best: Hypothesis, chance: float) -> tuple[tuple[NamedEffect, ...], list[str]]:
+        """Every effect of the best set with its class, and what is too doubtful."""
+        pool = list(self.sets.pool.values())
+        top = self.sets.posterior(best)
+        weights = np.exp(np.minimum([self.sets.posterior(one) - top for one in pool], 0.0))
+        explained = self.prepared.null.chi2 - best.chi2
+        like = cast(Any, SimpleNamespace(names=best.effects, probability_of_noise=chance))
+        outsider = outsider_probability(like, self.rules.outsider_prior, explained)
+        named, doubts = [], []
+        for name in best.effects:
+            members = self._class_of(best, name)
+            inside = np.array([bool(set(one.effects) & set(members)) for one in pool])
+            probability = float((weights * inside).sum() / weights.sum()) * (1.0 - outsider)
+            if probability < self.rules.least_probability:
+                doubts.append(f"the class of {name} has probability {probability_text(probability)} only")
+            others = tuple(sorted((one for one in members if one != name), key=lambda one: -members[one]))
+            without = self.sets.without(best, name)
+            named.append(
+                NamedEffect(
+                    name,
+                    self._parameters(best, name),
+                    probability,
+                    others,
+                    "further wavelengths; this search does not rank them yet" if others else "",
+                    members[name] / sum(members.values()),
+                    math.sqrt(max(without.chi2 - best.chi2, 0.0)),
+                )
+            )
+        return tuple(sorted(named, key=lambda one: -one.significance)), doubts
+
+    def _class_of(self, best: Hypothesis, name: str) -> dict[str, float]:
+        """Weights of the effects that explain the data about as well in the place of one."""
+        rest = frozenset(best.effects) - {name}
+        top, members = best.log_evidence, {name: 1.0}
+        for names, one in self.sets.pool.items():
+            extra = names - rest
+            if rest < names and len(extra) == 1 and len(names) == len(best.effects):
+                behind = top - one.log_evidence
+                if behind < self.rules.class_width:
+                    members[next(iter(extra))] = math.exp(-max(behind, 0.0))
+        return members
+
+    @staticmethod
+    def _parameters(best: Hypothesis, name: str) -> dict[str, ParameterValue]:
+        sigma = np.sqrt(np.maximum(np.diag(best.covariance), 0.0))
+        return {
+            item.parameter: ParameterValue(float(value), float(error), item.unit)
+            for item, value, error in zip(best.items, best.values, sigma, strict=True)
+            if item.effect == name
+        }
+
+    # Layout ---------------------------------------------------------------------------------------------------
+
+    def _unexplained(
+        self,
+        found: Hypothesis,
+        before: tuple[Channel, ...],
+        reasons: Sequence[str],
+        partial: Sequence[NamedEffect],
+        unseen: Unseen | None,
+    ) -> Verdict:
+        state = state_of(found.point, found.point.level_columns)
+        cells = self.prepared.cells
+        channels = self._channels(found)
+        description = {
+            "reason": "; ".join(reasons),
+            "too_poor": False,
+            "partial": [
+                {"name": e.name, "probability": e.probability, "significance": e.significance,
+                 "parameters": {k: [p.value, p.sigma] for k, p in e.parameters.items()}}
+                for e in partial
+            ],
+            **describe_residual(state, cells.geometry, self.index, cells.cell_px, channels),
+        }  # fmt: skip
+        return self._told("unexplained", found, before, (), description, unseen)
+
+    def _told(
+        self,
+        word: str,
+        found: Hypothesis,
+        before: tuple[Channel, ...],
+        effects: tuple[NamedEffect, ...],
+        unexplained: dict[str, Any],
+        unseen: Unseen | None,
+    ) -> Verdict:
+        null, cells = self.prepared.null, self.prepared.cells
+        state = state_of(null.point, null.point.level_columns)
+        first, last = self._rms(null), self._rms(found)
+        outside = (first, last) if unseen is None else (unseen.before_rms, unseen.after_rms)
+        steps: tuple[Step, ...] = ()
+        if found.effects:
+            gained = found.log_evidence - null.log_evidence
+            quiet = word == "named"
+            steps = (Step(found.effects, gained, null.chi2 - found.chi2, first, last, quiet),)
+        notes = ["searched by one likelihood (core marginal)"]
+        notes += [f"{name} was left out: {why}" for name, why in self.catalogue.left_out.items()]
+        scored = self.sets.scores(null)
+        return Verdict(
+            word, effects,
+            disagreement(state, before, cells.geometry, self.index, cells.cell_px),
+            Gap(_METRIC, first, last, *outside, cells.noise_rms),
+            steps, unexplained, self.model.setup.name, total_chance(before),
+            tuple({"name": one.name, "score": 2.0 * one.gain, "degrees": one.degrees} for one in scored),
+            (), tuple(notes), self._data(found), size=self._size(null),
+        )  # fmt: skip
+
+    def _data(self, found: Hypothesis) -> dict[str, Any]:
+        cells, thickness = self.prepared.cells, found.point.thickness_um
+        return {
+            "shape": list(cells.shape),
+            "cell_px": cells.cell_px,
+            "wavelength_nm": cells.wavelength_nm.tolist(),
+            "noise_factor": self.prepared.noise_factor.tolist(),
+            "response_scatter": cells.response_scatter,
+            "thickness_um": [float(thickness.min()), float(thickness.max())],
+        }
+
+    def _chi2(self, found: Hypothesis) -> tuple[float, float]:
+        """Chi square beside all that is free, and its degrees of freedom."""
+        point = found.point
+        seen = point.problem.data.seen
+        left = point.projected(point.residual)[:, seen]
+        free = len(point.levels) + len(found.items)
+        return float((left**2).sum()), float(point.noise_share[:, seen].sum()) - free
+
+    def _rms(self, found: Hypothesis) -> float:
+        chi2, degrees = self._chi2(found)
+        return self.prepared.cells.noise_rms * math.sqrt(chi2 / degrees)
+
+    def _size(self, null: Hypothesis) -> dict[str, float]:
+        """Size of what the unchanged model leaves beyond noise."""
+        chi2, degrees = self._chi2(null)
+        noise = self.prepared.cells.noise_rms
+        counts, most = (
+            noise * math.sqrt(max(chi2 / expected - 1.0, 0.0))
+            for expected in (degrees, float(chdtri(degrees, CONFIDENCE)))
+        )
+        pattern = null.point.value[:, null.point.problem.data.seen]
+        fringes = math.sqrt(float(pattern.var(axis=1).mean()))
+        return {
+            "of_counts": counts,
+            "of_fringes": counts / fringes,
+            "of_fringes_at_most": most / fringes,
+        }

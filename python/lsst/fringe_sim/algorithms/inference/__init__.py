@@ -1,0 +1,24 @@
+"""The core of the inference: one log marginal likelihood by which everything is compared."""
+
+from .cell_average import CellShape
+from .coordinates import Coordinate, coordinates_of
+from .forward import Forward
+from .marginal import Columns, Data, Point, Problem, joined
+from .optimise import Hypothesis, effect_columns, fit, jumped, relaxed
+
+__all__ = [
+    "CellShape",
+    "Columns",
+    "Coordinate",
+    "Data",
+    "Forward",
+    "Hypothesis",
+    "Point",
+    "Problem",
+    "coordinates_of",
+    "effect_columns",
+    "fit",
+    "joined",
+    "jumped",
+    "relaxed",
+]

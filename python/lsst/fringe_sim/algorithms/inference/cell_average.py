@@ -1,0 +1,139 @@
+"""The response averaged over a cell: three places in thickness stand for all of its area."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from ...compiled import contiguous, kernel
+
+__all__ = ["CellShape", "look_up"]
+
+FloatArray = NDArray[np.float64]
+
+LEAST_SPREAD_UM2 = 1e-14
+"""Variance of the thickness in a cell that is rounding [µm²]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellShape:
+    """What the thickness does within each of N cells: its change and its curvature.
+
+    A cell is the sum of its area and of a blur, which are independent. The moments of the thickness follow
+    from theirs to the second order of the curvature.
+    """
+
+    gradient: FloatArray  # (2, N): change along rows and columns [µm/px]
+    hessian: FloatArray  # (3, N): second derivatives yy, yx, xx [µm/px²]
+    cell_px: int
+    area: bool = True  # whether pixels see all of their area; otherwise the point in their middle
+
+    @classmethod
+    def of_field(
+        cls, thickness_um: FloatArray, cell_px: int, error_um: float = 0.0, *, area: bool = True
+    ) -> CellShape:
+        """From the thickness of all cells ``(ny, nx)``, through a spline that follows it but for its error."""
+        rows, columns = (cell_px * np.arange(size, dtype=float) for size in thickness_um.shape)
+        if min(thickness_um.shape) < 4:
+            empty = np.zeros((3, thickness_um.size))
+            return cls(empty[:2], empty, cell_px, area)
+        spline = RectBivariateSpline(rows, columns, thickness_um, s=error_um**2 * thickness_um.size)
+
+        def derivative(dy: int, dx: int) -> FloatArray:
+            return np.asarray(spline(rows, columns, dx=dy, dy=dx)).ravel()
+
+        first = np.stack([derivative(1, 0), derivative(0, 1)])
+        return cls(first, np.stack([derivative(2, 0), derivative(1, 1), derivative(0, 2)]), cell_px, area)
+
+    def nodes(self, blur_px: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Three places of every cell about its own thickness [µm], and their weights; each ``(3, N)``.
+
+        ``blur_px``: rms radius along one axis of a Gaussian blur. The three have the second, third and fourth moment
+        of the thickness: of an even slope those of Gauss and Legendre.
+        """
+        if blur_px == 0.0:
+            return self._unblurred
+        return self._nodes(blur_px)
+
+    @cached_property
+    def _unblurred(self) -> tuple[FloatArray, FloatArray]:
+        return self._nodes(0.0)
+
+    def _nodes(self, blur_px: float) -> tuple[FloatArray, FloatArray]:
+        shift, second, third, fourth = self._moments(blur_px)
+        some = second > LEAST_SPREAD_UM2
+        safe = np.where(some, second, 1.0)
+        skew = np.where(some, third / safe, 0.0)
+        tail = np.where(some, fourth / safe, 0.0)
+        skew = np.clip(skew, -np.sqrt(0.25 * tail), np.sqrt(0.25 * tail))
+        product = tail - skew**2  # of the two distances on both sides
+        width = np.sqrt(skew**2 + 4.0 * product)
+        upper, lower = 0.5 * (width + skew), 0.5 * (width - skew)
+        shares = [
+            np.divide(second, width * side, out=np.zeros_like(width), where=some) for side in (upper, lower)
+        ]
+        places = np.stack([np.zeros_like(width), upper, -lower]) + shift
+        return places, np.stack([1.0 - shares[0] - shares[1], *shares])
+
+    def _moments(self, blur_px: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Mean, and second to fourth moment of the thickness about that, from the place in the middle."""
+        side = float(self.cell_px)
+        point = 0.0 if self.area else 1.0
+        variance = (side**2 - point) / 12.0 + blur_px**2
+        cumulant = -(side**4 - point) / 120.0
+        down, along = self.gradient
+        yy, yx, xx = self.hessian
+        mean = 0.5 * variance * (yy + xx)
+        second = variance * (down**2 + along**2) + 0.5 * variance**2 * (yy**2 + 2.0 * yx**2 + xx**2)
+        second += 0.25 * cumulant * (yy**2 + xx**2)
+        own = 0.5 * (2.0 * variance**2 + cumulant) * (down**2 * yy + along**2 * xx)
+        third = 3.0 * (own + 2.0 * variance**2 * down * along * yx)
+        fourth = 3.0 * second**2 + cumulant * (down**4 + along**4)
+        return mean, second, third, fourth
+
+
+def look_up(
+    table: FloatArray,
+    start_um: float,
+    step_um: float,
+    thickness_um: FloatArray,
+    nodes: tuple[FloatArray, ...],
+) -> tuple[FloatArray, FloatArray]:
+    """Value and derivative of the rows of a table ``(W, D)``, averaged over the nodes of N cells; each ``(W, N)``."""
+    value, slope = np.zeros((2, len(table), thickness_um.size))
+    column = contiguous(table.T, float)
+    _look_up(column, start_um, step_um, contiguous(thickness_um, float), *nodes, value, slope)
+    return value, slope
+
+
+@kernel
+def _look_up(  # type: ignore[no-untyped-def]
+    column, start, step, thickness, away, share, value, slope
+):  # pragma: no cover - compiled
+    waves = column.shape[1]
+    own, steep = np.zeros(waves), np.zeros(waves)
+    for i in range(thickness.size):
+        own[:] = 0.0
+        steep[:] = 0.0
+        for j in range(away.shape[0]):
+            q = share[j, i]
+            if q == 0.0:
+                continue
+            place = min(max((thickness[i] + away[j, i] - start) / step, 1.0), column.shape[0] - 2.0)
+            k = min(math.floor(place), column.shape[0] - 3)
+            x = place - k
+            for w in range(waves):
+                a, b, c, d = column[k - 1, w], column[k, w], column[k + 1, w], column[k + 2, w]
+                c1 = c - a / 3.0 - b / 2.0 - d / 6.0
+                c2 = 0.5 * (a + c) - b
+                c3 = (d - a) / 6.0 + 0.5 * (b - c)
+                own[w] += q * (b + x * (c1 + x * (c2 + x * c3)))
+                steep[w] += q * (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / step
+        for w in range(waves):
+            value[w, i] = own[w]
+            slope[w, i] = steep[w]

@@ -1,0 +1,206 @@
+"""What the model says of the cells: a pure function of effects and thickness."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
+from ...model import FringeModel
+from ...optics.illumination import Illumination
+from ..discovery.evaluations import note_evaluation
+from .cell_average import CellShape, look_up
+
+__all__ = ["Forward"]
+
+FloatArray = NDArray[np.float64]
+Settings = Mapping[str, float]
+_Key = tuple[tuple[str, float], ...]
+
+TABLE_STEP_UM = 0.004
+"""Spacing of the thickness grid [µm]: 75 per fringe order; cubic interpolation is good to 1e-6."""
+
+TABLE_TOLERANCE = 1e-9
+"""Error of the tables relative to the fringes; derivatives are differences of tables 1e-3 of a prior scale apart."""
+
+LINE_STEP_NM = 0.1
+"""Spacing of wavelength nodes [nm]."""
+
+NUDGE_UM = 1e-3
+"""Change of thickness with which effects on the image are differentiated [µm]; they are nearly linear."""
+
+MOST_TABLES = 400
+"""Tables kept for reuse; which of them are there changes no answer."""
+
+
+@dataclass(frozen=True, eq=False)
+class Forward:
+    """Model of one sensor on cells.
+
+    Attributes
+    ----------
+    model : `FringeModel`
+        The model as it is known before the search.
+    catalogue : sequence of `Effect`
+        Effects that may be set.
+    geometry : `ImageGeometry`
+        Centres of the cells, wavelengths, levels.
+    shape : `CellShape`
+        What the thickness does within the cells.
+    range_um : `tuple` [`float`, `float`]
+        Thicknesses of the tables [µm]; the light is relative to its tapered mean over them, whatever is asked.
+    centroid : `numpy.ndarray`, shape ``(2, W, N)``, optional
+        Where the good pixels of a cell have their mean, from its centre [px].
+    """
+
+    model: FringeModel
+    catalogue: Sequence[Effect]
+    geometry: ImageGeometry
+    shape: CellShape
+    range_um: tuple[float, float]
+    centroid: FloatArray | None = None
+    _tables: dict[_Key, FloatArray] = field(default_factory=dict, repr=False)
+    _rows: dict[tuple[_Key, int, float], FloatArray] = field(default_factory=dict, repr=False)
+    _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        self._by_name.update({effect.name: effect for effect in self.catalogue})
+
+    @property
+    def waves(self) -> int:
+        """Number of exposures."""
+        return len(self.geometry.wavelength_nm)
+
+    def effect_of(self, key: str) -> Effect:
+        """The effect that a setting belongs to."""
+        return self._by_name[key.partition(".")[0]]
+
+    def predict(self, settings: Settings, thickness_um: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Signal of the cells relative to its mean level, and its derivative with respect to thickness [1/µm].
+
+        ``thickness_um`` (N,): thickness in the middle of the cells. Returns two arrays ``(W, N)``.
+        """
+        note_evaluation()
+        everything = {**self.model.effect_settings, **settings}
+        image = {key: value for key, value in everything.items() if self.effect_of(key).acts_on == "image"}
+        optical = {key: value for key, value in everything.items() if key not in image}
+        value, slope = self._light(optical, thickness_um, self._blur_px(image))
+        image = {key: value for key, value in image.items() if not self._is_blur(self.effect_of(key))}
+        if not any(
+            not item.is_null(self.model.base_system) for item in activate_effects(image, self.catalogue)
+        ):
+            return value, slope
+        changed = self._on_image(image, value)
+        return changed, (self._on_image(image, value + NUDGE_UM * slope) - changed) / NUDGE_UM
+
+    def _light(
+        self, optical: Settings, thickness_um: FloatArray, blur_px: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """The same before effects on the image."""
+        nodes = self.shape.nodes(blur_px)
+        everywhere = {key: value for key, value in optical.items() if not self.effect_of(key).local}
+        value, slope = self._looked_up(self.table(everywhere), thickness_um, nodes)
+        if len(everywhere) < len(optical):
+            for item, model in self._model(optical).islands:
+                part = item.coverage(self.model.base_system, self.geometry).ravel()
+                own = {f"{item.effect.name}.{name}": x for name, x in item.values.items()}
+                places = {f"{item.effect.name}.{name}" for name in item.effect.search.places}
+                key = tuple(
+                    sorted({**everywhere, **{k: v for k, v in own.items() if k not in places}}.items())
+                )
+                inside = self._looked_up(self._island_table(key, everywhere, model), thickness_um, nodes)
+                value, slope = (
+                    all_ + part * (here - all_) for all_, here in zip((value, slope), inside, strict=True)
+                )
+        return value, slope
+
+    def _looked_up(
+        self, table: FloatArray, thickness_um: FloatArray, nodes: tuple[FloatArray, ...]
+    ) -> tuple[FloatArray, FloatArray]:
+        value, slope = look_up(table, self.range_um[0], TABLE_STEP_UM, thickness_um, nodes)
+        if self.centroid is not None:
+            value = value + slope * np.einsum("an,awn->wn", self.shape.gradient, self.centroid)
+        return value, slope
+
+    def _on_image(self, settings: Settings, value: FloatArray) -> FloatArray:
+        active = activate_effects(settings, self.catalogue)
+        image = value.reshape(self.waves, *self.geometry.sample_shape)
+        return apply_to_image(active, self.model.base_system, image, self.geometry).reshape(value.shape)
+
+    @staticmethod
+    def _is_blur(effect: Effect) -> bool:
+        """Whether all that an effect on the image does is to spread signal alike."""
+        return type(effect).blur_px is not Effect.blur_px
+
+    def _blur_px(self, image: Settings) -> float:
+        """Blur of all effects, which is a spread of the thickness where that changes evenly."""
+        active = activate_effects(image, self.catalogue)
+        return math.hypot(
+            *(item.effect.blur_px(item.values) for item in active if self._is_blur(item.effect))
+        )
+
+    # Tables ---------------------------------------------------------------------------------------------------
+
+    def _model(self, settings: Settings) -> FringeModel:
+        return self.model.with_effects({**self.model.effect_settings, **settings}, self.catalogue)
+
+    @property
+    def _count(self) -> int:
+        return math.ceil((self.range_um[1] - self.range_um[0]) / TABLE_STEP_UM) + 1
+
+    def table(self, settings: Settings) -> FloatArray:
+        """Response ``(W, D)`` on the grid of thickness over its tapered mean, of effects that are everywhere."""
+        key = tuple(sorted(settings.items()))
+        if key not in self._tables:
+            self._keep(key, self._over_mean(self._response(settings)))
+        return self._tables[key]
+
+    def _island_table(self, key: _Key, everywhere: Settings, model: FringeModel) -> FloatArray:
+        """The same where a local effect is, over the mean of all other places."""
+        if key not in self._tables:
+            light = model.system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
+            outside = self._response(everywhere)
+            level = np.average(outside, axis=1, weights=self._taper)
+            self._keep(key, self._grid_response(model, light, slice(None)) / level[:, np.newaxis])
+        return self._tables[key]
+
+    @property
+    def _taper(self) -> FloatArray:
+        return np.hanning(self._count + 2)[1:-1]
+
+    def _over_mean(self, response: FloatArray) -> FloatArray:
+        return np.asarray(response / np.average(response, axis=1, weights=self._taper)[:, np.newaxis])
+
+    def _keep(self, key: _Key, table: FloatArray) -> None:
+        self._tables[key] = table
+        if len(self._tables) > MOST_TABLES:
+            self._tables.pop(next(iter(self._tables)))
+
+    def _response(self, settings: Settings) -> FloatArray:
+        """Response of all exposures; those whose wavelength stays are not computed again."""
+        model = self._model(settings)
+        light = model.system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
+        moving = {key for key in settings if self.effect_of(key).search.moves_wavelengths}
+        if not moving and settings:
+            return self._grid_response(model, light, slice(None))
+        rest = tuple(sorted((key, value) for key, value in settings.items() if key not in moving))
+        keys = [(rest, row, float(first)) for row, first in enumerate(light.wavelength_nm[:, 0])]
+        fresh = [row for row, key in enumerate(keys) if key not in self._rows]
+        if fresh:
+            if len(self._rows) > MOST_TABLES:
+                self._rows.clear()
+                fresh = list(range(self.waves))
+            found = self._grid_response(model, light, fresh)
+            self._rows.update({keys[row]: own for row, own in zip(fresh, found, strict=True)})
+        return np.stack([self._rows[key] for key in keys])
+
+    def _grid_response(self, model: FringeModel, light: Illumination, rows: list[int] | slice) -> FloatArray:
+        part = Illumination(light.wavelength_nm[rows], light.theta[rows], light.weight[rows])
+        wavelength = self.geometry.wavelength_nm[rows]
+        return model.respond_on_grid(
+            part, self.range_um[0], TABLE_STEP_UM, self._count, wavelength, tolerance=TABLE_TOLERANCE
+        )

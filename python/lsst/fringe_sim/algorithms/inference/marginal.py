@@ -1,0 +1,301 @@
+"""The likelihood linearised at a point: response and thickness of every cell leave in closed form, 2 x 2 per cell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .forward import Forward
+
+__all__ = ["Columns", "Data", "Point", "Problem"]
+
+FloatArray = NDArray[np.float64]
+
+SECOND_STEP_UM = 1e-3
+"""Change of thickness with which the slope is differentiated [µm]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """Values of N cells at W exposures, at any level, and their inverse variances; 0 where there are none."""
+
+    value: FloatArray  # (W, N)
+    weight: FloatArray  # (W, N)
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Cells with data, ``(N,)``."""
+        return np.asarray((self.weight > 0.0).any(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Data, model, and the priors of what every cell has for itself."""
+
+    data: Data
+    forward: Forward
+    thickness_um: FloatArray  # (N,): the first thickness, about which that of a cell is Gaussian
+    response_sigma: float  # prior of the response of a cell
+    thickness_sigma_um: float = 1.0  # some fringe orders, which pulls no cell
+    accuracy: float = (
+        0.0  # prior of the part in which the model's contrast is wrong, and of its trend in wavelength
+    )
+
+    def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
+        """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""
+        value, slope = self.forward.predict(settings, thickness_um)
+        return Point(self, dict(settings), levels, thickness_um, value, slope)
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant."""
+
+    value: FloatArray  # (K, W, N)
+    cells: (
+        FloatArray  # (K, 2, N): their part along response and thickness of the cells, in units of unit noise
+    )
+    log_det: FloatArray  # (K,): derivative of the log determinant of the cells, the thickness following
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Effects, levels and thickness, with the model there."""
+
+    problem: Problem
+    settings: dict[str, float]
+    levels: FloatArray
+    thickness_um: FloatArray
+    value: FloatArray  # (W, N): model over level
+    slope: FloatArray  # (W, N): its derivative with respect to thickness
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """Inverse standard deviations."""
+        return np.sqrt(self.problem.data.weight)
+
+    @cached_property
+    def response(self) -> FloatArray:
+        """Whitened model: the derivative with respect to the response of a cell."""
+        return self.whitened(self.value)
+
+    @cached_property
+    def steep(self) -> FloatArray:
+        """Whitened derivative with respect to thickness."""
+        return self.whitened(self.slope)
+
+    @cached_property
+    def residual(self) -> FloatArray:
+        """Whitened data minus model."""
+        return self.problem.data.value * self.root - self.response
+
+    def whitened(self, values: FloatArray) -> FloatArray:
+        """Model values in units of the noise."""
+        return np.asarray(values * self.levels[:, np.newaxis] * self.root)
+
+    # Cells ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _precision(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Elements uu, ut, tt of the 2 x 2 precision of every cell."""
+        uu = (self.response**2).sum(axis=0) + self.problem.response_sigma**-2
+        tt = (self.steep**2).sum(axis=0) + self.problem.thickness_sigma_um**-2
+        return uu, (self.response * self.steep).sum(axis=0), tt
+
+    @cached_property
+    def _root(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Cholesky factor of that: first diagonal, lower, second diagonal."""
+        uu, ut, tt = self._precision
+        first = np.sqrt(uu)
+        lower = ut / first
+        return first, lower, np.sqrt(np.maximum(tt - lower**2, 1e-12 * tt))
+
+    def _forward_solved(self, along: FloatArray) -> FloatArray:
+        """Inverse of the factor times vectors ``(..., 2, N)``."""
+        first, lower, second = self._root
+        top = along[..., 0, :] / first
+        return np.stack([top, (along[..., 1, :] - lower * top) / second], axis=-2)
+
+    def _back_solved(self, along: FloatArray) -> FloatArray:
+        first, lower, second = self._root
+        bottom = along[..., 1, :] / second
+        return np.stack([(along[..., 0, :] - lower * bottom) / first, bottom], axis=-2)
+
+    def _along(self, values: FloatArray) -> FloatArray:
+        """Products of whitened values ``(..., W, N)`` with the derivatives of the cells, ``(..., 2, N)``."""
+        return np.stack([(self.response * values).sum(axis=-2), (self.steep * values).sum(axis=-2)], axis=-2)
+
+    @cached_property
+    def _prior_pull(self) -> FloatArray:
+        """What the prior of the thickness adds to the products of the residual."""
+        pull = (self.problem.thickness_um - self.thickness_um) * self.problem.thickness_sigma_um**-2
+        return np.stack([np.zeros_like(pull), pull])
+
+    @cached_property
+    def residual_cells(self) -> FloatArray:
+        """The residual along the cells, in units of unit noise, ``(2, N)``."""
+        return self._forward_solved(self._along(self.residual) + self._prior_pull)
+
+    @cached_property
+    def cell_energy(self) -> FloatArray:
+        """Half of chi square of every cell with its response at the best, at this thickness, ``(N,)``."""
+        own = 0.5 * (self.residual**2).sum(axis=0)
+        own -= 0.5 * (self._along(self.residual)[0] / self._root[0]) ** 2
+        away = (self.thickness_um - self.problem.thickness_um) / self.problem.thickness_sigma_um
+        return np.asarray(own + 0.5 * away**2)
+
+    @cached_property
+    def log_det(self) -> float:
+        """Half of the log determinant of the cells over that of their priors."""
+        first, _, second = self._root
+        priors = len(first) * np.log(self.problem.response_sigma * self.problem.thickness_sigma_um)
+        return float(np.log(first).sum() + np.log(second).sum() + priors)
+
+    @cached_property
+    def cost(self) -> float:
+        """Minus the log likelihood with the cells integrated, but for the constant of the noise."""
+        return float(self.cell_energy.sum()) + self.log_det + self._accuracy_cost
+
+    @property
+    def linear_cost(self) -> float:
+        """The same with the thickness of every cell at the best of the linear model, not where it is."""
+        away = (self.thickness_um - self.problem.thickness_um) / self.problem.thickness_sigma_um
+        energy = 0.5 * float((self.residual**2).sum() + (away**2).sum() - (self.residual_cells**2).sum())
+        return energy + self.log_det + self._accuracy_cost
+
+    # Accuracy of the model --------------------------------------------------------------------------------------
+
+    @cached_property
+    def accuracy_columns(self) -> Columns:
+        """Fringes stronger or weaker than the model's by the prior, alike and in proportion to wavelength."""
+        fringes = self.response - self.root * (self.levels * self.value.mean(axis=1))[:, np.newaxis]
+        wavelength = self.problem.forward.geometry.wavelength_nm
+        colour = (wavelength - wavelength.mean()) / max(float(np.ptp(wavelength)), 1e-9)
+        trend = np.stack([np.ones(len(colour)), 2.0 * colour])[..., np.newaxis] * self.problem.accuracy
+        # What noise makes of the thickness strengthens the fringes; the log determinant takes that back.
+        return self.columns(trend * fringes, trend * self.steep)
+
+    @cached_property
+    def _accuracy(self) -> tuple[FloatArray, FloatArray]:
+        """Precision of those two beside the cells, and their score."""
+        columns = self.accuracy_columns
+        score = self._raw_score(columns) - columns.log_det
+        return np.eye(2) + self._raw_information(columns, columns), score
+
+    @cached_property
+    def _accuracy_cost(self) -> float:
+        if self.problem.accuracy == 0.0:
+            return 0.0
+        matrix, score = self._accuracy
+        return 0.5 * float(np.linalg.slogdet(matrix)[1] - score @ np.linalg.solve(matrix, score))
+
+    # Dense parameters -----------------------------------------------------------------------------------------
+
+    def columns(self, values: FloatArray, slopes: FloatArray) -> Columns:
+        """Dense columns from whitened derivatives of value and slope, each ``(K, W, N)``."""
+        cells = self._forward_solved(self._along(values))
+        return Columns(values, cells, self._log_det_change(values, slopes, cells))
+
+    @cached_property
+    def level_columns(self) -> Columns:
+        """Those of the levels."""
+        waves = len(self.levels)
+        values, slopes = np.zeros((2, waves, *self.value.shape))
+        values[np.arange(waves), np.arange(waves)] = self.value * self.root
+        slopes[np.arange(waves), np.arange(waves)] = self.slope * self.root
+        return self.columns(values, slopes)
+
+    def _log_det_change(self, values: FloatArray, slopes: FloatArray, cells: FloatArray) -> FloatArray:
+        """Change of the log determinant with dense parameters, with the thickness that follows them."""
+        direct = self._log_det_by(self._along(values), (self.response * slopes).sum(axis=-2),
+                                  (self.steep * slopes).sum(axis=-2))  # fmt: skip
+        moved = -self._back_solved(cells)[..., 1, :]
+        return np.asarray(direct.sum(axis=-1) + (moved * self._log_det_by_thickness).sum(axis=-1))
+
+    def _log_det_by(self, along: FloatArray, us: FloatArray, ts: FloatArray) -> FloatArray:
+        """Change of the half log determinant of cells whose derivatives change, ``(..., N)``."""
+        uu, ut, tt = self._precision
+        det = (self._root[0] * self._root[2]) ** 2
+        return np.asarray((tt * along[..., 0, :] - ut * (us + along[..., 1, :]) + uu * ts) / det)
+
+    @cached_property
+    def _log_det_by_thickness(self) -> FloatArray:
+        up, down = (
+            self.problem.forward.predict(self.settings, self.thickness_um + sign * SECOND_STEP_UM)[1]
+            for sign in (1.0, -1.0)
+        )
+        second = self.whitened((up - down) / (2.0 * SECOND_STEP_UM))
+        along = self._along(self.steep)
+        return self._log_det_by(
+            along, (self.response * second).sum(axis=0), (self.steep * second).sum(axis=0)
+        )
+
+    def information(self, first: Columns, second: Columns) -> FloatArray:
+        """Fisher matrix of dense columns with cells and accuracy integrated."""
+        plain = self._raw_information(first, second)
+        if self.problem.accuracy == 0.0:
+            return plain
+        own = self.accuracy_columns
+        solved = np.linalg.solve(self._accuracy[0], self._raw_information(own, second))
+        return np.asarray(plain - self._raw_information(first, own) @ solved)
+
+    def score(self, columns: Columns) -> FloatArray:
+        """Derivative of the log likelihood with respect to dense parameters, without that of the determinant."""
+        plain = self._raw_score(columns)
+        if self.problem.accuracy == 0.0:
+            return plain
+        matrix, score = self._accuracy
+        across = self._raw_information(columns, self.accuracy_columns)
+        return np.asarray(plain - across @ np.linalg.solve(matrix, score))
+
+    def _raw_information(self, first: Columns, second: Columns) -> FloatArray:
+        whole = np.tensordot(first.value, second.value, axes=([1, 2], [1, 2]))
+        return np.asarray(whole - np.tensordot(first.cells, second.cells, axes=([1, 2], [1, 2])))
+
+    def _raw_score(self, columns: Columns) -> FloatArray:
+        whole = np.tensordot(columns.value, self.residual, axes=([1, 2], [0, 1]))
+        return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
+
+    def followed_um(self, step: FloatArray, columns: Columns) -> FloatArray:
+        """Change of the thickness that goes with a step of dense parameters [µm]."""
+        left = self.residual_cells - np.tensordot(step, columns.cells, axes=1)
+        return np.asarray(self._back_solved(left)[1])
+
+    def projected(self, values: FloatArray) -> FloatArray:
+        """Whitened values less what response and thickness of the cells make of them."""
+        cells = self._back_solved(self._forward_solved(self._along(values)))
+        return np.asarray(values - self.response * cells[..., :1, :] - self.steep * cells[..., 1:, :])
+
+    @cached_property
+    def noise_share(self) -> FloatArray:
+        """Part of the variance of unit noise that the projection leaves, ``(W, N)``."""
+        solved = self._forward_solved(np.stack([self.response, self.steep], axis=-2))
+        return np.asarray(1.0 - (solved**2).sum(axis=-2))
+
+    @cached_property
+    def thickness_sigma_um(self) -> FloatArray:
+        """Error of the thickness of every cell, ``(N,)`` [µm]."""
+        return np.asarray(1.0 / self._root[2])
+
+    def problem_with(self, data: Data) -> Point:
+        """The same point of a problem with other data."""
+        return replace(self, problem=replace(self.problem, data=data))
+
+    def moved(
+        self, levels: FloatArray, thickness_um: FloatArray, settings: Mapping[str, float] | None = None
+    ) -> Point:
+        """The same problem elsewhere."""
+        return self.problem.at(self.settings if settings is None else settings, levels, thickness_um)
+
+
+def joined(first: Columns, second: Columns) -> Columns:
+    """Columns of two groups of parameters."""
+    return Columns(
+        np.concatenate([first.value, second.value]),
+        np.concatenate([first.cells, second.cells]),
+        np.concatenate([first.log_det, second.log_det]),
+    )

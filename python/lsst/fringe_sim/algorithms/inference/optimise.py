@@ -1,0 +1,203 @@
+"""Gauss-Newton with the cells projected out, and what a fit becomes: a hypothesis with its log evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import OutOfRangeError
+from .coordinates import Coordinate, log_evidence_of_parameters
+from .marginal import Columns, Point, joined
+
+__all__ = ["Hypothesis", "effect_columns", "fit", "jumped", "relaxed"]
+
+FloatArray = NDArray[np.float64]
+
+MOST_STEP_UM = 0.05
+"""Farthest that a step moves the thickness of a cell [µm]: a sixth of a fringe order."""
+
+MOST_JUMP_UM = 0.25
+"""The same of a finite change of an effect, whose thickness may have to follow by most of an order."""
+
+RIDGE_SCALES = 10.0
+"""Prior scales of the Gaussian that keeps parameters which the data do not see where they are."""
+
+SHRINK = (1.0, 0.4, 0.12, 0.03)
+"""Parts of a step that are tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A set of effects at its best, and its log evidence."""
+
+    effects: tuple[str, ...]
+    items: tuple[Coordinate, ...]
+    point: Point
+    log_evidence: float
+    covariance: FloatArray  # (K, K) of the parameters
+
+    @property
+    def values(self) -> FloatArray:
+        """Values of the parameters, ``(K,)``."""
+        return np.array([self.point.settings[item.key] for item in self.items])
+
+    @property
+    def chi2(self) -> float:
+        """Chi square with response and thickness of the cells at the best."""
+        return 2.0 * float(self.point.cell_energy.sum())
+
+
+def effect_columns(point: Point, items: Sequence[Coordinate]) -> Columns:
+    """Derivatives with respect to parameters of effects."""
+    shape = (len(items), *point.value.shape)
+    values, slopes = np.empty(shape), np.empty(shape)
+    for row, item in enumerate(items):
+        now = point.settings.get(item.key, item.null)
+        step = item.difference(now)
+        value, slope = point.problem.forward.predict(
+            {**point.settings, item.key: now + step}, point.thickness_um
+        )
+        values[row] = point.whitened((value - point.value) / step)
+        slopes[row] = point.whitened((slope - point.slope) / step)
+    return point.columns(values, slopes)
+
+
+def relaxed(point: Point, rounds: int = 3, tolerance: float = 0.02) -> Point:
+    """Levels and thickness at the best for these effects."""
+    for _ in range(rounds):
+        columns = point.level_columns
+        gradient = point.score(columns) - columns.log_det
+        step = np.asarray(np.linalg.solve(point.information(columns, columns), gradient))
+        moved = np.clip(point.followed_um(step, columns), -MOST_STEP_UM, MOST_STEP_UM)
+        for part in SHRINK[:2]:
+            new = point.moved(point.levels + part * step, point.thickness_um + part * moved)
+            if new.cost < point.cost:
+                break
+        else:
+            return point
+        gain, point = point.cost - new.cost, new
+        if gain < tolerance:
+            break
+    return point
+
+
+def jumped(point: Point, items: Sequence[Coordinate], values: Sequence[float]) -> Point:
+    """Another value of some parameters, with the thickness that goes with it, and relaxed."""
+    settings = {**point.settings, **{i.key: i.clipped(v) for i, v in zip(items, values, strict=True)}}
+    value, _ = point.problem.forward.predict(settings, point.thickness_um)
+    change = point.columns(point.whitened(value - point.value)[np.newaxis], np.zeros((1, *value.shape)))
+    moved = np.clip(point.followed_um(np.ones(1), change), -MOST_JUMP_UM, MOST_JUMP_UM)
+    return relaxed(point.moved(point.levels, point.thickness_um + moved, settings), rounds=2)
+
+
+def fit(
+    effects: Sequence[str],
+    items: Sequence[Coordinate],
+    start: Point,
+    *,
+    rounds: int = 12,
+    tolerance: float = 0.03,
+) -> Hypothesis:
+    """The best parameters, levels and thickness from a start, by steps that lower the cost."""
+    point = _started(items, start)
+    for number in range(rounds + 1):
+        columns = point.level_columns
+        if items:
+            columns = joined(columns, effect_columns(point, items))
+        information = point.information(columns, columns)
+        if number == rounds:
+            break
+        step = _step(point, items, columns, information)
+        new = _best_of_parts(point, items, step, point.followed_um(step, columns))
+        if new is None:
+            break
+        gain, point = _target(point, items) - _target(new, items), new
+        if gain < tolerance:
+            break
+    return _hypothesis(effects, items, point)
+
+
+def _started(items: Sequence[Coordinate], start: Point) -> Point:
+    """The start with a value for every parameter, none of them where nothing leads away from."""
+    settings = {item.key: start.settings.get(item.key, item.null) for item in items}
+    if settings == start.settings:
+        return start
+    return start.moved(start.levels, start.thickness_um, settings)
+
+
+def _target(point: Point, items: Sequence[Coordinate]) -> float:
+    ridge = sum(
+        ((point.settings[i.key] - i.null) / (RIDGE_SCALES * i.scale)) ** 2 for i in items if not i.place
+    )
+    return point.cost + 0.5 * float(ridge)
+
+
+def _step(point: Point, items: Sequence[Coordinate], columns: Columns, information: FloatArray) -> FloatArray:
+    """Gauss-Newton step of levels and parameters; those at a bound that want to leave it stay."""
+    waves = len(point.levels)
+    gradient = point.score(columns) - columns.log_det
+    matrix = information.copy()
+    for row, item in enumerate(items, start=waves):
+        precision = 0.0 if item.place else (RIDGE_SCALES * item.scale) ** -2.0
+        matrix[row, row] += precision + 1e-12 * information[row, row]
+        gradient[row] -= precision * (point.settings[item.key] - item.null)
+    step: FloatArray = np.asarray(np.linalg.solve(matrix, gradient))
+    free = np.ones(len(gradient), dtype=bool)
+    for row, item in enumerate(items, start=waves):
+        value = point.settings[item.key]
+        free[row] = not (value <= item.low and step[row] < 0.0) and not (
+            value >= item.high and step[row] > 0.0
+        )
+    if not free.all():
+        step = np.zeros(len(gradient))
+        step[free] = np.linalg.solve(matrix[np.ix_(free, free)], gradient[free])
+    return step
+
+
+def _best_of_parts(
+    point: Point, items: Sequence[Coordinate], step: FloatArray, moved_um: FloatArray
+) -> Point | None:
+    """The point of the longest part of a step that is better, or nothing."""
+    waves, now = len(point.levels), _target(point, items)
+    moved_um = np.clip(moved_um, -MOST_STEP_UM, MOST_STEP_UM)
+    for part in SHRINK:
+        settings = {
+            item.key: item.clipped(point.settings[item.key] + part * change)
+            for item, change in zip(items, step[waves:], strict=True)
+        }
+        try:
+            new = point.moved(
+                point.levels + part * step[:waves], point.thickness_um + part * moved_um, settings
+            )
+        except OutOfRangeError:  # no layer is thinner than nothing
+            continue
+        if not math.isfinite(new.cost):
+            continue
+        if _target(new, items) >= now:
+            new = relaxed(new, rounds=1)
+        if _target(new, items) < now:
+            return new
+    return None
+
+
+def _hypothesis(effects: Sequence[str], items: Sequence[Coordinate], point: Point) -> Hypothesis:
+    """The log evidence of a fit: levels and parameters leave as a Gaussian."""
+    waves, columns = len(point.levels), point.level_columns
+    if items:
+        columns = joined(columns, effect_columns(point, items))
+    information = point.information(columns, columns)
+    levels = information[:waves, :waves]
+    across = information[:waves, waves:]
+    own = information[waves:, waves:] - across.T @ np.linalg.solve(levels, across)
+    own = np.asarray(0.5 * (own + own.T), dtype=float)
+    values = np.array([point.settings[item.key] for item in items])
+    evidence = -point.cost - 0.5 * float(np.linalg.slogdet(levels)[1])
+    evidence += log_evidence_of_parameters(items, values, own)
+    covariance = np.zeros((len(items), len(items)))
+    if items:
+        covariance[:] = np.linalg.pinv(own, hermitian=True)
+    return Hypothesis(tuple(effects), tuple(items), point, evidence, covariance)

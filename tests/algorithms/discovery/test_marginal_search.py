@@ -1,0 +1,83 @@
+"""The search on one likelihood: what it finds, and what the part held out may not do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
+from lsst.fringe_sim.algorithms.discovery.marginal.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
+from lsst.fringe_sim.effects import known_effects
+from lsst.fringe_sim.errors import UnknownNameError
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube
+
+WAVELENGTHS = np.linspace(880.0, 990.0, 8)
+SIDE = 32
+ELECTRONS = 20_000.0
+
+
+def cube_of(rng: np.random.Generator, effects: dict[str, float]) -> FringeCube:
+    """Flats of a small sensor with photon noise; the optics are the package's own."""
+    y, x = np.mgrid[:SIDE, :SIDE] / SIDE
+    thickness = 15.0 + 0.5 * x + 0.3 * y**2 - 0.2 * x * y
+    model = FringeModel.from_setup("ts8_e2v", effects)
+    light = model.system.flat_fields(WAVELENGTHS, 0.1)
+    flats = model.respond(light, thickness, WAVELENGTHS)
+    flats *= ELECTRONS / flats.mean(axis=(1, 2), keepdims=True)
+    image = rng.poisson(flats).astype(np.float32)
+    setup = model.setup
+    rows = FlatExposures(
+        WAVELENGTHS, np.full(8, setup.bandwidth_fwhm_nm), np.full(8, model.base_system.temperature_k)
+    )
+    return FringeCube(image, np.maximum(image, 1.0), np.zeros(image.shape, np.int32), rows, "electron")
+
+
+def verdict_of(cube: FringeCube) -> Verdict:
+    """What the search says of it."""
+    return discover(cube, "ts8_e2v", rng=np.random.default_rng(5), options=SearchOptions(core="marginal"))
+
+
+@pytest.mark.slow
+@pytest.mark.rng("marginal null")
+def test_nothing_is_found_where_nothing_is(rng: np.random.Generator) -> None:
+    verdict = verdict_of(cube_of(rng, {}))
+    assert verdict.verdict == "no_discrepancy"
+    assert verdict.global_probability > 1e-3
+    assert Verdict.from_json(verdict.to_json()).verdict == "no_discrepancy"
+
+
+@pytest.mark.slow
+@pytest.mark.rng("marginal single")
+def test_an_effect_is_named(rng: np.random.Generator) -> None:
+    verdict = verdict_of(cube_of(rng, {"wavelength_offset.offset": 1.5}))
+    assert verdict.verdict == "named"
+    (found,) = verdict.effects
+    assert "wavelength_offset" in (found.name, *found.ambiguous_with)
+
+
+@pytest.mark.rng("marginal held out")
+def test_selection_does_not_see_the_part_held_out(rng: np.random.Generator) -> None:
+    cube = cube_of(rng, {})
+    model = FringeModel.from_setup("ts8_e2v")
+    effects = [effect for effect in known_effects(None) if not effect.sky_only]
+
+    def prepared(cube: FringeCube):  # type: ignore[no-untyped-def]
+        return prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+
+    first = prepared(cube)
+    held = first.unseen.seen
+    assert 0.1 < held.mean() < 0.4
+    assert not (held & first.cells.seen).any()
+    planted = np.where(held, cube.image * (1.0 + 0.3 * rng.standard_normal(held.shape)), cube.image)
+    second = prepared(replace(cube, image=planted.astype(np.float32)))
+    assert np.array_equal(first.null.point.thickness_um, second.null.point.thickness_um)
+    assert first.null.log_evidence == second.null.log_evidence
+
+
+def test_another_core_is_refused() -> None:
+    with pytest.raises(UnknownNameError, match="core"):
+        SearchOptions(core="newest")

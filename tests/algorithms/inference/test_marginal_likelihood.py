@@ -1,0 +1,175 @@
+"""The log marginal likelihood against a dense calculation, against pixels, and its gradient against differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.inference import (
+    CellShape,
+    Data,
+    Forward,
+    Point,
+    Problem,
+    coordinates_of,
+    effect_columns,
+    fit,
+    relaxed,
+)
+from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
+from lsst.fringe_sim.model import FringeModel
+
+WAVELENGTHS = np.array([900.0, 930.0, 955.0, 970.0, 985.0])
+SIDE = 10
+BY_NAME = {effect.name: effect for effect in EFFECTS}
+
+
+def field(y: np.ndarray, x: np.ndarray, part: float = 1.0) -> np.ndarray:
+    """A curved thickness [µm] at places in pixels, or in units of so many pixels."""
+    y, x = part * y, part * x
+    return 14.0 + 0.035 * x + 0.02 * y + 0.0008 * x**2 - 0.0005 * x * y + 0.0004 * y**2
+
+
+def forward_of(cell_px: int = 1, side: int = SIDE, part: float = 1.0) -> tuple[Forward, np.ndarray]:
+    """Forward model of cells, and their thickness."""
+    y = cell_px * np.arange(side) + 0.5 * (cell_px - 1.0)
+    thickness = field(*np.meshgrid(y, y, indexing="ij"), part)
+    geometry = ImageGeometry(
+        (cell_px * side, cell_px * side), y, y, WAVELENGTHS, np.full(len(WAVELENGTHS), 20_000.0)
+    )
+    limits = (float(thickness.min()) - 0.3, float(thickness.max()) + 0.3)
+    shape = CellShape.of_field(thickness, cell_px)
+    return Forward(FringeModel.from_setup("ts8_e2v"), EFFECTS, geometry, shape, limits), thickness.ravel()
+
+
+def point_of(rng: np.random.Generator, settings: dict[str, float], response: float = 0.003) -> Point:
+    """A point near the best of noisy data that have the settings."""
+    forward, thickness = forward_of()
+    value = forward.predict(settings, thickness)[0]
+    sigma = 0.005 * np.sqrt(value)
+    data = Data(value + sigma * rng.standard_normal(value.shape), sigma**-2.0)
+    problem = Problem(data, forward, thickness, response)
+    return relaxed(problem.at({}, np.ones(len(WAVELENGTHS)), thickness))
+
+
+@pytest.mark.rng("evidence of cells")
+@pytest.mark.parametrize("accuracy", [0.0, 0.01])
+def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator, accuracy: float) -> None:
+    point = point_of(rng, {})
+    point = replace(point, problem=replace(point.problem, accuracy=accuracy))
+    problem, waves, cells = point.problem, *point.value.shape
+    columns = point.level_columns
+    information, score = point.information(columns, columns), point.score(columns)
+    ours = -point.linear_cost + 0.5 * score @ np.linalg.solve(information, score)
+    ours -= 0.5 * np.linalg.slogdet(information)[1]
+    # All levels, responses and thicknesses in one matrix.
+    wrong = 2 if accuracy else 0
+    dense = np.zeros((waves * cells, waves + 2 * cells + wrong))
+    prior, pull = np.zeros(dense.shape[1]), np.zeros(dense.shape[1])
+    if accuracy:
+        fringes = point.value - point.value.mean(axis=1, keepdims=True)
+        fringes *= point.levels[:, np.newaxis] * np.sqrt(problem.data.weight)
+        colour = 2.0 * (WAVELENGTHS - WAVELENGTHS.mean()) / np.ptp(WAVELENGTHS)
+        dense[:, -2], dense[:, -1] = fringes.ravel(), (colour[:, np.newaxis] * fringes).ravel()
+        prior[-2:] = accuracy**-2
+    for w in range(waves):
+        for c in range(cells):
+            row = w * cells + c
+            root = np.sqrt(problem.data.weight[w, c])
+            dense[row, w] = root * point.value[w, c]
+            dense[row, waves + c] = root * point.levels[w] * point.value[w, c]
+            dense[row, waves + cells + c] = root * point.levels[w] * point.slope[w, c]
+    prior[waves : waves + cells] = problem.response_sigma**-2
+    prior[waves + cells : waves + 2 * cells] = problem.thickness_sigma_um**-2
+    away = problem.thickness_um - point.thickness_um
+    pull[waves + cells : waves + 2 * cells] = problem.thickness_sigma_um**-2 * away
+    residual = point.residual.ravel()
+    precision = dense.T @ dense + np.diag(prior)
+    gradient = dense.T @ residual + pull
+    if accuracy:
+        gradient[-2:] -= point.accuracy_columns.log_det / accuracy
+    energy = 0.5 * (residual @ residual + (away**2).sum() / problem.thickness_sigma_um**2)
+    expected = -energy + 0.5 * gradient @ np.linalg.solve(precision, gradient)
+    expected -= 0.5 * np.linalg.slogdet(precision)[1]
+    expected -= cells * np.log(problem.response_sigma * problem.thickness_sigma_um)
+    expected -= wrong * np.log(accuracy or 1.0)
+    assert ours == pytest.approx(expected, rel=1e-8)
+
+
+def with_best_cells(point: Point, settings: dict[str, float], levels: np.ndarray) -> Point:
+    """The same levels and effects with the thickness of every cell at its best."""
+    at = point.moved(levels, point.thickness_um, {**point.settings, **settings})
+    for _ in range(12):
+        columns = at.level_columns
+        moved = at.followed_um(np.zeros(len(levels)), columns)
+        at = at.moved(levels, at.thickness_um + moved)
+    return at
+
+
+@pytest.mark.rng("gradient of evidence")
+@pytest.mark.parametrize(
+    "key", ["bandwidth.fwhm", "wavelength_offset.offset", "illumination.gradient_x", "roughness.sigma"]
+)
+def test_gradients_are_differences(key: str, rng: np.random.Generator) -> None:
+    # Gauss and Newton neglect the product of response and derivative.
+    point = point_of(rng, {}, response=1e-5)
+    name, _, parameter = key.partition(".")
+    items = [
+        item for item in coordinates_of(BY_NAME[name], point.problem.forward) if item.parameter == parameter
+    ]
+    (item,) = items
+    start = item.null + 0.2 * item.scale
+    at = with_best_cells(point, {key: start}, point.levels)
+    columns = effect_columns(at, items)
+    gradient = -(at.score(columns) - columns.log_det)[0]
+    step = 0.01 * item.scale
+    costs = [with_best_cells(at, {key: start + sign * step}, at.levels).cost for sign in (1.0, -1.0)]
+    assert gradient == pytest.approx((costs[0] - costs[1]) / (2.0 * step), rel=2e-3, abs=0.02 / item.scale)
+
+
+@pytest.mark.rng("gradient of levels")
+def test_gradients_of_levels_are_differences(rng: np.random.Generator) -> None:
+    point = point_of(rng, {}, response=1e-5)
+    at = with_best_cells(point, {}, point.levels + 0.001)
+    gradient = -(at.score(at.level_columns) - at.level_columns.log_det)
+    for wave, step in enumerate(2e-4 * np.eye(len(at.levels))):
+        costs = [with_best_cells(at, {}, at.levels + sign * step).cost for sign in (1.0, -1.0)]
+        assert gradient[wave] == pytest.approx((costs[0] - costs[1]) / 4e-4, rel=1e-3, abs=0.5)
+
+
+@pytest.mark.rng("a fit finds it")
+def test_fit_finds_what_is_there(rng: np.random.Generator) -> None:
+    point = point_of(rng, {"bandwidth.fwhm": 2.9})
+    items = coordinates_of(BY_NAME["bandwidth"], point.problem.forward)
+    found, null = fit(("bandwidth",), items, point), fit((), (), point)
+    assert abs(found.values[0] - 2.9) < 4.0 * np.sqrt(found.covariance[0, 0])
+    assert np.sqrt(found.covariance[0, 0]) < 0.3
+    assert found.log_evidence > null.log_evidence
+
+
+def test_answer_does_not_depend_on_what_was_asked_before() -> None:
+    forward, thickness = forward_of()
+    first = forward.predict({"bandwidth.fwhm": 2.5}, thickness)[0]
+    forward.predict({"wavelength_offset.offset": 3.0}, thickness + 0.25)
+    fresh = forward_of()[0].predict({"bandwidth.fwhm": 2.5}, thickness)[0]
+    assert np.array_equal(first, forward.predict({"bandwidth.fwhm": 2.5}, thickness)[0])
+    assert np.array_equal(first, fresh)
+
+
+@pytest.mark.parametrize("cell_px", [1, 2, 4])
+def test_averages_in_cells_are_those_of_pixels(cell_px: int) -> None:
+    # A cell sees an eighth of a fringe order, whatever its size.
+    forward, thickness = forward_of(cell_px, 8, 1.0 / cell_px)
+    value = forward.predict({}, thickness)[0]
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    centre = cell_px * (np.arange(8) + 0.5) - 0.5
+    place = (centre[:, np.newaxis] + 0.5 * cell_px * nodes).ravel()
+    fine = field(*np.meshgrid(place, place, indexing="ij"), 1.0 / cell_px)
+    light = forward.model.system.flat_fields(WAVELENGTHS, 0.1)
+    exact = forward.model.respond(light, fine, WAVELENGTHS).reshape(len(WAVELENGTHS), 8, 6, 8, 6)
+    exact = np.einsum("wyaxb,a,b->wyx", exact, 0.5 * weights, 0.5 * weights).reshape(value.shape)
+    level = (value * exact).sum(axis=1, keepdims=True) / (exact**2).sum(axis=1, keepdims=True)
+    wrong = (value / level - exact) / exact.std(axis=1, keepdims=True)
+    assert wrong.std() < 1e-4
