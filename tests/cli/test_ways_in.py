@@ -165,8 +165,8 @@ def test_what_is_small_only_on_the_disk_is_refused(
     with open_user_fits(path) as hdus:
         assert hdus[0].data.shape == (2000, 2000)
     # Of a gigabyte it is refused; here a megabyte stands for it.
-    monkeypatch.setattr("lsst.fringe_sim.resources._SMALL", 1 << 20)
-    monkeypatch.setattr("lsst.fringe_sim.resources._EXPANSION", 10)
+    monkeypatch.setattr("lsst.fringe_sim.fits_gate._SMALL", 1 << 20)
+    monkeypatch.setattr("lsst.fringe_sim.fits_gate._EXPANSION", 10)
     with pytest.raises(FrameFormatError, match="bytes in the file"), open_user_fits(path):
         pass
     with open_user_fits(plain):
