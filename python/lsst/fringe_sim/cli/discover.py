@@ -69,7 +69,8 @@ OF_WHAT_WAS_LEARNED = ("learned.py", "learned_effect.py")
     type=click.Choice(["present", "marginal"]),
     default="present",
     show_default=True,
-    help="Which search of flats: the present one, or that on one likelihood, which cannot do everything yet.",
+    help="Which search of flats: the present one, or an experimental one on one likelihood, which cannot do "
+    "everything yet and may change in any version.",
 )
 @click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
 @click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")

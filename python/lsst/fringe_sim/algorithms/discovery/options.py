@@ -48,7 +48,8 @@ class SearchOptions:
     outsider_prior : `float`
         Prior probability of a cause that is not in the catalogue.
     core : {"present", "marginal"}
-        Which search: the present one, or that on one likelihood, which is to replace it and cannot do everything yet.
+        Which search: the present one, or an experimental one on one likelihood, which cannot do everything yet and
+        may change in any version.
     time_budget_s : `float`
         Time on the clock [s] after which the best answer so far is given; as long as it takes by default. A fifth of
         it is kept for the judgement of that answer on the data held out.
