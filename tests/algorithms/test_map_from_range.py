@@ -85,7 +85,12 @@ def test_a_model_that_is_wrong_is_told(rng):
     weights = [np.full(layer.shape, noise**-2)]
     try:
         found = map_from_range(
-            values, weights, (low, high), lambda grid: dark.frame(np.asarray(grid)[None])[0], order_um
+            values,
+            weights,
+            (low, high),
+            lambda grid: dark.frame(np.asarray(grid)[None])[0],
+            order_um,
+            model_accuracy=0.0,
         )
     except UndeterminedError:
         return
