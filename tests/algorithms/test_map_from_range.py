@@ -44,7 +44,7 @@ def test_a_map_is_found_from_a_range(rng):
         weight[20:24, 40:50] = 0.0
     for value in values:
         value[20:24, 40:50] = np.nan
-    found = map_from_range(values, weights, RANGE_UM, light, ORDER_UM)
+    found = map_from_range(values, weights, RANGE_UM, light, ORDER_UM, model_accuracy=0.0)
     away = (found.thickness_um - layer)[found.known]
     assert found.known.mean() > 0.6
     assert not found.known[20:24, 40:50].any()
@@ -85,7 +85,12 @@ def test_a_model_that_is_wrong_is_told(rng):
     weights = [np.full(layer.shape, noise**-2)]
     try:
         found = map_from_range(
-            values, weights, (low, high), lambda grid: dark.frame(np.asarray(grid)[None])[0], order_um
+            values,
+            weights,
+            (low, high),
+            lambda grid: dark.frame(np.asarray(grid)[None])[0],
+            order_um,
+            model_accuracy=0.0,
         )
     except UndeterminedError:
         return
@@ -94,9 +99,13 @@ def test_a_model_that_is_wrong_is_told(rng):
 
 @pytest.mark.slow
 @pytest.mark.rng("a map of the foreign simulator from a range")
-def test_a_map_of_another_simulator(rng):
-    """Its lines, films and silicon are not those of the model, so that phases are off by more than noise."""
-    low, high = 13.0, 14.4
+@pytest.mark.parametrize("low", [13.0, 14.1])
+def test_a_map_of_another_simulator(rng, low):
+    """Its lines, films and silicon are not those of the model, by more than orders differ, so that none is told.
+
+    In the first range the likeliest map is right nevertheless; in the second it is not.
+    """
+    high = low + 0.9
     setup = replace(
         Setup.from_name("lsst_e2v"), beam_kind="cone", f_number=2.25, obscuration=0.61, temperature_k=173.15
     )
@@ -104,25 +113,28 @@ def test_a_map_of_another_simulator(rng):
     order_um = float(model.fringe_order_um(960.0))
     span = low - 2.0 * order_um, high + 2.0 * order_um
     dark = sky_response(model, SkySpectrum.dark(), thickness_range_um=span).sky()
-    layer = foreign_map(rng, (128, 128), 13.1, 14.3)
-    frames = foreign_night(ForeignSky(f_number=2.25), layer, rng, 40)
+    layer = foreign_map(rng, (64, 64), low + 0.1, high - 0.1)
+    frames = foreign_night(ForeignSky(f_number=2.25), layer, rng, 40, electrons=6000.0)
     values = [each.image / each.image.mean() - 1.0 for each in frames]
     weights = [np.full(layer.shape, each.image.mean()) for each in frames]
     found = map_from_range(
         values, weights, (low, high), lambda grid: dark.frame(np.asarray(grid)[None])[0], order_um
     )
     away = (found.thickness_um - layer)[found.known] / order_um
-    assert found.known.mean() > 0.8
-    assert found.order_probability > 0.5
-    assert found.model_error < 0.3
-    assert abs(np.median(away)) < 0.05
-    assert np.mean(np.abs(away) < 0.1) > 0.98
+    assert found.order_probability < 0.5
+    assert found.apart < 0.2
+    if low == 13.0:
+        assert found.known.mean() > 0.8
+        assert found.model_error < 0.3
+        assert np.mean(np.abs(away) < 0.1) > 0.98
 
 
 def test_bad_input_is_named():
     blank = np.zeros((64, 64))
     with pytest.raises(OutOfRangeError, match="range of the thickness"):
         map_from_range([blank], [blank], (14.0, 13.0), light, ORDER_UM)
+    with pytest.raises(OutOfRangeError, match="accuracy of the model"):
+        map_from_range([blank], [blank], RANGE_UM, light, ORDER_UM, model_accuracy=-0.1)
     with pytest.raises(InputError, match="frames"):
         map_from_range([], [], RANGE_UM, light, ORDER_UM)
     with pytest.raises(InputError, match="shape of a frame"):

@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 from lsst.daf.butler import Butler
+from lsst.pipe.base import Pipeline
 from observed_night import ObservedNight, observed_night
 from task_commands import Command
 
+from lsst.fringe_sim.algorithms.correction import AMPLIFIERS_UNKNOWN
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.middleware import MonoCamFringe
 from lsst.fringe_sim.middleware.afw import observed_from_exposure
@@ -30,6 +32,13 @@ from lsst.fringe_sim.tasks import (
 
 NOW = "2026-11-21T03:43:40"
 PIPELINES = "resource://lsst.fringe_sim/pipelines"
+
+
+@pytest.mark.parametrize("camera", ["lsstCam", "hsc", "monocam"])
+def test_pipelines_leave_the_amplifiers_to_the_frame(camera: str) -> None:
+    """Names of amplifiers would free their levels, which then take of the fringes what the default leaves to them."""
+    graph = Pipeline.from_uri(f"{PIPELINES}/{camera}/fringeCorrection.yaml").to_graph()
+    assert {each.config.grid for each in graph.tasks.values()} == {AMPLIFIERS_UNKNOWN}
 
 
 def frame_of(image: np.ndarray) -> ObservedFrame:

@@ -377,7 +377,7 @@ def _correct(run: DemoRun) -> None:
     run.program(
         "correct",
         *("fringe-sim", "correct", str(run.folder / "visits"), "--templates", str(template)),
-        *("--amplifiers", "8x2", "--out", str(run.folder / "corrected"), "--overwrite"),
+        *("--out", str(run.folder / "corrected"), "--overwrite"),
         may_refuse=True,
     )
     if not (run.folder / "corrected" / "report.html").is_file():

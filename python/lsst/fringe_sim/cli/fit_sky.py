@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..algorithms.fringe_correction import CorrectionOptions
+    from ..algorithms.map_from_range import RangeMap
     from ..algorithms.map_on_sky import MapOnSky
     from ..algorithms.range_forecast import RangeForecast
     from ..algorithms.sky_response import Response
@@ -40,6 +41,9 @@ hundredth of the power of the fringes."""
 
 MOST_FRAMES = 1_000_000
 """More than these are not counted."""
+
+LEAST_PROBABILITY = 0.95
+"""Of the order of a map from a range that is written: as of an effect that a search names."""
 
 LARGE_ERROR = 0.3
 """Errors of the fringes, over the fringes, with which neighbouring orders were mistaken for each other in trials
@@ -76,6 +80,14 @@ class _MapOrRange(click.ParamType):
     default=None,
     help="What all of the map may be off by, one σ [µm]; by default 0.15 fringe orders.",
 )
+@click.option(
+    "--model-accuracy",
+    type=click.FloatRange(0.0, 1.0, max_open=True),
+    default=None,
+    metavar="PART",
+    help="Part of the fringes by which the model may be wrong, for the order of a map from a range; by default as "
+    "another simulator differs (0.17); 0 for a model without error.",
+)
 @background_options
 @model_effects("Effect on the sky; may be repeated.")
 @output_folder(
@@ -93,6 +105,7 @@ def fit_sky(
     setup: Setup,
     detector: str | None,
     map_sigma: float | None,
+    model_accuracy: float | None,
     background: Path | None,
     background_px: float,
     amplifiers: tuple[int, int] | None,
@@ -129,7 +142,7 @@ def fit_sky(
         if dry_run:
             click.echo(f"would say how many frames like {len(images)} of {sensor.name} a map takes")
         else:
-            _forecast(thickness, model, loaders, options, out)
+            _forecast(thickness, model, loaders, options, model_accuracy, out)
         return
     layer = read_map(thickness, setup, sensor)
     section = read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
@@ -183,6 +196,7 @@ def _forecast(
     model: FringeModel,
     loaders: Sequence[Callable[[], ObservedFrame]],
     options: CorrectionOptions,
+    model_accuracy: float | None,
     out: OutputFolder,
 ) -> None:
     """How many frames would tell a map of which a range is known."""
@@ -190,6 +204,7 @@ def _forecast(
 
     from astropy.table import Table
 
+    from ..algorithms.map_from_range import map_from_range
     from ..algorithms.range_forecast import forecast_of_range, frame_noise
     from ..algorithms.sky_response import sky_response
     from ..files import table_text, write_whole
@@ -213,20 +228,20 @@ def _forecast(
         click.echo(line)
     click.echo(str(folder / "forecast.ecsv"))
     if len(loaders) >= found.frames:
-        _search(range_um, predict, order_um, loaders, options, model.setup.varying, folder)
+        search = partial(map_from_range, range_um=range_um, predict=predict, order_um=order_um)
+        if model_accuracy is not None:
+            search = partial(search, model_accuracy=model_accuracy)
+        _search(search, loaders, options, model.setup.varying, folder)
 
 
 def _search(
-    range_um: tuple[float, float],
-    predict: Callable[[NDArray[np.float64]], NDArray[np.float32]],
-    order_um: float,
+    search: Callable[..., RangeMap],
     loaders: Sequence[Callable[[], ObservedFrame]],
     options: CorrectionOptions,
     layer: str,
     folder: Path,
 ) -> None:
     """Write the map that the frames tell, or say that they tell none."""
-    from ..algorithms.map_from_range import map_from_range
     from ..algorithms.map_on_sky import fringes_alone
     from ..errors import UndeterminedError
     from ..model.provenance import software_cards
@@ -240,12 +255,16 @@ def _search(
             weights.append(weight)
             advance()
     try:
-        found = map_from_range(values, weights, range_um, predict, order_um)
+        found = search(values, weights)
     except UndeterminedError as error:
         click.echo(f"no map was found: {error}")
         return
-    if found.order_probability < 0.5:
-        click.echo(f"no map was found: the likeliest one has a probability of {found.order_probability:.2g}")
+    if found.order_probability < LEAST_PROBABILITY:
+        click.echo(
+            f"no map was found: the likeliest one has a probability of {found.order_probability:.2g} among other "
+            f"orders and directions, and {LEAST_PROBABILITY:g} is asked for; the next leaves {found.apart:.2g} of its fringes, and the model may be wrong "
+            "by more (--model-accuracy)"
+        )
         return
     if found.model_error >= LARGE_ERROR:
         click.echo(
@@ -257,7 +276,8 @@ def _search(
     click.echo(
         f"{100.0 * float(found.known.mean()):.0f} % of the pixels are known, with a median σ of "
         f"{NM * float(np.median(found.sigma_um[found.known])):.3g} nm within their order; the order of all and the "
-        f"direction are right with a probability of {found.order_probability:.2g}, if the model is"
+        f"direction are right with a probability of {found.order_probability:.2g}, if the range is, and the model "
+        f"to {0.5 * found.apart:.2g} of its fringes"
     )
     click.echo(str(folder / "thickness.fits"))
 
@@ -275,7 +295,8 @@ def forecast_lines(found: RangeForecast, frames: int) -> list[str]:
         f"{found.orders:.1f} fringe orders lie within the range; the layer is a plane over {found.part_px} px",
         f"such a part shows its fringes in {_counted(found.to_see)} frames like the first, at the least; "
         f"one tells the thickness within the order to {found.sigma_um:.3f} µm",
-        f"all pixels tell the order in {_counted(found.to_tell_order)} frames, at the least",
+        f"all pixels tell the order in {_counted(found.to_tell_order)} frames, at the least, if the model is "
+        "right",
         f"{verdict}; a map from the laboratory takes fewer",
     ]
 

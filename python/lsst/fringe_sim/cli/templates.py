@@ -76,7 +76,7 @@ def templates(
     \b
     Examples:
       fringe-sim templates night/*.fits --out templates
-      fringe-sim templates night --amplifiers 8x2 --prior model/fringe_0.fits --out templates
+      fringe-sim templates night --prior model/fringe_0.fits --out templates
     """
     from ..algorithms.correction.empirical import LEARNING_ROUNDS, TemplateOptions
     from ..products import refuse_corrected
