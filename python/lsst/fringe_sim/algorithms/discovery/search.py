@@ -141,7 +141,8 @@ def discover(
         for effect in known_effects(effects)
         if not (effect.sky_only or effect.learned) or effect.name in known
     ]
-    return search_exposures(cube, model, own, rng, options, report)
+    verdict = search_exposures(cube, model, own, rng, options, report)
+    return replace(verdict, known=model.effect_settings)
 
 
 def search_exposures(
