@@ -115,7 +115,7 @@ LEARNED = replace(
     accuracy={"assumed": 0.014, "source": "a table", "chance": 1e-5},
     learned={
         "name": "learned_response",
-        "words": "length 30 nm",
+        "words": "alike over 30 nm",
         "beside": {"roughness.sigma": 20.0},
         "own": {
             f"learned_response.{wave}{harmonic}_{node}": 0.01 / harmonic
@@ -363,3 +363,8 @@ def test_a_pattern_is_said_to_leave_the_thickness_as_it_is() -> None:
     pattern = replace(LEARNED, learned={**LEARNED.learned, "name": "learned_map", "own": own})
     assert "the thickness does not change" in words(discovery_page(pattern).to_html())
     assert "the thickness does not change" not in words(discovery_page(LEARNED).to_html())
+
+
+def test_no_chance_is_zero() -> None:
+    verdict = replace(LEARNED, global_probability=0.0, accuracy={**LEARNED.accuracy, "chance": 0.0})
+    assert "chance below 1e-300 with it, below 1e-300 of noise alone" in verdict.summary()

@@ -54,6 +54,7 @@ from .validation import (
     whole_thickness,
 )
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
+from .verdict_words import chance_text
 
 __all__ = ["SearchOptions", "discover"]
 
@@ -555,7 +556,7 @@ class _Search:
         worst = min(found.channels, key=lambda channel: channel.probability)
         return (
             f"with {', '.join(found.names)} a residual remains in '{worst.name}' "
-            f"(chance {worst.probability:.2g})"
+            f"(chance {chance_text(worst.probability)})"
         )
 
     def _what_may_be_form(self, sets: SetSearch, chosen: Hypothesis) -> list[str]:
