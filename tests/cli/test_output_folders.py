@@ -15,6 +15,7 @@ from lsst.fringe_sim.cli.main import cli, run
 from lsst.fringe_sim.cli.output import OutputFolder
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.files import refuse_unfinished
+from lsst.fringe_sim.model.effects_override import ended
 
 FRAMES = ("--size", "64x64", "--wavelengths", "900", "--bias-frames", "1", "--seed", "1")
 
@@ -173,3 +174,14 @@ def test_the_truth_of_visits_does_not_take_their_place(
     (truth / "visit_1.fits").write_text("of an earlier run")
     assert run([*visits, str(truth)]) == 1
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_an_effect_that_a_person_has_finished_is_not_cleared(tmp_path: Path) -> None:
+    folder = OutputFolder(tmp_path, ("learned_effect.py",), overwrite=True)
+    file = tmp_path / "learned_effect.py"
+    file.write_text(ended("EFFECTS = []\n"))
+    folder.refuse_used()
+    file.write_text(file.read_text().replace("[]", "[Mine()]"))
+    with pytest.raises(InputError, match=r"learned_effect\.py is as it was written"):
+        folder.refuse_used()
+    assert "Mine" in file.read_text()

@@ -18,7 +18,7 @@ from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, Param
 from lsst.fringe_sim.algorithms.flat_residual import FlatResidual, ResidualPair, residual_pair
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.model.effects_override import read_effects_override
+from lsst.fringe_sim.model.effects_override import is_as_written, read_effects_override
 from lsst.fringe_sim.products import FlatExposures, ThicknessMap
 from lsst.fringe_sim.report.discovery_figures import candidates_figure, gap_figure, where_figure
 from lsst.fringe_sim.report.discovery_page import discovery_page
@@ -115,7 +115,7 @@ LEARNED = replace(
     accuracy={"assumed": 0.014, "source": "a table", "chance": 1e-5},
     learned={
         "name": "learned_response",
-        "words": "length 30 nm",
+        "words": "alike over 30 nm",
         "beside": {"roughness.sigma": 20.0},
         "own": {
             f"learned_response.{wave}{harmonic}_{node}": 0.01 / harmonic
@@ -342,3 +342,29 @@ def test_files_of_what_was_learned(tmp_path: Path) -> None:
     assert read_effects_override(text) == {**LEARNED.learned["beside"], **LEARNED.learned["own"]}
     assert read_effects_override((tmp_path / "effects.py").read_text()) == {}
     assert "0.375" in (tmp_path / "learned_effect.py").read_text()  # a phase of the wave form
+
+
+def test_a_correction_stands_behind_what_was_known_before(tmp_path: Path) -> None:
+    known = {"temperature.kelvin": 175.0}
+    replace(LEARNED, known=known).write(tmp_path)
+    read = read_effects_override((tmp_path / "learned.py").read_text())
+    assert read == {**known, **LEARNED.learned["beside"], **LEARNED.learned["own"]}
+
+
+def test_a_finished_effect_can_be_told_from_what_was_written(tmp_path: Path) -> None:
+    LEARNED.write(tmp_path)
+    written = (tmp_path / "learned_effect.py").read_text()
+    assert is_as_written(written)
+    assert not is_as_written(written.replace("Unnamed", "Satellite"))
+
+
+def test_a_pattern_is_said_to_leave_the_thickness_as_it_is() -> None:
+    own = {f"learned_map.{key}": 0.001 for key in ("y0x1", "y1x0")}
+    pattern = replace(LEARNED, learned={**LEARNED.learned, "name": "learned_map", "own": own})
+    assert "the thickness does not change" in words(discovery_page(pattern).to_html())
+    assert "the thickness does not change" not in words(discovery_page(LEARNED).to_html())
+
+
+def test_no_chance_is_zero() -> None:
+    verdict = replace(LEARNED, global_probability=0.0, accuracy={**LEARNED.accuracy, "chance": 0.0})
+    assert "chance below 1e-300 with it, below 1e-300 of noise alone" in verdict.summary()

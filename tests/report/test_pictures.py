@@ -41,8 +41,18 @@ def test_a_color_bar_is_as_high_as_its_map(layout) -> None:
         for axes, shape in zip(places, ((20, 160), (160, 20)), strict=True):
             show_image(axes, np.zeros(shape), label="nothing")
         to_png(made)  # only then the axes have their place
-        assert len(made.axes) == 4
         for part in made.subfigs:
-            image, bar = (axes.get_window_extent() for axes in part.axes)
+            ((axes,), (beside,)) = part.axes, part.axes[0].child_axes
+            image, bar = axes.get_window_extent(), beside.get_window_extent()
             assert (bar.y0, bar.y1) == pytest.approx((image.y0, image.y1), abs=1.0)
             assert bar.width > 5.0
+
+
+def test_what_a_color_bar_says_stays_in_its_panel() -> None:
+    with figure(9.0, 4.0) as made:
+        for axes in panels(made, 2, 2):
+            show_image(axes, np.arange(100.0).reshape(10, 10), label="thickness [µm]")
+        to_png(made)
+        for part in made.subfigs:
+            (beside,) = part.axes[0].child_axes
+            assert beside.yaxis.label.get_window_extent().x1 <= part.bbox.x1 + 2.0  # pixels

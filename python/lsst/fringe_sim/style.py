@@ -164,7 +164,8 @@ def show_image(
 
 def color_bar(axes: Axes, drawn: ScalarMappable, label: str) -> Colorbar:
     """Colour bar beside axes, as high as they are drawn."""
-    place = make_axes_locatable(axes).append_axes("right", BAR_INCH, pad=BAR_GAP_INCH)
+    place = make_axes_locatable(axes).new_horizontal(BAR_INCH, pad=BAR_GAP_INCH)
+    axes.add_child_axes(place)  # a part of the axes, so that a layout leaves room for its label, too
     bar: Colorbar = axes.figure.colorbar(drawn, cax=place, label=label)
     return bar
 

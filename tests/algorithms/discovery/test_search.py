@@ -156,6 +156,15 @@ def test_poor_data_are_told_to_be_poor() -> None:
     assert "nan" not in verdict.summary()
 
 
+def test_the_override_holds_what_was_known_before() -> None:
+    """With what was found alone, a sensor of known weak fringes was fitted and forecast with strong ones."""
+    cube = draw_case("none", np.random.default_rng(3), size=SIZE).cube
+    known = {"contrast_loss.factor": 0.13}
+    verdict = discover(cube.take([4]), FringeModel.from_setup("ts8_e2v", known), rng=np.random.default_rng(0))
+    assert read_effects_override(verdict.override()) == known
+    assert Verdict.from_json(verdict.to_json()).known == known
+
+
 def test_the_mean_of_a_few_pixels_is_no_level() -> None:
     """Twenty pixels in electrons, a third of a fringe, were named black coating; nothing was missing."""
     cube = draw_case("none", np.random.default_rng(3), size=(4, 5)).cube

@@ -42,8 +42,8 @@ hundredth of the power of the fringes."""
 MOST_FRAMES = 1_000_000
 """More than these are not counted."""
 
-LEAST_PROBABILITY = 0.95
-"""Of the order of a map from a range that is written: as of an effect that a search names."""
+LEAST_PROBABILITY = 0.5
+"""Of the order of a map from a range that is written: it is likelier than all others together."""
 
 LARGE_ERROR = 0.3
 """Errors of the fringes, over the fringes, with which neighbouring orders were mistaken for each other in trials
@@ -262,8 +262,8 @@ def _search(
     if found.order_probability < LEAST_PROBABILITY:
         click.echo(
             f"no map was found: the likeliest one has a probability of {found.order_probability:.2g} among other "
-            f"orders and directions, and {LEAST_PROBABILITY:g} is asked for; the next leaves {found.apart:.2g} of its fringes, and the model may be wrong "
-            "by more (--model-accuracy)"
+            f"orders and directions, and {LEAST_PROBABILITY:g} is asked for; the next leaves {found.apart:.2g} of "
+            "its fringes, and the model may be wrong by more (--model-accuracy)"
         )
         return
     if found.model_error >= LARGE_ERROR:

@@ -128,6 +128,22 @@ class OutputFolder(os.PathLike[str]):
                 str(self),
                 f"one in which {foreign[0]} was written by this program; nothing is cleared",
             )
+        self._refuse_changed()
+
+    def _refuse_changed(self) -> None:
+        # A search leaves the beginning of an effect, which a person finishes: that is not there twice.
+        from ..model.effects_override import is_as_written
+
+        for file in self._left():
+            if (
+                file.suffix == ".py"
+                and not file.is_symlink()
+                and not is_as_written(file.read_text(errors="replace"))
+            ):
+                allowed = (
+                    f"one in which {file.name} is as it was written; it was changed, and nothing is cleared"
+                )
+                raise InputError("output folder", str(self), allowed)
 
     def _clear(self) -> None:
         for file in self._left():

@@ -267,6 +267,9 @@ laboratory_of_the_mock = LABORATORY.name_option("ts8_e2v", "Laboratory set-up: n
 """Set-up that the mock reads itself: the command gets it as it was written."""
 
 
+EFFECTS_FILE_HELP = "YAML, or what a search has left: effects.py, learned.py."
+
+
 @dataclass(frozen=True)
 class ChosenEffects:
     """Effects that a command was given."""
@@ -276,7 +279,10 @@ class ChosenEffects:
 
 
 def model_effects(
-    help_text: str = "Effect in the model; may be repeated.", file_help: str = "YAML.", *, own: bool = True
+    help_text: str = "Effect in the model; may be repeated.",
+    file_help: str = EFFECTS_FILE_HELP,
+    *,
+    own: bool = True,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """``--effect`` and ``--effects-file`` of a command, which gets them as `ChosenEffects` named ``effects``.
 

@@ -9,7 +9,14 @@ from collections.abc import Mapping
 from ..effects import catalogue_of, known_effects
 from ..errors import InputError
 
-__all__ = ["effects_override", "read_effects_override", "refuse_other_effects", "written_effects"]
+__all__ = [
+    "effects_override",
+    "ended",
+    "is_as_written",
+    "read_effects_override",
+    "refuse_other_effects",
+    "written_effects",
+]
 
 _STATEMENT = re.compile(r"""config\.effects\[(["'])([\w.]+)\1\]\s*=\s*([^#]+?)\s*(?:#.*)?""")
 
@@ -48,8 +55,18 @@ def effects_override(
     lines += _needs({**(known or {}), **settings})
     if known:
         lines += ["# Known before the search:", *_statements(known), "# Found by it:"]
-    text = "\n".join([*lines, *_statements(settings)]) + "\n"
+    return ended("\n".join([*lines, *_statements(settings)]) + "\n")
+
+
+def ended(text: str) -> str:
+    """A text with a last line by which it can be told from one that was cut short or changed."""
     return f"{text}{_END}{_hash(text)}\n"
+
+
+def is_as_written(text: str) -> bool:
+    """Whether a text ends as `ended` left it, and nobody has changed it since."""
+    content, mark, stated = text.rpartition(_END)
+    return bool(mark) and stated.strip() == _hash(content)
 
 
 def _needs(settings: Mapping[str, float]) -> list[str]:
@@ -143,8 +160,7 @@ def _is_complete(text: str, source: str | None) -> bool:
     """Whether a search wrote a text to its end; `False` for one written by hand, which says nothing of it."""
     if not text.startswith((_WRITTEN, _BEGINNING)):
         return False
-    content, mark, stated = text.rpartition(_END)
-    if not mark or stated.strip() != _hash(content):
+    if not is_as_written(text):
         raise InputError(
             "override file",
             "not what a search has written: cut short, or changed",

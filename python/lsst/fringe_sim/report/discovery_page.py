@@ -11,7 +11,7 @@ from astropy.table import Table
 
 from ..algorithms.discovery import Verdict, probability_text
 from ..algorithms.discovery.verdict import NamedEffect
-from ..algorithms.discovery.verdict_words import accuracy_text, learned_text
+from ..algorithms.discovery.verdict_words import accuracy_text, chance_text, learned_text
 from ..algorithms.flat_residual import ResidualPair
 from ..products import SensorSection
 from .discovery_figures import candidates_figure, gap_figure, leftover_figure, where_figure
@@ -25,8 +25,6 @@ __all__ = ["discovery_page", "headline"]
 PERCENT = 100.0
 FRACTIONS = {"before", "after", "noise floor", "rms", "residual", "sigma", "cos", "sin"}
 """Columns with fractions of the counts, which pages show in percent."""
-
-LEAST_CHANCE = 1e-300
 
 MANY = 6
 """Parameters from which on the summary tells an effect by the rms of their values; the table has them all."""
@@ -208,7 +206,7 @@ def _answer(report: Report, verdict: Verdict) -> None:
 def _chance(chance: float | None) -> str:
     if chance is None or math.isnan(chance):
         return "unknown"
-    return f"{chance:.2g}" if chance > LEAST_CHANCE else f"below {LEAST_CHANCE:g}"
+    return chance_text(chance)
 
 
 def _where(report: Report, verdict: Verdict) -> None:

@@ -88,4 +88,8 @@ def add_learned(report: Report, verdict: Verdict) -> None:
         "learned.py beside this page puts it into any task (-C label:learned.py); patterns of the light stay in the "
         "laboratory. learned_effect.py is the beginning of an effect: a person writes the cause into it."
     )
+    if told["name"] != "learned_response":
+        report.paragraph(
+            "A fit uses it for data minus model alone: the thickness does not change with effects of the image."
+        )
     report.code("fringe-sim fit RAWS --effects-file learned.py --out fit")

@@ -123,6 +123,11 @@ def _used_nodes(wavelength_nm: FloatArray) -> tuple[list[int], FloatArray]:
     return [LEARNED_NODES_NM[number] for number in used], shares[:, used]
 
 
+def _alike(length_nm: float) -> str:
+    """How far wavelengths know of each other, in words."""
+    return "each wavelength by itself" if length_nm == LENGTHS_NM[0] else f"alike over {length_nm:g} nm"
+
+
 def _over_wavelength(nodes: Sequence[int], length_nm: float) -> FloatArray:
     """Root of the covariance of a smooth function at nodes."""
     away = np.subtract.outer(nodes, nodes) / length_nm
@@ -155,7 +160,7 @@ def _of_phase(problem: Problem, fit: Fit, state: State) -> Family:
     for length in LENGTHS_NM:
         for decay in DECAYS:
             sizes = np.repeat([decay ** (harmonic - 1) for harmonic in LEARNED_HARMONICS], 2)
-            words = f"length {length:g} nm, harmonics falling by {decay:g}"
+            words = f"{_alike(length)}, harmonics falling by {decay:g}"
             priors.append((words, _product(np.diag(sizes), _over_wavelength(nodes, length))))
     return Family("learned_response", keys, columns, tuple(priors))
 
@@ -183,7 +188,10 @@ def _of_map(geometry: ImageGeometry, state: State) -> Family:
     keys = tuple(f"learned_map.y{j}x{i}" for j, i in orders)
     columns = LocalColumns(_patterns(geometry, orders), state.whiten(state.value)[np.newaxis])
     priors = [
-        (f"smooth over 1/{width:g} of the sensor", _roots(np.exp(-0.5 * (down**2 + along**2) / width**2)))
+        (
+            f"smooth over {1.0 / width:.2g} of the sensor",
+            _roots(np.exp(-0.5 * (down**2 + along**2) / width**2)),
+        )
         for width in ORDERS
     ]
     priors.append(("of any scale", _roots(np.ones(len(orders)))))
@@ -203,7 +211,7 @@ def _of_light(geometry: ImageGeometry, state: State) -> Family:
     for length in LENGTHS_NM:
         for width in (1.5, 4.0):
             over = _roots(np.exp(-0.5 * (size / width) ** 2))
-            words = f"length {length:g} nm, smooth over 1/{width:g} of the sensor"
+            words = f"{_alike(length)}, smooth over {1.0 / width:.2g} of the sensor"
             priors.append((words, _product(_over_wavelength(nodes, length), over)))
     return Family("learned_light", keys, LocalColumns(_patterns(geometry, orders), terms), tuple(priors))
 

@@ -54,6 +54,7 @@ from .validation import (
     whole_thickness,
 )
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
+from .verdict_words import chance_text
 
 __all__ = ["SearchOptions", "discover"]
 
@@ -141,7 +142,8 @@ def discover(
         for effect in known_effects(effects)
         if not (effect.sky_only or effect.learned) or effect.name in known
     ]
-    return search_exposures(cube, model, own, rng, options, report)
+    verdict = search_exposures(cube, model, own, rng, options, report)
+    return replace(verdict, known=model.effect_settings)
 
 
 def search_exposures(
@@ -554,7 +556,7 @@ class _Search:
         worst = min(found.channels, key=lambda channel: channel.probability)
         return (
             f"with {', '.join(found.names)} a residual remains in '{worst.name}' "
-            f"(chance {worst.probability:.2g})"
+            f"(chance {chance_text(worst.probability)})"
         )
 
     def _what_may_be_form(self, sets: SetSearch, chosen: Hypothesis) -> list[str]:

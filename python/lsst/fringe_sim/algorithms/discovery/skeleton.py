@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...effects import LEARNED, ImageGeometry
 from ...effects.learned import LEARNED_HARMONICS, LEARNED_NODES_NM
-from ...model.effects_override import effects_override
+from ...model.effects_override import effects_override, ended
 
 if TYPE_CHECKING:
     from .verdict import Verdict
@@ -95,7 +95,7 @@ def learned_files(verdict: Verdict) -> dict[str, str]:
         return {}
     beside, own = verdict.learned["beside"], {key: x for key, x in verdict.learned["own"].items() if x}
     told = f"{verdict.verdict}; learned from what no effect explains, not physics"
-    override = effects_override({**beside, **own}, verdict.setup, told)
+    override = effects_override({**beside, **own}, verdict.setup, told, known=verdict.known)
     return {"learned.py": override, "learned_effect.py": effect_skeleton(verdict)}
 
 
@@ -107,10 +107,11 @@ def effect_skeleton(verdict: Verdict) -> str:
     values = {key.partition(".")[2]: value for key, value in told["own"].items() if value}
     listed = "{\n" + "".join(f"    {key!r}: {value!r},\n" for key, value in values.items()) + "}"
     table = _wave_table(told["own"]) if told["name"] == "learned_response" else ""
-    return _TEMPLATE.format(
+    text = _TEMPLATE.format(
         setup=ascii(verdict.setup)[1:-1], table=table, parent=parent, values=listed, acts_on=acts_on,
         method=method, call=call,
     )  # fmt: skip
+    return ended(text)
 
 
 def _wave_table(own: Mapping[str, float]) -> str:

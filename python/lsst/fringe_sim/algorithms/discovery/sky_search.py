@@ -415,7 +415,8 @@ def discover_sky(
         for effect in known_effects(effects)
         if not (effect.laboratory_only or effect.learned) or effect.name in known
     ]
-    return search_exposures(cube, model, own, rng, options or SKY_SEARCH, report, light)
+    verdict = search_exposures(cube, model, own, rng, options or SKY_SEARCH, report, light)
+    return replace(verdict, known=model.effect_settings)
 
 
 @named_units

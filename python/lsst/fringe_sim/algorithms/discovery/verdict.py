@@ -189,6 +189,8 @@ class Verdict(InNotebook):
         What the model may be wrong by: ``assumed``, a part of the fringes, its ``source``, and the ``chance`` that
         noise and such errors together disagree as much with the unchanged model, and ``within``, whether that is why
         there is no discrepancy; empty where that was not asked.
+    known : `dict`
+        Settings of the effects that were in the model before the search; the override holds them, too.
     """
 
     verdict: str
@@ -207,6 +209,7 @@ class Verdict(InNotebook):
     size: dict[str, float] = field(default_factory=lambda: dict.fromkeys(_SIZES, math.nan))
     learned: dict[str, Any] = field(default_factory=dict)
     accuracy: dict[str, Any] = field(default_factory=dict)
+    known: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         """What was found, and with which set-up."""
@@ -293,6 +296,7 @@ class Verdict(InNotebook):
             "learned": self.learned or None,
             "like": list(self.unexplained.get("like", ())),
             "accuracy": self.accuracy,
+            "known": self.known,
         }
         cleaned: dict[str, Any] = _plain(content)
         return cleaned
@@ -343,7 +347,7 @@ class Verdict(InNotebook):
             content["data"],
             complete=content.get("complete", True),
             size={key: _number(content.get("size", {}).get(key)) for key in _SIZES},
-            **{key: content.get(key) or {} for key in ("learned", "accuracy")},
+            **{key: content.get(key) or {} for key in ("learned", "accuracy", "known")},
         )
 
     def table(self) -> Table:
@@ -368,8 +372,8 @@ class Verdict(InNotebook):
         return table
 
     def override(self) -> str:
-        """Text of a config override that puts the effects into fit, sky simulation and templates."""
-        return effects_override(self.settings, self.setup, self.verdict)
+        """Text of a config override that puts effects, known and found, into fit, sky simulation and templates."""
+        return effects_override(self.settings, self.setup, self.verdict, known=self.known)
 
     @property
     def within_accuracy(self) -> bool:

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .verdict import Verdict
 
-__all__ = ["accuracy_text", "learned_text"]
+__all__ = ["accuracy_text", "chance_text", "learned_text"]
+
+LEAST_CHANCE = 1e-300
+"""Chances below this are not told: they are at the end of what a number can be."""
 
 LEARNED_WORDS = {
     "learned_response": "a wave form over the fringe phase",
@@ -18,6 +21,11 @@ LEARNED_WORDS = {
 """What a correction is, by its effect."""
 
 
+def chance_text(chance: float) -> str:
+    """A chance to two digits; none is zero."""
+    return f"{chance:.2g}" if chance > LEAST_CHANCE else f"below {LEAST_CHANCE:g}"
+
+
 def accuracy_text(verdict: Verdict) -> str:
     """The disagreement beside the accuracy of the model; empty where it was not asked for."""
     told = verdict.accuracy
@@ -26,7 +34,7 @@ def accuracy_text(verdict: Verdict) -> str:
     beyond = "within" if verdict.within_accuracy else "beside"
     return (
         f"{beyond} the accuracy of the model, {100.0 * told['assumed']:.2g} % of the fringes ({told['source']}): "
-        f"chance {told['chance']:.2g} with it, {verdict.global_probability:.2g} of noise alone"
+        f"chance {chance_text(told['chance'])} with it, {chance_text(verdict.global_probability)} of noise alone"
     )
 
 
