@@ -634,8 +634,10 @@ class _Search:
         state = whole.state(hypothesis.fit)
         channels: tuple[Channel, ...] = hypothesis.channels or whole.criticise(hypothesis.fit)
         accuracy = self._accuracy(whole, chance)
-        # A search that was stopped says nothing of what it did not try.
-        within = math.isinf(self.until) and accuracy.get("chance", 0.0) > self.options.significance
+        # A search that was stopped says nothing of what it did not try, and what an effect explains is no error of a
+        # table.
+        ended = math.isinf(self.until) and not partial
+        within = ended and accuracy.get("chance", 0.0) > self.options.significance
         verdict, accuracy = ("no_discrepancy" if within else "unexplained"), {**accuracy, "within": within}
         if within:
             reason = f"{WITHIN_ACCURACY}; {reason}"
