@@ -272,6 +272,17 @@ class Effect(Described, ABC):
         """Bounds of a parameter in a search on some samples; narrower where it could imitate something simpler."""
         return parameter.bounds
 
+    def seen_parameters(self, geometry: ImageGeometry) -> tuple[Parameter, ...]:
+        """Parameters that concern some exposure of these samples."""
+        nodes = np.array([parameter.wavelength_nm for parameter in self.parameters])
+        if np.isnan(nodes).any():
+            return tuple(self.parameters)
+        return tuple(
+            parameter
+            for parameter, alone in zip(self.parameters, np.eye(len(nodes)), strict=True)
+            if np.interp(geometry.wavelength_nm, nodes, alone).any()
+        )
+
     def check_search(self, geometry: ImageGeometry) -> None:
         """Refuse to be looked for on some samples.
 

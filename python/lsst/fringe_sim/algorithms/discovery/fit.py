@@ -141,7 +141,7 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
         hints.repeats_after if forward.exposures is None else {**hints.repeats_on_sky, **hints.repeats_after}
     )
     found = []
-    for parameter in _seen_parameters(effect, forward.geometry.wavelength_nm):
+    for parameter in effect.seen_parameters(forward.geometry):
         name = parameter.name
         null, (low, high) = nulls[name], effect.bounds_on(parameter, forward.geometry)
         one_sided = null <= low or null >= high
@@ -154,18 +154,6 @@ def coordinates_of(effect: Effect, forward: Forward, thickness_um: FloatArray) -
             )
         )  # fmt: skip
     return tuple(found)
-
-
-def _seen_parameters(effect: Effect, wavelength_nm: FloatArray) -> list[Parameter]:
-    """Parameters of an effect that concern some exposure."""
-    places = np.array([parameter.wavelength_nm for parameter in effect.parameters])
-    if np.isnan(places).any():
-        return list(effect.parameters)
-    return [
-        parameter
-        for parameter, alone in zip(effect.parameters, np.eye(len(places)), strict=True)
-        if np.interp(wavelength_nm, places, alone).any()
-    ]
 
 
 def _starts_quadratically(

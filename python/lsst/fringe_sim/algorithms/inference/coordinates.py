@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ...effects import Effect, Parameter
+from ...effects import Effect
 from .forward import Forward
 
 __all__ = ["Coordinate", "coordinates_of", "log_evidence_of_parameters"]
@@ -77,7 +77,7 @@ def coordinates_of(effect: Effect, forward: Forward) -> tuple[Coordinate, ...]:
     nulls, hints = effect.null_values(forward.model.base_system), effect.search
     known = forward.model.effect_settings
     found = []
-    for item in _seen_parameters(effect, forward.geometry.wavelength_nm):
+    for item in effect.seen_parameters(forward.geometry):
         low, high = effect.bounds_on(item, forward.geometry)
         name = item.name
         found.append(
@@ -88,19 +88,6 @@ def coordinates_of(effect: Effect, forward: Forward) -> tuple[Coordinate, ...]:
             )
         )  # fmt: skip
     return tuple(found)
-
-
-def _seen_parameters(effect: Effect, wavelength_nm: FloatArray) -> list[Parameter]:
-    """Parameters of an effect that concern some exposure."""
-    nodes = np.array([item.wavelength_nm for item in effect.parameters])
-    if np.isnan(nodes).any():
-        return list(effect.parameters)
-    alone = np.eye(len(nodes))
-    return [
-        item
-        for item, one in zip(effect.parameters, alone, strict=True)
-        if np.interp(wavelength_nm, nodes, one).any()
-    ]
 
 
 def log_evidence_of_parameters(
