@@ -51,7 +51,8 @@ def test_nothing_is_found_where_nothing_is(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.xfail(
-    strict=True, reason="the new core leaves an offset of the wavelengths unexplained since its contrast is free"
+    strict=True,
+    reason="the new core leaves an offset of the wavelengths unexplained since its contrast is free",
 )
 @pytest.mark.slow
 @pytest.mark.rng("marginal single")
