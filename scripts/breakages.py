@@ -1,6 +1,6 @@
 """Break the package in small ways, one at a time, and count how many of them the quick tests notice.
 
-usage: python scripts/breakages.py [--number 40] [--seed 1] [--workers 2] [--least 0.9] [--keep FOLDER --record]
+usage: python scripts/breakages.py [--number 40] [--seed 1] [--workers 2] [--least 0.9] [--room ROOM] [--keep FOLDER --record]
 
 A breakage is one operator, constant or comparison inside the body of a function. They are drawn over all rooms of the
 package in turn, so that a small room counts as much as a large one. Work is done in a copy of the files of the
@@ -180,12 +180,13 @@ def tests_of(room: str, root: Path) -> list[str]:
     return own[:1] or ["tests"]
 
 
-def draw(number: int, seed: int, files: list[Path]) -> list[Breakage]:
-    """Breakages of all rooms in turn."""
+def draw(number: int, seed: int, files: list[Path], only: Sequence[str] = ()) -> list[Breakage]:
+    """Breakages of all rooms in turn, or of some."""
     chance = random.Random(seed)
     rooms: dict[str, list[Breakage]] = defaultdict(list)
     for path in files:
-        rooms[room_of(path)].extend(breakages(path))
+        if not only or room_of(path) in only:
+            rooms[room_of(path)].extend(breakages(path))
     order = [room for room in sorted(rooms) if rooms[room]]
     chance.shuffle(order)
     drawn: list[Breakage] = []
@@ -383,7 +384,7 @@ def main() -> int:
         if options.record:
             copy.record()
         of_package = [name for name in copy.files if name.suffix == ".py" and name.is_relative_to(PACKAGE)]
-        drawn = draw(options.number, options.seed, of_package)
+        drawn = draw(options.number, options.seed, of_package, options.room)
         if options.list:
             print("\n".join(map(difference, drawn)))
             return 0
@@ -427,6 +428,7 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--number", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--room", action="append", default=[], help="only this room; may be repeated")
     parser.add_argument("--workers", type=int, default=2, help="processes of pytest")
     parser.add_argument("--least", type=float, default=0.9, help="smallest part that must be noticed")
     parser.add_argument("--list", action="store_true", help="only show what would be broken")
