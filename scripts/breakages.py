@@ -1,6 +1,6 @@
 """Break the package in small ways, one at a time, and count how many of them the quick tests notice.
 
-usage: python scripts/breakages.py [--number 40] [--seed 1] [--workers 2] [--least 0.9] [--room ROOM] [--keep FOLDER --record]
+usage: python scripts/breakages.py [--number 40] [--seed 1] [--room ROOM] [--workers 2] [--keep FOLDER --record] ...
 
 A breakage is one operator, constant or comparison inside the body of a function. They are drawn over all rooms of the
 package in turn, so that a small room counts as much as a large one. Work is done in a copy of the files of the
