@@ -151,6 +151,10 @@ def test_exposure_of_lsst_images_without_that_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "lsst.images", None)
     with pytest.raises(MissingPackageError, match=r"lsst-fringe-sim\[lsst-images\]"):
         image.read(path)
+    with fits.open(path, mode="update") as hdus:
+        hdus["MASK"].header["MSKM0004"] = 17
+    with pytest.raises(FrameFormatError, match="MSKM0004 is 17"):
+        image.read()
 
 
 def test_a_file_is_written_again_with_all_that_is_in_it(tmp_path):

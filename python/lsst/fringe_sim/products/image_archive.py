@@ -72,11 +72,18 @@ def archive_planes(hdus: fits.HDUList) -> list[tuple[NDArray[Any], dict[str, int
             numbers = [key[4:] for key in hdu.header if re.fullmatch(r"MSKN\d+", key)]
             names = {number: str(hdu.header[f"MSKN{number}"]) for number in numbers}
             bits = {
-                _PLANES.get(name, name): int(hdu.header[f"MSKM{number}"]).bit_length() - 1
-                for number, name in names.items()
+                _PLANES.get(name, name): _bit(hdu.header, f"MSKM{number}") for number, name in names.items()
             }
             found.append((np.asarray(hdu.data), bits))
     return found
+
+
+def _bit(header: fits.Header, keyword: str) -> int:
+    """Number of the bit of a plane."""
+    value = int(header[keyword])
+    if value <= 0 or value & (value - 1):
+        raise FrameFormatError(keyword, value, "a power of 2")
+    return value.bit_length() - 1
 
 
 def archived_background(path: Path, origin: tuple[int, int] | None, shape: tuple[int, ...]) -> NDArray[Any]:
