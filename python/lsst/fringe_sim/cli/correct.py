@@ -140,22 +140,23 @@ def _corrected(
             pixels: dict[int, Any] = {}
             for image in parts:
                 name = stem_of(path) if len(parts) == 1 else f"{stem_of(path)}[{image.name}]"
-                added = background_path(background, image)
+                put_back = background_path(background, image)
                 try:
-                    each, record = make(image.read(added), name)
+                    each, record = make(image.read(put_back), name)
                 except InputError as error:
                     refused.append(f"{name}: not corrected: {error}")
                 else:
                     done.append(record)
                     if each.proof.passed:
                         made[image.index] = each
-                        pixels[image.index] = each.correction.applied(image.pixels(added))
+                        pixels[image.index] = each.correction.applied(image.pixels(put_back))
                 advance()
             if made:
                 cards = {index: _cards(each) for index, each in made.items()}
                 flags = {index: each.correction.uncorrected for index, each in made.items()}
                 first = {"FRINGTID": next(iter(made.values())).correction.template_id, "FRINGUND": None}
-                write_images(path, target / names[path], pixels, cards, flags, first)
+                added = background is not None
+                write_images(path, target / names[path], pixels, cards, flags, first, added=added)
     return done, refused
 
 

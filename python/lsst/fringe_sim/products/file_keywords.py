@@ -138,6 +138,11 @@ FILE_KEYWORDS: tuple[FileKeyword, ...] = (
         _OBSERVED, "UTYPE", _CORRECTION, USED, "of UNCERT: standard deviation, variance or its inverse"
     ),
     FileKeyword(_OBSERVED, "MP_<plane>", _CORRECTION, USED, "bit of a plane of the mask, 0 to 62"),
+    FileKeyword(
+        _OBSERVED, "DATAMODL", _CORRECTION, USED, "a file of lsst.images, with sensor and filter in a table"
+    ),
+    FileKeyword(_OBSERVED, "MSKNn", _CORRECTION, USED, "name of a plane of its mask"),
+    FileKeyword(_OBSERVED, "MSKMn", _CORRECTION, USED, "bit of that plane"),
     FileKeyword(_ANY, "PRODUCT", "all", CHECKED, "the kind of file that the reader wants"),
     FileKeyword(_ANY, "PRODVER", "all", CHECKED, "the version of the layout"),
     FileKeyword(_ANY, "NEXTEND", "all", CHECKED, "the number of extensions"),
