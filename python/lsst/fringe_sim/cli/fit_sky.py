@@ -85,8 +85,8 @@ class _MapOrRange(click.ParamType):
     type=click.FloatRange(0.0, 1.0, max_open=True),
     default=None,
     metavar="PART",
-    help="Part of the fringes by which the model may be wrong along the difference between orders, for the order of a "
-    "map from a range; by default as another simulator differs (0.17); 0 for a model without error.",
+    help="Part of the fringes by which the model may be wrong along the difference between orders, for the order of "
+    "a map from a range; by default as another simulator differs (0.17); 0 for a model without error.",
 )
 @click.option(
     "--model-accuracy",

@@ -65,13 +65,15 @@ class EffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrumen
         dimensions=("instrument", "detector"),
     )
     learned = Output(
-        doc="A correction that was learned from what no effect explains, as an override; nothing where none is believed.",
+        doc="A correction that was learned from what no effect explains, as an override; nothing where none is "
+        "believed.",
         name="learnedOverride",
         storageClass="ConfigOverride",
         dimensions=("instrument", "detector"),
     )
     learned_effect = Output(
-        doc="The beginning of an effect that does what was learned, for --effects-from; nothing where none is believed.",
+        doc="The beginning of an effect that does what was learned, for --effects-from; nothing where none is "
+        "believed.",
         name="learnedEffect",
         storageClass="ConfigOverride",
         dimensions=("instrument", "detector"),

@@ -219,10 +219,10 @@ def degrees_of_freedom(problem: Problem, fit: Fit) -> int:
 def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
     """Size of what a fit leaves beyond noise, as `Verdict.size` states it.
 
-    The variance that is left is that of noise in single exposures, and of noise in all of them alike: what all
-    exposures share is not small where the responses of the cells scatter, only because the rest is. The limit takes the
-    sum of the two for a multiple of one chi-square (Satterthwaite 1946, doi 10.2307/3002019). Noise that happens to be
-    small gives no limit below that of mean noise: power-constrained limits of Cowan et al. 2011.
+    Noise of single exposures and noise that all of them share, the scatter of the response of the cells, are compared
+    with what is left of each: what all exposures share is lost in χ² where the response scatters. The limit takes
+    the sum for a multiple of one chi-square (Satterthwaite 1946, doi 10.2307/3002019). Noise that happens to be small
+    gives no limit below that of mean noise: power-constrained limits of Cowan et al. 2011.
     """
     variance, chi2, freedom = np.array(_noise_and_misfit(problem, fit)).T
     noise, left = float(variance.sum()), float((variance * chi2 / freedom).sum())
@@ -240,7 +240,7 @@ def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
 
 
 def _noise_and_misfit(problem: Problem, fit: Fit) -> list[tuple[float, float, float]]:
-    """Variance of a value by noise, χ² and degrees of freedom: in single exposures, and where there is one, in all."""
+    """Variance of a value by noise, χ² and degrees of freedom: of single exposures, and of what all of them share."""
     cells, degrees = problem.cells, float(degrees_of_freedom(problem, fit))
     if cells.response_scatter == 0.0:
         return [(cells.noise_rms**2, fit.chi2, degrees)]
