@@ -183,7 +183,7 @@ def outsider_probability(
     mimicked, and leaves noise as well, or leaves a residual whose chance may lie anywhere down to that of a signal to
     noise of 30, or of a third of what is explained, each power of ten as likely as the other. What share of it
     effects cannot mimic may be anything, and is seen if it is not too weak: nearly nothing is known of the cause of a
-    signal to noise of 5, and one effect more mimics as much more.
+    signal to noise of 5.
 
     The more effects a set has, the likelier is one cause outside the catalogue in their place; see
     `outsiders_for_one`.
@@ -193,7 +193,7 @@ def outsider_probability(
     effect, over that of the effect.
     """
     number = max(len(hypothesis.names), 1)
-    hidden = HIDDEN_CHI2 * number / max(explained, 1e-300)
+    hidden = HIDDEN_CHI2 / max(explained, 1e-300)
     mimicked = min(max(MIMICKED, hidden), 1.0)
     p = min(max(hypothesis.probability_of_noise, 1e-100), 1.0)
     decades = max(DECADES_OF_CHANCE, explained / CHI2_PER_DECADE)
