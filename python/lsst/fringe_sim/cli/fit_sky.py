@@ -81,12 +81,20 @@ class _MapOrRange(click.ParamType):
     help="What all of the map may be off by, one σ [µm]; by default 0.15 fringe orders.",
 )
 @click.option(
-    "--model-accuracy",
+    "--order-error",
     type=click.FloatRange(0.0, 1.0, max_open=True),
     default=None,
     metavar="PART",
-    help="Part of the fringes by which the model may be wrong, for the order of a map from a range; by default as "
-    "another simulator differs (0.17); 0 for a model without error.",
+    help="Part of the fringes by which the model may be wrong along the difference between orders, for the order of "
+    "a map from a range; by default as another simulator differs (0.17); 0 for a model without error.",
+)
+@click.option(
+    "--model-accuracy",
+    "former_order_error",
+    type=click.FloatRange(0.0, 1.0, max_open=True),
+    default=None,
+    deprecated="since 1.1, will be removed in 1.2: --order-error takes its place",
+    help="The former name of --order-error.",
 )
 @background_options
 @model_effects("Effect on the sky; may be repeated.")
@@ -105,7 +113,8 @@ def fit_sky(
     setup: Setup,
     detector: str | None,
     map_sigma: float | None,
-    model_accuracy: float | None,
+    order_error: float | None,
+    former_order_error: float | None,
     background: Path | None,
     background_px: float,
     amplifiers: tuple[int, int] | None,
@@ -142,7 +151,8 @@ def fit_sky(
         if dry_run:
             click.echo(f"would say how many frames like {len(images)} of {sensor.name} a map takes")
         else:
-            _forecast(thickness, model, loaders, options, model_accuracy, out)
+            wrong = former_order_error if order_error is None else order_error
+            _forecast(thickness, model, loaders, options, wrong, out)
         return
     layer = read_map(thickness, setup, sensor)
     section = read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
@@ -196,7 +206,7 @@ def _forecast(
     model: FringeModel,
     loaders: Sequence[Callable[[], ObservedFrame]],
     options: CorrectionOptions,
-    model_accuracy: float | None,
+    order_error: float | None,
     out: OutputFolder,
 ) -> None:
     """How many frames would tell a map of which a range is known."""
@@ -229,8 +239,8 @@ def _forecast(
     click.echo(str(folder / "forecast.ecsv"))
     if len(loaders) >= found.frames:
         search = partial(map_from_range, range_um=range_um, predict=predict, order_um=order_um)
-        if model_accuracy is not None:
-            search = partial(search, model_accuracy=model_accuracy)
+        if order_error is not None:
+            search = partial(search, order_error=order_error)
         _search(search, loaders, options, model.setup.varying, folder)
 
 
@@ -263,7 +273,7 @@ def _search(
         click.echo(
             f"no map was found: the likeliest one has a probability of {found.order_probability:.2g} among other "
             f"orders and directions, and {LEAST_PROBABILITY:g} is asked for; the next leaves {found.apart:.2g} of "
-            "its fringes, and the model may be wrong by more (--model-accuracy)"
+            "its fringes, and the model may be wrong by more (--order-error)"
         )
         return
     if found.model_error >= LARGE_ERROR:

@@ -22,6 +22,7 @@ from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms import discover
 from ..algorithms.discovery import SKY_SEARCH, SearchOptions, Verdict, discover_sky, placement_in_frames
+from ..algorithms.discovery.skeleton import learned_files
 from ..instrument.detector import Detector
 from ..model.effects_override import effects_override
 from ..products import FringeCube, FringeFlat, SkyFringe, ThicknessMap
@@ -60,6 +61,20 @@ class EffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrumen
         doc="Effects that were known and that were found, as an override for any task with a fringe model: "
         "-C label:FILE.",
         name="effectOverride",
+        storageClass="ConfigOverride",
+        dimensions=("instrument", "detector"),
+    )
+    learned = Output(
+        doc="A correction that was learned from what no effect explains, as an override; nothing where none is "
+        "believed.",
+        name="learnedOverride",
+        storageClass="ConfigOverride",
+        dimensions=("instrument", "detector"),
+    )
+    learned_effect = Output(
+        doc="The beginning of an effect that does what was learned, for --effects-from; nothing where none is "
+        "believed.",
+        name="learnedEffect",
         storageClass="ConfigOverride",
         dimensions=("instrument", "detector"),
     )
@@ -145,7 +160,8 @@ class EffectDiscoveryTask(PipelineTask):
         -------
         result : `~lsst.pipe.base.Struct`
             ``verdict``, the layout of ``discovery.json``; ``override``, the text of a configuration override. The
-            verdict names the dataset type of the override in place of a file.
+            verdict names the dataset type of the override in place of a file. ``learned`` and ``learned_effect`` are
+            the texts of ``learned.py`` and ``learned_effect.py``; `None` without a correction that is believed.
 
         Raises
         ------
@@ -162,7 +178,12 @@ class EffectDiscoveryTask(PipelineTask):
             report=functools.partial(self.log.verbose, "%s"),
         )
         self.log.info("%s: %s", detector.name, verdict.summary())
-        return _stored(self.config, choice, verdict, detector)
+        learned = learned_files(verdict, detector.name)
+        return Struct(
+            learned=learned.get("learned.py"),
+            learned_effect=learned.get("learned_effect.py"),
+            **_stored(self.config, choice, verdict, detector).getDict(),
+        )
 
 
 class SkyEffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
