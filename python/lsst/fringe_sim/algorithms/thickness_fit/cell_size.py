@@ -14,7 +14,7 @@ LARGEST_CELL_PX = 8
 MOST_CELLS = 600_000
 """Bound on the memory of the order evidence: about 84 orders of 4 bytes for each cell."""
 _FEWEST_CELLS = 64
-"""Cells on which what is learned beside the thickness, some nine numbers of each wavelength, is not fitted as well."""
+"""Cells that are more than what is learned beside the thickness: a dozen numbers of each wavelength."""
 _STEEPEST_STRUCTURE = 1.0
 """Largest ``1 - cos`` of the phase across a cell, in the steepest tenth of the sensor: a quarter of a fringe."""
 _LARGEST_LOSS = 1.0

@@ -96,11 +96,21 @@ class Solver:
         """Solve the orders, and again if the model turns out to be another than was thought."""
         if not self.free.any:
             return self._solve_held(cells, templates)
+        wide = True
         if np.isfinite(self.free.gain_accuracy):
-            described = self._described(cells, templates)
+            described, wide = self._described(cells, templates)
             if described is not None:
                 return described
-        nuisance = first_nuisances(cells, templates, self.free)
+        # Fringes of few orders look like light that each wavelength has of its own: both are tried.
+        states = [
+            self._solve_from(first_nuisances(cells, templates, self.free, own), cells, templates)
+            for own in ((True,) if wide else (True, False))
+        ]
+        shared = min((state.nuisance for state in states), key=lambda fit: fit.chi2 + fit.prior).shared
+        return min(states, key=lambda state: state.nuisance.chi2 / shared + state.nuisance.prior)
+
+    def _solve_from(self, nuisance: NuisanceFit, cells: Cells, templates: FringeTemplates) -> State:
+        """Orders and all that is free in turn, from a first light and contrast."""
         fitted, alike = nuisance.applied_to(templates), 1.0
         for turn in range(_MOST_SOLUTIONS):
             even = subtract_offset(cells, nuisance.light(cells, self.free))
@@ -111,8 +121,10 @@ class Solver:
             fitted, nuisance, alike = state.templates, state.nuisance, state.alike
         return state
 
-    def _described(self, cells: Cells, templates: FringeTemplates) -> State | None:
-        """Solution with the model as it is, if that describes the flats; what is free then moves no order.
+    def _described(self, cells: Cells, templates: FringeTemplates) -> tuple[State | None, bool]:
+        """Solution with the model as it is, if that describes the flats, and whether the sensor has many orders.
+
+        What is free moves no order then.
 
         Light and contrast of a sensor of few orders cannot be told from its fringes: there they stay as they are.
         """
@@ -123,13 +135,13 @@ class Solver:
         if narrow:
             state = held._solve_held(cells, templates, probe)
             alone = cells_leave_only_noise(state.cells, state.templates, state.thickness_um)
-            return state if alone and self._leaves_only_noise(state) else None
+            return state if alone and self._leaves_only_noise(state) else None, False
         if not self._leaves_only_noise(held.adjust(replace(probe, normalisation="sensor"))):
-            return None
+            return None, True
         state = held._solve_held(cells, templates, probe)
         count = patterns_of_cells(cells, self.free, *np.zeros((2, 1), np.intp))[0].shape[-1]
         start = NuisanceFit.none(templates.n_wavelengths, count)
-        return replace(state, free=self.free, nuisance=start, described=True)
+        return replace(state, free=self.free, nuisance=start, described=True), True
 
     def _leaves_only_noise(self, state: State) -> bool:
         """Whether a solution leaves over nothing that neighbouring pixels share."""
