@@ -179,7 +179,7 @@ class Solver:
         orders = self._open_orders(state.templates)
         if spans_orders(state.thickness_um, self.order_um, _SURELY_MORE * orders):
             return True
-        joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
+        joined = solve_orders(state.cells, state.found, sure=np.inf)
         return spans_orders(joined, self.order_um, orders)
 
     @staticmethod
@@ -199,7 +199,7 @@ class Solver:
         if spans_orders(state.thickness_um, self.order_um, _SURELY_MORE * orders):
             return False
         # Wrong orders make a sensor look thicker and thinner than it is; joined by phases alone it cannot jump.
-        joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
+        joined = solve_orders(state.cells, state.found, sure=np.inf)
         return not all(
             spans_orders(thickness, self.order_um, orders) for thickness in (state.thickness_um, joined)
         )
@@ -224,7 +224,7 @@ class Solver:
         )  # fmt: skip
         # Evidence of a model that does not describe the flats is worth less, however many agree: they err alike.
         alike = max(alike, self._erring_alike(state)) if self.free.any else 1.0
-        thickness = solve_orders(cells, found, SURE * alike).thickness_um
+        thickness = solve_orders(cells, found, SURE * alike)
         return replace(state, thickness_um=thickness, alike=alike)
 
     def _erring_alike(self, state: State) -> float:
@@ -268,7 +268,7 @@ class Solver:
             for other in ranked[:_MOST_MEANS]:
                 tried = solved if other is best else self._with_mean_of(other, cells, first)
                 joined = solve_orders(tried.cells, tried.found, sure=np.inf)
-                for shape in (tried.thickness_um, joined.thickness_um):
+                for shape in (tried.thickness_um, joined):
                     if not _among(shape, shapes, self.order_um):
                         shapes.append(shape)
             if all(_among(shape, known, self.order_um) for shape in shapes):
