@@ -74,6 +74,8 @@ class State:
     """Whether mean response and orders were found together, by a search that may have missed the true ones."""
     free: Nuisances = field(default_factory=Nuisances)
     margin: float = np.inf
+    rival: float = np.inf
+    """Improbability, above that of this one, of a solution of another order that the search came upon."""
     alike: float = 1.0
     """Variance of sums over cells relative to cells that err by themselves, the largest that was met on the way."""
     described: bool = False
@@ -102,24 +104,38 @@ class Solver:
             if described is not None:
                 return described
         # Fringes of few orders look like light that each wavelength has of its own: both are tried.
-        states = [
-            self._solve_from(first_nuisances(cells, templates, self.free, own), cells, templates)
-            for own in ((True,) if wide else (True, False))
+        starts = [
+            first_nuisances(cells, templates, self.free, own) for own in ((True,) if wide else (True, False))
         ]
-        shared = min((state.nuisance for state in states), key=lambda fit: fit.chi2 + fit.prior).shared
-        return min(states, key=lambda state: state.nuisance.chi2 / shared + state.nuisance.prior)
+        return self._likeliest(
+            [state for start in starts for state in self._solve_from(start, cells, templates)]
+        )
 
-    def _solve_from(self, nuisance: NuisanceFit, cells: Cells, templates: FringeTemplates) -> State:
-        """Orders and all that is free in turn, from a first light and contrast."""
+    def _likeliest(self, states: list[State]) -> State:
+        """The most probable of some solutions; the best of another order of the sensor is its rival."""
+        fits = [state.nuisance for state in states]
+        shared = min(fits, key=lambda fit: fit.chi2 + fit.prior).shared
+        cost = np.array([fit.chi2 / shared + fit.prior for fit in fits])
+        if not np.isfinite(cost.min()):
+            return states[-1]
+        best = states[int(np.argmin(cost))]
+        away = np.array([np.nanmedian(state.thickness_um - best.thickness_um) for state in states])
+        others = cost[np.abs(away) > _SAME_SHAPE * self.order_um] - cost.min()
+        return replace(best, rival=float(others.min(initial=np.inf)))
+
+    def _solve_from(self, nuisance: NuisanceFit, cells: Cells, templates: FringeTemplates) -> list[State]:
+        """Orders and all that is free in turn, from a first light and contrast: every solution on the way."""
         fitted, alike = nuisance.applied_to(templates), 1.0
+        states: list[State] = []
         for turn in range(_MOST_SOLUTIONS):
             even = subtract_offset(cells, nuisance.light(cells, self.free))
-            state = self._state(even, fitted, nuisance, "sensor", self.range_um, alike)
-            before, state = state, self._learn(state, ranked=turn == 0)
+            before = self._state(even, fitted, nuisance, "sensor", self.range_um, alike)
+            state = self._learn(before, ranked=turn == 0)
+            states.append(state)
             if _agree(before, state):
                 break
             fitted, nuisance, alike = state.templates, state.nuisance, state.alike
-        return state
+        return states
 
     def _described(self, cells: Cells, templates: FringeTemplates) -> tuple[State | None, bool]:
         """Solution with the model as it is, if that describes the flats, and whether the sensor has many orders.
@@ -310,7 +326,8 @@ class Solver:
         base = self.base or state.templates
         if ranked:
             found = rank_orders(sample, base, state.free, state.nuisance, self.order_um, state.range_um)
-            fit, shift, slip, margin = found.fit, found.shift, found.slip, found.margin
+            fit, shift, margin = found.fit, found.shift, min(found.margin, state.rival)
+            slip = 1.0 - (1.0 - found.slip) / (1.0 + (1.0 - found.slip) * np.exp(-0.5 * state.rival))
         else:
             fit, shift = learn(sample, base, state.free, state.nuisance)[1], 0.0
             slip, margin = state.common_slip, state.margin
