@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -108,34 +109,37 @@ class Solver:
             first_nuisances(cells, templates, self.free, own) for own in ((True,) if wide else (True, False))
         ]
         return self._likeliest(
-            [state for start in starts for state in self._solve_from(start, cells, templates)]
+            state for start in starts for state in self._solve_from(start, cells, templates)
         )
 
-    def _likeliest(self, states: list[State]) -> State:
+    def _likeliest(self, states: Iterator[State]) -> State:
         """The most probable of some solutions; the best of another order of the sensor is its rival."""
-        fits = [state.nuisance for state in states]
-        shared = min(fits, key=lambda fit: fit.chi2 + fit.prior).shared
-        cost = np.array([fit.chi2 / shared + fit.prior for fit in fits])
-        if not np.isfinite(cost.min()):
-            return states[-1]
-        best = states[int(np.argmin(cost))]
-        away = np.array([np.nanmedian(state.thickness_um - best.thickness_um) for state in states])
-        others = cost[np.abs(away) > _SAME_SHAPE * self.order_um] - cost.min()
-        return replace(best, rival=float(others.min(initial=np.inf)))
+        best, seen = next(states), []
+        seen.append((best.thickness_um, best.nuisance))
+        for state in states:  # one at a time: the evidence of all cells is large
+            seen.append((state.thickness_um, state.nuisance))
+            if state.nuisance.cost() <= best.nuisance.cost():
+                best = state
+        if not np.isfinite(best.nuisance.chi2):
+            return best
+        rivals = [
+            fit.cost(best.nuisance.shared) - best.nuisance.cost(best.nuisance.shared)
+            for thickness, fit in seen
+            if abs(np.nanmedian(thickness - best.thickness_um)) > _SAME_SHAPE * self.order_um
+        ]
+        return replace(best, rival=min(rivals, default=np.inf))
 
-    def _solve_from(self, nuisance: NuisanceFit, cells: Cells, templates: FringeTemplates) -> list[State]:
+    def _solve_from(self, nuisance: NuisanceFit, cells: Cells, templates: FringeTemplates) -> Iterator[State]:
         """Orders and all that is free in turn, from a first light and contrast: every solution on the way."""
         fitted, alike = nuisance.applied_to(templates), 1.0
-        states: list[State] = []
         for turn in range(_MOST_SOLUTIONS):
             even = subtract_offset(cells, nuisance.light(cells, self.free))
             before = self._state(even, fitted, nuisance, "sensor", self.range_um, alike)
             state = self._learn(before, ranked=turn == 0)
-            states.append(state)
+            yield state
             if _agree(before, state):
                 break
             fitted, nuisance, alike = state.templates, state.nuisance, state.alike
-        return states
 
     def _described(self, cells: Cells, templates: FringeTemplates) -> tuple[State | None, bool]:
         """Solution with the model as it is, if that describes the flats, and whether the sensor has many orders.
