@@ -19,6 +19,7 @@ import click
 from .. import __version__
 from ..errors import FringeSimError, InputError
 from ..files import write_whole
+from .command import command, flag, option
 from .output import LOCK, OutputFolder, output_folder
 from .parameters import SIZE
 
@@ -129,21 +130,14 @@ class DemoRun:
         write_whole(self._state, text)
 
 
-@click.command()
-@output_folder("Folder.", *PRODUCTS, default=Path("demo"), resumes=True)
-@click.option(
-    "--size", type=SIZE, default="1024x1024", show_default=True, help="Pixels of the part of the sensor."
-)
-@click.option(
-    "--seed",
-    type=click.IntRange(0),
-    default=1,
-    show_default=True,
-    help="Of the hidden effect, its size and all noise.",
-)
-@click.option("--fresh", is_flag=True, help="The same as --overwrite.")
-@click.option("--dry-run", is_flag=True, help="Say what would be done.")
-def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool) -> None:
+@command()
+def demo(
+    out: OutputFolder = output_folder("Folder.", *PRODUCTS, default=Path("demo"), resumes=True),
+    size: tuple[int, int] = option("Pixels of the part of the sensor.", "1024x1024", SIZE),
+    seed: int = option("Of the hidden effect, its size and all noise.", 1, click.IntRange(0)),
+    fresh: bool = flag("The same as --overwrite."),
+    dry_run: bool = flag("Say what would be done."),
+) -> None:
     """Hide an effect in raw flats, find it, and make templates with what was found.
 
     The sensor is a part of E2V-CCD250-321. The seed decides which effect is hidden in its flats beside the weak

@@ -8,6 +8,7 @@ import click
 
 from ..algorithms.thickness_fit_options import CONTRASTS, FIT_METHODS, SILICON_FIELDS, ZONES
 from ..errors import InputError, UnknownNameError
+from .command import argument, command, flag, option
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import LABORATORY, ChosenEffects, model_effects
 from .progress import progress
@@ -26,71 +27,44 @@ SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 """Smoothing of the flats [px]. It lowers the contrast where fringes are dense, so `global` does without."""
 
 
-@click.command()
-@click.argument("paths", nargs=-1, required=True, metavar="PATH...")
-@LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file.")
-@output_folder(
-    "Folder for maps, figures, report.", "thickness.fits", "silicon.fits", "thickness.png", "report.html"
-)
-@click.option(
-    "--method",
-    type=click.Choice(FIT_METHODS),
-    default="global",
-    show_default=True,
-    help="All pixels at once, or the walk of the paper.",
-)
-@click.option(
-    "--smoothing",
-    type=click.FloatRange(0.0, 100.0),
-    default=None,
-    help="Gaussian smoothing of the flats, σ [px]; 0 for 'global', which needs none, and 3 for 'guo2022'.",
-)
-@click.option(
-    "--silicon",
-    type=click.Choice(["fixed", *SILICON_FIELDS]),
-    default="fixed",
-    show_default=True,
-    help="Thickness of the silicon: as in the model, or fitted too where flats with a narrow line tell it.",
-)
-@click.option(
-    "--zones",
-    type=click.Choice(ZONES),
-    default=None,
-    help="Parts of the sensor with a level of their own at each wavelength, however large; by default those of "
-    "amplifiers, as well as gains are known.",
-)
-@click.option(
-    "--illumination-degree",
-    type=click.IntRange(0, 8),
-    default=None,
-    show_default="2",
-    help="Degree of a slow illumination, free at each wavelength; 0 for even light.",
-)
-@click.option(
-    "--contrast",
-    type=click.Choice(CONTRASTS),
-    default=None,
-    show_default="wavelength",
-    help="Contrast of the fringes: a free factor at each wavelength, or one for all, or that of the model.",
-)
-@model_effects()
-@click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
-@click.option("--strict", is_flag=True, help="Exit with 1 where model and flats do not go together.")
-@click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
+@command()
 def fit(
-    paths: tuple[str, ...],
-    setup: Setup,
-    out: OutputFolder,
-    method: str,
-    smoothing: float | None,
-    silicon: str,
-    zones: str | None,
-    illumination_degree: int | None,
-    contrast: str | None,
-    effects: ChosenEffects,
-    skip_bad: bool,
-    strict: bool,
-    dry_run: bool,
+    paths: tuple[str, ...] = argument("PATH..."),
+    setup: Setup = LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file."),
+    out: OutputFolder = output_folder(
+        "Folder for maps, figures, report.", "thickness.fits", "silicon.fits", "thickness.png", "report.html"
+    ),
+    method: str = option(
+        "All pixels at once, or the walk of the paper.", "global", click.Choice(FIT_METHODS)
+    ),
+    smoothing: float | None = option(
+        "Gaussian smoothing of the flats, σ [px]; 0 for 'global', which needs none, and 3 for 'guo2022'.",
+        kind=click.FloatRange(0.0, 100.0),
+    ),
+    silicon: str = option(
+        "Thickness of the silicon: as in the model, or fitted too where flats with a narrow line tell it.",
+        "fixed",
+        click.Choice(["fixed", *SILICON_FIELDS]),
+    ),
+    zones: str | None = option(
+        "Parts of the sensor with a level of their own at each wavelength, however large; by default those of "
+        "amplifiers, as well as gains are known.",
+        kind=click.Choice(ZONES),
+    ),
+    illumination_degree: int | None = option(
+        "Degree of a slow illumination, free at each wavelength; 0 for even light.",
+        kind=click.IntRange(0, 8),
+        show_default="2",
+    ),
+    contrast: str | None = option(
+        "Contrast of the fringes: a free factor at each wavelength, or one for all, or that of the model.",
+        kind=click.Choice(CONTRASTS),
+        show_default="wavelength",
+    ),
+    effects: ChosenEffects = model_effects(),
+    skip_bad: bool = flag("Go on without files that cannot be read."),
+    strict: bool = flag("Exit with 1 where model and flats do not go together."),
+    dry_run: bool = flag("Look at every header, say what would be done, write nothing."),
 ) -> None:
     """Fit the layer thickness of one sensor to raw flats (files, folders, patterns) or to a fringe cube.
 

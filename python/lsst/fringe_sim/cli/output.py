@@ -18,6 +18,7 @@ import click
 
 from ..errors import InputError, shown
 from ..files import LOCK, refuse_unfinished
+from .command import flag, option
 
 if TYPE_CHECKING:
     from ..report.page import Origin
@@ -239,16 +240,17 @@ def refuse_among_inputs(folder: Path, inputs: Iterable[str]) -> None:
             raise InputError("output folder", str(folder), allowed)
 
 
-def _inputs_of(context: click.Context, values: dict[str, Any]) -> list[str]:
+def _inputs_of(context: click.Context) -> list[str]:
     """What a command is given to read: its arguments, and options with a path that is not to be written.
 
     Several files of a folder are what a shell makes of a pattern, which finds more in a next run.
     """
     given: list[str] = []
     for parameter in context.command.params:
-        value = values.get(parameter.name or "")
+        value = context.params.get(parameter.name or "")
         if (
             value is not None
+            and parameter.name != "out"
             and (isinstance(parameter, click.Argument) or isinstance(parameter.type, click.Path))
             and not getattr(parameter.type, "writable", False)
         ):
@@ -306,7 +308,7 @@ def output_folder(
     default: Path | None = None,
     required: bool = True,
     resumes: bool = False,
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
+) -> Any:
     """``--out`` and ``--overwrite`` of a command, which gets them as one `OutputFolder` named ``out``.
 
     ``help_text``: what ``--out`` says under ``--help``.
@@ -321,7 +323,7 @@ def output_folder(
         def with_folder(*, out: Path | None, overwrite: bool, **others: Any) -> None:
             context = click.get_current_context()
             folder = None if out is None else OutputFolder(out, products, overwrite, resumes)
-            read = _inputs_of(context, others)
+            read = _inputs_of(context)
             if folder is not None:
                 folder.refuse_used()
                 refuse_among_inputs(folder.path, read)
@@ -334,15 +336,11 @@ def output_folder(
             context.meta.pop(AT_WORK, None)
 
         kind = click.Path(path_type=Path)
+        named = option(help_text, default, kind, required=required and default is None)("out")
         if argument:
             named = click.argument("out", metavar="OUTDIR", type=kind)
-        elif default is None:
-            named = click.option("--out", type=kind, required=required, help=help_text)
-        else:
-            named = click.option("--out", type=kind, default=default, show_default=True, help=help_text)
-        clear = click.option(
-            "--overwrite", is_flag=True, help="Clear what an earlier run of this command left in the folder."
-        )
-        return named(clear(with_folder))
+        clear = flag("Clear what an earlier run of this command left in the folder.")("overwrite")
+        made: Callable[..., None] = named(clear(with_folder))
+        return made
 
-    return decorate
+    return lambda name: decorate

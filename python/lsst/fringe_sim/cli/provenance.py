@@ -20,6 +20,7 @@ from ..errors import (
     printable_name,
     shown,
 )
+from .command import argument, command, flag, option
 
 __all__ = ["describe", "provenance", "read_header"]
 
@@ -34,14 +35,13 @@ _FORMAT = re.compile(
 _INPUT = re.compile(BUTLER + r"INPUT (\d{1,9}) (\w+)")
 
 
-@click.command()
-@click.argument("targets", nargs=-1, required=True, metavar="FILE|REPO...")
-@click.option("--dataset-type", metavar="NAME", help="Of a repository: which datasets, as epoxyThickness.")
-@click.option("--collections", default="*", show_default=True, help="Of a repository: where they are.")
-@click.option("--where", default="", help='Of a repository: a condition on the data ids, as "detector=37".')
-@click.option("--json", "as_json", is_flag=True, help="One JSON document, for programs.")
+@command()
 def provenance(
-    targets: tuple[str, ...], dataset_type: str | None, collections: str, where: str, as_json: bool
+    targets: tuple[str, ...] = argument("FILE|REPO..."),
+    dataset_type: str | None = option("Of a repository: which datasets, as epoxyThickness.", metavar="NAME"),
+    collections: str = option("Of a repository: where they are.", "*"),
+    where: str = option('Of a repository: a condition on the data ids, as "detector=37".', ""),
+    as_json: bool = flag("One JSON document, for programs.", "--json"),
 ) -> None:
     """Say what products were made with and from.
 

@@ -9,6 +9,7 @@ import click
 
 from ..errors import InputError
 from ..files import table_text, write_whole
+from .command import command, flag, option
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import SIZE
 from .progress import progress
@@ -25,27 +26,18 @@ SILICON_CHANGE = 0.05
 """Relative change by the constants of silicon from which both numbers are printed."""
 
 
-@click.command()
-@output_folder("Folder for the page and the table.", "paper.html", "paper.ecsv")
-@click.option(
-    "--size", type=SIZE, default="1024x1001", show_default=True, help="Pixels for the whole sensor."
-)
-@click.option(
-    "--coadds", type=click.IntRange(2), default=800, show_default=True, help="Exposures of the deepest coadd."
-)
-@click.option(
-    "--published",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
-    default=None,
-    help="Folder with curves read off the published figures (measured/); "
-    f"by default ${ENVIRONMENT}, then {BESIDE}, where they are there.",
-)
-@click.option(
-    "--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of noise and rotations."
-)
-@click.option("--dry-run", is_flag=True, help="Say what would be computed, write nothing.")
+@command()
 def reproduce_paper(
-    out: OutputFolder, size: tuple[int, int], coadds: int, published: Path | None, seed: int, dry_run: bool
+    out: OutputFolder = output_folder("Folder for the page and the table.", "paper.html", "paper.ecsv"),
+    size: tuple[int, int] = option("Pixels for the whole sensor.", "1024x1001", SIZE),
+    coadds: int = option("Exposures of the deepest coadd.", 800, click.IntRange(2)),
+    published: Path | None = option(
+        f"Folder with curves read off the published figures (measured/); by default ${ENVIRONMENT}, then "
+        f"{BESIDE}, where they are there.",
+        kind=click.Path(exists=True, file_okay=False, path_type=Path),
+    ),
+    seed: int = option("Seed of noise and rotations.", 1, click.IntRange(0)),
+    dry_run: bool = flag("Say what would be computed, write nothing."),
 ) -> None:
     """Recompute every figure and number of the paper, beside what it states.
 
