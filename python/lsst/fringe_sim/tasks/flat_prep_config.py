@@ -24,8 +24,7 @@ def _choice(default: Any, doc: str) -> Any:
 class FlatPrepConfig(Config):
     """Every choice of `FlatPrepOptions`, by the same name."""
 
-    overscan_method: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    overscan_method = ChoiceField[str](
         default=_DEFAULT.overscan_method,
         doc="Level of the serial overscan.",
         allowed={"median": "the median of each row", "spline": "a smooth curve through the rows"},
@@ -64,8 +63,7 @@ class FlatPrepConfig(Config):
         _DEFAULT.smoothing_sigma_px, "Standard deviation of the smoothing kernel, px; 0 for none."
     )
 
-    raws_limit_graph: Field[bool] = Field(
-        dtype=bool,
+    raws_limit_graph = Field[bool](
         default=True,
         doc="Whether only exposures that have raw frames enter the graph; False where the night to be simulated, "
         "whose exposures have none, is in the same graph.",

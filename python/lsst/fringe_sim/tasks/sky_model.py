@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField, RangeField
-from lsst.pipe.base import QuantumContext
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input
 
 from ..algorithms.field_response import SensorPlacement
@@ -33,7 +33,7 @@ from ..products import SensorSection, ThicknessMap
 from ..products.sensor_section import SECTION_KEYWORDS
 from ..products.thickness_map import thickness_span_um
 from .model_config import FringeModelConfig, ModelChoice
-from .quantum import common_header
+from .quantum import SENSOR, common_header
 
 __all__ = [
     "LINE_LIST",
@@ -130,8 +130,7 @@ class SensorSky(NamedTuple):
 class SkyModelConfig(FringeModelConfig):
     """Set-up, effects, spectrum and beams of the sky, and what replaces a thickness map that does not exist."""
 
-    beams: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    beams = ChoiceField[str](
         default="pixel",
         doc="Which beam a pixel sees, where the telescope has one that varies over the field.",
         allowed={
@@ -140,35 +139,27 @@ class SkyModelConfig(FringeModelConfig):
             "and more",
         },
     )
-    stand_in: Field[bool] = Field(
-        dtype=bool,
+    stand_in = Field[bool](
         default=False,
         doc="Whether a sensor without a thickness map gets a random field with the statistics of measured ones.",
     )
-    stand_in_seed: Field[int] = Field(
-        dtype=int,
-        default=0,
-        doc="With the number of the sensor, the seed of its stand-in.",
-        check=lambda n: n >= 0,
+    stand_in_seed = Field[int](
+        default=0, doc="With the number of the sensor, the seed of its stand-in.", check=lambda n: n >= 0
     )
-    stand_in_shape: ListField[int] = ListField(
-        dtype=int,
-        optional=True,
-        length=2,
-        doc="Rows and columns of stand-ins; by default those of the sensor.",
+    stand_in_shape = ListField[int](
+        optional=True, length=2, doc="Rows and columns of stand-ins; by default those of the sensor."
     )
-    rotational_temperature_k: Field[float] = Field(
-        dtype=float, optional=True, doc="Rotational temperature of OH, K; by default the PALACE populations."
+    rotational_temperature_k = Field[float](
+        optional=True, doc="Rotational temperature of OH, K; by default the PALACE populations."
     )
-    vibrational_temperature_k: Field[float] = Field(
-        dtype=float, optional=True, doc="Vibrational temperature of OH, K; by default the PALACE populations."
+    vibrational_temperature_k = Field[float](
+        optional=True, doc="Vibrational temperature of OH, K; by default the PALACE populations."
     )
-    solar_flux_sfu: Field[float] = Field(
-        dtype=float, default=129.0, doc="Solar radio flux, sfu, which scales the airglow continuum."
+    solar_flux_sfu = Field[float](
+        default=129.0, doc="Solar radio flux, sfu, which scales the airglow continuum."
     )
 
-    flat_spectrum: Field[str] = Field(
-        dtype=str,
+    flat_spectrum = Field[str](
         optional=True,
         doc="Light of the flat field: white, gaussian:MEAN:FWHM in nm, or a table with columns wavelength and "
         "photons; by default white where every pixel has its own beam, and none otherwise.",
@@ -238,8 +229,7 @@ class SkyModelConfig(FringeModelConfig):
 class SensorMapsConfig(SkyModelConfig):
     """What the maps of a sensor say of its sky: also the silicon, and what is not known of the adhesive."""
 
-    silicon: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    silicon = ChoiceField[str](
         default="even",
         doc="Thickness of the silicon above the varying layer.",
         allowed={
@@ -288,7 +278,7 @@ class SensorMapsConfig(SkyModelConfig):
         }
 
 
-def maps_of(butlerQC: QuantumContext, inputRefs: Any) -> list[ThicknessMap | None]:
+def maps_of(butlerQC: base.QuantumContext, inputRefs: Any) -> list[ThicknessMap | None]:
     """Maps of the varying layer and of the silicon, `None` for those that a quantum does without."""
     return [
         butlerQC.get(getattr(inputRefs, name)) if hasattr(inputRefs, name) else None
@@ -299,20 +289,20 @@ def maps_of(butlerQC: QuantumContext, inputRefs: Any) -> list[ThicknessMap | Non
 def silicon_input() -> Input:
     """Connection to a map of the silicon of each sensor."""
     return Input(
-        doc="Thickness of the silicon on the same pixels; only where the configuration asks for it.",
-        name="siliconThickness",
-        storageClass="ThicknessMap",
-        dimensions=("instrument", "detector"),
+        "siliconThickness",
+        "ThicknessMap",
+        "Thickness of the silicon on the same pixels; only where the configuration asks for it.",
+        dimensions=SENSOR,
     )
 
 
 def thickness_input() -> Input:
     """Connection to a thickness map of each sensor."""
     return Input(
-        doc="Thickness of the varying layer; not needed where the configuration allows stand-ins.",
-        name="epoxyThickness",
-        storageClass="ThicknessMap",
-        dimensions=("instrument", "detector"),
+        "epoxyThickness",
+        "ThicknessMap",
+        "Thickness of the varying layer; not needed where the configuration allows stand-ins.",
+        dimensions=SENSOR,
     )
 
 
