@@ -26,17 +26,6 @@ from numba.core import caching
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from threadpoolctl import threadpool_limits
 
-__all__ = [
-    "contiguous",
-    "kernel",
-    "limit_threads",
-    "one_blas_thread",
-    "processors",
-    "run_shares",
-    "run_threaded",
-    "subkernel",
-]
-
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["InNotebook", "OneLine", "axes_or_new", "do_nothing"]
-
 PREVIEW_INCH = (4.2, 3.2)
 
 LONGEST_TEXT, MOST_ITEMS = 60, 12

@@ -22,24 +22,6 @@ from mpl_toolkits.axes_grid1 import make_axes_locatable
 from numpy.typing import NDArray
 from PIL import Image
 
-__all__ = [
-    "DIVERGING",
-    "LINES",
-    "MOST_PIXELS",
-    "SEQUENTIAL",
-    "TITLE_PLACE",
-    "block_mean",
-    "color_bar",
-    "figure",
-    "finite_range",
-    "map_to_png",
-    "panels",
-    "pixels_to_png",
-    "show_image",
-    "to_pieces",
-    "to_png",
-]
-
 SEQUENTIAL = "cividis"
 DIVERGING = "PuOr_r"
 LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")

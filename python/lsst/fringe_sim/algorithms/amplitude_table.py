@@ -31,17 +31,6 @@ from .sky_frame import SkyQuadrature
 from .sky_response import tabulate_components, white_light
 from .thickness_stand_in import stand_in_thickness
 
-__all__ = [
-    "CASES",
-    "UNDAMPED",
-    "WITH_EFFECTS",
-    "AmplitudeCase",
-    "SkyCase",
-    "amplitude_table",
-    "compare_amplitudes",
-    "contradiction",
-]
-
 FloatArray = NDArray[np.float64]
 
 EDGE_DEG = 1.44

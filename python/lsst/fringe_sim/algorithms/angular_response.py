@@ -26,15 +26,6 @@ from .sky_response import (
     white_light,
 )
 
-__all__ = [
-    "ANGLES",
-    "CONTINUUM_ANGLES",
-    "AngularResponse",
-    "angular_response",
-    "of_other_silicon",
-    "silicon_um",
-]
-
 FloatArray = NDArray[np.float64]
 
 ANGLES = 192

@@ -16,8 +16,6 @@ from ..products import SkyFringe
 from .coadds import VisitPlaces, filled_pattern, patterns_left, placed_visits
 from .correction.injection import InjectionOptions, Source, bias_columns, free_places, stamp_side
 
-__all__ = ["sources_in_coadds"]
-
 FloatArray = NDArray[np.float64]
 
 SINGLE = 8

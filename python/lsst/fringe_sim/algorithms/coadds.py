@@ -16,16 +16,6 @@ from ..errors import InputError, OutOfRangeError, named_units
 from ..products import SkyFringe
 from ..resources import read_user_table
 
-__all__ = [
-    "Coadds",
-    "VisitPlaces",
-    "coadd_visits",
-    "coadds_of_frames",
-    "filled_pattern",
-    "patterns_left",
-    "placed_visits",
-]
-
 FloatArray = NDArray[np.float64]
 
 COUNTS = (1, 10, 100, 1000)

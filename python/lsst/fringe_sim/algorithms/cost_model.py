@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-__all__ = ["QUANTUM_COSTS", "FocalPlaneCost", "QuantumCost"]
-
 PIXELS = 4004 * 4096
 """Pixels of an e2v sensor."""
 

@@ -32,19 +32,6 @@ from .sky_response import (
     component_factors,
 )
 
-__all__ = [
-    "AngularResponse",
-    "FieldResponse",
-    "FieldTable",
-    "SensorPlacement",
-    "SensorResponse",
-    "angular_response",
-    "beam_field",
-    "beam_limits",
-    "field_response",
-    "sensor_response",
-]
-
 FloatArray = NDArray[np.float64]
 
 RADIUS_STEP_DEG = 0.005

@@ -13,17 +13,6 @@ from scipy.special import log_ndtr, ndtr
 from ..errors import OutOfRangeError
 from ..model import FringeModel
 
-__all__ = [
-    "NODES_PER_ORDER",
-    "SAME_SOLUTION",
-    "SEARCH_STRIDE",
-    "ChosenFlats",
-    "Curves",
-    "PlannedFlat",
-    "RankedFlat",
-    "Rivals",
-]
-
 FloatArray = NDArray[np.float64]
 
 NODES_PER_ORDER = 24

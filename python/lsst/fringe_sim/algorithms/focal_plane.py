@@ -27,17 +27,6 @@ from .field_response import SensorResponse
 from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
 from .sky_frame import component_electrons
 
-__all__ = [
-    "DES_CRITERION",
-    "ForecastOptions",
-    "PatternMoments",
-    "SensorForecast",
-    "SkyLevel",
-    "correction_residuals",
-    "forecast_sensor",
-    "pattern_moments",
-]
-
 FloatArray = NDArray[np.float64]
 
 DES_CRITERION = 0.1

@@ -17,8 +17,6 @@ from threadpoolctl import threadpool_limits
 from ..errors import InputError
 from ..products import SkyFringe
 
-__all__ = ["TILE_BYTES", "FrameStack"]
-
 FloatArray = NDArray[np.float64]
 
 TILE_BYTES = 8 * 2**20

@@ -21,8 +21,6 @@ from .observed_frames import frame_weight
 from .sky_response import FrameTable, Response
 from .sky_shift import MAP_SIGMA_ORDERS, SkyShift, fit_sky_shift
 
-__all__ = ["MapOnSky", "fringes_alone", "map_on_sky", "reach_um"]
-
 FloatArray = NDArray[np.float64]
 
 LARGEST_STEP_RAD = 0.5

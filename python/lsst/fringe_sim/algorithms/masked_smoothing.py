@@ -11,8 +11,6 @@ from scipy.ndimage import correlate1d
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError
 
-__all__ = ["smooth_masked"]
-
 Image = NDArray[np.float32]
 
 SMOOTHING_REACH = 4.0

@@ -14,8 +14,6 @@ from ..errors import OutOfRangeError
 from ..model import FringeModel
 from .flat_series import FlatSeries
 
-__all__ = ["SAMPLES", "Block", "Forecast", "Likeness", "Report", "Sample", "Tested"]
-
 FloatArray = NDArray[np.float64]
 
 Report = Callable[[str], None]

@@ -35,17 +35,6 @@ from ..model import FringeModel
 from .flat_series import LEVEL_E, FlatSeries
 from .measurement_forecast import Forecast, Report, Sample, Tested
 
-__all__ = [
-    "FlatMeasurement",
-    "FlatSeries",
-    "Measurement",
-    "PairForecast",
-    "RankedMeasurement",
-    "break_ambiguity",
-    "candidate_measurements",
-    "rank_measurements",
-]
-
 FloatArray = NDArray[np.float64]
 
 HIGH_LEVEL_E = 80_000.0

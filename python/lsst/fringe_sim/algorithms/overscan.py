@@ -14,8 +14,6 @@ from ..errors import FrameFormatError
 from ..instrument.raw_frame import RawAmplifier
 from .flat_prep_options import DEFAULT_OPTIONS, GAUSSIAN_MAD, FlatPrepOptions
 
-__all__ = ["OverscanCorrected", "correct_overscan"]
-
 Image = NDArray[np.float32]
 
 NEARBY_ROWS = 25

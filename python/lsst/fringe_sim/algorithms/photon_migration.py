@@ -20,8 +20,6 @@ from ..instrument.sky import SpectralComponent
 from ..instrument.telescope import RayBundle
 from ..optics import LayerStack
 
-__all__ = ["PhotonMigration", "photon_migration", "spread_charge"]
-
 FloatArray = NDArray[np.float64]
 
 _DEPTHS = 256

@@ -11,8 +11,6 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["PARTS", "FittedMap", "Polynomial", "RangeCells", "Seed", "across_degrees", "down_degrees"]
-
 FloatArray = NDArray[np.float64]
 
 DEGREE, BACKGROUND_DEGREE = 8, 1
@@ -186,6 +184,7 @@ class RangeCells:
 
 
 def cell_sums(image: FloatArray, cell: int) -> FloatArray:
+    """Sums over square cells of so many pixels; what is left at the far edges is left out."""
     rows, columns = (side // cell for side in image.shape)
     return np.asarray(
         image[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).sum(axis=(1, 3))

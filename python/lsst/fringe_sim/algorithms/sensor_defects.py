@@ -8,8 +8,6 @@ from scipy.ndimage import percentile_filter
 
 from .flat_prep_options import GAUSSIAN_MAD, FlatPrepOptions
 
-__all__ = ["bad_columns", "column_means", "isolated_defects"]
-
 Image = NDArray[np.float32]
 Mask = NDArray[np.int32]
 

@@ -24,8 +24,6 @@ from .field_response import SensorPlacement, sensor_response
 from .laboratory_shift import widened_um
 from .sky_response import FrameTable, Response, bandpass_of
 
-__all__ = ["SiliconSeries", "known_silicon_um", "silicon_nodes_um", "sky_of_maps"]
-
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 Respond = Callable[[FringeModel, tuple[float, float], tuple[Response, ...]], Response]

@@ -17,8 +17,6 @@ from .night_levels import BAND_SIGMA, Predictor, background_terms, levels_of, th
 from .sky_model_error import SIZES, Envelope, ModelError
 from .smooth_field import Splines, Spread, nearest_coefficients, prior_covariance
 
-__all__ = ["SkyShift", "fit_sky_shift"]
-
 FloatArray = NDArray[np.float64]
 
 MAP_SIGMA_ORDERS = 0.15

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 from ..model import FringeModel
 from .thickness_fit.fit import STEPS_PER_ORDER
 
-__all__ = ["template_errors"]
-
 SAMPLES = 257
 """Thicknesses at which the errors are looked for; many to every fringe order."""
 

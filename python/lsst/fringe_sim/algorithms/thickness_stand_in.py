@@ -18,8 +18,6 @@ from ..model import Setup
 from ..products import ThicknessMap
 from ..resources import read_yaml
 
-__all__ = ["ThicknessField", "stand_in_thickness"]
-
 FloatArray = NDArray[np.float64]
 
 _PERIOD = 1.5

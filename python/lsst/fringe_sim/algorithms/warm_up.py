@@ -22,8 +22,6 @@ from .thickness_fit.global_fit import global_fit
 from .thickness_fit.templates import FringeTemplates
 from .thickness_fit.uncertainty import slip_probability
 
-__all__ = ["FIRST", "THEN"]
-
 _WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 _RANGE_UM = (14.0, 18.0)
 _ORDER_UM = 0.3

@@ -18,8 +18,6 @@ from ..effects import EFFECTS
 from ..model import FringeModel
 from .sealed_cases import SealedCase
 
-__all__ = ["Oracle", "Visibility", "visibility"]
-
 FloatArray = NDArray[np.float64]
 
 ORDERS = (0.0, -1.0, 1.0)

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files import table_text, write_together
 
-__all__ = ["CASE_KINDS", "VISIBLE", "CaseResult", "ChallengeResult"]
-
 FloatArray = NDArray[np.float64]
 
 CASE_KINDS = ("none", "one", "two", "outsider")

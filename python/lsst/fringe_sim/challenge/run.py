@@ -25,8 +25,6 @@ from .oracle import Oracle, visibility
 from .result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
 from .sealed_cases import SealedCase, draw_case
 
-__all__ = ["is_right", "judge", "run_challenge"]
-
 
 def run_challenge(
     counts: Mapping[str, int],

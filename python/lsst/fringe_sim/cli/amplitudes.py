@@ -17,8 +17,6 @@ from .inputs import read_thickness
 from .output import OutputFolder, output_folder
 from .parameters import BUILT_IN, ChosenEffects, model_effects
 
-__all__ = ["amplitudes", "read_line_list"]
-
 STEP_PX = 16
 
 

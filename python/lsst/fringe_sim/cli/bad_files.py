@@ -8,8 +8,6 @@ import click
 
 from ..errors import FrameFormatError, FringeSimError, InputError
 
-__all__ = ["refuse_bad", "say_bad"]
-
 
 def say_bad(bad: Sequence[FringeSimError]) -> None:
     """Name files that are not used."""

@@ -16,8 +16,6 @@ from .parameters import with_effects_from
 if TYPE_CHECKING:
     from ..effects import Effect, Parameter
 
-__all__ = ["effects", "setups"]
-
 
 @command()
 def setups(

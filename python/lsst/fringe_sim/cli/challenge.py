@@ -17,8 +17,6 @@ from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
 if TYPE_CHECKING:
     from ..challenge.result import CaseResult
 
-__all__ = ["challenge"]
-
 RECORD = "cases.jsonl"
 TABLES = ("challenge.ecsv", "confusion.ecsv", "accuracy.ecsv", "calibration.ecsv", "pulls.ecsv")
 

@@ -12,8 +12,6 @@ from typing import Any
 
 import click
 
-__all__ = ["DRY_RUN", "EXISTING", "Declare", "Decorate", "argument", "command", "flag", "option"]
-
 Decorate = Callable[[Callable[..., None]], Callable[..., None]]
 Declare = Callable[[str], Decorate]
 """What the default of a parameter is: from the name of the parameter to a decorator, as those of click."""

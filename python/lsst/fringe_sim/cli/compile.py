@@ -12,8 +12,6 @@ import click
 from .command import command, option
 from .progress import progress
 
-__all__ = ["compile"]
-
 PROCESSES = 2
 SIMULATED = "simulated flats"
 

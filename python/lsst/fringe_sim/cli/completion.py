@@ -7,8 +7,6 @@ from click.shell_completion import get_completion_class
 
 from .command import argument, command
 
-__all__ = ["completion"]
-
 VARIABLE = "_FRINGE_SIM_COMPLETE"
 """Environment variable by which a shell asks for completions; click derives it from the name of the program."""
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from ..products.observed_files import ObservedImage
     from ..report.page import Origin
 
-__all__ = ["correct"]
-
 EXIT_REFUSED = 1
 
 OWN_CARD = re.compile(r"FRING(COR|TID|PRB|VER|S[CE]\d+)")

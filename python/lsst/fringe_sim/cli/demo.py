@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from .demo_outcome import Outcome
     from .demo_report import DemoDatasets
 
-__all__ = ["demo"]
-
 SETUP = "ts8_e2v"
 SENSOR = "E2V-CCD250-321"
 NIGHT = "20260115"

@@ -24,8 +24,6 @@ from ..report.words import measured_text
 from ..style import figure, finite_range, show_image
 from .demo_truth import DemoTruth
 
-__all__ = ["Outcome", "read_verdict"]
-
 FloatArray = NDArray[np.float64]
 
 PERCENT, NM_PER_UM = 100.0, 1000.0

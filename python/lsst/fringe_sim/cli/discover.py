@@ -25,8 +25,6 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..products import FringeCube, SensorSection
     from .sky_frames import SkyData
 
-__all__ = ["discover"]
-
 PRODUCTS = ("discovery.json", "discovery.ecsv", "effects.py", "report.html")
 OF_WHAT_WAS_LEARNED = ("learned.py", "learned_effect.py")
 """Files that are there where a correction was learned from what no effect explains."""

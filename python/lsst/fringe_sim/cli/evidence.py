@@ -12,8 +12,6 @@ from .output import OutputFolder, output_folder
 from .parameters import with_effects_from
 from .progress import progress
 
-__all__ = ["evidence"]
-
 
 @command()
 def evidence(

@@ -13,8 +13,6 @@ from .command import argument, command, flag
 from .output import OutputFolder, output_folder
 from .progress import progress
 
-__all__ = ["export"]
-
 
 @command()
 def export(

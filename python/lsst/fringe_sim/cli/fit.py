@@ -18,8 +18,6 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..instrument.setup import Setup
     from ..products import FringeCube, SensorSection, ThicknessMap
 
-__all__ = ["fit", "section_of_cube"]
-
 LEAST_WAVELENGTHS = 4
 """Below this the order of the fringe cannot be told."""
 

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from ..products.observed_files import ObservedImage
     from ..report.page import Origin
 
-__all__ = ["fit_sky"]
-
 NM = 1000.0
 WORTH_ORDERS = 0.02
 """Uncertainty to which a map is wanted, for what the command says of more frames [orders]: 0.13 rad of phase leave a

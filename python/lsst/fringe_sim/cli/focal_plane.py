@@ -39,8 +39,6 @@ from .output import OutputFolder, origin_of, output_folder
 from .parameters import effects_file_option, with_effects_from
 from .progress import progress
 
-__all__ = ["focal_plane"]
-
 SETUPS = {"e2v": "lsst_e2v", "ITL": "lsst_itl"}
 """Set-up of the sensors of each vendor."""
 

@@ -19,8 +19,6 @@ import click
 from .. import __version__
 from ..errors import LONGEST_MESSAGE, FringeSimError, UnknownNameError, shown
 
-__all__ = ["cli", "main"]
-
 MOST_NEW_OBJECTS = 10_000
 """Objects after which Python looks for unused ones."""
 

@@ -28,8 +28,6 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
 
     from ..instrument.setup import Setup
 
-__all__ = ["mock_flats"]
-
 STEEPEST_UM = 0.03
 """Range of a random map over the pixels of its shorter side: slopes of 0.05 µm per pixel, a sixth of a fringe."""
 

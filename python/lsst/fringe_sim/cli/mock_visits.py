@@ -19,8 +19,6 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["mock_visits"]
-
 VISITS = "visit_*.fits"  # in both folders
 
 

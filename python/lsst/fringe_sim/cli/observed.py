@@ -26,17 +26,6 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..products import FringeFrame, ObservedFrame
     from ..products.observed_files import ObservedImage
 
-__all__ = [
-    "Background",
-    "TemplateFolder",
-    "background_options",
-    "images_of",
-    "latest_date",
-    "other_light",
-    "stem_of",
-    "target_names",
-]
-
 SPACING_PX = 256.0
 
 

@@ -23,8 +23,6 @@ from .command import flag, option
 if TYPE_CHECKING:
     from ..report.page import Origin
 
-__all__ = ["OutputFolder", "origin_of", "output_folder", "refuse_among_inputs", "refuse_used_file"]
-
 OURS = (b"ORIGIN  = 'lsst.fringe_sim'", b"FRINGTID=", b"FRINGUND=")
 """What a FITS file of this program says in its first header: its origin, or that fringes were taken or put back."""
 

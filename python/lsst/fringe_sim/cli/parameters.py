@@ -23,26 +23,6 @@ if TYPE_CHECKING:  # none of it for --help
     from ..effects import Parameter
     from ..instrument.setup import Setup
 
-__all__ = [
-    "ANY_LIGHT",
-    "BUILT_IN",
-    "EFFECT",
-    "LABORATORY",
-    "SIZE",
-    "SKY",
-    "THICKNESS_RANGE",
-    "WAVELENGTHS",
-    "ChosenEffects",
-    "Quantity",
-    "SetupType",
-    "effect_settings",
-    "effects_file_option",
-    "laboratory_of_the_mock",
-    "model_effects",
-    "shape_of",
-    "with_effects_from",
-]
-
 
 BUILT_IN = "e2v_321"
 """Name of the thickness map that needs no file."""

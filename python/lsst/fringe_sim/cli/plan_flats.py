@@ -21,8 +21,6 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..algorithms.flat_plan import FlatForecast, PlannedFlat, RankedFlat
     from ..instrument.setup import Setup
 
-__all__ = ["plan_flats"]
-
 TABLE_ROWS = 10
 RANKED_ROWS = 5
 

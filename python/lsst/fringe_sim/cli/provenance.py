@@ -22,8 +22,6 @@ from ..errors import (
 )
 from .command import argument, command, flag, option
 
-__all__ = ["describe", "provenance", "read_header"]
-
 BUTLER = "LSST BUTLER "
 
 _ERRORS = {"QUADERR": "quadrature", "INTERR": "interpolation"}

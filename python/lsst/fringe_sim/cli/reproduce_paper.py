@@ -14,8 +14,6 @@ from .output import OutputFolder, origin_of, output_folder
 from .parameters import SIZE
 from .progress import progress
 
-__all__ = ["reproduce_paper"]
-
 ENVIRONMENT = "FRINGE_SIM_SHARED"
 BESIDE = Path("../shared")
 """Where the published curves lie beside a development checkout."""

@@ -34,8 +34,6 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["sky"]
-
 PERCENT = 100.0
 MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
 NO_DATE = "1970-01-01T00:00:00"  # of templates of a model: two runs agree to the byte

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from ..products import FringeFrame, FringeTemplates
     from ..products.observed_files import ObservedImage
 
-__all__ = ["templates"]
-
 LEAST_FRAMES = 3
 
 

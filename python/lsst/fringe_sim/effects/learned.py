@@ -15,8 +15,6 @@ from ..optics.system import OpticalSystem
 from .base import FloatArray, Parameter, PlainNullEffect, Values
 from .geometry import AMPLIFIERS, ImageGeometry
 
-__all__ = ["LearnedAmplifiers", "LearnedLight", "LearnedMap", "LearnedResponse"]
-
 LEARNED_NODES_NM = tuple(range(800, 1051, 10))
 """Wavelengths at which corrections are stated [nm]: in a straight line between them, constant beyond."""
 

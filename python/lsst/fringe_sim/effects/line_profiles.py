@@ -16,8 +16,6 @@ from ..optics.illumination import (
 )
 from .base import FloatArray
 
-__all__ = ["LorentzianProfile", "MixedProfile", "line_width"]
-
 _REACH = 10.0
 _PANEL_NODES = 8
 

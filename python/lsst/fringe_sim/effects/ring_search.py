@@ -13,8 +13,6 @@ from scipy.optimize import minimize
 
 from ..compiled import kernel
 
-__all__ = ["Rings", "find_rings"]
-
 FloatArray = NDArray[np.float64]
 
 FARTHEST_PX = 8000.0

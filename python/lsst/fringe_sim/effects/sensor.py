@@ -11,18 +11,6 @@ from ..errors import InputError
 from .base import FloatArray, Parameter, PlainNullEffect, SearchHints, Values
 from .geometry import AMPLIFIERS, ImageGeometry
 
-__all__ = [
-    "AmplifierGain",
-    "AmplifierOffset",
-    "BrighterFatter",
-    "ChargeDiffusion",
-    "Crosstalk",
-    "DarkCurrent",
-    "DarkPedestal",
-    "MidlineStep",
-    "NonLinearity",
-]
-
 LEAST_RATIO = 1.05
 """Longest over shortest exposure from which its length can tell a rate from a level."""
 

@@ -12,8 +12,6 @@ from ..optics.system import OpticalSystem
 from .base import FloatArray, Parameter, PlainNullEffect, Values
 from .geometry import ImageGeometry
 
-__all__ = ["SiliconGradient"]
-
 NODE_UM = 2.0
 """Silicon thicknesses from which the response is interpolated: nominal, and so much on both sides [µm]."""
 

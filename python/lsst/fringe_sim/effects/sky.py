@@ -8,8 +8,6 @@ from ..instrument.flat_spectrum import FlatSpectrum
 from ..instrument.sky import SkySpectrum
 from .base import Parameter, PlainNullEffect, SearchHints, Values
 
-__all__ = ["FlatFringes", "HotRotation", "OHBands", "RotationalTemperature", "SkyContinuum", "WaterVapour"]
-
 HOT_K = 1000.0
 """Temperature of a hot population that is added to that of the line list [K]."""
 

@@ -10,8 +10,6 @@ from .base import FloatArray, Parameter, PlainNullEffect, Residuals, SearchHints
 from .geometry import ImageGeometry
 from .ring_search import find_rings
 
-__all__ = ["TreeRings"]
-
 MEAN_SAMPLES = 64
 """Samples along each axis from which the mean of the pattern over a sensor is taken."""
 

@@ -21,8 +21,6 @@ from .ray_bundle import (
 )
 from .telescope import Telescope, TracedOptics, batoid_optic
 
-__all__ = ["TRACED_RADII", "BeamField"]
-
 FloatArray = NDArray[np.float64]
 
 TRACED_RADII = 8

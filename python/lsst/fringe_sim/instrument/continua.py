@@ -18,8 +18,6 @@ from ..errors import OutOfRangeError, named_units
 from ..resources import read_table
 from .oh_levels import SECOND_RADIATION_CM_K
 
-__all__ = ["ARCSEC2_PER_SR", "ContinuumTerm", "airglow_continuum", "moonlight", "zodiacal_light"]
-
 FloatArray = NDArray[np.float64]
 
 ARCSEC2_PER_SR = (180.0 * 3600.0 / math.pi) ** 2

@@ -15,8 +15,6 @@ import numpy as np
 from ..errors import InputError, UnknownNameError, named_units
 from ..notebook import OneLine
 
-__all__ = ["Amplifier", "Detector", "RawSegment", "refuse_misfits"]
-
 
 @dataclasses.dataclass(frozen=True)
 class RawSegment:

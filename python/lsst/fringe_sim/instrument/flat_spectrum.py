@@ -17,8 +17,6 @@ from .sky import SpectralComponent
 if TYPE_CHECKING:  # filters take time to import, and effects do without
     from .bandpass import Bandpass
 
-__all__ = ["FlatSpectrum"]
-
 FloatArray = NDArray[np.float64]
 
 STEP_NM = 0.2

@@ -15,8 +15,6 @@ from scipy.ndimage import map_coordinates
 from ..errors import InputError
 from ..resources import read_table
 
-__all__ = ["E2V_SHAPE", "Sampling", "e2v_321", "fit_to_sensor"]
-
 E2V_SHAPE = (4004, 4096)
 """Rows and columns of an assembled, trimmed E2V-CCD250."""
 

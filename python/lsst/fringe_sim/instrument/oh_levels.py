@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from ..errors import OutOfRangeError
 from ..resources import read_table
 
-__all__ = ["RotationalLevels"]
-
 FloatArray = NDArray[np.float64]
 
 SECOND_RADIATION_CM_K = 1.4387769

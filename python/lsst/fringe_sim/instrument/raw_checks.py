@@ -11,17 +11,6 @@ from ..errors import FrameFormatError, UnknownNameError
 from .camera import Camera
 from .detector import Detector
 
-__all__ = [
-    "refuse_binning",
-    "refuse_no_flat",
-    "refuse_other_day",
-    "refuse_other_instrument",
-    "refuse_other_sensor",
-    "refuse_other_unit",
-    "refuse_other_vendor",
-    "refuse_stutter",
-]
-
 OBSERVATION_PREFIX = {"lsstCam": "MC", "ts8": "TS"}
 """First letters of ``OBSID``: main camera, test stand. CC is ComCam, AT the auxiliary telescope."""
 

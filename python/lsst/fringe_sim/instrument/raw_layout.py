@@ -18,8 +18,6 @@ from ..errors import FrameFormatError
 from .raw_checks import refuse_other_unit
 from .raw_header import header_value
 
-__all__ = ["N_AMPLIFIERS", "AmplifierLayout", "Section", "amplifier_layouts", "image_shape"]
-
 N_AMPLIFIERS = 16
 """Outputs of an LSST science sensor."""
 

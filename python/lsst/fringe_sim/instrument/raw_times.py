@@ -12,8 +12,6 @@ from astropy.time import Time
 from .raw_checks import refuse_other_day
 from .raw_header import DeclaredHeader
 
-__all__ = ["DAY_ROLLOVER_H", "begin_of_exposure", "day_and_sequence", "exposure_id", "time_scale"]
-
 CONTROLLERS = "OCHPQS"
 """Data-acquisition controllers of the LSST Camera; the place adds thousands of years to the exposure number."""
 

@@ -11,17 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import OutOfRangeError
 from ..optics import Beam
 
-__all__ = [
-    "BEAM_NODES",
-    "QUANTILES",
-    "RayBundle",
-    "beam_of_quantiles",
-    "gauss_rule",
-    "lagrange_weights",
-    "quantiles",
-    "reduce_beam",
-]
-
 FloatArray = NDArray[np.float64]
 
 BEAM_NODES = 96

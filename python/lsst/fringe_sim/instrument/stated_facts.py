@@ -12,19 +12,6 @@ from typing import Any
 
 from ..errors import FrameFormatError, InputError, to_number
 
-__all__ = [
-    "FILTER_RANGE_NM",
-    "NO_READING_C",
-    "RAW_FACTS",
-    "SAME_CELSIUS",
-    "SAME_SECONDS",
-    "SETTING_NM",
-    "Fact",
-    "Statement",
-    "refuse_contradictions",
-    "refuse_other_filter",
-]
-
 SETTING_NM = 1.0
 """What two readings of one setting of the monochromator may differ by; steps between flats are 5 nm or more."""
 

@@ -16,14 +16,6 @@ from ..products import FringeFrame, SensorSection
 from .afw import read_exposure
 from .instruments import sensor_of
 
-__all__ = [
-    "ConfigOverrideFormatter",
-    "FitsProductFormatter",
-    "FringeFrameFormatter",
-    "RawFrameFormatter",
-    "StrictJsonFormatter",
-]
-
 PROVENANCE_PREFIX = "LSST BUTLER"
 """Start of the header keywords that say from which datasets a product was made, as in other Rubin images."""
 

@@ -23,8 +23,6 @@ from lsst.daf.butler.registry import RegistryError
 from ..errors import InputError
 from ..files import write_whole
 
-__all__ = ["EXPORT_FILE", "FRINGE", "ISR_FILE", "isr_override", "write_handoff"]
-
 FRINGE = "fringe"
 """Dataset type that Rubin's instrument signature removal reads."""
 

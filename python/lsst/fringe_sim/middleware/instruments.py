@@ -19,16 +19,6 @@ from ..errors import InputError, UnknownNameError
 from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 
-__all__ = [
-    "INSTRUMENTS",
-    "FringeInstrument",
-    "HscFringe",
-    "LsstCamFringe",
-    "MonoCamFringe",
-    "Ts8Fringe",
-    "sensor_of",
-]
-
 _LOG = logging.getLogger(__name__)
 
 NO_FILTER = "none"

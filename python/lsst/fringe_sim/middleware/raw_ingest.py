@@ -40,8 +40,6 @@ from .formatters import RawFrameFormatter
 from .instruments import INSTRUMENTS, FringeInstrument
 from .translators import TRANSLATORS
 
-__all__ = ["RAW", "IngestReport", "RawExposure", "examine", "ingest_raws", "raw_dataset_type"]
-
 RAW = "raw"
 """Dataset type of raw frames."""
 

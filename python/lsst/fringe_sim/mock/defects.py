@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from ..errors import OutOfRangeError
 from ..instrument.detector import Detector
 
-__all__ = ["Defects", "draw_defects"]
-
 BRIGHT_COLUMN_E = 2_000.0
 """Charge that a bright column adds to a flat [electrons]."""
 

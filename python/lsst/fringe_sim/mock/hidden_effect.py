@@ -12,8 +12,6 @@ from ..effects import Parameter
 from ..effects.base import Described
 from .optics import FlatFieldOptics
 
-__all__ = ["RIM_POINTS", "RIM_SQUARES", "ActiveHiddenEffect", "AmplifierState", "HiddenEffect", "Island"]
-
 FloatArray = NDArray[np.float64]
 Values = Mapping[str, float]
 

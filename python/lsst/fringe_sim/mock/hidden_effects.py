@@ -30,18 +30,6 @@ from .hidden_effect import (
 )
 from .optics import Film, FlatFieldOptics
 
-__all__ = [
-    "HIDDEN_EFFECTS",
-    "ActiveHiddenEffect",
-    "AmplifierState",
-    "HiddenEffect",
-    "Island",
-    "added_silicon",
-    "hidden_islands",
-    "validate_effects",
-    "with_hidden_optics",
-]
-
 REFERENCE_CHARGE_E = 100_000.0
 """Charge at which the coefficient of the non-linearity is stated [electrons]."""
 

@@ -16,8 +16,6 @@ from ..descriptions import read_table_of
 from ..errors import OutOfRangeError, UnknownNameError
 from ..resources import read_table, read_user_yaml, read_yaml
 
-__all__ = ["material_index"]
-
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 

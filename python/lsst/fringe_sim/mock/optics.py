@@ -24,8 +24,6 @@ from .line_shapes import LINE_SHAPES, LINE_STEP_NM
 from .materials import material_index
 from .signal_table import SignalTable
 
-__all__ = ["Film", "FlatFieldOptics", "SignalTable", "material_index"]
-
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 

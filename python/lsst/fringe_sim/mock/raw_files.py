@@ -17,8 +17,6 @@ from ..files import all_or_nothing
 from ..instrument.camera import Amplifier, Camera, Detector, RawSegment
 from .readout import BIAS_LEVEL_ADU, raw_segment
 
-__all__ = ["Clock", "primary_header", "write_frame"]
-
 EXPOSURE_BASE_S = 12.0
 """Exposure time at 800 nm [s]."""
 

@@ -14,8 +14,6 @@ from ..errors import InputError
 from ..instrument.camera import Amplifier, Detector, RawSegment
 from .hidden_effects import AmplifierState, HiddenEffect
 
-__all__ = ["Readout", "raw_segment"]
-
 FloatArray = NDArray[np.float64]
 ActiveEffects = Sequence[tuple[HiddenEffect, dict[str, float]]]
 

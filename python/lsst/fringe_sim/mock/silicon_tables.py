@@ -19,8 +19,6 @@ from ..errors import ConvergenceError
 from .optics import RELATIVE_TOLERANCE, FlatFieldOptics
 from .signal_table import SignalTable
 
-__all__ = ["SiliconTables"]
-
 FloatArray = NDArray[np.float64]
 Seen = Callable[..., FloatArray]
 

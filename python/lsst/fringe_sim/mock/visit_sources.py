@@ -17,8 +17,6 @@ from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
 from ..instrument.readout import zero_point
 
-__all__ = ["MASK_PLANES", "Pointing", "Scene", "VisitConditions", "VisitImage", "expected_sources"]
-
 FloatArray = NDArray[np.float64]
 
 MASK_PLANES = {"BAD": 0, "SAT": 1}

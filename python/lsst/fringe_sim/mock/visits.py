@@ -34,8 +34,6 @@ from .raw_frames import checked_thickness, films_of, parse_size, read_setup_file
 from .signal_table import SignalTable
 from .visit_sources import MASK_PLANES, Pointing, Scene, VisitConditions, VisitImage, expected_sources
 
-__all__ = ["MockVisit", "VisitConditions", "check_visits", "detected_sky", "write_mock_visits"]
-
 FloatArray = NDArray[np.float64]
 
 STEP_UM = 0.01

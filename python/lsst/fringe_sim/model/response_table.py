@@ -17,8 +17,6 @@ from ..notebook import OneLine
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
 
-__all__ = ["DEFAULT_TOLERANCE", "ResponseTable", "response_table", "tabulate"]
-
 FloatArray = NDArray[np.float64]
 Sampler = Callable[[float, float, int], FloatArray]
 """``(start_um, step_um, count) -> response [W, count]`` on a uniform grid of thickness."""

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from ..compiled import kernel, run_shares
 from .transfer_matrix import FloatArray
 
-__all__ = ["Nodes", "at_thicknesses", "derivative_bounds", "on_grid"]
-
 Nodes = tuple[NDArray[Any], ...]
 """``a, b, e, c, g, kappa`` of the Q nodes of W groups, and their weights, all ``(W, Q)``."""
 

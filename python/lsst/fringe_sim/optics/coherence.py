@@ -24,8 +24,6 @@ from .transfer_matrix import (
     layer_admittance,
 )
 
-__all__ = ["PhaseState", "phase_states"]
-
 _ERROR = 1e-14
 _FEWEST, _MOST = 8, 512
 

@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 
 from ..compiled import contiguous, kernel, processors, run_shares, run_threaded, subkernel
 
-__all__ = ["MOST_RATIO", "ROUNDING", "series_at", "series_on_grid"]
-
 FloatArray = NDArray[np.float64]
 
 ROUNDING = 2e-13

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from astropy.table import Table
     from scipy.interpolate import CubicSpline, PchipInterpolator
 
-__all__ = ["Medium", "check_range", "constant_medium", "get_medium", "medium_names", "read_media"]
-
 REFERENCE_TEMPERATURE_K = 300.0
 """Temperature at which Green (2008) tabulates silicon [K]."""
 

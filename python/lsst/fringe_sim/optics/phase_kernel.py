@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from ..compiled import contiguous, kernel, run_shares, subkernel
 
-__all__ = ["reduce_nodes"]
-
 
 def reduce_nodes(
     index: NDArray,

@@ -31,8 +31,6 @@ from .transfer_matrix import (
     pure_polarizations,
 )
 
-__all__ = ["PhaseResponse", "reduce_to_phase"]
-
 _COEFFICIENTS = ("a", "b", "e", "c", "g", "kappa")
 
 _SHORT_GRID = 256

@@ -16,8 +16,6 @@ from .laboratory import MAP_RANGE_UM, RAFT
 from .section import Context, Curve, Graph, Section
 from .sky import RANGE_UM, lines_only
 
-__all__ = ["coadd", "components"]
-
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0

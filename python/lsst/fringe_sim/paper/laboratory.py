@@ -19,8 +19,6 @@ from ..model import FringeModel
 from ..products import FlatExposures, FringeCube
 from .section import Context, Curve, Graph, Picture, Section, missing
 
-__all__ = ["flat_contrast", "one_pixel", "raft", "row_3000", "thickness_fit"]
-
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0

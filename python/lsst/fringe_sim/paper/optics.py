@@ -19,8 +19,6 @@ from ..optics import Beam, Illumination
 from ..resources import read_table
 from .section import Context, Curve, Graph, Section, missing
 
-__all__ = ["angles", "oh_lines", "photon_walk"]
-
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0

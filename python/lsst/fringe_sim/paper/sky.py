@@ -27,8 +27,6 @@ from ..model import FringeModel, Setup
 from ..optics import Illumination
 from .section import Context, Curve, Graph, Picture, Section, missing
 
-__all__ = ["hsc", "lines_only", "lsst", "monocam", "surface_brightness"]
-
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0

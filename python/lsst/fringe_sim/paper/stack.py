@@ -13,8 +13,6 @@ from ..optics.illumination import SIGMA_PER_FWHM, GaussianProfile
 from ..optics.system import OpticalSystem
 from .section import Context, Curve, Graph, Section, missing
 
-__all__ = ["absorption_depth", "bandwidth", "layers", "other_vendor"]
-
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from .sky_frame import CORRECTED_BY
 
-__all__ = ["FILE_KEYWORDS", "FILTER_NAMES", "SENSOR_NAMES", "FileKeyword", "declared_names"]
-
 USED, CHECKED, REFUSED = "used", "checked", "refused"
 """It decides something of the result; another value than the one allowed is refused; its presence is refused."""
 

@@ -21,8 +21,6 @@ from .mask import mask_bits
 from .same_light import refuse_equal_pixels
 from .sky_frame import NOISE, is_noiseless
 
-__all__ = ["CUBE_UNITS", "FlatExposures", "FringeCube"]
-
 CUBE_UNITS = ("electron", "relative")
 """Units of a cube: counts in electrons, or counts divided by their mean over the sensor (so near 1)."""
 

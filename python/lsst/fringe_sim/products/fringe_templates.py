@@ -14,8 +14,6 @@ from .fits_product import DETECTOR, FILTER, MASK, Card, FitsProduct, Image
 from .fringe_frame import FringeFrame
 from .mask import mask_bits
 
-__all__ = ["FringeTemplates"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FringeTemplates(FitsProduct):

@@ -24,8 +24,6 @@ from .file_keywords import FILTER_NAMES, SENSOR_NAMES, declared_names
 from .mask import MASK_PLANES, mask_bits
 from .observed_frame import ObservedFrame
 
-__all__ = ["UNCORRECTED", "ObservedImage", "detector_of", "is_companion", "observed_images", "write_images"]
-
 UNCORRECTED = "UNCORRECTED"
 """End of the name of an extension that is 1 where a template has no value."""
 

@@ -29,8 +29,6 @@ from .mask import mask_bits
 from .same_light import pixels_digest
 from .sky_frame import NOISE, refuse_noiseless
 
-__all__ = ["PlainImage", "read_plain_flats", "refuse_other_sensors", "stack_plain_flats"]
-
 DECLARED = declared_names("plain flat")
 
 WAVELENGTHS = ("MONOWL", "WAVELEN", "WAVELNTH")

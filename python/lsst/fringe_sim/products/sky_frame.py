@@ -14,16 +14,6 @@ from ..errors import InputError, UnknownNameError, named_units
 from . import _fits as io
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
 
-__all__ = [
-    "CORRECTED",
-    "NOISE",
-    "SKY_UNITS",
-    "SkyFringe",
-    "is_noiseless",
-    "refuse_corrected",
-    "refuse_noiseless",
-]
-
 CORRECTED = "FRINGCOR"
 """Keyword of an exposure from which fringes were subtracted; its value is the number of templates."""
 

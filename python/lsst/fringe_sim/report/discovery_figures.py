@@ -15,8 +15,6 @@ from ..algorithms.discovery.verdict import MOST_CANDIDATES
 from ..style import DIVERGING, LINES, color_bar, figure, panels
 from .figures import CURVE_INCH
 
-__all__ = ["candidates_figure", "gap_figure", "leftover_figure", "where_figure"]
-
 PERCENT = 100.0
 SMALLEST = 1e-300
 """Probabilities below this are drawn at it."""

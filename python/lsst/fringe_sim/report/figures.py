@@ -31,21 +31,6 @@ if TYPE_CHECKING:
     from ..algorithms.coadds import Coadds
     from ..algorithms.single_pixel import SinglePixelFit
 
-__all__ = [
-    "coadds_figure",
-    "components_figure",
-    "contrast_figure",
-    "flats_figure",
-    "map_row",
-    "phase_figure",
-    "pixel_noise",
-    "residuals_figure",
-    "single_pixel_figure",
-    "sky_figure",
-    "template_figure",
-    "thickness_figure",
-]
-
 PERCENT = 100.0
 
 MAP_INCH, CURVE_INCH, SMALL_INCH = (3.4, 2.8), (4.6, 3.4), (1.7, 1.8)

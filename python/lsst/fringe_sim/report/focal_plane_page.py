@@ -21,8 +21,6 @@ from ..style import DIVERGING, LINES, SEQUENTIAL, figure, panels
 from .page import Origin, Report
 from .words import span_text
 
-__all__ = ["focal_plane_figure", "write_focal_plane_page"]
-
 PLAIN = "{x:.2g}"
 """Format of logarithmic scales."""
 

@@ -27,8 +27,6 @@ from ..files import table_text, write_whole
 from ..style import finite_range, map_to_png, pixels_to_png, to_pieces
 from .words import number_text
 
-__all__ = ["Origin", "Report", "title_of"]
-
 GENERATOR = '<meta name="generator" content="lsst.fringe_sim">'
 HEAD_LENGTH = 1000
 """What pages of this program say in their beginning, and the length of it."""

@@ -19,8 +19,6 @@ from .figures import CURVE_INCH, MAP_INCH
 from .page import Origin, Report
 from .words import number_text
 
-__all__ = ["section_figures", "write_paper_page"]
-
 PER_ROW = 3
 MANY = 5
 """More panels than this are drawn small, as a gallery."""

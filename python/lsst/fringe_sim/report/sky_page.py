@@ -21,15 +21,6 @@ from .page import Origin, Report
 from .source_figure import bias_figure
 from .words import masked_text, of_sensor, span_text
 
-__all__ = [
-    "COADDS_CAPTION",
-    "COADDS_TEXT",
-    "SOURCES_FILE",
-    "coadd_table",
-    "sky_amplitudes",
-    "write_sky_report",
-]
-
 PERCENT = 100.0
 
 SOURCES_FILE = "coadd_sources.ecsv"

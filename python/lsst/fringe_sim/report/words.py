@@ -10,16 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..products import SensorSection
 
-__all__ = [
-    "amplitude_text",
-    "masked_text",
-    "measured_text",
-    "number_text",
-    "of_sensor",
-    "sigma_text",
-    "span_text",
-]
-
 PERCENT = 100.0
 NM = 1000.0
 

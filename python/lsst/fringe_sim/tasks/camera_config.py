@@ -11,8 +11,6 @@ from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 from ..middleware.instruments import INSTRUMENTS
 
-__all__ = ["CameraConfig"]
-
 
 class CameraConfig(Config):
     """The camera whose rafts and sensors a configuration names.

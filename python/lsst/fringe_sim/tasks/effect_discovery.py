@@ -23,15 +23,6 @@ from .model_config import FringeModelConfig, ModelChoice
 from .quantum import SENSOR, SENSOR_EXPOSURE, common_header, data_id_of, flats_input, sensor_of, unusable
 from .sky_model import SkyModelConfig, thickness_input
 
-__all__ = [
-    "EffectDiscoveryConfig",
-    "EffectDiscoveryConnections",
-    "EffectDiscoveryTask",
-    "SkyEffectDiscoveryConfig",
-    "SkyEffectDiscoveryConnections",
-    "SkyEffectDiscoveryTask",
-]
-
 
 class EffectDiscoveryConnections(base.PipelineTaskConnections, dimensions=SENSOR):
     """The flats of a sensor in; a verdict, and what it means for the model of all other tasks, out."""

@@ -26,8 +26,6 @@ from ..products import FringeCube, FringeFlat, ThicknessMap, describe_mask
 from .model_config import FringeModelConfig
 from .quantum import SENSOR, common_header, data_id_of, flats_input, sensor_of, unusable
 
-__all__ = ["EpoxyFitConfig", "EpoxyFitConnections", "EpoxyFitTask"]
-
 _LOG = getLogger(__name__)
 
 

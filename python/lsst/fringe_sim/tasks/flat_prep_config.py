@@ -10,8 +10,6 @@ from lsst.pex.config import ChoiceField, Config, Field, FieldValidationError
 from ..algorithms.flat_prep import FlatPrepOptions
 from ..errors import InputError
 
-__all__ = ["FlatPrepConfig"]
-
 _DEFAULT = FlatPrepOptions()
 _OVERSCAN = ("overscan_method", "overscan_knots", "overscan_skip", "parallel_overscan")
 

@@ -14,8 +14,6 @@ from lsst.pipe.base.connectionTypes import Input, Output
 from ..algorithms.focal_plane import summary_table
 from .quantum import SENSOR, common_header, put_in_order, unusable
 
-__all__ = ["FocalPlaneSummaryConfig", "FocalPlaneSummaryConnections", "FocalPlaneSummaryTask"]
-
 
 class FocalPlaneSummaryConnections(base.PipelineTaskConnections, dimensions=("instrument",)):
     """Forecasts of sensors in, one table out."""

@@ -16,8 +16,6 @@ from ..products import CombinedBias
 from .flat_prep_config import FlatPrepConfig
 from .quantum import SENSOR, SENSOR_EXPOSURE, common_header, data_id_of, sensor_of, unusable
 
-__all__ = ["FringeBiasConfig", "FringeBiasConnections", "FringeBiasTask"]
-
 _LOG = getLogger(__name__)
 
 

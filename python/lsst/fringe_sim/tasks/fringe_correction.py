@@ -17,8 +17,6 @@ from ..products import FringeTemplates, ObservedFrame
 from .observed_fringe import BackgroundConfig
 from .quantum import SENSOR_EXPOSURE, SENSOR_FILTER, common_header, data_id_of, sensor_of, unusable
 
-__all__ = ["FringeCorrectionConfig", "FringeCorrectionConnections", "FringeCorrectionTask"]
-
 
 class FringeCorrectionConnections(base.PipelineTaskConnections, dimensions=SENSOR_EXPOSURE):
     """A frame and templates in, the corrected frame and its row of the table out."""

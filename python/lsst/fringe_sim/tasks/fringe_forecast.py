@@ -24,8 +24,6 @@ from .sky_model import (
     without_constraint,
 )
 
-__all__ = ["FringeForecastConfig", "FringeForecastConnections", "FringeForecastTask"]
-
 
 class FringeForecastConnections(base.PipelineTaskConnections, dimensions=SENSOR):
     """A thickness map in, where there is one; one table out."""

@@ -27,8 +27,6 @@ from .quantum import (
     unusable,
 )
 
-__all__ = ["FringePcaConfig", "FringePcaConnections", "FringePcaTask"]
-
 
 class FringePcaConnections(base.PipelineTaskConnections, dimensions=SENSOR_FILTER):
     """The sky frames of a sensor in a filter in, one template and all components out."""

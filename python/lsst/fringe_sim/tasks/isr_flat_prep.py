@@ -22,8 +22,6 @@ from .flat_prep_config import FlatPrepConfig
 from .model_config import by_raft
 from .quantum import SENSOR, SENSOR_EXPOSURE, common_header, data_id_of, sensor_of, unusable
 
-__all__ = ["IsrFlatPrepConfig", "IsrFlatPrepConnections", "IsrFlatPrepTask"]
-
 _WAVELENGTH = re.compile(r"\s*([\d.]+) nm\s*")
 
 

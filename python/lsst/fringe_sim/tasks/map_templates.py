@@ -23,8 +23,6 @@ from .sky_model import (
     without_constraint,
 )
 
-__all__ = ["MapTemplatesConfig", "MapTemplatesConnections", "MapTemplatesTask"]
-
 
 class MapTemplatesConnections(base.PipelineTaskConnections, dimensions=SENSOR_FILTER):
     """Maps of a sensor in, templates of its sky in a filter out."""

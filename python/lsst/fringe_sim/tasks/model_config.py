@@ -22,8 +22,6 @@ from ..model.effects_override import refuse_other_effects
 from ..model.provenance import model_cards
 from .camera_config import CameraConfig
 
-__all__ = ["FringeModelConfig", "ModelChoice", "RaftConfig", "SensorConfig", "by_raft"]
-
 Value = TypeVar("Value")
 
 

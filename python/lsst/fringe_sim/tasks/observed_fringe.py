@@ -25,8 +25,6 @@ from .quantum import (
     unusable,
 )
 
-__all__ = ["BackgroundConfig", "ObservedFringeConfig", "ObservedFringeConnections", "ObservedFringeTask"]
-
 LEAST_FRAMES = 3
 
 

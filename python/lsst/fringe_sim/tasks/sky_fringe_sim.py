@@ -36,13 +36,6 @@ from .sky_model import (
     without_constraint,
 )
 
-__all__ = [
-    "SkyExposure",
-    "SkyFringeSimConfig",
-    "SkyFringeSimConnections",
-    "SkyFringeSimTask",
-]
-
 FIRST_HOUR = 19.0
 """Local time at which the tabulated night begins [h]."""
 

@@ -35,19 +35,6 @@ from ..products.thickness_map import thickness_span_um
 from .model_config import FringeModelConfig, ModelChoice
 from .quantum import SENSOR, common_header
 
-__all__ = [
-    "LINE_LIST",
-    "SensorMapsConfig",
-    "SensorSky",
-    "SkyModel",
-    "SkyModelConfig",
-    "maps_of",
-    "silicon_input",
-    "takes_images",
-    "thickness_input",
-    "without_constraint",
-]
-
 LINE_LIST = "PALACE OH (Noll et al. 2025)"
 
 

@@ -22,8 +22,6 @@ from ...model import FringeModel
 from .kinds import SHIFT_UM, Kind, PixelFlats
 from .models import LAB, models_with, without_bench
 
-__all__ = ["Axis", "JointFit", "Predictor", "parse_set"]
-
 FloatArray = NDArray[np.float64]
 
 MOST_PARAMETERS = 3

@@ -27,16 +27,6 @@ from ..single_pixel import published_pixel
 from ..sky_response import is_band
 from .models import LAB, Models
 
-__all__ = [
-    "SHIFT_UM",
-    "FlatContrast",
-    "Kind",
-    "PixelFlats",
-    "harmonics",
-    "public_kinds",
-    "sky_amplitude",
-]
-
 FloatArray = NDArray[np.float64]
 
 SHIFT_UM = np.linspace(-1.5, 1.5, 601)

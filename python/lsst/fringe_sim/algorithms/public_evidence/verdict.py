@@ -29,8 +29,6 @@ from .kinds import (
 )
 from .models import LAB, Models, models_with, without_bench
 
-__all__ = ["DECIDING", "RIVALS", "Comparison", "KindRow", "Measurement", "compare"]
-
 FloatArray = NDArray[np.float64]
 
 CLASS_WIDTH = SearchOptions().class_width
