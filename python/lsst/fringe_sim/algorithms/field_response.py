@@ -27,10 +27,7 @@ from .angular_response import ANGLES, AngularResponse, angular_response, of_othe
 from .island_response import parts_of, response_with_islands
 from .sensor_placement import SensorPlacement
 from .sky_frame import is_band, sky_response
-from .sky_response import (
-    Response,
-    component_factors,
-)
+from .sky_response import Response, component_factors
 
 FloatArray = NDArray[np.float64]
 
@@ -215,9 +212,7 @@ class FieldTable:
 
 
 def field_response(
-    angular: AngularResponse,
-    beams: BeamField,
-    radius_range_deg: tuple[float, float],
+    angular: AngularResponse, beams: BeamField, radius_range_deg: tuple[float, float]
 ) -> FieldResponse:
     """Give an angular response the beams of a range of field radii.
 

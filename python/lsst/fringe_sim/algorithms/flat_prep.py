@@ -193,10 +193,7 @@ def _assemble_adu(frame: RawFrame, options: FlatPrepOptions) -> tuple[Image, dic
 
 
 def assemble_charge(
-    frame: RawFrame,
-    bias: CombinedBias | None,
-    detector: Detector,
-    options: FlatPrepOptions = DEFAULT_OPTIONS,
+    frame: RawFrame, bias: CombinedBias | None, detector: Detector, options: FlatPrepOptions = DEFAULT_OPTIONS
 ) -> PreparedCharge:
     """Charge of every pixel of a flat on the assembled, trimmed sensor, with variance and mask.
 

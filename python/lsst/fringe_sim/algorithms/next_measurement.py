@@ -202,10 +202,7 @@ def rank_measurements(
 
 
 def _ranked(
-    forecast: Forecast,
-    measurements: Sequence[FlatMeasurement],
-    significance: float | None,
-    say: Report,
+    forecast: Forecast, measurements: Sequence[FlatMeasurement], significance: float | None, say: Report
 ) -> tuple[RankedMeasurement, ...]:
     before = forecast.pairs([forecast.present])
     first, *others = (item.effect.name for item in forecast.tested)

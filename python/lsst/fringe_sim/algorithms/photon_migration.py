@@ -79,10 +79,7 @@ class PhotonMigration:
 
 
 def photon_migration(
-    rays: RayBundle,
-    light: Sequence[SpectralComponent],
-    stack: LayerStack,
-    temperature_k: float,
+    rays: RayBundle, light: Sequence[SpectralComponent], stack: LayerStack, temperature_k: float
 ) -> PhotonMigration:
     """Walk of the photons of a sky in the detection layer.
 

@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 
 
 @command()
-def setups(
-    as_json: bool = flag("Machine-readable.", "--json"),
-) -> None:
+def setups(as_json: bool = flag("Machine-readable.", "--json")) -> None:
     """List the set-ups: sensors, telescopes and test stands.
 
     \b

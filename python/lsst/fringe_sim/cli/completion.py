@@ -12,9 +12,7 @@ VARIABLE = "_FRINGE_SIM_COMPLETE"
 
 
 @command()
-def completion(
-    shell: str = argument(kind=click.Choice(["bash", "zsh", "fish"]), nargs=1),
-) -> None:
+def completion(shell: str = argument(kind=click.Choice(["bash", "zsh", "fish"]), nargs=1)) -> None:
     """Print the lines that make a shell complete commands, options, set-ups and effects.
 
     \b

@@ -13,14 +13,7 @@ import click
 from ..errors import InputError
 from .bad_files import refuse_bad
 from .command import DRY_RUN, EXISTING, argument, command, flag, option
-from .observed import (
-    Background,
-    TemplateFolder,
-    background_options,
-    images_of,
-    stem_of,
-    target_names,
-)
+from .observed import Background, TemplateFolder, background_options, images_of, stem_of, target_names
 from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 

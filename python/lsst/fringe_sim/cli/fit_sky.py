@@ -135,13 +135,7 @@ def fit_sky(
     response = _response(layer, model, sensor, section, reach_um(order_um, map_sigma))
     with progress("finding fringes", len(images)) as advance:
         found = map_on_sky(
-            loaders,
-            layer,
-            response,
-            order_um,
-            options,
-            map_sigma_um=map_sigma,
-            advance=advance,
+            loaders, layer, response, order_um, options, map_sigma_um=map_sigma, advance=advance
         )
     given: list[str | Path] = [thickness, *dict.fromkeys(image.path for image in images)]
     origin = origin_of(folder, [*given, *effects.files])

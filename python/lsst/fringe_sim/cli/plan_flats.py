@@ -140,11 +140,7 @@ def forecast_table(forecast: FlatForecast) -> QTable:
 
 
 def _print(
-    now: FlatForecast,
-    ranked: tuple[RankedFlat, ...],
-    short: FlatForecast,
-    slip_limit: float,
-    width_nm: float,
+    now: FlatForecast, ranked: tuple[RankedFlat, ...], short: FlatForecast, slip_limit: float, width_nm: float
 ) -> None:
     import numpy as np
 

@@ -12,14 +12,7 @@ from uuid import UUID
 
 import click
 
-from ..errors import (
-    LONGEST_VALUE,
-    FrameFormatError,
-    InputError,
-    UnknownNameError,
-    printable_name,
-    shown,
-)
+from ..errors import LONGEST_VALUE, FrameFormatError, InputError, UnknownNameError, printable_name, shown
 from .command import argument, command, flag, option
 
 BUTLER = "LSST BUTLER "

@@ -13,13 +13,7 @@ from ..errors import InputError
 from ..files import same_file_key
 from .bad_files import refuse_bad
 from .command import DRY_RUN, EXISTING, argument, command, flag, option
-from .observed import (
-    Background,
-    TemplateFolder,
-    background_options,
-    images_of,
-    latest_date,
-)
+from .observed import Background, TemplateFolder, background_options, images_of, latest_date
 from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 

@@ -8,12 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError, OutOfRangeError
-from ..optics.illumination import (
-    DEFAULT_STEP_NM,
-    GaussianProfile,
-    SpectralProfile,
-    TriangularProfile,
-)
+from ..optics.illumination import DEFAULT_STEP_NM, GaussianProfile, SpectralProfile, TriangularProfile
 from .base import FloatArray
 
 _REACH = 10.0

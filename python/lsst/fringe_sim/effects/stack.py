@@ -142,8 +142,7 @@ class SiliconAbsorption(PlainNullEffect):
     def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
         """Scale the extinction coefficient of every layer of silicon."""
         return _with_silicon(
-            system,
-            lambda medium: medium.modified(extinction_scale=medium.extinction_scale * values["scale"]),
+            system, lambda medium: medium.modified(extinction_scale=medium.extinction_scale * values["scale"])
         )
 
 

@@ -80,11 +80,7 @@ def _middle(geometry: ImageGeometry) -> FloatArray:
 
 
 def _pattern(
-    values: Values,
-    middle: FloatArray,
-    rows: FloatArray,
-    columns: FloatArray,
-    cell: tuple[float, float],
+    values: Values, middle: FloatArray, rows: FloatArray, columns: FloatArray, cell: tuple[float, float]
 ) -> FloatArray:
     """Departure of the pattern from one, averaged over pixels or cells, ``(ny, nx)``."""
     down, along = rows[:, np.newaxis] - values["centre_y"], columns[np.newaxis, :] - values["centre_x"]

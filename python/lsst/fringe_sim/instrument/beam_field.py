@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, OutOfRangeError, ResourceError, named_units
 from ..optics import Beam
-from .ray_bundle import (
-    BEAM_NODES,
-    QUANTILES,
-    beam_of_quantiles,
-    lagrange_weights,
-    quantiles,
-)
+from .ray_bundle import BEAM_NODES, QUANTILES, beam_of_quantiles, lagrange_weights, quantiles
 from .telescope import Telescope, TracedOptics, batoid_optic
 
 FloatArray = NDArray[np.float64]

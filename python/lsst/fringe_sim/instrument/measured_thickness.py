@@ -23,10 +23,7 @@ Sampling = Literal["resample", "window"]
 
 
 def e2v_321(
-    shape: tuple[int, int] = E2V_SHAPE,
-    *,
-    sampling: Sampling = "resample",
-    corner: tuple[int, int] = (0, 0),
+    shape: tuple[int, int] = E2V_SHAPE, *, sampling: Sampling = "resample", corner: tuple[int, int] = (0, 0)
 ) -> NDArray[np.float64]:
     """Adhesive of E2V-CCD250-321, as a smooth model of the map that Guo et al. (2022) fitted.
 

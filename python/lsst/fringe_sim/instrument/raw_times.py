@@ -30,13 +30,7 @@ DAY_ROLLOVER_H = {"ts8": 8.0, "lsstCam": 12.0, "monocam": 12.0}
 MJD_DIGITS_S = 1.0
 """What a date and the same as a modified Julian date may differ by: some headers state five decimals of a day."""
 
-_DATES = (
-    ("DATE-BEG", "isot"),
-    ("MJD-BEG", "mjd"),
-    ("DATE-OBS", "isot"),
-    ("MJD-OBS", "mjd"),
-    ("MJD", "mjd"),
-)
+_DATES = (("DATE-BEG", "isot"), ("MJD-BEG", "mjd"), ("DATE-OBS", "isot"), ("MJD-OBS", "mjd"), ("MJD", "mjd"))
 """Keywords of the begin of the exposure, and their formats."""
 
 

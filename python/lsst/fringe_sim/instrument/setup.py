@@ -29,11 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Setup", "setup_names"]
 
 _PROFILES = {"gaussian": GaussianProfile, "triangular": TriangularProfile}
-_BEAM_KEYS = {
-    "collimated": set[str](),
-    "cone": {"f_number", "obscuration"},
-    "telescope": {"telescope"},
-}
+_BEAM_KEYS = {"collimated": set[str](), "cone": {"f_number", "obscuration"}, "telescope": {"telescope"}}
 
 
 SAME_WAVELENGTH_NM = 1.0

@@ -40,9 +40,7 @@ XENON_REFERENCE_NM, XENON_FWHM_NM = 992.592, 2.0
 """The line whose peak is the strength of all, and the width of each [nm]."""
 
 
-def validate_effects(
-    settings: Mapping[str, Any] | None,
-) -> tuple[tuple[HiddenEffect, dict[str, float]], ...]:
+def validate_effects(settings: Mapping[str, Any] | None) -> tuple[tuple[HiddenEffect, dict[str, float]], ...]:
     """Check settings and return the effects with their values, in the order of the catalogue.
 
     Parameters

@@ -48,11 +48,7 @@ def on_grid(
 
 @kernel
 def _point_kernel(
-    nodes: Nodes,
-    d: NDArray,
-    first: int,
-    last: int,
-    out: NDArray,
+    nodes: Nodes, d: NDArray, first: int, last: int, out: NDArray
 ) -> None:  # pragma: no cover - compiled
     a, b, e, c, g, kappa, w = nodes
     groups, count = w.shape
@@ -71,11 +67,7 @@ def _point_kernel(
 
 
 @kernel
-def derivative_bounds(
-    nodes: Nodes,
-    order: int,
-    start: float,
-) -> NDArray:  # pragma: no cover - compiled
+def derivative_bounds(nodes: Nodes, order: int, start: float) -> NDArray:  # pragma: no cover - compiled
     """Upper bounds of a thickness derivative above ``start``, ``(W,)``; see `PhaseResponse.derivative_bound`."""
     a, b, e, c, g, kappa, w = nodes
     groups, count = w.shape
@@ -115,12 +107,7 @@ def derivative_bounds(
 
 @kernel(relaxed=True)
 def _grid_kernel(
-    nodes: Nodes,
-    start: float,
-    step: float,
-    first_task: int,
-    last_task: int,
-    out: NDArray,
+    nodes: Nodes, start: float, step: float, first_task: int, last_task: int, out: NDArray
 ) -> None:  # pragma: no cover - compiled
     """Blocks of `_ANCHOR` thicknesses of the groups, counted through."""
     a, b, e, c, g, kappa, w = nodes

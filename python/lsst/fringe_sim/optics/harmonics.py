@@ -260,17 +260,7 @@ def _fill_grids(
         if transparent:
             sign = complex(1j**order)
             _grid_transparent(
-                own,
-                shape,
-                width,
-                smallest,
-                spread,
-                where,
-                step,
-                order,
-                sign,
-                grid[group, 0],
-                constant[group],
+                own, shape, width, smallest, spread, where, step, order, sign, grid[group, 0], constant[group]
             )
         else:
             _grid_absorbing(

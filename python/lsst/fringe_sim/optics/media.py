@@ -15,14 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..descriptions import Description, described, read_table_of
-from ..errors import (
-    InputError,
-    OutOfRangeError,
-    ResourceError,
-    UnknownNameError,
-    named_units,
-    printable_name,
-)
+from ..errors import InputError, OutOfRangeError, ResourceError, UnknownNameError, named_units, printable_name
 from ..notebook import OneLine
 from ..resources import read_table, read_user_yaml, read_yaml
 

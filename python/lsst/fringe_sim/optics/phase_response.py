@@ -25,11 +25,7 @@ from .closed_form import at_thicknesses, derivative_bounds, on_grid
 from .coherence import phase_states
 from .harmonics import MOST_RATIO, ROUNDING, series_at, series_on_grid
 from .phase_kernel import reduce_nodes
-from .transfer_matrix import (
-    ComplexArray,
-    FloatArray,
-    pure_polarizations,
-)
+from .transfer_matrix import ComplexArray, FloatArray, pure_polarizations
 
 _COEFFICIENTS = ("a", "b", "e", "c", "g", "kappa")
 
@@ -366,14 +362,7 @@ def reduce_to_phase(
             phase = 1j * extra
             phase[list(state.phases)] += list(state.phases.values())
             reduced = reduce_nodes(
-                flat,
-                thickness,
-                nodes,
-                each == "p",
-                varying,
-                np.array(layers, dtype=np.int64),
-                rough,
-                phase,
+                flat, thickness, nodes, each == "p", varying, np.array(layers, dtype=np.int64), rough, phase
             )
             parts.append([part.reshape(trailing) for part in reduced])
             shares.append(np.broadcast_to(state.share / len(polarizations), trailing))

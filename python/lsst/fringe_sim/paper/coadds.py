@@ -51,11 +51,7 @@ def components(context: Context) -> Section:
     return Section(
         "Components of a night: section 5.4",
         "Eleven hourly frames with the variation of the OH bands that the paper takes from Noll et al. (2015).",
-        {
-            "first_component": PERCENT * ratio[0],
-            "second_component": PERCENT * ratio[1],
-            "corrected": left,
-        },
+        {"first_component": PERCENT * ratio[0], "second_component": PERCENT * ratio[1], "corrected": left},
         (
             Graph(
                 "scree",

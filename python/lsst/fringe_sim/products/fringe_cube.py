@@ -82,10 +82,7 @@ class FringeCube(FitsProduct):
     detector: str = ""
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
-    CARDS = (
-        DETECTOR,
-        Card("layer", "LAYER", "layer of THICKNESS", kind=str, default="", omit=True),
-    )
+    CARDS = (DETECTOR, Card("layer", "LAYER", "layer of THICKNESS", kind=str, default="", omit=True))
     EXTENSIONS = (
         Image("image", "IMAGE", "{unit}", ndim=3),
         Image("variance", "VARIANCE", "{unit}2", ndim=3, nonnegative=True),

@@ -59,11 +59,7 @@ class FringeTemplates(FitsProduct):
     def _picture(self) -> tuple[NDArray[Any], str, bool]:
         return 100.0 * self.patterns[0], "first template [% of the sky]", True
 
-    CARDS = (
-        DETECTOR,
-        FILTER,
-        Card("creation_datetime", "CALIB_CREATION_DATETIME", "", kind=str),
-    )
+    CARDS = (DETECTOR, FILTER, Card("creation_datetime", "CALIB_CREATION_DATETIME", "", kind=str))
     EXTENSIONS = (
         Image("coverage", "COVERAGE", "frames", everywhere=True, nonnegative=True),
         Image("patterns", "PATTERNS", ndim=3, everywhere=True),

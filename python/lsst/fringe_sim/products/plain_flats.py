@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 from ..errors import FrameFormatError, InputError, named_units
 from ..instrument.raw_header import DeclaredHeader, header_value
 from ..instrument.raw_layout import AmplifierLayout, Section, amplifier_layouts
-from ..instrument.raw_metadata import (
-    TEMPERATURE_RANGE_C,
-    WAVELENGTH_RANGE_NM,
-    ZERO_CELSIUS_K,
-    is_of_lsst,
-)
+from ..instrument.raw_metadata import TEMPERATURE_RANGE_C, WAVELENGTH_RANGE_NM, ZERO_CELSIUS_K, is_of_lsst
 from ..instrument.stated_facts import SAME_CELSIUS, SETTING_NM, Fact, refuse_other_filter
 from ..notebook import do_nothing
 from ..resources import complete_fits

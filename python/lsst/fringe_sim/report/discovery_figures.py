@@ -120,9 +120,7 @@ def leftover_figure(unexplained: Mapping[str, Any]) -> Figure:
 
 def _draw_colour(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
     axes.plot(
-        [row["wavelength_nm"] for row in rows],
-        [PERCENT * row["variance_beyond_noise"] for row in rows],
-        "o-",
+        [row["wavelength_nm"] for row in rows], [PERCENT * row["variance_beyond_noise"] for row in rows], "o-"
     )
     axes.axhline(0.0, color="0.6", lw=0.8)
     axes.set_xlabel("wavelength [nm]")

@@ -17,15 +17,7 @@ from numpy.typing import NDArray
 
 from ..algorithms.flat_prep_options import GAUSSIAN_MAD
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
-from ..style import (
-    LINES,
-    TITLE_PLACE,
-    block_mean,
-    figure,
-    finite_range,
-    panels,
-    show_image,
-)
+from ..style import LINES, TITLE_PLACE, block_mean, figure, finite_range, panels, show_image
 
 if TYPE_CHECKING:
     from ..algorithms.coadds import Coadds
@@ -86,13 +78,7 @@ def thickness_figure(thickness: ThicknessMap, order_um: float) -> Figure:
     good = thickness.mask == 0
     chance = np.where(good, thickness.slip_probability, 0.0)
     with map_row(3 if chance.sum() >= 1.0 else 2) as (made, (left, middle, *others)):
-        show_image(
-            left,
-            thickness.value,
-            mask=thickness.mask,
-            label="thickness [µm]",
-            title=thickness.layer,
-        )
+        show_image(left, thickness.value, mask=thickness.mask, label="thickness [µm]", title=thickness.layer)
         _draw_orders(left, np.where(good, thickness.value, np.nan), order_um)
         show_image(middle, 1e3 * thickness.sigma, mask=thickness.mask, label="σ [nm]", title="uncertainty")
         for right in others:

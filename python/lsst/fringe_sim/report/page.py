@@ -181,12 +181,7 @@ class Report:
         self._body.append(f'<p class="small">{words}</p>')
 
     def table(
-        self,
-        table: Table,
-        name: str,
-        *,
-        download: Table | None = None,
-        marks: Sequence[str] | None = None,
+        self, table: Table, name: str, *, download: Table | None = None, marks: Sequence[str] | None = None
     ) -> None:
         """Add a table with its units, and a link that saves it as ECSV.
 

@@ -24,12 +24,7 @@ MANY = 5
 """More panels than this are drawn small, as a gallery."""
 
 STATUS_MARKS = {"agrees": "good", "erratum": "note", "differs": "bad", "skipped": "void"}
-STATUS_WORDS = {
-    "agrees": "agrees",
-    "erratum": "paper errs",
-    "differs": "differs",
-    "skipped": "skipped",
-}
+STATUS_WORDS = {"agrees": "agrees", "erratum": "paper errs", "differs": "differs", "skipped": "skipped"}
 
 
 def write_paper_page(

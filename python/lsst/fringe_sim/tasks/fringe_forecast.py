@@ -16,13 +16,7 @@ from ..instrument.night import NightHistory, random_nights
 from ..model import Setup
 from ..products import ThicknessMap
 from .quantum import SENSOR, common_header, data_id_of, sensor_of, unusable
-from .sky_model import (
-    LINE_LIST,
-    SkyModelConfig,
-    takes_images,
-    thickness_input,
-    without_constraint,
-)
+from .sky_model import LINE_LIST, SkyModelConfig, takes_images, thickness_input, without_constraint
 
 
 class FringeForecastConnections(base.PipelineTaskConnections, dimensions=SENSOR):
