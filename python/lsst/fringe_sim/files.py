@@ -21,8 +21,7 @@ from .errors import InputError
 if TYPE_CHECKING:
     from astropy.table import Table
 
-LOCK = ".fringe-sim.lock"
-"""File in a folder into which a command writes, locked as long as it does."""
+LOCK = ".fringe-sim.lock"  # File in a folder into which a command writes, locked as long as it does
 
 
 @contextmanager

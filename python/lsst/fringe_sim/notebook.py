@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
 PREVIEW_INCH = (4.2, 3.2)
 
-LONGEST_TEXT, MOST_ITEMS = 60, 12
-"""Characters of a text, and items of a tuple, that a line shows."""
+LONGEST_TEXT, MOST_ITEMS = 60, 12  # Characters of a text, and items of a tuple, that a line shows
 
 
 class OneLine:

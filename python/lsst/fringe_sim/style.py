@@ -33,11 +33,8 @@ BAD_COLOR, BAD_GREY = 255, 0.75
 TITLE_PLACE = 1.0
 """Height of titles in axes without ticks above. Where it is not given, matplotlib looks at every tick for it."""
 
-BAR_INCH, BAR_GAP_INCH = 0.1, 0.08
-"""Width of a colour bar, and its distance from what it belongs to."""
-
-MOST_PIXELS = 600
-"""Images are averaged down to about this many pixels a side before drawing."""
+BAR_INCH, BAR_GAP_INCH = 0.1, 0.08  # Width of a colour bar, and its distance from what it belongs to
+MOST_PIXELS = 600  # Images are averaged down to about this many pixels a side before drawing
 
 _RC: dict[Any, Any] = {
     "font.size": 9,

@@ -18,8 +18,7 @@ from .correction.injection import InjectionOptions, Source, bias_columns, free_p
 
 FloatArray = NDArray[np.float64]
 
-SINGLE = 8
-"""Single visits that are looked at; each has some dozens of sources of a kind and flux."""
+SINGLE = 8  # Single visits that are looked at; each has some dozens of sources of a kind and flux
 
 UNTOUCHED, FRINGES, CORRECTED = "untouched", "fringes", "corrected"
 

@@ -18,14 +18,12 @@ from ..resources import read_user_table
 
 FloatArray = NDArray[np.float64]
 
-COUNTS = (1, 10, 100, 1000)
-"""Exposures in coadds that are looked at, besides the deepest."""
+COUNTS = (1, 10, 100, 1000)  # Exposures in coadds that are looked at, besides the deepest
 
 VISITS = 100
 """Exposures in the deepest coadd where no visits are given; the y band of LSST has some more in ten years."""
 
-LARGEST_REGION_PX = 400
-"""Side of the region that is coadded [px]; a quarter of it is 20 arcsec of LSST."""
+LARGEST_REGION_PX = 400  # Side of the region that is coadded [px]; a quarter of it is 20 arcsec of LSST
 
 SMALLEST_REGION_PX = 16
 

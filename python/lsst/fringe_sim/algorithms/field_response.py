@@ -294,8 +294,7 @@ def beam_limits(beams: BeamField, radius_range_deg: tuple[float, float] | None =
     return max(0.0, low - margin), high + margin
 
 
-_LEAST_ROWS = 16
-"""Rows of a frame that are worth a thread."""
+_LEAST_ROWS = 16  # Rows of a frame that are worth a thread
 
 
 @kernel(relaxed=True)

@@ -33,8 +33,7 @@ from .flat_rivals import SEARCH_STRIDE, ChosenFlats, Curves, PlannedFlat, Ranked
 
 FloatArray = NDArray[np.float64]
 
-FEWEST_FLATS = 4
-"""A fit of fewer wavelengths is flagged."""
+FEWEST_FLATS = 4  # A fit of fewer wavelengths is flagged
 MOST_FLATS = 24
 
 

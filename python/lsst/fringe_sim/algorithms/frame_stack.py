@@ -19,8 +19,7 @@ from ..products import SkyFringe
 
 FloatArray = NDArray[np.float64]
 
-TILE_BYTES = 8 * 2**20
-"""Memory of one tile of all frames."""
+TILE_BYTES = 8 * 2**20  # Memory of one tile of all frames
 
 _FEW_FRAMES = 64
 """Up to so many frames tiles are in double precision, beyond in single precision, which is twice as fast; sums over

@@ -27,8 +27,7 @@ LARGEST_STEP_RAD = 0.5
 """Change of phase from one end of a cell of pixels to the other in all but a twentieth of the cells: the mean of the
 fringes over such a cell is that of its middle to 1 %."""
 
-SMALLEST_SIDE = 64
-"""Cells along a side below which no more pixels are put together."""
+SMALLEST_SIDE = 64  # Cells along a side below which no more pixels are put together
 
 
 class MapOnSky(NamedTuple):

@@ -43,8 +43,7 @@ COOLER_K = 20.0
 SECOND_F_NUMBER = 2.0
 WIDE_NM = (800.0, 1050.0)
 
-DECISIVE_SIGMA = 5.0
-"""Separation with which two effects count as told apart."""
+DECISIVE_SIGMA = 5.0  # Separation with which two effects count as told apart
 
 
 @dataclass(frozen=True)

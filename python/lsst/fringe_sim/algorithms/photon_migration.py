@@ -22,8 +22,7 @@ from ..optics import LayerStack
 
 FloatArray = NDArray[np.float64]
 
-_DEPTHS = 256
-"""Equally probable depths that stand for the distribution of depth."""
+_DEPTHS = 256  # Equally probable depths that stand for the distribution of depth
 
 _RAYS = 4000
 """Rays that stand for a bundle, taken from its order by the golden ratio: equal steps would meet the same spokes of

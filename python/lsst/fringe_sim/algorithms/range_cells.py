@@ -16,17 +16,10 @@ FloatArray = NDArray[np.float64]
 DEGREE, BACKGROUND_DEGREE = 8, 1
 """Degrees of the polynomials of the map and, along either side, of a background beside the fringes."""
 
-PLANE_ORDERS = 0.125
-"""What a layer may depart from a plane over a window [orders]: 45 degrees of phase."""
-
-LARGEST_TABLE = 2
-"""Orders beyond the range that the sky is asked for."""
-
-TABLE_STEPS = 48
-"""Thicknesses in an order at which the sky is tabulated."""
-
-PARTS = 16
-"""Parts along a side, in each of which the fringes must be seen."""
+PLANE_ORDERS = 0.125  # What a layer may depart from a plane over a window [orders]: 45 degrees of phase
+LARGEST_TABLE = 2  # Orders beyond the range that the sky is asked for
+TABLE_STEPS = 48  # Thicknesses in an order at which the sky is tabulated
+PARTS = 16  # Parts along a side, in each of which the fringes must be seen
 
 
 class Polynomial(NamedTuple):

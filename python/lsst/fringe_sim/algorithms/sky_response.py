@@ -21,11 +21,8 @@ from ..optics.phase_response import PhaseResponse
 
 FloatArray = NDArray[np.float64]
 
-_ERROR_SAMPLES = 48
-"""Thicknesses at which the quadrature is compared with a finer one."""
-
-_BOUND_ANGLES = 6
-"""Angles that stand for a beam where no phases are involved."""
+_ERROR_SAMPLES = 48  # Thicknesses at which the quadrature is compared with a finer one
+_BOUND_ANGLES = 6  # Angles that stand for a beam where no phases are involved
 
 
 @named_units

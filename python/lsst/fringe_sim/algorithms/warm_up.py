@@ -110,5 +110,4 @@ def _search() -> None:
 
 FIRST = {"thickness of cells and pixels": _fit_cells_and_pixels, "optics and sky": _sky}
 """Work that shares no compiled function, and can be done at the same time."""
-THEN = {"fit of a cube": _fits, "search": _search}
-"""Work that needs what the first has compiled."""
+THEN = {"fit of a cube": _fits, "search": _search}  # Work that needs what the first has compiled

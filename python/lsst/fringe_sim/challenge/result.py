@@ -21,8 +21,7 @@ FloatArray = NDArray[np.float64]
 
 CASE_KINDS = ("none", "one", "two", "outsider")
 
-VISIBLE = 10.0
-"""Signal to noise from which an effect is asked for by name."""
+VISIBLE = 10.0  # Signal to noise from which an effect is asked for by name
 
 SIGNAL_EDGES = (0.0, 3.0, 5.0, 10.0, 30.0, 100.0, math.inf)
 """Bins of signal to noise in the table of accuracy."""

@@ -16,8 +16,7 @@ Decorate = Callable[[Callable[..., None]], Callable[..., None]]
 Declare = Callable[[str], Decorate]
 """What the default of a parameter is: from the name of the parameter to a decorator, as those of click."""
 
-EXISTING = click.Path(exists=True, path_type=Path)
-"""A file or a folder."""
+EXISTING = click.Path(exists=True, path_type=Path)  # A file or a folder
 
 
 def command(name: str | None = None) -> Callable[[Callable[..., None]], click.Command]:

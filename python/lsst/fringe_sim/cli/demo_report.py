@@ -33,8 +33,7 @@ from ..report.thickness_page import phase_folded, residual_of_fit, residual_tabl
 from .demo_outcome import Outcome
 
 PERCENT = 100.0
-COADD_SEED = 16
-"""Of places and angles of the coadds; the number of the paper's figure."""
+COADD_SEED = 16  # Of places and angles of the coadds; the number of the paper's figure
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,7 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..instrument.setup import Setup
     from ..products import FringeCube, SensorSection, ThicknessMap
 
-LEAST_WAVELENGTHS = 4
-"""Below this the order of the fringe cannot be told."""
+LEAST_WAVELENGTHS = 4  # Below this the order of the fringe cannot be told
 
 SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 """Smoothing of the flats [px]. It lowers the contrast where fringes are dense, so `global` does without."""

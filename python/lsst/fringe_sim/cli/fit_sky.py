@@ -38,8 +38,7 @@ WORTH_ORDERS = 0.02
 """Uncertainty to which a map is wanted, for what the command says of more frames [orders]: 0.13 rad of phase leave a
 hundredth of the power of the fringes."""
 
-MOST_FRAMES = 1_000_000
-"""More than these are not counted."""
+MOST_FRAMES = 1_000_000  # More than these are not counted
 
 LEAST_PROBABILITY = 0.5
 """Of the order of a map from a range that is written: it is likelier than all others together."""

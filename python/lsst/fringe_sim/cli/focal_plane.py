@@ -39,11 +39,8 @@ from .output import OutputFolder, origin_of, output_folder
 from .parameters import effects_file_option, with_effects_from
 from .progress import progress
 
-SETUPS = {"e2v": "lsst_e2v", "ITL": "lsst_itl"}
-"""Set-up of the sensors of each vendor."""
-
-SAMPLE_PX = 5
-"""Pixels between the sampled ones: one per arcsecond, a tenth of the width of a fringe or less."""
+SETUPS = {"e2v": "lsst_e2v", "ITL": "lsst_itl"}  # Set-up of the sensors of each vendor
+SAMPLE_PX = 5  # Pixels between the sampled ones: one per arcsecond, a tenth of the width of a fringe or less
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ import click
 from .. import __version__
 from ..errors import LONGEST_MESSAGE, FringeSimError, UnknownNameError, shown
 
-MOST_NEW_OBJECTS = 10_000
-"""Objects after which Python looks for unused ones."""
+MOST_NEW_OBJECTS = 10_000  # Objects after which Python looks for unused ones
 
 EXIT_BAD_INPUT = 1
 EXIT_USAGE = 2
@@ -53,8 +52,7 @@ _COMMANDS = {
 }
 
 
-_LISTED = {"effect": "effects", "set-up": "setups"}
-"""Commands that list the names of a field."""
+_LISTED = {"effect": "effects", "set-up": "setups"}  # Commands that list the names of a field
 
 
 class _LazyGroup(click.Group):

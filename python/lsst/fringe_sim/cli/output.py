@@ -30,8 +30,7 @@ AT_WORK = f"{__name__}.at_work"
 """Entry of the memory of a command that has begun to write and has not come to its end."""
 
 PAGE = "report.html"
-LONGEST_COMMAND = 300
-"""Name of pages, and characters of a command that they show."""
+LONGEST_COMMAND = 300  # Name of pages, and characters of a command that they show
 
 HEADER_BYTES = 57_600  # of a FITS file, in which its ORIGIN is looked for
 

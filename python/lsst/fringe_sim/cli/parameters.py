@@ -24,8 +24,7 @@ if TYPE_CHECKING:  # none of it for --help
     from ..instrument.setup import Setup
 
 
-BUILT_IN = "e2v_321"
-"""Name of the thickness map that needs no file."""
+BUILT_IN = "e2v_321"  # Name of the thickness map that needs no file
 
 
 class Quantity(click.ParamType):

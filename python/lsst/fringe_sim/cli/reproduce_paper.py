@@ -15,13 +15,11 @@ from .parameters import SIZE
 from .progress import progress
 
 ENVIRONMENT = "FRINGE_SIM_SHARED"
-BESIDE = Path("../shared")
-"""Where the published curves lie beside a development checkout."""
+BESIDE = Path("../shared")  # Where the published curves lie beside a development checkout
 DETAIL_PX = 1000
 DETAIL_CORNER = (1500, 1500)
 LEAST_SIDE = 64
-SILICON_CHANGE = 0.05
-"""Relative change by the constants of silicon from which both numbers are printed."""
+SILICON_CHANGE = 0.05  # Relative change by the constants of silicon from which both numbers are printed
 
 
 @command()

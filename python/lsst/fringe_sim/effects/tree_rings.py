@@ -10,8 +10,7 @@ from .base import FloatArray, Parameter, PlainNullEffect, Residuals, SearchHints
 from .geometry import ImageGeometry
 from .ring_search import find_rings
 
-MEAN_SAMPLES = 64
-"""Samples along each axis from which the mean of the pattern over a sensor is taken."""
+MEAN_SAMPLES = 64  # Samples along each axis from which the mean of the pattern over a sensor is taken
 
 LONGEST_PERIOD = 0.7
 """Period of rings over the side of the sensor, beyond which they are not told from uneven light."""

@@ -30,8 +30,7 @@ _BEYOND_NODES = 0.2
 a parabola leaves it by at most 0.11."""
 
 
-_ROUNDING_M2 = 1e-9
-"""Rounding of squared radii [m²]."""
+_ROUNDING_M2 = 1e-9  # Rounding of squared radii [m²]
 
 
 @named_units

@@ -15,8 +15,7 @@ from scipy.ndimage import map_coordinates
 from ..errors import InputError
 from ..resources import read_table
 
-E2V_SHAPE = (4004, 4096)
-"""Rows and columns of an assembled, trimmed E2V-CCD250."""
+E2V_SHAPE = (4004, 4096)  # Rows and columns of an assembled, trimmed E2V-CCD250
 
 Sampling = Literal["resample", "window"]
 """How a large map becomes a small one: the whole of it on fewer pixels, or the pixels from a ``corner`` on."""

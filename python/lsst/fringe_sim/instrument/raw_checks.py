@@ -16,8 +16,7 @@ OBSERVATION_PREFIX = {"lsstCam": "MC", "ts8": "TS"}
 
 SIMULATORS = ("PHOSIM", "IMSIM")
 
-MODELS = {"CCD250": "e2v", "3800C": "itl"}
-"""Vendor by ``CCD_TYPE``."""
+MODELS = {"CCD250": "e2v", "3800C": "itl"}  # Vendor by ``CCD_TYPE``
 
 COUNTS = frozenset({"", "adu", "dn", "count", "counts"})
 """What ``BUNIT`` may say of numbers of the converter, without regard to case."""
@@ -25,11 +24,8 @@ COUNTS = frozenset({"", "adu", "dn", "count", "counts"})
 WITHOUT_FLATS = frozenset({"BIAS", "ZERO", "DARK", "FE55", "PPUMP", "TRAP"})
 """Values of ``TESTTYPE`` of tests whose frames are no flats: no light, X-rays, or charge that was moved."""
 
-FULL_SHAPE = {"e2v": (4004, 4096), "itl": (4000, 4072)}
-"""Rows and columns of a whole sensor, by vendor."""
-
-MOST_DAYS = 1
-"""Days that ``DAYOBS`` may be off: when it begins has changed with time and place."""
+FULL_SHAPE = {"e2v": (4004, 4096), "itl": (4000, 4072)}  # Rows and columns of a whole sensor, by vendor
+MOST_DAYS = 1  # Days that ``DAYOBS`` may be off: when it begins has changed with time and place
 
 
 def refuse_other_instrument(text: Mapping[str, str], camera: str, source: str) -> None:

@@ -21,8 +21,7 @@ LAST_DAY_OF_OWN_COUNT = {"C": 20231004, "P": 20250417, "Q": 20250417, "S": 20250
 TS8_NUMBERED_SINCE = datetime.datetime(2023, 5, 24, 23)
 """Since then exposures of TS8 are numbered like those of the camera (obs_lsst)."""
 
-OF_RUBIN = ("ts8", "lsstCam")
-"""Cameras whose headers state times in TAI unless they say otherwise (obs_lsst)."""
+OF_RUBIN = ("ts8", "lsstCam")  # Cameras whose headers state times in TAI unless they say otherwise (obs_lsst)
 
 DAY_ROLLOVER_H = {"ts8": 8.0, "lsstCam": 12.0, "monocam": 12.0}
 """UTC hour at which the observing day begins, as obs_lsst has it."""

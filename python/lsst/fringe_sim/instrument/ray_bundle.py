@@ -23,8 +23,7 @@ and its second harmonic; the third makes an error of 4 % of the peak-to-peak of 
 SAME_PLACE = 1e-10
 """Distance of points, relative to half the range of all, at which a Gauss rule takes them for one."""
 
-QUANTILES = 4096
-"""Groups of equal light into which the rays are gathered before the Gauss rule is formed."""
+QUANTILES = 4096  # Groups of equal light into which the rays are gathered before the Gauss rule is formed
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,7 @@ from ..instrument.detector import Detector
 
 _LOG = logging.getLogger(__name__)
 
-NO_FILTER = "none"
-"""Physical filter of frames without light and of white light."""
+NO_FILTER = "none"  # Physical filter of frames without light and of white light
 
 MONOCHROMATOR = "monochromator"
 """Physical filter of flats whose colour a monochromator sets; the wavelength is ``exposure.target_name``."""

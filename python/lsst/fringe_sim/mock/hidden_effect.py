@@ -87,5 +87,4 @@ class HiddenEffect(Described):
         return {p.name: values.get(p.name, p.null) for p in self.parameters}
 
 
-ActiveHiddenEffect = tuple[HiddenEffect, Mapping[str, float]]
-"""An effect and the values given for it."""
+ActiveHiddenEffect = tuple[HiddenEffect, Mapping[str, float]]  # An effect and the values given for it

@@ -30,8 +30,7 @@ from .hidden_effect import (
 )
 from .optics import Film, FlatFieldOptics
 
-REFERENCE_CHARGE_E = 100_000.0
-"""Charge at which the coefficient of the non-linearity is stated [electrons]."""
+REFERENCE_CHARGE_E = 100_000.0  # Charge at which the coefficient of the non-linearity is stated [electrons]
 
 COLOUR_PIVOT_NM, COLOUR_REACH_NM = 935.0, 50.0
 """Wavelength at which a chromatic illumination is even, and distance to that at which its numbers are stated [nm]."""

@@ -33,8 +33,7 @@ FloatArray = NDArray[np.float64]
 DEFAULT_LEVEL_E = 20_000.0
 DEFAULT_BIAS_FRAMES = 5
 
-LEVEL_SCATTER = 0.01
-"""Rms scatter of the level of the flats."""
+LEVEL_SCATTER = 0.01  # Rms scatter of the level of the flats
 
 FIRST_EXPOSURE = datetime.datetime(2018, 7, 24, 10, 0, 0)
 

@@ -24,11 +24,8 @@ Sampler = Callable[[float, float, int], FloatArray]
 DEFAULT_TOLERANCE = 1e-7
 """Interpolation error that is asked for by default: about the rounding of the float32 frames."""
 
-MOST_POINTS = 4_000_000
-"""Points of one row; a table that wants more is refused."""
-
-_LEAST_PIXELS = 20_000
-"""Pixels that are worth a thread."""
+MOST_POINTS = 4_000_000  # Points of one row; a table that wants more is refused
+_LEAST_PIXELS = 20_000  # Pixels that are worth a thread
 _REFINEMENTS = 6
 
 

@@ -14,8 +14,7 @@ from .transfer_matrix import FloatArray
 Nodes = tuple[NDArray[Any], ...]
 """``a, b, e, c, g, kappa`` of the Q nodes of W groups, and their weights, all ``(W, Q)``."""
 
-_LEAST_WORK = 20_000
-"""Nodes times thicknesses that are worth a thread."""
+_LEAST_WORK = 20_000  # Nodes times thicknesses that are worth a thread
 
 _ANCHOR = 64
 """Steps of the phase recurrence between two exact evaluations; keeps its rounding error below 1e-14."""

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
     from scipy.interpolate import CubicSpline, PchipInterpolator
 
-REFERENCE_TEMPERATURE_K = 300.0
-"""Temperature at which Green (2008) tabulates silicon [K]."""
+REFERENCE_TEMPERATURE_K = 300.0  # Temperature at which Green (2008) tabulates silicon [K]
 
 TEMPERATURE_RANGE_K = (100.0, 400.0)
 """Temperatures for which silicon is known: measured up to 300 K, by the power law of Green (2008) above."""

@@ -45,8 +45,7 @@ def reduce_nodes(
     return real[0], real[1], real[2], mixed[0], mixed[1], mixed[2]
 
 
-_LEAST_NODES = 256
-"""Nodes that are worth a thread."""
+_LEAST_NODES = 256  # Nodes that are worth a thread
 
 
 @kernel

@@ -29,11 +29,8 @@ from .transfer_matrix import ComplexArray, FloatArray, pure_polarizations
 
 _COEFFICIENTS = ("a", "b", "e", "c", "g", "kappa")
 
-_SHORT_GRID = 256
-"""Grid points up to which the closed form at every node is the faster way."""
-
-_LARGEST_RATIO = 0.9
-"""Ratio of two harmonics above which the series is too long to pay."""
+_SHORT_GRID = 256  # Grid points up to which the closed form at every node is the faster way
+_LARGEST_RATIO = 0.9  # Ratio of two harmonics above which the series is too long to pay
 
 
 @named_units

@@ -19,17 +19,13 @@ from .sky import RANGE_UM, lines_only
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
-SKY_E = 2717.0
-"""Electrons per pixel of the zenith sky in 30 s; decides the noise of an exposure."""
+SKY_E = 2717.0  # Electrons per pixel of the zenith sky in 30 s; decides the noise of an exposure
 
 REGION_PX = 240
 NULL_SCATTER_BELOW_PX = 10.0
 FIRST_HOUR = 19.0
-CORNER_PX, WINDOW_PX = 1500.0, 1000
-"""Part of every sensor from which pieces are cut."""
-
-RAFT_UM = (13.8, 28.5)
-"""Adhesive of all nine sensors, if the thinnest place of each has 14 µm."""
+CORNER_PX, WINDOW_PX = 1500.0, 1000  # Part of every sensor from which pieces are cut
+RAFT_UM = (13.8, 28.5)  # Adhesive of all nine sensors, if the thinnest place of each has 14 µm
 
 TREECORR_PX = 64
 

@@ -26,22 +26,18 @@ LAB = "ts8_e2v"
 WAVELENGTH_NM = 960.0
 SEARCH_UM = (5.0, 30.0)
 SEARCH_STEP_UM = 0.002
-MAP_RANGE_UM = (14.0, 22.0)
-"""Colour range of the published map."""
+MAP_RANGE_UM = (14.0, 22.0)  # Colour range of the published map
 
 FIT_NOISE = 2e-3
-FIT_CONTRAST = 0.15
-"""Brings the simulated flats to the measured contrast of about 2 %."""
+FIT_CONTRAST = 0.15  # Brings the simulated flats to the measured contrast of about 2 %
 
 FIT_SHAPE = (200, 204)
 
 FOREIGN_SILICON = "Si_schinke2015"
-FOREIGN_ERROR_NM = 0.5
-"""Accuracy of the wavelengths of the stand [nm]."""
+FOREIGN_ERROR_NM = 0.5  # Accuracy of the wavelengths of the stand [nm]
 
 FOREIGN_GRADIENT = 0.02
-ROW = 3015
-"""Row 3000 of the frame trimmed by 15 rows."""
+ROW = 3015  # Row 3000 of the frame trimmed by 15 rows
 
 MEASURED_FLAT = "E2V-321_960nm_flat_measured.fits"
 MEASURED_MAP = "RTM-020_S01_E2V-321_epoxy_map.fits"

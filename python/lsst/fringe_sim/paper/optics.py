@@ -22,8 +22,7 @@ from .section import Context, Curve, Graph, Section, missing
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
-SECOND_RADIATION_CONSTANT = 1.4387769
-"""hc/k [cm K]."""
+SECOND_RADIATION_CONSTANT = 1.4387769  # hc/k [cm K]
 
 NAMED_BANDS = ("7-3", "8-4", "3-0", "9-5", "4-1", "5-2")
 RED_BANDS = ("4-1", "5-2")
@@ -37,11 +36,8 @@ EDGE_DEG = 1.44
 FIELDS = ((0.0, "LSST, centre"), (EDGE_DEG, f"LSST, {EDGE_DEG}° off axis"))
 BINS = (10, 20, 50, 100)
 BEAM_NODES = 192
-PATH_RAYS = 7
-"""Rays on either side of the axis of which the path through the telescope is drawn."""
-
-FAINTEST = 1e-6
-"""Weight below which lines are not drawn."""
+PATH_RAYS = 7  # Rays on either side of the axis of which the path through the telescope is drawn
+FAINTEST = 1e-6  # Weight below which lines are not drawn
 
 
 def oh_lines(context: Context) -> Section:

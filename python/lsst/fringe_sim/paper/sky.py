@@ -34,12 +34,10 @@ AIRMASS = 1.2
 RANGE_UM = (13.9, 22.6)
 EDGE_DEG = 1.44
 READ_NOISE_E = 9.0
-SMOOTHING_PX = 4.0
-"""Gaussian kernel "of 16 by 16 pixels": σ of 4 px cut at 2 σ."""
+SMOOTHING_PX = 4.0  # Gaussian kernel "of 16 by 16 pixels": σ of 4 px cut at 2 σ
 
 PUBLISHED_MAP = "RTM-020_S01_E2V-321_epoxy_map.fits"
-PUBLISHED_LOWEST_UM = 14.022
-"""Lower end of the colour bar of Figure 5."""
+PUBLISHED_LOWEST_UM = 14.022  # Lower end of the colour bar of Figure 5
 
 DIAGONAL_PX = 3970
 

@@ -27,8 +27,7 @@ class FileKeyword:
 SENSOR_NAMES = ("DETNAME", "DETECTOR", "CCDNAME", "DETPOS", "CCDNUM", "CCDID")
 """Keywords by which cameras name a sensor; the first that is stated counts."""
 
-FILTER_NAMES = ("FILTER", "FILTNAM", "FILTERID")
-"""Keywords of the filter; the first that is stated counts."""
+FILTER_NAMES = ("FILTER", "FILTNAM", "FILTERID")  # Keywords of the filter; the first that is stated counts
 
 _MAP, _CUBE, _SKY, _ANY = "thickness map", "fringe cube", "sky frame", "any product"
 _PLAIN, _AMPLIFIERS, _OBSERVED = "plain flat", "flat of amplifiers", "observed frame"

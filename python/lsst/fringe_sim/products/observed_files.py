@@ -24,8 +24,7 @@ from .file_keywords import FILTER_NAMES, SENSOR_NAMES, declared_names
 from .mask import MASK_PLANES, mask_bits
 from .observed_frame import ObservedFrame
 
-UNCORRECTED = "UNCORRECTED"
-"""End of the name of an extension that is 1 where a template has no value."""
+UNCORRECTED = "UNCORRECTED"  # End of the name of an extension that is 1 where a template has no value
 
 IntArray = NDArray[np.int32]
 
@@ -58,8 +57,7 @@ _ZTF_BITS = {
 }
 """Source, source of the PSF catalogue, saturated, no number, track, ghost, halo; all others are bad pixels."""
 
-_BITS = 63
-"""Of a mask that is read as integers with a sign."""
+_BITS = 63  # Of a mask that is read as integers with a sign
 
 _HARMLESS = ("NOT_DEBLENDED", "INEXACT_PSF", "SENSOR_EDGE", "INJECTED", "INJECTED_CORE", "STREAK_FIT")
 """Planes of Rubin's masks that say nothing against the background of a pixel."""

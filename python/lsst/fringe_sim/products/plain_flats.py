@@ -26,15 +26,13 @@ from .sky_frame import NOISE, refuse_noiseless
 
 DECLARED = declared_names("plain flat")
 
-WAVELENGTHS = ("MONOWL", "WAVELEN", "WAVELNTH")
-"""Keywords of the wavelength [nm]."""
+WAVELENGTHS = ("MONOWL", "WAVELEN", "WAVELNTH")  # Keywords of the wavelength [nm]
 
 ELECTRONS = ("electron", "electrons", "e-", "e")
 ADU = ("adu", "dn", "count", "counts")
 BIASES = ("bias", "zero")
 
-OF_LSST = ("LSST_NUM", "RAFTNAME", "RAFTBAY", "TSTAND")
-"""Keywords of raw frames in the LSST layout."""
+OF_LSST = ("LSST_NUM", "RAFTNAME", "RAFTBAY", "TSTAND")  # Keywords of raw frames in the LSST layout
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ and of its like for Mosaic-3; that of fringez, for ZTF."""
 
 _NO = ("", "N", "NO", "F", "FALSE", "NONE", "0", "0.0")
 
-NOISE = "NOISE"
-"""Keyword of a simulated exposure: whether photon and read noise were added."""
+NOISE = "NOISE"  # Keyword of a simulated exposure: whether photon and read noise were added
 
 SKY_UNITS = ("electron", "fraction")
 """Units of a sky frame: electrons in the exposure, or (sky - mean) / mean."""

@@ -35,23 +35,12 @@ MAP_MARGINS = (0.62, 0.5, 0.45, 0.28)
 GALLERY_PIXELS = 150
 """Frames of a gallery are averaged down to about this many pixels a side, which a panel has."""
 
-RESIDUAL_CELLS = 100
-"""Residuals are averaged down to about this many cells a side."""
-
-SCALE_HEIGHT = 0.65
-"""Height of a scale of colours over that of the panels, where it has a row for itself."""
-
-NOISE_SIGMAS = 5.0
-"""Ends of the colours of residuals, in their noise."""
-
-LEGEND_ROOM = 5.0
-"""Factor by which the axis of coadds goes on beyond the largest value."""
-
-PIXEL_ROOM = 0.3
-"""Part by which the axis of a pixel goes on above its points, for the legend."""
-
-LEAST_CHANCE = 1e-12
-"""Smallest chance of a slipped order that is drawn."""
+RESIDUAL_CELLS = 100  # Residuals are averaged down to about this many cells a side
+SCALE_HEIGHT = 0.65  # Height of a scale of colours over that of the panels, where it has a row for itself
+NOISE_SIGMAS = 5.0  # Ends of the colours of residuals, in their noise
+LEGEND_ROOM = 5.0  # Factor by which the axis of coadds goes on beyond the largest value
+PIXEL_ROOM = 0.3  # Part by which the axis of a pixel goes on above its points, for the legend
+LEAST_CHANCE = 1e-12  # Smallest chance of a slipped order that is drawn
 
 
 @contextmanager

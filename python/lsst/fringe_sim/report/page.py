@@ -28,17 +28,10 @@ from ..style import finite_range, map_to_png, pixels_to_png, to_pieces
 from .words import number_text
 
 GENERATOR = '<meta name="generator" content="lsst.fringe_sim">'
-HEAD_LENGTH = 1000
-"""What pages of this program say in their beginning, and the length of it."""
-
-PHONE_PX = 380
-"""Pictures that are wider do not fit into the smallest windows, where a click enlarges them."""
-
-MAP_STEP = 5
-"""Pixels between those that decide the colours of a whole map."""
-
-SMALLEST_SCALE = 0.9
-"""Panels are put side by side as long as none is drawn smaller than this."""
+HEAD_LENGTH = 1000  # What pages of this program say in their beginning, and the length of it
+PHONE_PX = 380  # Pictures that are wider do not fit into the smallest windows, where a click enlarges them
+MAP_STEP = 5  # Pixels between those that decide the colours of a whole map
+SMALLEST_SCALE = 0.9  # Panels are put side by side as long as none is drawn smaller than this
 
 _STYLE = """
 :root { color-scheme: light; }

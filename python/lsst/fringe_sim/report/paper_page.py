@@ -20,8 +20,7 @@ from .page import Origin, Report
 from .words import number_text
 
 PER_ROW = 3
-MANY = 5
-"""More panels than this are drawn small, as a gallery."""
+MANY = 5  # More panels than this are drawn small, as a gallery
 
 STATUS_MARKS = {"agrees": "good", "erratum": "note", "differs": "bad", "skipped": "void"}
 STATUS_WORDS = {"agrees": "agrees", "erratum": "paper errs", "differs": "differs", "skipped": "skipped"}

@@ -13,8 +13,7 @@ from ..products import SensorSection
 PERCENT = 100.0
 NM = 1000.0
 
-MOST_DECIMALS, MOST_PLAIN = 100.0, 1e6
-"""Numbers from which on no decimals are shown, and an exponent is."""
+MOST_DECIMALS, MOST_PLAIN = 100.0, 1e6  # Numbers from which on no decimals are shown, and an exponent is
 
 
 def amplitude_text(fraction: float) -> str:

@@ -114,8 +114,7 @@ def config_digest(config: Config) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-NO_DATE = datetime.datetime(1970, 1, 1)
-"""Of what a model makes, where nothing tells a date."""
+NO_DATE = datetime.datetime(1970, 1, 1)  # Of what a model makes, where nothing tells a date
 
 
 def run_datetime(run: str, otherwise: datetime.datetime = NO_DATE) -> str:

@@ -36,8 +36,7 @@ from .sky_model import (
     without_constraint,
 )
 
-FIRST_HOUR = 19.0
-"""Local time at which the tabulated night begins [h]."""
+FIRST_HOUR = 19.0  # Local time at which the tabulated night begins [h]
 
 RANDOM_NIGHT_H = (12.0, 36.0, 0.25)
 """First, last and step of the times at which a random night is drawn [h]: the same for all its exposures."""

@@ -29,11 +29,8 @@ COARSE_NODES = (0, 11, 7, 5)
 """Values of each parameter that are computed, by the number of parameters; a second time where it matters."""
 
 FINE_NODES = (0, 61, 21, 9)
-RESOLVED = 2
-"""Times that the grid is made finer about the posterior; nothing is computed anew for it."""
-
-NEGLIGIBLE = 1e-5
-"""Posterior mass that a range of parameters may leave out, relative to its largest value."""
+RESOLVED = 2  # Times that the grid is made finer about the posterior; nothing is computed anew for it
+NEGLIGIBLE = 1e-5  # Posterior mass that a range of parameters may leave out, relative to its largest value
 
 
 @dataclass(frozen=True)
