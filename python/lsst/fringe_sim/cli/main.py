@@ -120,10 +120,7 @@ def _complain(message: str) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its status.
 
-    Parameters
-    ----------
-    arguments : sequence of `str`, optional
-        In place of ``sys.argv[1:]``.
+    ``arguments``: in place of ``sys.argv[1:]``.
     """
     # Threads that wait for work by spinning keep a second command on the same machine from its processors. OpenMP
     # reads this when it is loaded, with the first compiled loop.

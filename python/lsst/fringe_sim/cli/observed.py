@@ -102,10 +102,7 @@ def images_of(
 
     ``accept``: raises `InputError` over a header, with the name of its file, of a frame that is not to be used.
 
-    Raises
-    ------
-    InputError
-        There are no files, or no usable one.
+    `InputError`: there are no files, or no usable one.
     """
     from ..products.observed_files import is_companion, observed_images
 
@@ -135,10 +132,7 @@ def images_of(
 def target_names(images: Sequence[ObservedImage], ending: str, former: str = "") -> dict[Path, str]:
     """Name of the file that is written for each file; ``ending`` follows the stem, in place of ``former``.
 
-    Raises
-    ------
-    InputError
-        Two files would become one.
+    `InputError`: two files would become one.
     """
     names = {path: f"{stem_of(path).removesuffix(former)}{ending}.fits" for path in _paths(images)}
     taken: dict[str, Path] = {}
@@ -181,10 +175,7 @@ class TemplateFolder:
     def check(self, images: Sequence[ObservedImage]) -> None:
         """Read the templates of all sensors of images, before long work.
 
-        Raises
-        ------
-        InputError
-            A file is damaged, or there twice.
+        `InputError`: a file is damaged, or there twice.
         """
         from ..products.observed_files import detector_of
 
@@ -195,10 +186,7 @@ class TemplateFolder:
     def of(self, detector: str, physical_filter: str = "") -> list[FringeFrame]:
         """Templates of a sensor; templates without a name are those of any sensor.
 
-        Raises
-        ------
-        InputError
-            There are none of it, or those of another filter, or a file is damaged or there twice.
+        `InputError`: there are none of it, or those of another filter, or a file is damaged or there twice.
         """
         names = sorted(self._files)
         if detector not in self._files and names != [""]:

@@ -85,10 +85,7 @@ class OutputFolder(os.PathLike[str]):
 
         A folder that was not there, and into which nothing was written, is taken away when the command ends.
 
-        Raises
-        ------
-        InputError
-            It cannot be made or written, another run writes into it, or it is used (`refuse_used`).
+        `InputError`: it cannot be made or written, another run writes into it, or it is used (`refuse_used`).
         """
         self.refuse_used()
         new = [path for path in (self.path, *self.path.parents) if not path.exists()]
@@ -208,17 +205,9 @@ def _is_ours(path: Path) -> bool:
 def refuse_among_inputs(folder: Path, inputs: Iterable[str]) -> None:
     """Refuse to write into a folder that is read: the next run would take products for frames.
 
-    Parameters
-    ----------
-    folder : `pathlib.Path`
-        Where products go; it need not exist.
-    inputs : iterable of `str`
-        Files, folders, which are read with all below them, and patterns.
-
-    Raises
-    ------
-    InputError
-        The folder is one of the inputs, inside one, or where a pattern finds files.
+    ``folder``: where products go; it need not exist.
+    ``inputs``: files, folders, which are read with all below them, and patterns.
+    `InputError`: the folder is one of the inputs, inside one, or where a pattern finds files.
     """
     target = folder.resolve()
     for given in inputs:
@@ -263,12 +252,8 @@ def _inputs_of(context: click.Context) -> list[str]:
 def origin_of(out: Path, given: Iterable[str | os.PathLike[str]]) -> Origin:
     """Command that runs, and pages of this program that lie beside what it was given.
 
-    Parameters
-    ----------
-    out : `pathlib.Path`
-        Folder of the page to be written.
-    given : iterable of path-like
-        Files and folders that were read, or their names.
+    ``out``: folder of the page to be written.
+    ``given``: files and folders that were read, or their names.
     """
     from ..report.page import Origin, title_of
 

@@ -307,10 +307,7 @@ def effects_file_option(help_text: str = "YAML.") -> Any:
 def effect_settings(settings: tuple[tuple[str, float], ...]) -> dict[str, float]:
     """Mapping from repeated ``--effect`` options, each of another name.
 
-    Raises
-    ------
-    InputError
-        One of them is given two values.
+    `InputError`: one of them is given two values.
     """
     found: dict[str, float] = {}
     for name, value in settings:

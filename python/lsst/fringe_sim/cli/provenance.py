@@ -134,15 +134,8 @@ def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def describe(header: Mapping[str, Any]) -> dict[str, Any]:
     """Sort the keywords of a product by what they say.
 
-    Parameters
-    ----------
-    header : mapping
-        Keywords and values.
-
-    Returns
-    -------
-    record : `dict`
-        ``product``, ``software``, ``configuration``, ``setup``, ``effects``, ``tables``, ``seeds``, ``errors``,
+    ``header``: keywords and values.
+    ``product``, ``software``, ``configuration``, ``setup``, ``effects``, ``tables``, ``seeds``, ``errors``,
         ``dataset``, ``inputs``, and under ``other`` what is left. Plain values, ready for JSON.
     """
     from ..model.provenance import effects_of_header
