@@ -92,9 +92,8 @@ def discover(
         data = read_sky_frames(paths, setup, thickness)
         placement = placement_in_frames(data.sky.frames, data.detector, setup.pixel_scale_arcsec)
         if dry_run:
-            click.echo(
-                f"would search {len(data.sky.frames)} frames of {data.sky.shape[1]} x {data.sky.shape[0]} pixels"
-            )
+            rows, columns = data.sky.shape
+            click.echo(f"would search {len(data.sky.frames)} frames of {columns} x {rows} pixels")
             return
         model = data.model(sky_settings(effects.settings))
         _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, **limits), given)

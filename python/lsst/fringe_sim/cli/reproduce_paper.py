@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,6 +15,9 @@ from .command import command, flag, option
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import SIZE
 from .progress import progress
+
+if TYPE_CHECKING:
+    from ..paper.published import Finding
 
 ENVIRONMENT = "FRINGE_SIM_SHARED"
 BESIDE = Path("../shared")  # Where the published curves lie beside a development checkout
@@ -71,7 +76,7 @@ def reproduce_paper(
     notices = []
     if folder is not None:
         click.echo(f"published curves: {folder}", err=True)
-    if folder is None:
+    else:
         notices.append(
             "Curves and maps read off the published figures are not at hand: comparisons with them are skipped "
             f"(--published FOLDER or ${ENVIRONMENT})."
@@ -83,23 +88,25 @@ def reproduce_paper(
         made = reproduce(context, advance=advance)
     write_whole(target / "paper.ecsv", table_text(made.table()))
     write_paper_page(made, target / "paper.html", notices, origin_of(target, ()))
-    for finding in made.all_findings:
+    for line in (*_notable(made.all_findings), made.summary(), target / "paper.html", target / "paper.ecsv"):
+        click.echo(str(line))
+
+
+def _notable(findings: Sequence[Finding]) -> Iterator[str]:
+    """Numbers that differ from those of the paper, and those that the constants of silicon change."""
+    for finding in findings:
+        number = finding.number
         if finding.status == "differs":
-            number = finding.number
-            click.echo(
-                f"differs: {number.place}: {number.quantity}: {finding.value:.4g} {number.unit} "
-                f"(paper {number.stated} ± {number.tolerance:g})"
-            )
-    for finding in made.all_findings:
+            yield f"differs: {_told(finding)} (paper {number.stated} ± {number.tolerance:g})"
+    for finding in findings:
         if abs(finding.cold - finding.value) > SILICON_CHANGE * abs(finding.value):
-            number = finding.number
-            click.echo(
-                f"silicon: {number.place}: {number.quantity}: {finding.value:.4g} {number.unit} with the "
-                f"constants of the paper, {finding.cold:.4g} with those measured in the cold"
-            )
-    click.echo(made.summary())
-    for name in ("paper.html", "paper.ecsv"):
-        click.echo(str(target / name))
+            cold = f"{finding.cold:.4g} with those measured in the cold"
+            yield f"silicon: {_told(finding)} with the constants of the paper, {cold}"
+
+
+def _told(finding: Finding) -> str:
+    number = finding.number
+    return f"{number.place}: {number.quantity}: {finding.value:.4g} {number.unit}"
 
 
 def _found() -> Path | None:

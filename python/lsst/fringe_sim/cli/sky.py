@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -114,34 +114,27 @@ def sky(
     header = map_header(thickness)
     contrast = laboratory_contrast(header, thickness)
     layer, section = _layer(thickness, sensor, setup)
-    silicon = (
-        None
-        if silicon_thickness is None
-        else _silicon(silicon_thickness, layer, setup, str(header.get("DETNAME", "")))
-    )
+    silicon = _silicon(silicon_thickness, layer, setup, str(header.get("DETNAME", "")))
     settings = sky_settings(effects.settings)
     history = NightHistory.guo2022() if night else None
     flat = None if flat_spectrum is None else FlatSpectrum.from_name(flat_spectrum)
     count = 1 if history is None else len(history)
     places = None if visits is None else _places(visits, noiseless, count, layer.shape)
     if dry_run:
-        click.echo(
-            f"would simulate {count} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
-        )
+        pixels = f"{layer.shape[1]} x {layer.shape[0]} pixels"
+        click.echo(f"would simulate {count} frames of {sensor.name}, {pixels}")
         return
     model = placed_model(setup, settings, sensor).at_laboratory_temperature(header)
     maps = [name for name in (thickness, silicon_thickness) if name not in (BUILT_IN, None)]
     given: list[str | Path] = [*maps, *effects.files]
-    cards = _cards(model, given, contrast, section)
-    if flat is not None:
-        cards["FLATSPEC"] = flat.name
+    cards = _cards(model, given, contrast, section) | ({} if flat is None else {"FLATSPEC": flat.name})
     folder = out.prepare()
-    common: dict[str, Any] = {
-        "read_noise_e": 0.0 if noiseless else sensor.read_noise,
-        "seed": None if noiseless else seed,
-        "detector": sensor.name,
-        "physical_filter": setup.filter_name,
-    }
+    common: dict[str, Any] = {"detector": sensor.name, "physical_filter": setup.filter_name}
+    common |= (
+        {"read_noise_e": 0.0, "seed": None}
+        if noiseless
+        else {"read_noise_e": sensor.read_noise, "seed": seed}
+    )
     exposure = Exposure(exptime, airmass or setup.airmass, history, level == "measured", flat)
     layers = Layers(layer, silicon, section, phase_sigma)
     response = _response(layers, model, sensor, exposure)
@@ -149,25 +142,20 @@ def sky(
     made = _written(series, scales, folder / f"sky_{sensor.name}", cards, section)
     if templates:
         _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
-    page = write_sky_report(
-        folder / "report.html",
-        made,
-        setup.name,
-        seed,
-        places,
-        picture=folder / "sky.png",
-        pixel_arcsec=setup.pixel_scale_arcsec,
-        section=section,
-        origin=origin_of(folder, given),
-    )
-    for frame in made:
-        click.echo(_describe(frame))
+    shown: dict[str, Any] = {"picture": folder / "sky.png", "pixel_arcsec": setup.pixel_scale_arcsec}
+    shown |= {"section": section, "origin": origin_of(folder, given)}
+    page = write_sky_report(folder / "report.html", made, setup.name, seed, places, **shown)
+    for line in (*_said(made, model, contrast), folder, page):
+        click.echo(str(line))
+
+
+def _said(made: list[SkyFringe], model: FringeModel, contrast: tuple[float, float] | None) -> Iterator[str]:
+    """What the command says of the frames, line by line."""
+    yield from map(_describe, made)
     if "PHASERMS" in made[0].metadata:
-        click.echo(_open_phase(made[0], model))
+        yield _open_phase(made[0], model)
     if contrast is not None:
-        click.echo(_both_forecasts(made[0], *contrast))
-    click.echo(str(folder))
-    click.echo(str(page))
+        yield _both_forecasts(made[0], *contrast)
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,11 +341,13 @@ def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:
     )
 
 
-def _silicon(path: str, layer: FloatArray, setup: Setup, sensor: str) -> FloatArray:
+def _silicon(path: str | None, layer: FloatArray, setup: Setup, sensor: str) -> FloatArray | None:
     """Thickness of the silicon [µm] on the pixels of another layer, which loses those where it is not known."""
     from ..algorithms.sky_of_maps import DETECTION, known_silicon_um
     from ..products import ThicknessMap
 
+    if path is None:
+        return None
     silicon = known_silicon_um(ThicknessMap.read_any(path, DETECTION), layer.shape, setup, path, sensor)
     layer[silicon != silicon] = math.nan  # not known
     return silicon
