@@ -67,10 +67,7 @@ def coadd(context: Context) -> Section:
     maps = _raft_maps(context)
     table = lines_only(context.setup("lsst_e2v"), range_um=RAFT_UM if maps else RANGE_UM).sky()
     layers = maps or [context.detail_um]
-    patterns = []
-    for layer in layers:
-        frame = table.lookup(layer)[0]
-        patterns.append(frame / frame.mean() - 1.0)
+    patterns = [frame / frame.mean() - 1.0 for frame in (table.lookup(layer)[0] for layer in layers)]
     counts = tuple(sorted({count for count in (1, 10, 100, context.coadds) if count <= context.coadds}))
     result = coadd_correlation(
         patterns,
@@ -94,11 +91,8 @@ def coadd(context: Context) -> Section:
     scatter = 1.0 / (SKY_E * deepest * np.sqrt(last.weight))
     curves.append(Curve(separation, scatter, f"σ of noise, {deepest}", "--"))
     rms = PERCENT * float(np.sqrt(np.mean([pattern.var() for pattern in patterns])))
-    sensors = (
-        "the nine sensors of the raft"
-        if maps
-        else "one sensor, where the paper has nine (their maps are not at hand)"
-    )
+    one = "one sensor, where the paper has nine (their maps are not at hand)"
+    sensors = "the nine sensors of the raft" if maps else one
     return Section(
         "Coadds: Fig. 16",
         f"Coadds of randomly placed and rotated pieces of {sensors} (fringes {rms:.2f} % rms, uncorrected) with "

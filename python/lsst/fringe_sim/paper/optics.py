@@ -17,7 +17,7 @@ from ..instrument.telescope import RayBundle, Telescope, batoid_optic
 from ..model import FringeModel
 from ..optics import Beam, Illumination
 from ..resources import read_table
-from .section import Context, Curve, Graph, Section, missing
+from .section import Context, Curve, Graph, Section, columns, missing
 
 FloatArray = NDArray[np.float64]
 
@@ -76,8 +76,8 @@ def _against_figure_8(context: Context) -> tuple[dict[str, float], tuple[Graph, 
     theirs, ours = context.lines_of_figure_8(), read_table("sky", "oh_lines_palace_yband.ecsv")
     if theirs is None:
         return missing("lines_found", "lines_strength", "red_bands"), ()
-    wavelength, intensity = (np.asarray(theirs[name], dtype=float) for name in ("wavelength", "intensity"))
-    own_wavelength, own = (np.asarray(ours[name], dtype=float) for name in ("wavelength", "photon_radiance"))
+    wavelength, intensity = columns(theirs, "wavelength", "intensity")
+    own_wavelength, own = columns(ours, "wavelength", "photon_radiance")
     near = np.abs(wavelength[:, None] - own_wavelength) < NEAR_NM
     near &= np.asarray(theirs["band"], dtype=str)[:, None] == np.asarray(ours["band"], dtype=str)
     found = near.any(axis=1)
@@ -120,7 +120,7 @@ def _rotational_temperature() -> float:
 def _vibrational_temperature() -> float:
     table = read_table("sky", "oh_levels_palace.ecsv")
     rows = table[(table["v_up"] >= 3) & (table["v_up"] <= 9)]
-    energy, population = (np.asarray(rows[name], dtype=float) for name in ("E_v0", "ln_pop_N1"))
+    energy, population = columns(rows, "E_v0", "ln_pop_N1")
     return float(-SECOND_RADIATION_CONSTANT / np.polyfit(energy, population, 1)[0])
 
 

@@ -130,3 +130,8 @@ class Context:
 def missing(*items: str) -> dict[str, float]:
     """Items that cannot be computed."""
     return dict.fromkeys(items, math.nan)
+
+
+def columns(table: Table, *names: str) -> list[FloatArray]:
+    """Columns of a table as numbers."""
+    return [np.asarray(table[name], dtype=float) for name in names]
