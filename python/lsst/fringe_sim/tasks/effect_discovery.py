@@ -21,7 +21,7 @@ from ..model.effects_override import effects_override
 from ..products import FringeCube, FringeFlat, SkyFringe, ThicknessMap
 from .model_config import FringeModelConfig, ModelChoice
 from .quantum import SENSOR, SENSOR_EXPOSURE, common_header, data_id_of, flats_input, sensor_of, unusable
-from .sky_model import SkyModelConfig, thickness_input
+from .sky_model import MapConnections, SkyModelConfig
 
 
 class EffectDiscoveryConnections(base.PipelineTaskConnections, dimensions=SENSOR):
@@ -150,7 +150,7 @@ class SkyEffectDiscoveryConnections(base.PipelineTaskConnections, dimensions=SEN
         multiple=True,
         deferLoad=True,
     )
-    thickness = thickness_input()
+    thickness = MapConnections.thickness
     verdict = Output(
         "skyEffectDiscovery",
         "FringeJson",

@@ -16,31 +16,18 @@ from ..instrument.night import NightHistory, random_nights
 from ..model import Setup
 from ..products import ThicknessMap
 from .quantum import SENSOR, common_header, data_id_of, sensor_of, unusable
-from .sky_model import LINE_LIST, SkyModelConfig, takes_images, thickness_input, without_constraint
+from .sky_model import LINE_LIST, MapConnections, SkyModelConfig
 
 
-class FringeForecastConnections(base.PipelineTaskConnections, dimensions=SENSOR):
+class FringeForecastConnections(MapConnections, dimensions=SENSOR):
     """A thickness map in, where there is one; one table out."""
 
-    config: FringeForecastConfig
-
-    thickness = thickness_input()
     forecast = Output(
         "fringeForecast",
         "AstropyTable",
         "Fringes in cells of the sensor; the header has those of the whole sensor.",
         dimensions=SENSOR,
     )
-
-    def __init__(self, *, config: FringeForecastConfig | None = None) -> None:
-        if config is not None and config.stand_in:
-            self.thickness = without_constraint(self.thickness)
-
-    def adjust_all_quanta(self, adjuster: base.QuantaAdjuster) -> None:
-        """Keep the science sensors."""
-        for data_id in list(adjuster.iter_data_ids()):
-            if not takes_images(adjuster.expand_quantum_data_id(data_id)):
-                adjuster.remove_quantum(data_id)
 
 
 class FringeForecastConfig(

@@ -14,23 +14,12 @@ from ..algorithms.laboratory_shift import template_pair
 from ..instrument.detector import Detector
 from ..products import FringeTemplates, ThicknessMap
 from .quantum import SENSOR_FILTER, data_id_of, run_datetime, sensor_of, unusable
-from .sky_model import (
-    SensorMapsConfig,
-    maps_of,
-    silicon_input,
-    takes_images,
-    thickness_input,
-    without_constraint,
-)
+from .sky_model import SensorMapsConfig, SensorMapsConnections, maps_of
 
 
-class MapTemplatesConnections(base.PipelineTaskConnections, dimensions=SENSOR_FILTER):
+class MapTemplatesConnections(SensorMapsConnections, dimensions=SENSOR_FILTER):
     """Maps of a sensor in, templates of its sky in a filter out."""
 
-    config: MapTemplatesConfig
-
-    thickness = thickness_input()
-    silicon = silicon_input()
     templates = Output(
         "fringeTemplates",
         "FringeTemplates",
@@ -38,19 +27,6 @@ class MapTemplatesConnections(base.PipelineTaskConnections, dimensions=SENSOR_FI
         dimensions=SENSOR_FILTER,
         isCalibration=True,
     )
-
-    def __init__(self, *, config: MapTemplatesConfig | None = None) -> None:
-        if config is not None and config.stand_in:
-            self.thickness = without_constraint(self.thickness)
-        if config is not None and config.silicon != "map":
-            del self.silicon
-
-    def adjust_all_quanta(self, adjuster: base.QuantaAdjuster) -> None:
-        """Keep the science sensors, and the filters in the band of the set-up."""
-        for data_id in list(adjuster.iter_data_ids()):
-            expanded = adjuster.expand_quantum_data_id(data_id)
-            if expanded["band"] != self.config.band or not takes_images(expanded):
-                adjuster.remove_quantum(data_id)
 
 
 class MapTemplatesConfig(

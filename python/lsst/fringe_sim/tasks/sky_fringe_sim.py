@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField
 from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Output
@@ -26,15 +27,7 @@ from ..middleware.night import airmass_of, hour_of_night
 from ..model import FringeModel, Setup
 from ..products import ThicknessMap, band_cards
 from .quantum import SENSOR_EXPOSURE, data_id_of, sensor_of, unusable
-from .sky_model import (
-    SensorMapsConfig,
-    SkyModel,
-    maps_of,
-    silicon_input,
-    takes_images,
-    thickness_input,
-    without_constraint,
-)
+from .sky_model import SensorMapsConfig, SensorMapsConnections, SkyModel, maps_of
 
 FIRST_HOUR = 19.0  # Local time at which the tabulated night begins [h]
 
@@ -56,31 +49,17 @@ class SkyExposure:
     physical_filter: str  # filter, as the instrument names it
 
 
-class SkyFringeSimConnections(base.PipelineTaskConnections, dimensions=SENSOR_EXPOSURE):
+class SkyFringeSimConnections(SensorMapsConnections, dimensions=SENSOR_EXPOSURE):
     """A thickness map in, one sky frame out."""
 
-    config: SkyFringeSimConfig
-
-    thickness = thickness_input()
-    silicon = silicon_input()
     sky = Output(
         "skyFringe", "SkyFringe", "Night sky with its fringes, in electrons.", dimensions=SENSOR_EXPOSURE
     )
 
-    def __init__(self, *, config: SkyFringeSimConfig | None = None) -> None:
-        if config is not None and config.stand_in:
-            self.thickness = without_constraint(self.thickness)
-        if config is not None and config.silicon != "map":
-            del self.silicon
-
-    def adjust_all_quanta(self, adjuster: base.QuantaAdjuster) -> None:
-        """Keep the exposures of the sky in the band of the set-up: laboratory frames have exposures too."""
-        for data_id in list(adjuster.iter_data_ids()):
-            expanded = adjuster.expand_quantum_data_id(data_id)
-            exposure: Any = expanded.records["exposure"]
-            wanted = exposure.observation_type in self.config.observation_types
-            if not wanted or expanded["band"] != self.config.band or not takes_images(expanded):
-                adjuster.remove_quantum(data_id)
+    def wants(self, data_id: DataCoordinate) -> bool:
+        """Whether it is an exposure of the sky in the band of the set-up: laboratory frames have exposures too."""
+        exposure: Any = data_id.records["exposure"]
+        return super().wants(data_id) and exposure.observation_type in self.config.observation_types
 
 
 class SkyFringeSimConfig(

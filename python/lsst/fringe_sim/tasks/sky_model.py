@@ -213,6 +213,56 @@ class SkyModelConfig(FringeModelConfig):
         )
 
 
+class MapConnections(base.PipelineTaskConnections, dimensions=SENSOR):
+    """A thickness map in, of science sensors."""
+
+    config: Any
+
+    thickness = Input(
+        "epoxyThickness",
+        "ThicknessMap",
+        "Thickness of the varying layer; not needed where the configuration allows stand-ins.",
+        dimensions=SENSOR,
+    )
+
+    def __init__(self, *, config: Any = None) -> None:
+        if config is not None and config.stand_in:
+            # For sensors with and without a map.
+            self.thickness = dataclasses.replace(self.thickness, minimum=0, deferGraphConstraint=True)
+
+    def adjust_all_quanta(self, adjuster: base.QuantaAdjuster) -> None:
+        """Keep the science sensors, and of them what is wanted."""
+        for data_id in list(adjuster.iter_data_ids()):
+            expanded = adjuster.expand_quantum_data_id(data_id)
+            record: Any = expanded.records["detector"]
+            if record.purpose != "SCIENCE" or not self.wants(expanded):
+                adjuster.remove_quantum(data_id)
+
+    def wants(self, data_id: DataCoordinate) -> bool:
+        """Whether there is a quantum for an expanded data id of a science sensor."""
+        return True
+
+
+class SensorMapsConnections(MapConnections, dimensions=SENSOR):
+    """Maps of a sensor in, of both layers."""
+
+    silicon = Input(
+        "siliconThickness",
+        "ThicknessMap",
+        "Thickness of the silicon on the same pixels; only where the configuration asks for it.",
+        dimensions=SENSOR,
+    )
+
+    def __init__(self, *, config: Any = None) -> None:
+        super().__init__(config=config)
+        if config is not None and config.silicon != "map":
+            del self.silicon
+
+    def wants(self, data_id: DataCoordinate) -> bool:
+        """Whether the filter is in the band of the set-up."""
+        return bool(data_id["band"] == self.config.band)
+
+
 class SensorMapsConfig(SkyModelConfig):
     """What the maps of a sensor say of its sky: also the silicon, and what is not known of the adhesive."""
 
@@ -271,37 +321,6 @@ def maps_of(butlerQC: base.QuantumContext, inputRefs: Any) -> list[ThicknessMap 
         butlerQC.get(getattr(inputRefs, name)) if hasattr(inputRefs, name) else None
         for name in ("thickness", "silicon")
     ]
-
-
-def silicon_input() -> Input:
-    """Connection to a map of the silicon of each sensor."""
-    return Input(
-        "siliconThickness",
-        "ThicknessMap",
-        "Thickness of the silicon on the same pixels; only where the configuration asks for it.",
-        dimensions=SENSOR,
-    )
-
-
-def thickness_input() -> Input:
-    """Connection to a thickness map of each sensor."""
-    return Input(
-        "epoxyThickness",
-        "ThicknessMap",
-        "Thickness of the varying layer; not needed where the configuration allows stand-ins.",
-        dimensions=SENSOR,
-    )
-
-
-def without_constraint(connection: Input) -> Input:
-    """The same connection for sensors with and without a map."""
-    return dataclasses.replace(connection, minimum=0, deferGraphConstraint=True)
-
-
-def takes_images(data_id: DataCoordinate) -> bool:
-    """Whether the detector of an expanded data id is a science sensor."""
-    record: Any = data_id.records["detector"]
-    return bool(record.purpose == "SCIENCE")
 
 
 def _band(setup: Setup) -> str:
