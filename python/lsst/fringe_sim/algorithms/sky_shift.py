@@ -19,8 +19,6 @@ from .night_sums import BACKGROUND, NightSums, Slopes
 from .sky_model_error import SIZES, Envelope, ModelError
 from .smooth_field import Splines, Spread, nearest_coefficients, prior_covariance
 
-__all__ = ["SkyShift", "fit_sky_shift"]
-
 FloatArray = NDArray[np.float64]
 
 MAP_SIGMA_ORDERS = 0.15
@@ -33,14 +31,12 @@ STEPS_PER_ORDER = 24
 SPANS = (0, 1, 2, 4, 8, 16)
 """Spans of the splines along a side that compete; with none, all pixels have one shift."""
 
-LEAST_PX_OF_SPAN = 8
-"""Pixels in a span: fewer would not carry a cubic."""
+LEAST_PX_OF_SPAN = 8  # Pixels in a span: fewer would not carry a cubic
 
 SPREADS = 13
 """Spreads of the shifts over which the evidence is averaged, from a thousandth of an order to one order."""
 
-MOST_STARTS = 4
-"""Most common shifts from which splines begin; an order has about one."""
+MOST_STARTS = 4  # Most common shifts from which splines begin; an order has about one
 
 NEGLIGIBLE = 10.0
 """Splines whose evidence is e to this less than that of coarser ones end the search for finer ones."""

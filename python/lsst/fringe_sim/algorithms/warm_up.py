@@ -25,8 +25,6 @@ from .thickness_fit.global_fit import global_fit
 from .thickness_fit.templates import FringeTemplates
 from .thickness_fit.uncertainty import slip_probability
 
-__all__ = ["FIRST", "THEN"]
-
 _WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 _RANGE_UM = (14.0, 18.0)
 _ORDER_UM = 0.3
@@ -125,5 +123,4 @@ def _night() -> None:
 
 FIRST = {"thickness of cells and pixels": _fit_cells_and_pixels, "optics and sky": _sky, "night": _night}
 """Work that shares no compiled function, and can be done at the same time."""
-THEN = {"fit of a cube": _fits, "search": _search}
-"""Work that needs what the first has compiled."""
+THEN = {"fit of a cube": _fits, "search": _search}  # Work that needs what the first has compiled

@@ -26,25 +26,6 @@ from ._check import check_mapping
 from .mask import mask_plane_cards, planes_from_header, remap_mask
 from .sensor_section import SECTION_KEYWORDS, SensorSection
 
-__all__ = [
-    "Scalar",
-    "bintable_hdu",
-    "image_hdu",
-    "in_unit",
-    "mask_hdu",
-    "merge_metadata",
-    "normalise_metadata",
-    "open_fits",
-    "primary_hdu",
-    "read_image",
-    "read_keyword",
-    "read_mask",
-    "read_metadata",
-    "refuse_other_unit",
-    "write_hdus",
-    "write_summed",
-]
-
 Scalar = bool | int | float | str | None
 
 PRODUCT_KEY = "PRODUCT"

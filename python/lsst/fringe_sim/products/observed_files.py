@@ -35,10 +35,7 @@ from .image_archive import (
 from .mask import MASK_PLANES, mask_bits
 from .observed_frame import ObservedFrame
 
-__all__ = ["UNCORRECTED", "ObservedImage", "detector_of", "is_companion", "observed_images", "write_images"]
-
-UNCORRECTED = "UNCORRECTED"
-"""End of the name of an extension that is 1 where a template has no value."""
+UNCORRECTED = "UNCORRECTED"  # End of the name of an extension that is 1 where a template has no value
 
 IntArray = NDArray[np.int32]
 
@@ -71,8 +68,7 @@ _ZTF_BITS = {
 }
 """Source, source of the PSF catalogue, saturated, no number, track, ghost, halo; all others are bad pixels."""
 
-_BITS = 63
-"""Of a mask that is read as integers with a sign."""
+_BITS = 63  # Of a mask that is read as integers with a sign
 
 _HARMLESS = ("NOT_DEBLENDED", "INEXACT_PSF", "SENSOR_EDGE", "INJECTED", "INJECTED_CORE", "STREAK_FIT")
 """Planes of Rubin's masks that say nothing against the background of a pixel."""
