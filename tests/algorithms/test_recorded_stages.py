@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 from foreign_sky import foreign_map
 from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms import fit_thickness
+from lsst.fringe_sim.algorithms.correction.empirical import TemplateOptions
 from lsst.fringe_sim.algorithms.map_from_range import map_from_range
+from lsst.fringe_sim.algorithms.observed_frames import make_templates
 from lsst.fringe_sim.algorithms.public_evidence.kinds import SeenOnSky, public_kinds
 from lsst.fringe_sim.algorithms.public_evidence.models import models_with
 from lsst.fringe_sim.algorithms.public_evidence.verdict import DECIDING, compare
 from lsst.fringe_sim.algorithms.thickness_fit import SiliconSearch, silicon_map
+from lsst.fringe_sim.challenge.sealed_cases import expose
 from lsst.fringe_sim.model import FringeModel
-from lsst.fringe_sim.products import FlatExposures, FringeCube
+from lsst.fringe_sim.products import FlatExposures, FringeCube, ObservedFrame
 
 SETTINGS = {"contrast_loss.factor": 0.6, "bandwidth.fwhm": 3.0}
 
@@ -97,3 +103,29 @@ def test_a_map_from_a_range_is_as_recorded(recorded: Record) -> None:
     weights = [np.full(layer.shape, 3e-3**-2) for _ in values]
     values[1][20:24, 10:14], weights[1][20:24, 10:14] = np.nan, 0.0
     recorded(map_from_range(values, weights, (13.0, 13.9), light, 0.3, model_accuracy=0.02))
+
+
+def test_a_fit_beside_a_void_is_as_recorded(recorded: Record) -> None:
+    rng = np.random.default_rng(12)
+    void = {"void.centre_x": 24.0, "void.centre_y": 17.0, "void.radius": 8.0, "void.thickness": 190.0}
+    cube, _ = expose(foreign_map(rng, (40, 44), 14.0, 14.9), void, rng)
+    recorded(fit_thickness(cube, FringeModel.from_setup("ts8_e2v", void)))
+
+
+def test_the_number_of_templates_is_as_recorded(recorded: Record) -> None:
+    """That which tells frames that the templates were not made of."""
+    rng = np.random.default_rng(6)
+    y, x = np.mgrid[:64, :72]
+    patterns = np.sin(x / 3.0 + y / 9.0), np.cos(y / 3.5 - x / 20.0)
+    frames = []
+    for number in range(7):
+        sky = 2000.0 * (
+            1.0 + 0.03 * (1.0 + 0.3 * np.sin(number)) * patterns[0] + 0.02 * np.cos(number) * patterns[1]
+        )
+        image = rng.poisson(sky).astype(np.float32)
+        frame = ObservedFrame(
+            image, np.zeros(image.shape, np.int32), image.copy(), detector="R22_S11", physical_filter="y_10"
+        )
+        frames.append(partial(replace, frame))
+    made = make_templates(frames, "2026-11-21T03:43:40", TemplateOptions())
+    recorded({"patterns": made.patterns, "scores": made.scores, "variance": made.variance})

@@ -129,6 +129,7 @@ CHOICES: dict[str, dict[str, Any]] = {
     "held": {"level_zones": "none", "contrast": "fixed", "illumination_degree": 0},
     "halves": {"level_zones": "halves", "contrast": "common", "illumination_degree": 1},
     "walk": {"method": "guo2022", "start_pixel": [9, 11], "range_um": [12.5, 14.5]},
+    "wrong": {"level_zones": "sensor"},
     "few": {"range_um": [12.0, 14.5], "slip_limit": 1e-9, "min_wavelengths": 12},
 }
 
@@ -161,6 +162,12 @@ def test_fits_are_as_recorded(
 ) -> None:
     caplog.set_level("INFO")
     config = CHOICES[name]
+    if name == "wrong":
+        flats = [
+            *flats[:4],
+            dataclasses.replace(flats[4], wavelength_nm=flats[4].wavelength_nm + 1.5),
+            *flats[5:],
+        ]
     if name == "few":
         flats = [*flats, dataclasses.replace(flats[0], wavelength_nm=flats[0].wavelength_nm + 5.0)]
     found = EpoxyFitTask(config=EpoxyFitConfig(**config)).run(iter(flats), len(flats), LAB)
