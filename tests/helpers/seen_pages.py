@@ -58,7 +58,11 @@ def drawn(made: Figure) -> dict[str, Any]:
 def _of_artist(artist: Artist) -> list[tuple[str, Any]]:
     match artist:
         case Text() if artist.get_text():
+            placed = (
+                artist.axes is None or artist in artist.axes.texts
+            )  # others stand where matplotlib has room
             return [
+                ("place of text", artist.get_position() if placed else []),
                 ("text", artist.get_text()),
                 ("text", [artist.get_fontsize(), artist.get_rotation(), *to_rgba(artist.get_color())]),
             ]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lsst.pex.config import FieldValidationError
 from recorded_numbers import Record, Words
 
 from lsst.fringe_sim.instrument.camera import Camera
@@ -239,3 +240,9 @@ def test_inputs_that_may_be_missing_do_not_limit_a_graph() -> None:
         for limits in (False, True):
             made = getattr(connections(config=config(raws_limit_graph=limits)), name)
             assert made.deferGraphConstraint is not limits
+
+
+@pytest.mark.parametrize("change", [{"beams": "centre"}, {"setup": "monocam"}, {"apertures_arcsec": [0.5]}])
+def test_a_forecast_needs_the_beams_of_a_traced_telescope_and_whole_apertures(change: dict[str, Any]) -> None:
+    with pytest.raises(FieldValidationError):
+        FringeForecastConfig(**change).validate()
