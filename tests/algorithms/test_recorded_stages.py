@@ -82,7 +82,12 @@ def flats(narrow: bool, tilt: float) -> FringeCube:
 
 
 @pytest.mark.parametrize(
-    ("degree", "narrow"), [(0, True), (1, True), (1, False)], ids=["one", "plane", "broad flats"]
+    ("degree", "narrow"),
+    [
+        pytest.param(0, True, id="one", marks=pytest.mark.slow),
+        pytest.param(1, True, id="plane"),
+        pytest.param(1, False, id="broad flats", marks=pytest.mark.slow),
+    ],
 )
 def test_silicon_of_a_small_sensor_is_as_recorded(degree: int, narrow: bool, recorded: Record) -> None:
     model = FringeModel.from_setup("ts8_e2v")
@@ -105,6 +110,7 @@ def test_a_map_from_a_range_is_as_recorded(recorded: Record) -> None:
     recorded(map_from_range(values, weights, (13.0, 13.9), light, 0.3, model_accuracy=0.02))
 
 
+@pytest.mark.slow
 def test_a_fit_beside_a_void_is_as_recorded(recorded: Record) -> None:
     rng = np.random.default_rng(12)
     void = {"void.centre_x": 24.0, "void.centre_y": 17.0, "void.radius": 8.0, "void.thickness": 190.0}

@@ -94,7 +94,9 @@ def context(tmp_path_factory: pytest.TempPathFactory) -> Context:
 @pytest.mark.parametrize(
     "compute",
     [
-        pytest.param(one, id=one.__name__, marks=[pytest.mark.slow] * (one.__name__ == "hsc"))  # ten seconds
+        pytest.param(
+            one, id=one.__name__, marks=[pytest.mark.slow] * (one.__name__ in ("hsc", "angles"))
+        )  # seconds
         for one in SECTIONS
     ],
 )

@@ -245,7 +245,9 @@ def many() -> Verdict:
     ("found", "pair"),
     [
         pytest.param(many, ResidualPair(residual(0.01), residual(0.005), 0.3), id="two of them"),
-        pytest.param(verdict, ResidualPair(residual(0.01), None, 0.3), id="one of them"),
+        pytest.param(
+            verdict, ResidualPair(residual(0.01), None, 0.3), id="one of them", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_search_with_images_is_as_recorded(

@@ -66,7 +66,13 @@ def silicon_of(thickness: ThicknessMap) -> ThicknessMap:
     return dataclasses.replace(thickness, value=value, mask=mask, layer="detection", metadata={})
 
 
-@pytest.mark.parametrize("silicon", [False, True], ids=["even silicon", "silicon of a map"])
+@pytest.mark.parametrize(
+    "silicon",
+    [
+        pytest.param(False, id="even silicon", marks=pytest.mark.slow),
+        pytest.param(True, id="silicon of a map"),
+    ],
+)
 def test_frames_and_templates_are_as_recorded(
     silicon: bool, recorded: Record, caplog: pytest.LogCaptureFixture
 ) -> None:

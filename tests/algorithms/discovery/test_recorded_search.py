@@ -27,7 +27,7 @@ def catalogue(*names: str) -> list[Effect]:
 @pytest.mark.parametrize(
     ("names", "size"),
     [
-        (("ghost_pedestal", "roughness", "vignetting"), (48, 64)),
+        pytest.param(("ghost_pedestal", "roughness", "vignetting"), (48, 64), marks=pytest.mark.slow),
         (("tilt", "ghost_pedestal", "bandwidth"), (48, 40)),
     ],
     ids=["named", "outside"],
@@ -41,6 +41,7 @@ def test_a_verdict_is_as_recorded(names: tuple[str, ...], size: tuple[int, int],
     recorded(found)
 
 
+@pytest.mark.slow
 def test_a_search_where_the_thickness_is_known_is_as_recorded(recorded: Record) -> None:
     rng = np.random.default_rng(32)
     case = draw_case("one", rng, size=(32, 40), only=["roughness"])
@@ -50,12 +51,14 @@ def test_a_search_where_the_thickness_is_known_is_as_recorded(recorded: Record) 
     recorded(discover(cube, case.setup, catalogue("roughness", "tilt"), rng=np.random.default_rng(0)))
 
 
+@pytest.mark.slow
 def test_a_search_of_the_other_core_is_as_recorded(recorded: Record) -> None:
     case = draw_case("one", np.random.default_rng(31), size=(24, 28), only=["ghost_pedestal"])
     known, options = catalogue("ghost_pedestal", "roughness"), SearchOptions(core="marginal")
     recorded(discover(case.cube, case.setup, known, rng=np.random.default_rng(0), options=options))
 
 
+@pytest.mark.slow
 def test_planes_and_a_thickness_that_grows_are_as_recorded(recorded: Record) -> None:
     """Where some cells have lost their order, from noisy flats and from behind a blur."""
     case = draw_case("one", np.random.default_rng(33), size=(32, 40), only=["charge_diffusion"])
