@@ -223,13 +223,17 @@ class Point:
         return np.asarray((tt * along[..., 0, :] - ut * (us + along[..., 1, :]) + uu * ts) / det)
 
     @cached_property
-    def _log_det_by_thickness(self) -> FloatArray:
+    def _curved(self) -> FloatArray:
+        """Whitened second derivative with respect to thickness."""
         up, down = (
             self.problem.forward.predict(self.settings, self.thickness_um + sign * SECOND_STEP_UM)[1]
             for sign in (1.0, -1.0)
         )
-        second = self.whitened((up - down) / (2.0 * SECOND_STEP_UM))
-        along = self._along(self.steep)
+        return self.whitened((up - down) / (2.0 * SECOND_STEP_UM))
+
+    @cached_property
+    def _log_det_by_thickness(self) -> FloatArray:
+        along, second = self._along(self.steep), self._curved
         return self._log_det_by(
             along, (self.response * second).sum(axis=0), (self.steep * second).sum(axis=0)
         )
@@ -251,6 +255,23 @@ class Point:
         matrix, score = self._accuracy
         across = self._raw_information(columns, self.accuracy_columns)
         return np.asarray(plain - across @ np.linalg.solve(matrix, score))
+
+    def unbiased_score(self, columns: Columns) -> FloatArray:
+        """Derivative of the log likelihood, the thickness of every cell at its best, that is 0 on the average.
+
+        A cell that follows its noise leaves a mean residual of second order, half of the variance of its thickness
+        times the second derivative; a score that falls on many cells would take that for an effect.
+        """
+        left = 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
+
+        def plain(own: Columns) -> FloatArray:
+            return np.asarray(self._raw_score(own) + np.tensordot(own.value, left, axes=([1, 2], [0, 1])))
+
+        if self.problem.accuracy == 0.0:
+            return plain(columns)
+        own = self.accuracy_columns
+        across = self._raw_information(columns, own)
+        return np.asarray(plain(columns) - across @ np.linalg.solve(self._accuracy[0], plain(own)))
 
     def _raw_information(self, first: Columns, second: Columns) -> FloatArray:
         whole = np.tensordot(first.value, second.value, axes=([1, 2], [1, 2]))

@@ -18,7 +18,7 @@ from ..continuation import continued
 from ..outliers import spoiled_cells
 from ..start import starting_thickness
 from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
-from .noise import measured_noise
+from .noise import measured_noise, neighbour_scatter
 from .rules import Rules
 
 __all__ = ["Prepared", "prepare", "prepare_again"]
@@ -144,7 +144,9 @@ def _judged(cells: CellData, point: Point) -> tuple[CellData, FloatArray, Proble
     geometry = old.geometry
     if geometry is cells.geometry:
         geometry = replace(geometry, level_e=geometry.level_e * point.levels)
-    error, known = _thickness_error_um(point), (old.model, old.catalogue)
+    # A wrong model errs in the thickness by more than noise does, and slopes that follow the errors blur fringes.
+    error = max(_thickness_error_um(point), neighbour_scatter(thickness, cells.seen, 0.0))
+    known = old.model, old.catalogue
     return cells, noise, _problem(cells, *known, thickness, error, max(scatter, NO_SCATTER), geometry)
 
 
