@@ -53,7 +53,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant."""
+    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant of `Point.cost`."""
 
     value: FloatArray  # (K, W, N)
     cells: (
@@ -156,9 +156,19 @@ class Point:
         return float(np.log(first).sum() + np.log(second).sum() + priors)
 
     @cached_property
+    def _mean_log_det(self) -> float:
+        """The same with the curvature of the likelihood that the data have: the mean of the model's and of one number.
+
+        The curvature along thickness at the best is the square of the slope less the second derivative times the
+        residual. For fringes of amplitude A in data of amplitude a it is A a instead of A², so that half of the
+        logarithm depends on the model.
+        """
+        return self.log_det - 0.5 * float(np.log(self._root[2]).sum())
+
+    @cached_property
     def cost(self) -> float:
-        """Minus the log likelihood with the cells integrated, but for the constant of the noise."""
-        return float(self.cell_energy.sum()) + self.log_det + self._accuracy_cost
+        """Minus the log likelihood with the cells integrated, but for constants of the noise and of the data."""
+        return float(self.cell_energy.sum()) + self._mean_log_det + self._accuracy_cost
 
     @property
     def linear_cost(self) -> float:
@@ -217,10 +227,11 @@ class Point:
         return np.asarray(direct.sum(axis=-1) + (moved * self._log_det_by_thickness).sum(axis=-1))
 
     def _log_det_by(self, along: FloatArray, us: FloatArray, ts: FloatArray) -> FloatArray:
-        """Change of the half log determinant of cells whose derivatives change, ``(..., N)``."""
+        """Change of `_mean_log_det` of cells whose derivatives change, ``(..., N)``."""
         uu, ut, tt = self._precision
         det = (self._root[0] * self._root[2]) ** 2
-        return np.asarray((tt * along[..., 0, :] - ut * (us + along[..., 1, :]) + uu * ts) / det)
+        both = (tt * along[..., 0, :] - ut * (us + along[..., 1, :]) + uu * ts) / det
+        return np.asarray(0.5 * (both + along[..., 0, :] / uu))
 
     @cached_property
     def _curved(self) -> FloatArray:
