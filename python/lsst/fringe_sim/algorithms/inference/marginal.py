@@ -53,7 +53,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant of `Point.cost`."""
+    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant of a cost."""
 
     value: FloatArray  # (K, W, N)
     cells: (
@@ -127,7 +127,8 @@ class Point:
 
     def _along(self, values: FloatArray) -> FloatArray:
         """Products of whitened values ``(..., W, N)`` with the derivatives of the cells, ``(..., 2, N)``."""
-        return np.stack([(self.response * values).sum(axis=-2), (self.steep * values).sum(axis=-2)], axis=-2)
+        both = [np.einsum("wn,...wn->...n", own, values) for own in (self.response, self.steep)]
+        return np.stack(both, axis=-2)
 
     @cached_property
     def _prior_pull(self) -> FloatArray:
@@ -157,7 +158,7 @@ class Point:
 
     @cached_property
     def _mean_log_det(self) -> float:
-        """The same with the curvature of the likelihood that the data have: the mean of the model's and of one number.
+        """The same with the curvature that the data have: the mean of the model's and of one number.
 
         The curvature along thickness at the best is the square of the slope less the second derivative times the
         residual. For fringes of amplitude A in data of amplitude a it is A a instead of A², so that half of the
@@ -207,22 +208,30 @@ class Point:
 
     def columns(self, values: FloatArray, slopes: FloatArray) -> Columns:
         """Dense columns from whitened derivatives of value and slope, each ``(K, W, N)``."""
-        cells = self._forward_solved(self._along(values))
-        return Columns(values, cells, self._log_det_change(values, slopes, cells))
+        along = self._along(values)
+        cells = self._forward_solved(along)
+        us, ts = (np.einsum("wn,...wn->...n", own, slopes) for own in (self.response, self.steep))
+        return Columns(values, cells, self._log_det_change(along, us, ts, cells))
 
     @cached_property
     def level_columns(self) -> Columns:
         """Those of the levels."""
         waves = len(self.levels)
-        values, slopes = np.zeros((2, waves, *self.value.shape))
-        values[np.arange(waves), np.arange(waves)] = self.value * self.root
-        slopes[np.arange(waves), np.arange(waves)] = self.slope * self.root
-        return self.columns(values, slopes)
+        value, slope = self.value * self.root, self.slope * self.root
+        values = np.zeros((waves, *self.value.shape))
+        values[np.arange(waves), np.arange(waves)] = value
+        # Each is of one exposure alone.
+        along = np.stack([self.response * value, self.steep * value], axis=-2)
+        cells = self._forward_solved(along)
+        return Columns(
+            values, cells, self._log_det_change(along, self.response * slope, self.steep * slope, cells)
+        )
 
-    def _log_det_change(self, values: FloatArray, slopes: FloatArray, cells: FloatArray) -> FloatArray:
+    def _log_det_change(
+        self, along: FloatArray, us: FloatArray, ts: FloatArray, cells: FloatArray
+    ) -> FloatArray:
         """Change of the log determinant with dense parameters, with the thickness that follows them."""
-        direct = self._log_det_by(self._along(values), (self.response * slopes).sum(axis=-2),
-                                  (self.steep * slopes).sum(axis=-2))  # fmt: skip
+        direct = self._log_det_by(along, us, ts)
         moved = -self._back_solved(cells)[..., 1, :]
         return np.asarray(direct.sum(axis=-1) + (moved * self._log_det_by_thickness).sum(axis=-1))
 

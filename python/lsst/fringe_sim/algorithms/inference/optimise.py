@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import OutOfRangeError
-from .coordinates import Coordinate, log_evidence_of_parameters
+from .coordinates import SECANT, Coordinate, log_evidence_of_parameters
 from .marginal import Columns, Point, joined
 
 __all__ = ["Hypothesis", "effect_columns", "fit", "jumped", "relaxed"]
@@ -51,13 +51,13 @@ class Hypothesis:
         return 2.0 * float(self.point.cell_energy.sum())
 
 
-def effect_columns(point: Point, items: Sequence[Coordinate]) -> Columns:
-    """Derivatives with respect to parameters of effects."""
+def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SECANT) -> Columns:
+    """Derivatives with respect to parameters of effects; ``secant``: see `Coordinate.difference`."""
     shape = (len(items), *point.value.shape)
     values, slopes = np.empty(shape), np.empty(shape)
     for row, item in enumerate(items):
         now = point.settings.get(item.key, item.null)
-        step = item.difference(now)
+        step = item.difference(now, secant)
         value, slope = point.problem.forward.predict(
             {**point.settings, item.key: now + step}, point.thickness_um
         )

@@ -64,6 +64,7 @@ class _Judgement:
         wavelength = prepared.cells.wavelength_nm
         self.index = np.real(medium.index(wavelength, model.system.temperature_k))
         self.order_um = float(model.fringe_order_um(np.median(wavelength)))
+        self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
         self.catalogue = Catalogue.of(effects, prepared.problem.forward)
         self.sets = SetSearch(self.catalogue, prepared.null, rules, report, self._leaves_noise)
 
@@ -71,7 +72,10 @@ class _Judgement:
         return total_chance(self._channels(found)) > self.rules.significance
 
     def _channels(self, found: Hypothesis) -> tuple[Channel, ...]:
-        return judge(found, self.prepared.null, self.index, self.rules)
+        key = found, self.prepared.null
+        if key not in self._judged:
+            self._judged[key] = judge(*key, self.index, self.rules)
+        return self._judged[key]
 
     def verdict(self) -> Verdict:
         """The answer."""
