@@ -82,11 +82,14 @@ class _Judgement:
         null = self.prepared.null
         before = self._channels(null)
         self.report(f"chance that noise alone disagrees as much: {total_chance(before):.3g}")
-        best = self.sets.run(1)
-        if best.effects:
+        best, judged = self.sets.run(1), [self.sets.null.effects]
+        while best.effects not in judged:
+            judged.append(best.effects)
             self.report(f"noise and cells are judged again with {best.effects[0]}")
             self.prepared = prepare_again(self.prepared, best)
             self.sets = self.sets.on(self.prepared.null)
+            best = self.sets.run(1)
+        if len(judged) > 1:
             best = self.sets.run(self.rules.most_effects)
         if not best.effects:
             if total_chance(before) > self.rules.significance:
