@@ -45,8 +45,8 @@ class Rules:
         Largest phase across a cell [rad] for which they are: three places describe it to 1e-3 of the fringes,
         which are weak then.
     least_of_promise : `float`
-        Part of what an effect brings that derivatives promise; sets that cannot come near the best are not fitted, and
-        an effect that brings less is tried from elsewhere.
+        Part of what an effect brings that derivatives promise; sets that cannot come near the best are not fitted,
+        and an effect that brings less is tried from elsewhere.
         Seen in the fits of four cases of the panel, where all but a few kept within it.
     sizes : `tuple` [`float`, ...]
         Departures, in prior scales, at which an effect of one parameter is tried where its linear step does not bring
