@@ -225,7 +225,7 @@ class SetSearch:
         for group in groups:
             names = {one.name for one in group}
             if alike & names or missing in names:
-                for one in group[: self.rules.refits]:
+                for one in group:
                     if one.name != missing and self._may_lead(base, one):
                         self._added(base, one)
 
