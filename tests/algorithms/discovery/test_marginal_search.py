@@ -50,10 +50,6 @@ def test_nothing_is_found_where_nothing_is(rng: np.random.Generator) -> None:
     assert Verdict.from_json(verdict.to_json()).verdict == "no_discrepancy"
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the new core leaves an offset of the wavelengths unexplained since its contrast is free",
-)
 @pytest.mark.slow
 @pytest.mark.rng("marginal single")
 def test_an_effect_is_named(rng: np.random.Generator) -> None:

@@ -16,6 +16,7 @@ from lsst.fringe_sim.algorithms.inference import (
     coordinates_of,
     effect_columns,
     fit,
+    jumped,
     relaxed,
 )
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
@@ -173,3 +174,34 @@ def test_averages_in_cells_are_those_of_pixels(cell_px: int) -> None:
     level = (value * exact).sum(axis=1, keepdims=True) / (exact**2).sum(axis=1, keepdims=True)
     wrong = (value / level - exact) / exact.std(axis=1, keepdims=True)
     assert wrong.std() < 1e-4
+
+
+@pytest.mark.rng("scores of noise")
+def test_noise_of_the_thickness_imitates_no_contrast(rng: np.random.Generator) -> None:
+    forward, thickness = forward_of()
+    value, levels, sigma = forward.predict({}, thickness)[0], np.ones(len(WAVELENGTHS)), 0.02
+    scores = []
+    for _ in range(60):
+        data = Data(value + sigma * rng.standard_normal(value.shape), np.full(value.shape, sigma**-2.0))
+        point = with_best_cells(Problem(data, forward, thickness, 1e-5).at({}, levels, thickness), {}, levels)
+        fringes = point.whitened(point.value - point.value.mean(axis=1, keepdims=True))
+        column = point.columns(fringes[np.newaxis], np.zeros((1, *value.shape)))
+        error = np.sqrt(point.information(column, column)[0, 0])
+        scores.append([point.score(column)[0] / error, point.unbiased_score(column)[0] / error])
+    plain, unbiased = np.mean(scores, axis=0) * np.sqrt(len(scores))
+    assert plain > 3.0
+    assert abs(unbiased) < 2.5
+
+
+def test_thickness_follows_to_another_order() -> None:
+    forward, thickness = forward_of()
+    hidden = {"black_coating.thickness": 0.3}
+    value = forward.predict(hidden, thickness)[0]
+    data = Data(value, np.full(value.shape, 1e-3**-2.0))
+    items = coordinates_of(BY_NAME["black_coating"], forward)
+    problem = Problem(data, forward, thickness, 1e-5)
+    # Without the coating, fringes of another order are the most like its own.
+    start = relaxed(problem.at({}, np.ones(len(WAVELENGTHS)), thickness + 0.28), rounds=8)
+    found = jumped(start, items, [0.3])
+    assert np.abs(start.thickness_um - thickness).mean() > 0.2
+    assert np.abs(found.thickness_um - thickness).max() < 1e-3

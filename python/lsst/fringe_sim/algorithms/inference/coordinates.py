@@ -56,12 +56,12 @@ class Coordinate:
         """The nearest value within the bounds."""
         return float(min(max(value, self.low), self.high))
 
-    def difference(self, value: float) -> float:
-        """Step with which the model is differentiated at a value."""
+    def difference(self, value: float, secant: float = SECANT) -> float:
+        """Step with which the model is differentiated at a value; at null ``secant`` scales if it is one-sided."""
         step = self.step or STEP * self.scale
         away = abs(value - self.null)
         if self.side and not self.place:
-            step = self.side * (SECANT * self.scale if away < 1e-6 * self.scale else min(step, 0.1 * away))
+            step = self.side * (secant * self.scale if away < 1e-6 * self.scale else min(step, 0.1 * away))
         return step if self.low <= value + step <= self.high else -step
 
 

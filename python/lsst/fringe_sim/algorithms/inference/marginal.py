@@ -53,7 +53,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant."""
+    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant of a cost."""
 
     value: FloatArray  # (K, W, N)
     cells: (
@@ -127,7 +127,8 @@ class Point:
 
     def _along(self, values: FloatArray) -> FloatArray:
         """Products of whitened values ``(..., W, N)`` with the derivatives of the cells, ``(..., 2, N)``."""
-        return np.stack([(self.response * values).sum(axis=-2), (self.steep * values).sum(axis=-2)], axis=-2)
+        both = [np.einsum("wn,...wn->...n", own, values) for own in (self.response, self.steep)]
+        return np.stack(both, axis=-2)
 
     @cached_property
     def _prior_pull(self) -> FloatArray:
@@ -156,9 +157,19 @@ class Point:
         return float(np.log(first).sum() + np.log(second).sum() + priors)
 
     @cached_property
+    def _mean_log_det(self) -> float:
+        """The same with the curvature that the data have: the mean of the model's and of one number.
+
+        The curvature along thickness at the best is the square of the slope less the second derivative times the
+        residual. For fringes of amplitude A in data of amplitude a it is A a instead of A², so that half of the
+        logarithm depends on the model.
+        """
+        return self.log_det - 0.5 * float(np.log(self._root[2]).sum())
+
+    @cached_property
     def cost(self) -> float:
-        """Minus the log likelihood with the cells integrated, but for the constant of the noise."""
-        return float(self.cell_energy.sum()) + self.log_det + self._accuracy_cost
+        """Minus the log likelihood with the cells integrated, but for constants of the noise and of the data."""
+        return float(self.cell_energy.sum()) + self._mean_log_det + self._accuracy_cost
 
     @property
     def linear_cost(self) -> float:
@@ -197,39 +208,52 @@ class Point:
 
     def columns(self, values: FloatArray, slopes: FloatArray) -> Columns:
         """Dense columns from whitened derivatives of value and slope, each ``(K, W, N)``."""
-        cells = self._forward_solved(self._along(values))
-        return Columns(values, cells, self._log_det_change(values, slopes, cells))
+        along = self._along(values)
+        cells = self._forward_solved(along)
+        us, ts = (np.einsum("wn,...wn->...n", own, slopes) for own in (self.response, self.steep))
+        return Columns(values, cells, self._log_det_change(along, us, ts, cells))
 
     @cached_property
     def level_columns(self) -> Columns:
         """Those of the levels."""
         waves = len(self.levels)
-        values, slopes = np.zeros((2, waves, *self.value.shape))
-        values[np.arange(waves), np.arange(waves)] = self.value * self.root
-        slopes[np.arange(waves), np.arange(waves)] = self.slope * self.root
-        return self.columns(values, slopes)
+        value, slope = self.value * self.root, self.slope * self.root
+        values = np.zeros((waves, *self.value.shape))
+        values[np.arange(waves), np.arange(waves)] = value
+        # Each is of one exposure alone.
+        along = np.stack([self.response * value, self.steep * value], axis=-2)
+        cells = self._forward_solved(along)
+        return Columns(
+            values, cells, self._log_det_change(along, self.response * slope, self.steep * slope, cells)
+        )
 
-    def _log_det_change(self, values: FloatArray, slopes: FloatArray, cells: FloatArray) -> FloatArray:
+    def _log_det_change(
+        self, along: FloatArray, us: FloatArray, ts: FloatArray, cells: FloatArray
+    ) -> FloatArray:
         """Change of the log determinant with dense parameters, with the thickness that follows them."""
-        direct = self._log_det_by(self._along(values), (self.response * slopes).sum(axis=-2),
-                                  (self.steep * slopes).sum(axis=-2))  # fmt: skip
+        direct = self._log_det_by(along, us, ts)
         moved = -self._back_solved(cells)[..., 1, :]
         return np.asarray(direct.sum(axis=-1) + (moved * self._log_det_by_thickness).sum(axis=-1))
 
     def _log_det_by(self, along: FloatArray, us: FloatArray, ts: FloatArray) -> FloatArray:
-        """Change of the half log determinant of cells whose derivatives change, ``(..., N)``."""
+        """Change of `_mean_log_det` of cells whose derivatives change, ``(..., N)``."""
         uu, ut, tt = self._precision
         det = (self._root[0] * self._root[2]) ** 2
-        return np.asarray((tt * along[..., 0, :] - ut * (us + along[..., 1, :]) + uu * ts) / det)
+        both = (tt * along[..., 0, :] - ut * (us + along[..., 1, :]) + uu * ts) / det
+        return np.asarray(0.5 * (both + along[..., 0, :] / uu))
 
     @cached_property
-    def _log_det_by_thickness(self) -> FloatArray:
+    def _curved(self) -> FloatArray:
+        """Whitened second derivative with respect to thickness."""
         up, down = (
             self.problem.forward.predict(self.settings, self.thickness_um + sign * SECOND_STEP_UM)[1]
             for sign in (1.0, -1.0)
         )
-        second = self.whitened((up - down) / (2.0 * SECOND_STEP_UM))
-        along = self._along(self.steep)
+        return self.whitened((up - down) / (2.0 * SECOND_STEP_UM))
+
+    @cached_property
+    def _log_det_by_thickness(self) -> FloatArray:
+        along, second = self._along(self.steep), self._curved
         return self._log_det_by(
             along, (self.response * second).sum(axis=0), (self.steep * second).sum(axis=0)
         )
@@ -251,6 +275,23 @@ class Point:
         matrix, score = self._accuracy
         across = self._raw_information(columns, self.accuracy_columns)
         return np.asarray(plain - across @ np.linalg.solve(matrix, score))
+
+    def unbiased_score(self, columns: Columns) -> FloatArray:
+        """Derivative of the log likelihood, the thickness of every cell at its best, that is 0 on the average.
+
+        A cell that follows its noise leaves a mean residual of second order, half of the variance of its thickness
+        times the second derivative; a score that falls on many cells would take that for an effect.
+        """
+        left = 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
+
+        def plain(own: Columns) -> FloatArray:
+            return np.asarray(self._raw_score(own) + np.tensordot(own.value, left, axes=([1, 2], [0, 1])))
+
+        if self.problem.accuracy == 0.0:
+            return plain(columns)
+        own = self.accuracy_columns
+        across = self._raw_information(columns, own)
+        return np.asarray(plain(columns) - across @ np.linalg.solve(self._accuracy[0], plain(own)))
 
     def _raw_information(self, first: Columns, second: Columns) -> FloatArray:
         whole = np.tensordot(first.value, second.value, axes=([1, 2], [1, 2]))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import OutOfRangeError
-from .coordinates import Coordinate, log_evidence_of_parameters
+from .coordinates import SECANT, Coordinate, log_evidence_of_parameters
 from .marginal import Columns, Point, joined
 
 __all__ = ["Hypothesis", "effect_columns", "fit", "jumped", "relaxed"]
@@ -22,6 +22,9 @@ MOST_STEP_UM = 0.05
 
 MOST_JUMP_UM = 0.25
 """The same of a finite change of an effect, whose thickness may have to follow by most of an order."""
+
+STRIDE_UM, MOST_STRIDES = 0.05, 16
+"""Typical length of a stride of the thickness [µm], and how many of them are walked at most."""
 
 RIDGE_SCALES = 10.0
 """Prior scales of the Gaussian that keeps parameters which the data do not see where they are."""
@@ -51,13 +54,13 @@ class Hypothesis:
         return 2.0 * float(self.point.cell_energy.sum())
 
 
-def effect_columns(point: Point, items: Sequence[Coordinate]) -> Columns:
-    """Derivatives with respect to parameters of effects."""
+def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SECANT) -> Columns:
+    """Derivatives with respect to parameters of effects; ``secant``: see `Coordinate.difference`."""
     shape = (len(items), *point.value.shape)
     values, slopes = np.empty(shape), np.empty(shape)
     for row, item in enumerate(items):
         now = point.settings.get(item.key, item.null)
-        step = item.difference(now)
+        step = item.difference(now, secant)
         value, slope = point.problem.forward.predict(
             {**point.settings, item.key: now + step}, point.thickness_um
         )
@@ -86,12 +89,35 @@ def relaxed(point: Point, rounds: int = 3, tolerance: float = 0.02) -> Point:
 
 
 def jumped(point: Point, items: Sequence[Coordinate], values: Sequence[float]) -> Point:
-    """Another value of some parameters, with the thickness that goes with it, and relaxed."""
-    settings = {**point.settings, **{i.key: i.clipped(v) for i, v in zip(items, values, strict=True)}}
-    value, _ = point.problem.forward.predict(settings, point.thickness_um)
-    change = point.columns(point.whitened(value - point.value)[np.newaxis], np.zeros((1, *value.shape)))
-    moved = np.clip(point.followed_um(np.ones(1), change), -MOST_JUMP_UM, MOST_JUMP_UM)
-    return relaxed(point.moved(point.levels, point.thickness_um + moved, settings), rounds=2)
+    """Another value of some parameters, with the thickness that goes with it, and relaxed.
+
+    The thickness follows in strides that are short beside a fringe order; a longer one ends in a wrong order.
+    """
+    begin = np.array([point.settings.get(item.key, item.null) for item in items])
+    change = np.array([i.clipped(v) for i, v in zip(items, values, strict=True)]) - begin
+
+    def followed(part: float) -> tuple[dict[str, float], FloatArray]:
+        own = begin + part * change
+        settings = {**point.settings, **{i.key: float(v) for i, v in zip(items, own, strict=True)}}
+        value, _ = point.problem.forward.predict(settings, point.thickness_um)
+        column = point.columns(point.whitened(value - point.value)[np.newaxis], np.zeros((1, *value.shape)))
+        return settings, point.followed_um(np.ones(1), column)
+
+    _, first = followed(1.0 / MOST_STRIDES)
+    far = MOST_STRIDES * _typical_um(
+        point, first - point.followed_um(np.zeros(len(point.levels)), point.level_columns)
+    )
+    strides = min(max(math.ceil(far / STRIDE_UM), 1), MOST_STRIDES)
+    for number in range(1, strides + 1):
+        settings, moved = followed(number / strides)
+        moved = np.clip(moved, -MOST_JUMP_UM, MOST_JUMP_UM)
+        point = point.moved(point.levels, point.thickness_um + moved, settings)
+    return relaxed(point, rounds=2)
+
+
+def _typical_um(point: Point, moved_um: FloatArray) -> float:
+    """Median distance that cells with data are moved [µm]."""
+    return float(np.median(np.abs(moved_um[point.problem.data.seen])))
 
 
 def fit(
@@ -163,8 +189,9 @@ def _best_of_parts(
 ) -> Point | None:
     """The point of the longest part of a step that is better, or nothing."""
     waves, now = len(point.levels), _target(point, items)
-    moved_um = np.clip(moved_um, -MOST_STEP_UM, MOST_STEP_UM)
-    for part in SHRINK:
+    longest = min(1.0, STRIDE_UM / max(_typical_um(point, moved_um), 1e-12))
+    moved_um = np.clip(moved_um, -MOST_STEP_UM / longest, MOST_STEP_UM / longest)
+    for part in longest * np.array(SHRINK):
         settings = {
             item.key: item.clipped(point.settings[item.key] + part * change)
             for item, change in zip(items, step[waves:], strict=True)

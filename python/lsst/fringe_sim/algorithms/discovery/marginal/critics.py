@@ -62,7 +62,7 @@ class Judged:
         base = point.information(self.columns, self.columns)
         across = np.linalg.solve(base, point.information(self.columns, own))
         matrix = point.information(own, own) - point.information(own, self.columns) @ across
-        score = point.score(own) - across.T @ point.score(self.columns)
+        score = point.unbiased_score(own) - across.T @ point.unbiased_score(self.columns)
         scale = np.sqrt(np.maximum((values**2).sum(axis=(1, 2)), 1e-300))
         size, axes = np.linalg.eigh(matrix / np.outer(scale, scale))
         keep = size > RANK

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ...inference import Point
 
-__all__ = ["measured_noise"]
+__all__ = ["measured_noise", "neighbour_scatter"]
 
 FloatArray = NDArray[np.float64]
 
@@ -38,6 +38,16 @@ def measured_noise(point: Point, shape: tuple[int, int, int]) -> tuple[FloatArra
     excess = (_second(along)[0, good] ** 2).mean() - float(np.mean(factor**2))
     scatter2 = excess / _mean_of_nine((length**2).reshape(1, *shape[1:]))[0, good].mean()
     return factor, float(np.sqrt(max(scatter2, 0.0)))
+
+
+def neighbour_scatter(field: FloatArray, seen: NDArray[np.bool_], stated: float) -> float:
+    """Standard deviation of what neighbours of a field ``(ny, nx)`` do not share; the stated one if there are few."""
+    if min(field.shape) < 3:
+        return stated
+    good = _nine(seen[np.newaxis])[0]
+    if good.sum() < FEWEST:
+        return stated
+    return float(np.sqrt((_second(field[np.newaxis])[0, good] ** 2).mean()))
 
 
 OVERLAP = 3.78

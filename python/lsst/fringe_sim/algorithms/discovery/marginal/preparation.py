@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ....effects import Effect, ImageGeometry
+from ....effects import Effect
 from ....model import FringeModel
 from ....products.fringe_cube import FringeCube
 from ....products.mask import mask_bits
@@ -18,7 +18,7 @@ from ..continuation import continued
 from ..outliers import spoiled_cells
 from ..start import starting_thickness
 from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
-from .noise import measured_noise
+from .noise import measured_noise, neighbour_scatter
 from .rules import Rules
 
 __all__ = ["Prepared", "prepare", "prepare_again"]
@@ -106,7 +106,7 @@ def _in_cells(
         bin_cube(_masked(cube, ~held), size) if held.any() else cells.restricted(np.zeros(cells.shape, bool))
     )
     first = continued(starting_thickness(model, cells), cells.seen)
-    problem = _problem(cells, model, effects, first, FIRST_ERROR_UM, FIRST_SCATTER, cells.geometry)
+    problem = _problem(cells, model, effects, first)
     point = relaxed(problem.at({}, np.ones(cells.shape[0]), problem.thickness_um), rounds=8)
     factor = np.ones(cells.shape[0])
     for _ in range(2):
@@ -144,8 +144,18 @@ def _judged(cells: CellData, point: Point) -> tuple[CellData, FloatArray, Proble
     geometry = old.geometry
     if geometry is cells.geometry:
         geometry = replace(geometry, level_e=geometry.level_e * point.levels)
-    error, known = _thickness_error_um(point), (old.model, old.catalogue)
-    return cells, noise, _problem(cells, *known, thickness, error, max(scatter, NO_SCATTER), geometry)
+    # A wrong model errs in the thickness by more than noise does, and slopes that follow the errors blur fringes.
+    error = max(_thickness_error_um(point), neighbour_scatter(thickness, cells.seen, 0.0))
+    # Tables stay; they reach farther than the thickness moves.
+    forward = replace(old, shape=CellShape.of_field(thickness, cells.cell_px, error), geometry=geometry)
+    problem = replace(
+        point.problem,
+        data=_data(cells),
+        forward=forward,
+        thickness_um=thickness.ravel(),
+        response_sigma=max(scatter, NO_SCATTER),
+    )
+    return cells, noise, problem
 
 
 def _left(point: Point, cells: CellData) -> FloatArray:
@@ -165,22 +175,16 @@ def _data(cells: CellData) -> Data:
 
 
 def _problem(
-    cells: CellData,
-    model: FringeModel,
-    effects: Sequence[Effect],
-    thickness_um: FloatArray,
-    error_um: float,
-    scatter: float,
-    geometry: ImageGeometry,
+    cells: CellData, model: FringeModel, effects: Sequence[Effect], thickness_um: FloatArray
 ) -> Problem:
     """Problem about a first thickness ``(ny, nx)``."""
-    shape = CellShape.of_field(thickness_um, cells.cell_px, error_um)
+    shape = CellShape.of_field(thickness_um, cells.cell_px, FIRST_ERROR_UM)
     limits = (max(float(thickness_um.min()) - MARGIN_UM, 0.05), float(thickness_um.max()) + MARGIN_UM)
     centroid = None
     if cells.centroid is not None:
         centroid = cells.cell_px * cells.centroid.reshape(2, cells.shape[0], -1)
-    forward = Forward(model, effects, geometry, shape, limits, centroid)
-    return Problem(_data(cells), forward, thickness_um.ravel(), scatter, accuracy=ACCURACY)
+    forward = Forward(model, effects, cells.geometry, shape, limits, centroid)
+    return Problem(_data(cells), forward, thickness_um.ravel(), FIRST_SCATTER, accuracy=ACCURACY)
 
 
 def _thickness_error_um(point: Point) -> float:

@@ -16,7 +16,8 @@ class Rules:
     refits : `int`
         Groups of effects that are refitted in each round, best scores first; the prototype had eight effects.
     fewest_refits : `int`
-        The same where no score reaches the price of an effect: what derivatives at null do not see.
+        The same where no score reaches the price of an effect: what derivatives at null do not see. Sets with effects
+        are enlarged by their scores alone.
     beam : `int`
         Sets of each size that are enlarged.
     twin_cosine : `float`
@@ -44,10 +45,12 @@ class Rules:
         Largest phase across a cell [rad] for which they are: three places describe it to 1e-3 of the fringes,
         which are weak then.
     least_of_promise : `float`
-        Part of what an effect brings that derivatives promise; sets that cannot come near the best are not fitted.
+        Part of what an effect brings that derivatives promise; sets that cannot come near the best are not fitted,
+        and an effect that brings less is tried from elsewhere.
         Seen in the fits of four cases of the panel, where all but a few kept within it.
     sizes : `tuple` [`float`, ...]
-        Departures, in prior scales, at which an effect of one parameter is tried beside its linear step.
+        Departures, in prior scales, at which an effect of one parameter is tried where its linear step does not bring
+        what it promised, and to which its secants reach if it departs to one side.
     """
 
     refits: int = 6

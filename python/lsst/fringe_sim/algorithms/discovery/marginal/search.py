@@ -101,6 +101,7 @@ class SetSearch:
         self.pool[frozenset()] = self.null
         self._scores: dict[frozenset[str], list[Scored]] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
+        self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
 
     def posterior(self, found: Hypothesis) -> float:
         """Log evidence less the price of the effects."""
@@ -131,13 +132,16 @@ class SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
         again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise)
         known = sorted(self.pool.values(), key=self.posterior, reverse=True)
+        least = self.rules.least_of_promise * (known[0].log_evidence - self.null.log_evidence)
         for one in known[: 2 * self.rules.refits]:
-            if one.effects:
+            if one.effects and one.log_evidence - self.null.log_evidence > least - self.rules.class_width:
                 at = one.point
                 start = null.point.problem.at(at.settings, at.levels, at.thickness_um)
                 again._keep(fit(one.effects, one.items, start))
                 if len(one.effects) == 1:
                     again._added_before.add((frozenset(), one.effects[0]))
+            elif len(one.effects) == 1:
+                again._short.add((frozenset(), one.effects[0]))
         return again
 
     def _is_surely_better(self, larger: Hypothesis, smaller: Hypothesis) -> bool:
@@ -201,18 +205,19 @@ class SetSearch:
 
         ``missing``: a member of a larger set that was taken out here; its twins are refitted in any case.
         """
-        scored = self.scores(base)
-        groups = self._groups(scored)
+        key = frozenset(base.effects)
+        groups = self._groups([one for one in self.scores(base) if (key, one.name) not in self._short])
         worth = [group for group in groups if group[0].gain > self.catalogue.price]
         if base.effects and not missing:
             worth = [group for group in worth if self._may_lead(base, group[0])]
-        fewest = self.rules.fewest_refits if most is None else 0
+        fewest = 0 if base.effects and not missing else self.rules.fewest_refits
         number = max(fewest, min(len(worth), most or self.rules.refits))
         if missing:
             number = min(number, self.rules.fewest_refits)
-        found = {}
+        found: dict[str, Hypothesis] = {}
         for group in groups[:number]:
-            found[group[0].name] = self._added(base, group[0])
+            if self._may_lead(base, group[0]) or len(found) < fewest:
+                found[group[0].name] = self._added(base, group[0])
         if not found:
             return
         top = max(self.posterior(one) for one in found.values())
@@ -220,8 +225,8 @@ class SetSearch:
         for group in groups:
             names = {one.name for one in group}
             if alike & names or missing in names:
-                for one in group[: self.rules.refits]:
-                    if one.name != missing:
+                for one in group:
+                    if one.name != missing and self._may_lead(base, one):
                         self._added(base, one)
 
     def _may_lead(self, base: Hypothesis, one: Scored) -> bool:
@@ -252,7 +257,7 @@ class SetSearch:
             columns = point.level_columns
             if base.items:
                 columns = joined(columns, effect_columns(point, base.items))
-            scorer = _Scorer(point, columns)
+            scorer = _Scorer(point, columns, self.rules.sizes)
             found = []
             for name, items in self.catalogue.items.items():
                 if name in base.effects:
@@ -271,56 +276,78 @@ class SetSearch:
         if step in self._added_before:
             return self.pool[frozenset(names)]
         items = self.catalogue.items[one.name]
-        starts = [one.start] if one.start is not None else self._starts(base, one, items)
-        found = None
-        for start in starts:
-            if start is not None:
-                new = fit(names, (*base.items, *items), start)
-                found = new if found is None or new.log_evidence > found.log_evidence else found
-        if found is None:
-            return base
+        if one.start is not None:
+            found = fit(names, (*base.items, *items), one.start)
+        else:
+            found = self._fitted(base, one, names, items)
         self._added_before.add(step)
         self.say(
             f"  {'+'.join(names)}: promised {one.gain:.1f}, brings {found.log_evidence - base.log_evidence:.1f}"
         )
         return self._keep(found)
 
-    def _starts(self, base: Hypothesis, one: Scored, items: tuple[Coordinate, ...]) -> list[Point]:
-        """The best of the linear step, other sizes, and what lies a repetition away."""
+    def _fitted(
+        self, base: Hypothesis, one: Scored, names: tuple[str, ...], items: tuple[Coordinate, ...]
+    ) -> Hypothesis:
+        """The fit from the linear step; from elsewhere where that does not bring what it promised, or repeats."""
+        every = (*base.items, *items)
         parts = (1.0,) if len(items) == 1 else (1.0, 0.3)
-        tried = [
-            [item.null + part * step for item, step in zip(items, one.step, strict=True)] for part in parts
-        ]
-        if len(items) == 1:
-            (item,) = items
+        first = self._best_start(base, items, [self._part(items, one.step, part) for part in parts])
+        found = fit(names, every, base.point if first is None else first)
+        kept = found.log_evidence - base.log_evidence >= self.rules.least_of_promise * one.gain
+        if len(items) > 1 or (kept and not items[0].repeat):
+            return found
+        (item,) = items
+        tried: list[FloatArray] = []
+        if item.repeat:
+            value = found.point.settings[item.key]
+            tried += [np.array([value + turn * item.repeat]) for turn in (-1.0, 1.0)]
+        if not kept:
             sides = (item.side,) if item.side else (1.0, -1.0)
-            tried += [[item.null + side * size * item.scale] for side in sides for size in self.rules.sizes]
-            if item.side:  # its signature may grow with its square
-                square = abs(one.step[0]) * SECANT * item.scale
-                tried.append([item.null + item.side * math.sqrt(square)])
-            if item.repeat:
-                tried += [[tried[0][0] + turn * item.repeat] for turn in (-1.0, 1.0)]
-        found = [base.point]
+            tried += [np.array([item.null + s * x * item.scale]) for s in sides for x in self.rules.sizes]
+        other = self._best_start(base, items, tried)
+        if other is not None:
+            new = fit(names, every, other)
+            found = new if new.log_evidence > found.log_evidence else found
+        return found
+
+    @staticmethod
+    def _part(items: Sequence[Coordinate], step: FloatArray, part: float) -> FloatArray:
+        return np.array([item.null for item in items]) + part * step
+
+    @staticmethod
+    def _best_start(
+        base: Hypothesis, items: tuple[Coordinate, ...], tried: Sequence[FloatArray]
+    ) -> Point | None:
+        """The best of other values that is better than none, or nothing."""
+        best = None
         for values in tried:
             try:
-                found.append(jumped(base.point, items, values))
+                start = jumped(base.point, items, list(values))
             except OutOfRangeError:  # no layer is thinner than nothing
                 continue
-        return sorted(found, key=lambda point: point.cost)[: 2 if len(items) == 1 else 1]
+            if start.cost < (base.point if best is None else best).cost:
+                best = start
+        return best
 
 
 class _Scorer:
     """Scores of effects beside what is free at a point."""
 
-    def __init__(self, point: Point, columns: Columns) -> None:
-        self.point, self.columns = point, columns
+    def __init__(self, point: Point, columns: Columns, sizes: Sequence[float]) -> None:
+        self.point, self.columns, self.sizes = point, columns, sizes
         self.base = point.information(columns, columns)
         self.gradient = point.score(columns) - columns.log_det
 
     def score(self, name: str, items: tuple[Coordinate, ...]) -> Scored | None:
-        """What the derivatives of an effect promise."""
+        """What an effect promises by its derivatives; by the best of several secants where they may vanish."""
+        sizes = self.sizes if len(items) == 1 and items[0].side and not items[0].step else (SECANT,)
+        every = [self._with_secant(name, items, size) for size in sizes]
+        return max((one for one in every if one is not None), key=lambda one: one.gain, default=None)
+
+    def _with_secant(self, name: str, items: tuple[Coordinate, ...], secant: float) -> Scored | None:
         try:
-            own = effect_columns(self.point, items)
+            own = effect_columns(self.point, items, secant)
         except OutOfRangeError:
             return None
         across = np.linalg.solve(self.base, self.point.information(self.columns, own))

@@ -64,6 +64,7 @@ class _Judgement:
         wavelength = prepared.cells.wavelength_nm
         self.index = np.real(medium.index(wavelength, model.system.temperature_k))
         self.order_um = float(model.fringe_order_um(np.median(wavelength)))
+        self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
         self.catalogue = Catalogue.of(effects, prepared.problem.forward)
         self.sets = SetSearch(self.catalogue, prepared.null, rules, report, self._leaves_noise)
 
@@ -71,18 +72,24 @@ class _Judgement:
         return total_chance(self._channels(found)) > self.rules.significance
 
     def _channels(self, found: Hypothesis) -> tuple[Channel, ...]:
-        return judge(found, self.prepared.null, self.index, self.rules)
+        key = found, self.prepared.null
+        if key not in self._judged:
+            self._judged[key] = judge(*key, self.index, self.rules)
+        return self._judged[key]
 
     def verdict(self) -> Verdict:
         """The answer."""
         null = self.prepared.null
         before = self._channels(null)
         self.report(f"chance that noise alone disagrees as much: {total_chance(before):.3g}")
-        best = self.sets.run(1)
-        if best.effects:
+        best, judged = self.sets.run(1), [self.sets.null.effects]
+        while best.effects not in judged:
+            judged.append(best.effects)
             self.report(f"noise and cells are judged again with {best.effects[0]}")
             self.prepared = prepare_again(self.prepared, best)
             self.sets = self.sets.on(self.prepared.null)
+            best = self.sets.run(1)
+        if len(judged) > 1:
             best = self.sets.run(self.rules.most_effects)
         if not best.effects:
             if total_chance(before) > self.rules.significance:
