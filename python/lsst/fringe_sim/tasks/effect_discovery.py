@@ -153,7 +153,7 @@ class EffectDiscoveryTask(base.PipelineTask):
         )
         self.log.info("%s: %s", detector.name, verdict.summary())
         learned = learned_files(verdict, detector.name)
-        return Struct(
+        return base.Struct(
             learned=learned.get("learned.py"),
             learned_effect=learned.get("learned_effect.py"),
             **_stored(self.config, choice, verdict, detector).getDict(),
