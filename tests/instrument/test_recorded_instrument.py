@@ -135,7 +135,7 @@ def test_nights_that_are_drawn(recorded: Record) -> None:
     rng = np.random.default_rng(41)
     drawn = StochasticNight(0.3, 0.2, 0.05, 0.02, 2.0).draw([0.0, 0.5, 0.5, 3.0], rng)
     np.testing.assert_allclose(drawn.intensity[1], drawn.intensity[2])
-    several = random_nights(3, rng)
+    several = random_nights(3, 17)
     joined = join_nights([drawn, dataclasses.replace(drawn, hours=drawn.hours + 1.0)])
     assert len(joined) == 8
     recorded({"drawn": drawn, "several": several, "joined": joined})
