@@ -207,6 +207,7 @@ class Copy:
         self.files = [Path(name) for name in listed.decode().split("\0") if name]
         for name in self.files:
             (self.root / name).parent.mkdir(parents=True, exist_ok=True)
+            (self.root / name).unlink(missing_ok=True)  # a link is not replaced
             shutil.copy2(ROOT / name, self.root / name, follow_symlinks=False)
 
     def digests(self) -> dict[str, str]:
