@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -229,6 +230,11 @@ def test_a_program_that_fails(
     assert "failed" in captured.out
     done = json.loads((programs.folder / "demo.json").read_text())["done"]
     assert ("raws" in done, log in done) == (True, False)
+    for _ in range(1000):  # the search runs beside the others, and must not run into the next test
+        if (programs.folder / "discovery" / "discovery.json").exists():
+            return
+        time.sleep(0.01)
+    pytest.fail("nothing was searched")
 
 
 def test_visits_that_are_refused_do_not_end_it(
