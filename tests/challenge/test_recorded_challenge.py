@@ -12,7 +12,7 @@ from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms.discovery import Verdict
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Where
-from lsst.fringe_sim.challenge import run
+from lsst.fringe_sim.challenge import oracle, run
 from lsst.fringe_sim.challenge.demo_case import SECOND_EFFECTS, draw_demo_case, thickness_of_demo
 from lsst.fringe_sim.challenge.oracle import Oracle, Visibility, visibility
 from lsst.fringe_sim.challenge.page import write_challenge_report
@@ -134,15 +134,15 @@ def test_numbers_of_a_judgement() -> None:
         NamedEffect("roughness", {"sigma": ParameterValue(43.0, 2.0, "nm")}, 0.9, (), "", 0.5),
         NamedEffect("vignetting", {"corner": ParameterValue(0.1, 0.0, "")}, 0.8),
     )
-    oracle = Oracle(Visibility(60.0, {"vignetting": 10.0, "roughness": 50.0}), verdict_of(found, 3.0, 1.0))
-    judged = run.judge(case, verdict_of(found, 3.0, 2.0), 5, 1.5, oracle)
+    seen = Oracle(Visibility(60.0, {"vignetting": 10.0, "roughness": 50.0}), verdict_of(found, 3.0, 1.0))
+    judged = run.judge(case, verdict_of(found, 3.0, 2.0), 5, 1.5, seen)
     assert (judged.number, judged.seconds, judged.right_class, judged.exact) == (5, 1.5, True, True)
     assert judged.pulls == {"roughness.sigma": 1.5}
     assert judged.shrinkage == pytest.approx(5.0 / 8.0)
     assert (judged.signal_to_noise, judged.weakest) == (60.0, 10.0)
     assert judged.probability == 0.8
     assert judged.name_probability == pytest.approx(0.9 * 0.5 * 0.8)
-    still = replace(oracle, verdict=verdict_of(found, 1.0, 1.0))
+    still = replace(seen, verdict=verdict_of(found, 1.0, 1.0))
     alone = run.judge(case, verdict_of(found[:1], 3.0, 2.0), 5, 1.5, still)
     assert math.isnan(alone.shrinkage)
     assert not alone.right_class
@@ -152,7 +152,7 @@ def test_numbers_of_a_judgement() -> None:
     unnamed = replace(verdict_of(found, 3.0, 2.0), verdict="unexplained")
     assert not run.is_right(case.names, unnamed)
     assert not run.judge(
-        replace(case, kind="outsider"), verdict_of(found, 3.0, 2.0), 5, 1.5, oracle
+        replace(case, kind="outsider"), verdict_of(found, 3.0, 2.0), 5, 1.5, seen
     ).right_class
 
 
@@ -203,13 +203,16 @@ def test_cases_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
         }
     ],
 )
-def test_visibility_of_a_case(values: dict[str, float], recorded: Record) -> None:
+def test_visibility_of_a_case(
+    values: dict[str, float], recorded: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A record of how clearly two effects are seen, one of them in a part of a small sensor only."""
+    monkeypatch.setattr(oracle, "VALLEYS", 1)
     rng = np.random.default_rng(23)
-    case = draw_case("none", rng, size=(12, 12))
+    case = draw_case("none", rng, size=(8, 8))
     cube, _ = expose(case.thickness_um, values, rng)
     names = tuple(dict.fromkeys(key.partition(".")[0] for key in values))
-    recorded(visibility(replace(case, cube=cube, kind="two", names=names, values=values), most_cells=36))
+    recorded(visibility(replace(case, cube=cube, kind="two", names=names, values=values), most_cells=16))
 
 
 def test_names_in_any_order() -> None:

@@ -37,7 +37,7 @@ from lsst.fringe_sim.mock.visits import detected_sky, write_mock_visits
 
 LIGHT = {"pixel_scale_arcsec": 0.2, "bandpass": "lsst_y", "effective_area_m2": 32.4}
 SENSOR = Camera.from_name("lsstCam").detector("R22_S11")
-COARSE = {"BEAM_NODES": 3, "CONTINUUM_NODES": 2, "CONTINUUM_STEP_NM": 5.0, "BLEND_NM": 2.0}
+COARSE = {"BEAM_NODES": 3, "CONTINUUM_NODES": 2, "CONTINUUM_STEP_NM": 5.0, "BLEND_NM": 5.0}
 """Nodes of the light of the sky that show every line of the code; what they are for is tested elsewhere."""
 
 BUSY = VisitConditions(
@@ -88,7 +88,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
             "lsst_e2v",
             "R02_S12",
             (14.9, 15.1),
-            {"contrast_loss.factor": 0.5, "thickness_spread.sigma": 5.0},
+            {"contrast_loss.factor": 0.5},
         ),
         ("hsc", 0, (199.98, 200.02), {}),
     ],
