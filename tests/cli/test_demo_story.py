@@ -31,6 +31,8 @@ from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube
 from lsst.fringe_sim.report.page import Report
 
+pytestmark = pytest.mark.middleware
+
 SIDE = 24
 VISITS = [f"visit_{number + 1:03d}_R11_S01" for number in range(4)]
 

@@ -244,3 +244,33 @@ def test_effects_of_ones_own(changes: dict[str, str], said: str, tmp_path) -> No
 
 def test_effects_are_told_apart_by_their_name() -> None:
     assert len(BY_NAME) == len(known_effects()) > len(EFFECTS)
+
+
+def test_effects_on_a_system_that_has_them_already(recorded: Record) -> None:
+    """A lamp seen through its own lines twice, a layer that grows, a cone of rays about a tilted beam."""
+    system = FringeModel.from_setup("ts8_e2v").base_system
+
+    def twice(name: str, values: dict[str, float]) -> tuple[Any, Any]:
+        effect = BY_NAME[name]
+        once = effect.change_system(system, values)
+        return once, effect.change_system(once, values)
+
+    one, two = (each.lamp for each in twice("lamp_lines", {"strength": 0.3}))
+    np.testing.assert_allclose(two.at(two.wavelength_nm), one.at(two.wavelength_nm) ** 2)
+    assert two.wavelength_nm.size == one.wavelength_nm.size
+    assert np.ptp(two.at(two.wavelength_nm)) > 0.1
+    for name, layer, scale in (("black_coating", "black_coating", 1.0), ("air_gap", "air_gap", 1e-3)):
+        thickness = [
+            each.stack.layers[each.stack.position(layer)].thickness_um
+            for each in twice(name, {"thickness": 0.5})
+        ]
+        assert thickness == pytest.approx([0.5 * scale, scale])
+    tilted = BY_NAME["tilt"].change_system(system, {"angle": 8.0})
+    cones = [
+        BY_NAME["converging_beam"].change_system(each, {"numerical_aperture": 0.2})
+        for each in (system, tilted)
+    ]
+    for cone in cones:
+        assert cone.beam.weight.sum() == pytest.approx(1.0)
+    assert cones[1].beam.theta.max() > cones[0].beam.theta.max() > 0.9 * np.arcsin(0.2)
+    recorded([[cone.beam.theta, cone.beam.weight] for cone in cones])
