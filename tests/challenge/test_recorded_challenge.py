@@ -29,8 +29,8 @@ def test_sizes_of_all_effects(recorded: Record) -> None:
     drawn = [draw_demo_case(seed, (32, 40)) for seed in range(4)]
     recorded(
         {
-            "sizes": sizes,
-            "second": second,
+            "sizes": [list(each.values()) for pair in sizes.values() for each in pair],
+            "second": [list(each.values()) for pair in second.values() for each in pair],
             "demo": [[case.values, case.names, case.on_sky] for case in drawn],
             "noise": [[case.frames_rng.random(), case.visits_rng.random()] for case in drawn],
             "thickness": thickness_of_demo((12, 16)),

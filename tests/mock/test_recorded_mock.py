@@ -202,7 +202,7 @@ def test_everything_that_hides(recorded: Record) -> None:
         if effect.on_amplifier is not None:
             done += [after := effect.on_amplifier(state, values, 1.3), after.dark_signal_e(7.0)]
         found[effect.name] = done
-    recorded(found)
+    recorded(list(found.items()))
 
 
 def test_signal_of_a_wedge_with_an_island(recorded: Record) -> None:
