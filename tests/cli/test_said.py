@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -195,7 +196,7 @@ def test_compiling_does_every_piece_of_work(say: Say, monkeypatch) -> None:
     monkeypatch.setenv("NUMBA_CPU_NAME", "")
     status, out, _ = say("compile")
     assert (status, len(out)) == (0, 1)
-    assert out == ["compiled in 0 s"]
+    assert re.fullmatch(r"compiled in \d s", out[0])
     assert os.environ["NUMBA_CPU_NAME"] == ""
     assert done == [*warm_up.FIRST, "simulated flats", *warm_up.THEN]
     assert say("compile", "--cpu", "generic")[0] == 0
