@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.cli.progress import progress
-from lsst.fringe_sim.compiled import limit_threads, processors, run_shares, run_threaded
+from lsst.fringe_sim.compiled import kernel, limit_threads, processors, run_shares, run_threaded, subkernel
 from lsst.fringe_sim.descriptions import Description, files_of, is_file_name, with_files_beside
 from lsst.fringe_sim.errors import (
     InputError,
@@ -218,6 +218,12 @@ def test_one_thread_works_in_its_own() -> None:
     seen: list[int] = []
     run_threaded(lambda item: seen.append(threading.get_ident()), 4, 1)
     assert set(seen) == {threading.get_ident()}
+
+
+def test_only_what_asks_for_it_is_rounded_freely() -> None:
+    for declared in (kernel, subkernel):
+        assert not declared(lambda x: x).targetoptions["fastmath"]
+        assert declared(lambda x: x, relaxed=True).targetoptions["fastmath"]
 
 
 # At the prompt

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from product_makers import observed
 from small_pages import SIDE, WAVELENGTHS_NM, smooth_map, verdict
 
@@ -135,6 +136,7 @@ def test_a_fit_of_a_cube(tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
         "…/a/report.html",
         "would fit the layer adhesive to 8 flats",
     ]
+    assert fits.getheader(tmp_path / "a" / "thickness.fits")["NFLATS"] == 8
     masked = ThicknessMap(value, zero + 3.21e-3, zero + 1.0, zero, mask + 1, "adhesive", detector="S1")
     monkeypatch.setattr(
         "lsst.fringe_sim.algorithms.thickness_fit.fit_thickness", lambda *parts, **more: masked
