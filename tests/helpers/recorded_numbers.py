@@ -68,6 +68,8 @@ def numbers_of(value: Any, name: str = "") -> Iterator[tuple[str, Leaf]]:
     elif isinstance(value, bool | str | None.__class__):
         if not isinstance(value, str) or re.fullmatch(r"[A-Za-z_ +.-]{1,60}", value):
             yield name, str(value)
+    elif isinstance(value, complex | np.complexfloating):
+        yield f"{name}#", [float(value.real), float(value.imag), abs(value)]
     elif isinstance(value, int | float | np.number):
         yield name, float(value)
     elif isinstance(value, list | tuple | np.ndarray):
@@ -77,6 +79,8 @@ def numbers_of(value: Any, name: str = "") -> Iterator[tuple[str, Leaf]]:
 def _of_values(values: Any, name: str) -> Iterator[tuple[str, Leaf]]:
     try:
         array = np.asarray(np.ma.filled(values, np.nan) if np.ma.isMaskedArray(values) else values)
+        if array.dtype.kind == "c":
+            array = np.stack([array.real, array.imag], axis=-1)
         plain = array.dtype.kind in "biuf"
     except ValueError:  # parts of unequal lengths
         plain = False

@@ -281,4 +281,4 @@ def test_defects_cannot_be_negative() -> None:
 
 def test_frames_are_as_recorded(run: MockRun, recorded: Record) -> None:
     """A record of what the seed gives today, for edits that are not meant to change it."""
-    recorded({"files": run.paths, "headers": [RawFrame.read(path).metadata for path in run.paths]})
+    recorded({"frames": run.paths, "headers": [RawFrame.read(path).metadata for path in run.paths]})
