@@ -207,6 +207,8 @@ class Copy:
         self.files = [Path(name) for name in listed.decode().split("\0") if name]
         for name in self.files:
             (self.root / name).parent.mkdir(parents=True, exist_ok=True)
+            if (self.root / name).is_symlink():
+                (self.root / name).unlink()
             shutil.copy2(ROOT / name, self.root / name, follow_symlinks=False)
 
     def digests(self) -> dict[str, str]:

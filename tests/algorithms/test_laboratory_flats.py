@@ -49,6 +49,31 @@ def test_weak_fringes_are_fitted_by_default(name, model, rng) -> None:
     assert np.all(np.abs(fitted.contrast - 0.13) < 6.0 * fitted.contrast_sigma)
 
 
+@pytest.mark.parametrize("seed", [117, 122])
+def test_a_sensor_of_few_pixels_is_solved_on_enough_cells(seed, model) -> None:
+    """16 by 16 pixels of little more than one order, which 16 cells fit as well with a wrong model and relief."""
+    rng = np.random.default_rng(seed)
+    truth = random_field((16, 16), rng, mean=rng.uniform(10.0, 18.0), span=rng.uniform(0.3, 0.5))
+    result = judge(fit_thickness(make_flats(ROWS["contrast 0.25"], truth, rng), model), truth)
+    assert result.masked > 0.99 or (result.wrong < 1e-3 and result.own < 1.5), str(result)
+
+
+def test_fringes_of_few_orders_are_not_taken_for_light(model) -> None:
+    """Light that each wavelength has of its own follows weak fringes that are as smooth as itself."""
+    laboratory = replace(ROWS["contrast 0.05"], electrons=20_000.0)
+    result = fit_one(laboratory, 41_001, model, 128)[1]
+    assert result.wrong < 1e-3, str(result)
+    assert result.masked < 0.05, str(result)
+    assert 0.8 < result.own < 1.15, str(result)
+
+
+def test_an_order_that_the_search_came_upon_is_a_rival(model) -> None:
+    """Fringes of a hundredth of the model's: two orders are about as likely, and neither is said to be sure."""
+    laboratory = replace(ROWS["roughness 80 nm, gradient 3 %"], contrast=0.05)
+    result = fit_one(laboratory, 41_061, model, 128)[1]
+    assert result.masked > 0.99 or result.wrong < 1e-3, str(result)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",

@@ -44,7 +44,7 @@ def test_a_map_is_found_from_a_range(rng):
         weight[20:24, 40:50] = 0.0
     for value in values:
         value[20:24, 40:50] = np.nan
-    found = map_from_range(values, weights, RANGE_UM, light, ORDER_UM, model_accuracy=0.0)
+    found = map_from_range(values, weights, RANGE_UM, light, ORDER_UM, order_error=0.0)
     away = (found.thickness_um - layer)[found.known]
     assert found.known.mean() > 0.6
     assert not found.known[20:24, 40:50].any()
@@ -90,7 +90,7 @@ def test_a_model_that_is_wrong_is_told(rng):
             (low, high),
             lambda grid: dark.frame(np.asarray(grid)[None])[0],
             order_um,
-            model_accuracy=0.0,
+            order_error=0.0,
         )
     except UndeterminedError:
         return
@@ -133,7 +133,12 @@ def test_bad_input_is_named():
     blank = np.zeros((64, 64))
     with pytest.raises(OutOfRangeError, match="range of the thickness"):
         map_from_range([blank], [blank], (14.0, 13.0), light, ORDER_UM)
-    with pytest.raises(OutOfRangeError, match="accuracy of the model"):
+    with pytest.raises(OutOfRangeError, match="error between orders"):
+        map_from_range([blank], [blank], RANGE_UM, light, ORDER_UM, order_error=-0.1)
+    with (
+        pytest.warns(FutureWarning, match="use order_error"),
+        pytest.raises(OutOfRangeError, match="error between orders"),
+    ):
         map_from_range([blank], [blank], RANGE_UM, light, ORDER_UM, model_accuracy=-0.1)
     with pytest.raises(InputError, match="frames"):
         map_from_range([], [], RANGE_UM, light, ORDER_UM)

@@ -48,7 +48,7 @@ def test_a_map_is_written_where_its_order_is_told(
     layer = foreign_map(rng, (64, 64), 13.1, 13.8)
     frames = night(tmp_path / "night", str(setup), layer, rng, 20)
     command = ["fit-sky", frames, "--setup", str(setup), "--thickness", "13um:13.9um", "--out"]
-    assert run([*command, str(tmp_path / "told"), "--model-accuracy", "0"]) == 0
+    assert run([*command, str(tmp_path / "told"), "--order-error", "0"]) == 0
     assert "direction are right with a probability of" in capsys.readouterr().out
     found = ThicknessMap.read_fits(tmp_path / "told" / "thickness.fits")
     known = np.isfinite(found.known_um())

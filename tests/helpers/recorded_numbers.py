@@ -23,7 +23,7 @@ from astropy.io import fits
 from astropy.table import Table
 from PIL import Image
 
-__all__ = ["Record", "differences", "numbers_of"]
+__all__ = ["Record", "Words", "differences", "numbers_of"]
 
 RELATIVE, RELATIVE_ELSEWHERE = 1e-6, 1e-3
 """Part of a number by which it may differ. Other processors sum in another order, so that a pixel at a limit may fall
@@ -35,6 +35,11 @@ GREY, GREY_ELSEWHERE = 2.0, 8.0
 PROCESSOR = llvmlite.binding.get_host_cpu_name()
 
 Leaf = float | str | list[float] | list[str]
+
+
+class Words(list[str]):
+    """Words that are compared one by one, whatever they are made of."""
+
 
 _NUMBER = re.compile(r"(?<![\w.])[-−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _OF_A_RUN = re.compile(
@@ -50,6 +55,8 @@ def numbers_of(value: Any, name: str = "") -> Iterator[tuple[str, Leaf]]:
     """Names and values of all numbers and words in a result, a file or a folder, without times, versions, paths."""
     if isinstance(value, Path):
         yield from _of_path(value, name)
+    elif isinstance(value, Words):
+        yield f"{name}=", list(value)
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield from numbers_of({one.name: getattr(value, one.name) for one in dataclasses.fields(value)}, name)
     elif isinstance(value, Mapping):

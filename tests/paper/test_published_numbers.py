@@ -150,17 +150,13 @@ def test_bad_contexts_are_named(tmp_path) -> None:
         Context(small, small, shared=tmp_path)
 
 
-SLOW_SECTIONS = ("thickness_fit", "angles", "hsc")
-"""Seconds each; what they call is called by quick tests, too."""
+OF_CURVES = ("one_pixel", "flat_contrast", "row_3000", "raft", "bandwidth", "absorption_depth", "oh_lines")
+"""What else there is without the published curves; others are recorded with made-up ones."""
 
 
 @pytest.mark.parametrize(
     "compute",
-    [
-        pytest.param(one, id=one.__name__, marks=[pytest.mark.slow] * (one.__name__ in SLOW_SECTIONS))
-        for one in SECTIONS
-        if one.__name__ != "coadd"  # needs a region of 240 pixels
-    ],
+    [pytest.param(one, id=one.__name__) for one in SECTIONS if one.__name__ in OF_CURVES],
 )
 def test_a_section_of_a_small_sensor_is_as_recorded(
     compute, without_curves: Context, recorded: Record

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 from product_makers import MAKERS
+from recorded_numbers import Record, Words
+from seen_pages import drawn
 
 from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.model import FringeModel
@@ -17,8 +19,8 @@ matplotlib.use("agg")
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:All-NaN")
 @pytest.mark.parametrize("kind", MAKERS)
-def test_every_product_is_drawn_and_described(kind: str) -> None:
-    product = MAKERS[kind]()
+def test_every_product_is_drawn_and_described(kind: str, recorded: Record) -> None:
+    product = MAKERS[kind](metadata={"NOTE": "x"})
     shown = product._repr_html_()
     assert kind in shown
     assert "masked" in shown
@@ -26,15 +28,18 @@ def test_every_product_is_drawn_and_described(kind: str) -> None:
     axes = pyplot.figure().add_subplot()
     assert product.plot(axes) is axes
     assert axes.images
+    axes.figure.canvas.draw()
+    stated = [f"{name} {value}" for name, value in product.facts().items()]
+    recorded({"stated": Words([*stated, repr(product)]), "drawn": drawn(axes.figure)})
     pyplot.close("all")
 
 
 def test_a_cube_of_arrays_shows_fringes_in_percent() -> None:
     counts = 1e4 * (1.0 + 0.1 * np.sin(np.arange(24.0).reshape(1, 4, 6)) * np.ones((3, 1, 1)))
     cube = FringeCube.from_arrays(counts, [950.0, 960.0, 970.0])
-    drawn = cube.plot().images[0]
+    image = cube.plot().images[0]
     expected = 100.0 * (counts[1] / counts[1].mean() - 1.0)
-    np.testing.assert_allclose(drawn.get_array(), expected, atol=1e-3)
+    np.testing.assert_allclose(image.get_array(), expected, atol=1e-3)
     assert "950, 960, 970" in cube._repr_html_()
     pyplot.close("all")
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import sys
+
 import numpy as np
 import pytest
 from astropy.io import fits
 
-from lsst.fringe_sim.errors import FrameFormatError, InputError
+from lsst.fringe_sim.errors import FrameFormatError, InputError, MissingPackageError
 from lsst.fringe_sim.products import MASK_PLANES, describe_mask
 from lsst.fringe_sim.products.observed_files import detector_of, observed_images, write_images
 
@@ -121,6 +124,37 @@ def test_a_background_is_put_back(tmp_path):
     fits.PrimaryHDU(np.ones((3, 3))).writeto(other, overwrite=True)
     with pytest.raises(FrameFormatError, match=r"background.fits: image is \(3, 3\)"):
         observed_images(path)[0].read(other)
+
+
+def test_exposure_of_lsst_images_without_that_package(tmp_path, monkeypatch):
+    """Its tree names sensor and filter; only a background that it holds has to be drawn by the package."""
+    tree = {"detector": {"attributes": {"name": "R22_S11"}}, "obs_info": {"physical_filter": "y_10"}}
+    stored = np.frombuffer(json.dumps(tree | {"image": {"yx0": [0, 0]}}).encode(), dtype=np.uint8)
+    table = fits.BinTableHDU.from_columns([fits.Column("JSON", "PB", array=[stored])], name="JSON")
+    mask = fits.ImageHDU(
+        (IMAGE == 7).astype(np.int32) << 4, fits.Header({"MSKN0004": "SATURATED"}), name="MASK"
+    )
+    mask.header["MSKM0004"] = 16
+    other = fits.ImageHDU(np.ones((9, 9)), name="BACKGROUNDS/FIELDS/STANDARD/DATA")
+    path = write(
+        tmp_path / "visit.fits",
+        fits.ImageHDU(IMAGE, name="IMAGE"),
+        mask,
+        other,
+        table,
+        DATAMODL="visit_image",
+    )
+    (image,) = observed_images(path)
+    frame = image.read()
+    assert (frame.detector, frame.physical_filter) == ("R22_S11", "y_10")
+    assert describe_mask(frame.mask) == {"SAT": 1}
+    monkeypatch.setitem(sys.modules, "lsst.images", None)
+    with pytest.raises(MissingPackageError, match=r"lsst-fringe-sim\[lsst-images\]"):
+        image.read(path)
+    with fits.open(path, mode="update") as hdus:
+        hdus["MASK"].header["MSKM0004"] = 17
+    with pytest.raises(FrameFormatError, match="MSKM0004 is 17"):
+        image.read()
 
 
 def test_a_file_is_written_again_with_all_that_is_in_it(tmp_path):

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from product_makers import MAKERS, cube, sky, thickness
+from recorded_numbers import Record, Words
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.errors import FringeSimError, InputError, MissingPackageError, UnknownNameError
@@ -146,3 +147,31 @@ def test_the_command(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "xarray", None)
     assert run(["export", files[0], "--out", str(tmp_path / "other")]) == 1
     assert "lsst-fringe-sim[xarray]" in capsys.readouterr().err
+
+
+SECTION = {"DETSEC": "[101:106,7:10]", "NOTE": "x"}
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        pytest.param(thickness((4, 6), metadata=SECTION), id="map"),
+        pytest.param(thickness((4, 6), n_wavelengths=None), id="map without numbers"),
+        pytest.param(cube((4, 6), metadata=SECTION), id="cube"),
+        pytest.param(
+            cube((4, 6), unit="relative", image=1.0 + 0.01 * cube((4, 6)).image / 2e4), id="relative"
+        ),
+        pytest.param(sky((4, 6)), id="sky"),
+        pytest.param(sky((4, 6), unit="fraction", seed=None, mask=np.zeros((4, 6), int)), id="fraction"),
+    ],
+)
+def test_a_data_set_is_as_recorded(made, recorded: Record) -> None:
+    found = to_xarray(made)
+    parts = {
+        str(name): {
+            "values": np.atleast_1d(one.values), "dims": Words(map(str, one.dims)),
+            "attributes": Words(f"{key} {value}" for key, value in one.attrs.items()),
+        }
+        for name, one in {**found.data_vars, **found.coords}.items()
+    }  # fmt: skip
+    recorded({"parts": parts, "attributes": Words(f"{key} {value}" for key, value in found.attrs.items())})

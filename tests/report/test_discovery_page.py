@@ -5,13 +5,18 @@ from __future__ import annotations
 import base64
 import math
 import re
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from astropy.table import Table
 from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from recorded_numbers import Record
+from seen_pages import drawn
 
 from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Step, Where
@@ -22,6 +27,7 @@ from lsst.fringe_sim.model.effects_override import is_as_written, read_effects_o
 from lsst.fringe_sim.products import FlatExposures, ThicknessMap
 from lsst.fringe_sim.report.discovery_figures import candidates_figure, gap_figure, where_figure
 from lsst.fringe_sim.report.discovery_page import discovery_page
+from lsst.fringe_sim.report.learned_part import learned_figure
 
 WAVELENGTHS = [880.0 + 10.0 * k for k in range(12)]
 
@@ -161,9 +167,13 @@ def words(text: str) -> str:
 
 
 @pytest.mark.parametrize("verdict", [NAMED, UNEXPLAINED, LEARNED, AGREES, TOO_POOR], ids=lambda v: v.verdict)
-def test_every_page_is_whole_and_fetches_nothing(verdict: Verdict, tmp_path) -> None:
-    page = discovery_page(verdict)
-    text = page.write(tmp_path / "report.html").read_text(encoding="utf-8")
+def test_every_page_is_whole_and_fetches_nothing(
+    verdict: Verdict, tmp_path: Path, seen: Callable[[Path], dict[str, Any]], recorded: Record
+) -> None:
+    """What it shows is as recorded."""
+    page = discovery_page(verdict).write(tmp_path / "report.html")
+    recorded(seen(page))
+    text = page.read_text(encoding="utf-8")
     assert "<script" not in text
     assert not re.findall(r'(?:src|href)="(?!data:|#)', text)
     titles = re.findall(r'<h2 id="\w+">([^<]+)</h2>', text)
@@ -308,11 +318,14 @@ def test_many_parameters_are_one_number_in_the_summary_and_all_in_the_table() ->
 
 
 @pytest.mark.parametrize("name", ["response", "map", "light", "amplifiers"])
-def test_what_was_learned_is_told_and_shown(name: str) -> None:
+def test_what_was_learned_is_told_and_shown(name: str, recorded: Record) -> None:
     """Size first, then the shape, the gap before and after, and which effect it is like."""
     keys = {"map": "y1x2", "light": "at_960_y1x2", "amplifiers": "C00"}
     own = {f"learned_{name}.{keys[name]}": 0.01} if name in keys else LEARNED.learned["own"]
     verdict = replace(LEARNED, learned={**LEARNED.learned, "name": f"learned_{name}", "own": own})
+    made = learned_figure(verdict.learned)
+    FigureCanvasAgg(made).draw()
+    recorded(drawn(made))
     text = discovery_page(verdict).to_html()
     told = words(text)
     assert "like roughness, and not quite" in told

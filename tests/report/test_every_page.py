@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -22,6 +24,7 @@ from lsst.fringe_sim.report.page import Origin
 from lsst.fringe_sim.style import DIVERGING, figure, map_to_png, panels, to_pieces
 
 PHONE = 400
+Seen = Callable[[Path], dict[str, Any]]
 COMMAND = "fringe-sim fit 'my raws' --out <fit>"
 
 
@@ -60,7 +63,7 @@ def read(path: Path) -> Reader:
 
 
 @pytest.fixture(params=SMALL_PAGES)
-def page(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+def page(request: pytest.FixtureRequest, tmp_path: Path, seen: Seen) -> Path:
     """One of the pages, in a folder beside that of another page."""
     beside, folder = tmp_path / "other folder", tmp_path / request.param
     beside.mkdir()
@@ -71,22 +74,25 @@ def page(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:All-NaN")
-def test_every_page_begins_with_a_summary_and_its_links_resolve(page: Path, recorded: Record) -> None:
-    """Its numbers and pictures are as recorded: nothing else draws the same pages."""
-    seen = read(page)
-    after_heading = seen.elements[seen.elements.index("h1") :]
+def test_every_page_begins_with_a_summary_and_its_links_resolve(
+    page: Path, seen: Seen, recorded: Record
+) -> None:
+    """Its words, numbers and pictures are as recorded: nothing else draws the same pages."""
+    shown = seen(page)
+    reader = read(page)
+    after_heading = reader.elements[reader.elements.index("h1") :]
     assert after_heading[:3] == ["h1", "p.lead", "section.summary"]
-    stated = dict(zip(seen.names, seen.values, strict=True))
-    assert len(stated) == len(seen.names) >= 6
+    stated = dict(zip(reader.names, reader.values, strict=True))
+    assert len(stated) == len(reader.names) >= 6
     assert all(value.strip() for value in stated.values())
     assert not any(re.search(r"\bnan\b", value) for value in stated.values())
     assert __version__ in stated["version"]
     assert stated["command"] == COMMAND
     assert stated["see also"] == "Other & page"
-    files = [link for link in seen.links if not link.startswith(("data:", "#"))]
+    files = [link for link in reader.links if not link.startswith(("data:", "#"))]
     assert "../other%20folder/report.html" in files
     assert all((page.parent / unquote(link)).is_file() for link in files)
-    recorded(page.parent)
+    recorded({"page": page.parent, **shown})
 
 
 @pytest.mark.slow

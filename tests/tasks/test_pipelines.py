@@ -63,6 +63,8 @@ def test_dataset_types_and_dimensions_are_those_agreed() -> None:
     agreed = {
         "effectDiscovery": ("FringeJson", {"instrument", "detector"}),
         "effectOverride": ("ConfigOverride", {"instrument", "detector"}),
+        "learnedOverride": ("ConfigOverride", {"instrument", "detector"}),
+        "learnedEffect": ("ConfigOverride", {"instrument", "detector"}),
         "skyEffectDiscovery": ("FringeJson", {"instrument", "detector"}),
         "skyEffectOverride": ("ConfigOverride", {"instrument", "detector"}),
         "raw": ("RawFrame", {"instrument", "exposure", "detector"}),

@@ -26,24 +26,12 @@ from numba.core import caching
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from threadpoolctl import threadpool_limits
 
-__all__ = [
-    "contiguous",
-    "kernel",
-    "limit_threads",
-    "one_blas_thread",
-    "processors",
-    "run_shares",
-    "run_threaded",
-    "subkernel",
-]
-
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 _LOG = logging.getLogger(__name__)
 
-_RELAXED = {"reassoc", "contract", "arcp", "nsz"}
-"""Freedom of rounding; NaN and infinity keep their meaning."""
+_RELAXED = {"reassoc", "contract", "arcp", "nsz"}  # Freedom of rounding; NaN and infinity keep their meaning
 
 
 def kernel(
@@ -243,5 +231,4 @@ def run_shares(work: Callable[[int, int], object], count: int, least: int) -> No
     run_threaded(lambda share: work(edges[share], edges[share + 1]), shares)
 
 
-_SHARES = 4
-"""Shares per thread: some cost more than others."""
+_SHARES = 4  # Shares per thread: some cost more than others

@@ -14,16 +14,6 @@ from .resources import REQUIRED_PROVENANCE, first_line, read_table, read_user_ta
 if TYPE_CHECKING:
     from astropy.table import Table
 
-__all__ = [
-    "Description",
-    "described",
-    "files_of",
-    "is_file_name",
-    "read_description",
-    "read_table_of",
-    "with_files_beside",
-]
-
 _NAMES = (
     ("camera",),
     ("stack",),

@@ -21,18 +21,7 @@ from .errors import InputError
 if TYPE_CHECKING:
     from astropy.table import Table
 
-__all__ = [
-    "LOCK",
-    "all_or_nothing",
-    "refuse_unfinished",
-    "same_file_key",
-    "table_text",
-    "write_together",
-    "write_whole",
-]
-
-LOCK = ".fringe-sim.lock"
-"""File in a folder into which a command writes, locked as long as it does."""
+LOCK = ".fringe-sim.lock"  # File in a folder into which a command writes, locked as long as it does
 
 
 @contextmanager

@@ -14,8 +14,6 @@ from typing import IO
 
 from .errors import FrameFormatError
 
-__all__ = ["check_axes"]
-
 _EXPANSION, _SMALL = 100, 1 << 30
 """A file may stand for so many bytes, and beyond them for so many times what it takes on the disk. No frame of
 a detector is compressed more than tenfold."""

@@ -14,12 +14,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["InNotebook", "OneLine", "axes_or_new", "do_nothing"]
-
 PREVIEW_INCH = (4.2, 3.2)
 
-LONGEST_TEXT, MOST_ITEMS = 60, 12
-"""Characters of a text, and items of a tuple, that a line shows."""
+LONGEST_TEXT, MOST_ITEMS = 60, 12  # Characters of a text, and items of a tuple, that a line shows
 
 
 class OneLine:

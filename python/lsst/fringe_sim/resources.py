@@ -22,24 +22,6 @@ import yaml
 from .errors import FrameFormatError, InputError, ResourceError, UnknownNameError
 from .fits_gate import check_axes
 
-__all__ = [
-    "DAMAGE",
-    "check_axes",
-    "complete_fits",
-    "first_line",
-    "list_resources",
-    "open_user_fits",
-    "parse_user_yaml",
-    "read_table",
-    "read_user_table",
-    "read_user_text",
-    "read_user_yaml",
-    "read_yaml",
-    "refuse_damage",
-    "resource_path",
-    "revision",
-]
-
 REQUIRED_PROVENANCE = ("source", "doi", "licence")
 
 REVISION_LENGTH = 12

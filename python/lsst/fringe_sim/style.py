@@ -22,24 +22,6 @@ from mpl_toolkits.axes_grid1 import make_axes_locatable
 from numpy.typing import NDArray
 from PIL import Image
 
-__all__ = [
-    "DIVERGING",
-    "LINES",
-    "MOST_PIXELS",
-    "SEQUENTIAL",
-    "TITLE_PLACE",
-    "block_mean",
-    "color_bar",
-    "figure",
-    "finite_range",
-    "map_to_png",
-    "panels",
-    "pixels_to_png",
-    "show_image",
-    "to_pieces",
-    "to_png",
-]
-
 SEQUENTIAL = "cividis"
 DIVERGING = "PuOr_r"
 LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
@@ -51,11 +33,8 @@ BAD_COLOR, BAD_GREY = 255, 0.75
 TITLE_PLACE = 1.0
 """Height of titles in axes without ticks above. Where it is not given, matplotlib looks at every tick for it."""
 
-BAR_INCH, BAR_GAP_INCH = 0.1, 0.08
-"""Width of a colour bar, and its distance from what it belongs to."""
-
-MOST_PIXELS = 600
-"""Images are averaged down to about this many pixels a side before drawing."""
+BAR_INCH, BAR_GAP_INCH = 0.1, 0.08  # Width of a colour bar, and its distance from what it belongs to
+MOST_PIXELS = 600  # Images are averaged down to about this many pixels a side before drawing
 
 _RC: dict[Any, Any] = {
     "font.size": 9,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from lsst.fringe_sim.algorithms.discovery.classes import (
     EffectClass,
     classes_in_all_data,
     outsider_probability,
+    outsiders_for_one,
 )
 from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit
 from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis
@@ -79,3 +81,23 @@ def test_a_cause_outside_the_catalogue_leaves_the_more_the_stronger_it_is() -> N
     assert weak > 0.05
     much = replace(left, channels=(Channel("amplifiers", 90.0, 20.0, 1e-9),))
     assert outsider_probability(much, 0.15, 160.0**2) > 0.99
+
+
+def test_a_cause_outside_is_likelier_in_the_place_of_several_effects() -> None:
+    """Against the sum over all numbers of causes, Poisson distributed with mean 1, one of them outside."""
+
+    def of_causes(number: int) -> float:
+        return math.exp(-1.0) / math.factorial(number)
+
+    for number, factor in ((1, 1), (2, 4), (3, 15)):
+        with_one_outside = sum((kept + 1) * of_causes(kept + 1) for kept in range(number))
+        assert with_one_outside / of_causes(number) == pytest.approx(factor)
+        assert outsiders_for_one(number) == factor
+    one = replace(fitted("roughness", 60.0), channels=(Channel("amplifiers", 20.0, 20.0, 0.5),))
+    odds = []
+    for names in (("roughness",), ("roughness", NEAR), ("roughness", NEAR, FAR)):
+        chance = outsider_probability(replace(one, names=names), 0.15, 1000.0**2)
+        odds.append(chance / (1.0 - chance))
+    assert odds[1:] == pytest.approx([4.0 * odds[0], 15.0 * odds[0]])
+    spots = outsider_probability(replace(one, names=("gain", "void")), 0.15, 1000.0**2, 0.0)
+    assert spots / (1.0 - spots) - odds[1] == pytest.approx(2.0 * 0.15 / 0.85)

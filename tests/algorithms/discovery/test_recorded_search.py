@@ -1,20 +1,78 @@
-"""A record of a whole search, for edits that are not meant to change it."""
+"""Records of whole searches, for edits that are not meant to change them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from recorded_numbers import Record
 
-from lsst.fringe_sim.algorithms.discovery import discover
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
+from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
+from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
+from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
+from lsst.fringe_sim.algorithms.discovery.growth import grown_thickness
+from lsst.fringe_sim.algorithms.discovery.planes import joined_planes
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
-from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.effects import EFFECTS, Effect
+from lsst.fringe_sim.model import FringeModel
 
-CATALOGUE = [one for one in EFFECTS if one.name in ("ghost_pedestal", "roughness", "vignetting")]
+
+def catalogue(*names: str) -> list[Effect]:
+    return [one for one in EFFECTS if one.name in names]
+
+
+@pytest.mark.parametrize(
+    ("names", "size"),
+    [
+        pytest.param(("ghost_pedestal", "roughness", "vignetting"), (48, 64), marks=pytest.mark.slow),
+        (("tilt", "ghost_pedestal", "bandwidth"), (48, 40)),
+    ],
+    ids=["named", "outside"],
+)
+def test_a_verdict_is_as_recorded(names: tuple[str, ...], size: tuple[int, int], recorded: Record) -> None:
+    """Few effects and cells; other tests say whether verdicts are right."""
+    case = draw_case("one", np.random.default_rng(31), size=size, only=[names[0]])
+    hidden = names[0] if names[0] == "tilt" else ""
+    known = catalogue(*(name for name in names if name != hidden))
+    found = discover(case.cube, case.setup, known, rng=np.random.default_rng(0))
+    recorded(found)
 
 
 @pytest.mark.slow
-def test_the_verdict_on_a_pedestal_is_as_recorded(recorded: Record) -> None:
-    """Few effects and cells; other tests say whether verdicts are right."""
-    case = draw_case("one", np.random.default_rng(31), size=(48, 64), only=["ghost_pedestal"])
-    recorded(discover(case.cube, case.setup, CATALOGUE, rng=np.random.default_rng(0)))
+def test_a_search_where_the_thickness_is_known_is_as_recorded(recorded: Record) -> None:
+    rng = np.random.default_rng(32)
+    case = draw_case("one", rng, size=(32, 40), only=["roughness"])
+    thickness = (case.thickness_um + 0.01 * rng.standard_normal(case.thickness_um.shape)).astype(np.float32)
+    sigma = np.full(thickness.shape, 0.01, np.float32)
+    cube = replace(case.cube, thickness=thickness, thickness_sigma=sigma, layer="adhesive")
+    recorded(discover(cube, case.setup, catalogue("roughness", "tilt"), rng=np.random.default_rng(0)))
+
+
+@pytest.mark.slow
+def test_a_search_of_the_other_core_is_as_recorded(recorded: Record) -> None:
+    case = draw_case("one", np.random.default_rng(31), size=(24, 28), only=["ghost_pedestal"])
+    known, options = catalogue("ghost_pedestal", "roughness"), SearchOptions(core="marginal")
+    recorded(discover(case.cube, case.setup, known, rng=np.random.default_rng(0), options=options))
+
+
+@pytest.mark.slow
+def test_planes_and_a_thickness_that_grows_are_as_recorded(recorded: Record) -> None:
+    """Where some cells have lost their order, from noisy flats and from behind a blur."""
+    case = draw_case("one", np.random.default_rng(33), size=(32, 40), only=["charge_diffusion"])
+    truth, model = case.thickness_um, FringeModel.from_setup(case.setup)
+    cells = bin_cube(case.cube, 1)
+    order = float(model.fringe_order_um(float(np.median(cells.wavelength_nm))))
+    torn = truth + order * (np.indices(truth.shape)[1] > 28)
+    forward = Forward.of_cells(model, EFFECTS, cells, (float(truth.min()) - 1.0, float(truth.max()) + 1.0))
+    problem = Problem(cells, forward, CellBasis(truth.shape), np.eye(len(cells.value)))
+    (blur,) = catalogue("charge_diffusion")
+    own = coordinates_of(blur, forward, torn)
+    position = np.array([own[0].coordinate(case.values["charge_diffusion.sigma"])])
+    grown = grown_thickness(problem, fit_model(problem, own, position, torn.ravel()), torn)
+    recorded({
+        "planes": joined_planes(model, cells, torn),
+        "grown": None if grown is None else {"thickness": grown.thickness_um, "settings": grown.settings},
+    })  # fmt: skip

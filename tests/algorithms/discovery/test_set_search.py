@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions
+from lsst.fringe_sim.algorithms.discovery import set_search as module
 from lsst.fringe_sim.algorithms.discovery.channels import Channel
+from lsst.fringe_sim.algorithms.discovery.classes import EffectClass
 from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit
 from lsst.fringe_sim.algorithms.discovery.selection import Candidate, Hypothesis
 from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
@@ -86,3 +91,30 @@ def test_it_is_fitted_while_none_does() -> None:
     fits = MadeUpFits(promises, 0.0)
     found = SetSearch(fits, OPTIONS, lambda text: None, lambda found: found)._larger_sets(fits.singles[0])  # type: ignore[arg-type]
     assert [item.names for item in found] == list(promises)
+
+
+@pytest.mark.parametrize(
+    ("brought", "left"), [(0.1, ("coat", "light")), (40.0, ("coat", "bystander", "light"))]
+)
+def test_a_member_that_brings_nothing_where_a_rival_has_led_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, brought: float, left: tuple[str, ...]
+) -> None:
+    """Another effect in the place of one may find a minimum in which a third is not needed."""
+
+    def improved(names: tuple[str, ...], base: Fit) -> Hypothesis:
+        needed = {"coat", "light"} <= set(names)
+        chi2 = 1000.0 + (brought if needed and "bystander" not in names else 0.0)
+        return fitted(names, chi2, NOISE) if needed else fitted(names, 5000.0, MUCH)
+
+    def classes_of(selector: object, chosen: Hypothesis, width: float) -> dict[str, EffectClass]:
+        taken = {name: brought if name == "bystander" else 4000.0 for name in chosen.names}
+        return {n: EffectClass({n: 1.0}, 1.0, {}, fall**0.5, chosen, {}) for n, fall in taken.items()}
+
+    selector = SimpleNamespace(improved=improved, with_channels=lambda found: found)
+    monkeypatch.setattr(module, "classes_of", classes_of)
+    sets = SetSearch(selector, OPTIONS, lambda text: None, lambda found: found)  # type: ignore[arg-type]
+    monkeypatch.setattr(sets, "step", lambda before, after: after.names)
+    steps: list[object] = []
+    chosen, classes = sets.classified(improved(("coat", "bystander", "light"), Fit), steps)  # type: ignore[arg-type]
+    assert chosen.names == tuple(classes) == left
+    assert steps == ([left] if len(left) == 2 else [])

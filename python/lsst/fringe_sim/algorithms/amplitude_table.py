@@ -31,26 +31,13 @@ from .sky_frame import SkyQuadrature
 from .sky_response import tabulate_components, white_light
 from .thickness_stand_in import stand_in_thickness
 
-__all__ = [
-    "CASES",
-    "UNDAMPED",
-    "WITH_EFFECTS",
-    "AmplitudeCase",
-    "SkyCase",
-    "amplitude_table",
-    "compare_amplitudes",
-    "contradiction",
-]
-
 FloatArray = NDArray[np.float64]
 
-EDGE_DEG = 1.44
-"""Field radius that the paper calls the edge of the focal plane [deg]."""
+EDGE_DEG = 1.44  # Field radius that the paper calls the edge of the focal plane [deg]
 
 _FLAT_ANGLES = 32
 
-_QUADRATURE = SkyQuadrature(table_tolerance=3e-6)
-"""Amplitudes are given to 1e-6 of the sky."""
+_QUADRATURE = SkyQuadrature(table_tolerance=3e-6)  # Amplitudes are given to 1e-6 of the sky
 
 
 @dataclass(frozen=True)
@@ -133,11 +120,8 @@ class SkyCase:
         return SkySpectrum(self.lines, (), airmass)
 
 
-UNDAMPED = "undamped"
-"""Rows of the model without effects, which is that of the paper."""
-
-WITH_EFFECTS = "with effects"
-"""Rows of the model with the effects that were given."""
+UNDAMPED = "undamped"  # Rows of the model without effects, which is that of the paper
+WITH_EFFECTS = "with effects"  # Rows of the model with the effects that were given
 
 
 def amplitude_table(
@@ -232,11 +216,8 @@ def contradiction(table: Table) -> str:
     )
 
 
-_MEASURED_FLAT = 1.5
-"""Half range of E2V-CCD250-321 at 960 nm: the measured fundamental [%]."""
-
-_MEASURED_MONOCAM = 2.0
-"""Amplitude of MonoCam's fringes in Table 2 [%]."""
+_MEASURED_FLAT = 1.5  # Half range of E2V-CCD250-321 at 960 nm: the measured fundamental [%]
+_MEASURED_MONOCAM = 2.0  # Amplitude of MonoCam's fringes in Table 2 [%]
 
 
 def _model(case: AmplitudeCase, settings: Mapping[str, Any], silicon: str | None) -> FringeModel:

@@ -26,15 +26,6 @@ from .sky_response import (
     white_light,
 )
 
-__all__ = [
-    "ANGLES",
-    "CONTINUUM_ANGLES",
-    "AngularResponse",
-    "angular_response",
-    "of_other_silicon",
-    "silicon_um",
-]
-
 FloatArray = NDArray[np.float64]
 
 ANGLES = 192
@@ -47,8 +38,7 @@ faintest (96 give 4e-3)."""
 _SUM_ERROR = 1e-9
 """Error allowed in the sum over lines under one angle, relative to its fringes; interpolation has 3e-7 of the sky."""
 
-_CELLS = 16_384
-"""Cells of the histogram of rays; the phase between two of them differs by less than 0.01 rad."""
+_CELLS = 16_384  # Cells of the histogram of rays; the phase between two of them differs by less than 0.01 rad
 
 
 @dataclass(frozen=True, eq=False)

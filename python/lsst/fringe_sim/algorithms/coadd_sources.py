@@ -16,12 +16,9 @@ from ..products import SkyFringe
 from .coadds import VisitPlaces, filled_pattern, patterns_left, placed_visits
 from .correction.injection import InjectionOptions, Source, bias_columns, free_places, stamp_side
 
-__all__ = ["sources_in_coadds"]
-
 FloatArray = NDArray[np.float64]
 
-SINGLE = 8
-"""Single visits that are looked at; each has some dozens of sources of a kind and flux."""
+SINGLE = 8  # Single visits that are looked at; each has some dozens of sources of a kind and flux
 
 UNTOUCHED, FRINGES, CORRECTED = "untouched", "fringes", "corrected"
 

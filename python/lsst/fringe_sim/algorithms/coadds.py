@@ -16,26 +16,14 @@ from ..errors import InputError, OutOfRangeError, named_units
 from ..products import SkyFringe
 from ..resources import read_user_table
 
-__all__ = [
-    "Coadds",
-    "VisitPlaces",
-    "coadd_visits",
-    "coadds_of_frames",
-    "filled_pattern",
-    "patterns_left",
-    "placed_visits",
-]
-
 FloatArray = NDArray[np.float64]
 
-COUNTS = (1, 10, 100, 1000)
-"""Exposures in coadds that are looked at, besides the deepest."""
+COUNTS = (1, 10, 100, 1000)  # Exposures in coadds that are looked at, besides the deepest
 
 VISITS = 100
 """Exposures in the deepest coadd where no visits are given; the y band of LSST has some more in ten years."""
 
-LARGEST_REGION_PX = 400
-"""Side of the region that is coadded [px]; a quarter of it is 20 arcsec of LSST."""
+LARGEST_REGION_PX = 400  # Side of the region that is coadded [px]; a quarter of it is 20 arcsec of LSST
 
 SMALLEST_REGION_PX = 16
 

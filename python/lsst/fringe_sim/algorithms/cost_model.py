@@ -6,25 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-__all__ = ["QUANTUM_COSTS", "FocalPlaneCost", "QuantumCost"]
-
-PIXELS = 4004 * 4096
-"""Pixels of an e2v sensor."""
-
-RESPONSE_S = 9.0
-"""Response of one sensor to the sky with the beam of every pixel [s of processor time]."""
-
-FRAME_S = 0.7
-"""One frame of 16.4 Mpix with the beam of every pixel, in float32 and written as FITS [s]."""
-
-COMPONENT_S = 0.35
-"""Principal components, per frame that enters them [s]."""
-
-FORECAST_S = 6.0
-"""Forecast of one sensor beside its response [s]."""
-
-SAMPLED_S = 0.9
-"""The same with one sampled pixel per arcsecond, beside a response that all sensors share [s]."""
+PIXELS = 4004 * 4096  # Pixels of an e2v sensor
+RESPONSE_S = 9.0  # Response of one sensor to the sky with the beam of every pixel [s of processor time]
+FRAME_S = 0.7  # One frame of 16.4 Mpix with the beam of every pixel, in float32 and written as FITS [s]
+COMPONENT_S = 0.35  # Principal components, per frame that enters them [s]
+FORECAST_S = 6.0  # Forecast of one sensor beside its response [s]
+SAMPLED_S = 0.9  # The same with one sampled pixel per arcsecond, beside a response that all sensors share [s]
 
 MIB = 2.0**20
 

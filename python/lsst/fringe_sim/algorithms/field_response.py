@@ -27,23 +27,7 @@ from .angular_response import ANGLES, AngularResponse, angular_response, of_othe
 from .island_response import parts_of, response_with_islands
 from .sensor_placement import SensorPlacement
 from .sky_frame import is_band, sky_response
-from .sky_response import (
-    Response,
-    component_factors,
-)
-
-__all__ = [
-    "AngularResponse",
-    "FieldResponse",
-    "FieldTable",
-    "SensorPlacement",
-    "SensorResponse",
-    "angular_response",
-    "beam_field",
-    "beam_limits",
-    "field_response",
-    "sensor_response",
-]
+from .sky_response import Response, component_factors
 
 FloatArray = NDArray[np.float64]
 
@@ -228,9 +212,7 @@ class FieldTable:
 
 
 def field_response(
-    angular: AngularResponse,
-    beams: BeamField,
-    radius_range_deg: tuple[float, float],
+    angular: AngularResponse, beams: BeamField, radius_range_deg: tuple[float, float]
 ) -> FieldResponse:
     """Give an angular response the beams of a range of field radii.
 
@@ -312,8 +294,7 @@ def beam_limits(beams: BeamField, radius_range_deg: tuple[float, float] | None =
     return max(0.0, low - margin), high + margin
 
 
-_LEAST_ROWS = 16
-"""Rows of a frame that are worth a thread."""
+_LEAST_ROWS = 16  # Rows of a frame that are worth a thread
 
 
 @kernel(relaxed=True)

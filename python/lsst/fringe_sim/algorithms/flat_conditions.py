@@ -10,8 +10,6 @@ from ..errors import InputError, OutOfRangeError
 from ..model import FringeModel
 from ..products import FlatExposures
 
-__all__ = ["FARTHEST_K", "SAME_K", "model_of_flats"]
-
 SAME_K, FARTHEST_K = 0.5, 5.0
 """How far temperatures are taken to be the same, and how far those of flats of one series may be apart [K]."""
 _SAME_WIDTH, _OTHER_UNIT = 0.02, 5.0

@@ -31,20 +31,9 @@ from ..errors import InputError, OutOfRangeError, named_units
 from ..model import FringeModel
 from .flat_rivals import SEARCH_STRIDE, ChosenFlats, Curves, PlannedFlat, RankedFlat, Rivals
 
-__all__ = [
-    "FlatForecast",
-    "PlannedFlat",
-    "RankedFlat",
-    "forecast_flats",
-    "nyquist_thickness_um",
-    "rank_flats",
-    "recommend_flats",
-]
-
 FloatArray = NDArray[np.float64]
 
-FEWEST_FLATS = 4
-"""A fit of fewer wavelengths is flagged."""
+FEWEST_FLATS = 4  # A fit of fewer wavelengths is flagged
 MOST_FLATS = 24
 
 

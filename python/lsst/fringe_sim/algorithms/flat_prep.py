@@ -119,12 +119,10 @@ def combine_biases(frames: Iterable[RawFrame], options: FlatPrepOptions = DEFAUL
     dead: set[str] = set()
     count = 0
     for frame in frames:
-        if frame.metadata.observation_type != "bias":
-            raise FrameFormatError(
-                "IMGTYPE", frame.metadata.observation_type, "bias", source=frame.metadata.source
-            )
-        if first is None:
-            first = frame
+        told = frame.metadata
+        if told.observation_type != "bias":
+            raise FrameFormatError("IMGTYPE", told.observation_type, "bias", source=told.source)
+        first = frame if first is None else first
         _check_same_sensor(frame, first.detector_shape, first.metadata.serial)
         image, measured = _assemble_adu(frame, options)
         if total is None:
@@ -193,10 +191,7 @@ def _assemble_adu(frame: RawFrame, options: FlatPrepOptions) -> tuple[Image, dic
 
 
 def assemble_charge(
-    frame: RawFrame,
-    bias: CombinedBias | None,
-    detector: Detector,
-    options: FlatPrepOptions = DEFAULT_OPTIONS,
+    frame: RawFrame, bias: CombinedBias | None, detector: Detector, options: FlatPrepOptions = DEFAULT_OPTIONS
 ) -> PreparedCharge:
     """Charge of every pixel of a flat on the assembled, trimmed sensor, with variance and mask.
 

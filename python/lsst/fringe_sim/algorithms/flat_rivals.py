@@ -13,17 +13,6 @@ from scipy.special import log_ndtr, ndtr
 from ..errors import OutOfRangeError
 from ..model import FringeModel
 
-__all__ = [
-    "NODES_PER_ORDER",
-    "SAME_SOLUTION",
-    "SEARCH_STRIDE",
-    "ChosenFlats",
-    "Curves",
-    "PlannedFlat",
-    "RankedFlat",
-    "Rivals",
-]
-
 FloatArray = NDArray[np.float64]
 
 NODES_PER_ORDER = 24
@@ -123,13 +112,7 @@ class Curves:
         electrons = np.array([flat.electrons for flat in flats])[:, None]
         noise = electrons * relative + read_noise_e**2
         return cls(
-            tuple(flats),
-            thickness,
-            truth,
-            relative - 1.0,
-            step * slope / mean,
-            electrons**2 / noise,
-            order,
+            tuple(flats), thickness, truth, relative - 1.0, step * slope / mean, electrons**2 / noise, order
         )
 
     def with_truths(self, nodes: NDArray[np.intp]) -> Curves:

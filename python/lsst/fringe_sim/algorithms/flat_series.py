@@ -15,10 +15,7 @@ from ..optics import Beam
 from ..optics.illumination import GaussianProfile, TriangularProfile
 from ..optics.system import OpticalSystem
 
-__all__ = ["LEVEL_E", "FlatSeries"]
-
-LEVEL_E = 20_000.0
-"""Usual level of a flat [electrons per pixel]."""
+LEVEL_E = 20_000.0  # Usual level of a flat [electrons per pixel]
 
 
 @named_units

@@ -27,17 +27,6 @@ from .field_response import SensorResponse
 from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
 from .sky_frame import component_electrons
 
-__all__ = [
-    "DES_CRITERION",
-    "ForecastOptions",
-    "PatternMoments",
-    "SensorForecast",
-    "SkyLevel",
-    "correction_residuals",
-    "forecast_sensor",
-    "pattern_moments",
-]
-
 FloatArray = NDArray[np.float64]
 
 DES_CRITERION = 0.1
@@ -336,21 +325,17 @@ def forecast_sensor(
     # The rms over exposures stands for the single ones here.
     sky = times[1] @ moments.share
     relative = left[-1] / sky[:, None]
-    cell_left = np.sqrt(
-        np.maximum(np.einsum("tc,ayxcd,td->ayx", relative, moments.product, relative) / len(sky), 0.0)
-    )
+    square = np.einsum("tc,ayxcd,td->ayx", relative, moments.product, relative) / len(sky)
+    cell_left = np.sqrt(np.maximum(square, 0.0))
     typical = np.sqrt((noises**2).mean(axis=1))[:, None, None]
     x_mm, y_mm = _cell_centres(detector, chosen.cells)
+    radius_deg = math.hypot(response.placement.field_x_deg, response.placement.field_y_deg)
     return SensorForecast(
         detector=detector.name,
         vendor=detector.vendor,
         stand_in=stand_in,
-        field_radius_deg=math.hypot(response.placement.field_x_deg, response.placement.field_y_deg),
-        relative_illumination=float(
-            response.field.relative_illumination(
-                math.hypot(response.placement.field_x_deg, response.placement.field_y_deg)
-            )
-        ),
+        field_radius_deg=radius_deg,
+        relative_illumination=float(response.field.relative_illumination(radius_deg)),
         amplitudes=moments.amplitudes,
         mean_electrons=float(level.electrons.sum()),
         microjansky=level.microjansky,

@@ -17,12 +17,9 @@ from threadpoolctl import threadpool_limits
 from ..errors import InputError
 from ..products import SkyFringe
 
-__all__ = ["TILE_BYTES", "FrameStack"]
-
 FloatArray = NDArray[np.float64]
 
-TILE_BYTES = 8 * 2**20
-"""Memory of one tile of all frames."""
+TILE_BYTES = 8 * 2**20  # Memory of one tile of all frames
 
 _FEW_FRAMES = 64
 """Up to so many frames tiles are in double precision, beyond in single precision, which is twice as fast; sums over

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError
 
-__all__ = ["add_exposure_noise"]
-
 _BAND_ROWS = 64
 """Rows with a random stream of their own: their number, not that of the threads, decides the numbers."""
 

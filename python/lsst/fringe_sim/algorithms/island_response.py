@@ -15,8 +15,6 @@ from ..model import FringeModel
 if TYPE_CHECKING:
     from .sky_response import FrameTable, Response
 
-__all__ = ["IslandResponse", "IslandTable", "parts_of", "response_with_islands"]
-
 FloatArray = NDArray[np.float64]
 
 

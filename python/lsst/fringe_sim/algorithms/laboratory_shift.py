@@ -23,8 +23,7 @@ __all__ = ["ADHESIVE_PHASE_SIGMA", "phase_change", "template_pair", "widened_um"
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
-LARGEST_SIGMA = 2.0
-"""Bound of the effect `epoxy_temperature` [rad per 10 K]."""
+LARGEST_SIGMA = 2.0  # Bound of the effect `epoxy_temperature` [rad per 10 K]
 
 
 def _factor(model: FringeModel, sigma: float) -> float:

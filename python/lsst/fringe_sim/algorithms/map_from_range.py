@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, stdtr
 
+from ..deprecation import deprecated
 from ..errors import InputError, OutOfRangeError, UndeterminedError, named_units
 from ..products import ThicknessMap, mask_bits
 from .night_levels import BAND_SIGMA
 from .range_cells import PARTS, FittedMap, Polynomial, RangeCells, Seed, across_degrees, down_degrees
 
-__all__ = ["MODEL_ACCURACY", "RangeMap", "map_from_range"]
+__all__ = ["MODEL_ACCURACY", "ORDER_ERROR", "RangeMap", "map_from_range"]
 
 FloatArray = NDArray[np.float64]
 
@@ -41,10 +42,13 @@ ROUNDS, STEPS, FINISHED_ORDERS = 20, 3, 1e-3
 COMPARED_PARTS = 8
 """Parts along a side by which maps are compared."""
 
-MODEL_ACCURACY = 0.17
+ORDER_ERROR = 0.17
 """What the fringes of an independent simulator have beyond those of the model, over the fringes, along the difference
 between neighbouring orders: lines of the ESO sky model, silicon at its own temperature, f/2.25, ranges of 0.9 µm
 between 12.9 and 16.2 µm. Of the neighbours, half were likelier than the order that was right."""
+
+MODEL_ACCURACY = ORDER_ERROR
+"""The former name of `ORDER_ERROR`, until version 1.2."""
 
 SHIFTS = 4
 """Shifts of a part of the sensor up to half an order, above and below, that must not be likelier than none."""
@@ -97,6 +101,7 @@ class RangeMap:
         )
 
 
+@deprecated("1.1", "order_error", removed_in="1.2", argument="model_accuracy")
 @named_units
 def map_from_range(
     values: Sequence[ArrayLike],
@@ -104,7 +109,7 @@ def map_from_range(
     range_um: tuple[float, float],
     predict: Callable[[FloatArray], ArrayLike],
     order_um: float,
-    model_accuracy: float = MODEL_ACCURACY,
+    order_error: float = ORDER_ERROR,
 ) -> RangeMap:
     """Find the thickness map of a layer that is smooth.
 
@@ -118,15 +123,16 @@ def map_from_range(
         ``thickness_um -> light`` of the dark sky, up to two orders beyond the range; any unit.
     order_um : `float`
         Thickness of one fringe order [µm].
-    model_accuracy : `float`
-        Part of the fringes by which the model may be wrong; 0 for a model without error.
+    order_error : `float`
+        Part of the fringes by which the model may be wrong along the difference between neighbouring orders; 0 for a
+        model without error.
 
     Raises
     ------
     InputError
         No frames, or frames of several shapes.
     OutOfRangeError
-        A range of no extent, or a negative accuracy.
+        A range of no extent, or a negative error.
     UndeterminedError
         No window of the frames shows the fringes of a plane, or no map has those of all parts.
 
@@ -145,8 +151,8 @@ def map_from_range(
     low, high = range_um
     if not 0.0 < low < high:
         raise OutOfRangeError("range of the thickness [um]", range_um, "two increasing, positive numbers")
-    if not 0.0 <= model_accuracy < math.inf:
-        raise OutOfRangeError("accuracy of the model", model_accuracy, "0 or more")
+    if not 0.0 <= order_error < math.inf:
+        raise OutOfRangeError("error between orders", order_error, "0 or more")
     image, weight = _one_image(values, weights)
     cell = _cell_px(image.shape, (high - low) / order_um)
     problem = RangeCells.of(image, weight, cell, range_um, predict, order_um)
@@ -163,7 +169,7 @@ def map_from_range(
             "so much that no shifts of single parts are likelier: more frames, or the lines and films of the sensor",
         )  # fmt: skip
     others = _distinct(problem, best, [*begun, *tried])
-    odds = 1.0 + sum(_odds(problem, each, best, model_accuracy) for each in others)
+    odds = 1.0 + sum(_odds(problem, each, best, order_error) for each in others)
     across = Polynomial.of(image.shape)
     whole = np.zeros(image.shape, dtype=bool)
     wide = known.reshape(problem.shape).repeat(cell, axis=0).repeat(cell, axis=1)
@@ -427,7 +433,7 @@ def _apart(problem: RangeCells, other: FittedMap, best: FittedMap) -> float:
     return min(math.sqrt(max(other.cost - best.cost, 0.0) / max(power, 1e-300)), 1.0)
 
 
-def _odds(problem: RangeCells, other: FittedMap, best: FittedMap, model_accuracy: float) -> float:
+def _odds(problem: RangeCells, other: FittedMap, best: FittedMap, order_error: float) -> float:
     """Of another map against the best."""
     rise = other.residual2 - best.residual2
     by_part = np.bincount(problem.parts(COMPARED_PARTS), rise, COMPARED_PARTS**2)
@@ -435,6 +441,6 @@ def _odds(problem: RangeCells, other: FittedMap, best: FittedMap, model_accuracy
     by_chi2 = math.exp(-0.5 * max(float(by_part.sum()), 0.0) / max(best.misfit, 1.0))
     spread = float(by_part.std(ddof=1)) * math.sqrt(number)
     chance = float(stdtr(number - 1, -float(by_part.sum()) / spread)) if spread > 0.0 else 0.5
-    if model_accuracy > 0.0:
-        chance = max(chance, float(ndtr(-0.5 * _apart(problem, other, best) / model_accuracy)))
+    if order_error > 0.0:
+        chance = max(chance, float(ndtr(-0.5 * _apart(problem, other, best) / order_error)))
     return max(by_chi2, chance / (1.0 - min(chance, 0.999)))

@@ -21,16 +21,13 @@ from .observed_frames import frame_weight
 from .sky_response import FrameTable, Response
 from .sky_shift import MAP_SIGMA_ORDERS, SkyShift, fit_sky_shift
 
-__all__ = ["MapOnSky", "fringes_alone", "map_on_sky", "reach_um"]
-
 FloatArray = NDArray[np.float64]
 
 LARGEST_STEP_RAD = 0.5
 """Change of phase from one end of a cell of pixels to the other in all but a twentieth of the cells: the mean of the
 fringes over such a cell is that of its middle to 1 %."""
 
-SMALLEST_SIDE = 64
-"""Cells along a side below which no more pixels are put together."""
+SMALLEST_SIDE = 64  # Cells along a side below which no more pixels are put together
 
 
 class MapOnSky(NamedTuple):

@@ -11,18 +11,14 @@ from scipy.ndimage import correlate1d
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError
 
-__all__ = ["smooth_masked"]
-
 Image = NDArray[np.float32]
 
-SMOOTHING_REACH = 4.0
-"""Half width of the smoothing kernel in standard deviations."""
+SMOOTHING_REACH = 4.0  # Half width of the smoothing kernel in standard deviations
 
 MINIMUM_WEIGHT = 0.02
 """Least part of the smoothing kernel that must lie on good pixels for a value in a pixel that is not good."""
 
-_BAND_ROWS = 256
-"""Rows that one thread smooths at a time."""
+_BAND_ROWS = 256  # Rows that one thread smooths at a time
 
 
 def smooth_masked(

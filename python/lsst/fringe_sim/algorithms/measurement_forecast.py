@@ -14,26 +14,18 @@ from ..errors import OutOfRangeError
 from ..model import FringeModel
 from .flat_series import FlatSeries
 
-__all__ = ["SAMPLES", "Block", "Forecast", "Likeness", "Report", "Sample", "Tested"]
-
 FloatArray = NDArray[np.float64]
 
 Report = Callable[[str], None]
 
-SENSOR_PX = (4004, 4096)
-"""Rows and columns of the sensor whose information is forecast."""
+SENSOR_PX = (4004, 4096)  # Rows and columns of the sensor whose information is forecast
 
 SAMPLES = (6, 24)
 """Thicknesses of the silicon, within one of its fringe orders, and of the varying layer at each of them."""
 
-RESPONSE_SCATTER = 0.01
-"""Scatter of the response of single pixels that is known beforehand (relative)."""
-
-DERIVATIVE_STEP = 0.002
-"""Step of a difference in units of the prior scale of a parameter."""
-
-THICKNESS_STEP_UM = 1e-4
-"""Step of a difference in thickness [µm]; a fringe of the silicon takes 0.13."""
+RESPONSE_SCATTER = 0.01  # Scatter of the response of single pixels that is known beforehand (relative)
+DERIVATIVE_STEP = 0.002  # Step of a difference in units of the prior scale of a parameter
+THICKNESS_STEP_UM = 1e-4  # Step of a difference in thickness [µm]; a fringe of the silicon takes 0.13
 
 ORDERS_MOVED, STEPS_PER_ORDER = 6, 24
 """Fringe orders, either way, and steps in which the thickness that suits an effect is looked for."""

@@ -35,17 +35,6 @@ from ..model import FringeModel
 from .flat_series import LEVEL_E, FlatSeries
 from .measurement_forecast import Forecast, Report, Sample, Tested
 
-__all__ = [
-    "FlatMeasurement",
-    "FlatSeries",
-    "Measurement",
-    "PairForecast",
-    "RankedMeasurement",
-    "break_ambiguity",
-    "candidate_measurements",
-    "rank_measurements",
-]
-
 FloatArray = NDArray[np.float64]
 
 HIGH_LEVEL_E = 80_000.0
@@ -54,8 +43,7 @@ COOLER_K = 20.0
 SECOND_F_NUMBER = 2.0
 WIDE_NM = (800.0, 1050.0)
 
-DECISIVE_SIGMA = 5.0
-"""Separation with which two effects count as told apart."""
+DECISIVE_SIGMA = 5.0  # Separation with which two effects count as told apart
 
 
 @dataclass(frozen=True)
@@ -213,10 +201,7 @@ def rank_measurements(
 
 
 def _ranked(
-    forecast: Forecast,
-    measurements: Sequence[FlatMeasurement],
-    significance: float | None,
-    say: Report,
+    forecast: Forecast, measurements: Sequence[FlatMeasurement], significance: float | None, say: Report
 ) -> tuple[RankedMeasurement, ...]:
     before = forecast.pairs([forecast.present])
     first, *others = (item.effect.name for item in forecast.tested)

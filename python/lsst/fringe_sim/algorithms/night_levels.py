@@ -8,8 +8,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BAND_SIGMA", "Predictor", "background_terms", "levels_of", "thinned"]
-
 FloatArray = NDArray[np.float64]
 Predictor = Callable[[FloatArray], FloatArray]
 

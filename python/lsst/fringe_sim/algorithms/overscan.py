@@ -14,12 +14,9 @@ from ..errors import FrameFormatError
 from ..instrument.raw_frame import RawAmplifier
 from .flat_prep_options import DEFAULT_OPTIONS, GAUSSIAN_MAD, FlatPrepOptions
 
-__all__ = ["OverscanCorrected", "correct_overscan"]
-
 Image = NDArray[np.float32]
 
-NEARBY_ROWS = 25
-"""Rows on either side among which the overscan of a row is judged; fewer may hold charge."""
+NEARBY_ROWS = 25  # Rows on either side among which the overscan of a row is judged; fewer may hold charge
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,12 +20,9 @@ from ..instrument.sky import SpectralComponent
 from ..instrument.telescope import RayBundle
 from ..optics import LayerStack
 
-__all__ = ["PhotonMigration", "photon_migration", "spread_charge"]
-
 FloatArray = NDArray[np.float64]
 
-_DEPTHS = 256
-"""Equally probable depths that stand for the distribution of depth."""
+_DEPTHS = 256  # Equally probable depths that stand for the distribution of depth
 
 _RAYS = 4000
 """Rays that stand for a bundle, taken from its order by the golden ratio: equal steps would meet the same spokes of
@@ -81,10 +78,7 @@ class PhotonMigration:
 
 
 def photon_migration(
-    rays: RayBundle,
-    light: Sequence[SpectralComponent],
-    stack: LayerStack,
-    temperature_k: float,
+    rays: RayBundle, light: Sequence[SpectralComponent], stack: LayerStack, temperature_k: float
 ) -> PhotonMigration:
     """Walk of the photons of a sky in the detection layer.
 

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .frame_stack import TILE_BYTES
 
-__all__ = ["Projection", "project"]
-
 FloatArray = NDArray[np.float64]
 
 

@@ -11,24 +11,15 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["PARTS", "FittedMap", "Polynomial", "RangeCells", "Seed", "across_degrees", "down_degrees"]
-
 FloatArray = NDArray[np.float64]
 
 DEGREE, BACKGROUND_DEGREE = 8, 1
 """Degrees of the polynomials of the map and, along either side, of a background beside the fringes."""
 
-PLANE_ORDERS = 0.125
-"""What a layer may depart from a plane over a window [orders]: 45 degrees of phase."""
-
-LARGEST_TABLE = 2
-"""Orders beyond the range that the sky is asked for."""
-
-TABLE_STEPS = 48
-"""Thicknesses in an order at which the sky is tabulated."""
-
-PARTS = 16
-"""Parts along a side, in each of which the fringes must be seen."""
+PLANE_ORDERS = 0.125  # What a layer may depart from a plane over a window [orders]: 45 degrees of phase
+LARGEST_TABLE = 2  # Orders beyond the range that the sky is asked for
+TABLE_STEPS = 48  # Thicknesses in an order at which the sky is tabulated
+PARTS = 16  # Parts along a side, in each of which the fringes must be seen
 
 
 class Polynomial(NamedTuple):
@@ -186,6 +177,7 @@ class RangeCells:
 
 
 def cell_sums(image: FloatArray, cell: int) -> FloatArray:
+    """Sums over square cells of so many pixels; what is left at the far edges is left out."""
     rows, columns = (side // cell for side in image.shape)
     return np.asarray(
         image[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).sum(axis=(1, 3))

@@ -8,23 +8,13 @@ from scipy.ndimage import percentile_filter
 
 from .flat_prep_options import GAUSSIAN_MAD, FlatPrepOptions
 
-__all__ = ["bad_columns", "column_means", "isolated_defects"]
-
 Image = NDArray[np.float32]
 Mask = NDArray[np.int32]
 
-_BAND_ROWS = 256
-"""Rows that are looked at at a time."""
-
-
-WIDEST_GROUP = 10
-"""Most columns side by side that are looked for as one defect."""
-
-BESIDE = 2
-"""Columns on either side to which a group is compared."""
-
-NEARBY = 40
-"""Columns on either side, at least, that tell how much the fringes rise and fall."""
+_BAND_ROWS = 256  # Rows that are looked at at a time
+WIDEST_GROUP = 10  # Most columns side by side that are looked for as one defect
+BESIDE = 2  # Columns on either side to which a group is compared
+NEARBY = 40  # Columns on either side, at least, that tell how much the fringes rise and fall
 
 USUAL_PERCENT = 80.0
 EXCEPTIONAL = 6.0

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..instrument.detector import Detector
 from ..products import SensorSection
 
-__all__ = ["SensorPlacement"]
-
 FloatArray = NDArray[np.float64]
 
 

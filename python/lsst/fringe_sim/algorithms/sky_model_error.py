@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,52 +57,73 @@ class Envelope:
         step = self.nodes_um[1] - self.nodes_um[0]
         place = np.clip((thickness_um.ravel() - self.nodes_um[0]) / step, 0.0, self.nodes_um.size - 1.0)
         tents = np.maximum(0.0, 1.0 - np.abs(place - np.arange(self.nodes_um.size)[:, None]))
-        amplitude = math.sqrt(2.0) * float(bands.sum(axis=0).std())
-        return np.asarray(amplitude * np.concatenate([tents * np.cos(phase), tents * np.sin(phase)]))
+        return np.asarray(
+            self.amplitude(bands) * np.concatenate([tents * np.cos(phase), tents * np.sin(phase)])
+        )
+
+    def amplitude(self, bands: FloatArray) -> float:
+        """Amplitude of the fringes of the dark sky."""
+        return math.sqrt(2.0) * float(bands.sum(axis=0).std())
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class ModelError:
-    """Sums over frames, from which the coefficients of an envelope follow, the levels of each frame being free."""
+    """Coefficients of an envelope that the frames of a night share, the levels of each frame being free.
+
+    Attributes
+    ----------
+    envelope : `Envelope`
+        What is fitted.
+    coefficient, inverse : `numpy.ndarray`, shapes ``(J,)`` and ``(J, J)``
+        The coefficients, and their covariance.
+    strength : `numpy.ndarray`, shape ``(F,)``
+        Fringes of every frame over those of the dark sky.
+    beside : `list` of `numpy.ndarray`, shape ``(J, terms)``
+        Products of the envelope with the other terms in every frame.
+    gain, log_volume : `float`
+        By how much half the χ² falls, and the log of the volume that the coefficients take.
+    """
 
     envelope: Envelope
-    terms: FloatArray
-    _weighted: list[FloatArray] = field(default_factory=list)
-    _beside: list[FloatArray] = field(default_factory=list)
-    strength: list[float] = field(default_factory=list)
-    coefficient: FloatArray = field(default_factory=lambda: np.zeros(0))
-    inverse: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    coefficient: FloatArray
+    inverse: FloatArray
+    strength: FloatArray
+    beside: list[FloatArray]
+    gain: float
+    log_volume: float
 
-    def add(self, weight: FloatArray, design: FloatArray, strength: float) -> None:
-        """Take a frame in: weight of its pixels, its own terms, its fringes over those of the dark sky."""
-        weighted = self.terms * weight.ravel()
-        self._weighted.append(weighted)
-        self._beside.append(weighted @ design.T)
-        self.strength.append(strength)
+    @classmethod
+    def of(
+        cls,
+        envelope: Envelope,
+        sums: tuple[FloatArray, FloatArray],
+        levels: FloatArray,
+        inverses: Sequence[FloatArray],
+        strength: FloatArray,
+    ) -> ModelError:
+        """From products of all terms in every frame, those of the envelope last, with each other and with the values.
 
-    def solve(self, residuals: Sequence[FloatArray], inverses: Sequence[FloatArray]) -> tuple[float, float]:
-        """Find the coefficients; returned is by how much half the χ² falls, and the log of the volume they take."""
-        size = self.envelope.size
-        normal, side = np.eye(len(self.terms)) / size**2, np.zeros(len(self.terms))
-        for weighted, beside, strength, residual, inverse in zip(
-            self._weighted, self._beside, self.strength, residuals, inverses, strict=True
-        ):
-            normal += strength**2 * (weighted @ self.terms.T - beside @ inverse @ beside.T)
-            side += strength * weighted @ residual.ravel()
-        self.inverse = np.asarray(np.linalg.inv(normal))
-        self.coefficient = self.inverse @ side
+        ``levels`` and ``inverses``: of the other terms, and their covariances.
+        """
+        size, own = envelope.size, 2 * envelope.nodes_um.size
+        normal, side, beside = np.eye(own) / size**2, np.zeros(own), []
+        for product, moment, level, inverse, part in zip(*sums, levels, inverses, strength, strict=True):
+            beside.append(product[-own:, :-own])
+            normal += part**2 * (product[-own:, -own:] - beside[-1] @ inverse @ beside[-1].T)
+            side += part * (moment[-own:] - beside[-1] @ level)
+        covariance = np.asarray(np.linalg.inv(normal))
+        coefficient = covariance @ side
         log_volume = -0.5 * float(np.linalg.slogdet(size**2 * normal)[1])
-        return 0.5 * float(side @ self.coefficient), log_volume
+        gain = 0.5 * float(side @ coefficient)
+        return cls(envelope, coefficient, covariance, strength, beside, gain, log_volume)
 
-    def taken(self, frame: int, inverse: FloatArray, design: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What the envelope changes in the levels of a frame, and what is to be taken off its residual."""
-        strength = self.strength[frame]
-        change = -strength * inverse @ (self._beside[frame].T @ self.coefficient)
-        return change, strength * self.coefficient @ self.terms + change @ design
+    def change(self, frame: int, inverse: FloatArray) -> FloatArray:
+        """What the envelope changes in the levels of a frame."""
+        return np.asarray(-self.strength[frame] * inverse @ (self.beside[frame].T @ self.coefficient))
 
     def cross(self, sums: FloatArray, frame: int, crossed: FloatArray) -> FloatArray:
         """Products of splines with the terms in a frame, its levels being free, ``(splines, J)``.
 
         ``sums``: those with the terms themselves. ``crossed``: those with the design, times its covariance.
         """
-        return np.asarray(self.strength[frame] * (sums - crossed @ self._beside[frame].T))
+        return np.asarray(self.strength[frame] * (sums - crossed @ self.beside[frame].T))

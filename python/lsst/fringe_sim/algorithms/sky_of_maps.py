@@ -24,8 +24,6 @@ from .field_response import SensorPlacement, sensor_response
 from .laboratory_shift import widened_um
 from .sky_response import FrameTable, Response, bandpass_of
 
-__all__ = ["SiliconSeries", "known_silicon_um", "silicon_nodes_um", "sky_of_maps"]
-
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 Respond = Callable[[FringeModel, tuple[float, float], tuple[Response, ...]], Response]
@@ -33,8 +31,7 @@ Respond = Callable[[FringeModel, tuple[float, float], tuple[Response, ...]], Res
 NODES_PER_ORDER = 10
 """Thicknesses in one fringe order of the silicon. The error of the interpolation is stated with every frame."""
 
-STENCIL = 6
-"""Neighbours of a pixel that take part: the polynomial of fifth degree through them."""
+STENCIL = 6  # Neighbours of a pixel that take part: the polynomial of fifth degree through them
 
 REMAINDER = (2.5 * 1.5 * 0.5) ** 2 / 720.0
 """Largest error of that polynomial in the middle, over the sixth difference."""
@@ -49,14 +46,9 @@ CHECKED = 3
 """Node, a third of an order of the silicon from the first, at which that line is compared with the whole sum; it is
 taken where the difference is within the stated error of the sum, as it would not be behind a narrow filter."""
 
-PROBE = 16
-"""Rows and columns of the thicknesses at which the interpolation is judged."""
-
-DETECTION = "detection"
-"""Name of the layer that a map of the silicon is of."""
-
-BESIDE = "silicon_gradient"
-"""Effect that a map takes the place of."""
+PROBE = 16  # Rows and columns of the thicknesses at which the interpolation is judged
+DETECTION = "detection"  # Name of the layer that a map of the silicon is of
+BESIDE = "silicon_gradient"  # Effect that a map takes the place of
 
 
 def known_silicon_um(

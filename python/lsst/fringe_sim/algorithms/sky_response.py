@@ -19,31 +19,10 @@ from ..model import FringeModel, ResponseTable, tabulate
 from ..optics import Beam, Illumination
 from ..optics.phase_response import PhaseResponse
 
-__all__ = [
-    "FrameTable",
-    "Response",
-    "SkyQuadrature",
-    "SkyResponse",
-    "bandpass_of",
-    "component_factors",
-    "electrons_on_grid",
-    "error_samples",
-    "is_band",
-    "sky_response",
-    "sky_with_effects",
-    "spectral_error",
-    "split_components",
-    "tabulate_components",
-    "white_light",
-]
-
 FloatArray = NDArray[np.float64]
 
-_ERROR_SAMPLES = 48
-"""Thicknesses at which the quadrature is compared with a finer one."""
-
-_BOUND_ANGLES = 6
-"""Angles that stand for a beam where no phases are involved."""
+_ERROR_SAMPLES = 48  # Thicknesses at which the quadrature is compared with a finer one
+_BOUND_ANGLES = 6  # Angles that stand for a beam where no phases are involved
 
 
 @named_units

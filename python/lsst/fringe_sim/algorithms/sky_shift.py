@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +15,9 @@ from scipy.special import logsumexp
 from ..errors import InputError, named_units
 from .correction.objects import square_sums
 from .night_levels import BAND_SIGMA, Predictor, background_terms, levels_of, thinned
+from .night_sums import BACKGROUND, NightSums, Slopes
 from .sky_model_error import SIZES, Envelope, ModelError
 from .smooth_field import Splines, Spread, nearest_coefficients, prior_covariance
-
-__all__ = ["SkyShift", "fit_sky_shift"]
 
 FloatArray = NDArray[np.float64]
 
@@ -31,14 +31,12 @@ STEPS_PER_ORDER = 24
 SPANS = (0, 1, 2, 4, 8, 16)
 """Spans of the splines along a side that compete; with none, all pixels have one shift."""
 
-LEAST_PX_OF_SPAN = 8
-"""Pixels in a span: fewer would not carry a cubic."""
+LEAST_PX_OF_SPAN = 8  # Pixels in a span: fewer would not carry a cubic
 
 SPREADS = 13
 """Spreads of the shifts over which the evidence is averaged, from a thousandth of an order to one order."""
 
-MOST_STARTS = 4
-"""Most common shifts from which splines begin; an order has about one."""
+MOST_STARTS = 4  # Most common shifts from which splines begin; an order has about one
 
 NEGLIGIBLE = 10.0
 """Splines whose evidence is e to this less than that of coarser ones end the search for finer ones."""
@@ -125,7 +123,7 @@ def fit_sky_shift(
             starts = [best.shift_um]
             if best.log_evidence < max(fit.log_evidence for fit in found) - NEGLIGIBLE:
                 break
-    unmoved = night.state(np.zeros(layer.shape))
+    unmoved = night.state(np.zeros(layer.shape))._replace(bands=None)
     return _averaged(night, unmoved, found, others)
 
 
@@ -151,15 +149,14 @@ def _frames(
 
 
 class _State(NamedTuple):
-    """A night at one shift, with the best levels of its bands and backgrounds."""
+    """A night at one shift, with the best levels of its bands, backgrounds and errors of the envelope."""
 
     shift_um: FloatArray
+    bands: FloatArray | None  # (B, ny, nx): light of the bands, less its mean; None where it was let go
     half_chi2: float  # with the prior of the bands
     log_volume: float  # -0.5 log det of the levels
-    levels: list[FloatArray]  # (B,) each: of the bands
-    designs: list[FloatArray]  # (terms, pixels) each
-    inverses: list[FloatArray]  # (terms, terms) each: covariance of the levels
-    residuals: list[FloatArray]  # (ny, nx) each
+    levels: FloatArray  # (F, terms): of all terms of `NightSums`
+    inverses: list[FloatArray]  # (terms, terms) each: covariance of the levels but those of the envelope
     strength: FloatArray  # (F,): fringes over those of the dark sky
     error: ModelError | None = None
 
@@ -188,6 +185,11 @@ class _Night:
     map_sigma_um: float
     envelope: Envelope | None = None  # what the model may have wrong
 
+    @cached_property
+    def sums(self) -> NightSums:
+        """The same frames, as their sums want them."""
+        return NightSums.of(self.frames)
+
     def starts(self) -> list[FloatArray]:
         """Common shifts to begin with: all at which the night is likelier than on either side, and none."""
         half = max(STEPS_PER_ORDER, math.ceil(3.0 * STEPS_PER_ORDER * self.map_sigma_um / self.order_um))
@@ -210,10 +212,10 @@ class _Night:
 
     def with_noise_of(self, fit: _Fit) -> _Night:
         """The same with weights of the residuals' own variance, and of what all frames miss alike."""
-        night, residuals = self, fit.state.residuals
+        night, residuals = self, self.residuals(fit.state)
         for _ in range(2):  # what the model has wrong is no noise
             night = night._scaled_to(residuals).with_likeliest_envelope(fit.shift_um)
-            residuals = night.state(fit.shift_um).residuals
+            residuals = night.residuals(night.state(fit.shift_um))
         night = night._scaled_to(residuals)
         share = night._noise_share(residuals)
         return replace(night, frames=[(value, share * weight) for value, weight in night.frames])
@@ -228,9 +230,11 @@ class _Night:
     def with_likeliest_envelope(self, shift_um: FloatArray) -> _Night:
         """The same with the error of the model that has the largest evidence at a shift."""
         tried = [None, *(Envelope.of(size, self.layer_um, self.order_um) for size in SIZES if size > 0.0)]
-        nights = [replace(self, envelope=envelope) for envelope in tried]
-        states = [night.state(shift_um) for night in nights]
-        return nights[int(np.argmax([state.log_volume - state.half_chi2 for state in states]))]
+        bands = self._bands(shift_um)
+        sums = self.sums.products(bands, self.layer_um + shift_um, tried[-1])
+        states = [self._solved(shift_um, bands, sums, envelope) for envelope in tried]
+        likeliest = np.argmax([state.log_volume - state.half_chi2 for state in states])
+        return replace(self, envelope=tried[int(likeliest)])
 
     def _noise_share(self, residuals: Sequence[FloatArray]) -> float:
         """Part of the variance of the mean residual that is noise, in squares of a quarter of a fringe.
@@ -250,70 +254,78 @@ class _Night:
         # Where all is noise, these squares have a mean of 1, and the scatter of a mean.
         return min(1.0, 1.0 / float(np.mean(shared[known] ** 2 / total[known], dtype=float)))
 
+    def _bands(self, shift_um: FloatArray) -> FloatArray:
+        """Light of the bands at a shift, less its mean, which a background has."""
+        bands = self.predict(self.layer_um + shift_um)
+        return np.asarray(bands - bands.mean(axis=(1, 2), keepdims=True), dtype=float)
+
     def state(self, shift_um: FloatArray) -> _State:
         """The night at a shift, with the levels that suit it best."""
-        bands, smooth = self.predict(self.layer_um + shift_um), background_terms(self.layer_um.shape)
-        made = _State(shift_um, 0.0, 0.0, [], [], [], [], np.zeros(len(self.frames)))
-        half_chi2 = log_volume = 0.0
-        for number, (value, weight) in enumerate(self.frames):
-            middle = np.average(bands, axis=(1, 2), weights=weight)
-            design = np.concatenate([bands - middle[:, None, None], smooth])
-            flat = design.reshape(len(design), -1)
-            weighted = flat * weight.ravel()
-            level, inverse, log_det = levels_of(weighted @ flat.T, weighted @ value.ravel(), len(bands))
-            residual = value - np.tensordot(level, design, axes=1)
-            away = (level[: len(bands)] - 1.0) / BAND_SIGMA
-            half_chi2 += 0.5 * float((weight * residual**2).sum() + away @ away)
-            log_volume -= 0.5 * log_det
-            made.levels.append(level[: len(bands)])
-            made.designs.append(flat)
-            made.inverses.append(inverse)
-            made.residuals.append(residual)
-            power = (weight * np.square(bands - middle[:, None, None])).sum(axis=(1, 2))
-            made.strength[number] = float(level[: len(bands)] @ power / max(power.sum(), 1e-300))
-        made = made._replace(half_chi2=half_chi2, log_volume=log_volume)
-        return made if self.envelope is None else self._with_error(made, self.envelope, bands)
+        bands = self._bands(shift_um)
+        sums = self.sums.products(bands, self.layer_um + shift_um, self.envelope)
+        return self._solved(shift_um, bands, sums, self.envelope)
 
-    def _with_error(self, state: _State, envelope: Envelope, bands: FloatArray) -> _State:
-        """The same where the envelope of the fringes is another than the model's, in all frames alike."""
-        found = ModelError(envelope, envelope.terms(self.layer_um + state.shift_um, bands))
-        for (_, weight), design, strength in zip(self.frames, state.designs, state.strength, strict=True):
-            found.add(weight, design, float(strength))
-        gain, log_volume = found.solve(state.residuals, state.inverses)
-        for number, (inverse, design) in enumerate(zip(state.inverses, state.designs, strict=True)):
-            change, taken = found.taken(number, inverse, design)
-            state.levels[number] = state.levels[number] + change[: len(bands)]
-            state.residuals[number] = state.residuals[number] - taken.reshape(self.layer_um.shape)
-        return state._replace(
-            half_chi2=state.half_chi2 - gain, log_volume=state.log_volume + log_volume, error=found
-        )
+    def _solved(
+        self,
+        shift_um: FloatArray,
+        bands: FloatArray,
+        sums: tuple[FloatArray, FloatArray],
+        envelope: Envelope | None,
+    ) -> _State:
+        """The levels that suit a night best; ``sums``: of `NightSums.products`, maybe of more than these terms."""
+        number, terms = len(bands), len(bands) + BACKGROUND
+        half_chi2 = log_volume = 0.0
+        inverses, strength = [], np.zeros(len(self.frames))
+        levels = np.zeros(sums[1].shape)
+        for frame, (product, side) in enumerate(zip(*sums, strict=True)):
+            level, inverse, log_det = levels_of(product[:terms, :terms], side[:terms], number)
+            away = (level[:number] - 1.0) / BAND_SIGMA
+            chi2 = self.sums.squares[frame] + level @ (product[:terms, :terms] @ level - 2.0 * side[:terms])
+            half_chi2 += 0.5 * float(chi2 + away @ away)
+            log_volume -= 0.5 * log_det
+            levels[frame, :terms] = level
+            inverses.append(inverse)
+            inner = product[:number, :number].diagonal()
+            power = inner - product[:number, number] ** 2 / product[number, number]
+            strength[frame] = float(level[:number] @ power / max(power.sum(), 1e-300))
+        made = _State(shift_um, bands, half_chi2, log_volume, levels, inverses, strength)
+        return made if envelope is None else _with_error(made, envelope, sums, terms)
+
+    def residuals(self, state: _State) -> list[FloatArray]:
+        """What is left of every frame."""
+        bands = self._bands(state.shift_um) if state.bands is None else state.bands
+        terms = np.concatenate([bands, background_terms(self.layer_um.shape)])
+        left = [
+            value - np.tensordot(level[: len(terms)], terms, axes=1)
+            for (value, _), level in zip(self.frames, state.levels, strict=True)
+        ]
+        if state.error is not None:
+            envelope = state.error.envelope.terms(self.layer_um + state.shift_um, bands)
+            taken = (state.error.coefficient @ envelope).reshape(self.layer_um.shape)
+            left = [each - part * taken for each, part in zip(left, state.strength, strict=True)]
+        return left
 
     def normal(self, splines: Splines, state: _State) -> tuple[FloatArray, FloatArray]:
         """Information on the coefficients, the levels being free, and minus the gradient of half the χ²."""
         apart = DERIVATIVE_ORDERS * self.order_um
         above, below = (self.predict(self.layer_um + state.shift_um + step) for step in (apart, -apart))
         change = (above - below) / (2.0 * apart)  # of each band with the shift [1/µm]
-        gradient = np.zeros(splines.count)
-        total = np.zeros(self.layer_um.shape)
+        bands = self._bands(state.shift_um) if state.bands is None else state.bands
+        error, terms = state.error, len(bands) + BACKGROUND
+        told = (bands, self.layer_um + state.shift_um, None if error is None else error.envelope)
+        used = state.levels if error is not None else state.levels[:, :terms]
+        slopes = Slopes.of(self.sums, told, used, change, splines)
         reduced = np.zeros((splines.count, splines.count))
-        error, shared = state.error, np.zeros(1)
-
-        def products(image: FloatArray, terms: FloatArray) -> FloatArray:
-            return np.stack([splines.sums(image * each.reshape(image.shape)) for each in terms], axis=1)
-
-        frames = zip(self.frames, state.levels, state.designs, state.inverses, state.residuals, strict=True)
-        for number, ((_, weight), level, design, inverse, residual) in enumerate(frames):
-            slope = np.tensordot(level, change, axes=1)
-            total += weight * slope**2
-            gradient += splines.sums(weight * slope * residual)
-            cross = products(weight * slope, design)
-            reduced += cross @ inverse @ cross.T
+        shared = np.zeros(1)
+        for frame, (inverse, cross) in enumerate(zip(state.inverses, slopes.cross, strict=True)):
+            own = cross[:terms].T
+            crossed = own @ inverse
+            reduced += crossed @ own.T
             if error is not None:
-                sums = products(weight * slope, error.terms)
-                shared = shared + error.cross(sums, number, cross @ inverse)
+                shared = shared + error.cross(cross[terms:].T, frame, crossed)
         if error is not None:
             reduced += shared @ error.inverse @ np.transpose(shared)
-        return splines.products(total) - reduced, gradient
+        return splines.products(slopes.total) - reduced, splines.sums(slopes.gradient)
 
     def fitted(self, splines: Splines, start_um: FloatArray) -> _Fit:
         """Gauss and Newton from a start, with the spread of the coefficients that the evidence prefers."""
@@ -337,7 +349,8 @@ class _Night:
         found = Spread.of(splines, *self.normal(splines, state), coefficient, spreads, reach)
         total = found.log_evidence - state.half_chi2 + state.log_volume
         mean, covariance = found.posterior()
-        return _Fit(splines, mean, covariance, found.information, splines.surface(mean), total, state)
+        kept = state._replace(bands=None)
+        return _Fit(splines, mean, covariance, found.information, splines.surface(mean), total, kept)
 
     def _moved(
         self, splines: Splines, coefficient: FloatArray, step: FloatArray, penalty: FloatArray, state: _State
@@ -354,6 +367,17 @@ class _Night:
                 return tried, new
             step = 0.5 * step
         return coefficient, state
+
+
+def _with_error(state: _State, envelope: Envelope, sums: tuple[FloatArray, FloatArray], terms: int) -> _State:
+    """The same where the envelope of the fringes is another than the model's, in all frames alike."""
+    found = ModelError.of(envelope, sums, state.levels[:, :terms], state.inverses, state.strength)
+    for frame, inverse in enumerate(state.inverses):
+        state.levels[frame, :terms] += found.change(frame, inverse)
+        state.levels[frame, terms:] = found.strength[frame] * found.coefficient
+    return state._replace(
+        half_chi2=state.half_chi2 - found.gain, log_volume=state.log_volume + found.log_volume, error=found
+    )
 
 
 def _averaged(night: _Night, unmoved: _State, fits: Sequence[_Fit], others: Sequence[_Fit]) -> SkyShift:
@@ -397,6 +421,6 @@ def _other_order(night: _Night, fits: Sequence[_Fit], others: Sequence[_Fit]) ->
 
 
 def _mean_square(night: _Night, state: _State) -> float:
-    pairs = list(zip(night.frames, state.residuals, strict=True))
+    pairs = list(zip(night.frames, night.residuals(state), strict=True))
     total = sum(float((weight * residual**2).sum()) for (_, weight), residual in pairs)
     return total / sum(int(np.count_nonzero(weight)) for (_, weight), _ in pairs)

@@ -11,8 +11,6 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
-__all__ = ["Splines", "Spread", "nearest_coefficients", "prior_covariance"]
-
 FloatArray = NDArray[np.float64]
 
 NEGLIGIBLE_WEIGHT = 1e-4

@@ -10,10 +10,7 @@ from numpy.typing import ArrayLike
 from ..model import FringeModel
 from .thickness_fit.fit import STEPS_PER_ORDER
 
-__all__ = ["template_errors"]
-
-SAMPLES = 257
-"""Thicknesses at which the errors are looked for; many to every fringe order."""
+SAMPLES = 257  # Thicknesses at which the errors are looked for; many to every fringe order
 
 
 def template_errors(

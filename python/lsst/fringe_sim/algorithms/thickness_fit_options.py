@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["CONTRASTS", "FIT_METHODS", "SILICON_FIELDS", "ZONES"]
-
 FIT_METHODS = ("global", "guo2022")
 
 SILICON_FIELDS = {"sensor": 0, "plane": 1, "paraboloid": 2}

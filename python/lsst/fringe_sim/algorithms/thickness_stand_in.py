@@ -18,12 +18,9 @@ from ..model import Setup
 from ..products import ThicknessMap
 from ..resources import read_yaml
 
-__all__ = ["ThicknessField", "stand_in_thickness"]
-
 FloatArray = NDArray[np.float64]
 
-_PERIOD = 1.5
-"""Sides of the sensor after which the cosines of the field have no slope: beyond its edge."""
+_PERIOD = 1.5  # Sides of the sensor after which the cosines of the field have no slope: beyond its edge
 
 _HIGHEST = 4.0
 """Wave number, in units of the inverse correlation length, beyond which the field has nothing left (exp(-8))."""

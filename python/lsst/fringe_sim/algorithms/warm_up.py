@@ -14,15 +14,16 @@ from ..model.response_table import ResponseTable
 from ..products import FlatExposures, FringeCube
 from .discovery import SearchOptions, discover
 from .field_response import FieldTable
+from .night_sums import NightSums, Slopes
 from .sensor_placement import SensorPlacement
 from .sky_frame import simulate_sky_frame, sky_response
+from .sky_model_error import Envelope
+from .smooth_field import Splines
 from .thickness_fit import fit_thickness
 from .thickness_fit.amplitudes import Amplitudes
 from .thickness_fit.global_fit import global_fit
 from .thickness_fit.templates import FringeTemplates
 from .thickness_fit.uncertainty import slip_probability
-
-__all__ = ["FIRST", "THEN"]
 
 _WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 _RANGE_UM = (14.0, 18.0)
@@ -110,7 +111,16 @@ def _search() -> None:
     discover(_cube(), _SETUP, rng=np.random.default_rng(1), options=options)
 
 
-FIRST = {"thickness of cells and pixels": _fit_cells_and_pixels, "optics and sky": _sky}
+def _night() -> None:
+    """Sums of a map that is held against a night."""
+    layer = _relief(16)
+    bands = np.cos(layer)[None]
+    envelope = Envelope.of(1.0, layer, _ORDER_UM)
+    sums = NightSums.of([(bands[0], np.ones(layer.shape))])
+    _, side = sums.products(bands, layer, envelope)
+    Slopes.of(sums, (bands, layer, envelope), side, bands, Splines.of(layer.shape, 1))
+
+
+FIRST = {"thickness of cells and pixels": _fit_cells_and_pixels, "optics and sky": _sky, "night": _night}
 """Work that shares no compiled function, and can be done at the same time."""
-THEN = {"fit of a cube": _fits, "search": _search}
-"""Work that needs what the first has compiled."""
+THEN = {"fit of a cube": _fits, "search": _search}  # Work that needs what the first has compiled

@@ -18,17 +18,6 @@ from ..instrument.measured_thickness import e2v_321, fit_to_sensor
 from ..mock.hidden_effects import HIDDEN_EFFECTS
 from .run import is_right
 
-__all__ = [
-    "CELLS",
-    "CONTRAST",
-    "SECOND_EFFECTS",
-    "DemoCase",
-    "draw_demo_case",
-    "found_words",
-    "of_the_layers",
-    "thickness_of_demo",
-]
-
 CONTRAST = 0.13
 """Fringes of the flats over those of the model, as at the one measured pixel of such a sensor (Guo et al. 2022)."""
 

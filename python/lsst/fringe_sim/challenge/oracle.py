@@ -18,15 +18,12 @@ from ..effects import EFFECTS
 from ..model import FringeModel
 from .sealed_cases import SealedCase
 
-__all__ = ["Oracle", "Visibility", "visibility"]
-
 FloatArray = NDArray[np.float64]
 
 ORDERS = (0.0, -1.0, 1.0)
 """Fringe orders by which the thickness is shifted for a fit that lacks an effect: it may be likelier there."""
 
-VALLEYS = 8
-"""Minima on both sides that are tried for a parameter that comes back after a fringe."""
+VALLEYS = 8  # Minima on both sides that are tried for a parameter that comes back after a fringe
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,6 @@ from ..report.page import Origin, Report
 from ..style import LINES, SEQUENTIAL, figure, panels
 from .result import VISIBLE, ChallengeResult
 
-__all__ = [
-    "accuracy_figure",
-    "calibration_figure",
-    "confusion_figure",
-    "pulls_figure",
-    "write_challenge_report",
-]
-
 LARGEST_PULL = 6.0
 WANTED_SHRINKAGE = 0.95
 MIDDLE = 0.5  # of the colours

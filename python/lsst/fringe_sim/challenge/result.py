@@ -17,14 +17,11 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files import table_text, write_together
 
-__all__ = ["CASE_KINDS", "VISIBLE", "CaseResult", "ChallengeResult"]
-
 FloatArray = NDArray[np.float64]
 
 CASE_KINDS = ("none", "one", "two", "outsider")
 
-VISIBLE = 10.0
-"""Signal to noise from which an effect is asked for by name."""
+VISIBLE = 10.0  # Signal to noise from which an effect is asked for by name
 
 SIGNAL_EDGES = (0.0, 3.0, 5.0, 10.0, 30.0, 100.0, math.inf)
 """Bins of signal to noise in the table of accuracy."""

@@ -25,8 +25,6 @@ from .oracle import Oracle, visibility
 from .result import CASE_KINDS, VISIBLE, CaseResult, ChallengeResult
 from .sealed_cases import SealedCase, draw_case
 
-__all__ = ["is_right", "judge", "run_challenge"]
-
 
 def run_challenge(
     counts: Mapping[str, int],
@@ -69,13 +67,7 @@ def _results(
 
 
 def _run_case(
-    kind: str,
-    number: int,
-    *,
-    seed: int,
-    size: tuple[int, int],
-    only: Sequence[str],
-    setup: str,
+    kind: str, number: int, *, seed: int, size: tuple[int, int], only: Sequence[str], setup: str
 ) -> CaseResult:
     streams = np.random.default_rng([seed, CASE_KINDS.index(kind), number]).spawn(2)
     effects = only if kind in ("one", "two") else ()

@@ -23,8 +23,6 @@ from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
 from .result import CASE_KINDS
 
-__all__ = ["OUTSIDERS", "SIZES", "SealedCase", "draw_case", "expose"]
-
 FloatArray = NDArray[np.float64]
 Draw = Callable[[np.random.Generator], dict[str, float]]
 

@@ -12,42 +12,33 @@ from ..files import table_text, write_whole
 from ..instrument.measured_thickness import e2v_321
 from ..model import Setup
 from ..resources import read_user_table
+from .command import command, flag, option
 from .inputs import read_thickness
 from .output import OutputFolder, output_folder
 from .parameters import BUILT_IN, ChosenEffects, model_effects
 
-__all__ = ["amplitudes", "read_line_list"]
-
 STEP_PX = 16
 
 
-@click.command()
-@click.option(
-    "--thickness", default=BUILT_IN, show_default=True, help="Adhesive: 'e2v_321' or a FITS file [µm]."
-)
-@click.option(
-    "--lines",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    multiple=True,
-    help="Another line list beside PALACE: ECSV with wavelength [nm] and intensity; may be repeated.",
-)
-@click.option(
-    "--case",
-    "cases",
-    type=click.Choice([case.name for case in CASES]),
-    multiple=True,
-    help="Row of the table; may be repeated. All by default.",
-)
-@model_effects()
-@output_folder("Folder for the table as ECSV.", "amplitudes.ecsv", required=False)
-@click.option("--dry-run", is_flag=True, help="Check everything, compute nothing.")
+@command()
 def amplitudes(
-    thickness: str,
-    lines: tuple[Path, ...],
-    cases: tuple[str, ...],
-    effects: ChosenEffects,
-    out: OutputFolder | None,
-    dry_run: bool,
+    thickness: str = option("Adhesive: 'e2v_321' or a FITS file [µm].", BUILT_IN),
+    lines: tuple[Path, ...] = option(
+        "Another line list beside PALACE: ECSV with wavelength [nm] and intensity; may be repeated.",
+        kind=click.Path(exists=True, dir_okay=False, path_type=Path),
+        multiple=True,
+    ),
+    cases: tuple[str, ...] = option(
+        "Row of the table; may be repeated. All by default.",
+        kind=click.Choice([case.name for case in CASES]),
+        names="--case",
+        multiple=True,
+    ),
+    effects: ChosenEffects = model_effects(),
+    out: OutputFolder | None = output_folder(
+        "Folder for the table as ECSV.", "amplitudes.ecsv", required=False
+    ),
+    dry_run: bool = flag("Check everything, compute nothing."),
 ) -> None:
     """Fringe amplitudes of every set-up of the paper: its Table 2.
 

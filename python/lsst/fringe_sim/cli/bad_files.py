@@ -8,8 +8,6 @@ import click
 
 from ..errors import FrameFormatError, FringeSimError, InputError
 
-__all__ = ["refuse_bad", "say_bad"]
-
 
 def say_bad(bad: Sequence[FringeSimError]) -> None:
     """Name files that are not used."""
@@ -22,10 +20,7 @@ def refuse_bad(bad: Sequence[FringeSimError], *, skip_bad: bool, others: bool = 
 
     A single one is an error of the command; of several, each is named before.
 
-    Raises
-    ------
-    FringeSimError
-        There are some.
+    `FringeSimError`: there are some.
     """
     if not bad or (skip_bad and others):
         say_bad(bad)

@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import UnknownNameError
-from .parameters import effects_from_option
+from .command import argument, command, flag
+from .parameters import with_effects_from
 
 if TYPE_CHECKING:
     from ..effects import Effect, Parameter
 
-__all__ = ["effects", "setups"]
 
-
-@click.command()
-@click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
-def setups(as_json: bool) -> None:
+@command()
+def setups(as_json: bool = flag("Machine-readable.", "--json")) -> None:
     """List the set-ups: sensors, telescopes and test stands.
 
     \b
@@ -70,11 +68,11 @@ def _named(known: Sequence[Effect], names: Sequence[str]) -> list[Effect]:
     return [by_name[name] for name in names] or [effect for effect in known if not effect.learned]
 
 
-@click.command()
-@click.argument("names", nargs=-1, metavar="[NAME]...")
-@click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
-@effects_from_option
-def effects(names: tuple[str, ...], as_json: bool) -> None:
+@command()
+def effects(
+    names: tuple[str, ...] = argument("[NAME]...", required=False),
+    as_json: bool = with_effects_from(flag("Machine-readable.", "--json")),
+) -> None:
     """List the physical effects that the model knows, or those of some names, with parameters, units, null values.
 
     \b

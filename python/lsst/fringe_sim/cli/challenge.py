@@ -10,52 +10,31 @@ import click
 
 from ..errors import InputError
 from ..files import write_whole
+from .command import command, flag, option
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
 
 if TYPE_CHECKING:
     from ..challenge.result import CaseResult
 
-__all__ = ["challenge"]
-
 RECORD = "cases.jsonl"
 TABLES = ("challenge.ecsv", "confusion.ecsv", "accuracy.ecsv", "calibration.ecsv", "pulls.ecsv")
 
 
-@click.command()
-@output_folder("Folder for results, tables and page.", RECORD, *TABLES, "challenge.html", resumes=True)
-@click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all cases.")
-@click.option(
-    "--none", "none", type=click.IntRange(0), default=200, show_default=True, help="Cases without effect."
-)
-@click.option(
-    "--one", "one", type=click.IntRange(0), default=100, show_default=True, help="Cases with one effect."
-)
-@click.option(
-    "--two", "two", type=click.IntRange(0), default=40, show_default=True, help="Cases with two effects."
-)
-@click.option(
-    "--outsider",
-    type=click.IntRange(0),
-    default=100,
-    show_default=True,
-    help="Cases with a cause that the catalogue lacks.",
-)
-@laboratory_of_the_mock
-@click.option("--size", type=SIZE, default="96x96", show_default=True, help="Columns x rows of the sensors.")
-@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Cases at the same time.")
-@click.option("--dry-run", is_flag=True, help="Say what would be done, write nothing.")
+@command()
 def challenge(
-    out: OutputFolder,
-    seed: int,
-    none: int,
-    one: int,
-    two: int,
-    outsider: int,
-    setup: str,
-    size: tuple[int, int],
-    jobs: int,
-    dry_run: bool,
+    out: OutputFolder = output_folder(
+        "Folder for results, tables and page.", RECORD, *TABLES, "challenge.html", resumes=True
+    ),
+    seed: int = option("Seed of all cases.", kind=click.IntRange(0), required=True),
+    none: int = option("Cases without effect.", 200, click.IntRange(0)),
+    one: int = option("Cases with one effect.", 100, click.IntRange(0)),
+    two: int = option("Cases with two effects.", 40, click.IntRange(0)),
+    outsider: int = option("Cases with a cause that the catalogue lacks.", 100, click.IntRange(0)),
+    setup: str = laboratory_of_the_mock,
+    size: tuple[int, int] = option("Columns x rows of the sensors.", "96x96", SIZE),
+    jobs: int = option("Cases at the same time.", 1, click.IntRange(1)),
+    dry_run: bool = flag("Say what would be done, write nothing."),
 ) -> None:
     """Hide random effects in simulated sensors, search each, and count how often the search is right.
 

@@ -9,23 +9,21 @@ from multiprocessing import get_context
 
 import click
 
+from .command import command, option
 from .progress import progress
-
-__all__ = ["compile"]
 
 PROCESSES = 2
 SIMULATED = "simulated flats"
 
 
-@click.command()
-@click.option(
-    "--cpu",
-    type=click.Choice(["native", "generic"]),
-    default="native",
-    show_default=True,
-    help="Processor to compile for; 'generic' runs on any, somewhat slower.",
-)
-def compile(cpu: str) -> None:
+@command()
+def compile(
+    cpu: str = option(
+        "Processor to compile for; 'generic' runs on any, somewhat slower.",
+        "native",
+        click.Choice(["native", "generic"]),
+    ),
+) -> None:
     """Compile what simulated flats, a fit, a sky and a search need, and keep it.
 
     The first command in a new environment compiles for half a minute; afterwards none does. The compiled functions

@@ -5,15 +5,14 @@ from __future__ import annotations
 import click
 from click.shell_completion import get_completion_class
 
-__all__ = ["completion"]
+from .command import argument, command
 
 VARIABLE = "_FRINGE_SIM_COMPLETE"
 """Environment variable by which a shell asks for completions; click derives it from the name of the program."""
 
 
-@click.command()
-@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
-def completion(shell: str) -> None:
+@command()
+def completion(shell: str = argument(kind=click.Choice(["bash", "zsh", "fish"]), nargs=1)) -> None:
     """Print the lines that make a shell complete commands, options, set-ups and effects.
 
     \b

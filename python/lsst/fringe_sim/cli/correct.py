@@ -12,15 +12,8 @@ import click
 
 from ..errors import InputError
 from .bad_files import refuse_bad
-from .observed import (
-    TemplateFolder,
-    background_options,
-    background_path,
-    grid_of,
-    images_of,
-    stem_of,
-    target_names,
-)
+from .command import DRY_RUN, EXISTING, argument, command, flag, option
+from .observed import Background, TemplateFolder, background_options, images_of, stem_of, target_names
 from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 
@@ -31,53 +24,36 @@ if TYPE_CHECKING:
     from ..products.observed_files import ObservedImage
     from ..report.page import Origin
 
-__all__ = ["correct"]
-
 EXIT_REFUSED = 1
 
 OWN_CARD = re.compile(r"FRING(COR|TID|PRB|VER|S[CE]\d+)")
 """Keywords that a correction writes, and its undoing removes."""
 
 
-@click.command()
-@click.argument("frames", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
-@click.option(
-    "--templates",
-    "folder",
-    required=True,
-    type=click.Path(exists=True, path_type=Path),
-    help="Folder of 'fringe-sim templates', or with fringe_*.fits of a model.",
-)
-@background_options
-@click.option(
-    "--pixel-scale",
-    type=click.FloatRange(0.0, min_open=True),
-    default=0.2,
-    show_default=True,
-    help="Size of a pixel [arcsec]: fringes are judged on scales up to 20 arcsec.",
-)
-@click.option(
-    "--inject",
-    is_flag=True,
-    help="Draw stars and galaxies into a copy of each frame, and tell their fluxes and shapes before and after.",
-)
-@click.option("--undo", is_flag=True, help="Put the fringes back that an earlier run has subtracted.")
-@output_folder(
-    "Folder for frames, table and report.",
-    *("*_corrected.fits", "*_restored.fits", "frames.ecsv", "injected.ecsv", "report.html"),
-)
-@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+@command()
 def correct(
-    frames: tuple[Path, ...],
-    folder: Path,
-    background: Path | None,
-    background_px: float,
-    amplifiers: tuple[int, int] | None,
-    pixel_scale: float,
-    inject: bool,
-    undo: bool,
-    out: OutputFolder,
-    dry_run: bool,
+    frames: tuple[Path, ...] = argument(kind=EXISTING),
+    folder: Path = option(
+        "Folder of 'fringe-sim templates', or with fringe_*.fits of a model.",
+        kind=EXISTING,
+        names="--templates",
+        required=True,
+    ),
+    background: Background = background_options(),
+    pixel_scale: float = option(
+        "Size of a pixel [arcsec]: fringes are judged on scales up to 20 arcsec.",
+        0.2,
+        click.FloatRange(0.0, min_open=True),
+    ),
+    inject: bool = flag(
+        "Draw stars and galaxies into a copy of each frame, and tell their fluxes and shapes before and after."
+    ),
+    undo: bool = flag("Put the fringes back that an earlier run has subtracted."),
+    out: OutputFolder = output_folder(
+        "Folder for frames, table and report.",
+        *("*_corrected.fits", "*_restored.fits", "frames.ecsv", "injected.ecsv", "report.html"),
+    ),
+    dry_run: bool = DRY_RUN,
 ) -> None:
     """Subtract fringe templates from observed frames, and prove frame by frame that it helped.
 
@@ -90,7 +66,7 @@ def correct(
       fringe-sim correct night/*.fits --templates templates --out corrected
       fringe-sim correct corrected/*_corrected.fits --templates templates --out restored --undo
     """
-    from ..algorithms.fringe_correction import CorrectionOptions, refuse_uncorrected
+    from ..algorithms.fringe_correction import refuse_uncorrected
     from ..products import refuse_corrected
 
     images, unusable = images_of(frames, refuse_uncorrected if undo else refuse_corrected)
@@ -106,8 +82,7 @@ def correct(
         refused = _restore(images, known, target, names)
         passed = True
     else:
-        options = CorrectionOptions(background_px, grid_of(amplifiers))
-        make = partial(_correct_one, known, options, pixel_scale, inject)
+        make = partial(_correct_one, known, background.options, pixel_scale, inject)
         done, refused = _corrected(images, make, background, target, names)
         origin = origin_of(target, [folder, *frames])
         _write_report(target, done, [*map(str, unusable), *refused], origin)
@@ -125,7 +100,7 @@ def correct(
 def _corrected(
     images: list[ObservedImage],
     make: Callable[[ObservedFrame, str], tuple[CorrectedFrame, FrameRecord]],
-    background: Path | None,
+    background: Background,
     target: Path,
     names: Mapping[Path, str],
 ) -> tuple[list[FrameRecord], list[str]]:
@@ -140,22 +115,23 @@ def _corrected(
             pixels: dict[int, Any] = {}
             for image in parts:
                 name = stem_of(path) if len(parts) == 1 else f"{stem_of(path)}[{image.name}]"
-                added = background_path(background, image)
+                put_back = background.of(image)
                 try:
-                    each, record = make(image.read(added), name)
+                    each, record = make(image.read(put_back), name)
                 except InputError as error:
                     refused.append(f"{name}: not corrected: {error}")
                 else:
                     done.append(record)
                     if each.proof.passed:
                         made[image.index] = each
-                        pixels[image.index] = each.correction.applied(image.pixels(added))
+                        pixels[image.index] = each.correction.applied(image.pixels(put_back))
                 advance()
             if made:
                 cards = {index: _cards(each) for index, each in made.items()}
                 flags = {index: each.correction.uncorrected for index, each in made.items()}
                 first = {"FRINGTID": next(iter(made.values())).correction.template_id, "FRINGUND": None}
-                write_images(path, target / names[path], pixels, cards, flags, first)
+                added = background.folder is not None
+                write_images(path, target / names[path], pixels, cards, flags, first, added=added)
     return done, refused
 
 

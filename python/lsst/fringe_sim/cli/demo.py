@@ -8,9 +8,10 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,14 +20,13 @@ import click
 from .. import __version__
 from ..errors import FringeSimError, InputError
 from ..files import write_whole
+from .command import command, flag, option
 from .output import LOCK, OutputFolder, output_folder
 from .parameters import SIZE
 
 if TYPE_CHECKING:
     from .demo_outcome import Outcome
     from .demo_report import DemoDatasets
-
-__all__ = ["demo"]
 
 SETUP = "ts8_e2v"
 SENSOR = "E2V-CCD250-321"
@@ -124,26 +124,43 @@ class DemoRun:
             tail = "\n".join(path.read_text(encoding="utf-8").splitlines()[-15:])
             raise DemoError(f"{command[0]} {command[1]} failed; see {path}\n{tail}")
 
+    def butler(self, name: str, command: str, *words: str) -> None:
+        """A step that is one command of ``butler`` on the repository."""
+        title = f"butler {command}"
+        self.step(name, title, lambda: self.program(name, "butler", command, str(self.repo), *words))
+
+    def pipetask(
+        self, name: str, what: str, inputs: str, output: str, pipeline: str, where: str, *overrides: str
+    ) -> None:
+        """A step that runs a pipeline in the repository."""
+        options = ("-i", inputs, "-o", output, "-p", f"{PIPELINES}/{pipeline}", "-d", where)
+        given = [word for override in overrides for word in ("-C", override)]
+        words = (
+            "pipetask",
+            "run",
+            "-b",
+            str(self.repo),
+            *options,
+            *given,
+            "--register-dataset-types",
+            "-j",
+            "1",
+        )
+        self.step(name, f"pipetask run: {what}", lambda: self.program(name, *words))
+
     def _remember(self) -> None:
         text = json.dumps({"settings": asdict(self.settings), "done": self._done}, indent=2)
         write_whole(self._state, text)
 
 
-@click.command()
-@output_folder("Folder.", *PRODUCTS, default=Path("demo"), resumes=True)
-@click.option(
-    "--size", type=SIZE, default="1024x1024", show_default=True, help="Pixels of the part of the sensor."
-)
-@click.option(
-    "--seed",
-    type=click.IntRange(0),
-    default=1,
-    show_default=True,
-    help="Of the hidden effect, its size and all noise.",
-)
-@click.option("--fresh", is_flag=True, help="The same as --overwrite.")
-@click.option("--dry-run", is_flag=True, help="Say what would be done.")
-def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_run: bool) -> None:
+@command()
+def demo(
+    out: OutputFolder = output_folder("Folder.", *PRODUCTS, default=Path("demo"), resumes=True),
+    size: tuple[int, int] = option("Pixels of the part of the sensor.", "1024x1024", SIZE),
+    seed: int = option("Of the hidden effect, its size and all noise.", 1, click.IntRange(0)),
+    fresh: bool = flag("The same as --overwrite."),
+    dry_run: bool = flag("Say what would be done."),
+) -> None:
     """Hide an effect in raw flats, find it, and make templates with what was found.
 
     The sensor is a part of E2V-CCD250-321. The seed decides which effect is hidden in its flats beside the weak
@@ -161,16 +178,13 @@ def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_r
     text = f"{size[0]}x{size[1]}"
     shape = (size[1], size[0])
     Camera.from_name("ts8").detector(SENSOR).cut_down(shape)
-    settings, out = (
-        DemoSettings(__version__, text, seed),
-        _folder(replace(out, overwrite=True) if fresh else out),
-    )
+    settings = DemoSettings(__version__, text, seed)
+    out = _folder(replace(out, overwrite=True) if fresh else out)
     if dry_run:
         if not out.overwrite:
             _steps_done(out.path, settings)
-        click.echo(
-            f"would simulate {text} pixels of {SENSOR} with a hidden effect and process them in {out}/repo"
-        )
+        words = f"would simulate {text} pixels of {SENSOR} with a hidden effect and process them in"
+        click.echo(f"{words} {out}/repo")
         return
     from .demo_outcome import Outcome
     from .demo_report import DemoDatasets, write_demo_report
@@ -180,11 +194,8 @@ def demo(out: OutputFolder, size: tuple[int, int], seed: int, fresh: bool, dry_r
     run = DemoRun(folder, settings)
     truth = DemoTruth(folder / SEALED, seed, shape)
     click.echo(f"Demo in {folder}: {text} pixels of {SENSOR}, seed {seed}")
-    run.step(
-        "raws",
-        "hide an effect, simulate raw bias frames and flats",
-        lambda: truth.write_flats(folder / "raws"),
-    )
+    words = "hide an effect, simulate raw bias frames and flats"
+    run.step("raws", words, lambda: truth.write_flats(folder / "raws"))
     searched = run.beside("discovery", "search for a missing effect", lambda: _discover(run, seed))
     _laboratory(run)
     run.step("visits", "simulate visits with stars", lambda: truth.write_visits(folder / "visits", VISITS))
@@ -238,16 +249,9 @@ def _laboratory(run: DemoRun) -> None:
 
     run.step("create", "butler create", create)
     run.step("register", "butler register-instrument", register)
-    run.step(
-        "ingest",
-        "butler ingest-fringe-raws",
-        lambda: run.program("ingest", "butler", "ingest-fringe-raws", repo, str(run.folder / "raws")),
-    )
-    run.step(
-        "lab",
-        "pipetask run: biases, flats, thickness",
-        lambda: _pipetask(run, "lab", f"{_ts8()}/raw/all", LAB_RUN, "ts8/labFlats.yaml", _in_ts8()),
-    )
+    run.butler("ingest", "ingest-fringe-raws", str(run.folder / "raws"))
+    inputs = f"{_ts8()}/raw/all"
+    run.pipetask("lab", "biases, flats, thickness", inputs, LAB_RUN, "ts8/labFlats.yaml", _in_ts8())
 
 
 def _with_what_was_found(run: DemoRun) -> None:
@@ -264,65 +268,29 @@ def _with_what_was_found(run: DemoRun) -> None:
         write_whole(override, text)
 
     run.step("model", "add what was found to the model", write)
-    run.step(
-        "found",
-        "pipetask run: thickness with what was found",
-        lambda: _pipetask(
-            run, "found", LAB_RUN, FOUND_RUN, "ts8/labFlats.yaml#epoxyFit", _in_ts8(), f"epoxyFit:{override}"
-        ),
-    )
-    run.step(
-        "sky_with",
-        "forecast of the sky, with it",
-        lambda: _forecast(run, "sky_with", "--effects-file", str(override)),
-    )
+    words = "thickness with what was found"
+    pipeline, changed = "ts8/labFlats.yaml#epoxyFit", f"epoxyFit:{override}"
+    run.pipetask("found", words, LAB_RUN, FOUND_RUN, pipeline, _in_ts8(), changed)
+    forecast = partial(_forecast, run, "sky_with", "--effects-file", str(override))
+    run.step("sky_with", "forecast of the sky, with it", forecast)
 
 
 def _sky(run: DemoRun) -> None:
     from ..instrument.camera import Camera
     from ..middleware.instruments import LsstCamFringe
 
-    repo, camera = str(run.repo), LsstCamFringe.getName()
-    hours = f"{FIRST_HOUR}:{LAST_HOUR}"
-    run.step(
-        "night",
-        "butler define-fringe-night",
-        lambda: run.program(
-            "night", "butler", "define-fringe-night", repo, camera, "--date", NIGHT, "--hours", hours
-        ),
+    camera = LsstCamFringe.getName()
+    run.butler(
+        "night", "define-fringe-night", camera, "--date", NIGHT, "--hours", f"{FIRST_HOUR}:{LAST_HOUR}"
     )
-    run.step(
-        "adopt",
-        "butler adopt-sensor-datasets",
-        lambda: run.program(
-            "adopt",
-            "butler",
-            "adopt-sensor-datasets",
-            repo,
-            "epoxyThickness",
-            FOUND_RUN,
-            camera,
-            THICKNESS_RUN,
-        ),
-    )
+    run.butler("adopt", "adopt-sensor-datasets", "epoxyThickness", FOUND_RUN, camera, THICKNESS_RUN)
     detector = Camera.from_name("lsstCam").detector(SENSOR).id
     where = f"instrument='{camera}' AND detector={detector}"
     override = f"skyFringeSim:{run.folder / 'model.py'}"
-    run.step(
-        "sky",
-        "pipetask run: sky frames, templates",
-        lambda: _pipetask(run, "sky", THICKNESS_RUN, SKY_RUN, "lsstCam/skyFringe.yaml", where, override),
-    )
-    begin, end = VALID
-    run.step(
-        "certify",
-        "butler certify-calibrations",
-        lambda: run.program(
-            "certify",
-            *("butler", "certify-calibrations", repo, SKY_RUN, CALIBRATIONS, "fringe"),
-            *("--begin-date", begin, "--end-date", end),
-        ),
-    )
+    pipeline = "lsstCam/skyFringe.yaml"
+    run.pipetask("sky", "sky frames, templates", THICKNESS_RUN, SKY_RUN, pipeline, where, override)
+    dates = ("--begin-date", VALID[0], "--end-date", VALID[1])
+    run.butler("certify", "certify-calibrations", SKY_RUN, CALIBRATIONS, "fringe", *dates)
 
 
 def _ts8() -> str:
@@ -335,16 +303,6 @@ def _in_ts8() -> str:
     from ..instrument.camera import Camera
 
     return f"instrument='{_ts8()}' AND detector={Camera.from_name('ts8').detector(SENSOR).id}"
-
-
-def _pipetask(
-    run: DemoRun, log: str, inputs: str, output: str, pipeline: str, where: str, *overrides: str
-) -> None:
-    options: Sequence[str] = ("-i", inputs, "-o", output, "-p", f"{PIPELINES}/{pipeline}", "-d", where)
-    given = [word for override in overrides for word in ("-C", override)]
-    run.program(
-        log, "pipetask", "run", "-b", str(run.repo), *options, *given, "--register-dataset-types", "-j", "1"
-    )
 
 
 def _discover(run: DemoRun, seed: int) -> None:

@@ -24,8 +24,6 @@ from ..report.words import measured_text
 from ..style import figure, finite_range, show_image
 from .demo_truth import DemoTruth
 
-__all__ = ["Outcome", "read_verdict"]
-
 FloatArray = NDArray[np.float64]
 
 PERCENT, NM_PER_UM = 100.0, 1000.0
@@ -210,8 +208,7 @@ def _names_on_sky(verdict: Verdict) -> list[str]:
     return [effect.name for effect in EFFECTS if effect.name in kept and not effect.laboratory_only]
 
 
-MANY = 6
-"""Parameters from which on an effect is told by the rms of their values."""
+MANY = 6  # Parameters from which on an effect is told by the rms of their values
 
 
 def _told(values: Mapping[str, float], sigmas: Mapping[str, float] | None = None) -> str:

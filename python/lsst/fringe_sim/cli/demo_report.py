@@ -32,11 +32,8 @@ from ..report.sky_page import COADDS_CAPTION, COADDS_TEXT, sky_amplitudes
 from ..report.thickness_page import phase_folded, residual_of_fit, residual_table
 from .demo_outcome import Outcome
 
-__all__ = ["DemoDatasets", "dataset_path", "write_demo_report"]
-
 PERCENT = 100.0
-COADD_SEED = 16
-"""Of places and angles of the coadds; the number of the paper's figure."""
+COADD_SEED = 16  # Of places and angles of the coadds; the number of the paper's figure
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,6 @@ from ..instrument.setup import Setup
 from ..mock.raw_frames import write_mock_flats
 from ..mock.visits import write_mock_visits
 
-__all__ = ["DemoTruth"]
-
 LABORATORY, TELESCOPE, SENSOR = "ts8_e2v", "lsst_e2v", "E2V-CCD250-321"
 CASE, FRINGES = "truth.json", "fringes.npz"
 

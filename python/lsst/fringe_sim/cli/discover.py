@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import InputError
+from .command import argument, command, flag, option
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import ANY_LIGHT, ChosenEffects, model_effects
 from .progress import progress
@@ -24,71 +25,41 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..products import FringeCube, SensorSection
     from .sky_frames import SkyData
 
-__all__ = ["discover"]
-
 PRODUCTS = ("discovery.json", "discovery.ecsv", "effects.py", "report.html")
 OF_WHAT_WAS_LEARNED = ("learned.py", "learned_effect.py")
 """Files that are there where a correction was learned from what no effect explains."""
 
 
-@click.command()
-@click.argument("paths", nargs=-1, required=True, metavar="PATH...")
-@ANY_LIGHT.option("ts8_e2v", "Set-up of flats, or of frames of the sky: name or file.")
-@output_folder("Folder for the verdict.", *PRODUCTS, *OF_WHAT_WAS_LEARNED)
-@click.option(
-    "--seed", type=int, default=1, show_default=True, help="Which parts of the sensor are held out."
-)
-@model_effects("Effect known already; may be repeated.")
-@click.option(
-    "--thickness", default=None, help="Map of the varying layer, for frames of the sky: a FITS file [µm]."
-)
-@click.option(
-    "--collections", default="*", show_default=True, help="Of a Butler repository, comma-separated."
-)
-@click.option("--detector", default=None, help="Sensor of a Butler repository, by number or name.")
-@click.option(
-    "--cells", type=click.IntRange(100), default=20_000, show_default=True, help="Cells to average to."
-)
-@click.option(
-    "--time-budget",
-    type=click.FloatRange(0.0, min_open=True),
-    default=None,
-    metavar="SECONDS",
-    help="Stop after so long with the best answer so far, which says that it is not complete.",
-)
-@click.option(
-    "--model-accuracy",
-    type=click.FloatRange(0.0, 1.0, max_open=True),
-    default=None,
-    metavar="PART",
-    help="Part of the fringes by which the model may be wrong, by default as the tables of silicon (0.014); 0 for a "
-    "model without error.",
-)
-@click.option(
-    "--core",
-    type=click.Choice(["present", "marginal"]),
-    default="present",
-    show_default=True,
-    help="Which search of flats: the present one, or an experimental one on one likelihood, which cannot do "
-    "everything yet and may change in any version.",
-)
-@click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
-@click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
+@command()
 def discover(
-    paths: tuple[str, ...],
-    setup: Setup,
-    out: OutputFolder,
-    seed: int,
-    effects: ChosenEffects,
-    thickness: str | None,
-    collections: str,
-    detector: str | None,
-    cells: int,
-    time_budget: float | None,
-    model_accuracy: float | None,
-    core: str,
-    skip_bad: bool,
-    dry_run: bool,
+    paths: tuple[str, ...] = argument("PATH..."),
+    setup: Setup = ANY_LIGHT.option("ts8_e2v", "Set-up of flats, or of frames of the sky: name or file."),
+    out: OutputFolder = output_folder("Folder for the verdict.", *PRODUCTS, *OF_WHAT_WAS_LEARNED),
+    seed: int = option("Which parts of the sensor are held out.", 1, int),
+    effects: ChosenEffects = model_effects("Effect known already; may be repeated."),
+    thickness: str | None = option("Map of the varying layer, for frames of the sky: a FITS file [µm]."),
+    collections: str = option("Of a Butler repository, comma-separated.", "*"),
+    detector: str | None = option("Sensor of a Butler repository, by number or name."),
+    cells: int = option("Cells to average to.", 20_000, click.IntRange(100)),
+    time_budget: float | None = option(
+        "Stop after so long with the best answer so far, which says that it is not complete.",
+        kind=click.FloatRange(0.0, min_open=True),
+        metavar="SECONDS",
+    ),
+    model_accuracy: float | None = option(
+        "Part of the fringes by which the model may be wrong, by default as the tables of silicon (0.014); 0 "
+        "for a model without error.",
+        kind=click.FloatRange(0.0, 1.0, max_open=True),
+        metavar="PART",
+    ),
+    core: str = option(
+        "Which search of flats: the present one, or an experimental one on one likelihood, which cannot do "
+        "everything yet and may change in any version.",
+        "present",
+        click.Choice(["present", "marginal"]),
+    ),
+    skip_bad: bool = flag("Go on without files that cannot be read."),
+    dry_run: bool = flag("Look at every header, say what would be done, write nothing."),
 ) -> None:
     """Find the effect that the model of a sensor lacks.
 
@@ -121,9 +92,8 @@ def discover(
         data = read_sky_frames(paths, setup, thickness)
         placement = placement_in_frames(data.sky.frames, data.detector, setup.pixel_scale_arcsec)
         if dry_run:
-            click.echo(
-                f"would search {len(data.sky.frames)} frames of {data.sky.shape[1]} x {data.sky.shape[0]} pixels"
-            )
+            rows, columns = data.sky.shape
+            click.echo(f"would search {len(data.sky.frames)} frames of {columns} x {rows} pixels")
             return
         model = data.model(sky_settings(effects.settings))
         _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, **limits), given)

@@ -7,25 +7,27 @@ import json
 import click
 
 from ..files import write_whole
+from .command import command, flag, option
 from .output import OutputFolder, output_folder
-from .parameters import effects_from_option
+from .parameters import with_effects_from
 from .progress import progress
 
-__all__ = ["evidence"]
 
-
-@click.command()
-@click.option(
-    "--effect",
-    "effects",
-    multiple=True,
-    metavar="NAME[.PARAMETER]",
-    help="Effect of the set; may be repeated. Without any, sets that lower the contrast are compared.",
-)
-@effects_from_option
-@output_folder("Folder for the verdict.", "evidence.json", "evidence.txt", required=False)
-@click.option("--dry-run", is_flag=True, help="Say what would be compared, compute nothing.")
-def evidence(effects: tuple[str, ...], out: OutputFolder | None, dry_run: bool) -> None:
+@command()
+def evidence(
+    effects: tuple[str, ...] = with_effects_from(
+        option(
+            "Effect of the set; may be repeated. Without any, sets that lower the contrast are compared.",
+            names="--effect",
+            multiple=True,
+            metavar="NAME[.PARAMETER]",
+        )
+    ),
+    out: OutputFolder | None = output_folder(
+        "Folder for the verdict.", "evidence.json", "evidence.txt", required=False
+    ),
+    dry_run: bool = flag("Say what would be compared, compute nothing."),
+) -> None:
     """Judge effects by all public data of the real sensor together.
 
     Twelve flats of one pixel, contrast, shape and phase of the 960 nm flat, the published thickness map, the quantum

@@ -9,17 +9,17 @@ import click
 
 from ..errors import InputError
 from ..files import same_file_key
+from .command import argument, command, flag
 from .output import OutputFolder, output_folder
 from .progress import progress
 
-__all__ = ["export"]
 
-
-@click.command()
-@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE...")
-@output_folder("Folder for the NetCDF files.")
-@click.option("--dry-run", is_flag=True, help="Read everything, write nothing.")
-def export(files: tuple[Path, ...], out: OutputFolder, dry_run: bool) -> None:
+@command()
+def export(
+    files: tuple[Path, ...] = argument("FILE...", click.Path(path_type=Path)),
+    out: OutputFolder = output_folder("Folder for the NetCDF files."),
+    dry_run: bool = flag("Read everything, write nothing."),
+) -> None:
     """Write thickness maps, fringe cubes and sky frames as NetCDF, for xarray.
 
     Axes are named, coordinates and images have units, header keywords become attributes. Needs the extra:

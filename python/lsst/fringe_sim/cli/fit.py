@@ -8,6 +8,7 @@ import click
 
 from ..algorithms.thickness_fit_options import CONTRASTS, FIT_METHODS, SILICON_FIELDS, ZONES
 from ..errors import InputError, UnknownNameError
+from .command import argument, command, flag, option
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import LABORATORY, ChosenEffects, model_effects
 from .progress import progress
@@ -17,80 +18,50 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..instrument.setup import Setup
     from ..products import FringeCube, SensorSection, ThicknessMap
 
-__all__ = ["fit", "section_of_cube"]
-
-LEAST_WAVELENGTHS = 4
-"""Below this the order of the fringe cannot be told."""
+LEAST_WAVELENGTHS = 4  # Below this the order of the fringe cannot be told
 
 SMOOTHING_PX = {"global": 0.0, "guo2022": 3.0}
 """Smoothing of the flats [px]. It lowers the contrast where fringes are dense, so `global` does without."""
 
 
-@click.command()
-@click.argument("paths", nargs=-1, required=True, metavar="PATH...")
-@LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file.")
-@output_folder(
-    "Folder for maps, figures, report.", "thickness.fits", "silicon.fits", "thickness.png", "report.html"
-)
-@click.option(
-    "--method",
-    type=click.Choice(FIT_METHODS),
-    default="global",
-    show_default=True,
-    help="All pixels at once, or the walk of the paper.",
-)
-@click.option(
-    "--smoothing",
-    type=click.FloatRange(0.0, 100.0),
-    default=None,
-    help="Gaussian smoothing of the flats, σ [px]; 0 for 'global', which needs none, and 3 for 'guo2022'.",
-)
-@click.option(
-    "--silicon",
-    type=click.Choice(["fixed", *SILICON_FIELDS]),
-    default="fixed",
-    show_default=True,
-    help="Thickness of the silicon: as in the model, or fitted too where flats with a narrow line tell it.",
-)
-@click.option(
-    "--zones",
-    type=click.Choice(ZONES),
-    default=None,
-    help="Parts of the sensor with a level of their own at each wavelength, however large; by default those of "
-    "amplifiers, as well as gains are known.",
-)
-@click.option(
-    "--illumination-degree",
-    type=click.IntRange(0, 8),
-    default=None,
-    show_default="2",
-    help="Degree of a slow illumination, free at each wavelength; 0 for even light.",
-)
-@click.option(
-    "--contrast",
-    type=click.Choice(CONTRASTS),
-    default=None,
-    show_default="wavelength",
-    help="Contrast of the fringes: a free factor at each wavelength, or one for all, or that of the model.",
-)
-@model_effects()
-@click.option("--skip-bad", is_flag=True, help="Go on without files that cannot be read.")
-@click.option("--strict", is_flag=True, help="Exit with 1 where model and flats do not go together.")
-@click.option("--dry-run", is_flag=True, help="Look at every header, say what would be done, write nothing.")
+@command()
 def fit(
-    paths: tuple[str, ...],
-    setup: Setup,
-    out: OutputFolder,
-    method: str,
-    smoothing: float | None,
-    silicon: str,
-    zones: str | None,
-    illumination_degree: int | None,
-    contrast: str | None,
-    effects: ChosenEffects,
-    skip_bad: bool,
-    strict: bool,
-    dry_run: bool,
+    paths: tuple[str, ...] = argument("PATH..."),
+    setup: Setup = LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file."),
+    out: OutputFolder = output_folder(
+        "Folder for maps, figures, report.", "thickness.fits", "silicon.fits", "thickness.png", "report.html"
+    ),
+    method: str = option(
+        "All pixels at once, or the walk of the paper.", "global", click.Choice(FIT_METHODS)
+    ),
+    smoothing: float | None = option(
+        "Gaussian smoothing of the flats, σ [px]; 0 for 'global', which needs none, and 3 for 'guo2022'.",
+        kind=click.FloatRange(0.0, 100.0),
+    ),
+    silicon: str = option(
+        "Thickness of the silicon: as in the model, or fitted too where flats with a narrow line tell it.",
+        "fixed",
+        click.Choice(["fixed", *SILICON_FIELDS]),
+    ),
+    zones: str | None = option(
+        "Parts of the sensor with a level of their own at each wavelength, however large; by default those of "
+        "amplifiers, as well as gains are known.",
+        kind=click.Choice(ZONES),
+    ),
+    illumination_degree: int | None = option(
+        "Degree of a slow illumination, free at each wavelength; 0 for even light.",
+        kind=click.IntRange(0, 8),
+        show_default="2",
+    ),
+    contrast: str | None = option(
+        "Contrast of the fringes: a free factor at each wavelength, or one for all, or that of the model.",
+        kind=click.Choice(CONTRASTS),
+        show_default="wavelength",
+    ),
+    effects: ChosenEffects = model_effects(),
+    skip_bad: bool = flag("Go on without files that cannot be read."),
+    strict: bool = flag("Exit with 1 where model and flats do not go together."),
+    dry_run: bool = flag("Look at every header, say what would be done, write nothing."),
 ) -> None:
     """Fit the layer thickness of one sensor to raw flats (files, folders, patterns) or to a fringe cube.
 
@@ -100,87 +71,80 @@ def fit(
       fringe-sim fit 'raws/*flat*.fits' 'raws/*bias*.fits' --method guo2022 --out fit_guo
       fringe-sim fit broad_and_narrow.fits --silicon plane --out fit_both
     """
-    import numpy as np
-
     from ..algorithms.flat_conditions import model_of_flats
     from ..algorithms.thickness_fit import SiliconSearch, fit_thickness, remarks, says_misfit, silicon_map
     from ..model import LABORATORY_TEMPERATURE, FringeModel
     from ..model.provenance import input_cards
     from ..report.thickness_page import write_thickness_report
     from .inputs import effect_cards
-    from .lab_frames import read_cube
 
     model = FringeModel.from_setup(setup, effects.settings)
     search = None if silicon == "fixed" else SiliconSearch(SILICON_FIELDS[silicon])
     if search is not None and method != "global":
         raise InputError("--silicon", silicon, "fixed with method guo2022")
-    asked = (zones, illumination_degree, contrast)
-    if any(choice is not None for choice in asked) and (search is not None or method != "global"):
-        raise InputError(
-            "--zones, --illumination-degree, --contrast", "given", "nothing with method guo2022 or --silicon"
-        )
-    free = None if asked == (None, None, None) else _free(*asked, setup.wavelength_accuracy_nm)
-    cube, used = (read_cube(paths[0], setup) if len(paths) == 1 else None), paths
+    usual = search is None and method == "global"
+    free = _free(zones, illumination_degree, contrast, setup.wavelength_accuracy_nm, usual=usual)
+    kernel_px = SMOOTHING_PX[method] if smoothing is None else smoothing
+    cube, used = _read(paths, setup, kernel_px, skip_bad, dry_run)
     if cube is None:
-        kernel_px = SMOOTHING_PX[method] if smoothing is None else smoothing
-        cube, used = _prepare(paths, setup, kernel_px, skip_bad, dry_run)
-    if dry_run and cube is None:
         return
-    if cube is None or len(np.unique(cube.wavelength_nm)) < LEAST_WAVELENGTHS:
-        found = 0 if cube is None else len(np.unique(cube.wavelength_nm))
-        raise InputError("number of wavelengths", found, f"{LEAST_WAVELENGTHS} or more")
+    _refuse_few(len(set(cube.wavelength_nm.tolist())))
     section = section_of_cube(cube, setup)
     model = model_of_flats(model, cube.exposures)
     if dry_run:
         click.echo(f"would fit the layer {setup.varying} to {len(cube.wavelength_nm)} flats")
         return
     folder = out.prepare()
-    cards = {
-        **effect_cards(model),
-        **input_cards([*used, *effects.files]),
-        LABORATORY_TEMPERATURE: model.system.temperature_k,
-    }
+    about = {"SETUP": setup.name, "NFLATS": cube.shape[0], **effect_cards(model)}
+    about |= {**input_cards([*used, *effects.files]), LABORATORY_TEMPERATURE: model.system.temperature_k}
     click.echo("fitting the thickness", err=True)
     fitted = fit_thickness(cube, model, method, nuisances=free, silicon=search)
-    good = fitted.mask == 0
     said = remarks(fitted.metadata, fitted.flats)
-    if not good.any():
+    if not (fitted.mask == 0).any():
         raise InputError("good pixels of the thickness map", 0, f"one or more. {'; '.join(said)}".strip())
-    about = {"SETUP": setup.name, "NFLATS": cube.shape[0], **cards}
     fitted.write_fits(folder / "thickness.fits", about, section=section)
     of_silicon = silicon_map(fitted, model)
     if of_silicon is not None:
         of_silicon.write_fits(folder / "silicon.fits", about, section=section)
     origin = origin_of(folder, [*paths, *effects.files])
     write_thickness_report(folder, cube, fitted, model, method, section=section, origin=origin)
-    low, high = np.percentile(fitted.value[good], [1.0, 99.0])
-    click.echo(
-        f"{fitted.layer}: {low:.3f} to {high:.3f} µm (1–99 %), median σ "
-        f"{1e3 * np.median(fitted.sigma[good]):.2f} nm, {100 * (1 - good.mean()):.2f} % of the pixels masked"
-    )
-    for sentence in said:
-        click.echo(sentence)
-    if search is not None:
-        click.echo(_silicon_line(fitted))
-    for name in ("thickness.fits", *(["silicon.fits"] if of_silicon is not None else []), "report.html"):
-        click.echo(str(folder / name))
+    names = ["thickness.fits", *(["silicon.fits"] if of_silicon is not None else []), "report.html"]
+    more = [] if search is None else [_silicon_line(fitted)]
+    for line in (_thickness_line(fitted), *said, *more, *(folder / name for name in names)):
+        click.echo(str(line))
     if strict and says_misfit(fitted.metadata):
         raise InputError("--strict", "a misfit", f"flats that the model describes. {'; '.join(said)}")
 
 
 def _free(
-    zones: str | None, illumination_degree: int | None, contrast: str | None, wavelength_accuracy_nm: float
-) -> Nuisances:
-    """What is free: as by default, but for what was asked for."""
+    zones: str | None, degree: int | None, contrast: str | None, wavelength_accuracy_nm: float, *, usual: bool
+) -> Nuisances | None:
+    """What is free: as by default, `None`, but for what was asked for of the ``usual`` fit, of one layer at once."""
     from dataclasses import replace
     from math import inf
 
     from ..algorithms.thickness_fit import Nuisances
 
+    if zones is None and degree is None and contrast is None:
+        return None
+    if not usual:
+        options = "--zones, --illumination-degree, --contrast"
+        raise InputError(options, "given", "nothing with method guo2022 or --silicon")
     free = Nuisances.automatic(contrast or "wavelength", wavelength_accuracy_nm)
     if zones is not None:
         free = replace(free, zones=zones, gain_accuracy=inf)
-    return free if illumination_degree is None else replace(free, illumination_degree=illumination_degree)
+    return free if degree is None else replace(free, illumination_degree=degree)
+
+
+def _thickness_line(fitted: ThicknessMap) -> str:
+    import numpy as np
+
+    good = fitted.mask == 0
+    low, high = np.percentile(fitted.value[good], [1.0, 99.0])
+    return (
+        f"{fitted.layer}: {low:.3f} to {high:.3f} µm (1–99 %), median σ "
+        f"{1e3 * np.median(fitted.sigma[good]):.2f} nm, {100 * (1 - good.mean()):.2f} % of the pixels masked"
+    )
 
 
 def _silicon_line(fitted: ThicknessMap) -> str:
@@ -202,20 +166,27 @@ def _silicon_line(fitted: ThicknessMap) -> str:
     )
 
 
-def _prepare(
+def _refuse_few(wavelengths: int) -> None:
+    if wavelengths < LEAST_WAVELENGTHS:
+        raise InputError("number of wavelengths", wavelengths, f"{LEAST_WAVELENGTHS} or more")
+
+
+def _read(
     paths: tuple[str, ...], setup: Setup, smoothing: float, skip_bad: bool, dry_run: bool
 ) -> tuple[FringeCube | None, tuple[str, ...]]:
     """The cube, `None` in a dry run, and the files that it is made of."""
     from ..algorithms.flat_prep_options import FlatPrepOptions
-    from .lab_frames import announced_series
+    from .lab_frames import announced_series, read_cube
 
+    cube = read_cube(paths[0], setup) if len(paths) == 1 else None
+    if cube is not None:
+        return cube, paths
     series = announced_series(paths, setup, skip_bad=skip_bad)
     missing = series.missing_nm(setup)
     if missing:
         listed = ", ".join(f"{w:g}" for w in missing)
         click.echo(f"no flats at {listed} nm; the fit is less certain without them", err=True)
-    if len(series.wavelengths_nm) < LEAST_WAVELENGTHS:
-        raise InputError("number of wavelengths", len(series.wavelengths_nm), f"{LEAST_WAVELENGTHS} or more")
+    _refuse_few(len(series.wavelengths_nm))
     if dry_run:
         click.echo(f"would prepare {series.steps} frames and fit the layer {setup.varying}")
         return None, series.paths

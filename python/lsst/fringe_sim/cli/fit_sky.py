@@ -12,7 +12,8 @@ import numpy as np
 
 from ..errors import InputError
 from .bad_files import refuse_bad
-from .observed import background_options, background_path, grid_of, images_of, other_light
+from .command import DRY_RUN, EXISTING, argument, command, flag, option
+from .observed import Background, background_options, images_of, other_light
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import SKY, THICKNESS_RANGE, ChosenEffects, model_effects
 from .progress import progress
@@ -32,15 +33,12 @@ if TYPE_CHECKING:
     from ..products.observed_files import ObservedImage
     from ..report.page import Origin
 
-__all__ = ["fit_sky"]
-
 NM = 1000.0
 WORTH_ORDERS = 0.02
 """Uncertainty to which a map is wanted, for what the command says of more frames [orders]: 0.13 rad of phase leave a
 hundredth of the power of the fringes."""
 
-MOST_FRAMES = 1_000_000
-"""More than these are not counted."""
+MOST_FRAMES = 1_000_000  # More than these are not counted
 
 LEAST_PROBABILITY = 0.5
 """Of the order of a map from a range that is written: it is likelier than all others together."""
@@ -64,55 +62,43 @@ class _MapOrRange(click.ParamType):
         return THICKNESS_RANGE.convert(value, param, ctx)
 
 
-@click.command()
-@click.argument("frames", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
-@click.option(
-    "--thickness",
-    required=True,
-    type=_MapOrRange(),
-    help="Map of the sensor; or its range alone, as 13um:17um, for how many frames would tell a map.",
-)
-@SKY.option("lsst_e2v", "Set-up with a telescope: name or file.")
-@click.option("--detector", default=None, help="Place in the focal plane; by default as the frames say.")
-@click.option(
-    "--map-sigma",
-    type=click.FloatRange(0.0, 10.0, min_open=True),
-    default=None,
-    help="What all of the map may be off by, one σ [µm]; by default 0.15 fringe orders.",
-)
-@click.option(
-    "--model-accuracy",
-    type=click.FloatRange(0.0, 1.0, max_open=True),
-    default=None,
-    metavar="PART",
-    help="Part of the fringes by which the model may be wrong, for the order of a map from a range; by default as "
-    "another simulator differs (0.17); 0 for a model without error.",
-)
-@background_options
-@model_effects("Effect on the sky; may be repeated.")
-@output_folder(
-    "Folder for the moved map and the report.",
-    "thickness.fits",
-    "thickness.png",
-    "forecast.ecsv",
-    "report.html",
-)
-@click.option("--skip-bad", is_flag=True, help="Go on without frames that cannot be read.")
-@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+@command()
 def fit_sky(
-    frames: tuple[Path, ...],
-    thickness: str | tuple[float, float],
-    setup: Setup,
-    detector: str | None,
-    map_sigma: float | None,
-    model_accuracy: float | None,
-    background: Path | None,
-    background_px: float,
-    amplifiers: tuple[int, int] | None,
-    effects: ChosenEffects,
-    out: OutputFolder,
-    skip_bad: bool,
-    dry_run: bool,
+    frames: tuple[Path, ...] = argument(kind=EXISTING),
+    thickness: str | tuple[float, float] = option(
+        "Map of the sensor; or its range alone, as 13um:17um, for how many frames would tell a map.",
+        kind=_MapOrRange(),
+        required=True,
+    ),
+    setup: Setup = SKY.option("lsst_e2v", "Set-up with a telescope: name or file."),
+    detector: str | None = option("Place in the focal plane; by default as the frames say."),
+    map_sigma: float | None = option(
+        "What all of the map may be off by, one σ [µm]; by default 0.15 fringe orders.",
+        kind=click.FloatRange(0.0, 10.0, min_open=True),
+    ),
+    order_error: float | None = option(
+        "Part of the fringes by which the model may be wrong along the difference between orders, for the order of "
+        "a map from a range; by default as another simulator differs (0.17); 0 for a model without error.",
+        kind=click.FloatRange(0.0, 1.0, max_open=True),
+        metavar="PART",
+    ),
+    former_order_error: float | None = option(
+        "The former name of --order-error.",
+        kind=click.FloatRange(0.0, 1.0, max_open=True),
+        names="--model-accuracy",
+        deprecated="since 1.1, will be removed in 1.2: --order-error takes its place",
+    ),
+    background: Background = background_options(),
+    effects: ChosenEffects = model_effects("Effect on the sky; may be repeated."),
+    out: OutputFolder = output_folder(
+        "Folder for the moved map and the report.",
+        "thickness.fits",
+        "thickness.png",
+        "forecast.ecsv",
+        "report.html",
+    ),
+    skip_bad: bool = flag("Go on without frames that cannot be read."),
+    dry_run: bool = DRY_RUN,
 ) -> None:
     """Hold a thickness map against frames of the night sky, and move it where they disagree.
 
@@ -127,22 +113,21 @@ def fit_sky(
       fringe-sim fit-sky night --thickness fit/thickness.fits --detector R22_S11 --out on_sky
       fringe-sim fit-sky night --thickness 13um:17um --detector R22_S11 --out how_many
     """
-    from ..algorithms.fringe_correction import CorrectionOptions
     from ..algorithms.map_on_sky import map_on_sky, reach_um
     from .inputs import placed_model, read_map, read_section, sky_settings
 
     images, unusable = images_of(frames, _refuse_unfit)
     refuse_bad(unusable, skip_bad=skip_bad)
     sensor = _sensor_of(images, setup, detector)
-    options = CorrectionOptions(background_px, grid_of(amplifiers))
-    loaders = [partial(image.read, background_path(background, image)) for image in images]
+    options, loaders = background.options, background.loaders(images)
     if not isinstance(thickness, str):
         model = placed_model(setup, sky_settings(effects.settings), sensor)
         _check_frames(loaders, images, None, setup)
         if dry_run:
             click.echo(f"would say how many frames like {len(images)} of {sensor.name} a map takes")
         else:
-            _forecast(thickness, model, loaders, options, model_accuracy, out)
+            wrong = former_order_error if order_error is None else order_error
+            _forecast(thickness, model, loaders, options, wrong, out)
         return
     layer = read_map(thickness, setup, sensor)
     section = read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
@@ -156,13 +141,7 @@ def fit_sky(
     response = _response(layer, model, sensor, section, reach_um(order_um, map_sigma))
     with progress("finding fringes", len(images)) as advance:
         found = map_on_sky(
-            loaders,
-            layer,
-            response,
-            order_um,
-            options,
-            map_sigma_um=map_sigma,
-            advance=advance,
+            loaders, layer, response, order_um, options, map_sigma_um=map_sigma, advance=advance
         )
     given: list[str | Path] = [thickness, *dict.fromkeys(image.path for image in images)]
     origin = origin_of(folder, [*given, *effects.files])
@@ -196,7 +175,7 @@ def _forecast(
     model: FringeModel,
     loaders: Sequence[Callable[[], ObservedFrame]],
     options: CorrectionOptions,
-    model_accuracy: float | None,
+    order_error: float | None,
     out: OutputFolder,
 ) -> None:
     """How many frames would tell a map of which a range is known."""
@@ -229,8 +208,8 @@ def _forecast(
     click.echo(str(folder / "forecast.ecsv"))
     if len(loaders) >= found.frames:
         search = partial(map_from_range, range_um=range_um, predict=predict, order_um=order_um)
-        if model_accuracy is not None:
-            search = partial(search, model_accuracy=model_accuracy)
+        if order_error is not None:
+            search = partial(search, order_error=order_error)
         _search(search, loaders, options, model.setup.varying, folder)
 
 
@@ -263,7 +242,7 @@ def _search(
         click.echo(
             f"no map was found: the likeliest one has a probability of {found.order_probability:.2g} among other "
             f"orders and directions, and {LEAST_PROBABILITY:g} is asked for; the next leaves {found.apart:.2g} of "
-            "its fringes, and the model may be wrong by more (--model-accuracy)"
+            "its fringes, and the model may be wrong by more (--order-error)"
         )
         return
     if found.model_error >= LARGE_ERROR:

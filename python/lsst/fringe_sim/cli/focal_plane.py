@@ -33,18 +33,14 @@ from ..instrument.sky import SkySpectrum
 from ..model import FringeModel, Setup
 from ..products.thickness_map import thickness_span_um
 from ..report.focal_plane_page import write_focal_plane_page
+from .command import command, flag, option
 from .inputs import read_settings, read_thickness, sky_settings
 from .output import OutputFolder, origin_of, output_folder
-from .parameters import effects_file_option, effects_from_option
+from .parameters import effects_file_option, with_effects_from
 from .progress import progress
 
-__all__ = ["focal_plane"]
-
-SETUPS = {"e2v": "lsst_e2v", "ITL": "lsst_itl"}
-"""Set-up of the sensors of each vendor."""
-
-SAMPLE_PX = 5
-"""Pixels between the sampled ones: one per arcsecond, a tenth of the width of a fringe or less."""
+SETUPS = {"e2v": "lsst_e2v", "ITL": "lsst_itl"}  # Set-up of the sensors of each vendor
+SAMPLE_PX = 5  # Pixels between the sampled ones: one per arcsecond, a tenth of the width of a fringe or less
 
 
 @dataclass(frozen=True)
@@ -67,48 +63,32 @@ class _SensorMapType(click.ParamType):
         return SensorMap(name, Path(path))
 
 
-@click.command()
-@click.option(
-    "--sensor", "sensors", multiple=True, help="A sensor or a raft; may be repeated. By default all 189."
-)
-@click.option(
-    "--thickness",
-    "maps",
-    type=_SensorMapType(),
-    multiple=True,
-    help="Measured map [µm] of a sensor; may be repeated. Other sensors get a random field like the measured ones.",
-)
-@click.option("--airmass", type=click.FloatRange(1.0, 5.0), default=1.2, show_default=True, help="Airmass.")
-@click.option(
-    "--flat-spectrum",
-    default="white",
-    show_default=True,
-    help="Light of the flat field: white, gaussian:MEAN:FWHM in nm, or a table.",
-)
-@click.option(
-    "--nights", type=click.IntRange(1, 1000), default=5, show_default=True, help="Random nights to correct."
-)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of stand-ins and nights.")
-@effects_file_option()
-@effects_from_option
-@output_folder(
-    "Folder for tables, figure and report.",
-    "cells.ecsv",
-    "focal_plane.ecsv",
-    "focal_plane.png",
-    "report.html",
-)
-@click.option("--dry-run", is_flag=True, help="Check everything, state the cost, write nothing.")
+@command()
 def focal_plane(
-    sensors: tuple[str, ...],
-    maps: tuple[SensorMap, ...],
-    airmass: float,
-    flat_spectrum: str,
-    nights: int,
-    seed: int,
-    effects_file: Path | None,
-    out: OutputFolder,
-    dry_run: bool,
+    sensors: tuple[str, ...] = option(
+        "A sensor or a raft; may be repeated. By default all 189.", names="--sensor", multiple=True
+    ),
+    maps: tuple[SensorMap, ...] = option(
+        "Measured map [µm] of a sensor; may be repeated. Other sensors get a random field like the measured ones.",
+        kind=_SensorMapType(),
+        names="--thickness",
+        multiple=True,
+    ),
+    airmass: float = option("Airmass.", 1.2, click.FloatRange(1.0, 5.0)),
+    flat_spectrum: str = option(
+        "Light of the flat field: white, gaussian:MEAN:FWHM in nm, or a table.", "white"
+    ),
+    nights: int = option("Random nights to correct.", 5, click.IntRange(1, 1000)),
+    seed: int = option("Of stand-ins and nights.", 0, click.IntRange(0)),
+    effects_file: Path | None = with_effects_from(effects_file_option()),
+    out: OutputFolder = output_folder(
+        "Folder for tables, figure and report.",
+        "cells.ecsv",
+        "focal_plane.ecsv",
+        "focal_plane.png",
+        "report.html",
+    ),
+    dry_run: bool = flag("Check everything, state the cost, write nothing."),
 ) -> None:
     """Forecast the fringes of every sensor of the LSST Camera.
 

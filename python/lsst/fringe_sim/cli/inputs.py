@@ -23,16 +23,6 @@ from ..products import SensorSection, ThicknessMap
 from ..products.sensor_section import SECTION_KEYWORDS
 from ..resources import LONGEST_USER_FILE, complete_fits, read_user_text, read_user_yaml
 
-__all__ = [
-    "effect_cards",
-    "placed_model",
-    "read_map",
-    "read_section",
-    "read_settings",
-    "read_thickness",
-    "sky_settings",
-]
-
 
 def placed_model(setup: Setup, settings: Mapping[str, Any], sensor: Detector) -> FringeModel:
     """A sensor of a camera behind its telescope, with effects, in the beam of its centre."""

@@ -22,8 +22,6 @@ from ..products.plain_flats import PlainImage, refuse_other_sensors, stack_plain
 from ..resources import complete_fits
 from .bad_files import refuse_bad
 
-__all__ = ["LabSeries", "PlainSeries", "announced_series", "find_series", "of_vendor", "read_cube"]
-
 
 class FrameHeader(Protocol):
     """What a series asks of a frame."""

@@ -19,10 +19,7 @@ import click
 from .. import __version__
 from ..errors import LONGEST_MESSAGE, FringeSimError, UnknownNameError, shown
 
-__all__ = ["cli", "main"]
-
-MOST_NEW_OBJECTS = 10_000
-"""Objects after which Python looks for unused ones."""
+MOST_NEW_OBJECTS = 10_000  # Objects after which Python looks for unused ones
 
 EXIT_BAD_INPUT = 1
 EXIT_USAGE = 2
@@ -55,8 +52,7 @@ _COMMANDS = {
 }
 
 
-_LISTED = {"effect": "effects", "set-up": "setups"}
-"""Commands that list the names of a field."""
+_LISTED = {"effect": "effects", "set-up": "setups"}  # Commands that list the names of a field
 
 
 class _LazyGroup(click.Group):
@@ -124,10 +120,7 @@ def _complain(message: str) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its status.
 
-    Parameters
-    ----------
-    arguments : sequence of `str`, optional
-        In place of ``sys.argv[1:]``.
+    ``arguments``: in place of ``sys.argv[1:]``.
     """
     # Threads that wait for work by spinning keep a second command on the same machine from its processors. OpenMP
     # reads this when it is loaded, with the first compiled loop.

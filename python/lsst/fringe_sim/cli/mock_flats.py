@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import InputError
+from .command import DRY_RUN, command, option
 from .output import OutputFolder, output_folder
 from .parameters import (
     BUILT_IN,
@@ -27,8 +28,6 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
 
     from ..instrument.setup import Setup
 
-__all__ = ["mock_flats"]
-
 STEEPEST_UM = 0.03
 """Range of a random map over the pixels of its shorter side: slopes of 0.05 µm per pixel, a sixth of a fringe."""
 
@@ -36,51 +35,31 @@ BLEMISHES: dict[str, Any] = {"bad_columns": 6, "hot_pixels": 200, "prnu_rms": 0.
 """What ``--blemishes`` puts on the sensor: about what a science-grade sensor shows."""
 
 
-@click.command("mock-flats")
-@output_folder("Folder for the frames.", "*_bias_bias_*.fits", "*_lambda_flat_*.fits", argument=True)
-@laboratory_of_the_mock
-@click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
-@click.option(
-    "--thickness",
-    default=BUILT_IN,
-    show_default=True,
-    help="Map of the varying layer: a FITS file [µm], 'random', or 'e2v_321' (model of a measured sensor).",
-)
-@click.option("--wavelengths", type=WAVELENGTHS, default=None, help="first:last:step or a list [nm].")
-@model_effects("Hidden effect; may be repeated.", "YAML with hidden effects.", own=False)
-@click.option(
-    "--size", type=SIZE, default=None, help="Cut-down sensor, columns x rows; full size if not given."
-)
-@click.option(
-    "--bias-frames", type=click.IntRange(1, 200), default=5, show_default=True, help="How many of them."
-)
-@click.option(
-    "--level", type=click.FloatRange(10.0, 1e5), default=20000.0, show_default=True, help="Electrons."
-)
-@click.option(
-    "--temperature", type=Quantity("K"), default=None, help="Sensor temperature, as 183.15 or -90degC."
-)
-@click.option(
-    "--silicon", default=None, help="Table of silicon, as Si_franta2017; that of the set-up if not given."
-)
-@click.option("--blemishes/--no-blemishes", default=False, help="Bad columns and hot pixels.")
-@click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all randomness.")
-@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+@command("mock-flats")
 def mock_flats(
-    out: OutputFolder,
-    setup: str,
-    detector: str | None,
-    thickness: str,
-    wavelengths: tuple[float, ...] | None,
-    effects: ChosenEffects,
-    size: tuple[int, int] | None,
-    bias_frames: int,
-    level: float,
-    temperature: float | None,
-    silicon: str | None,
-    blemishes: bool,
-    seed: int,
-    dry_run: bool,
+    out: OutputFolder = output_folder(
+        "Folder for the frames.", "*_bias_bias_*.fits", "*_lambda_flat_*.fits", argument=True
+    ),
+    setup: str = laboratory_of_the_mock,
+    detector: str | None = option("Sensor; that of the set-up if not given."),
+    thickness: str = option(
+        "Map of the varying layer: a FITS file [µm], 'random', or 'e2v_321' (model of a measured sensor).",
+        BUILT_IN,
+    ),
+    wavelengths: tuple[float, ...] | None = option("first:last:step or a list [nm].", kind=WAVELENGTHS),
+    effects: ChosenEffects = model_effects(
+        "Hidden effect; may be repeated.", "YAML with hidden effects.", own=False
+    ),
+    size: tuple[int, int] | None = option(
+        "Cut-down sensor, columns x rows; full size if not given.", kind=SIZE
+    ),
+    bias_frames: int = option("How many of them.", 5, click.IntRange(1, 200)),
+    level: float = option("Electrons.", 20_000.0, click.FloatRange(10.0, 100000.0)),
+    temperature: float | None = option("Sensor temperature, as 183.15 or -90degC.", kind=Quantity("K")),
+    silicon: str | None = option("Table of silicon, as Si_franta2017; that of the set-up if not given."),
+    blemishes: bool = option("Bad columns and hot pixels.", False, names="--blemishes/--no-blemishes"),
+    seed: int = option("Seed of all randomness.", kind=click.IntRange(0), required=True),
+    dry_run: bool = DRY_RUN,
 ) -> None:
     """Write raw bias frames and flats of a simulated sensor in the LSST raw layout.
 

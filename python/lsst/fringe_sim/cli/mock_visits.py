@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import InputError
+from .command import DRY_RUN, command, option
 from .mock_flats import thickness_map
 from .output import OutputFolder, output_folder
 from .parameters import BUILT_IN, SIZE, SKY, ChosenEffects, model_effects, shape_of
@@ -18,56 +19,34 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["mock_visits"]
-
 VISITS = "visit_*.fits"  # in both folders
 
 
-@click.command("mock-visits")
-@output_folder("Folder for the visits.", VISITS, argument=True)
-@SKY.name_option("lsst_e2v", "Set-up behind a telescope: name or file.")
-@click.option("--detector", default=None, help="Sensor; that of the set-up if not given.")
-@click.option(
-    "--thickness",
-    default=BUILT_IN,
-    show_default=True,
-    help="Map of the varying layer: a FITS file [µm], 'random', or 'e2v_321' (model of a measured sensor).",
-)
-@click.option("--visits", type=click.IntRange(1, 1000), default=12, show_default=True, help="How many.")
-@click.option(
-    "--stars", type=click.FloatRange(0.0), default=3.0, show_default=True, help="Per square arcminute."
-)
-@click.option(
-    "--moon", type=click.FloatRange(0.0), default=0.5, show_default=True, help="Largest, in dark skies."
-)
-@model_effects("Hidden effect; may be repeated.", "YAML with hidden effects.", own=False)
-@click.option(
-    "--size", type=SIZE, default=None, help="Cut-down sensor, columns x rows; full size if not given."
-)
-@click.option(
-    "--silicon", default=None, help="Table of silicon, as Si_franta2017; that of the set-up if not given."
-)
-@click.option("--seed", type=click.IntRange(0), required=True, help="Seed of all randomness.")
-@click.option(
-    "--truth",
-    type=click.Path(path_type=Path, writable=True),
-    help="Another folder, for the fringes of each visit as FITS [e⁻].",
-)
-@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+@command("mock-visits")
 def mock_visits(
-    out: OutputFolder,
-    setup: str,
-    detector: str | None,
-    thickness: str,
-    visits: int,
-    stars: float,
-    moon: float,
-    effects: ChosenEffects,
-    size: tuple[int, int] | None,
-    silicon: str | None,
-    seed: int,
-    truth: Path | None,
-    dry_run: bool,
+    out: OutputFolder = output_folder("Folder for the visits.", VISITS, argument=True),
+    setup: str = SKY.name_option("lsst_e2v", "Set-up behind a telescope: name or file."),
+    detector: str | None = option("Sensor; that of the set-up if not given."),
+    thickness: str = option(
+        "Map of the varying layer: a FITS file [µm], 'random', or 'e2v_321' (model of a measured sensor).",
+        BUILT_IN,
+    ),
+    visits: int = option("How many.", 12, click.IntRange(1, 1000)),
+    stars: float = option("Per square arcminute.", 3.0, click.FloatRange(0.0)),
+    moon: float = option("Largest, in dark skies.", 0.5, click.FloatRange(0.0)),
+    effects: ChosenEffects = model_effects(
+        "Hidden effect; may be repeated.", "YAML with hidden effects.", own=False
+    ),
+    size: tuple[int, int] | None = option(
+        "Cut-down sensor, columns x rows; full size if not given.", kind=SIZE
+    ),
+    silicon: str | None = option("Table of silicon, as Si_franta2017; that of the set-up if not given."),
+    seed: int = option("Seed of all randomness.", kind=click.IntRange(0), required=True),
+    truth: Path | None = option(
+        "Another folder, for the fringes of each visit as FITS [e⁻].",
+        kind=click.Path(path_type=Path, writable=True),
+    ),
+    dry_run: bool = DRY_RUN,
 ) -> None:
     """Write y-band visits of a simulated sensor: fringes, stars, galaxies, moonlight, cosmic rays, noise.
 

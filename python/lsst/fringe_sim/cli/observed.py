@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,61 +17,80 @@ import click
 from ..errors import InputError, UnknownNameError
 from ..files import same_file_key
 from .bad_files import refuse_bad
+from .command import Decorate, option
 from .parameters import SIZE
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..algorithms.correction import AmplifierGrid
-    from ..algorithms.fringe_correction import TemplateSet
-    from ..products import FringeFrame
+    from ..algorithms.fringe_correction import CorrectionOptions, TemplateSet
+    from ..products import FringeFrame, ObservedFrame
     from ..products.observed_files import ObservedImage
-
-__all__ = [
-    "TemplateFolder",
-    "background_options",
-    "background_path",
-    "grid_of",
-    "images_of",
-    "latest_date",
-    "other_light",
-    "stem_of",
-    "target_names",
-]
 
 SPACING_PX = 256.0
 
 
-def background_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Options of what is fitted beside the fringes."""
-    for option in (
-        click.option(
-            "--background",
-            type=click.Path(exists=True, file_okay=False, path_type=Path),
-            help="Folder with the backgrounds that were subtracted, in files named as the frames; added first.",
-        ),
-        click.option(
-            "--background-px",
-            type=click.FloatRange(8.0),
-            default=SPACING_PX,
-            show_default=True,
-            help="Scale of the smooth background that is fitted beside the fringes.",
-        ),
-        click.option(
-            "--amplifiers",
-            type=SIZE,
-            default=None,
-            help="Amplifiers beside and on top of each other, such as 3x1, each with a level of its own, or 1x1. By "
-            "default a frame tells whether the levels of 8x2, 4x1, 2x1 or 2x2 differ.",
-        ),
-    ):
-        command = option(command)
-    return command
+@dataclass(frozen=True)
+class Background:
+    """What is fitted beside the fringes."""
+
+    folder: Path | None  # of the backgrounds that were subtracted
+    spacing_px: float
+    amplifiers: tuple[int, int] | None  # columns x rows; where nobody states them the frame tells
+
+    @property
+    def grid(self) -> AmplifierGrid:
+        """Amplifiers with levels of their own."""
+        from ..algorithms.correction import AMPLIFIERS_UNKNOWN, AmplifierGrid
+
+        return AmplifierGrid(*self.amplifiers[::-1]) if self.amplifiers else AMPLIFIERS_UNKNOWN
+
+    @property
+    def options(self) -> CorrectionOptions:
+        """The same for a correction."""
+        from ..algorithms.fringe_correction import CorrectionOptions
+
+        return CorrectionOptions(self.spacing_px, self.grid)
+
+    def of(self, image: ObservedImage) -> Path | None:
+        """File with what was subtracted from a frame; `InputError` if the folder does not have it."""
+        path = None if self.folder is None else self.folder / image.path.name
+        if path is not None and not path.is_file():
+            raise InputError("background", str(path), f"a file named as the frame {image.path}")
+        return path
+
+    def loaders(self, images: Sequence[ObservedImage]) -> list[Callable[[], ObservedFrame]]:
+        """What reads each frame, its background added."""
+        return [partial(image.read, self.of(image)) for image in images]
 
 
-def grid_of(amplifiers: tuple[int, int] | None) -> AmplifierGrid:
-    """Amplifiers of columns x rows; where nobody states them the frame tells whether levels differ."""
-    from ..algorithms.correction import AMPLIFIERS_UNKNOWN, AmplifierGrid
+def background_options() -> Any:
+    """Options of a command, which gets them as one `Background`."""
+    folder = option(
+        "Folder with the backgrounds that were subtracted, in files named as the frames; added first.",
+        kind=click.Path(exists=True, file_okay=False, path_type=Path),
+    )
+    scale = "Scale of the smooth background that is fitted beside the fringes."
+    spacing_px = option(scale, SPACING_PX, click.FloatRange(8.0))
+    grid = option(
+        "Amplifiers beside and on top of each other, such as 3x1, each with a level of its own, or 1x1. By default a "
+        "frame tells whether the levels of 8x2, 4x1, 2x1 or 2x2 differ.",
+        kind=SIZE,
+    )
 
-    return AMPLIFIERS_UNKNOWN if amplifiers is None else AmplifierGrid(amplifiers[1], amplifiers[0])
+    def declare(name: str) -> Decorate:
+        def decorate(command: Callable[..., None]) -> Callable[..., None]:
+            @functools.wraps(command)
+            def with_background(
+                *, background: Any, background_px: Any, amplifiers: Any, **others: Any
+            ) -> None:
+                command(**{name: Background(background, background_px, amplifiers)}, **others)
+
+            made = spacing_px("background_px")(folder("background")(with_background))
+            return grid("amplifiers")(made)
+
+        return decorate
+
+    return declare
 
 
 def images_of(
@@ -80,10 +102,7 @@ def images_of(
 
     ``accept``: raises `InputError` over a header, with the name of its file, of a frame that is not to be used.
 
-    Raises
-    ------
-    InputError
-        There are no files, or no usable one.
+    `InputError`: there are no files, or no usable one.
     """
     from ..products.observed_files import is_companion, observed_images
 
@@ -113,10 +132,7 @@ def images_of(
 def target_names(images: Sequence[ObservedImage], ending: str, former: str = "") -> dict[Path, str]:
     """Name of the file that is written for each file; ``ending`` follows the stem, in place of ``former``.
 
-    Raises
-    ------
-    InputError
-        Two files would become one.
+    `InputError`: two files would become one.
     """
     names = {path: f"{stem_of(path).removesuffix(former)}{ending}.fits" for path in _paths(images)}
     taken: dict[str, Path] = {}
@@ -129,22 +145,6 @@ def target_names(images: Sequence[ObservedImage], ending: str, former: str = "")
 
 def _paths(images: Sequence[ObservedImage]) -> list[Path]:
     return list(dict.fromkeys(image.path for image in images))
-
-
-def background_path(folder: Path | None, image: ObservedImage) -> Path | None:
-    """File with the background of a frame.
-
-    Raises
-    ------
-    InputError
-        The folder does not have it.
-    """
-    if folder is None:
-        return None
-    path = folder / image.path.name
-    if not path.is_file():
-        raise InputError("background", str(path), f"a file named as the frame {image.path}")
-    return path
 
 
 def stem_of(path: Path) -> str:
@@ -175,10 +175,7 @@ class TemplateFolder:
     def check(self, images: Sequence[ObservedImage]) -> None:
         """Read the templates of all sensors of images, before long work.
 
-        Raises
-        ------
-        InputError
-            A file is damaged, or there twice.
+        `InputError`: a file is damaged, or there twice.
         """
         from ..products.observed_files import detector_of
 
@@ -189,10 +186,7 @@ class TemplateFolder:
     def of(self, detector: str, physical_filter: str = "") -> list[FringeFrame]:
         """Templates of a sensor; templates without a name are those of any sensor.
 
-        Raises
-        ------
-        InputError
-            There are none of it, or those of another filter, or a file is damaged or there twice.
+        `InputError`: there are none of it, or those of another filter, or a file is damaged or there twice.
         """
         names = sorted(self._files)
         if detector not in self._files and names != [""]:

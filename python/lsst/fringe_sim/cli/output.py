@@ -18,11 +18,10 @@ import click
 
 from ..errors import InputError, shown
 from ..files import LOCK, refuse_unfinished
+from .command import flag, option
 
 if TYPE_CHECKING:
     from ..report.page import Origin
-
-__all__ = ["OutputFolder", "origin_of", "output_folder", "refuse_among_inputs", "refuse_used_file"]
 
 OURS = (b"ORIGIN  = 'lsst.fringe_sim'", b"FRINGTID=", b"FRINGUND=")
 """What a FITS file of this program says in its first header: its origin, or that fringes were taken or put back."""
@@ -31,8 +30,7 @@ AT_WORK = f"{__name__}.at_work"
 """Entry of the memory of a command that has begun to write and has not come to its end."""
 
 PAGE = "report.html"
-LONGEST_COMMAND = 300
-"""Name of pages, and characters of a command that they show."""
+LONGEST_COMMAND = 300  # Name of pages, and characters of a command that they show
 
 HEADER_BYTES = 57_600  # of a FITS file, in which its ORIGIN is looked for
 
@@ -87,10 +85,7 @@ class OutputFolder(os.PathLike[str]):
 
         A folder that was not there, and into which nothing was written, is taken away when the command ends.
 
-        Raises
-        ------
-        InputError
-            It cannot be made or written, another run writes into it, or it is used (`refuse_used`).
+        `InputError`: it cannot be made or written, another run writes into it, or it is used (`refuse_used`).
         """
         self.refuse_used()
         new = [path for path in (self.path, *self.path.parents) if not path.exists()]
@@ -210,17 +205,9 @@ def _is_ours(path: Path) -> bool:
 def refuse_among_inputs(folder: Path, inputs: Iterable[str]) -> None:
     """Refuse to write into a folder that is read: the next run would take products for frames.
 
-    Parameters
-    ----------
-    folder : `pathlib.Path`
-        Where products go; it need not exist.
-    inputs : iterable of `str`
-        Files, folders, which are read with all below them, and patterns.
-
-    Raises
-    ------
-    InputError
-        The folder is one of the inputs, inside one, or where a pattern finds files.
+    ``folder``: where products go; it need not exist.
+    ``inputs``: files, folders, which are read with all below them, and patterns.
+    `InputError`: the folder is one of the inputs, inside one, or where a pattern finds files.
     """
     target = folder.resolve()
     for given in inputs:
@@ -239,16 +226,17 @@ def refuse_among_inputs(folder: Path, inputs: Iterable[str]) -> None:
             raise InputError("output folder", str(folder), allowed)
 
 
-def _inputs_of(context: click.Context, values: dict[str, Any]) -> list[str]:
+def _inputs_of(context: click.Context) -> list[str]:
     """What a command is given to read: its arguments, and options with a path that is not to be written.
 
     Several files of a folder are what a shell makes of a pattern, which finds more in a next run.
     """
     given: list[str] = []
     for parameter in context.command.params:
-        value = values.get(parameter.name or "")
+        value = context.params.get(parameter.name or "")
         if (
             value is not None
+            and parameter.name != "out"
             and (isinstance(parameter, click.Argument) or isinstance(parameter.type, click.Path))
             and not getattr(parameter.type, "writable", False)
         ):
@@ -264,12 +252,8 @@ def _inputs_of(context: click.Context, values: dict[str, Any]) -> list[str]:
 def origin_of(out: Path, given: Iterable[str | os.PathLike[str]]) -> Origin:
     """Command that runs, and pages of this program that lie beside what it was given.
 
-    Parameters
-    ----------
-    out : `pathlib.Path`
-        Folder of the page to be written.
-    given : iterable of path-like
-        Files and folders that were read, or their names.
+    ``out``: folder of the page to be written.
+    ``given``: files and folders that were read, or their names.
     """
     from ..report.page import Origin, title_of
 
@@ -306,7 +290,7 @@ def output_folder(
     default: Path | None = None,
     required: bool = True,
     resumes: bool = False,
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
+) -> Any:
     """``--out`` and ``--overwrite`` of a command, which gets them as one `OutputFolder` named ``out``.
 
     ``help_text``: what ``--out`` says under ``--help``.
@@ -321,7 +305,7 @@ def output_folder(
         def with_folder(*, out: Path | None, overwrite: bool, **others: Any) -> None:
             context = click.get_current_context()
             folder = None if out is None else OutputFolder(out, products, overwrite, resumes)
-            read = _inputs_of(context, others)
+            read = _inputs_of(context)
             if folder is not None:
                 folder.refuse_used()
                 refuse_among_inputs(folder.path, read)
@@ -334,15 +318,11 @@ def output_folder(
             context.meta.pop(AT_WORK, None)
 
         kind = click.Path(path_type=Path)
+        named = option(help_text, default, kind, required=required and default is None)("out")
         if argument:
             named = click.argument("out", metavar="OUTDIR", type=kind)
-        elif default is None:
-            named = click.option("--out", type=kind, required=required, help=help_text)
-        else:
-            named = click.option("--out", type=kind, default=default, show_default=True, help=help_text)
-        clear = click.option(
-            "--overwrite", is_flag=True, help="Clear what an earlier run of this command left in the folder."
-        )
-        return named(clear(with_folder))
+        clear = flag("Clear what an earlier run of this command left in the folder.")("overwrite")
+        made: Callable[..., None] = named(clear(with_folder))
+        return made
 
-    return decorate
+    return lambda name: decorate

@@ -17,34 +17,14 @@ import click
 from click.shell_completion import CompletionItem
 
 from ..errors import InputError, OutOfRangeError
+from .command import Declare, Decorate, option
 
 if TYPE_CHECKING:  # none of it for --help
     from ..effects import Parameter
     from ..instrument.setup import Setup
 
-__all__ = [
-    "ANY_LIGHT",
-    "BUILT_IN",
-    "EFFECT",
-    "LABORATORY",
-    "SIZE",
-    "SKY",
-    "THICKNESS_RANGE",
-    "WAVELENGTHS",
-    "ChosenEffects",
-    "Quantity",
-    "SetupType",
-    "effect_settings",
-    "effects_file_option",
-    "effects_from_option",
-    "laboratory_of_the_mock",
-    "model_effects",
-    "shape_of",
-]
 
-
-BUILT_IN = "e2v_321"
-"""Name of the thickness map that needs no file."""
+BUILT_IN = "e2v_321"  # Name of the thickness map that needs no file
 
 
 class Quantity(click.ParamType):
@@ -156,33 +136,28 @@ class SetupType(click.ParamType):
             raise InputError("set-up", text, self.wanted)
         return setup
 
-    def option(self, default: str, help_text: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    def option(self, default: str, help_text: str) -> Any:
         """``--setup``, read when all else on the command line is known to be well formed.
 
         ``default``, ``help_text``: set-up without the option, and what it says under ``--help``.
         """
 
-        def decorate(command: Callable[..., None]) -> Callable[..., None]:
-            @functools.wraps(command)
-            def with_setup(*, setup: str, **others: Any) -> None:
-                command(setup=self.convert(setup, None, None), **others)
+        def declare(name: str) -> Decorate:
+            def decorate(command: Callable[..., None]) -> Callable[..., None]:
+                @functools.wraps(command)
+                def with_setup(**given: Any) -> None:
+                    command(**{**given, name: self.convert(given[name], None, None)})
 
-            return self.name_option(default, help_text)(with_setup)
+                made: Callable[..., None] = self.name_option(default, help_text)(name)(with_setup)
+                return made
 
-        return decorate
+            return decorate
 
-    def name_option(
-        self, default: str, help_text: str
-    ) -> Callable[[Callable[..., None]], Callable[..., None]]:
+        return declare
+
+    def name_option(self, default: str, help_text: str) -> Any:
         """``--setup`` as it was written."""
-        return click.option(
-            "--setup",
-            default=default,
-            metavar=self.name,
-            show_default=True,
-            shell_complete=self.shell_complete,
-            help=help_text,
-        )
+        return option(help_text, default, metavar=self.name, shell_complete=self.shell_complete)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
@@ -283,8 +258,8 @@ def model_effects(
     file_help: str = EFFECTS_FILE_HELP,
     *,
     own: bool = True,
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """``--effect`` and ``--effects-file`` of a command, which gets them as `ChosenEffects` named ``effects``.
+) -> Any:
+    """``--effect`` and ``--effects-file`` of a command, which gets them as `ChosenEffects`, here named ``effects``.
 
     An option wins over the file; an option with two values is refused. ``own``: with ``--effects-from``.
     """
@@ -300,46 +275,39 @@ def model_effects(
             files = () if effects_file is None else (effects_file,)
             command(effects=ChosenEffects({**settings, **effect_settings(effects)}, files), **others)
 
-        one = click.option("--effect", "effects", type=EFFECT, multiple=True, help=help_text)
-        with_options = one(effects_file_option(file_help)(with_effects))
-        return effects_from_option(with_options) if own else with_options
+        one = option(help_text, kind=EFFECT, names="--effect", multiple=True)
+        made = one("effects")(effects_file_option(file_help)("effects_file")(with_effects))
+        return _effects_from(made) if own else made
 
-    return decorate
+    return lambda name: decorate
 
 
-def effects_from_option(command: Callable[..., None]) -> Callable[..., None]:
-    """``--effects-from``, which puts effects of one's own into the catalogue until the command ends."""
+def with_effects_from(declare: Declare) -> Any:
+    """``--effects-from`` after another option: effects of one's own are known until the command ends."""
+    return lambda name: lambda command: declare(name)(_effects_from(command))
 
+
+def _effects_from(command: Callable[..., None]) -> Any:
     def put(ctx: click.Context, param: click.Parameter, sources: tuple[str, ...]) -> None:
         for source in sources:
             from ..effects import effects_from
 
             ctx.with_resource(effects_from(source))
 
-    return click.option(
-        "--effects-from",
-        multiple=True,
-        metavar="FILE.py|MODULE",
-        is_eager=True,
-        expose_value=False,
-        callback=put,
-        help="Python file or module with effects of your own, as EFFECTS; it is executed.",
-    )(command)
+    text = "Python file or module with effects of your own, as EFFECTS; it is executed."
+    hidden: Any = {"is_eager": True, "expose_value": False, "callback": put}
+    return option(text, multiple=True, metavar="FILE.py|MODULE", **hidden)("effects_from")(command)
 
 
-def effects_file_option(help_text: str = "YAML.") -> Callable[[Callable[..., None]], Callable[..., None]]:
+def effects_file_option(help_text: str = "YAML.") -> Any:
     """``--effects-file`` as it was written."""
-    kind = click.Path(exists=True, dir_okay=False, path_type=Path)
-    return click.option("--effects-file", type=kind, help=help_text)
+    return option(help_text, kind=click.Path(exists=True, dir_okay=False, path_type=Path))
 
 
 def effect_settings(settings: tuple[tuple[str, float], ...]) -> dict[str, float]:
     """Mapping from repeated ``--effect`` options, each of another name.
 
-    Raises
-    ------
-    InputError
-        One of them is given two values.
+    `InputError`: one of them is given two values.
     """
     found: dict[str, float] = {}
     for name, value in settings:

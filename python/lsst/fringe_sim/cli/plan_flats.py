@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..files import table_text, write_whole
+from .command import command, flag, option
 from .output import refuse_used_file
 from .parameters import LABORATORY, THICKNESS_RANGE, WAVELENGTHS, ChosenEffects, Quantity, model_effects
 
@@ -20,70 +21,50 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..algorithms.flat_plan import FlatForecast, PlannedFlat, RankedFlat
     from ..instrument.setup import Setup
 
-__all__ = ["plan_flats"]
-
 TABLE_ROWS = 10
 RANKED_ROWS = 5
 
 
-@click.command(name="plan-flats")
-@LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file.")
-@click.option("--thickness", type=THICKNESS_RANGE, help="Thicknesses of the layer, µm; those of the set-up.")
-@click.option("--search", type=THICKNESS_RANGE, help="Thicknesses the fit will search, µm; as 'fit' does.")
-@click.option("--wavelengths", type=WAVELENGTHS, help="Flats, nm: 880:990:10 or a list; those of the set-up.")
-@click.option("--bandwidth", type=Quantity("nm"), help="Width of their line, FWHM; that of the set-up.")
-@click.option(
-    "--electrons", type=Quantity("electron"), default=20_000.0, show_default=True, help="Level of each flat."
-)
-@click.option(
-    "--read-noise", type=Quantity("electron"), default=7.0, show_default=True, help="Read noise per pixel."
-)
-@click.option(
-    "--region",
-    type=click.IntRange(1),
-    default=64,
-    show_default=True,
-    help="Pixels whose evidence on the order is added (8 x 8: a cell of the global fit).",
-)
-@click.option(
-    "--slip-limit",
-    type=click.FloatRange(0.0, 1.0, min_open=True),
-    default=1e-5,
-    show_default=True,
-    help="Largest slip probability of a region.",
-)
-@click.option("--sigma", type=Quantity("nm"), help="Largest uncertainty of a pixel in the recommended list.")
-@click.option("--candidates", type=WAVELENGTHS, help="Further flats, nm; every 5 nm across the list.")
-@click.option(
-    "--candidate-bandwidth",
-    "widths",
-    type=Quantity("nm"),
-    multiple=True,
-    help="Width of their line; may be repeated; the width of the list and half of it.",
-)
-@model_effects()
-@click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
-@click.option("--ecsv", type=click.Path(path_type=Path), help="File for the forecast at every thickness.")
-@click.option("--overwrite", is_flag=True, help="Replace the file of --ecsv.")
-@click.option("--dry-run", is_flag=True, help="Check everything, say what would be done, write nothing.")
+@command("plan-flats")
 def plan_flats(
-    setup: Setup,
-    thickness: tuple[float, float] | None,
-    search: tuple[float, float] | None,
-    wavelengths: tuple[float, ...] | None,
-    bandwidth: float | None,
-    electrons: float,
-    read_noise: float,
-    region: int,
-    slip_limit: float,
-    sigma: float | None,
-    candidates: tuple[float, ...] | None,
-    widths: tuple[float, ...],
-    effects: ChosenEffects,
-    as_json: bool,
-    ecsv: Path | None,
-    overwrite: bool,
-    dry_run: bool,
+    setup: Setup = LABORATORY.option("ts8_e2v", "Laboratory set-up: name or file."),
+    thickness: tuple[float, float] | None = option(
+        "Thicknesses of the layer, µm; those of the set-up.", kind=THICKNESS_RANGE
+    ),
+    search: tuple[float, float] | None = option(
+        "Thicknesses the fit will search, µm; as 'fit' does.", kind=THICKNESS_RANGE
+    ),
+    wavelengths: tuple[float, ...] | None = option(
+        "Flats, nm: 880:990:10 or a list; those of the set-up.", kind=WAVELENGTHS
+    ),
+    bandwidth: float | None = option("Width of their line, FWHM; that of the set-up.", kind=Quantity("nm")),
+    electrons: float = option("Level of each flat.", 20_000.0, Quantity("electron")),
+    read_noise: float = option("Read noise per pixel.", 7.0, Quantity("electron")),
+    region: int = option(
+        "Pixels whose evidence on the order is added (8 x 8: a cell of the global fit).",
+        64,
+        click.IntRange(1),
+    ),
+    slip_limit: float = option(
+        "Largest slip probability of a region.", 1e-5, click.FloatRange(0.0, 1.0, min_open=True)
+    ),
+    sigma: float | None = option(
+        "Largest uncertainty of a pixel in the recommended list.", kind=Quantity("nm")
+    ),
+    candidates: tuple[float, ...] | None = option(
+        "Further flats, nm; every 5 nm across the list.", kind=WAVELENGTHS
+    ),
+    widths: tuple[float, ...] = option(
+        "Width of their line; may be repeated; the width of the list and half of it.",
+        kind=Quantity("nm"),
+        names="--candidate-bandwidth",
+        multiple=True,
+    ),
+    effects: ChosenEffects = model_effects(),
+    as_json: bool = flag("Machine-readable.", "--json"),
+    ecsv: Path | None = option("File for the forecast at every thickness.", kind=click.Path(path_type=Path)),
+    overwrite: bool = flag("Replace the file of --ecsv."),
+    dry_run: bool = flag("Check everything, say what would be done, write nothing."),
 ) -> None:
     """Say what a list of flats will tell about the layer, which flat to add, and which few would do.
 
@@ -159,11 +140,7 @@ def forecast_table(forecast: FlatForecast) -> QTable:
 
 
 def _print(
-    now: FlatForecast,
-    ranked: tuple[RankedFlat, ...],
-    short: FlatForecast,
-    slip_limit: float,
-    width_nm: float,
+    now: FlatForecast, ranked: tuple[RankedFlat, ...], short: FlatForecast, slip_limit: float, width_nm: float
 ) -> None:
     import numpy as np
 

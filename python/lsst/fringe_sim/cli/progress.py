@@ -8,8 +8,6 @@ from contextlib import contextmanager
 
 import click
 
-__all__ = ["progress"]
-
 
 @contextmanager
 def progress(label: str, steps: int) -> Iterator[Callable[[], None]]:

@@ -12,16 +12,8 @@ from uuid import UUID
 
 import click
 
-from ..errors import (
-    LONGEST_VALUE,
-    FrameFormatError,
-    InputError,
-    UnknownNameError,
-    printable_name,
-    shown,
-)
-
-__all__ = ["describe", "provenance", "read_header"]
+from ..errors import LONGEST_VALUE, FrameFormatError, InputError, UnknownNameError, printable_name, shown
+from .command import argument, command, flag, option
 
 BUTLER = "LSST BUTLER "
 
@@ -34,14 +26,13 @@ _FORMAT = re.compile(
 _INPUT = re.compile(BUTLER + r"INPUT (\d{1,9}) (\w+)")
 
 
-@click.command()
-@click.argument("targets", nargs=-1, required=True, metavar="FILE|REPO...")
-@click.option("--dataset-type", metavar="NAME", help="Of a repository: which datasets, as epoxyThickness.")
-@click.option("--collections", default="*", show_default=True, help="Of a repository: where they are.")
-@click.option("--where", default="", help='Of a repository: a condition on the data ids, as "detector=37".')
-@click.option("--json", "as_json", is_flag=True, help="One JSON document, for programs.")
+@command()
 def provenance(
-    targets: tuple[str, ...], dataset_type: str | None, collections: str, where: str, as_json: bool
+    targets: tuple[str, ...] = argument("FILE|REPO..."),
+    dataset_type: str | None = option("Of a repository: which datasets, as epoxyThickness.", metavar="NAME"),
+    collections: str = option("Of a repository: where they are.", "*"),
+    where: str = option('Of a repository: a condition on the data ids, as "detector=37".', ""),
+    as_json: bool = flag("One JSON document, for programs.", "--json"),
 ) -> None:
     """Say what products were made with and from.
 
@@ -143,15 +134,8 @@ def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def describe(header: Mapping[str, Any]) -> dict[str, Any]:
     """Sort the keywords of a product by what they say.
 
-    Parameters
-    ----------
-    header : mapping
-        Keywords and values.
-
-    Returns
-    -------
-    record : `dict`
-        ``product``, ``software``, ``configuration``, ``setup``, ``effects``, ``tables``, ``seeds``, ``errors``,
+    ``header``: keywords and values.
+    ``product``, ``software``, ``configuration``, ``setup``, ``effects``, ``tables``, ``seeds``, ``errors``,
         ``dataset``, ``inputs``, and under ``other`` what is left. Plain values, ready for JSON.
     """
     from ..model.provenance import effects_of_header

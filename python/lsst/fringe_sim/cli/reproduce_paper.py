@@ -3,49 +3,42 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ..errors import InputError
 from ..files import table_text, write_whole
+from .command import command, flag, option
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import SIZE
 from .progress import progress
 
-__all__ = ["reproduce_paper"]
+if TYPE_CHECKING:
+    from ..paper.published import Finding
 
 ENVIRONMENT = "FRINGE_SIM_SHARED"
-BESIDE = Path("../shared")
-"""Where the published curves lie beside a development checkout."""
+BESIDE = Path("../shared")  # Where the published curves lie beside a development checkout
 DETAIL_PX = 1000
 DETAIL_CORNER = (1500, 1500)
 LEAST_SIDE = 64
-SILICON_CHANGE = 0.05
-"""Relative change by the constants of silicon from which both numbers are printed."""
+SILICON_CHANGE = 0.05  # Relative change by the constants of silicon from which both numbers are printed
 
 
-@click.command()
-@output_folder("Folder for the page and the table.", "paper.html", "paper.ecsv")
-@click.option(
-    "--size", type=SIZE, default="1024x1001", show_default=True, help="Pixels for the whole sensor."
-)
-@click.option(
-    "--coadds", type=click.IntRange(2), default=800, show_default=True, help="Exposures of the deepest coadd."
-)
-@click.option(
-    "--published",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
-    default=None,
-    help="Folder with curves read off the published figures (measured/); "
-    f"by default ${ENVIRONMENT}, then {BESIDE}, where they are there.",
-)
-@click.option(
-    "--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of noise and rotations."
-)
-@click.option("--dry-run", is_flag=True, help="Say what would be computed, write nothing.")
+@command()
 def reproduce_paper(
-    out: OutputFolder, size: tuple[int, int], coadds: int, published: Path | None, seed: int, dry_run: bool
+    out: OutputFolder = output_folder("Folder for the page and the table.", "paper.html", "paper.ecsv"),
+    size: tuple[int, int] = option("Pixels for the whole sensor.", "1024x1001", SIZE),
+    coadds: int = option("Exposures of the deepest coadd.", 800, click.IntRange(2)),
+    published: Path | None = option(
+        f"Folder with curves read off the published figures (measured/); by default ${ENVIRONMENT}, then "
+        f"{BESIDE}, where they are there.",
+        kind=click.Path(exists=True, file_okay=False, path_type=Path),
+    ),
+    seed: int = option("Seed of noise and rotations.", 1, click.IntRange(0)),
+    dry_run: bool = flag("Say what would be computed, write nothing."),
 ) -> None:
     """Recompute every figure and number of the paper, beside what it states.
 
@@ -83,7 +76,7 @@ def reproduce_paper(
     notices = []
     if folder is not None:
         click.echo(f"published curves: {folder}", err=True)
-    if folder is None:
+    else:
         notices.append(
             "Curves and maps read off the published figures are not at hand: comparisons with them are skipped "
             f"(--published FOLDER or ${ENVIRONMENT})."
@@ -95,23 +88,25 @@ def reproduce_paper(
         made = reproduce(context, advance=advance)
     write_whole(target / "paper.ecsv", table_text(made.table()))
     write_paper_page(made, target / "paper.html", notices, origin_of(target, ()))
-    for finding in made.all_findings:
+    for line in (*_notable(made.all_findings), made.summary(), target / "paper.html", target / "paper.ecsv"):
+        click.echo(str(line))
+
+
+def _notable(findings: Sequence[Finding]) -> Iterator[str]:
+    """Numbers that differ from those of the paper, and those that the constants of silicon change."""
+    for finding in findings:
+        number = finding.number
         if finding.status == "differs":
-            number = finding.number
-            click.echo(
-                f"differs: {number.place}: {number.quantity}: {finding.value:.4g} {number.unit} "
-                f"(paper {number.stated} ± {number.tolerance:g})"
-            )
-    for finding in made.all_findings:
+            yield f"differs: {_told(finding)} (paper {number.stated} ± {number.tolerance:g})"
+    for finding in findings:
         if abs(finding.cold - finding.value) > SILICON_CHANGE * abs(finding.value):
-            number = finding.number
-            click.echo(
-                f"silicon: {number.place}: {number.quantity}: {finding.value:.4g} {number.unit} with the "
-                f"constants of the paper, {finding.cold:.4g} with those measured in the cold"
-            )
-    click.echo(made.summary())
-    for name in ("paper.html", "paper.ecsv"):
-        click.echo(str(target / name))
+            cold = f"{finding.cold:.4g} with those measured in the cold"
+            yield f"silicon: {_told(finding)} with the constants of the paper, {cold}"
+
+
+def _told(finding: Finding) -> str:
+    number = finding.number
+    return f"{number.place}: {number.quantity}: {finding.value:.4g} {number.unit}"
 
 
 def _found() -> Path | None:

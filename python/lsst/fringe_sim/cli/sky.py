@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -14,6 +14,7 @@ import click
 
 from ..errors import InputError, OutOfRangeError, to_number
 from ..instrument.setup import LONGEST_EXPOSURE_S
+from .command import DRY_RUN, command, option
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import BUILT_IN, SKY, ChosenEffects, Quantity, model_effects
 from .progress import progress
@@ -33,91 +34,64 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["sky"]
-
 PERCENT = 100.0
 MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer
 NO_DATE = "1970-01-01T00:00:00"  # of templates of a model: two runs agree to the byte
 
 
-@click.command()
-@SKY.option("lsst_e2v", "Sensor and telescope: name or file.")
-@click.option(
-    "--thickness", required=True, help="Map of the varying layer: a FITS file [µm], or 'e2v_321' (built in)."
-)
-@click.option(
-    "--silicon-thickness",
-    default=None,
-    metavar="FILE",
-    help="Map of the silicon on the same pixels, as 'fringe-sim fit --silicon' writes it; even without.",
-)
-@click.option(
-    "--phase-sigma",
-    type=click.FloatRange(0.0, 2.0),
-    default=0.3,
-    show_default=True,
-    help="Uncertainty of the phase of the adhesive between laboratory and sky [rad per 10 K]; its value, 0, is the "
-    "effect epoxy_temperature.phase_per_10k.",
-)
-@click.option("--detector", default=None, help="Place in the focal plane; decides the beam.")
-@click.option("--exptime", type=Quantity("s"), default=None, help="Exposure time; by default the set-up's.")
-@click.option("--airmass", type=click.FloatRange(1.0, 5.0), default=None, help="By default the set-up's.")
-@click.option(
-    "--flat-spectrum",
-    default=None,
-    help="Light of the flat field: white, gaussian:MEAN:FWHM in nm (an LED or a laser), or a table; by default "
-    "white where every pixel has its own beam, and none otherwise.",
-)
-@click.option("--night/--one-frame", default=False, help="Eleven hourly frames of the published night.")
-@click.option(
-    "--level",
-    type=click.Choice(["measured", "model"]),
-    default="measured",
-    show_default=True,
-    help="Mean level: that of the measured quantum efficiency, or what the stack itself detects.",
-)
-@click.option(
-    "--templates/--no-templates",
-    default=False,
-    help="Also write templates for 'fringe-sim correct': the sky, and how that phase changes it.",
-)
-@click.option("--noiseless/--noise", default=False, help="Without photon and read noise, as for templates.")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the noise.")
-@click.option(
-    "--visits",
-    default=None,
-    metavar="FILE",
-    help="Table (ECSV) of visits for the coadd in the report of noiseless frames: x, y [px] and rotation [deg] of a "
-    "region of the sky on the sensor, perhaps the number of its frame; by default at random.",
-)
-@model_effects()
-@output_folder(
-    "Folder for frames, figure and report.",
-    "sky_*_[0-9][0-9].fits",
-    "fringe_*.fits",
-    "sky.png",
-    "coadd_sources.ecsv",
-    "report.html",
-)
-@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+@command()
 def sky(
-    setup: Setup,
-    thickness: str,
-    silicon_thickness: str | None,
-    phase_sigma: float,
-    detector: str | None,
-    exptime: float | None,
-    airmass: float | None,
-    flat_spectrum: str | None,
-    night: bool,
-    level: str,
-    templates: bool,
-    noiseless: bool,
-    seed: int,
-    visits: str | None,
-    effects: ChosenEffects,
-    out: OutputFolder,
-    dry_run: bool,
+    setup: Setup = SKY.option("lsst_e2v", "Sensor and telescope: name or file."),
+    thickness: str = option(
+        "Map of the varying layer: a FITS file [µm], or 'e2v_321' (built in).", required=True
+    ),
+    silicon_thickness: str | None = option(
+        "Map of the silicon on the same pixels, as 'fringe-sim fit --silicon' writes it; even without.",
+        metavar="FILE",
+    ),
+    phase_sigma: float = option(
+        "Uncertainty of the phase of the adhesive between laboratory and sky [rad per 10 K]; its value, 0, is "
+        "the effect epoxy_temperature.phase_per_10k.",
+        0.3,
+        click.FloatRange(0.0, 2.0),
+    ),
+    detector: str | None = option("Place in the focal plane; decides the beam."),
+    exptime: float | None = option("Exposure time; by default the set-up's.", kind=Quantity("s")),
+    airmass: float | None = option("By default the set-up's.", kind=click.FloatRange(1.0, 5.0)),
+    flat_spectrum: str | None = option(
+        "Light of the flat field: white, gaussian:MEAN:FWHM in nm (an LED or a laser), or a table; by default "
+        "white where every pixel has its own beam, and none otherwise."
+    ),
+    night: bool = option("Eleven hourly frames of the published night.", False, names="--night/--one-frame"),
+    level: str = option(
+        "Mean level: that of the measured quantum efficiency, or what the stack itself detects.",
+        "measured",
+        click.Choice(["measured", "model"]),
+    ),
+    templates: bool = option(
+        "Also write templates for 'fringe-sim correct': the sky, and how that phase changes it.",
+        False,
+        names="--templates/--no-templates",
+    ),
+    noiseless: bool = option(
+        "Without photon and read noise, as for templates.", False, names="--noiseless/--noise"
+    ),
+    seed: int = option("Seed of the noise.", 1, click.IntRange(0)),
+    visits: str | None = option(
+        "Table (ECSV) of visits for the coadd in the report of noiseless frames: x, y [px] and rotation [deg] "
+        "of a region of the sky on the sensor, perhaps the number of its frame; by default at random.",
+        metavar="FILE",
+    ),
+    effects: ChosenEffects = model_effects(),
+    out: OutputFolder = output_folder(
+        "Folder for frames, figure and report.",
+        "sky_*_[0-9][0-9].fits",
+        "fringe_*.fits",
+        "sky.png",
+        "coadd_sources.ecsv",
+        "report.html",
+    ),
+    dry_run: bool = DRY_RUN,
 ) -> None:
     """Simulate the fringes of the night sky for one sensor behind a telescope.
 
@@ -140,34 +114,27 @@ def sky(
     header = map_header(thickness)
     contrast = laboratory_contrast(header, thickness)
     layer, section = _layer(thickness, sensor, setup)
-    silicon = (
-        None
-        if silicon_thickness is None
-        else _silicon(silicon_thickness, layer, setup, str(header.get("DETNAME", "")))
-    )
+    silicon = _silicon(silicon_thickness, layer, setup, str(header.get("DETNAME", "")))
     settings = sky_settings(effects.settings)
     history = NightHistory.guo2022() if night else None
     flat = None if flat_spectrum is None else FlatSpectrum.from_name(flat_spectrum)
     count = 1 if history is None else len(history)
     places = None if visits is None else _places(visits, noiseless, count, layer.shape)
     if dry_run:
-        click.echo(
-            f"would simulate {count} frames of {sensor.name}, {layer.shape[1]} x {layer.shape[0]} pixels"
-        )
+        pixels = f"{layer.shape[1]} x {layer.shape[0]} pixels"
+        click.echo(f"would simulate {count} frames of {sensor.name}, {pixels}")
         return
     model = placed_model(setup, settings, sensor).at_laboratory_temperature(header)
     maps = [name for name in (thickness, silicon_thickness) if name not in (BUILT_IN, None)]
     given: list[str | Path] = [*maps, *effects.files]
-    cards = _cards(model, given, contrast, section)
-    if flat is not None:
-        cards["FLATSPEC"] = flat.name
+    cards = _cards(model, given, contrast, section) | ({} if flat is None else {"FLATSPEC": flat.name})
     folder = out.prepare()
-    common: dict[str, Any] = {
-        "read_noise_e": 0.0 if noiseless else sensor.read_noise,
-        "seed": None if noiseless else seed,
-        "detector": sensor.name,
-        "physical_filter": setup.filter_name,
-    }
+    common: dict[str, Any] = {"detector": sensor.name, "physical_filter": setup.filter_name}
+    common |= (
+        {"read_noise_e": 0.0, "seed": None}
+        if noiseless
+        else {"read_noise_e": sensor.read_noise, "seed": seed}
+    )
     exposure = Exposure(exptime, airmass or setup.airmass, history, level == "measured", flat)
     layers = Layers(layer, silicon, section, phase_sigma)
     response = _response(layers, model, sensor, exposure)
@@ -175,25 +142,20 @@ def sky(
     made = _written(series, scales, folder / f"sky_{sensor.name}", cards, section)
     if templates:
         _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
-    page = write_sky_report(
-        folder / "report.html",
-        made,
-        setup.name,
-        seed,
-        places,
-        picture=folder / "sky.png",
-        pixel_arcsec=setup.pixel_scale_arcsec,
-        section=section,
-        origin=origin_of(folder, given),
-    )
-    for frame in made:
-        click.echo(_describe(frame))
+    shown: dict[str, Any] = {"picture": folder / "sky.png", "pixel_arcsec": setup.pixel_scale_arcsec}
+    shown |= {"section": section, "origin": origin_of(folder, given)}
+    page = write_sky_report(folder / "report.html", made, setup.name, seed, places, **shown)
+    for line in (*_said(made, model, contrast), folder, page):
+        click.echo(str(line))
+
+
+def _said(made: list[SkyFringe], model: FringeModel, contrast: tuple[float, float] | None) -> Iterator[str]:
+    """What the command says of the frames, line by line."""
+    yield from map(_describe, made)
     if "PHASERMS" in made[0].metadata:
-        click.echo(_open_phase(made[0], model))
+        yield _open_phase(made[0], model)
     if contrast is not None:
-        click.echo(_both_forecasts(made[0], *contrast))
-    click.echo(str(folder))
-    click.echo(str(page))
+        yield _both_forecasts(made[0], *contrast)
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,11 +341,13 @@ def _both_forecasts(frame: SkyFringe, contrast: float, sigma: float) -> str:
     )
 
 
-def _silicon(path: str, layer: FloatArray, setup: Setup, sensor: str) -> FloatArray:
+def _silicon(path: str | None, layer: FloatArray, setup: Setup, sensor: str) -> FloatArray | None:
     """Thickness of the silicon [µm] on the pixels of another layer, which loses those where it is not known."""
     from ..algorithms.sky_of_maps import DETECTION, known_silicon_um
     from ..products import ThicknessMap
 
+    if path is None:
+        return None
     silicon = known_silicon_um(ThicknessMap.read_any(path, DETECTION), layer.shape, setup, path, sensor)
     layer[silicon != silicon] = math.nan  # not known
     return silicon

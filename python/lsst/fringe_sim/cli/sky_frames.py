@@ -15,8 +15,6 @@ from ..products import SkyFrames, SkyFringe
 from ..products.same_light import pixels_digest
 from .inputs import placed_model, read_map
 
-__all__ = ["SkyData", "read_sky_frames"]
-
 
 @dataclass(frozen=True, eq=False)
 class SkyData:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,14 +12,8 @@ import click
 from ..errors import InputError
 from ..files import same_file_key
 from .bad_files import refuse_bad
-from .observed import (
-    TemplateFolder,
-    background_options,
-    background_path,
-    grid_of,
-    images_of,
-    latest_date,
-)
+from .command import DRY_RUN, EXISTING, argument, command, flag, option
+from .observed import Background, TemplateFolder, background_options, images_of, latest_date
 from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 
@@ -29,43 +22,26 @@ if TYPE_CHECKING:
     from ..products import FringeFrame, FringeTemplates
     from ..products.observed_files import ObservedImage
 
-__all__ = ["templates"]
-
 LEAST_FRAMES = 3
 
 
-@click.command()
-@click.argument("frames", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
-@background_options
-@click.option(
-    "--components", type=click.IntRange(1), help="Templates; by default as many as predict other frames."
-)
-@click.option(
-    "--least-frames",
-    type=click.IntRange(1),
-    default=LEAST_FRAMES,
-    show_default=True,
-    help="Frames that must see a pixel.",
-)
-@click.option(
-    "--prior",
-    type=click.Path(exists=True, path_type=Path),
-    help="Templates of a model, a file or a folder: what the frames do not decide is taken from them.",
-)
-@output_folder("Folder for templates, figure and report.", "templates_*.fits", "report.html")
-@click.option("--skip-bad", is_flag=True, help="Go on without frames that cannot be read.")
-@click.option("--dry-run", is_flag=True, help="Check everything, write nothing.")
+@command()
 def templates(
-    frames: tuple[Path, ...],
-    background: Path | None,
-    background_px: float,
-    amplifiers: tuple[int, int] | None,
-    components: int | None,
-    least_frames: int,
-    prior: Path | None,
-    out: OutputFolder,
-    skip_bad: bool,
-    dry_run: bool,
+    frames: tuple[Path, ...] = argument(kind=EXISTING),
+    background: Background = background_options(),
+    components: int | None = option(
+        "Templates; by default as many as predict other frames.", kind=click.IntRange(1)
+    ),
+    least_frames: int = option("Frames that must see a pixel.", LEAST_FRAMES, click.IntRange(1)),
+    prior: Path | None = option(
+        "Templates of a model, a file or a folder: what the frames do not decide is taken from them.",
+        kind=EXISTING,
+    ),
+    out: OutputFolder = output_folder(
+        "Folder for templates, figure and report.", "templates_*.fits", "report.html"
+    ),
+    skip_bad: bool = flag("Go on without frames that cannot be read."),
+    dry_run: bool = DRY_RUN,
 ) -> None:
     """Make fringe templates of each sensor from observed frames in one filter.
 
@@ -86,7 +62,7 @@ def templates(
     refuse_bad(unusable, skip_bad=skip_bad)
     sensors = _by_sensor(images)
     options = TemplateOptions(
-        components, least_frames=least_frames, spacing_px=background_px, amplifiers=grid_of(amplifiers)
+        components, least_frames=least_frames, spacing_px=background.spacing_px, amplifiers=background.grid
     )
     expected = None if prior is None else TemplateFolder(prior)
     if dry_run:
@@ -132,17 +108,16 @@ def _made(
     images: list[ObservedImage],
     options: TemplateOptions,
     prior: list[FringeFrame],
-    background: Path | None,
+    background: Background,
     advance: Callable[[], None],
 ) -> FringeTemplates:
     """Templates of one sensor; each frame is read anew in every round."""
     from ..algorithms.observed_frames import make_templates
     from ..model.provenance import software_cards
 
-    loaders = [partial(image.read, background_path(background, image)) for image in images]
     date = latest_date([image.header() for image in images])
     names = [f"{image.path}[{image.name}]" for image in images]
-    return make_templates(loaders, date, options, prior, software_cards(), advance, names)
+    return make_templates(background.loaders(images), date, options, prior, software_cards(), advance, names)
 
 
 def _file_name(sensor: str) -> str:

@@ -12,17 +12,6 @@ from ..optics.system import OpticalSystem
 from .base import Described, Effect, FloatArray, ResponseContext
 from .geometry import ImageGeometry
 
-__all__ = [
-    "ActiveEffect",
-    "activate_effects",
-    "apply_to_image",
-    "apply_to_response",
-    "apply_to_sky",
-    "apply_to_system",
-    "check_settings",
-    "settings_of",
-]
-
 AnyEffect = TypeVar("AnyEffect", bound=Described)
 
 

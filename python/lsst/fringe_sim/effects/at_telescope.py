@@ -8,8 +8,6 @@ from dataclasses import replace
 from ..optics.system import OpticalSystem
 from .base import Parameter, PlainNullEffect, Values
 
-__all__ = ["ADHESIVE_PHASE_SIGMA", "EpoxyTemperature", "SensorTemperature", "adhesive_change"]
-
 PHASE_NM, PER_K = 960.0, 10.0
 """Wavelength at which the phase of the adhesive is stated [nm], and the change of temperature that it is for [K]."""
 

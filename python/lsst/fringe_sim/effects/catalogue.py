@@ -16,8 +16,6 @@ from typing import Any
 from ..errors import InputError
 from .base import Effect
 
-__all__ = ["ENTRY_POINTS", "catalogue_of", "effects_from", "known_effects"]
-
 ENTRY_POINTS = "lsst.fringe_sim.effects"
 """Group of the entry points by which an installed package offers effects: each names a sequence of `Effect`."""
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, named_units
 
-__all__ = ["AMPLIFIERS", "ImageGeometry"]
-
 FloatArray = NDArray[np.float64]
 
 AMPLIFIERS = tuple(f"C{row}{column}" for row in (0, 1) for column in range(8))

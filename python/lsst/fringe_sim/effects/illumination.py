@@ -7,10 +7,7 @@ import numpy as np
 from .base import FloatArray, Parameter, PlainNullEffect, SearchHints, Values
 from .geometry import ImageGeometry
 
-__all__ = ["ChromaticIllumination", "IlluminationPattern", "Vignetting"]
-
-REACH_NM = 50.0
-"""Distance in wavelength at which the pattern of a chromatic illumination is stated."""
+REACH_NM = 50.0  # Distance in wavelength at which the pattern of a chromatic illumination is stated
 
 _CURVED = {
     "curvature_xx": ("u²", 0.005, 1),

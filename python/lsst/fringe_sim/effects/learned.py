@@ -15,18 +15,13 @@ from ..optics.system import OpticalSystem
 from .base import FloatArray, Parameter, PlainNullEffect, Values
 from .geometry import AMPLIFIERS, ImageGeometry
 
-__all__ = ["LearnedAmplifiers", "LearnedLight", "LearnedMap", "LearnedResponse"]
-
 LEARNED_NODES_NM = tuple(range(800, 1051, 10))
 """Wavelengths at which corrections are stated [nm]: in a straight line between them, constant beyond."""
 
 LEARNED_HARMONICS = (1, 2, 3)
 
-COLOUR_NM = 50.0
-"""Distance in wavelength at which the colour of amplifiers is stated [nm]."""
-
-COLOUR_MIDDLE_NM = 935.0
-"""Wavelength at which it vanishes [nm]."""
+COLOUR_NM = 50.0  # Distance in wavelength at which the colour of amplifiers is stated [nm]
+COLOUR_MIDDLE_NM = 935.0  # Wavelength at which it vanishes [nm]
 
 MAP_ORDER, LINE_ORDER, LIGHT_ORDER = 16, 64, 8
 """Orders of the cosines of a map along both sides, of lines along one, and of light that differs by exposure."""

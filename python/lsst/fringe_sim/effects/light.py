@@ -18,22 +18,6 @@ from ..resources import read_table
 from .base import Effect, FloatArray, Parameter, PlainNullEffect, ResponseContext, SearchHints, Values
 from .line_profiles import LorentzianProfile, MixedProfile, line_width
 
-__all__ = [
-    "Bandwidth",
-    "ConvergingBeam",
-    "GhostPedestal",
-    "LampLines",
-    "LineTriangle",
-    "LineWing",
-    "Tilt",
-    "WavelengthJitter",
-    "WavelengthOffset",
-    "WavelengthScale",
-    "tilted",
-    "widened",
-    "xenon_lines",
-]
-
 JITTER_NODES_NM = tuple(range(800, 1051, 10))
 """Nominal wavelengths at which the error of single exposures is free [nm]: those of flats, 10 nm from one another."""
 

@@ -8,15 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError, OutOfRangeError
-from ..optics.illumination import (
-    DEFAULT_STEP_NM,
-    GaussianProfile,
-    SpectralProfile,
-    TriangularProfile,
-)
+from ..optics.illumination import DEFAULT_STEP_NM, GaussianProfile, SpectralProfile, TriangularProfile
 from .base import FloatArray
-
-__all__ = ["LorentzianProfile", "MixedProfile", "line_width"]
 
 _REACH = 10.0
 _PANEL_NODES = 8

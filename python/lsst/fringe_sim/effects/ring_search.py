@@ -13,12 +13,9 @@ from scipy.optimize import minimize
 
 from ..compiled import kernel
 
-__all__ = ["Rings", "find_rings"]
-
 FloatArray = NDArray[np.float64]
 
-FARTHEST_PX = 8000.0
-"""Distance of the centre from the middle of a sensor [px]: the radius of a wafer."""
+FARTHEST_PX = 8000.0  # Distance of the centre from the middle of a sensor [px]: the radius of a wafer
 
 SHORTEST_CELLS = 2.3
 """Shortest period that is looked for, in cells: with two, rings along rows or columns would be any other wave too."""
@@ -29,8 +26,7 @@ that are not seen to be bent may be anything."""
 
 FEWEST_CELLS = 500
 
-SIDE_CELLS = 100
-"""Side of the map that is searched [cells]; the work grows with the fourth power of it."""
+SIDE_CELLS = 100  # Side of the map that is searched [cells]; the work grows with the fourth power of it
 
 
 @dataclass(frozen=True)

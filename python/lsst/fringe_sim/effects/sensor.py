@@ -11,26 +11,9 @@ from ..errors import InputError
 from .base import FloatArray, Parameter, PlainNullEffect, SearchHints, Values
 from .geometry import AMPLIFIERS, ImageGeometry
 
-__all__ = [
-    "AmplifierGain",
-    "AmplifierOffset",
-    "BrighterFatter",
-    "ChargeDiffusion",
-    "Crosstalk",
-    "DarkCurrent",
-    "DarkPedestal",
-    "MidlineStep",
-    "NonLinearity",
-]
-
-LEAST_RATIO = 1.05
-"""Longest over shortest exposure from which its length can tell a rate from a level."""
-
-REFERENCE_E = 100_000.0
-"""Charge at which brighter-fatter effect and non-linearity are stated [electrons]."""
-
-MOST_PASSED = 0.2
-"""Part of its departure that a pixel may pass on; what is first order here is not beyond."""
+LEAST_RATIO = 1.05  # Longest over shortest exposure from which its length can tell a rate from a level
+REFERENCE_E = 100_000.0  # Charge at which brighter-fatter effect and non-linearity are stated [electrons]
+MOST_PASSED = 0.2  # Part of its departure that a pixel may pass on; what is first order here is not beyond
 
 
 class MidlineStep(PlainNullEffect):

@@ -12,8 +12,6 @@ from ..optics.system import OpticalSystem
 from .base import FloatArray, Parameter, PlainNullEffect, Values
 from .geometry import ImageGeometry
 
-__all__ = ["SiliconGradient"]
-
 NODE_UM = 2.0
 """Silicon thicknesses from which the response is interpolated: nominal, and so much on both sides [µm]."""
 
@@ -21,11 +19,8 @@ RIPPLE_UM = 0.13
 RIPPLE_PLACES = np.array([-0.375, -0.125, 0.125, 0.375])
 """Period of the fringes of the silicon itself at 930 nm [µm], and the parts of it over which they are averaged."""
 
-STEP_UM, STEPS = 0.025, 60
-"""Grid of the varying layer, five fringe orders, on which responses are compared."""
-
-LEAST_SPAN_NM = 20.0
-"""Span of wavelengths below which a gradient of the silicon is one of the light."""
+STEP_UM, STEPS = 0.025, 60  # Grid of the varying layer, five fringe orders, on which responses are compared
+LEAST_SPAN_NM = 20.0  # Span of wavelengths below which a gradient of the silicon is one of the light
 
 
 class SiliconGradient(PlainNullEffect):

@@ -8,10 +8,7 @@ from ..instrument.flat_spectrum import FlatSpectrum
 from ..instrument.sky import SkySpectrum
 from .base import Parameter, PlainNullEffect, SearchHints, Values
 
-__all__ = ["FlatFringes", "HotRotation", "OHBands", "RotationalTemperature", "SkyContinuum", "WaterVapour"]
-
-HOT_K = 1000.0
-"""Temperature of a hot population that is added to that of the line list [K]."""
+HOT_K = 1000.0  # Temperature of a hot population that is added to that of the line list [K]
 
 _TWO_POPULATIONS = "Noll et al. 2020, doi 10.5194/acp-20-5269-2020 (two populations in every v')"
 

@@ -12,29 +12,6 @@ from ..optics.diffuse import DiffuseReturn
 from ..optics.system import OpticalSystem, Structure
 from .base import Effect, FloatArray, Parameter, PlainNullEffect, ResponseContext, SearchHints, Values
 
-__all__ = [
-    "AirGap",
-    "ArCoating",
-    "BlackCoating",
-    "ContrastLoss",
-    "DiffuseGateSide",
-    "EpoxyAbsorption",
-    "EpoxyIndex",
-    "GateOxide",
-    "GateStructure",
-    "GateThickness",
-    "InsertedLayer",
-    "Insulation",
-    "InterfaceRoughness",
-    "SiliconAbsorption",
-    "SiliconConstants",
-    "SiliconThickness",
-    "SupportCoherence",
-    "SupportIndex",
-    "Temperature",
-    "ThicknessSpread",
-]
-
 _LAGE = "Lage 2019, doi 10.48550/arXiv.1911.09577"
 
 
@@ -165,8 +142,7 @@ class SiliconAbsorption(PlainNullEffect):
     def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
         """Scale the extinction coefficient of every layer of silicon."""
         return _with_silicon(
-            system,
-            lambda medium: medium.modified(extinction_scale=medium.extinction_scale * values["scale"]),
+            system, lambda medium: medium.modified(extinction_scale=medium.extinction_scale * values["scale"])
         )
 
 

@@ -10,10 +10,7 @@ from .base import FloatArray, Parameter, PlainNullEffect, Residuals, SearchHints
 from .geometry import ImageGeometry
 from .ring_search import find_rings
 
-__all__ = ["TreeRings"]
-
-MEAN_SAMPLES = 64
-"""Samples along each axis from which the mean of the pattern over a sensor is taken."""
+MEAN_SAMPLES = 64  # Samples along each axis from which the mean of the pattern over a sensor is taken
 
 LONGEST_PERIOD = 0.7
 """Period of rings over the side of the sensor, beyond which they are not told from uneven light."""
@@ -82,11 +79,7 @@ def _middle(geometry: ImageGeometry) -> FloatArray:
 
 
 def _pattern(
-    values: Values,
-    middle: FloatArray,
-    rows: FloatArray,
-    columns: FloatArray,
-    cell: tuple[float, float],
+    values: Values, middle: FloatArray, rows: FloatArray, columns: FloatArray, cell: tuple[float, float]
 ) -> FloatArray:
     """Departure of the pattern from one, averaged over pixels or cells, ``(ny, nx)``."""
     down, along = rows[:, np.newaxis] - values["centre_y"], columns[np.newaxis, :] - values["centre_x"]

@@ -10,8 +10,6 @@ from .base import FloatArray, Parameter, SearchHints, Values
 from .geometry import ImageGeometry
 from .stack import InsertedLayer
 
-__all__ = ["Void"]
-
 LEAST_SLANT = 1e-3
 """Sides of the ramp that the rim of a disc has in a pixel [px], where it runs along the pixel's own side."""
 

@@ -12,16 +12,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, OutOfRangeError, ResourceError, named_units
 from ..optics import Beam
-from .ray_bundle import (
-    BEAM_NODES,
-    QUANTILES,
-    beam_of_quantiles,
-    lagrange_weights,
-    quantiles,
-)
+from .ray_bundle import BEAM_NODES, QUANTILES, beam_of_quantiles, lagrange_weights, quantiles
 from .telescope import Telescope, TracedOptics, batoid_optic
-
-__all__ = ["TRACED_RADII", "BeamField"]
 
 FloatArray = NDArray[np.float64]
 
@@ -38,8 +30,7 @@ _BEYOND_NODES = 0.2
 a parabola leaves it by at most 0.11."""
 
 
-_ROUNDING_M2 = 1e-9
-"""Rounding of squared radii [m²]."""
+_ROUNDING_M2 = 1e-9  # Rounding of squared radii [m²]
 
 
 @named_units

@@ -18,14 +18,11 @@ from ..errors import OutOfRangeError, named_units
 from ..resources import read_table
 from .oh_levels import SECOND_RADIATION_CM_K
 
-__all__ = ["ARCSEC2_PER_SR", "ContinuumTerm", "airglow_continuum", "moonlight", "zodiacal_light"]
-
 FloatArray = NDArray[np.float64]
 
 ARCSEC2_PER_SR = (180.0 * 3600.0 / math.pi) ** 2
 
-_PHOTON_ENERGY_NM_J = 1.98644586e-16
-"""Energy of a photon times its wavelength [J nm]."""
+_PHOTON_ENERGY_NM_J = 1.98644586e-16  # Energy of a photon times its wavelength [J nm]
 
 
 _V_BAND_NM = 551.0

@@ -15,8 +15,6 @@ import numpy as np
 from ..errors import InputError, UnknownNameError, named_units
 from ..notebook import OneLine
 
-__all__ = ["Amplifier", "Detector", "RawSegment", "refuse_misfits"]
-
 
 @dataclasses.dataclass(frozen=True)
 class RawSegment:
@@ -172,11 +170,4 @@ def _resized(amp: Amplifier, row: int, column: int, height: int, width: int) -> 
     if raw is not None:
         shape = (raw.shape[0] + height - amp.height, raw.shape[1] + width - amp.width)
         raw = dataclasses.replace(raw, shape=shape)
-    return dataclasses.replace(
-        amp,
-        y0=row * height,
-        x0=column * width,
-        height=height,
-        width=width,
-        raw=raw,
-    )
+    return dataclasses.replace(amp, y0=row * height, x0=column * width, height=height, width=width, raw=raw)

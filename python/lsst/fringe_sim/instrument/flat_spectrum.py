@@ -17,18 +17,11 @@ from .sky import SpectralComponent
 if TYPE_CHECKING:  # filters take time to import, and effects do without
     from .bandpass import Bandpass
 
-__all__ = ["FlatSpectrum"]
-
 FloatArray = NDArray[np.float64]
 
-STEP_NM = 0.2
-"""Spacing of the wavelengths that stand for white light [nm]."""
-
-NODES = 160
-"""Least number of wavelengths that stand for the light of a lamp."""
-
-REACH = 4.0
-"""Standard deviations to which a Gaussian lamp shines."""
+STEP_NM = 0.2  # Spacing of the wavelengths that stand for white light [nm]
+NODES = 160  # Least number of wavelengths that stand for the light of a lamp
+REACH = 4.0  # Standard deviations to which a Gaussian lamp shines
 
 SIGMA_PER_FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
 

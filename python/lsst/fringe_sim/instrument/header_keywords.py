@@ -10,8 +10,6 @@ import functools
 import re
 from collections.abc import Mapping
 
-__all__ = ["NOT_READ", "RAW_KEYWORDS", "READERS", "HeaderKeyword", "is_unknown", "reason_not_read"]
-
 USED, CHECKED, REFUSED = "used", "checked", "refused"
 """It decides something of the result; another value than the one allowed is refused; its presence is refused."""
 

@@ -15,20 +15,14 @@ from scipy.ndimage import map_coordinates
 from ..errors import InputError
 from ..resources import read_table
 
-__all__ = ["E2V_SHAPE", "Sampling", "e2v_321", "fit_to_sensor"]
-
-E2V_SHAPE = (4004, 4096)
-"""Rows and columns of an assembled, trimmed E2V-CCD250."""
+E2V_SHAPE = (4004, 4096)  # Rows and columns of an assembled, trimmed E2V-CCD250
 
 Sampling = Literal["resample", "window"]
 """How a large map becomes a small one: the whole of it on fewer pixels, or the pixels from a ``corner`` on."""
 
 
 def e2v_321(
-    shape: tuple[int, int] = E2V_SHAPE,
-    *,
-    sampling: Sampling = "resample",
-    corner: tuple[int, int] = (0, 0),
+    shape: tuple[int, int] = E2V_SHAPE, *, sampling: Sampling = "resample", corner: tuple[int, int] = (0, 0)
 ) -> NDArray[np.float64]:
     """Adhesive of E2V-CCD250-321, as a smooth model of the map that Guo et al. (2022) fitted.
 

@@ -17,18 +17,14 @@ from numpy.typing import NDArray
 from ..errors import OutOfRangeError
 from ..resources import read_table
 
-__all__ = ["RotationalLevels"]
-
 FloatArray = NDArray[np.float64]
 
-SECOND_RADIATION_CM_K = 1.4387769
-"""hc/k [cm K]."""
+SECOND_RADIATION_CM_K = 1.4387769  # hc/k [cm K]
 
 COLD_K = 191.0
 """Temperature of the cold population of every vibrational level in PALACE, from the fits of `of_reference` [K]."""
 
-GROUND_CM = 1.0
-"""A list of levels that starts below this energy is complete at its lower end [1/cm]."""
+GROUND_CM = 1.0  # A list of levels that starts below this energy is complete at its lower end [1/cm]
 
 
 @dataclass(frozen=True, eq=False)

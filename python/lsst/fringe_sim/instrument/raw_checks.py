@@ -11,24 +11,12 @@ from ..errors import FrameFormatError, UnknownNameError
 from .camera import Camera
 from .detector import Detector
 
-__all__ = [
-    "refuse_binning",
-    "refuse_no_flat",
-    "refuse_other_day",
-    "refuse_other_instrument",
-    "refuse_other_sensor",
-    "refuse_other_unit",
-    "refuse_other_vendor",
-    "refuse_stutter",
-]
-
 OBSERVATION_PREFIX = {"lsstCam": "MC", "ts8": "TS"}
 """First letters of ``OBSID``: main camera, test stand. CC is ComCam, AT the auxiliary telescope."""
 
 SIMULATORS = ("PHOSIM", "IMSIM")
 
-MODELS = {"CCD250": "e2v", "3800C": "itl"}
-"""Vendor by ``CCD_TYPE``."""
+MODELS = {"CCD250": "e2v", "3800C": "itl"}  # Vendor by ``CCD_TYPE``
 
 COUNTS = frozenset({"", "adu", "dn", "count", "counts"})
 """What ``BUNIT`` may say of numbers of the converter, without regard to case."""
@@ -36,11 +24,8 @@ COUNTS = frozenset({"", "adu", "dn", "count", "counts"})
 WITHOUT_FLATS = frozenset({"BIAS", "ZERO", "DARK", "FE55", "PPUMP", "TRAP"})
 """Values of ``TESTTYPE`` of tests whose frames are no flats: no light, X-rays, or charge that was moved."""
 
-FULL_SHAPE = {"e2v": (4004, 4096), "itl": (4000, 4072)}
-"""Rows and columns of a whole sensor, by vendor."""
-
-MOST_DAYS = 1
-"""Days that ``DAYOBS`` may be off: when it begins has changed with time and place."""
+FULL_SHAPE = {"e2v": (4004, 4096), "itl": (4000, 4072)}  # Rows and columns of a whole sensor, by vendor
+MOST_DAYS = 1  # Days that ``DAYOBS`` may be off: when it begins has changed with time and place
 
 
 def refuse_other_instrument(text: Mapping[str, str], camera: str, source: str) -> None:

@@ -13,10 +13,7 @@ import numpy as np
 from ..errors import InputError
 from .raw_frame import RawFrame
 
-__all__ = ["find_raw_files", "pixel_digest"]
-
-SUFFIXES = (".fits", ".fits.fz", ".fits.gz", ".fz")
-"""Endings of the files that are taken from a directory."""
+SUFFIXES = (".fits", ".fits.fz", ".fits.gz", ".fz")  # Endings of the files that are taken from a directory
 
 _ENDINGS = f"one that ends in {', '.join(SUFFIXES)}, or the file itself as PATH"
 

@@ -13,8 +13,6 @@ from ..errors import FrameFormatError, InputError, to_number
 from .header_keywords import RAW_KEYWORDS
 from .stated_facts import SAME_SECONDS
 
-__all__ = ["DeclaredHeader", "header_value"]
-
 _DECLARED = frozenset(keyword.name for keyword in RAW_KEYWORDS)
 
 

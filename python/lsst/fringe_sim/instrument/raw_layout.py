@@ -18,10 +18,7 @@ from ..errors import FrameFormatError
 from .raw_checks import refuse_other_unit
 from .raw_header import header_value
 
-__all__ = ["N_AMPLIFIERS", "AmplifierLayout", "Section", "amplifier_layouts", "image_shape"]
-
-N_AMPLIFIERS = 16
-"""Outputs of an LSST science sensor."""
+N_AMPLIFIERS = 16  # Outputs of an LSST science sensor
 
 
 @dataclasses.dataclass(frozen=True)

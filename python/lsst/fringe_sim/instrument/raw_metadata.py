@@ -186,11 +186,8 @@ class RawMetadata:
 
 def _interpret(header: DeclaredHeader) -> RawMetadata:
     camera = _camera(header)
-    refuse_other_instrument(
-        {key: header.text(key) for key in ("OBSID", "CAMCODE", "TESTTYPE", "CREATOR", "CONTRLLR")},
-        camera,
-        header.source,
-    )
+    told = {key: header.text(key) for key in ("OBSID", "CAMCODE", "TESTTYPE", "CREATOR", "CONTRLLR")}
+    refuse_other_instrument(told, camera, header.source)
     refuse_contradictions([("", header.cards)], lambda _, keyword: header.value(keyword), header.source)
     observation_type = _observation_type(header)
     refuse_stutter(header.value("STUTTER ROWS"), observation_type, header.source)

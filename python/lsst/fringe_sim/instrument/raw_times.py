@@ -12,8 +12,6 @@ from astropy.time import Time
 from .raw_checks import refuse_other_day
 from .raw_header import DeclaredHeader
 
-__all__ = ["DAY_ROLLOVER_H", "begin_of_exposure", "day_and_sequence", "exposure_id", "time_scale"]
-
 CONTROLLERS = "OCHPQS"
 """Data-acquisition controllers of the LSST Camera; the place adds thousands of years to the exposure number."""
 
@@ -23,8 +21,7 @@ LAST_DAY_OF_OWN_COUNT = {"C": 20231004, "P": 20250417, "Q": 20250417, "S": 20250
 TS8_NUMBERED_SINCE = datetime.datetime(2023, 5, 24, 23)
 """Since then exposures of TS8 are numbered like those of the camera (obs_lsst)."""
 
-OF_RUBIN = ("ts8", "lsstCam")
-"""Cameras whose headers state times in TAI unless they say otherwise (obs_lsst)."""
+OF_RUBIN = ("ts8", "lsstCam")  # Cameras whose headers state times in TAI unless they say otherwise (obs_lsst)
 
 DAY_ROLLOVER_H = {"ts8": 8.0, "lsstCam": 12.0, "monocam": 12.0}
 """UTC hour at which the observing day begins, as obs_lsst has it."""
@@ -32,13 +29,7 @@ DAY_ROLLOVER_H = {"ts8": 8.0, "lsstCam": 12.0, "monocam": 12.0}
 MJD_DIGITS_S = 1.0
 """What a date and the same as a modified Julian date may differ by: some headers state five decimals of a day."""
 
-_DATES = (
-    ("DATE-BEG", "isot"),
-    ("MJD-BEG", "mjd"),
-    ("DATE-OBS", "isot"),
-    ("MJD-OBS", "mjd"),
-    ("MJD", "mjd"),
-)
+_DATES = (("DATE-BEG", "isot"), ("MJD-BEG", "mjd"), ("DATE-OBS", "isot"), ("MJD-OBS", "mjd"), ("MJD", "mjd"))
 """Keywords of the begin of the exposure, and their formats."""
 
 

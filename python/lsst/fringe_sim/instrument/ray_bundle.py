@@ -11,17 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import OutOfRangeError
 from ..optics import Beam
 
-__all__ = [
-    "BEAM_NODES",
-    "QUANTILES",
-    "RayBundle",
-    "beam_of_quantiles",
-    "gauss_rule",
-    "lagrange_weights",
-    "quantiles",
-    "reduce_beam",
-]
-
 FloatArray = NDArray[np.float64]
 
 BEAM_NODES = 96
@@ -34,8 +23,7 @@ and its second harmonic; the third makes an error of 4 % of the peak-to-peak of 
 SAME_PLACE = 1e-10
 """Distance of points, relative to half the range of all, at which a Gauss rule takes them for one."""
 
-QUANTILES = 4096
-"""Groups of equal light into which the rays are gathered before the Gauss rule is formed."""
+QUANTILES = 4096  # Groups of equal light into which the rays are gathered before the Gauss rule is formed
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,12 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import named_units
 from .bandpass import Bandpass
 
-__all__ = [
-    "electrons_to_microjansky",
-    "magnitude_to_microjansky",
-    "microjansky_to_magnitude",
-    "zero_point",
-]
+__all__ = ["electrons_to_microjansky", "magnitude_to_microjansky", "microjansky_to_magnitude", "zero_point"]
 
 FloatArray = NDArray[np.float64]
 

@@ -29,11 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Setup", "setup_names"]
 
 _PROFILES = {"gaussian": GaussianProfile, "triangular": TriangularProfile}
-_BEAM_KEYS = {
-    "collimated": set[str](),
-    "cone": {"f_number", "obscuration"},
-    "telescope": {"telescope"},
-}
+_BEAM_KEYS = {"collimated": set[str](), "cone": {"f_number", "obscuration"}, "telescope": {"telescope"}}
 
 
 SAME_WAVELENGTH_NM = 1.0
@@ -251,10 +247,9 @@ class Setup(InNotebook):
             raise InputError(
                 "thickness_range_um", [low, high], "two increasing numbers", source=reader.source
             )
-        laboratory = kind == "monochromator"
-        bandwidth = light.number("bandwidth_fwhm_nm", low=0.0, high=200.0) if laboratory else 0.0
         temperature_k = reader.number("temperature_k", low=100.0, high=400.0)
         named = [reader.text("camera"), reader.text("stack"), reader.optional("media", "")]
+        cone = beam_kind == "cone"
         setup = cls(
             name=name,
             title=reader.text("title"),
@@ -266,29 +261,12 @@ class Setup(InNotebook):
             thickness_range_um=(low, high),
             temperature_k=temperature_k,
             kind=kind,
-            bandwidth_fwhm_nm=bandwidth,
-            profile_name=light.choice("profile", tuple(_PROFILES)) if laboratory else "",
-            wavelengths_nm=tuple(light.numbers("wavelengths_nm")) if laboratory else (),
             beam_kind=beam_kind,
-            f_number=beam.number("f_number", low=0.5, high=1e6) if beam_kind == "cone" else float("inf"),
-            obscuration=(
-                beam.number("obscuration", low=0.0, high=0.999, default=0.0) if beam_kind == "cone" else 0.0
-            ),
+            f_number=beam.number("f_number", low=0.5, high=1e6) if cone else float("inf"),
+            obscuration=beam.number("obscuration", low=0.0, high=0.999, default=0.0) if cone else 0.0,
             telescope=beam.text("telescope") if beam_kind == "telescope" else "",
-            bandpass="" if laboratory else light.text("bandpass"),
-            effective_area_m2=0.0 if laboratory else light.number("effective_area_m2", low=1e-6, high=1e6),
-            pixel_scale_arcsec=0.0 if laboratory else light.number("pixel_scale_arcsec", low=1e-6, high=1e4),
-            exposure_s=0.0 if laboratory else light.number("exposure_s", low=0.0, high=LONGEST_EXPOSURE_S),
-            airmass=0.0 if laboratory else light.number("airmass", low=1.0, high=10.0),
-            wavelength_accuracy_nm=(
-                light.number("wavelength_accuracy_nm", low=0.0, high=20.0, default=WAVELENGTH_ACCURACY_NM)
-                if laboratory
-                else 0.0
-            ),
-            laboratory_temperature_k=(
-                None
-                if laboratory
-                else reader.number("laboratory_temperature_k", low=100.0, high=400.0, default=temperature_k)
+            **(
+                _of_monochromator(light) if kind == "monochromator" else _of_sky(light, reader, temperature_k)
             ),
         )
         setup.stack.position(setup.varying)
@@ -367,3 +345,41 @@ def _vendor_of(setup: Setup) -> str:
 @functools.lru_cache(maxsize=32)
 def _shipped(name: str) -> Setup:
     return Setup.from_mapping(name, read_yaml("setups", f"{name}.yaml"), source_file=f"set-up {name}")
+
+
+def _of_monochromator(light: Description) -> dict[str, Any]:
+    """What a set-up of the laboratory says of its light, and nothing of the sky."""
+    return {
+        "bandwidth_fwhm_nm": light.number("bandwidth_fwhm_nm", low=0.0, high=200.0),
+        "profile_name": light.choice("profile", tuple(_PROFILES)),
+        "wavelengths_nm": tuple(light.numbers("wavelengths_nm")),
+        "wavelength_accuracy_nm": light.number(
+            "wavelength_accuracy_nm", low=0.0, high=20.0, default=WAVELENGTH_ACCURACY_NM
+        ),
+        "bandpass": "",
+        "effective_area_m2": 0.0,
+        "pixel_scale_arcsec": 0.0,
+        "exposure_s": 0.0,
+        "airmass": 0.0,
+    }
+
+
+def _of_sky(light: Description, reader: Description, temperature_k: float) -> dict[str, Any]:
+    """What a set-up at a telescope says of the sky, and nothing of a lamp."""
+    limits = {
+        "effective_area_m2": (1e-6, 1e6),
+        "pixel_scale_arcsec": (1e-6, 1e4),
+        "exposure_s": (0.0, LONGEST_EXPOSURE_S),
+        "airmass": (1.0, 10.0),
+    }
+    return {
+        "bandpass": light.text("bandpass"),
+        **{name: light.number(name, low=low, high=high) for name, (low, high) in limits.items()},
+        "laboratory_temperature_k": reader.number(
+            "laboratory_temperature_k", low=100.0, high=400.0, default=temperature_k
+        ),
+        "bandwidth_fwhm_nm": 0.0,
+        "profile_name": "",
+        "wavelengths_nm": (),
+        "wavelength_accuracy_nm": 0.0,
+    }

@@ -114,9 +114,7 @@ class EmissionLines(OneLine):
     @classmethod
     @named_units
     def oh(
-        cls,
-        rotational_temperature_k: float | None = None,
-        vibrational_temperature_k: float | None = None,
+        cls, rotational_temperature_k: float | None = None, vibrational_temperature_k: float | None = None
     ) -> EmissionLines:
         """OH lines between 880 and 1110 nm, recomputed from Einstein coefficients and populations.
 

@@ -12,19 +12,6 @@ from typing import Any
 
 from ..errors import FrameFormatError, InputError, to_number
 
-__all__ = [
-    "FILTER_RANGE_NM",
-    "NO_READING_C",
-    "RAW_FACTS",
-    "SAME_CELSIUS",
-    "SAME_SECONDS",
-    "SETTING_NM",
-    "Fact",
-    "Statement",
-    "refuse_contradictions",
-    "refuse_other_filter",
-]
-
 SETTING_NM = 1.0
 """What two readings of one setting of the monochromator may differ by; steps between flats are 5 nm or more."""
 
@@ -37,11 +24,8 @@ In headers of obs_lsst that state both (TS3, TS8) it is 0.1 to 0.5; flats of one
 NO_READING_C = -200.0
 """Readings up to this are those of a sensor of temperature that is not connected, as -260 [°C]."""
 
-SAME_SECONDS = 0.1
-"""Digits of exposure times: those of obs_lsst are repeated to a millisecond."""
-
-Statement = tuple[str, Any]
-"""A keyword, with its HDU where that is not the first, and its value."""
+SAME_SECONDS = 0.1  # Digits of exposure times: those of obs_lsst are repeated to a millisecond
+Statement = tuple[str, Any]  # A keyword, with its HDU where that is not the first, and its value
 
 
 @dataclass(frozen=True)

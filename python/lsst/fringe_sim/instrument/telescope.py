@@ -19,23 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..descriptions import is_file_name, read_description
-from ..errors import (
-    InputError,
-    OutOfRangeError,
-    ResourceError,
-    UnknownNameError,
-    named_units,
-    printable_name,
-)
+from ..errors import InputError, OutOfRangeError, ResourceError, UnknownNameError, named_units, printable_name
 from ..optics import Beam
 from ..resources import first_line, list_resources, read_yaml
-from .ray_bundle import (
-    BEAM_NODES,
-    RayBundle,
-    beam_of_quantiles,
-    gauss_rule,
-    reduce_beam,
-)
+from .ray_bundle import BEAM_NODES, RayBundle, beam_of_quantiles, gauss_rule, reduce_beam
 
 __all__ = [
     "ConeOptics",

@@ -23,8 +23,6 @@ from ..errors import InputError, UnknownNameError
 from ..instrument.detector import Detector
 from .instruments import INSTRUMENTS, FringeInstrument
 
-__all__ = ["AdoptionReport", "adopt_datasets"]
-
 
 @dataclasses.dataclass(frozen=True)
 class AdoptionReport:

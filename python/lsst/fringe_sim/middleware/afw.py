@@ -10,8 +10,6 @@ from ..errors import InputError
 from ..products import MASK_PLANES, FringeFrame, ObservedFrame, mask_bits
 from ..products.sky_frame import CORRECTED_BY
 
-__all__ = ["frame_from_exposure", "observed_from_exposure", "put_into_exposure", "read_exposure"]
-
 UNITS = ("BUNIT", "LSST ISR UNITS")
 """Keywords that name the unit of an exposure: that of FITS, and that of ip_isr."""
 

@@ -17,8 +17,6 @@ from typing import Any
 from lsst.ctrl.bps import initialize
 from lsst.resources import ResourcePath
 
-__all__ = ["accept_resources", "point_to_this_environment"]
-
 
 def point_to_this_environment() -> None:
     """Let the commands of bps find the programs that are installed beside this Python."""

@@ -11,8 +11,6 @@ from lsst.ctrl.bps.htcondor import HTCondorService
 
 from .bps_environment import accept_resources, point_to_this_environment
 
-__all__ = ["FringeHTCondorService"]
-
 
 class FringeHTCondorService(HTCondorService):
     """HTCondor without Rubin's own installation; see `bps_environment`."""

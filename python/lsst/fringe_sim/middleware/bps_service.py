@@ -16,8 +16,6 @@ from lsst.ctrl.bps.parsl.workflow import ParslWorkflow
 
 from .bps_environment import accept_resources, point_to_this_environment
 
-__all__ = ["FringeParslService", "failed_jobs"]
-
 
 def failed_jobs(workflow: Any) -> list[str]:
     """Names of the jobs of a workflow that ended with an error, or that had to wait for one that did."""

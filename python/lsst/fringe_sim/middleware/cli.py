@@ -19,16 +19,6 @@ from ..errors import FringeSimError
 if TYPE_CHECKING:
     from lsst.daf.butler import Butler
 
-__all__ = [
-    "adopt_sensor_datasets",
-    "define_fringe_night",
-    "get_cli_subcommands",
-    "ingest_fringe_raws",
-    "prepare_fringe_repo",
-    "recover_fringe_repo",
-    "write_fringe_handoff",
-]
-
 
 def get_cli_subcommands() -> list[click.Command]:
     """Return the subcommands; the entry point ``butler.cli`` leads here."""

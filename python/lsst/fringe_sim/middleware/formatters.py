@@ -16,19 +16,10 @@ from ..products import FringeFrame, SensorSection
 from .afw import read_exposure
 from .instruments import sensor_of
 
-__all__ = [
-    "ConfigOverrideFormatter",
-    "FitsProductFormatter",
-    "FringeFrameFormatter",
-    "RawFrameFormatter",
-    "StrictJsonFormatter",
-]
-
 PROVENANCE_PREFIX = "LSST BUTLER"
 """Start of the header keywords that say from which datasets a product was made, as in other Rubin images."""
 
-MOST_INPUTS_IN_HEADER = 1000
-"""With more inputs than this only their number is written."""
+MOST_INPUTS_IN_HEADER = 1000  # With more inputs than this only their number is written
 
 LONGEST_RUN_IN_HEADER = 60
 """Names of runs beyond this length would need continued cards under long keywords, which not every reader takes."""

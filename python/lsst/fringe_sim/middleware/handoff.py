@@ -23,17 +23,13 @@ from lsst.daf.butler.registry import RegistryError
 from ..errors import InputError
 from ..files import write_whole
 
-__all__ = ["EXPORT_FILE", "FRINGE", "ISR_FILE", "isr_override", "write_handoff"]
-
-FRINGE = "fringe"
-"""Dataset type that Rubin's instrument signature removal reads."""
+FRINGE = "fringe"  # Dataset type that Rubin's instrument signature removal reads
 
 EXPORT_FILE = "export.yaml"
 
 ISR_FILE = "isr_fringe.py"
 
-APERTURES = 20_000
-"""Places at which the scale of a template is measured; the default of ip_isr is 30 000."""
+APERTURES = 20_000  # Places at which the scale of a template is measured; the default of ip_isr is 30 000
 
 EXPOSURE_FORMATTER = "lsst.obs.base.formatters.fitsExposure.FitsExposureFormatter"
 

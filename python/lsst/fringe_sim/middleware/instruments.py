@@ -19,20 +19,9 @@ from ..errors import InputError, UnknownNameError
 from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 
-__all__ = [
-    "INSTRUMENTS",
-    "FringeInstrument",
-    "HscFringe",
-    "LsstCamFringe",
-    "MonoCamFringe",
-    "Ts8Fringe",
-    "sensor_of",
-]
-
 _LOG = logging.getLogger(__name__)
 
-NO_FILTER = "none"
-"""Physical filter of frames without light and of white light."""
+NO_FILTER = "none"  # Physical filter of frames without light and of white light
 
 MONOCHROMATOR = "monochromator"
 """Physical filter of flats whose colour a monochromator sets; the wavelength is ``exposure.target_name``."""

@@ -21,8 +21,6 @@ from lsst.daf.butler.registry import ConflictingDefinitionError
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from .instruments import INSTRUMENTS, FringeInstrument
 
-__all__ = ["NightPlan", "airmass_of", "define_night", "hour_of_night", "parse_hours"]
-
 SIMULATED_YEARS = 50_000_000
 """Added to the day in the number of an exposure: the place of controller S, for simulated exposures."""
 

@@ -40,10 +40,7 @@ from .formatters import RawFrameFormatter
 from .instruments import INSTRUMENTS, FringeInstrument
 from .translators import TRANSLATORS
 
-__all__ = ["RAW", "IngestReport", "RawExposure", "examine", "ingest_raws", "raw_dataset_type"]
-
-RAW = "raw"
-"""Dataset type of raw frames."""
+RAW = "raw"  # Dataset type of raw frames
 
 COMPARED_BLOCKS, COMPARED_BYTES = 64, 8192
 """Blocks in which a file is compared with that in the repository, and their length."""
@@ -96,8 +93,7 @@ def raw_dataset_type(butler: Butler) -> DatasetType:
     )
 
 
-ATTEMPTS = 3
-"""How often frames are looked for and stored, if other processes store them at the same time."""
+ATTEMPTS = 3  # How often frames are looked for and stored, if other processes store them at the same time
 
 
 def ingest_raws(

@@ -17,8 +17,6 @@ from lsst.daf.butler import Butler, ButlerConfig, Config
 from ..errors import InputError
 from ..files import write_whole
 
-__all__ = ["open_repository", "prepare_repository", "recover_repository", "require_prepared", "unprepared"]
-
 SEED = "resource://lsst.fringe_sim/configs/butler.yaml"
 """Storage classes and formatters that a repository needs for the datasets of this package."""
 

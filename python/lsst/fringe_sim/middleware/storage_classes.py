@@ -9,8 +9,6 @@ import functools
 
 from lsst.daf.butler import Config, StorageClassConfig, StorageClassFactory
 
-__all__ = ["STORAGE_CLASSES", "register_storage_classes"]
-
 STORAGE_CLASSES = "resource://lsst.fringe_sim/configs/storageClasses.yaml"
 """Where the storage classes are defined."""
 

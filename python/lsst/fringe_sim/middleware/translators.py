@@ -17,15 +17,6 @@ from ..errors import InputError
 from ..instrument.raw_metadata import DAY_ROLLOVER_H, RawMetadata
 from .instruments import INSTRUMENTS, MONOCHROMATOR, NO_FILTER
 
-__all__ = [
-    "TRANSLATORS",
-    "FringeLsstCamTranslator",
-    "FringeMonoCamTranslator",
-    "FringeTranslator",
-    "FringeTs8Translator",
-    "target_name",
-]
-
 NO_TARGET = "none"
 
 

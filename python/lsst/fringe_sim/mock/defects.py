@@ -10,18 +10,9 @@ from numpy.typing import NDArray
 from ..errors import OutOfRangeError
 from ..instrument.detector import Detector
 
-__all__ = ["Defects", "draw_defects"]
-
-BRIGHT_COLUMN_E = 2_000.0
-"""Charge that a bright column adds to a flat [electrons]."""
-
-
-DEAD_COLUMN_RESPONSE = 0.4
-"""Response of a dead column."""
-
-
-HOT_PIXEL_E = (4_000.0, 30_000.0)
-"""Range of the charge that a hot pixel adds to a flat [electrons]."""
+BRIGHT_COLUMN_E = 2_000.0  # Charge that a bright column adds to a flat [electrons]
+DEAD_COLUMN_RESPONSE = 0.4  # Response of a dead column
+HOT_PIXEL_E = (4_000.0, 30_000.0)  # Range of the charge that a hot pixel adds to a flat [electrons]
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,6 @@ from ..compiled import kernel
 if TYPE_CHECKING:
     from .optics import Film, FlatFieldOptics
 
-__all__ = ["Light", "add_mode", "add_periodic_mode", "light_in"]
-
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 

@@ -12,8 +12,6 @@ from ..effects import Parameter
 from ..effects.base import Described
 from .optics import FlatFieldOptics
 
-__all__ = ["RIM_POINTS", "RIM_SQUARES", "ActiveHiddenEffect", "AmplifierState", "HiddenEffect", "Island"]
-
 FloatArray = NDArray[np.float64]
 Values = Mapping[str, float]
 
@@ -89,5 +87,4 @@ class HiddenEffect(Described):
         return {p.name: values.get(p.name, p.null) for p in self.parameters}
 
 
-ActiveHiddenEffect = tuple[HiddenEffect, Mapping[str, float]]
-"""An effect and the values given for it."""
+ActiveHiddenEffect = tuple[HiddenEffect, Mapping[str, float]]  # An effect and the values given for it

@@ -30,20 +30,7 @@ from .hidden_effect import (
 )
 from .optics import Film, FlatFieldOptics
 
-__all__ = [
-    "HIDDEN_EFFECTS",
-    "ActiveHiddenEffect",
-    "AmplifierState",
-    "HiddenEffect",
-    "Island",
-    "added_silicon",
-    "hidden_islands",
-    "validate_effects",
-    "with_hidden_optics",
-]
-
-REFERENCE_CHARGE_E = 100_000.0
-"""Charge at which the coefficient of the non-linearity is stated [electrons]."""
+REFERENCE_CHARGE_E = 100_000.0  # Charge at which the coefficient of the non-linearity is stated [electrons]
 
 COLOUR_PIVOT_NM, COLOUR_REACH_NM = 935.0, 50.0
 """Wavelength at which a chromatic illumination is even, and distance to that at which its numbers are stated [nm]."""
@@ -52,9 +39,7 @@ XENON_REFERENCE_NM, XENON_FWHM_NM = 992.592, 2.0
 """The line whose peak is the strength of all, and the width of each [nm]."""
 
 
-def validate_effects(
-    settings: Mapping[str, Any] | None,
-) -> tuple[tuple[HiddenEffect, dict[str, float]], ...]:
+def validate_effects(settings: Mapping[str, Any] | None) -> tuple[tuple[HiddenEffect, dict[str, float]], ...]:
     """Check settings and return the effects with their values, in the order of the catalogue.
 
     Parameters

@@ -9,8 +9,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LINE_SHAPES", "LINE_STEP_NM"]
-
 FloatArray = NDArray[np.float64]
 
 LINE_STEP_NM = 0.03

@@ -16,8 +16,6 @@ from ..descriptions import read_table_of
 from ..errors import OutOfRangeError, UnknownNameError
 from ..resources import read_table, read_user_yaml, read_yaml
 
-__all__ = ["material_index"]
-
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
@@ -27,8 +25,7 @@ GREEN_TEMPERATURE_K = 300.0
 EXTINCTION_FLOOR = 1e-12
 
 
-COLD_RANGE_NM = (300.0, 1200.0)
-"""Wavelengths at which silicon was measured cold (Franta et al. 2017) [nm]."""
+COLD_RANGE_NM = (300.0, 1200.0)  # Wavelengths at which silicon was measured cold (Franta et al. 2017) [nm].
 
 
 def material_index(

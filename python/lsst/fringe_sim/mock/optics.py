@@ -24,26 +24,18 @@ from .line_shapes import LINE_SHAPES, LINE_STEP_NM
 from .materials import material_index
 from .signal_table import SignalTable
 
-__all__ = ["Film", "FlatFieldOptics", "SignalTable", "material_index"]
-
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
-DISPERSION_PIVOT_NM = 960.0
-"""Wavelength at which added dispersion leaves the index as it is [nm]."""
-
-SCALE_PIVOT_NM = 935.0
-"""Wavelength at which an error of the wavelength scale vanishes [nm]."""
-
-TABLE_STEP_UM = 0.003
-"""Spacing of the thickness grid [µm]: a hundred points per fringe order."""
+DISPERSION_PIVOT_NM = 960.0  # Wavelength at which added dispersion leaves the index as it is [nm]
+SCALE_PIVOT_NM = 935.0  # Wavelength at which an error of the wavelength scale vanishes [nm]
+TABLE_STEP_UM = 0.003  # Spacing of the thickness grid [µm]: a hundred points per fringe order
 
 HEIGHT_STEP_NM = 25.0
 """Largest spacing of the thicknesses inside a pixel [nm]: a fifth of a fringe in silicon."""
 
-HEIGHT_REACH = 5.0
-"""Largest departure of the thickness inside a pixel in standard deviations."""
+HEIGHT_REACH = 5.0  # Largest departure of the thickness inside a pixel in standard deviations
 
 RELATIVE_TOLERANCE = 1e-5
 """Largest error of a table that is accepted, relative to its mean: 1/700 of the noise of a 20 000 e⁻ pixel."""
@@ -88,8 +80,7 @@ class Film:
         return n + 1j * (table.imag * self.extinction_scale + self.extinction_shift)
 
 
-PHASES = 16
-"""Thicknesses within a fringe over which the part that all phases have in common is averaged."""
+PHASES = 16  # Thicknesses within a fringe over which the part that all phases have in common is averaged
 
 
 @dataclass(frozen=True)

@@ -17,16 +17,9 @@ from ..files import all_or_nothing
 from ..instrument.camera import Amplifier, Camera, Detector, RawSegment
 from .readout import BIAS_LEVEL_ADU, raw_segment
 
-__all__ = ["Clock", "primary_header", "write_frame"]
-
-EXPOSURE_BASE_S = 12.0
-"""Exposure time at 800 nm [s]."""
-
-READOUT_S = 40
-"""Time between two exposures [s]."""
-
-DAY_ROLLOVER_H = 8
-"""UTC hour at which the observing day of the test stand begins."""
+EXPOSURE_BASE_S = 12.0  # Exposure time at 800 nm [s]
+READOUT_S = 40  # Time between two exposures [s]
+DAY_ROLLOVER_H = 8  # UTC hour at which the observing day of the test stand begins
 
 
 class Clock:
@@ -49,11 +42,8 @@ def exposure_time(wavelength_nm: float | None) -> float:
     return round(EXPOSURE_BASE_S * math.exp(max(wavelength_nm - 800.0, 0.0) / 120.0), 3)
 
 
-LSST_LAYOUT = frozenset({"lsstCam", "ts8", "monocam"})
-"""Cameras whose raw frames are in the LSST layout."""
-
-OVERSCAN_PX = 32
-"""Columns of overscan of an amplifier whose raw layout is not known."""
+LSST_LAYOUT = frozenset({"lsstCam", "ts8", "monocam"})  # Cameras whose raw frames are in the LSST layout
+OVERSCAN_PX = 32  # Columns of overscan of an amplifier whose raw layout is not known
 
 
 def with_raw_layout(sensor: Detector) -> Detector:

@@ -28,23 +28,12 @@ from .raw_files import Clock, primary_header, with_raw_layout, write_frame
 from .readout import Readout
 from .sensor_signal import SensorSignal
 
-__all__ = [
-    "Defects",
-    "MockExposure",
-    "MockRun",
-    "MockTruth",
-    "parse_size",
-    "setup_optics",
-    "write_mock_flats",
-]
-
 FloatArray = NDArray[np.float64]
 
 DEFAULT_LEVEL_E = 20_000.0
 DEFAULT_BIAS_FRAMES = 5
 
-LEVEL_SCATTER = 0.01
-"""Rms scatter of the level of the flats."""
+LEVEL_SCATTER = 0.01  # Rms scatter of the level of the flats
 
 FIRST_EXPOSURE = datetime.datetime(2018, 7, 24, 10, 0, 0)
 
@@ -341,6 +330,7 @@ def _sensor(camera: str, detector: int | str, size: str | None) -> Detector:
 
 
 def checked_thickness(thickness_um: NDArray[np.floating], shape: tuple[int, int]) -> FloatArray:
+    """Map that has the shape of its sensor and positive numbers everywhere."""
     thickness = np.asarray(thickness_um, dtype=float)
     if thickness.shape != shape:
         raise InputError(

@@ -14,25 +14,17 @@ from ..errors import InputError
 from ..instrument.camera import Amplifier, Detector, RawSegment
 from .hidden_effects import AmplifierState, HiddenEffect
 
-__all__ = ["Readout", "raw_segment"]
-
 FloatArray = NDArray[np.float64]
 ActiveEffects = Sequence[tuple[HiddenEffect, dict[str, float]]]
 
-ADC_MAXIMUM = 2**18 - 1
-"""Largest number of the 18-bit converters [ADU]."""
+ADC_MAXIMUM = 2**18 - 1  # Largest number of the 18-bit converters [ADU]
 
 BIAS_LEVEL_ADU = (27_000.0, 300.0)
 """Mean and scatter between amplifiers of the level without signal [ADU]; TS8 frames show about 27 000."""
 
-ROW_DRIFT_ADU = 0.5
-"""Rms of the slow wander of the level from row to row [ADU]."""
-
-BIAS_PATTERN_ADU = 1.0
-"""Rms of the fixed pattern of the columns of an amplifier [ADU]."""
-
-BIAS_RAMP = (4.0, 12.0)
-"""Height [ADU] and length [px] of the settling of the output at the start of each row."""
+ROW_DRIFT_ADU = 0.5  # Rms of the slow wander of the level from row to row [ADU]
+BIAS_PATTERN_ADU = 1.0  # Rms of the fixed pattern of the columns of an amplifier [ADU]
+BIAS_RAMP = (4.0, 12.0)  # Height [ADU] and length [px] of the settling of the output at the start of each row
 
 DEFERRED_CHARGE = (2e-4, 0.25)
 """Part of the last pixel's charge found in the first overscan pixel, and ratio from one pixel to the next."""

@@ -14,8 +14,6 @@ from .optics import FlatFieldOptics
 from .silicon_tables import SiliconTables
 from .thickness import PixelArea
 
-__all__ = ["SensorSignal"]
-
 FloatArray = NDArray[np.float64]
 
 

@@ -12,8 +12,6 @@ from scipy.interpolate import CubicSpline
 from ..compiled import kernel
 from ..errors import OutOfRangeError
 
-__all__ = ["SignalTable"]
-
 FloatArray = NDArray[np.float64]
 
 

@@ -19,19 +19,14 @@ from ..errors import ConvergenceError
 from .optics import RELATIVE_TOLERANCE, FlatFieldOptics
 from .signal_table import SignalTable
 
-__all__ = ["SiliconTables"]
-
 FloatArray = NDArray[np.float64]
 Seen = Callable[..., FloatArray]
 
 PER_ORDER = 6
 """Detection layers in one of its fringes, at first; twice as many until the error is small enough."""
 
-HALVINGS = 4
-"""Times that their number is doubled at most."""
-
-STENCIL = 8
-"""Neighbours that take part in the interpolation: the polynomial of seventh degree through them."""
+HALVINGS = 4  # Times that their number is doubled at most
+STENCIL = 8  # Neighbours that take part in the interpolation: the polynomial of seventh degree through them
 
 PROBES = 5
 """Places between detection layers, and thicknesses of the varying layer at each, at which the error is measured."""

@@ -16,13 +16,7 @@ from numpy.typing import NDArray
 from ..errors import OutOfRangeError
 from ..instrument.measured_thickness import E2V_SHAPE, e2v_321, fit_to_sensor
 
-__all__ = [
-    "E2V_SHAPE",
-    "PixelArea",
-    "e2v_321",
-    "fit_to_sensor",
-    "random_field",
-]
+__all__ = ["E2V_SHAPE", "PixelArea", "e2v_321", "fit_to_sensor", "random_field"]
 
 GAUSS_NODES = ((-0.5 * math.sqrt(0.6), 5.0 / 18.0), (0.0, 4.0 / 9.0), (0.5 * math.sqrt(0.6), 5.0 / 18.0))
 """Places along a side of a pixel [px] and their weights: exact to the fifth power."""

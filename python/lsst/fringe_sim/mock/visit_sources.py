@@ -17,15 +17,10 @@ from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
 from ..instrument.readout import zero_point
 
-__all__ = ["MASK_PLANES", "Pointing", "Scene", "VisitConditions", "VisitImage", "expected_sources"]
-
 FloatArray = NDArray[np.float64]
 
-MASK_PLANES = {"BAD": 0, "SAT": 1}
-"""Bits as Rubin's masks have them."""
-
-CENTRE_DEG = (150.1, 2.2)
-"""Right ascension and declination about which the visits point."""
+MASK_PLANES = {"BAD": 0, "SAT": 1}  # Bits as Rubin's masks have them
+CENTRE_DEG = (150.1, 2.2)  # Right ascension and declination about which the visits point
 
 BRIGHTEST, COUNTED, FAINTEST = 13.0, 22.0, 24.0
 """Magnitudes: of the brightest source, down to which densities are given, and of the faintest source."""
@@ -33,18 +28,14 @@ BRIGHTEST, COUNTED, FAINTEST = 13.0, 22.0, 24.0
 STAR_SLOPE, GALAXY_SLOPE = 0.2, 0.4
 """Slopes of log counts with magnitude: stars near the galactic pole, galaxies brighter than their turnover."""
 
-BLUR_OF_A_RAY_PX = 0.4
-"""Diffusion of the charge of a cosmic ray [px rms]."""
-
-RAY_E_PER_UM = 80.0
-"""Charge that a minimum ionising particle leaves in silicon [e⁻ / µm]."""
+BLUR_OF_A_RAY_PX = 0.4  # Diffusion of the charge of a cosmic ray [px rms]
+RAY_E_PER_UM = 80.0  # Charge that a minimum ionising particle leaves in silicon [e⁻ / µm]
 
 STAMP_PX, STAMP_ARCSEC = 513, 102.6
 """Largest side of the image of a source, and of that of a bright star: GalSim's Fourier transform of a star over many
 arcminutes does not fit into memory."""
 
-MOST_SOURCES = 100_000
-"""In a visit: some twenty seconds. A whole sensor of the LSST has 18,000."""
+MOST_SOURCES = 100_000  # In a visit: some twenty seconds. A whole sensor of the LSST has 18,000.
 
 DTYPE = [("x", float), ("y", float), ("magnitude", float), ("electrons", float), ("galaxy", bool)]
 

@@ -34,8 +34,6 @@ from .raw_frames import checked_thickness, films_of, parse_size, read_setup_file
 from .signal_table import SignalTable
 from .visit_sources import MASK_PLANES, Pointing, Scene, VisitConditions, VisitImage, expected_sources
 
-__all__ = ["MockVisit", "VisitConditions", "check_visits", "detected_sky", "write_mock_visits"]
-
 FloatArray = NDArray[np.float64]
 
 STEP_UM = 0.01
@@ -44,8 +42,7 @@ STEP_UM = 0.01
 BEAM_NODES = 64
 """Angles of the beam; twice as many change the fringes of the centre of the LSST by less than 1e-5."""
 
-BLEND_NM = 0.005
-"""Rms shift of lines that are summed as one [nm]; a fringe of all the silicon is 1.3 nm wide."""
+BLEND_NM = 0.005  # Rms shift of lines that are summed as one [nm]; a fringe of all the silicon is 1.3 nm wide
 
 FIELD_NODES = 2
 """Distances from the axis at which the beam is traced; between them light changes with the square of the distance."""
@@ -53,8 +50,7 @@ FIELD_NODES = 2
 CONTINUUM_NODES, CONTINUUM_STEP_NM = 8, 0.1
 """Angles and spacing of the wavelengths of continua: with 96 angles fringes differ by 3e-4, with 0.5 nm by 6e-2."""
 
-PARTS = 3
-"""Moments of an exposure over which the drifting bands are averaged."""
+PARTS = 3  # Moments of an exposure over which the drifting bands are averaged
 
 FIRST_VISIT = datetime.datetime(2026, 1, 15, 1, 0, tzinfo=datetime.UTC)
 

@@ -9,15 +9,6 @@ from collections.abc import Mapping
 from ..effects import catalogue_of, known_effects
 from ..errors import InputError
 
-__all__ = [
-    "effects_override",
-    "ended",
-    "is_as_written",
-    "read_effects_override",
-    "refuse_other_effects",
-    "written_effects",
-]
-
 _STATEMENT = re.compile(r"""config\.effects\[(["'])([\w.]+)\1\]\s*=\s*([^#]+?)\s*(?:#.*)?""")
 
 _WRITTEN = "config.written_effects = "

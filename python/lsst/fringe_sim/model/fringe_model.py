@@ -32,8 +32,6 @@ from ..optics.system import OpticalSystem
 from .response_table import DEFAULT_TOLERANCE, ResponseTable, response_table, tabulate
 from .spectrum import StackSpectrum, spectrum_of
 
-__all__ = ["LABORATORY_TEMPERATURE", "FringeModel"]
-
 FloatArray = NDArray[np.float64]
 
 LABORATORY_TEMPERATURE = "LABTEMP"

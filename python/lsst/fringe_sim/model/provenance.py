@@ -34,18 +34,6 @@ from ..optics.stack import LayerStack
 from ..optics.system import OpticalSystem
 from ..resources import REVISION_LENGTH, read_user_yaml, read_yaml, revision
 
-__all__ = [
-    "SKY_TABLES",
-    "effect_cards",
-    "effects_of_header",
-    "input_cards",
-    "inputs_of_header",
-    "model_cards",
-    "software_cards",
-    "table_cards",
-    "tables_of",
-]
-
 PACKAGES = {
     "NUMPY": "numpy",
     "SCIPY": "scipy",

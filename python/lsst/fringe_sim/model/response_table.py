@@ -17,8 +17,6 @@ from ..notebook import OneLine
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
 
-__all__ = ["DEFAULT_TOLERANCE", "ResponseTable", "response_table", "tabulate"]
-
 FloatArray = NDArray[np.float64]
 Sampler = Callable[[float, float, int], FloatArray]
 """``(start_um, step_um, count) -> response [W, count]`` on a uniform grid of thickness."""
@@ -26,11 +24,8 @@ Sampler = Callable[[float, float, int], FloatArray]
 DEFAULT_TOLERANCE = 1e-7
 """Interpolation error that is asked for by default: about the rounding of the float32 frames."""
 
-MOST_POINTS = 4_000_000
-"""Points of one row; a table that wants more is refused."""
-
-_LEAST_PIXELS = 20_000
-"""Pixels that are worth a thread."""
+MOST_POINTS = 4_000_000  # Points of one row; a table that wants more is refused
+_LEAST_PIXELS = 20_000  # Pixels that are worth a thread
 _REFINEMENTS = 6
 
 

@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 from ..compiled import kernel, run_shares
 from .transfer_matrix import FloatArray
 
-__all__ = ["Nodes", "at_thicknesses", "derivative_bounds", "on_grid"]
-
 Nodes = tuple[NDArray[Any], ...]
 """``a, b, e, c, g, kappa`` of the Q nodes of W groups, and their weights, all ``(W, Q)``."""
 
-_LEAST_WORK = 20_000
-"""Nodes times thicknesses that are worth a thread."""
+_LEAST_WORK = 20_000  # Nodes times thicknesses that are worth a thread
 
 _ANCHOR = 64
 """Steps of the phase recurrence between two exact evaluations; keeps its rounding error below 1e-14."""
@@ -50,11 +47,7 @@ def on_grid(
 
 @kernel
 def _point_kernel(
-    nodes: Nodes,
-    d: NDArray,
-    first: int,
-    last: int,
-    out: NDArray,
+    nodes: Nodes, d: NDArray, first: int, last: int, out: NDArray
 ) -> None:  # pragma: no cover - compiled
     a, b, e, c, g, kappa, w = nodes
     groups, count = w.shape
@@ -73,11 +66,7 @@ def _point_kernel(
 
 
 @kernel
-def derivative_bounds(
-    nodes: Nodes,
-    order: int,
-    start: float,
-) -> NDArray:  # pragma: no cover - compiled
+def derivative_bounds(nodes: Nodes, order: int, start: float) -> NDArray:  # pragma: no cover - compiled
     """Upper bounds of a thickness derivative above ``start``, ``(W,)``; see `PhaseResponse.derivative_bound`."""
     a, b, e, c, g, kappa, w = nodes
     groups, count = w.shape
@@ -117,12 +106,7 @@ def derivative_bounds(
 
 @kernel(relaxed=True)
 def _grid_kernel(
-    nodes: Nodes,
-    start: float,
-    step: float,
-    first_task: int,
-    last_task: int,
-    out: NDArray,
+    nodes: Nodes, start: float, step: float, first_task: int, last_task: int, out: NDArray
 ) -> None:  # pragma: no cover - compiled
     """Blocks of `_ANCHOR` thicknesses of the groups, counted through."""
     a, b, e, c, g, kappa, w = nodes

@@ -17,14 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .transfer_matrix import (
-    ComplexArray,
-    FloatArray,
-    interface_coefficients,
-    layer_admittance,
-)
-
-__all__ = ["PhaseState", "phase_states"]
+from .transfer_matrix import ComplexArray, FloatArray, interface_coefficients, layer_admittance
 
 _ERROR = 1e-14
 _FEWEST, _MOST = 8, 512

@@ -29,41 +29,21 @@ from numpy.typing import NDArray
 
 from ..compiled import contiguous, kernel, processors, run_shares, run_threaded, subkernel
 
-__all__ = ["MOST_RATIO", "ROUNDING", "series_at", "series_on_grid"]
-
 FloatArray = NDArray[np.float64]
 
-ROUNDING = 2e-13
-"""Error of the sum on a grid that is not told to be less exact, relative to the fringes."""
-
-COARSEST = 1e-3
-"""Largest error that makes sense."""
-
-_SMALLEST = 1e-17
-"""Terms below this are left out; the response is of order one."""
-
-_LEFT_OUT = 0.01
-"""Terms that a tolerance allows to leave out, per tolerance: they fall geometrically."""
+ROUNDING = 2e-13  # Error of the sum on a grid that is not told to be less exact, relative to the fringes
+COARSEST = 1e-3  # Largest error that makes sense
+_SMALLEST = 1e-17  # Terms below this are left out; the response is of order one
+_LEFT_OUT = 0.01  # Terms that a tolerance allows to leave out, per tolerance: they fall geometrically
 
 _MOST_TERMS = 600
 
-_CACHED = 131_072
-"""Complex numbers that the second-level cache of a processor holds."""
-
-MOST_RATIO = 0.94
-"""Largest ``|g|`` whose harmonics fall below rounding within the terms that are summed."""
-
-_PIECES = 4
-"""Shares of the nodes of a single group, which cores take in turn."""
-
-_LEAST_PIECE = 4096
-"""Nodes of a share that are worth a grid of their own."""
-
-_LEAST_SUMS = 2_000
-"""Nodes times thicknesses that are worth a thread."""
-
-_POWERS = 12
-"""Powers of the slow factor ``exp(-p Im kappa d)`` in one segment of an absorbing layer."""
+_CACHED = 131_072  # Complex numbers that the second-level cache of a processor holds
+MOST_RATIO = 0.94  # Largest ``|g|`` whose harmonics fall below rounding within the terms that are summed
+_PIECES = 4  # Shares of the nodes of a single group, which cores take in turn
+_LEAST_PIECE = 4096  # Nodes of a share that are worth a grid of their own
+_LEAST_SUMS = 2_000  # Nodes times thicknesses that are worth a thread
+_POWERS = 12  # Powers of the slow factor ``exp(-p Im kappa d)`` in one segment of an absorbing layer
 
 _SLOW_RANGE = 0.067
 """Largest ``Im kappa`` times half length of a segment, per ``-ln |h|``.
@@ -262,17 +242,7 @@ def _fill_grids(
         if transparent:
             sign = complex(1j**order)
             _grid_transparent(
-                own,
-                shape,
-                width,
-                smallest,
-                spread,
-                where,
-                step,
-                order,
-                sign,
-                grid[group, 0],
-                constant[group],
+                own, shape, width, smallest, spread, where, step, order, sign, grid[group, 0], constant[group]
             )
         else:
             _grid_absorbing(

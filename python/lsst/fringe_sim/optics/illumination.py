@@ -326,9 +326,7 @@ class Illumination:
             raise InputError("weights of the spectrum", float(photons.min()), "not negative, not all zero")
         joint = np.outer(photons / photons.sum(), beam.weight).ravel()
         return cls(
-            np.repeat(wave, beam.theta.size)[None, :],
-            np.tile(beam.theta, wave.size)[None, :],
-            joint[None, :],
+            np.repeat(wave, beam.theta.size)[None, :], np.tile(beam.theta, wave.size)[None, :], joint[None, :]
         )
 
 

@@ -15,14 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..descriptions import Description, described, read_table_of
-from ..errors import (
-    InputError,
-    OutOfRangeError,
-    ResourceError,
-    UnknownNameError,
-    named_units,
-    printable_name,
-)
+from ..errors import InputError, OutOfRangeError, ResourceError, UnknownNameError, named_units, printable_name
 from ..notebook import OneLine
 from ..resources import read_table, read_user_yaml, read_yaml
 
@@ -30,10 +23,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
     from scipy.interpolate import CubicSpline, PchipInterpolator
 
-__all__ = ["Medium", "check_range", "constant_medium", "get_medium", "medium_names", "read_media"]
-
-REFERENCE_TEMPERATURE_K = 300.0
-"""Temperature at which Green (2008) tabulates silicon [K]."""
+REFERENCE_TEMPERATURE_K = 300.0  # Temperature at which Green (2008) tabulates silicon [K]
 
 TEMPERATURE_RANGE_K = (100.0, 400.0)
 """Temperatures for which silicon is known: measured up to 300 K, by the power law of Green (2008) above."""

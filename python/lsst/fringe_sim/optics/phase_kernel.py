@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from ..compiled import contiguous, kernel, run_shares, subkernel
 
-__all__ = ["reduce_nodes"]
-
 
 def reduce_nodes(
     index: NDArray,
@@ -47,8 +45,7 @@ def reduce_nodes(
     return real[0], real[1], real[2], mixed[0], mixed[1], mixed[2]
 
 
-_LEAST_NODES = 256
-"""Nodes that are worth a thread."""
+_LEAST_NODES = 256  # Nodes that are worth a thread
 
 
 @kernel

@@ -25,21 +25,12 @@ from .closed_form import at_thicknesses, derivative_bounds, on_grid
 from .coherence import phase_states
 from .harmonics import MOST_RATIO, ROUNDING, series_at, series_on_grid
 from .phase_kernel import reduce_nodes
-from .transfer_matrix import (
-    ComplexArray,
-    FloatArray,
-    pure_polarizations,
-)
-
-__all__ = ["PhaseResponse", "reduce_to_phase"]
+from .transfer_matrix import ComplexArray, FloatArray, pure_polarizations
 
 _COEFFICIENTS = ("a", "b", "e", "c", "g", "kappa")
 
-_SHORT_GRID = 256
-"""Grid points up to which the closed form at every node is the faster way."""
-
-_LARGEST_RATIO = 0.9
-"""Ratio of two harmonics above which the series is too long to pay."""
+_SHORT_GRID = 256  # Grid points up to which the closed form at every node is the faster way
+_LARGEST_RATIO = 0.9  # Ratio of two harmonics above which the series is too long to pay
 
 
 @named_units
@@ -368,14 +359,7 @@ def reduce_to_phase(
             phase = 1j * extra
             phase[list(state.phases)] += list(state.phases.values())
             reduced = reduce_nodes(
-                flat,
-                thickness,
-                nodes,
-                each == "p",
-                varying,
-                np.array(layers, dtype=np.int64),
-                rough,
-                phase,
+                flat, thickness, nodes, each == "p", varying, np.array(layers, dtype=np.int64), rough, phase
             )
             parts.append([part.reshape(trailing) for part in reduced])
             shares.append(np.broadcast_to(state.share / len(polarizations), trailing))

@@ -16,8 +16,6 @@ from ..notebook import OneLine
 from ..resources import list_resources, read_yaml
 from .media import Medium, get_medium
 
-__all__ = ["Layer", "LayerStack"]
-
 
 @named_units
 @dataclass(frozen=True, repr=False)

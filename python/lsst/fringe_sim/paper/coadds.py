@@ -16,22 +16,16 @@ from .laboratory import MAP_RANGE_UM, RAFT
 from .section import Context, Curve, Graph, Section
 from .sky import RANGE_UM, lines_only
 
-__all__ = ["coadd", "components"]
-
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
-SKY_E = 2717.0
-"""Electrons per pixel of the zenith sky in 30 s; decides the noise of an exposure."""
+SKY_E = 2717.0  # Electrons per pixel of the zenith sky in 30 s; decides the noise of an exposure
 
 REGION_PX = 240
 NULL_SCATTER_BELOW_PX = 10.0
 FIRST_HOUR = 19.0
-CORNER_PX, WINDOW_PX = 1500.0, 1000
-"""Part of every sensor from which pieces are cut."""
-
-RAFT_UM = (13.8, 28.5)
-"""Adhesive of all nine sensors, if the thinnest place of each has 14 µm."""
+CORNER_PX, WINDOW_PX = 1500.0, 1000  # Part of every sensor from which pieces are cut
+RAFT_UM = (13.8, 28.5)  # Adhesive of all nine sensors, if the thinnest place of each has 14 µm
 
 TREECORR_PX = 64
 
@@ -53,11 +47,7 @@ def components(context: Context) -> Section:
     return Section(
         "Components of a night: section 5.4",
         "Eleven hourly frames with the variation of the OH bands that the paper takes from Noll et al. (2015).",
-        {
-            "first_component": PERCENT * ratio[0],
-            "second_component": PERCENT * ratio[1],
-            "corrected": left,
-        },
+        {"first_component": PERCENT * ratio[0], "second_component": PERCENT * ratio[1], "corrected": left},
         (
             Graph(
                 "scree",
@@ -77,10 +67,7 @@ def coadd(context: Context) -> Section:
     maps = _raft_maps(context)
     table = lines_only(context.setup("lsst_e2v"), range_um=RAFT_UM if maps else RANGE_UM).sky()
     layers = maps or [context.detail_um]
-    patterns = []
-    for layer in layers:
-        frame = table.lookup(layer)[0]
-        patterns.append(frame / frame.mean() - 1.0)
+    patterns = [frame / frame.mean() - 1.0 for frame in (table.lookup(layer)[0] for layer in layers)]
     counts = tuple(sorted({count for count in (1, 10, 100, context.coadds) if count <= context.coadds}))
     result = coadd_correlation(
         patterns,
@@ -104,11 +91,8 @@ def coadd(context: Context) -> Section:
     scatter = 1.0 / (SKY_E * deepest * np.sqrt(last.weight))
     curves.append(Curve(separation, scatter, f"σ of noise, {deepest}", "--"))
     rms = PERCENT * float(np.sqrt(np.mean([pattern.var() for pattern in patterns])))
-    sensors = (
-        "the nine sensors of the raft"
-        if maps
-        else "one sensor, where the paper has nine (their maps are not at hand)"
-    )
+    one = "one sensor, where the paper has nine (their maps are not at hand)"
+    sensors = "the nine sensors of the raft" if maps else one
     return Section(
         "Coadds: Fig. 16",
         f"Coadds of randomly placed and rotated pieces of {sensors} (fringes {rms:.2f} % rms, uncorrected) with "

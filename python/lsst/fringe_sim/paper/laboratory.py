@@ -17,9 +17,7 @@ from ..mock.raw_frames import setup_optics
 from ..mock.thickness import E2V_SHAPE
 from ..model import FringeModel
 from ..products import FlatExposures, FringeCube
-from .section import Context, Curve, Graph, Picture, Section, missing
-
-__all__ = ["flat_contrast", "one_pixel", "raft", "row_3000", "thickness_fit"]
+from .section import Context, Curve, Graph, Picture, Section, columns, missing
 
 FloatArray = NDArray[np.float64]
 
@@ -28,22 +26,18 @@ LAB = "ts8_e2v"
 WAVELENGTH_NM = 960.0
 SEARCH_UM = (5.0, 30.0)
 SEARCH_STEP_UM = 0.002
-MAP_RANGE_UM = (14.0, 22.0)
-"""Colour range of the published map."""
+MAP_RANGE_UM = (14.0, 22.0)  # Colour range of the published map
 
 FIT_NOISE = 2e-3
-FIT_CONTRAST = 0.15
-"""Brings the simulated flats to the measured contrast of about 2 %."""
+FIT_CONTRAST = 0.15  # Brings the simulated flats to the measured contrast of about 2 %
 
 FIT_SHAPE = (200, 204)
 
 FOREIGN_SILICON = "Si_schinke2015"
-FOREIGN_ERROR_NM = 0.5
-"""Accuracy of the wavelengths of the stand [nm]."""
+FOREIGN_ERROR_NM = 0.5  # Accuracy of the wavelengths of the stand [nm]
 
 FOREIGN_GRADIENT = 0.02
-ROW = 3015
-"""Row 3000 of the frame trimmed by 15 rows."""
+ROW = 3015  # Row 3000 of the frame trimmed by 15 rows
 
 MEASURED_FLAT = "E2V-321_960nm_flat_measured.fits"
 MEASURED_MAP = "RTM-020_S01_E2V-321_epoxy_map.fits"
@@ -114,10 +108,8 @@ def _fit_as_published(
 def flat_contrast(context: Context) -> Section:
     """Figures 2, 5 and 6 and the first row of Table 2."""
     phase = (np.arange(256) + 0.5) / 256.0
-    detection, total = (
-        FringeModel.from_setup(context.setup(LAB), observable=observable)
-        for observable in ("detection", "total")
-    )
+    lab = context.setup(LAB)
+    detection, total = (FringeModel.from_setup(lab, observable=each) for each in ("detection", "total"))
     order = float(total.fringe_order_um(WAVELENGTH_NM))
     layer = 17.0 // order * order + phase * order
     absolute = total.response(layer, [WAVELENGTH_NM])[0]
@@ -136,13 +128,13 @@ def flat_contrast(context: Context) -> Section:
     ]
     folded = context.curve("E2V-321_960nm_phase_folded")
     if folded is not None:
-        place, measured = (np.asarray(folded[name], dtype=float) for name in ("phase", "measured"))
+        place, measured, simulated = columns(folded, "phase", "measured", "simulated")
         values["flat_measured"] = _fundamental(normalised) / _fundamental(measured)
         # The zero of the published phase is that of its thickness, fitted with 1 − R − T.
         curves.append(Curve(place, PERCENT * measured, "measured (Fig. 2, folded)", "."))
-        simulated = np.asarray(folded["simulated"], dtype=float)
         curves.append(Curve(place, PERCENT * simulated, "simulated as published (Fig. 5)", "--"))
-    picture = detection.response(context.thickness_um, [WAVELENGTH_NM])[0]
+    flat = detection.response(context.thickness_um, [WAVELENGTH_NM])[0]
+    picture = PERCENT * (flat / flat.mean() - 1.0)
     return Section(
         "Flats at 960 nm: Figs. 2, 5, 6 and Table 2",
         "What the model says about a flat in parallel light of 2 nm bandwidth, for both observables. The contrast of "
@@ -150,13 +142,7 @@ def flat_contrast(context: Context) -> Section:
         values,
         (
             Graph("one fringe order", "thickness / fringe order", "fringe amplitude [%]", tuple(curves)),
-            Picture(
-                "detection layer",
-                "flat / mean − 1 [%]",
-                PERCENT * (picture / picture.mean() - 1.0),
-                True,
-                context.step_px,
-            ),
+            Picture("detection layer", "flat / mean − 1 [%]", picture, True, context.step_px),
             Picture("adhesive", "thickness [µm]", context.thickness_um, step_px=context.step_px),
         ),
         "Fringe profile at 960 nm, the flat of the whole sensor, and the thickness that makes it.",

@@ -17,15 +17,12 @@ from ..instrument.telescope import RayBundle, Telescope, batoid_optic
 from ..model import FringeModel
 from ..optics import Beam, Illumination
 from ..resources import read_table
-from .section import Context, Curve, Graph, Section, missing
-
-__all__ = ["angles", "oh_lines", "photon_walk"]
+from .section import Context, Curve, Graph, Section, columns, missing
 
 FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
-SECOND_RADIATION_CONSTANT = 1.4387769
-"""hc/k [cm K]."""
+SECOND_RADIATION_CONSTANT = 1.4387769  # hc/k [cm K]
 
 NAMED_BANDS = ("7-3", "8-4", "3-0", "9-5", "4-1", "5-2")
 RED_BANDS = ("4-1", "5-2")
@@ -39,11 +36,8 @@ EDGE_DEG = 1.44
 FIELDS = ((0.0, "LSST, centre"), (EDGE_DEG, f"LSST, {EDGE_DEG}° off axis"))
 BINS = (10, 20, 50, 100)
 BEAM_NODES = 192
-PATH_RAYS = 7
-"""Rays on either side of the axis of which the path through the telescope is drawn."""
-
-FAINTEST = 1e-6
-"""Weight below which lines are not drawn."""
+PATH_RAYS = 7  # Rays on either side of the axis of which the path through the telescope is drawn
+FAINTEST = 1e-6  # Weight below which lines are not drawn
 
 
 def oh_lines(context: Context) -> Section:
@@ -82,8 +76,8 @@ def _against_figure_8(context: Context) -> tuple[dict[str, float], tuple[Graph, 
     theirs, ours = context.lines_of_figure_8(), read_table("sky", "oh_lines_palace_yband.ecsv")
     if theirs is None:
         return missing("lines_found", "lines_strength", "red_bands"), ()
-    wavelength, intensity = (np.asarray(theirs[name], dtype=float) for name in ("wavelength", "intensity"))
-    own_wavelength, own = (np.asarray(ours[name], dtype=float) for name in ("wavelength", "photon_radiance"))
+    wavelength, intensity = columns(theirs, "wavelength", "intensity")
+    own_wavelength, own = columns(ours, "wavelength", "photon_radiance")
     near = np.abs(wavelength[:, None] - own_wavelength) < NEAR_NM
     near &= np.asarray(theirs["band"], dtype=str)[:, None] == np.asarray(ours["band"], dtype=str)
     found = near.any(axis=1)
@@ -126,7 +120,7 @@ def _rotational_temperature() -> float:
 def _vibrational_temperature() -> float:
     table = read_table("sky", "oh_levels_palace.ecsv")
     rows = table[(table["v_up"] >= 3) & (table["v_up"] <= 9)]
-    energy, population = (np.asarray(rows[name], dtype=float) for name in ("E_v0", "ln_pop_N1"))
+    energy, population = columns(rows, "E_v0", "ln_pop_N1")
     return float(-SECOND_RADIATION_CONSTANT / np.polyfit(energy, population, 1)[0])
 
 

@@ -11,8 +11,6 @@ from typing import Any
 from ..errors import ResourceError, UnknownNameError
 from ..resources import read_yaml
 
-__all__ = ["Finding", "PublishedNumber", "published_numbers"]
-
 
 @dataclass(frozen=True)
 class PublishedNumber:

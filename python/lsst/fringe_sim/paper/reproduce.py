@@ -14,8 +14,6 @@ from . import coadds, laboratory, optics, sky, stack
 from .published import Finding, published_number
 from .section import COLD_SILICON, Context, Section
 
-__all__ = ["SECTIONS", "Reproduction", "reproduce"]
-
 SECTIONS: tuple[Callable[[Context], Section], ...] = (
     stack.layers,
     stack.bandwidth,

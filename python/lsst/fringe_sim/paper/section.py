@@ -16,8 +16,6 @@ from ..instrument.setup import Setup
 from ..mock.thickness import E2V_SHAPE
 from ..optics import LayerStack
 
-__all__ = ["COLD_SILICON", "PAPER_SILICON", "Context", "Curve", "Graph", "Picture", "Section"]
-
 PAPER_SILICON, COLD_SILICON = "Si_green2008", "Si"
 """Tables of silicon: that of the paper, a law extrapolated to the cold, and what was measured there."""
 
@@ -132,3 +130,8 @@ class Context:
 def missing(*items: str) -> dict[str, float]:
     """Items that cannot be computed."""
     return dict.fromkeys(items, math.nan)
+
+
+def columns(table: Table, *names: str) -> list[FloatArray]:
+    """Columns of a table as numbers."""
+    return [np.asarray(table[name], dtype=float) for name in names]

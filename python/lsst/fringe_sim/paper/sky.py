@@ -25,9 +25,7 @@ from ..instrument.readout import (
 from ..instrument.sky import EmissionLines, SkySpectrum
 from ..model import FringeModel, Setup
 from ..optics import Illumination
-from .section import Context, Curve, Graph, Picture, Section, missing
-
-__all__ = ["hsc", "lines_only", "lsst", "monocam", "surface_brightness"]
+from .section import Context, Curve, Graph, Picture, Section, columns, missing
 
 FloatArray = NDArray[np.float64]
 
@@ -36,12 +34,10 @@ AIRMASS = 1.2
 RANGE_UM = (13.9, 22.6)
 EDGE_DEG = 1.44
 READ_NOISE_E = 9.0
-SMOOTHING_PX = 4.0
-"""Gaussian kernel "of 16 by 16 pixels": σ of 4 px cut at 2 σ."""
+SMOOTHING_PX = 4.0  # Gaussian kernel "of 16 by 16 pixels": σ of 4 px cut at 2 σ
 
 PUBLISHED_MAP = "RTM-020_S01_E2V-321_epoxy_map.fits"
-PUBLISHED_LOWEST_UM = 14.022
-"""Lower end of the colour bar of Figure 5."""
+PUBLISHED_LOWEST_UM = 14.022  # Lower end of the colour bar of Figure 5
 
 DIAGONAL_PX = 3970
 
@@ -109,8 +105,7 @@ def hsc(context: Context) -> Section:
     )
     published = context.curve("HSC-data-sim_measured_diagonal")
     if published is not None:
-        place = np.asarray(published["diagonal_pixel"], dtype=float)
-        amplitude = np.asarray(published["amp"], dtype=float)
+        place, amplitude = columns(published, "diagonal_pixel", "amp")
         curves.append(Curve(place / place.max(), amplitude, "measured frame of Fig. 13", "--"))
     return Section(
         "Hyper Suprime-Cam: section 5.2, Fig. 13",
@@ -201,8 +196,7 @@ def surface_brightness(context: Context) -> Section:
     sky = brightness(sky_e)
     frame = lines_only(context.setup("lsst_e2v")).sky().lookup(context.detail_um)[0]
     # Continua do not fringe; their share of the light dilutes the fringe of the lines.
-    light = SkySpectrum.dark().components(band)
-    photons = {item.name: float(item.photons.sum()) for item in light}
+    photons = {item.name: float(item.photons.sum()) for item in SkySpectrum.dark().components(band)}
     lines = sum(value for name, value in photons.items() if name[0].isdigit()) / sum(photons.values())
     relative = lines * (frame / frame.mean() - 1.0)
     rng = context.rng("surface brightness")

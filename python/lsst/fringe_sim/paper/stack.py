@@ -11,9 +11,7 @@ from ..model import FringeModel
 from ..optics import Beam, LayerStack, Medium, get_medium
 from ..optics.illumination import SIGMA_PER_FWHM, GaussianProfile
 from ..optics.system import OpticalSystem
-from .section import Context, Curve, Graph, Section, missing
-
-__all__ = ["absorption_depth", "bandwidth", "layers", "other_vendor"]
+from .section import Context, Curve, Graph, Section, columns, missing
 
 FloatArray = NDArray[np.float64]
 
@@ -21,8 +19,7 @@ PERCENT = 100.0
 LAB_K = 183.0
 SHARP_NM = 0.1
 """Bandwidth [nm] that leaves 97 % of the fringes of the silicon, with which those of 1 nm are compared."""
-NINETY_NINE = float(np.log(100.0))
-"""Optical depths that absorb 99 %."""
+NINETY_NINE = float(np.log(100.0))  # Optical depths that absorb 99 %
 
 
 def layers(context: Context) -> Section:
@@ -109,8 +106,7 @@ def _fundamental(wavelength_nm: FloatArray, ripple: FloatArray, spacing_nm: floa
 
 def bandwidth(context: Context) -> Section:
     """Figure 1."""
-    wide = np.arange(820.0, 1000.0, 0.5)
-    close = np.arange(958.0, 970.0, 0.1)
+    wide, close = np.arange(820.0, 1000.0, 0.5), np.arange(958.0, 970.0, 0.1)
     stack = context.stack
     narrow = _ripple(close, _absorption(stack, close, 1.0))
     values = {
@@ -124,7 +120,7 @@ def bandwidth(context: Context) -> Section:
     inset = [Curve(close, _absorption(stack, close, 1.0), "this package, 1 nm")]
     published = context.curve("bandwidth_verify_2nm")
     if published is not None:
-        place, theirs = (np.asarray(published[name], dtype=float) for name in ("wavelength", "absorption"))
+        place, theirs = columns(published, "wavelength", "absorption")
         departure = _absorption(stack, place, 2.0) - theirs
         x = place - place.mean()
         residual = departure - np.polyval(np.polyfit(x, departure, 3), x)
@@ -135,14 +131,8 @@ def bandwidth(context: Context) -> Section:
         curves.append(Curve(place, theirs, "Fig. 1", "--"))
     narrow_curve = context.curve("bandwidth_verify_1nm_inset")
     if narrow_curve is not None:
-        inset.append(
-            Curve(
-                np.asarray(narrow_curve["wavelength"], dtype=float),
-                np.asarray(narrow_curve["absorption"], dtype=float),
-                "Fig. 1, inset",
-                "--",
-            )
-        )
+        place, theirs = columns(narrow_curve, "wavelength", "absorption")
+        inset.append(Curve(place, theirs, "Fig. 1, inset", "--"))
     label = "absorbed in the stack, 1 − R − T"
     return Section(
         "Bandwidth: Fig. 1",

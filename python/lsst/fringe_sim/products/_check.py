@@ -12,21 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import FrameFormatError, InputError, OutOfRangeError, is_masked, to_number, without_unit
 from .mask import ALL_BITS
 
-__all__ = [
-    "as_float_array",
-    "as_mask",
-    "check_good_pixels",
-    "check_mapping",
-    "check_name",
-    "check_number",
-    "check_shape",
-    "check_whole_number",
-    "read_only",
-]
-
-
-_ROWS = 256
-"""Rows of an image that are looked at at a time."""
+_ROWS = 256  # Rows of an image that are looked at at a time
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:

@@ -10,7 +10,7 @@ import contextlib
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -25,25 +25,6 @@ from ..resources import open_user_fits, refuse_damage
 from ._check import check_mapping
 from .mask import mask_plane_cards, planes_from_header, remap_mask
 from .sensor_section import SECTION_KEYWORDS, SensorSection
-
-__all__ = [
-    "Scalar",
-    "bintable_hdu",
-    "image_hdu",
-    "in_unit",
-    "mask_hdu",
-    "merge_metadata",
-    "normalise_metadata",
-    "open_fits",
-    "primary_hdu",
-    "read_image",
-    "read_keyword",
-    "read_mask",
-    "read_metadata",
-    "refuse_other_unit",
-    "write_hdus",
-    "write_summed",
-]
 
 Scalar = bool | int | float | str | None
 
@@ -222,16 +203,28 @@ def write_hdus(
     write_summed(target, hdus, verify="exception")
 
 
-def write_summed(target: Path, hdus: Sequence[Any], verify: str = "fix") -> None:
-    """Write HDUs with their checksums, in which nothing is of the clock; ``verify`` as of astropy."""
+def write_summed(
+    target: Path,
+    hdus: Sequence[Any],
+    verify: str = "fix",
+    *,
+    finish: Callable[[Path], None] | None = None,
+) -> None:
+    """Write HDUs with their checksums, in which nothing is of the clock; ``verify`` as of astropy.
+
+    ``finish`` is called with the path of the file before it is where it belongs.
+    """
     whole = fits.HDUList(list(hdus))
     whole.update_extend()
     for hdu in whole:
         hdu.verify(verify)
         hdu.add_datasum(when="data unit checksum")
         hdu.add_checksum(when="HDU checksum", override_datasum=True)
-    with all_or_nothing(target) as temporary, open(temporary, "wb") as stream:
-        whole.writeto(stream, output_verify=verify)
+    with all_or_nothing(target) as temporary:
+        with open(temporary, "wb") as stream:
+            whole.writeto(stream, output_verify=verify)
+        if finish is not None:
+            finish(Path(temporary))
 
 
 def existing_folder(path: str | os.PathLike[str]) -> Path:

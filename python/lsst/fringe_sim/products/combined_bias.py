@@ -15,8 +15,6 @@ from ..errors import InputError
 from . import _check as check
 from .fits_product import DETECTOR, MASK, Card, Extension, Image, SensorProduct
 
-__all__ = ["CombinedBias"]
-
 
 class _NoiseTable(Extension):
     """Read noise by amplifier."""

@@ -22,19 +22,6 @@ from .sensor_section import SensorSection
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = [
-    "DETECTOR",
-    "FILTER",
-    "MASK",
-    "NOTED",
-    "Card",
-    "Extension",
-    "FitsProduct",
-    "Image",
-    "SensorProduct",
-    "check_noted",
-]
-
 
 class _NEEDED:
     """Stands for no default: a header must have the keyword."""

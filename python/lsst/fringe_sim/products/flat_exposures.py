@@ -16,8 +16,6 @@ from . import _check as check
 from . import _fits as io
 from .fits_product import Extension
 
-__all__ = ["ExposureTable", "FlatExposures"]
-
 
 @named_units
 @dataclass(frozen=True, eq=False, repr=False)

@@ -14,8 +14,6 @@ from ..errors import FrameFormatError, named_units
 from . import _fits as io
 from .fits_product import Extension
 
-__all__ = ["FlatFit", "FlatTable"]
-
 FloatArray = NDArray[np.float64]
 
 FLAT_COLUMNS = (

@@ -15,8 +15,6 @@ from . import _check as check
 from . import _fits as io
 from .fits_product import DETECTOR, FILTER, MASK, Extension, FitsProduct, Image
 
-__all__ = ["FringeComponents"]
-
 _COLUMNS = ("explained_variance", "explained_variance_ratio")
 
 

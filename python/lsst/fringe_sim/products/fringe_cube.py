@@ -21,8 +21,6 @@ from .mask import mask_bits
 from .same_light import refuse_equal_pixels
 from .sky_frame import NOISE, is_noiseless
 
-__all__ = ["CUBE_UNITS", "FlatExposures", "FringeCube"]
-
 CUBE_UNITS = ("electron", "relative")
 """Units of a cube: counts in electrons, or counts divided by their mean over the sensor (so near 1)."""
 
@@ -84,10 +82,7 @@ class FringeCube(FitsProduct):
     detector: str = ""
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
-    CARDS = (
-        DETECTOR,
-        Card("layer", "LAYER", "layer of THICKNESS", kind=str, default="", omit=True),
-    )
+    CARDS = (DETECTOR, Card("layer", "LAYER", "layer of THICKNESS", kind=str, default="", omit=True))
     EXTENSIONS = (
         Image("image", "IMAGE", "{unit}", ndim=3),
         Image("variance", "VARIANCE", "{unit}2", ndim=3, nonnegative=True),

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ..errors import named_units
 from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
 
-__all__ = ["FringeFlat"]
-
 
 @named_units
 @dataclass(frozen=True, eq=False, repr=False)

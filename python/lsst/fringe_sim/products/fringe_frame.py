@@ -15,8 +15,6 @@ from ..errors import InputError, OutOfRangeError
 from . import _fits as io
 from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
 
-__all__ = ["FringeFrame"]
-
 _DATETIME = re.compile(r"(\d{4}-\d{2}-\d{2})T(\d{2}:\d{2}:\d{2}(?:\.\d+)?)")
 
 

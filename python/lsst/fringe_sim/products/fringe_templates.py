@@ -14,8 +14,6 @@ from .fits_product import DETECTOR, FILTER, MASK, Card, FitsProduct, Image
 from .fringe_frame import FringeFrame
 from .mask import mask_bits
 
-__all__ = ["FringeTemplates"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FringeTemplates(FitsProduct):
@@ -61,11 +59,7 @@ class FringeTemplates(FitsProduct):
     def _picture(self) -> tuple[NDArray[Any], str, bool]:
         return 100.0 * self.patterns[0], "first template [% of the sky]", True
 
-    CARDS = (
-        DETECTOR,
-        FILTER,
-        Card("creation_datetime", "CALIB_CREATION_DATETIME", "", kind=str),
-    )
+    CARDS = (DETECTOR, FILTER, Card("creation_datetime", "CALIB_CREATION_DATETIME", "", kind=str))
     EXTENSIONS = (
         Image("coverage", "COVERAGE", "frames", everywhere=True, nonnegative=True),
         Image("patterns", "PATTERNS", ndim=3, everywhere=True),

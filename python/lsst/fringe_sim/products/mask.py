@@ -17,15 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FrameFormatError, UnknownNameError
 
-__all__ = [
-    "MASK_PLANES",
-    "describe_mask",
-    "mask_bits",
-    "mask_plane_cards",
-    "planes_from_header",
-    "remap_mask",
-]
-
 MASK_PLANES: Mapping[str, int] = MappingProxyType(
     {
         "BAD": 0,

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,21 @@ from ..errors import FrameFormatError, InputError, printable_name, to_number
 from ..instrument.raw_header import header_value
 from ..resources import complete_fits, open_user_fits, refuse_damage
 from ._fits import write_summed
+from .afw_background import afw_background, is_afw_background
 from .file_keywords import FILTER_NAMES, SENSOR_NAMES, declared_names
+from .image_archive import (
+    IMAGE,
+    address_again,
+    archive_cards,
+    archive_planes,
+    archived_background,
+    is_archive,
+    origin_of,
+)
 from .mask import MASK_PLANES, mask_bits
 from .observed_frame import ObservedFrame
 
-__all__ = ["UNCORRECTED", "ObservedImage", "detector_of", "is_companion", "observed_images", "write_images"]
-
-UNCORRECTED = "UNCORRECTED"
-"""End of the name of an extension that is 1 where a template has no value."""
+UNCORRECTED = "UNCORRECTED"  # End of the name of an extension that is 1 where a template has no value
 
 IntArray = NDArray[np.int32]
 
@@ -60,8 +68,7 @@ _ZTF_BITS = {
 }
 """Source, source of the PSF catalogue, saturated, no number, track, ghost, halo; all others are bad pixels."""
 
-_BITS = 63
-"""Of a mask that is read as integers with a sign."""
+_BITS = 63  # Of a mask that is read as integers with a sign
 
 _HARMLESS = ("NOT_DEBLENDED", "INEXACT_PSF", "SENSOR_EDGE", "INJECTED", "INJECTED_CORE", "STREAK_FIT")
 """Planes of Rubin's masks that say nothing against the background of a pixel."""
@@ -80,7 +87,7 @@ class ObservedImage:
         image = self.pixels(background).astype(np.float32, copy=False)
         with complete_fits(self.path) as hdus:
             header = _merged(hdus, self.index)
-            layout = _layout_of(self)
+            layout = _layout_of(self, hdus)
             mask = layout.mask(self, hdus, header)
             variance = layout.variance(self, hdus, header)
         if mask is None:
@@ -115,8 +122,9 @@ class ObservedImage:
             if stored.dtype.kind == "f" and stored.dtype.itemsize > np.dtype(kind).itemsize:
                 kind = np.float64
             image: NDArray[np.floating] = np.array(stored, dtype=kind)
+            origin = origin_of(hdus) if is_archive(hdus) else None
         if background is not None:
-            image += _companion(background, self, image.shape)
+            image += _background(background, self, image.shape, origin)
         return image
 
     def header(self) -> dict[str, Any]:
@@ -133,6 +141,7 @@ def observed_images(path: Path) -> list[ObservedImage]:
             ObservedImage(path, number, hdu.name if number and hdu.name else path.name.partition(".")[0])
             for number, hdu in enumerate(hdus)
             if hdu.is_image and len(hdu.shape) == 2 and not hdu.name.upper().endswith(_NOT_SKY)
+            if not is_archive(hdus) or hdu.name == IMAGE
         ]
         for image in found:
             _refuse_two_statements(hdus, image, alone=len(found) == 1)
@@ -160,12 +169,14 @@ def write_images(
     cards: Mapping[int, Mapping[str, Any]],
     uncorrected: Mapping[int, NDArray[np.bool_]],
     primary: Mapping[str, Any],
+    *,
+    added: bool = False,
 ) -> None:
     """Write a file again with other pixels; all else in it stays, and no image is compressed with loss.
 
     ``images``, ``cards`` and ``uncorrected`` are by number of the HDU: new pixels, keywords (values alone or with
     comments; `None` removes one), and the pixels that are as they were, named in an extension of their own.
-    ``primary``: keywords of the primary header.
+    ``primary``: keywords of the primary header. ``added``: the pixels have a background that was subtracted before.
     """
     with complete_fits(source) as hdus, _as_stored(source) as stored:
         made, flags = [], []
@@ -183,7 +194,8 @@ def write_images(
                 name = f"{hdu.name}_{UNCORRECTED}" if number and hdu.name else UNCORRECTED
                 flags.append(fits.ImageHDU(uncorrected[number].astype(np.uint8), name=name))
         _set_cards(made[0].header, primary)
-        write_summed(target, made + flags)
+        finish = partial(address_again, added=added) if is_archive(hdus) else None
+        write_summed(target, made + flags, finish=finish)
 
 
 @contextmanager
@@ -205,7 +217,8 @@ def _set_cards(header: fits.Header, cards: Mapping[str, Any]) -> None:
 
 
 def _merged(hdus: fits.HDUList, index: int) -> dict[str, Any]:
-    return {**dict(hdus[0].header), **dict(hdus[index].header)}
+    told = archive_cards(hdus) if is_archive(hdus) else {}
+    return {**dict(hdus[0].header), **dict(hdus[index].header), **told}
 
 
 def _refuse_two_statements(hdus: fits.HDUList, image: ObservedImage, *, alone: bool) -> None:
@@ -236,7 +249,9 @@ class _Layout:
     variance: Callable[[ObservedImage, fits.HDUList, Mapping[str, Any]], NDArray[np.float32] | None]
 
 
-def _layout_of(image: ObservedImage) -> _Layout:
+def _layout_of(image: ObservedImage, hdus: fits.HDUList) -> _Layout:
+    if is_archive(hdus):
+        return _Layout(_archive_mask, _own_variance)
     if _sibling(image.path, "_ood") is not None or _sibling(image.path, "_oow") is not None:
         return _Layout(_decam_mask, _decam_variance)
     if "sciimg" in image.path.name:
@@ -248,6 +263,21 @@ def _sibling(path: Path, kind: str) -> Path | None:
     """The file of another kind beside this one, as c4d_…_ood_z_v1.fits.fz beside c4d_…_ooi_z_v1.fits.fz."""
     other = path.with_name(re.sub(r"_ooi(?=[_.])", kind, path.name))
     return other if other != path and other.is_file() else None
+
+
+def _background(
+    path: Path, image: ObservedImage, shape: tuple[int, ...], origin: tuple[int, int] | None
+) -> NDArray[Any]:
+    """What was subtracted: an image, or what Rubin's packages draw one from."""
+    with complete_fits(path) as hdus:
+        if is_archive(hdus):
+            return archived_background(path, origin, shape)
+        if not is_afw_background(hdus):
+            return _companion(path, image, shape)
+        drawn = afw_background(hdus)
+    if drawn.shape != shape:
+        raise FrameFormatError("background", drawn.shape, f"one of shape {shape}", source=str(path))
+    return drawn
 
 
 def _companion(path: Path, image: ObservedImage, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
@@ -316,9 +346,19 @@ def _own_mask(image: ObservedImage, hdus: fits.HDUList, _: Mapping[str, Any]) ->
         for keyword, bit in hdu.header.items()
         if str(keyword).startswith("MP_")
     }
+    return _of_planes(np.asarray(hdu.data), bits)
+
+
+def _archive_mask(_: ObservedImage, hdus: fits.HDUList, __: Mapping[str, Any]) -> IntArray | None:
+    each = [_of_planes(stored, bits) for stored, bits in archive_planes(hdus)]
+    return np.bitwise_or.reduce(each) if each else None
+
+
+def _of_planes(stored: NDArray[Any], bits: Mapping[str, int]) -> IntArray:
+    """Mask of this package from the bits of planes by name."""
     harmless = sum(1 << bit for name, bit in bits.items() if name in _HARMLESS)
     planes = {bit: _plane(name) for name, bit in bits.items() if name not in _HARMLESS}
-    return _named(planes, _whole(np.asarray(hdu.data)) & ~harmless, bits=True)
+    return _named(planes, _whole(stored) & ~harmless, bits=True)
 
 
 def _bit(keyword: str, value: Any) -> int:

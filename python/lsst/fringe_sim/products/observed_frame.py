@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
 from .sky_frame import SkyFringe
 
-__all__ = ["ObservedFrame", "observed_from_simulation"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ObservedFrame(SensorProduct):

@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 from ..errors import FrameFormatError, InputError, named_units
 from ..instrument.raw_header import DeclaredHeader, header_value
 from ..instrument.raw_layout import AmplifierLayout, Section, amplifier_layouts
-from ..instrument.raw_metadata import (
-    TEMPERATURE_RANGE_C,
-    WAVELENGTH_RANGE_NM,
-    ZERO_CELSIUS_K,
-    is_of_lsst,
-)
+from ..instrument.raw_metadata import TEMPERATURE_RANGE_C, WAVELENGTH_RANGE_NM, ZERO_CELSIUS_K, is_of_lsst
 from ..instrument.stated_facts import SAME_CELSIUS, SETTING_NM, Fact, refuse_other_filter
 from ..notebook import do_nothing
 from ..resources import complete_fits
@@ -29,19 +24,15 @@ from .mask import mask_bits
 from .same_light import pixels_digest
 from .sky_frame import NOISE, refuse_noiseless
 
-__all__ = ["PlainImage", "read_plain_flats", "refuse_other_sensors", "stack_plain_flats"]
-
 DECLARED = declared_names("plain flat")
 
-WAVELENGTHS = ("MONOWL", "WAVELEN", "WAVELNTH")
-"""Keywords of the wavelength [nm]."""
+WAVELENGTHS = ("MONOWL", "WAVELEN", "WAVELNTH")  # Keywords of the wavelength [nm]
 
 ELECTRONS = ("electron", "electrons", "e-", "e")
 ADU = ("adu", "dn", "count", "counts")
 BIASES = ("bias", "zero")
 
-OF_LSST = ("LSST_NUM", "RAFTNAME", "RAFTBAY", "TSTAND")
-"""Keywords of raw frames in the LSST layout."""
+OF_LSST = ("LSST_NUM", "RAFTNAME", "RAFTBAY", "TSTAND")  # Keywords of raw frames in the LSST layout
 
 
 @dataclass(frozen=True)

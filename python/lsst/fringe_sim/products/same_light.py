@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 
-__all__ = ["pixels_digest", "refuse_equal_pixels", "refuse_mixed_models"]
-
 _MODEL = re.compile(r"SETUP|BEAMS|(EFFECT|EFFVAL|TABLE)\d+")
 
 

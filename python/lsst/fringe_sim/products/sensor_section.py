@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from ..errors import FrameFormatError, InputError, OutOfRangeError
 from ..instrument.detector import Detector
 
-__all__ = ["SECTION_KEYWORDS", "SensorSection", "section_pixels"]
-
 SECTION_KEYWORDS = ("DETSEC", "CCDSEC")
 """Keywords in which the header of an image says what it shows: ``[x1:x2,y1:y2]``, from 1, both ends included."""
 

@@ -14,16 +14,6 @@ from ..errors import InputError, UnknownNameError, named_units
 from . import _fits as io
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
 
-__all__ = [
-    "CORRECTED",
-    "NOISE",
-    "SKY_UNITS",
-    "SkyFringe",
-    "is_noiseless",
-    "refuse_corrected",
-    "refuse_noiseless",
-]
-
 CORRECTED = "FRINGCOR"
 """Keyword of an exposure from which fringes were subtracted; its value is the number of templates."""
 
@@ -33,8 +23,7 @@ and of its like for Mosaic-3; that of fringez, for ZTF."""
 
 _NO = ("", "N", "NO", "F", "FALSE", "NONE", "0", "0.0")
 
-NOISE = "NOISE"
-"""Keyword of a simulated exposure: whether photon and read noise were added."""
+NOISE = "NOISE"  # Keyword of a simulated exposure: whether photon and read noise were added
 
 SKY_UNITS = ("electron", "fraction")
 """Units of a sky frame: electrons in the exposure, or (sky - mean) / mean."""

@@ -20,8 +20,6 @@ from .thickness_map import UNKNOWN_SIGMA_UM, ThicknessMap
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["SkyFrames"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SkyFrames(InNotebook):

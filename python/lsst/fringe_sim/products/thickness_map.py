@@ -21,10 +21,7 @@ from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
 from .flat_fit import FlatFit, FlatTable
 from .mask import mask_bits
 
-__all__ = ["THICKNESS_LIMITS_UM", "UNKNOWN_SIGMA_UM", "ThicknessMap", "thickness_span_um"]
-
-UNKNOWN_SIGMA_UM = 0.003
-"""Uncertainty of a map that states none."""
+UNKNOWN_SIGMA_UM = 0.003  # Uncertainty of a map that states none
 
 THICKNESS_LIMITS_UM = (0.5, 1000.0)
 """Layers that make fringes in a sensor: a map in nm or mm that does not say so lies outside."""

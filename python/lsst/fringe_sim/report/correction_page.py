@@ -20,8 +20,6 @@ from .page import Origin, Report
 from .source_figure import bias_figure
 from .words import measured_text, of_sensor, span_text
 
-__all__ = ["frame_figure", "write_correction_report", "write_templates_report"]
-
 PERCENT = 100.0
 MOST_PICTURES = 3
 

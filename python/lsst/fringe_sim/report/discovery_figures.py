@@ -15,31 +15,20 @@ from ..algorithms.discovery.verdict import MOST_CANDIDATES
 from ..style import DIVERGING, LINES, color_bar, figure, panels
 from .figures import CURVE_INCH
 
-__all__ = ["candidates_figure", "gap_figure", "leftover_figure", "where_figure"]
-
 PERCENT = 100.0
-SMALLEST = 1e-300
-"""Probabilities below this are drawn at it."""
-
-CHANCE_LIMIT = 1e-3
-"""Chance below which a test says that there is a disagreement."""
-
-LARGEST_LINEAR = 30.0
-"""Axes that reach beyond this are logarithmic."""
+SMALLEST = 1e-300  # Probabilities below this are drawn at it
+CHANCE_LIMIT = 1e-3  # Chance below which a test says that there is a disagreement
+LARGEST_LINEAR = 30.0  # Axes that reach beyond this are logarithmic
 
 CANDIDATE_INCH, BAR_INCH, LEAST_BARS = (6.4, 1.2), 0.27, 3
 """Size of the figure of candidates without its bars, that of a bar, and the bars for which there is always room."""
 
-BAR_PLACES = {1: (0.0,), 2: (-0.2, 0.2)}
-"""Where bars beside each other stand, by their number."""
-
-HALVES = ("C1", "C0")
-"""Rows of amplifiers, the upper one first."""
+BAR_PLACES = {1: (0.0,), 2: (-0.2, 0.2)}  # Where bars beside each other stand, by their number
+HALVES = ("C1", "C0")  # Rows of amplifiers, the upper one first
 
 CHANNELS_PER_HALF = 8
 
-WIDE_PULL = 99.95
-"""From here on a number with a decimal is wider than its amplifier."""
+WIDE_PULL = 99.95  # From here on a number with a decimal is wider than its amplifier
 
 
 def where_figure(verdict: Verdict) -> Figure:
@@ -122,9 +111,7 @@ def leftover_figure(unexplained: Mapping[str, Any]) -> Figure:
 
 def _draw_colour(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
     axes.plot(
-        [row["wavelength_nm"] for row in rows],
-        [PERCENT * row["variance_beyond_noise"] for row in rows],
-        "o-",
+        [row["wavelength_nm"] for row in rows], [PERCENT * row["variance_beyond_noise"] for row in rows], "o-"
     )
     axes.axhline(0.0, color="0.6", lw=0.8)
     axes.set_xlabel("wavelength [nm]")

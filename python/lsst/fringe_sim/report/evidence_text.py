@@ -5,8 +5,6 @@ from __future__ import annotations
 from ..algorithms.public_evidence.joint import JointFit
 from ..algorithms.public_evidence.verdict import Comparison
 
-__all__ = ["evidence_text"]
-
 
 def evidence_text(found: Comparison) -> str:
     """Tables of sets and of kinds, and the verdict in sentences."""

@@ -17,34 +17,11 @@ from numpy.typing import NDArray
 
 from ..algorithms.flat_prep_options import GAUSSIAN_MAD
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
-from ..style import (
-    LINES,
-    TITLE_PLACE,
-    block_mean,
-    figure,
-    finite_range,
-    panels,
-    show_image,
-)
+from ..style import LINES, TITLE_PLACE, block_mean, figure, finite_range, panels, show_image
 
 if TYPE_CHECKING:
     from ..algorithms.coadds import Coadds
     from ..algorithms.single_pixel import SinglePixelFit
-
-__all__ = [
-    "coadds_figure",
-    "components_figure",
-    "contrast_figure",
-    "flats_figure",
-    "map_row",
-    "phase_figure",
-    "pixel_noise",
-    "residuals_figure",
-    "single_pixel_figure",
-    "sky_figure",
-    "template_figure",
-    "thickness_figure",
-]
 
 PERCENT = 100.0
 
@@ -58,23 +35,12 @@ MAP_MARGINS = (0.62, 0.5, 0.45, 0.28)
 GALLERY_PIXELS = 150
 """Frames of a gallery are averaged down to about this many pixels a side, which a panel has."""
 
-RESIDUAL_CELLS = 100
-"""Residuals are averaged down to about this many cells a side."""
-
-SCALE_HEIGHT = 0.65
-"""Height of a scale of colours over that of the panels, where it has a row for itself."""
-
-NOISE_SIGMAS = 5.0
-"""Ends of the colours of residuals, in their noise."""
-
-LEGEND_ROOM = 5.0
-"""Factor by which the axis of coadds goes on beyond the largest value."""
-
-PIXEL_ROOM = 0.3
-"""Part by which the axis of a pixel goes on above its points, for the legend."""
-
-LEAST_CHANCE = 1e-12
-"""Smallest chance of a slipped order that is drawn."""
+RESIDUAL_CELLS = 100  # Residuals are averaged down to about this many cells a side
+SCALE_HEIGHT = 0.65  # Height of a scale of colours over that of the panels, where it has a row for itself
+NOISE_SIGMAS = 5.0  # Ends of the colours of residuals, in their noise
+LEGEND_ROOM = 5.0  # Factor by which the axis of coadds goes on beyond the largest value
+PIXEL_ROOM = 0.3  # Part by which the axis of a pixel goes on above its points, for the legend
+LEAST_CHANCE = 1e-12  # Smallest chance of a slipped order that is drawn
 
 
 @contextmanager
@@ -101,13 +67,7 @@ def thickness_figure(thickness: ThicknessMap, order_um: float) -> Figure:
     good = thickness.mask == 0
     chance = np.where(good, thickness.slip_probability, 0.0)
     with map_row(3 if chance.sum() >= 1.0 else 2) as (made, (left, middle, *others)):
-        show_image(
-            left,
-            thickness.value,
-            mask=thickness.mask,
-            label="thickness [µm]",
-            title=thickness.layer,
-        )
+        show_image(left, thickness.value, mask=thickness.mask, label="thickness [µm]", title=thickness.layer)
         _draw_orders(left, np.where(good, thickness.value, np.nan), order_um)
         show_image(middle, 1e3 * thickness.sigma, mask=thickness.mask, label="σ [nm]", title="uncertainty")
         for right in others:

@@ -21,13 +21,8 @@ from ..style import DIVERGING, LINES, SEQUENTIAL, figure, panels
 from .page import Origin, Report
 from .words import span_text
 
-__all__ = ["focal_plane_figure", "write_focal_plane_page"]
-
-PLAIN = "{x:.2g}"
-"""Format of logarithmic scales."""
-
-PLANE_INCH = (4.6, 3.7)
-"""Width and height of a panel."""
+PLAIN = "{x:.2g}"  # Format of logarithmic scales
+PLANE_INCH = (4.6, 3.7)  # Width and height of a panel
 
 
 def write_focal_plane_page(

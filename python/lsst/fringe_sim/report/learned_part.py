@@ -17,8 +17,6 @@ from ..style import DIVERGING, figure, panels
 from .figures import CURVE_INCH
 from .page import Report
 
-__all__ = ["add_learned", "learned_figure"]
-
 PERCENT = 100.0
 
 SIDE = 64

@@ -17,13 +17,8 @@ from .figures import map_row
 from .page import Origin, Report
 from .words import NM, masked_text, of_sensor, sigma_text
 
-__all__ = ["write_map_on_sky_report"]
-
-EVEN = 0.5
-"""Chance that a map is right from which on no shift is shown."""
-
-LEAST_SIGMAS = 3.0
-"""Least reach of the colours of a shift, in its median uncertainty."""
+EVEN = 0.5  # Chance that a map is right from which on no shift is shown
+LEAST_SIGMAS = 3.0  # Least reach of the colours of a shift, in its median uncertainty
 
 
 def write_map_on_sky_report(

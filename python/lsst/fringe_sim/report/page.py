@@ -27,20 +27,11 @@ from ..files import table_text, write_whole
 from ..style import finite_range, map_to_png, pixels_to_png, to_pieces
 from .words import number_text
 
-__all__ = ["Origin", "Report", "title_of"]
-
 GENERATOR = '<meta name="generator" content="lsst.fringe_sim">'
-HEAD_LENGTH = 1000
-"""What pages of this program say in their beginning, and the length of it."""
-
-PHONE_PX = 380
-"""Pictures that are wider do not fit into the smallest windows, where a click enlarges them."""
-
-MAP_STEP = 5
-"""Pixels between those that decide the colours of a whole map."""
-
-SMALLEST_SCALE = 0.9
-"""Panels are put side by side as long as none is drawn smaller than this."""
+HEAD_LENGTH = 1000  # What pages of this program say in their beginning, and the length of it
+PHONE_PX = 380  # Pictures that are wider do not fit into the smallest windows, where a click enlarges them
+MAP_STEP = 5  # Pixels between those that decide the colours of a whole map
+SMALLEST_SCALE = 0.9  # Panels are put side by side as long as none is drawn smaller than this
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -183,12 +174,7 @@ class Report:
         self._body.append(f'<p class="small">{words}</p>')
 
     def table(
-        self,
-        table: Table,
-        name: str,
-        *,
-        download: Table | None = None,
-        marks: Sequence[str] | None = None,
+        self, table: Table, name: str, *, download: Table | None = None, marks: Sequence[str] | None = None
     ) -> None:
         """Add a table with its units, and a link that saves it as ECSV.
 

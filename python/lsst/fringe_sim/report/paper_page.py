@@ -19,19 +19,11 @@ from .figures import CURVE_INCH, MAP_INCH
 from .page import Origin, Report
 from .words import number_text
 
-__all__ = ["section_figures", "write_paper_page"]
-
 PER_ROW = 3
-MANY = 5
-"""More panels than this are drawn small, as a gallery."""
+MANY = 5  # More panels than this are drawn small, as a gallery
 
 STATUS_MARKS = {"agrees": "good", "erratum": "note", "differs": "bad", "skipped": "void"}
-STATUS_WORDS = {
-    "agrees": "agrees",
-    "erratum": "paper errs",
-    "differs": "differs",
-    "skipped": "skipped",
-}
+STATUS_WORDS = {"agrees": "agrees", "erratum": "paper errs", "differs": "differs", "skipped": "skipped"}
 
 
 def write_paper_page(

@@ -21,15 +21,6 @@ from .page import Origin, Report
 from .source_figure import bias_figure
 from .words import masked_text, of_sensor, span_text
 
-__all__ = [
-    "COADDS_CAPTION",
-    "COADDS_TEXT",
-    "SOURCES_FILE",
-    "coadd_table",
-    "sky_amplitudes",
-    "write_sky_report",
-]
-
 PERCENT = 100.0
 
 SOURCES_FILE = "coadd_sources.ecsv"
@@ -120,10 +111,7 @@ def write_sky_report(
     report.table(amplitudes, "sky_fringe_amplitudes")
     if len(frames) > 1:
         report.section("Components", "Principal components of the frames: the templates of a correction.")
-        report.figure(
-            components_figure(fit_pca(frames)),
-            CAPTION_OF_COMPONENTS,
-        )
+        report.figure(components_figure(fit_pca(frames)), CAPTION_OF_COMPONENTS)
     if found is not None:
         report.section("Coadds", COADDS_TEXT if places is None else COADDS_OF_VISITS_TEXT)
         report.figure(coadds_figure(found), COADDS_CAPTION)

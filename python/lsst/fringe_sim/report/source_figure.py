@@ -10,8 +10,6 @@ from matplotlib.figure import Figure
 
 from ..style import LINES, figure
 
-__all__ = ["bias_figure"]
-
 PANELS = {
     "": "flux: bias [parts]",
     "e1_": "first ellipticity: bias",

@@ -17,8 +17,6 @@ from .figures import contrast_figure, flats_figure, phase_figure, residuals_figu
 from .page import Origin, Report
 from .words import masked_text, of_sensor, sigma_text
 
-__all__ = ["phase_folded", "residual_of_fit", "residual_table", "write_thickness_report"]
-
 PERCENT = 100.0
 PHASE_BINS = 32
 RMS = "rms of flat − model"

@@ -10,21 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..products import SensorSection
 
-__all__ = [
-    "amplitude_text",
-    "masked_text",
-    "measured_text",
-    "number_text",
-    "of_sensor",
-    "sigma_text",
-    "span_text",
-]
-
 PERCENT = 100.0
 NM = 1000.0
 
-MOST_DECIMALS, MOST_PLAIN = 100.0, 1e6
-"""Numbers from which on no decimals are shown, and an exponent is."""
+MOST_DECIMALS, MOST_PLAIN = 100.0, 1e6  # Numbers from which on no decimals are shown, and an exponent is
 
 
 def amplitude_text(fraction: float) -> str:

@@ -11,8 +11,6 @@ from ..instrument.camera import Camera
 from ..instrument.detector import Detector
 from ..middleware.instruments import INSTRUMENTS
 
-__all__ = ["CameraConfig"]
-
 
 class CameraConfig(Config):
     """The camera whose rafts and sensors a configuration names.
@@ -21,11 +19,10 @@ class CameraConfig(Config):
     another configuration. It is refused with the configuration, before any graph is built.
     """
 
-    camera: Field[str] = Field(
-        dtype=str,
+    camera = Field[str](
         default="",
-        doc="Camera whose rafts and sensors are named in this configuration. The instrument of a pipeline sets it; "
-        "without one, the names of all cameras are taken.",
+        doc="Camera whose rafts and sensors are named in this configuration. The instrument of a pipeline sets "
+        "it; without one, the names of all cameras are taken.",
     )
 
     def validate(self) -> None:

@@ -11,55 +11,48 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lsst.pex.config import Config, Field, FieldValidationError
-from lsst.pipe.base import (
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms import discover
 from ..algorithms.discovery import SKY_SEARCH, SearchOptions, Verdict, discover_sky, placement_in_frames
+from ..algorithms.discovery.skeleton import learned_files
 from ..instrument.detector import Detector
 from ..model.effects_override import effects_override
 from ..products import FringeCube, FringeFlat, SkyFringe, ThicknessMap
 from .model_config import FringeModelConfig, ModelChoice
-from .quantum import common_header, data_id_of, sensor_of, unusable
-from .sky_model import SkyModelConfig, thickness_input
-
-__all__ = [
-    "EffectDiscoveryConfig",
-    "EffectDiscoveryConnections",
-    "EffectDiscoveryTask",
-    "SkyEffectDiscoveryConfig",
-    "SkyEffectDiscoveryConnections",
-    "SkyEffectDiscoveryTask",
-]
+from .quantum import SENSOR, SENSOR_EXPOSURE, common_header, data_id_of, flats_input, sensor_of, unusable
+from .sky_model import MapConnections, SkyModelConfig
 
 
-class EffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
+class EffectDiscoveryConnections(base.PipelineTaskConnections, dimensions=SENSOR):
     """The flats of a sensor in; a verdict, and what it means for the model of all other tasks, out."""
 
-    flats = Input(
-        doc="Fringe patterns of the sensor at all wavelengths.",
-        name="fringeFlat",
-        storageClass="FringeFlat",
-        dimensions=("instrument", "exposure", "detector"),
-        multiple=True,
-        deferLoad=True,
-    )
+    flats = flats_input()
     verdict = Output(
-        doc="Whether flats and model disagree, and which effect is the reason.",
-        name="effectDiscovery",
-        storageClass="FringeJson",
-        dimensions=("instrument", "detector"),
+        "effectDiscovery",
+        "FringeJson",
+        "Whether flats and model disagree, and which effect is the reason.",
+        dimensions=SENSOR,
     )
     override = Output(
-        doc="Effects that were known and that were found, as an override for any task with a fringe model: "
-        "-C label:FILE.",
-        name="effectOverride",
+        "effectOverride",
+        "ConfigOverride",
+        "Effects that were known and that were found, as an override for any task with a fringe model: -C "
+        "label:FILE.",
+        dimensions=SENSOR,
+    )
+    learned = Output(
+        doc="A correction that was learned from what no effect explains, as an override; nothing where none is "
+        "believed.",
+        name="learnedOverride",
+        storageClass="ConfigOverride",
+        dimensions=("instrument", "detector"),
+    )
+    learned_effect = Output(
+        doc="The beginning of an effect that does what was learned, for --effects-from; nothing where none is "
+        "believed.",
+        name="learnedEffect",
         storageClass="ConfigOverride",
         dimensions=("instrument", "detector"),
     )
@@ -68,24 +61,20 @@ class EffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrumen
 class SearchConfig(Config):
     """How hard a search looks."""
 
-    seed: Field[int] = Field(
-        dtype=int, default=1, doc="With the number of the sensor: which parts of it are held out."
+    seed = Field[int](default=1, doc="With the number of the sensor: which parts of it are held out.")
+    most_cells = Field[int](
+        default=20_000, doc="Cells that the images are averaged to, if the pattern allows it."
     )
-    most_cells: Field[int] = Field(
-        dtype=int, default=20_000, doc="Cells that the images are averaged to, if the pattern allows it."
+    significance = Field[float](
+        default=1e-3, doc="Chance of noise below which the model is held to disagree."
     )
-    significance: Field[float] = Field(
-        dtype=float, default=1e-3, doc="Chance of noise below which the model is held to disagree."
-    )
-    time_budget_s: Field[float] = Field(
-        dtype=float,
+    time_budget_s = Field[float](
         default=None,
         optional=True,
         doc="Time for one sensor [s], after which the best answer so far is given; by default as long as it takes.",
     )
 
-    model_accuracy: Field[float] = Field(
-        dtype=float,
+    model_accuracy = Field[float](
         default=SearchOptions().model_accuracy,
         doc="Part of the fringes by which the model may be wrong; by default as the tables of silicon.",
     )
@@ -107,21 +96,21 @@ class SearchConfig(Config):
 
 
 class EffectDiscoveryConfig(
-    SearchConfig, FringeModelConfig, PipelineTaskConfig, pipelineConnections=EffectDiscoveryConnections
+    SearchConfig, FringeModelConfig, base.PipelineTaskConfig, pipelineConnections=EffectDiscoveryConnections
 ):
     """Configuration of `EffectDiscoveryTask`; ``effects`` are those that are known already."""
 
     task_name: ClassVar[str] = "effectDiscovery"
 
 
-class EffectDiscoveryTask(PipelineTask):
+class EffectDiscoveryTask(base.PipelineTask):
     """Find where model and flats of a sensor disagree, and name the missing effect."""
 
     ConfigClass = EffectDiscoveryConfig
     config: EffectDiscoveryConfig
     _DefaultName = "effectDiscovery"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the flats one by one into a cube, search, store."""
         detector = sensor_of(data_id_of(butlerQC))
         flats = (butlerQC.get(ref).get() for ref in inputRefs.flats)
@@ -129,7 +118,7 @@ class EffectDiscoveryTask(PipelineTask):
             result = self.run(flats, len(inputRefs.flats), detector)
         butlerQC.put(result, outputRefs)
 
-    def run(self, flats: Iterable[FringeFlat], number: int, detector: Detector) -> Struct:
+    def run(self, flats: Iterable[FringeFlat], number: int, detector: Detector) -> base.Struct:
         """Search one sensor.
 
         Parameters
@@ -145,7 +134,8 @@ class EffectDiscoveryTask(PipelineTask):
         -------
         result : `~lsst.pipe.base.Struct`
             ``verdict``, the layout of ``discovery.json``; ``override``, the text of a configuration override. The
-            verdict names the dataset type of the override in place of a file.
+            verdict names the dataset type of the override in place of a file. ``learned`` and ``learned_effect`` are
+            the texts of ``learned.py`` and ``learned_effect.py``; `None` without a correction that is believed.
 
         Raises
         ------
@@ -162,38 +152,43 @@ class EffectDiscoveryTask(PipelineTask):
             report=functools.partial(self.log.verbose, "%s"),
         )
         self.log.info("%s: %s", detector.name, verdict.summary())
-        return _stored(self.config, choice, verdict, detector)
+        learned = learned_files(verdict, detector.name)
+        return base.Struct(
+            learned=learned.get("learned.py"),
+            learned_effect=learned.get("learned_effect.py"),
+            **_stored(self.config, choice, verdict, detector).getDict(),
+        )
 
 
-class SkyEffectDiscoveryConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
+class SkyEffectDiscoveryConnections(base.PipelineTaskConnections, dimensions=SENSOR):
     """Frames of the sky and the thickness of a sensor in; a verdict, and an override with what was found, out."""
 
     frames = Input(
-        doc="Frames of the night sky, not corrected for fringes, whose headers state the OH bands.",
-        name="skyFringe",
-        storageClass="SkyFringe",
-        dimensions=("instrument", "exposure", "detector"),
+        "skyFringe",
+        "SkyFringe",
+        "Frames of the night sky, not corrected for fringes, whose headers state the OH bands.",
+        dimensions=SENSOR_EXPOSURE,
         multiple=True,
         deferLoad=True,
     )
-    thickness = thickness_input()
+    thickness = MapConnections.thickness
     verdict = Output(
-        doc="Whether the sky and the model disagree, and which effect is the reason.",
-        name="skyEffectDiscovery",
-        storageClass="FringeJson",
-        dimensions=("instrument", "detector"),
+        "skyEffectDiscovery",
+        "FringeJson",
+        "Whether the sky and the model disagree, and which effect is the reason.",
+        dimensions=SENSOR,
     )
     override = Output(
-        doc="Effects that were known and that were found, as an override for any task with a fringe model: "
-        "-C label:FILE.",
-        name="skyEffectOverride",
-        storageClass="ConfigOverride",
-        dimensions=("instrument", "detector"),
+        "skyEffectOverride",
+        "ConfigOverride",
+        "Effects that were known and that were found, as an override for any task with a fringe model: -C "
+        "label:FILE.",
+        dimensions=SENSOR,
     )
 
 
 class SkyEffectDiscoveryConfig(
-    SearchConfig, SkyModelConfig, PipelineTaskConfig, pipelineConnections=SkyEffectDiscoveryConnections
+    SearchConfig, SkyModelConfig, base.PipelineTaskConfig, pipelineConnections=SkyEffectDiscoveryConnections
 ):
     """Configuration of `SkyEffectDiscoveryTask`; ``effects`` are those that are known already."""
 
@@ -206,14 +201,14 @@ class SkyEffectDiscoveryConfig(
             raise FieldValidationError(SkyModelConfig.stand_in, self, "a search needs the map of the sensor")
 
 
-class SkyEffectDiscoveryTask(PipelineTask):
+class SkyEffectDiscoveryTask(base.PipelineTask):
     """Find where model and sky of a sensor disagree, and name the missing effect."""
 
     ConfigClass = SkyEffectDiscoveryConfig
     config: SkyEffectDiscoveryConfig
     _DefaultName = "skyEffectDiscovery"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read frames and map, search, store."""
         detector = sensor_of(data_id_of(butlerQC))
         frames = [butlerQC.get(ref).get() for ref in inputRefs.frames]
@@ -221,7 +216,7 @@ class SkyEffectDiscoveryTask(PipelineTask):
             result = self.run(frames, butlerQC.get(inputRefs.thickness), detector)
         butlerQC.put(result, outputRefs)
 
-    def run(self, frames: Sequence[SkyFringe], thickness: ThicknessMap, detector: Detector) -> Struct:
+    def run(self, frames: Sequence[SkyFringe], thickness: ThicknessMap, detector: Detector) -> base.Struct:
         """Search one sensor.
 
         Parameters
@@ -271,11 +266,13 @@ def _stored(
     choice: ModelChoice,
     verdict: Verdict,
     detector: Detector,
-) -> Struct:
+) -> base.Struct:
     """Verdict and override as they are stored."""
     stated = {**common_header(config), **choice.header(), "SEED": config.seed}
     content = verdict.as_mapping(model_override=config.connections.override)
-    return Struct(verdict={**content, "provenance": stated}, override=_override(choice, verdict, detector))
+    return base.Struct(
+        verdict={**content, "provenance": stated}, override=_override(choice, verdict, detector)
+    )
 
 
 def _override(choice: ModelChoice, verdict: Verdict, detector: Detector) -> str:

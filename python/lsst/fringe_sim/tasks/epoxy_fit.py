@@ -11,17 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lsst.pex.config import ChoiceField, Field, ListField, RangeField
-from lsst.pipe.base import (
-    InputQuantizedConnection,
-    NoWorkFound,
-    OutputQuantizedConnection,
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantumContext,
-    Struct,
-)
-from lsst.pipe.base.connectionTypes import Input, Output
+from lsst.pipe import base
+from lsst.pipe.base.connectionTypes import Output
 from lsst.utils.logging import getLogger
 
 from ..algorithms import fit_thickness
@@ -33,36 +24,27 @@ from ..instrument.detector import Detector
 from ..model import LABORATORY_TEMPERATURE, Setup
 from ..products import FringeCube, FringeFlat, ThicknessMap, describe_mask
 from .model_config import FringeModelConfig
-from .quantum import common_header, data_id_of, sensor_of, unusable
-
-__all__ = ["EpoxyFitConfig", "EpoxyFitConnections", "EpoxyFitTask"]
+from .quantum import SENSOR, common_header, data_id_of, flats_input, sensor_of, unusable
 
 _LOG = getLogger(__name__)
 
 
-class EpoxyFitConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
+class EpoxyFitConnections(base.PipelineTaskConnections, dimensions=SENSOR):
     """The flats of a sensor in, its thickness map out."""
 
-    flats = Input(
-        doc="Fringe patterns of the sensor at all wavelengths.",
-        name="fringeFlat",
-        storageClass="FringeFlat",
-        dimensions=("instrument", "exposure", "detector"),
-        multiple=True,
-        deferLoad=True,
-    )
+    flats = flats_input()
     thickness = Output(
-        doc="Thickness of the varying layer, with its uncertainty.",
-        name="epoxyThickness",
-        storageClass="ThicknessMap",
-        dimensions=("instrument", "detector"),
+        "epoxyThickness",
+        "ThicknessMap",
+        "Thickness of the varying layer, with its uncertainty.",
+        dimensions=SENSOR,
     )
 
     silicon = Output(
-        doc="Thickness of the silicon in front of it, where the flats tell it; only if it is fitted.",
-        name="siliconThickness",
-        storageClass="ThicknessMap",
-        dimensions=("instrument", "detector"),
+        "siliconThickness",
+        "ThicknessMap",
+        "Thickness of the silicon in front of it, where the flats tell it; only if it is fitted.",
+        dimensions=SENSOR,
     )
 
     def __init__(self, *, config: EpoxyFitConfig | None = None) -> None:
@@ -73,7 +55,7 @@ class EpoxyFitConnections(PipelineTaskConnections, dimensions=("instrument", "de
         """Put the flats in the order of their wavelengths."""
         connection, refs = inputs["flats"]
         if not refs:
-            raise NoWorkFound(label, "flats", connection)
+            raise base.NoWorkFound(label, "flats", connection)
         ordered = sorted(refs, key=_wavelength_order)
         inputs["flats"] = (connection, ordered)
         super().adjustQuantum(inputs, outputs, label, data_id)
@@ -86,13 +68,12 @@ def _wavelength_order(ref: Any) -> tuple[str, int]:
     return exposure.target_name or "", exposure.id
 
 
-class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=EpoxyFitConnections):
+class EpoxyFitConfig(FringeModelConfig, base.PipelineTaskConfig, pipelineConnections=EpoxyFitConnections):
     """Configuration of `EpoxyFitTask`."""
 
     task_name: ClassVar[str] = "epoxyFit"
 
-    method: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    method = ChoiceField[str](
         default="global",
         doc="How the thickness is found.",
         allowed={
@@ -100,8 +81,7 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
             "guo2022": "walk from pixel to pixel, steps 1 to 4 of Guo, Walter, Lage & Lupton 2022",
         },
     )
-    observable: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    observable = ChoiceField[str](
         default="detection",
         doc="What a pixel responds to.",
         allowed={
@@ -109,20 +89,16 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
             "total": "light absorbed in the whole stack, as the published fit had it",
         },
     )
-    min_wavelengths: Field[int] = Field(
-        dtype=int, default=4, doc="Least number of different wavelengths with which a sensor is fitted."
+    min_wavelengths = Field[int](
+        default=4, doc="Least number of different wavelengths with which a sensor is fitted."
     )
-    range_um: ListField[float] = ListField(
-        dtype=float,
-        optional=True,
-        length=2,
-        doc="Thicknesses that are searched, µm; by default the set-up's.",
+    range_um = ListField[float](
+        optional=True, length=2, doc="Thicknesses that are searched, µm; by default the set-up's."
     )
-    start_pixel: ListField[int] = ListField(
-        dtype=int, optional=True, length=2, doc="Row and column at which the walk of 'guo2022' begins."
+    start_pixel = ListField[int](
+        optional=True, length=2, doc="Row and column at which the walk of 'guo2022' begins."
     )
-    silicon: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    silicon = ChoiceField[str](
         default="fixed",
         doc="Thickness of the silicon in front of the varying layer.",
         allowed={
@@ -132,8 +108,7 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
             "paraboloid": "a polynomial of second degree over the sensor, fitted likewise",
         },
     )
-    level_zones: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    level_zones = ChoiceField[str](
         default="known",
         doc="Parts of the sensor whose level is free at each wavelength.",
         allowed={
@@ -152,8 +127,7 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
         inclusiveMax=True,
         doc="Degree of a slow illumination that is free at each wavelength; 0 for none.",
     )
-    contrast: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    contrast = ChoiceField[str](
         default="wavelength",
         doc="Contrast of the fringes.",
         allowed={
@@ -162,31 +136,23 @@ class EpoxyFitConfig(FringeModelConfig, PipelineTaskConfig, pipelineConnections=
             "fixed": "that of the model",
         },
     )
-    slip_limit: Field[float] = Field(
-        dtype=float,
-        default=0.01,
-        doc="Pixels whose fringe order is wrong with a larger probability are masked.",
+    slip_limit = Field[float](
+        default=0.01, doc="Pixels whose fringe order is wrong with a larger probability are masked."
     )
-    threads: Field[int] = Field(
-        dtype=int,
+    threads = Field[int](
         optional=True,
         doc="Number of threads, without influence on the result; by default as many as there are processors.",
     )
 
 
-class EpoxyFitTask(PipelineTask):
+class EpoxyFitTask(base.PipelineTask):
     """Fit the thickness of the varying layer at every pixel of a sensor."""
 
     ConfigClass = EpoxyFitConfig
     config: EpoxyFitConfig
     _DefaultName = "epoxyFit"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the flats one by one into a cube, fit, store."""
         detector = sensor_of(data_id_of(butlerQC))
         flats = (butlerQC.get(ref).get() for ref in inputRefs.flats)
@@ -196,7 +162,7 @@ class EpoxyFitTask(PipelineTask):
         if result.silicon is not None:
             butlerQC.put(result.silicon, outputRefs.silicon)
 
-    def run(self, flats: Iterable[FringeFlat], number: int, detector: Detector) -> Struct:
+    def run(self, flats: Iterable[FringeFlat], number: int, detector: Detector) -> base.Struct:
         """Fit one sensor.
 
         Parameters
@@ -243,7 +209,7 @@ class EpoxyFitTask(PipelineTask):
                 silicon, detector=detector.name, metadata={**metadata, **silicon.metadata}
             )
         thickness = dataclasses.replace(fitted, detector=detector.name, metadata=metadata)
-        return Struct(thickness=thickness, silicon=silicon)
+        return base.Struct(thickness=thickness, silicon=silicon)
 
     def _options(self, setup: Setup) -> dict[str, Any]:
         config = self.config

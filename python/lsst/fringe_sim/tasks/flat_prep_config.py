@@ -10,8 +10,6 @@ from lsst.pex.config import ChoiceField, Config, Field, FieldValidationError
 from ..algorithms.flat_prep import FlatPrepOptions
 from ..errors import InputError
 
-__all__ = ["FlatPrepConfig"]
-
 _DEFAULT = FlatPrepOptions()
 _OVERSCAN = ("overscan_method", "overscan_knots", "overscan_skip", "parallel_overscan")
 
@@ -24,8 +22,7 @@ def _choice(default: Any, doc: str) -> Any:
 class FlatPrepConfig(Config):
     """Every choice of `FlatPrepOptions`, by the same name."""
 
-    overscan_method: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    overscan_method = ChoiceField[str](
         default=_DEFAULT.overscan_method,
         doc="Level of the serial overscan.",
         allowed={"median": "the median of each row", "spline": "a smooth curve through the rows"},
@@ -64,8 +61,7 @@ class FlatPrepConfig(Config):
         _DEFAULT.smoothing_sigma_px, "Standard deviation of the smoothing kernel, px; 0 for none."
     )
 
-    raws_limit_graph: Field[bool] = Field(
-        dtype=bool,
+    raws_limit_graph = Field[bool](
         default=True,
         doc="Whether only exposures that have raw frames enter the graph; False where the night to be simulated, "
         "whose exposures have none, is in the same graph.",

@@ -8,37 +8,20 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from lsst.pipe.base import (
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.focal_plane import summary_table
-from .quantum import common_header, put_in_order, unusable
-
-__all__ = ["FocalPlaneSummaryConfig", "FocalPlaneSummaryConnections", "FocalPlaneSummaryTask"]
+from .quantum import SENSOR, common_header, put_in_order, unusable
 
 
-class FocalPlaneSummaryConnections(PipelineTaskConnections, dimensions=("instrument",)):
+class FocalPlaneSummaryConnections(base.PipelineTaskConnections, dimensions=("instrument",)):
     """Forecasts of sensors in, one table out."""
 
     forecasts = Input(
-        doc="Forecasts of single sensors.",
-        name="fringeForecast",
-        storageClass="AstropyTable",
-        dimensions=("instrument", "detector"),
-        multiple=True,
+        "fringeForecast", "AstropyTable", "Forecasts of single sensors.", dimensions=SENSOR, multiple=True
     )
-    summary = Output(
-        doc="One row per sensor.",
-        name="focalPlaneForecast",
-        storageClass="AstropyTable",
-        dimensions=("instrument",),
-    )
+    summary = Output("focalPlaneForecast", "AstropyTable", "One row per sensor.", dimensions=("instrument",))
 
     def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
         """Put the sensors in the order of their numbers."""
@@ -47,24 +30,24 @@ class FocalPlaneSummaryConnections(PipelineTaskConnections, dimensions=("instrum
         return ordered, {}
 
 
-class FocalPlaneSummaryConfig(PipelineTaskConfig, pipelineConnections=FocalPlaneSummaryConnections):
+class FocalPlaneSummaryConfig(base.PipelineTaskConfig, pipelineConnections=FocalPlaneSummaryConnections):
     """Configuration of `FocalPlaneSummaryTask`."""
 
 
-class FocalPlaneSummaryTask(PipelineTask):
+class FocalPlaneSummaryTask(base.PipelineTask):
     """Gather the forecasts of a focal plane."""
 
     ConfigClass = FocalPlaneSummaryConfig
     config: FocalPlaneSummaryConfig
     _DefaultName = "focalPlaneSummary"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read, gather, store."""
         with unusable("focal plane"):
             result = self.run(butlerQC.get(inputRefs.forecasts))
         butlerQC.put(result, outputRefs)
 
-    def run(self, forecasts: Sequence[Table]) -> Struct:
+    def run(self, forecasts: Sequence[Table]) -> base.Struct:
         """Gather forecasts.
 
         Parameters
@@ -81,4 +64,4 @@ class FocalPlaneSummaryTask(PipelineTask):
         summary.meta.update(common_header(self.config))
         rms = np.asarray(summary["rms"])
         self.log.info("%d sensors: fringe rms %.4f to %.4f %%", len(summary), rms.min(), rms.max())
-        return Struct(summary=summary)
+        return base.Struct(summary=summary)

@@ -6,14 +6,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from lsst.pipe.base import (
-    NoWorkFound,
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input, Output
 from lsst.utils.logging import getLogger
 
@@ -21,30 +14,23 @@ from ..algorithms.flat_prep import combine_biases
 from ..instrument.raw_frame import RawFrame
 from ..products import CombinedBias
 from .flat_prep_config import FlatPrepConfig
-from .quantum import common_header, data_id_of, sensor_of, unusable
-
-__all__ = ["FringeBiasConfig", "FringeBiasConnections", "FringeBiasTask"]
+from .quantum import SENSOR, SENSOR_EXPOSURE, common_header, data_id_of, sensor_of, unusable
 
 _LOG = getLogger(__name__)
 
 
-class FringeBiasConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
+class FringeBiasConnections(base.PipelineTaskConnections, dimensions=SENSOR):
     """Raw biases in, one combined bias out."""
 
     raws = Input(
-        doc="Raw frames of the sensor; those that are no biases are left aside.",
-        name="raw",
-        storageClass="RawFrame",
-        dimensions=("instrument", "exposure", "detector"),
+        "raw",
+        "RawFrame",
+        "Raw frames of the sensor; those that are no biases are left aside.",
+        dimensions=SENSOR_EXPOSURE,
         multiple=True,
         deferLoad=True,
     )
-    bias = Output(
-        doc="Mean bias.",
-        name="fringeBias",
-        storageClass="CombinedBias",
-        dimensions=("instrument", "detector"),
-    )
+    bias = Output("fringeBias", "CombinedBias", "Mean bias.", dimensions=SENSOR)
 
     def __init__(self, *, config: FringeBiasConfig | None = None) -> None:
         if config is not None and not config.raws_limit_graph:
@@ -57,32 +43,32 @@ class FringeBiasConnections(PipelineTaskConnections, dimensions=("instrument", "
         if not biases:
             if refs:
                 _LOG.warning("%s: no bias frames of %s; its flats will not be prepared", label, data_id)
-            raise NoWorkFound(label, "raws", connection)
+            raise base.NoWorkFound(label, "raws", connection)
         biases.sort(key=lambda ref: ref.dataId["exposure"])
         inputs["raws"] = (connection, biases)
         super().adjustQuantum(inputs, outputs, label, data_id)
         return {"raws": (connection, biases)}, {}
 
 
-class FringeBiasConfig(FlatPrepConfig, PipelineTaskConfig, pipelineConnections=FringeBiasConnections):
+class FringeBiasConfig(FlatPrepConfig, base.PipelineTaskConfig, pipelineConnections=FringeBiasConnections):
     """Configuration of `FringeBiasTask`."""
 
 
-class FringeBiasTask(PipelineTask):
+class FringeBiasTask(base.PipelineTask):
     """Combine the bias frames of a sensor."""
 
     ConfigClass = FringeBiasConfig
     config: FringeBiasConfig
     _DefaultName = "fringeBias"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the frames one by one while they are combined."""
         detector = sensor_of(data_id_of(butlerQC))
         with unusable(detector.name):
             result = self.run((butlerQC.get(ref).get() for ref in inputRefs.raws), detector.name)
         butlerQC.put(result, outputRefs)
 
-    def run(self, raws: Iterable[RawFrame], detector: str) -> Struct:
+    def run(self, raws: Iterable[RawFrame], detector: str) -> base.Struct:
         """Combine bias frames.
 
         Parameters
@@ -107,7 +93,7 @@ class FringeBiasTask(PipelineTask):
         bias: CombinedBias = combine_biases(self._told(raws), self.config.options())
         self.log.info("%s: %d bias frames combined", detector, bias.n_frames)
         metadata = {**common_header(self.config), **bias.metadata}
-        return Struct(bias=dataclasses.replace(bias, detector=detector, metadata=metadata))
+        return base.Struct(bias=dataclasses.replace(bias, detector=detector, metadata=metadata))
 
     def _told(self, raws: Iterable[RawFrame]) -> Iterator[RawFrame]:
         """The frames; what was taken for granted of each is said."""

@@ -6,15 +6,7 @@ import dataclasses
 from typing import Any
 
 from lsst.pex.config import ChoiceField, Field
-from lsst.pipe.base import (
-    InputQuantizedConnection,
-    OutputQuantizedConnection,
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input, Output, PrerequisiteInput
 
 from ..algorithms.fringe_correction import CorrectionOptions
@@ -23,40 +15,35 @@ from ..errors import InputError
 from ..middleware.afw import observed_from_exposure, put_into_exposure
 from ..products import FringeTemplates, ObservedFrame
 from .observed_fringe import BackgroundConfig
-from .quantum import common_header, data_id_of, sensor_of, unusable
-
-__all__ = ["FringeCorrectionConfig", "FringeCorrectionConnections", "FringeCorrectionTask"]
+from .quantum import SENSOR_EXPOSURE, SENSOR_FILTER, common_header, data_id_of, sensor_of, unusable
 
 
-class FringeCorrectionConnections(PipelineTaskConnections, dimensions=("instrument", "exposure", "detector")):
+class FringeCorrectionConnections(base.PipelineTaskConnections, dimensions=SENSOR_EXPOSURE):
     """A frame and templates in, the corrected frame and its row of the table out."""
 
     config: FringeCorrectionConfig
 
     frame = Input(
-        doc="Frame after the removal of the instrument's signature, with its fringes.",
-        name="post_isr_image",
-        storageClass="ObservedFrame",
-        dimensions=("instrument", "exposure", "detector"),
+        "post_isr_image",
+        "ObservedFrame",
+        "Frame after the removal of the instrument's signature, with its fringes.",
+        dimensions=SENSOR_EXPOSURE,
     )
     templates = Input(
-        doc="Fringe templates of the sensor in the filter of the frame.",
-        name="fringeTemplates",
-        storageClass="FringeTemplates",
-        dimensions=("instrument", "physical_filter", "detector"),
+        "fringeTemplates",
+        "FringeTemplates",
+        "Fringe templates of the sensor in the filter of the frame.",
+        dimensions=SENSOR_FILTER,
         isCalibration=True,
     )
     corrected = Output(
-        doc="The frame without fringes.",
-        name="fringeCorrected",
-        storageClass="ObservedFrame",
-        dimensions=("instrument", "exposure", "detector"),
+        "fringeCorrected", "ObservedFrame", "The frame without fringes.", dimensions=SENSOR_EXPOSURE
     )
     summary = Output(
-        doc="Scales, structure before and after, and whether the templates may be trusted; one row.",
-        name="fringeCorrectionSummary",
-        storageClass="AstropyTable",
-        dimensions=("instrument", "exposure", "detector"),
+        "fringeCorrectionSummary",
+        "AstropyTable",
+        "Scales, structure before and after, and whether the templates may be trusted; one row.",
+        dimensions=SENSOR_EXPOSURE,
     )
 
     def __init__(self, *, config: FringeCorrectionConfig | None = None) -> None:
@@ -73,18 +60,16 @@ class FringeCorrectionConnections(PipelineTaskConnections, dimensions=("instrume
 
 
 class FringeCorrectionConfig(
-    BackgroundConfig, PipelineTaskConfig, pipelineConnections=FringeCorrectionConnections
+    BackgroundConfig, base.PipelineTaskConfig, pipelineConnections=FringeCorrectionConnections
 ):
     """Configuration of `FringeCorrectionTask`."""
 
-    certified_templates: Field[bool] = Field(
-        dtype=bool,
+    certified_templates = Field[bool](
         default=False,
-        doc="Whether the templates come from a calibration collection, by the time of the exposure; otherwise from "
-        "the run in which they are made.",
+        doc="Whether the templates come from a calibration collection, by the time of the exposure; otherwise "
+        "from the run in which they are made.",
     )
-    frame_storage_class: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    frame_storage_class = ChoiceField[str](
         default="ObservedFrame",
         doc="Storage class of the frame, before and after.",
         allowed={
@@ -92,27 +77,21 @@ class FringeCorrectionConfig(
             "Exposure": "as the next task of Rubin's pipelines wants it; needs lsst.afw",
         },
     )
-    pixel_arcsec: Field[float] = Field(
-        dtype=float,
+    pixel_arcsec = Field[float](
         default=0.2,
         doc="Size of a pixel [arcsec]: fringes are judged on scales up to 20 arcsec.",
         check=lambda value: value > 0.0,
     )
 
 
-class FringeCorrectionTask(PipelineTask):
+class FringeCorrectionTask(base.PipelineTask):
     """Subtract fringe templates from a frame, if their fringes are seen; refuse those that add structure."""
 
     ConfigClass = FringeCorrectionConfig
     config: FringeCorrectionConfig
     _DefaultName = "fringeCorrection"
 
-    def runQuantum(
-        self,
-        butlerQC: QuantumContext,
-        inputRefs: InputQuantizedConnection,
-        outputRefs: OutputQuantizedConnection,
-    ) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read, correct, store."""
         data_id = data_id_of(butlerQC)
         name = f"{sensor_of(data_id).name}, exposure {data_id['exposure']}"
@@ -120,7 +99,7 @@ class FringeCorrectionTask(PipelineTask):
             result = self.run(butlerQC.get(inputRefs.frame), butlerQC.get(inputRefs.templates), name)
         butlerQC.put(result, outputRefs)
 
-    def run(self, frame: Any, templates: FringeTemplates, name: str = "") -> Struct:
+    def run(self, frame: Any, templates: FringeTemplates, name: str = "") -> base.Struct:
         """Correct one frame.
 
         Parameters
@@ -158,7 +137,7 @@ class FringeCorrectionTask(PipelineTask):
         )
         metadata = {**made.frame.metadata, **common_header(self.config)}
         corrected = dataclasses.replace(made.frame, metadata=metadata)
-        return Struct(
+        return base.Struct(
             corrected=corrected if observed is frame else put_into_exposure(frame, corrected),
             summary=summary_table([made.record(name)]),
         )

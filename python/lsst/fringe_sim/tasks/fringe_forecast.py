@@ -5,14 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from lsst.pex.config import Field, FieldValidationError, ListField
-from lsst.pipe.base import (
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantaAdjuster,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Output
 
 from ..algorithms.field_response import SensorResponse
@@ -22,70 +15,41 @@ from ..instrument.detector import Detector
 from ..instrument.night import NightHistory, random_nights
 from ..model import Setup
 from ..products import ThicknessMap
-from .quantum import common_header, data_id_of, sensor_of, unusable
-from .sky_model import (
-    LINE_LIST,
-    SkyModelConfig,
-    takes_images,
-    thickness_input,
-    without_constraint,
-)
-
-__all__ = ["FringeForecastConfig", "FringeForecastConnections", "FringeForecastTask"]
+from .quantum import SENSOR, common_header, data_id_of, sensor_of, unusable
+from .sky_model import LINE_LIST, MapConnections, SkyModelConfig
 
 
-class FringeForecastConnections(PipelineTaskConnections, dimensions=("instrument", "detector")):
+class FringeForecastConnections(MapConnections, dimensions=SENSOR):
     """A thickness map in, where there is one; one table out."""
 
-    config: FringeForecastConfig
-
-    thickness = thickness_input()
     forecast = Output(
-        doc="Fringes in cells of the sensor; the header has those of the whole sensor.",
-        name="fringeForecast",
-        storageClass="AstropyTable",
-        dimensions=("instrument", "detector"),
+        "fringeForecast",
+        "AstropyTable",
+        "Fringes in cells of the sensor; the header has those of the whole sensor.",
+        dimensions=SENSOR,
     )
 
-    def __init__(self, *, config: FringeForecastConfig | None = None) -> None:
-        if config is not None and config.stand_in:
-            self.thickness = without_constraint(self.thickness)
 
-    def adjust_all_quanta(self, adjuster: QuantaAdjuster) -> None:
-        """Keep the science sensors."""
-        for data_id in list(adjuster.iter_data_ids()):
-            if not takes_images(adjuster.expand_quantum_data_id(data_id)):
-                adjuster.remove_quantum(data_id)
-
-
-class FringeForecastConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnections=FringeForecastConnections):
+class FringeForecastConfig(
+    SkyModelConfig, base.PipelineTaskConfig, pipelineConnections=FringeForecastConnections
+):
     """Configuration of `FringeForecastTask`."""
 
     task_name: ClassVar[str] = "fringeForecast"
 
-    airmass: Field[float] = Field(
-        dtype=float, default=1.2, doc="Airmass of the exposures.", check=lambda airmass: 1.0 <= airmass < 10.0
+    airmass = Field[float](
+        default=1.2, doc="Airmass of the exposures.", check=lambda airmass: 1.0 <= airmass < 10.0
     )
-    cells: Field[int] = Field(
-        dtype=int, default=8, doc="Cells along each side of a sensor.", check=lambda cells: cells > 0
-    )
-    apertures_arcsec: ListField[float] = ListField(
-        dtype=float,
+    cells = Field[int](default=8, doc="Cells along each side of a sensor.", check=lambda cells: cells > 0)
+    apertures_arcsec = ListField[float](
         default=[1.0, 2.0, 5.0, 10.0, 20.0],
         doc="Sides of the square apertures in which fringe and noise are compared, whole arcseconds.",
     )
-    templates: Field[int] = Field(
-        dtype=int,
-        default=3,
-        doc="Largest number of templates of the correction.",
-        check=lambda count: count > 0,
+    templates = Field[int](
+        default=3, doc="Largest number of templates of the correction.", check=lambda count: count > 0
     )
-    nights: Field[int] = Field(
-        dtype=int, default=5, doc="Random nights that are corrected.", check=lambda count: count > 0
-    )
-    nights_seed: Field[int] = Field(
-        dtype=int, default=0, doc="Seed of the random nights.", check=lambda seed: seed >= 0
-    )
+    nights = Field[int](default=5, doc="Random nights that are corrected.", check=lambda count: count > 0)
+    nights_seed = Field[int](default=0, doc="Seed of the random nights.", check=lambda seed: seed >= 0)
 
     def setDefaults(self) -> None:
         """Every sensor has a forecast."""
@@ -113,14 +77,14 @@ class FringeForecastConfig(SkyModelConfig, PipelineTaskConfig, pipelineConnectio
         return random_nights(self.nights, self.nights_seed)
 
 
-class FringeForecastTask(PipelineTask):
+class FringeForecastTask(base.PipelineTask):
     """Forecast the fringes of one sensor."""
 
     ConfigClass = FringeForecastConfig
     config: FringeForecastConfig
     _DefaultName = "fringeForecast"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the map if there is one, forecast, store."""
         detector = sensor_of(data_id_of(butlerQC))
         with unusable(detector.name):
@@ -128,7 +92,7 @@ class FringeForecastTask(PipelineTask):
             result = self.run(thickness, detector)
         butlerQC.put(result, outputRefs)
 
-    def run(self, thickness: ThicknessMap | None, detector: Detector) -> Struct:
+    def run(self, thickness: ThicknessMap | None, detector: Detector) -> base.Struct:
         """Forecast one sensor.
 
         Parameters
@@ -176,4 +140,4 @@ class FringeForecastTask(PipelineTask):
             *(detector.name, 100.0 * forecast.amplitudes.rms, forecast.over_noise.max()),
             *(len(forecast.residual_over_noise), forecast.residual_over_noise[-1].max()),
         )
-        return Struct(forecast=table)
+        return base.Struct(forecast=table)

@@ -10,46 +10,47 @@ from typing import Any
 import numpy as np
 
 from lsst.pex.config import ChoiceField, Field
-from lsst.pipe.base import (
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.pca import fit_pca, fringe_templates
 from ..products import FringeComponents, SkyFringe
 from ..products.same_light import refuse_equal_pixels, refuse_mixed_models
-from .quantum import common_header, data_id_of, put_in_order, run_datetime, sensor_of, unusable
+from .quantum import (
+    SENSOR_EXPOSURE,
+    SENSOR_FILTER,
+    common_header,
+    data_id_of,
+    put_in_order,
+    run_datetime,
+    sensor_of,
+    unusable,
+)
 
-__all__ = ["FringePcaConfig", "FringePcaConnections", "FringePcaTask"]
 
-
-class FringePcaConnections(PipelineTaskConnections, dimensions=("instrument", "physical_filter", "detector")):
+class FringePcaConnections(base.PipelineTaskConnections, dimensions=SENSOR_FILTER):
     """The sky frames of a sensor in a filter in, one template and all components out."""
 
     frames = Input(
-        doc="Sky frames of the sensor in this filter.",
-        name="skyFringe",
-        storageClass="SkyFringe",
-        dimensions=("instrument", "exposure", "detector"),
+        "skyFringe",
+        "SkyFringe",
+        "Sky frames of the sensor in this filter.",
+        dimensions=SENSOR_EXPOSURE,
         multiple=True,
         minimum=2,
     )
     fringe = Output(
-        doc="Zero-mean fractional fringe frame, which instrument signature removal subtracts.",
-        name="fringe",
-        storageClass="FringeFrame",
-        dimensions=("instrument", "physical_filter", "detector"),
+        "fringe",
+        "FringeFrame",
+        "Zero-mean fractional fringe frame, which instrument signature removal subtracts.",
+        dimensions=SENSOR_FILTER,
         isCalibration=True,
     )
     components = Output(
-        doc="Mean and principal components of the frames.",
-        name="fringeComponents",
-        storageClass="FringeComponents",
-        dimensions=("instrument", "physical_filter", "detector"),
+        "fringeComponents",
+        "FringeComponents",
+        "Mean and principal components of the frames.",
+        dimensions=SENSOR_FILTER,
     )
 
     def __init__(self, *, config: FringePcaConfig | None = None) -> None:
@@ -63,23 +64,20 @@ class FringePcaConnections(PipelineTaskConnections, dimensions=("instrument", "p
         return ordered, {}
 
 
-class FringePcaConfig(PipelineTaskConfig, pipelineConnections=FringePcaConnections):
+class FringePcaConfig(base.PipelineTaskConfig, pipelineConnections=FringePcaConnections):
     """Configuration of `FringePcaTask`."""
 
-    n_components: Field[int] = Field(
-        dtype=int,
+    n_components = Field[int](
         optional=True,
         doc="Number of components to keep; by default those above the noise and above least_rms.",
     )
-    least_rms: Field[float] = Field(
-        dtype=float,
+    least_rms = Field[float](
         default=1e-5,
         doc="A component is left out if it adds less than this to a typical frame, as a fraction of the sky. The "
         "photon noise of an LSST y exposure averaged over 20 arcsec is 2e-4.",
         check=lambda value: value >= 0,
     )
-    fringeStorageClass: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    fringeStorageClass = ChoiceField[str](
         default="FringeFrame",
         doc="Storage class of the template; the file is the same.",
         allowed={
@@ -89,14 +87,14 @@ class FringePcaConfig(PipelineTaskConfig, pipelineConnections=FringePcaConnectio
     )
 
 
-class FringePcaTask(PipelineTask):
+class FringePcaTask(base.PipelineTask):
     """Decompose the sky frames of a sensor and make the fringe template."""
 
     ConfigClass = FringePcaConfig
     config: FringePcaConfig
     _DefaultName = "fringePca"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the frames, decompose, store."""
         data_id = data_id_of(butlerQC)
         detector = sensor_of(data_id)
@@ -105,7 +103,7 @@ class FringePcaTask(PipelineTask):
             result = self.run(butlerQC.get(inputRefs.frames), created)
         butlerQC.put(result, outputRefs)
 
-    def run(self, frames: Sequence[SkyFringe], creation_datetime: str) -> Struct:
+    def run(self, frames: Sequence[SkyFringe], creation_datetime: str) -> base.Struct:
         """Decompose the frames of one sensor in one filter.
 
         Parameters
@@ -149,7 +147,7 @@ class FringePcaTask(PipelineTask):
             *(first.detector, first.physical_filter, len(frames)),
             ", ".join(f"{100 * share:.2f} %" for share in components.explained_variance_ratio[:4]),
         )
-        return Struct(fringe=template, components=components)
+        return base.Struct(fringe=template, components=components)
 
 
 def _end_of(refs: Sequence[Any]) -> datetime.datetime:

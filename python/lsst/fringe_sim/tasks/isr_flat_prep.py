@@ -7,14 +7,7 @@ import re
 from typing import Any, ClassVar
 
 from lsst.pex.config import DictField, Field, FieldValidationError
-from lsst.pipe.base import (
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantaAdjuster,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.flat_prep import prepare_flat
@@ -27,42 +20,27 @@ from ..products import CombinedBias, describe_mask
 from .camera_config import CameraConfig
 from .flat_prep_config import FlatPrepConfig
 from .model_config import by_raft
-from .quantum import common_header, data_id_of, sensor_of, unusable
-
-__all__ = ["IsrFlatPrepConfig", "IsrFlatPrepConnections", "IsrFlatPrepTask"]
+from .quantum import SENSOR, SENSOR_EXPOSURE, common_header, data_id_of, sensor_of, unusable
 
 _WAVELENGTH = re.compile(r"\s*([\d.]+) nm\s*")
 
 
-class IsrFlatPrepConnections(PipelineTaskConnections, dimensions=("instrument", "exposure", "detector")):
+class IsrFlatPrepConnections(base.PipelineTaskConnections, dimensions=SENSOR_EXPOSURE):
     """One raw flat and the bias of its sensor in, one fringe pattern out."""
 
     config: IsrFlatPrepConfig
 
-    raw = Input(
-        doc="Raw monochromatic flat.",
-        name="raw",
-        storageClass="RawFrame",
-        dimensions=("instrument", "exposure", "detector"),
-    )
-    bias = Input(
-        doc="Mean bias of the sensor.",
-        name="fringeBias",
-        storageClass="CombinedBias",
-        dimensions=("instrument", "detector"),
-    )
+    raw = Input("raw", "RawFrame", "Raw monochromatic flat.", dimensions=SENSOR_EXPOSURE)
+    bias = Input("fringeBias", "CombinedBias", "Mean bias of the sensor.", dimensions=SENSOR)
     flat = Output(
-        doc="Fringe pattern, counts / mean - 1.",
-        name="fringeFlat",
-        storageClass="FringeFlat",
-        dimensions=("instrument", "exposure", "detector"),
+        "fringeFlat", "FringeFlat", "Fringe pattern, counts / mean - 1.", dimensions=SENSOR_EXPOSURE
     )
 
     def __init__(self, *, config: IsrFlatPrepConfig | None = None) -> None:
         if config is not None and not config.raws_limit_graph:
             self.raw = dataclasses.replace(self.raw, deferGraphConstraint=True)
 
-    def adjust_all_quanta(self, adjuster: QuantaAdjuster) -> None:
+    def adjust_all_quanta(self, adjuster: base.QuantaAdjuster) -> None:
         """Keep the monochromatic flats in the wavelength range: biases and nights have exposures too."""
         for data_id in list(adjuster.iter_data_ids()):
             exposure: Any = adjuster.expand_quantum_data_id(data_id).records["exposure"]
@@ -77,28 +55,23 @@ class IsrFlatPrepConnections(PipelineTaskConnections, dimensions=("instrument", 
 
 
 class IsrFlatPrepConfig(
-    CameraConfig, FlatPrepConfig, PipelineTaskConfig, pipelineConnections=IsrFlatPrepConnections
+    CameraConfig, FlatPrepConfig, base.PipelineTaskConfig, pipelineConnections=IsrFlatPrepConnections
 ):
     """Configuration of `IsrFlatPrepTask`."""
 
     task_name: ClassVar[str] = "isrFlatPrep"
 
-    setup: Field[str] = Field(
-        dtype=str,
+    setup = Field[str](
         default="ts8_e2v",
         doc="Set-up in which the flats were taken: width of the line and beam, where headers tell none.",
     )
     raft_setups: DictField[str, str] = DictField(
         keytype=str, itemtype=str, default={}, doc="Set-up of single rafts, by raft."
     )
-    min_wavelength_nm: Field[float] = Field(
-        dtype=float,
-        default=800.0,
-        doc="Flats of shorter wavelength are left aside; e2v sensors are opaque there.",
+    min_wavelength_nm = Field[float](
+        default=800.0, doc="Flats of shorter wavelength are left aside; e2v sensors are opaque there."
     )
-    max_wavelength_nm: Field[float] = Field(
-        dtype=float, default=1100.0, doc="Flats of longer wavelength are left aside."
-    )
+    max_wavelength_nm = Field[float](default=1100.0, doc="Flats of longer wavelength are left aside.")
 
     def validate(self) -> None:
         """Refuse rafts and set-ups that do not exist, and set-ups that have no monochromator."""
@@ -125,14 +98,14 @@ class IsrFlatPrepConfig(
         return by_raft({"": self.setup, **self.raft_setups})
 
 
-class IsrFlatPrepTask(PipelineTask):
+class IsrFlatPrepTask(base.PipelineTask):
     """Overscan, bias, gain, masks, smoothing and division by the mean of one flat."""
 
     ConfigClass = IsrFlatPrepConfig
     config: IsrFlatPrepConfig
     _DefaultName = "isrFlatPrep"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read, prepare, store."""
         data_id = data_id_of(butlerQC)
         detector = sensor_of(data_id)
@@ -140,7 +113,7 @@ class IsrFlatPrepTask(PipelineTask):
             result = self.run(butlerQC.get(inputRefs.raw), butlerQC.get(inputRefs.bias), detector)
         butlerQC.put(result, outputRefs)
 
-    def run(self, raw: RawFrame, bias: CombinedBias, detector: Detector) -> Struct:
+    def run(self, raw: RawFrame, bias: CombinedBias, detector: Detector) -> base.Struct:
         """Prepare one flat.
 
         Parameters
@@ -187,4 +160,4 @@ class IsrFlatPrepTask(PipelineTask):
         shipped = () if setup.files else (("setups", f"{setup.name}.yaml"),)
         tables = table_cards((*shipped, ("instrument", "lsstcam_amps.ecsv")), setup.files)
         metadata = {**common_header(self.config), "SETUP": setup.name, **tables, **flat.metadata}
-        return Struct(flat=dataclasses.replace(flat, detector=detector.name, metadata=metadata))
+        return base.Struct(flat=dataclasses.replace(flat, detector=detector.name, metadata=metadata))

@@ -7,81 +7,48 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lsst.pex.config import Field
-from lsst.pipe.base import (
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantaAdjuster,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Output
 
 from ..algorithms.laboratory_shift import template_pair
 from ..instrument.detector import Detector
 from ..products import FringeTemplates, ThicknessMap
-from .quantum import data_id_of, run_datetime, sensor_of, unusable
-from .sky_model import (
-    SensorMapsConfig,
-    maps_of,
-    silicon_input,
-    takes_images,
-    thickness_input,
-    without_constraint,
-)
-
-__all__ = ["MapTemplatesConfig", "MapTemplatesConnections", "MapTemplatesTask"]
+from .quantum import SENSOR_FILTER, data_id_of, run_datetime, sensor_of, unusable
+from .sky_model import SensorMapsConfig, SensorMapsConnections, maps_of
 
 
-class MapTemplatesConnections(
-    PipelineTaskConnections, dimensions=("instrument", "physical_filter", "detector")
-):
+class MapTemplatesConnections(SensorMapsConnections, dimensions=SENSOR_FILTER):
     """Maps of a sensor in, templates of its sky in a filter out."""
 
-    config: MapTemplatesConfig
-
-    thickness = thickness_input()
-    silicon = silicon_input()
     templates = Output(
-        doc="The sky of the map, and how the phase of the adhesive, which the laboratory does not tell, changes it.",
-        name="fringeTemplates",
-        storageClass="FringeTemplates",
-        dimensions=("instrument", "physical_filter", "detector"),
+        "fringeTemplates",
+        "FringeTemplates",
+        "The sky of the map, and how the phase of the adhesive, which the laboratory does not tell, changes it.",
+        dimensions=SENSOR_FILTER,
         isCalibration=True,
     )
 
-    def __init__(self, *, config: MapTemplatesConfig | None = None) -> None:
-        if config is not None and config.stand_in:
-            self.thickness = without_constraint(self.thickness)
-        if config is not None and config.silicon != "map":
-            del self.silicon
 
-    def adjust_all_quanta(self, adjuster: QuantaAdjuster) -> None:
-        """Keep the science sensors, and the filters in the band of the set-up."""
-        for data_id in list(adjuster.iter_data_ids()):
-            expanded = adjuster.expand_quantum_data_id(data_id)
-            if expanded["band"] != self.config.band or not takes_images(expanded):
-                adjuster.remove_quantum(data_id)
-
-
-class MapTemplatesConfig(SensorMapsConfig, PipelineTaskConfig, pipelineConnections=MapTemplatesConnections):
+class MapTemplatesConfig(
+    SensorMapsConfig, base.PipelineTaskConfig, pipelineConnections=MapTemplatesConnections
+):
     """Configuration of `MapTemplatesTask`."""
 
     task_name: ClassVar[str] = "mapTemplates"
 
-    airmass: Field[float] = Field(
-        dtype=float, default=1.2, doc="Airmass of the exposures.", check=lambda airmass: 1.0 <= airmass < 10.0
+    airmass = Field[float](
+        default=1.2, doc="Airmass of the exposures.", check=lambda airmass: 1.0 <= airmass < 10.0
     )
 
 
-class MapTemplatesTask(PipelineTask):
+class MapTemplatesTask(base.PipelineTask):
     """Make the templates that a correction fits from what the laboratory knows of a sensor."""
 
     ConfigClass = MapTemplatesConfig
     config: MapTemplatesConfig
     _DefaultName = "mapTemplates"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the maps, make the templates, store."""
         data_id = data_id_of(butlerQC)
         detector = sensor_of(data_id)
@@ -98,7 +65,7 @@ class MapTemplatesTask(PipelineTask):
         physical_filter: str,
         creation_datetime: str,
         silicon: ThicknessMap | None = None,
-    ) -> Struct:
+    ) -> base.Struct:
         """Make the templates of one sensor.
 
         Parameters
@@ -151,4 +118,4 @@ class MapTemplatesTask(PipelineTask):
             *(detector.name, physical_filter),
             ", ".join(f"{100 * float(pattern[mask == 0].std()):.4f} %" for pattern in patterns),
         )
-        return Struct(templates=templates)
+        return base.Struct(templates=templates)

@@ -22,8 +22,6 @@ from ..model.effects_override import refuse_other_effects
 from ..model.provenance import model_cards
 from .camera_config import CameraConfig
 
-__all__ = ["FringeModelConfig", "ModelChoice", "RaftConfig", "SensorConfig", "by_raft"]
-
 Value = TypeVar("Value")
 
 
@@ -57,7 +55,7 @@ class ModelChoice:
 class RaftConfig(Config):
     """What one raft has of its own."""
 
-    setup: Field[str] = Field(dtype=str, optional=True, doc="Set-up of this raft, if not that of the task.")
+    setup = Field[str](optional=True, doc="Set-up of this raft, if not that of the task.")
     effects: DictField[str, float] = DictField(
         keytype=str,
         itemtype=float,
@@ -104,10 +102,8 @@ class FringeModelConfig(CameraConfig):
     task_name: ClassVar[str] = ""
     """Name of the task; by it a raft's override file finds the file of its camera."""
 
-    setup: Field[str] = Field(
-        dtype=str,
-        default="ts8_e2v",
-        doc="Set-up: sensor, temperature and light; a name, or the path of a YAML file.",
+    setup = Field[str](
+        default="ts8_e2v", doc="Set-up: sensor, temperature and light; a name, or the path of a YAML file."
     )
     effects: DictField[str, float] = DictField(
         keytype=str,
@@ -116,8 +112,7 @@ class FringeModelConfig(CameraConfig):
         doc="Physical effects that the set-up lacks: value by 'name.parameter', as 'bandwidth.fwhm'. "
         "Those of the laboratory's light and bench are left out on the sky.",
     )
-    written_effects: Field[str] = Field(
-        dtype=str,
+    written_effects = Field[str](
         default="",
         doc="Names of the effects that an override of a search sets, and a hash of their values: one that was cut "
         "short or changed is refused. The override sets it.",

@@ -7,45 +7,44 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lsst.pex.config import Config, Field
-from lsst.pipe.base import (
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.correction import AMPLIFIERS_UNKNOWN, AmplifierGrid
 from ..algorithms.correction.empirical import TemplateOptions
 from ..algorithms.observed_frames import make_templates
 from ..products import ObservedFrame
-from .quantum import common_header, data_id_of, put_in_order, run_datetime, sensor_of, unusable
-
-__all__ = ["BackgroundConfig", "ObservedFringeConfig", "ObservedFringeConnections", "ObservedFringeTask"]
+from .quantum import (
+    SENSOR_EXPOSURE,
+    SENSOR_FILTER,
+    common_header,
+    data_id_of,
+    put_in_order,
+    run_datetime,
+    sensor_of,
+    unusable,
+)
 
 LEAST_FRAMES = 3
 
 
-class ObservedFringeConnections(
-    PipelineTaskConnections, dimensions=("instrument", "physical_filter", "detector")
-):
+class ObservedFringeConnections(base.PipelineTaskConnections, dimensions=SENSOR_FILTER):
     """The frames of a sensor in a filter in, its templates out."""
 
     frames = Input(
-        doc="Frames after the removal of the instrument's signature, with their fringes.",
-        name="post_isr_image",
-        storageClass="ObservedFrame",
-        dimensions=("instrument", "exposure", "detector"),
+        "post_isr_image",
+        "ObservedFrame",
+        "Frames after the removal of the instrument's signature, with their fringes.",
+        dimensions=SENSOR_EXPOSURE,
         multiple=True,
         minimum=LEAST_FRAMES,
         deferLoad=True,
     )
     templates = Output(
-        doc="Fringe templates with variance and coverage.",
-        name="fringeTemplates",
-        storageClass="FringeTemplates",
-        dimensions=("instrument", "physical_filter", "detector"),
+        "fringeTemplates",
+        "FringeTemplates",
+        "Fringe templates with variance and coverage.",
+        dimensions=SENSOR_FILTER,
         isCalibration=True,
     )
 
@@ -59,21 +58,17 @@ class ObservedFringeConnections(
 class BackgroundConfig(Config):
     """What is fitted beside the fringes."""
 
-    background_px: Field[float] = Field(
-        dtype=float,
+    background_px = Field[float](
         default=256.0,
         doc="Distance between the knots of the smooth background [px].",
         check=lambda value: value >= 8.0,
     )
-    amplifier_columns: Field[int] = Field(
-        dtype=int,
+    amplifier_columns = Field[int](
         optional=True,
         doc="Amplifiers beside each other; where neither number is given, a frame tells whether their levels differ.",
         check=lambda n: n > 0,
     )
-    amplifier_rows: Field[int] = Field(
-        dtype=int, optional=True, doc="Amplifiers on top of each other.", check=lambda n: n > 0
-    )
+    amplifier_rows = Field[int](optional=True, doc="Amplifiers on top of each other.", check=lambda n: n > 0)
 
     @property
     def grid(self) -> AmplifierGrid:
@@ -85,24 +80,24 @@ class BackgroundConfig(Config):
 
 
 class ObservedFringeConfig(
-    BackgroundConfig, PipelineTaskConfig, pipelineConnections=ObservedFringeConnections
+    BackgroundConfig, base.PipelineTaskConfig, pipelineConnections=ObservedFringeConnections
 ):
     """Configuration of `ObservedFringeTask`."""
 
-    components: Field[int] = Field(
-        dtype=int, optional=True, doc="Number of templates; by default as many as predict other frames."
+    components = Field[int](
+        optional=True, doc="Number of templates; by default as many as predict other frames."
     )
-    least_frames: Field[int] = Field(dtype=int, default=LEAST_FRAMES, doc="Frames that must see a pixel.")
+    least_frames = Field[int](default=LEAST_FRAMES, doc="Frames that must see a pixel.")
 
 
-class ObservedFringeTask(PipelineTask):
+class ObservedFringeTask(base.PipelineTask):
     """Find the fringes that the frames of a sensor share."""
 
     ConfigClass = ObservedFringeConfig
     config: ObservedFringeConfig
     _DefaultName = "observedFringe"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the frames one by one, decompose, store."""
         data_id = data_id_of(butlerQC)
         detector = sensor_of(data_id)
@@ -114,7 +109,7 @@ class ObservedFringeTask(PipelineTask):
             result = self.run(loaders, created)
         butlerQC.put(result, outputRefs)
 
-    def run(self, frames: Sequence[Callable[[], ObservedFrame]], creation_datetime: str) -> Struct:
+    def run(self, frames: Sequence[Callable[[], ObservedFrame]], creation_datetime: str) -> base.Struct:
         """Make the templates of one sensor in one filter.
 
         Parameters
@@ -147,4 +142,4 @@ class ObservedFringeTask(PipelineTask):
             "%s in %s: %d templates from %d frames",
             *(made.detector, made.physical_filter, len(made.patterns), len(frames)),
         )
-        return Struct(templates=made)
+        return base.Struct(templates=made)

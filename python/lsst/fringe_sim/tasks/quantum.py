@@ -12,27 +12,37 @@ from typing import Any
 
 from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import Config
-from lsst.pipe.base import AlgorithmError, QuantumContext
+from lsst.pipe import base
+from lsst.pipe.base.connectionTypes import Input
 
 from ..errors import FringeSimError, InputError
 from ..middleware.instruments import sensor_of
 from ..model.provenance import software_cards
 
 __all__ = [
+    "SENSOR",
+    "SENSOR_EXPOSURE",
+    "SENSOR_FILTER",
     "UnusableDataError",
     "common_header",
     "config_digest",
     "data_id_of",
+    "flats_input",
     "put_in_order",
     "run_datetime",
     "sensor_of",
     "unusable",
 ]
 
+SENSOR = ("instrument", "detector")
+SENSOR_EXPOSURE = ("instrument", "exposure", "detector")
+SENSOR_FILTER = ("instrument", "physical_filter", "detector")
+"""Dimensions of what there is once for each sensor, and for each of its exposures and filters."""
+
 _TIMESTAMP = re.compile(r"(\d{8}T\d{6})Z?$")
 
 
-class UnusableDataError(AlgorithmError):
+class UnusableDataError(base.AlgorithmError):
     """The data of one sensor cannot be used; the quanta of all others go on.
 
     Parameters
@@ -74,7 +84,7 @@ def unusable(where: str) -> Iterator[None]:
         raise UnusableDataError(where, error) from error
 
 
-def data_id_of(butlerQC: QuantumContext) -> DataCoordinate:
+def data_id_of(butlerQC: base.QuantumContext) -> DataCoordinate:
     """Expanded data id of the quantum that runs."""
     data_id = butlerQC.quantum.dataId
     if data_id is None:
@@ -104,8 +114,7 @@ def config_digest(config: Config) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-NO_DATE = datetime.datetime(1970, 1, 1)
-"""Of what a model makes, where nothing tells a date."""
+NO_DATE = datetime.datetime(1970, 1, 1)  # Of what a model makes, where nothing tells a date
 
 
 def run_datetime(run: str, otherwise: datetime.datetime = NO_DATE) -> str:
@@ -119,3 +128,9 @@ def run_datetime(run: str, otherwise: datetime.datetime = NO_DATE) -> str:
     match = _TIMESTAMP.search(run)
     found = datetime.datetime.strptime(match[1], "%Y%m%dT%H%M%S") if match else otherwise
     return found.isoformat(timespec="seconds")
+
+
+def flats_input() -> Input:
+    """Connection to the prepared flats of each sensor."""
+    doc = "Fringe patterns of the sensor at all wavelengths."
+    return Input("fringeFlat", "FringeFlat", doc, dimensions=SENSOR_EXPOSURE, multiple=True, deferLoad=True)

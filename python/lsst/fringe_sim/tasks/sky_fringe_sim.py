@@ -10,15 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField
-from lsst.pipe.base import (
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-    QuantaAdjuster,
-    QuantumContext,
-    Struct,
-)
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Output
 
 from ..algorithms.photon_migration import photon_migration
@@ -32,26 +26,10 @@ from ..instrument.telescope import Telescope
 from ..middleware.night import airmass_of, hour_of_night
 from ..model import FringeModel, Setup
 from ..products import ThicknessMap, band_cards
-from .quantum import data_id_of, sensor_of, unusable
-from .sky_model import (
-    SensorMapsConfig,
-    SkyModel,
-    maps_of,
-    silicon_input,
-    takes_images,
-    thickness_input,
-    without_constraint,
-)
+from .quantum import SENSOR_EXPOSURE, data_id_of, sensor_of, unusable
+from .sky_model import SensorMapsConfig, SensorMapsConnections, SkyModel, maps_of
 
-__all__ = [
-    "SkyExposure",
-    "SkyFringeSimConfig",
-    "SkyFringeSimConnections",
-    "SkyFringeSimTask",
-]
-
-FIRST_HOUR = 19.0
-"""Local time at which the tabulated night begins [h]."""
+FIRST_HOUR = 19.0  # Local time at which the tabulated night begins [h]
 
 RANDOM_NIGHT_H = (12.0, 36.0, 0.25)
 """First, last and step of the times at which a random night is drawn [h]: the same for all its exposures."""
@@ -71,46 +49,30 @@ class SkyExposure:
     physical_filter: str  # filter, as the instrument names it
 
 
-class SkyFringeSimConnections(PipelineTaskConnections, dimensions=("instrument", "exposure", "detector")):
+class SkyFringeSimConnections(SensorMapsConnections, dimensions=SENSOR_EXPOSURE):
     """A thickness map in, one sky frame out."""
 
-    config: SkyFringeSimConfig
-
-    thickness = thickness_input()
-    silicon = silicon_input()
     sky = Output(
-        doc="Night sky with its fringes, in electrons.",
-        name="skyFringe",
-        storageClass="SkyFringe",
-        dimensions=("instrument", "exposure", "detector"),
+        "skyFringe", "SkyFringe", "Night sky with its fringes, in electrons.", dimensions=SENSOR_EXPOSURE
     )
 
-    def __init__(self, *, config: SkyFringeSimConfig | None = None) -> None:
-        if config is not None and config.stand_in:
-            self.thickness = without_constraint(self.thickness)
-        if config is not None and config.silicon != "map":
-            del self.silicon
-
-    def adjust_all_quanta(self, adjuster: QuantaAdjuster) -> None:
-        """Keep the exposures of the sky in the band of the set-up: laboratory frames have exposures too."""
-        for data_id in list(adjuster.iter_data_ids()):
-            expanded = adjuster.expand_quantum_data_id(data_id)
-            exposure: Any = expanded.records["exposure"]
-            wanted = exposure.observation_type in self.config.observation_types
-            if not wanted or expanded["band"] != self.config.band or not takes_images(expanded):
-                adjuster.remove_quantum(data_id)
+    def wants(self, data_id: DataCoordinate) -> bool:
+        """Whether it is an exposure of the sky in the band of the set-up: laboratory frames have exposures too."""
+        exposure: Any = data_id.records["exposure"]
+        return super().wants(data_id) and exposure.observation_type in self.config.observation_types
 
 
-class SkyFringeSimConfig(SensorMapsConfig, PipelineTaskConfig, pipelineConnections=SkyFringeSimConnections):
+class SkyFringeSimConfig(
+    SensorMapsConfig, base.PipelineTaskConfig, pipelineConnections=SkyFringeSimConnections
+):
     """Configuration of `SkyFringeSimTask`."""
 
     task_name: ClassVar[str] = "skyFringeSim"
 
-    observation_types: ListField[str] = ListField(
-        dtype=str, default=["science"], doc="Observation types of exposures that show the sky."
+    observation_types = ListField[str](
+        default=["science"], doc="Observation types of exposures that show the sky."
     )
-    night: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    night = ChoiceField[str](
         default="guo2022",
         doc="How the OH bands change with time.",
         allowed={
@@ -119,8 +81,7 @@ class SkyFringeSimConfig(SensorMapsConfig, PipelineTaskConfig, pipelineConnectio
             "steady": "not at all",
         },
     )
-    level: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    level = ChoiceField[str](
         default="throughput",
         doc="Mean level of a frame.",
         allowed={
@@ -128,19 +89,15 @@ class SkyFringeSimConfig(SensorMapsConfig, PipelineTaskConfig, pipelineConnectio
             "throughput": "what the measured quantum efficiency in the throughput tables detects",
         },
     )
-    noise: Field[bool] = Field(
-        dtype=bool,
+    noise = Field[bool](
         default=True,
         doc="Whether photon and read noise are added. Pipelines that make templates go without; nothing can be "
         "searched for in frames without.",
     )
-    seed: Field[int] = Field(
-        dtype=int,
-        default=0,
-        doc="With exposure and sensor, the seed of the noise; with the date, of random nights.",
+    seed = Field[int](
+        default=0, doc="With exposure and sensor, the seed of the noise; with the date, of random nights."
     )
-    migration: Field[bool] = Field(
-        dtype=bool,
+    migration = Field[bool](
         default=False,
         doc="Whether photons walk to neighbouring pixels before they are absorbed (behind a traced telescope).",
     )
@@ -154,14 +111,14 @@ class SkyFringeSimConfig(SensorMapsConfig, PipelineTaskConfig, pipelineConnectio
             raise FieldValidationError(type(self).migration, self, "needs a traced telescope")
 
 
-class SkyFringeSimTask(PipelineTask):
+class SkyFringeSimTask(base.PipelineTask):
     """Simulate the sky of one exposure on one sensor."""
 
     ConfigClass = SkyFringeSimConfig
     config: SkyFringeSimConfig
     _DefaultName = "skyFringeSim"
 
-    def runQuantum(self, butlerQC: QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
+    def runQuantum(self, butlerQC: base.QuantumContext, inputRefs: Any, outputRefs: Any) -> None:
         """Read the map, simulate, store."""
         data_id = data_id_of(butlerQC)
         detector = sensor_of(data_id)
@@ -186,7 +143,7 @@ class SkyFringeSimTask(PipelineTask):
         exposure: SkyExposure,
         detector: Detector,
         silicon: ThicknessMap | None = None,
-    ) -> Struct:
+    ) -> base.Struct:
         """Simulate one frame.
 
         Parameters
@@ -251,7 +208,7 @@ class SkyFringeSimTask(PipelineTask):
             *(100.0 * float(frame.metadata["FRINGRMS"]), frame.quadrature_error),
         )
         # What the map calls doubtful stays doubtful.
-        return Struct(sky=dataclasses.replace(frame, mask=frame.mask | layer.mask, metadata=metadata))
+        return base.Struct(sky=dataclasses.replace(frame, mask=frame.mask | layer.mask, metadata=metadata))
 
     def _band_scale(self, exposure: SkyExposure, lines: EmissionLines) -> Mapping[str, float]:
         """Factors on the OH bands at the time of the exposure."""

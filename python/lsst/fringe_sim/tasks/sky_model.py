@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField, RangeField
-from lsst.pipe.base import QuantumContext
+from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input
 
 from ..algorithms.field_response import SensorPlacement
@@ -33,20 +33,7 @@ from ..products import SensorSection, ThicknessMap
 from ..products.sensor_section import SECTION_KEYWORDS
 from ..products.thickness_map import thickness_span_um
 from .model_config import FringeModelConfig, ModelChoice
-from .quantum import common_header
-
-__all__ = [
-    "LINE_LIST",
-    "SensorMapsConfig",
-    "SensorSky",
-    "SkyModel",
-    "SkyModelConfig",
-    "maps_of",
-    "silicon_input",
-    "takes_images",
-    "thickness_input",
-    "without_constraint",
-]
+from .quantum import SENSOR, common_header
 
 LINE_LIST = "PALACE OH (Noll et al. 2025)"
 
@@ -130,8 +117,7 @@ class SensorSky(NamedTuple):
 class SkyModelConfig(FringeModelConfig):
     """Set-up, effects, spectrum and beams of the sky, and what replaces a thickness map that does not exist."""
 
-    beams: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    beams = ChoiceField[str](
         default="pixel",
         doc="Which beam a pixel sees, where the telescope has one that varies over the field.",
         allowed={
@@ -140,35 +126,27 @@ class SkyModelConfig(FringeModelConfig):
             "and more",
         },
     )
-    stand_in: Field[bool] = Field(
-        dtype=bool,
+    stand_in = Field[bool](
         default=False,
         doc="Whether a sensor without a thickness map gets a random field with the statistics of measured ones.",
     )
-    stand_in_seed: Field[int] = Field(
-        dtype=int,
-        default=0,
-        doc="With the number of the sensor, the seed of its stand-in.",
-        check=lambda n: n >= 0,
+    stand_in_seed = Field[int](
+        default=0, doc="With the number of the sensor, the seed of its stand-in.", check=lambda n: n >= 0
     )
-    stand_in_shape: ListField[int] = ListField(
-        dtype=int,
-        optional=True,
-        length=2,
-        doc="Rows and columns of stand-ins; by default those of the sensor.",
+    stand_in_shape = ListField[int](
+        optional=True, length=2, doc="Rows and columns of stand-ins; by default those of the sensor."
     )
-    rotational_temperature_k: Field[float] = Field(
-        dtype=float, optional=True, doc="Rotational temperature of OH, K; by default the PALACE populations."
+    rotational_temperature_k = Field[float](
+        optional=True, doc="Rotational temperature of OH, K; by default the PALACE populations."
     )
-    vibrational_temperature_k: Field[float] = Field(
-        dtype=float, optional=True, doc="Vibrational temperature of OH, K; by default the PALACE populations."
+    vibrational_temperature_k = Field[float](
+        optional=True, doc="Vibrational temperature of OH, K; by default the PALACE populations."
     )
-    solar_flux_sfu: Field[float] = Field(
-        dtype=float, default=129.0, doc="Solar radio flux, sfu, which scales the airglow continuum."
+    solar_flux_sfu = Field[float](
+        default=129.0, doc="Solar radio flux, sfu, which scales the airglow continuum."
     )
 
-    flat_spectrum: Field[str] = Field(
-        dtype=str,
+    flat_spectrum = Field[str](
         optional=True,
         doc="Light of the flat field: white, gaussian:MEAN:FWHM in nm, or a table with columns wavelength and "
         "photons; by default white where every pixel has its own beam, and none otherwise.",
@@ -235,11 +213,60 @@ class SkyModelConfig(FringeModelConfig):
         )
 
 
+class MapConnections(base.PipelineTaskConnections, dimensions=SENSOR):
+    """A thickness map in, of science sensors."""
+
+    config: Any
+
+    thickness = Input(
+        "epoxyThickness",
+        "ThicknessMap",
+        "Thickness of the varying layer; not needed where the configuration allows stand-ins.",
+        dimensions=SENSOR,
+    )
+
+    def __init__(self, *, config: Any = None) -> None:
+        if config is not None and config.stand_in:
+            # For sensors with and without a map.
+            self.thickness = dataclasses.replace(self.thickness, minimum=0, deferGraphConstraint=True)
+
+    def adjust_all_quanta(self, adjuster: base.QuantaAdjuster) -> None:
+        """Keep the science sensors, and of them what is wanted."""
+        for data_id in list(adjuster.iter_data_ids()):
+            expanded = adjuster.expand_quantum_data_id(data_id)
+            record: Any = expanded.records["detector"]
+            if record.purpose != "SCIENCE" or not self.wants(expanded):
+                adjuster.remove_quantum(data_id)
+
+    def wants(self, data_id: DataCoordinate) -> bool:
+        """Whether there is a quantum for an expanded data id of a science sensor."""
+        return True
+
+
+class SensorMapsConnections(MapConnections, dimensions=SENSOR):
+    """Maps of a sensor in, of both layers."""
+
+    silicon = Input(
+        "siliconThickness",
+        "ThicknessMap",
+        "Thickness of the silicon on the same pixels; only where the configuration asks for it.",
+        dimensions=SENSOR,
+    )
+
+    def __init__(self, *, config: Any = None) -> None:
+        super().__init__(config=config)
+        if config is not None and config.silicon != "map":
+            del self.silicon
+
+    def wants(self, data_id: DataCoordinate) -> bool:
+        """Whether the filter is in the band of the set-up."""
+        return bool(data_id["band"] == self.config.band)
+
+
 class SensorMapsConfig(SkyModelConfig):
     """What the maps of a sensor say of its sky: also the silicon, and what is not known of the adhesive."""
 
-    silicon: ChoiceField[str] = ChoiceField(
-        dtype=str,
+    silicon = ChoiceField[str](
         default="even",
         doc="Thickness of the silicon above the varying layer.",
         allowed={
@@ -288,43 +315,12 @@ class SensorMapsConfig(SkyModelConfig):
         }
 
 
-def maps_of(butlerQC: QuantumContext, inputRefs: Any) -> list[ThicknessMap | None]:
+def maps_of(butlerQC: base.QuantumContext, inputRefs: Any) -> list[ThicknessMap | None]:
     """Maps of the varying layer and of the silicon, `None` for those that a quantum does without."""
     return [
         butlerQC.get(getattr(inputRefs, name)) if hasattr(inputRefs, name) else None
         for name in ("thickness", "silicon")
     ]
-
-
-def silicon_input() -> Input:
-    """Connection to a map of the silicon of each sensor."""
-    return Input(
-        doc="Thickness of the silicon on the same pixels; only where the configuration asks for it.",
-        name="siliconThickness",
-        storageClass="ThicknessMap",
-        dimensions=("instrument", "detector"),
-    )
-
-
-def thickness_input() -> Input:
-    """Connection to a thickness map of each sensor."""
-    return Input(
-        doc="Thickness of the varying layer; not needed where the configuration allows stand-ins.",
-        name="epoxyThickness",
-        storageClass="ThicknessMap",
-        dimensions=("instrument", "detector"),
-    )
-
-
-def without_constraint(connection: Input) -> Input:
-    """The same connection for sensors with and without a map."""
-    return dataclasses.replace(connection, minimum=0, deferGraphConstraint=True)
-
-
-def takes_images(data_id: DataCoordinate) -> bool:
-    """Whether the detector of an expanded data id is a science sensor."""
-    record: Any = data_id.records["detector"]
-    return bool(record.purpose == "SCIENCE")
 
 
 def _band(setup: Setup) -> str:

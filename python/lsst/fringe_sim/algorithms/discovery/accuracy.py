@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from ...errors import InputError
 from .channels import Channel, State, combined_probability, in_looks, measure_channels
 from .fit import Design, Fit, FullColumns, PlaneColumns, Problem
+from .learned_columns import over_wavelength
 from .selection import Selector, chance_of
 from .spots import spot_channel
 
@@ -62,11 +63,9 @@ def _correlation(problem: Problem, fit: Fit) -> float:
 
 
 def _block(problem: Problem, fit: Fit, state: State, accuracy: float) -> FullColumns:
-    """Whitened columns ``(2 W, W, ny, nx)`` of unit variance: amplitude and phase of the fringes."""
+    """Whitened columns ``(2 R, W, ny, nx)`` of unit variance: amplitude and phase of the fringes."""
     wavelength = problem.cells.wavelength_nm
-    away = np.subtract.outer(wavelength, wavelength) / TABLE_STEP_NM
-    values, vectors = np.linalg.eigh(np.exp(-0.5 * away**2))
-    root = accuracy * vectors * np.sqrt(np.maximum(values, 0.0))
+    root = accuracy * over_wavelength(wavelength, TABLE_STEP_NM)
     level, fringes = problem.amplitudes(fit.levels)
     prediction = problem.forward.predict(fit.settings, state.thickness_um)
     radian_um = (problem.forward.model.fringe_order_um(wavelength) / (2.0 * np.pi))[:, None, None]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...effects import AMPLIFIERS, LEARNED, ImageGeometry
 from ...effects.learned import (
@@ -22,7 +22,7 @@ from ...effects.learned import (
 from .channels import State
 from .fit import Columns, Fit, PlaneColumns, Problem
 
-__all__ = ["Family", "LocalColumns", "families", "with_learned"]
+__all__ = ["Family", "LocalColumns", "families", "over_wavelength", "with_learned"]
 
 FloatArray = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ ORDERS = (1.5, 3.0, 6.0, 12.0)
 """Widths of the spectra of smooth patterns over the sensor [half waves along a side]."""
 
 LEAST_POWER = 1e-4
-"""Relative power of a wave that is left out."""
+"""Relative power of a wave that is left out: columns that are all but dependent would cost time and say nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +128,9 @@ def _alike(length_nm: float) -> str:
     return "each wavelength by itself" if length_nm == LENGTHS_NM[0] else f"alike over {length_nm:g} nm"
 
 
-def _over_wavelength(nodes: Sequence[int], length_nm: float) -> FloatArray:
-    """Root of the covariance of a smooth function at nodes."""
-    away = np.subtract.outer(nodes, nodes) / length_nm
+def over_wavelength(wavelength_nm: ArrayLike, length_nm: float) -> FloatArray:
+    """Root ``(W, R)`` of the covariance of a smooth function of unit variance; what has no power is left out."""
+    away = np.subtract.outer(wavelength_nm, wavelength_nm) / length_nm
     values, vectors = np.linalg.eigh(np.exp(-0.5 * away**2))
     keep = values > LEAST_POWER * values[-1]
     return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
@@ -161,7 +161,7 @@ def _of_phase(problem: Problem, fit: Fit, state: State) -> Family:
         for decay in DECAYS:
             sizes = np.repeat([decay ** (harmonic - 1) for harmonic in LEARNED_HARMONICS], 2)
             words = f"{_alike(length)}, harmonics falling by {decay:g}"
-            priors.append((words, _product(np.diag(sizes), _over_wavelength(nodes, length))))
+            priors.append((words, _product(np.diag(sizes), over_wavelength(nodes, length))))
     return Family("learned_response", keys, columns, tuple(priors))
 
 
@@ -212,7 +212,7 @@ def _of_light(geometry: ImageGeometry, state: State) -> Family:
         for width in (1.5, 4.0):
             over = _roots(np.exp(-0.5 * (size / width) ** 2))
             words = f"{_alike(length)}, smooth over {1.0 / width:.2g} of the sensor"
-            priors.append((words, _product(_over_wavelength(nodes, length), over)))
+            priors.append((words, _product(over_wavelength(nodes, length), over)))
     return Family("learned_light", keys, LocalColumns(_patterns(geometry, orders), terms), tuple(priors))
 
 

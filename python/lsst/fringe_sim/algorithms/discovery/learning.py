@@ -22,7 +22,7 @@ from .fit import Design, Fit, Problem, Projected, fit_model, linearise_at
 from .learned_columns import Family, families, with_learned
 from .validation import FEWEST_ROWS, misfit_rms, thickness_starts
 
-__all__ = ["FALSE_ALARMS", "Learned", "Prior", "judging_cells", "learn"]
+__all__ = ["FALSE_ALARMS", "Learned", "Prior", "evidence_of_correction", "judging_cells", "learn"]
 
 FloatArray = NDArray[np.float64]
 
@@ -246,6 +246,17 @@ def learn(
         after_rms=misfit_rms(outside, after),
         noise_floor=problem.cells.noise_rms,
     )
+
+
+def evidence_of_correction(problem: Problem, fit: Fit) -> float:
+    """Largest log evidence of a correction beside a fit, in all cells, over none; 0 where nothing speaks for one."""
+    side = _Side.of(with_learned(problem), fit.held())
+    best = [
+        prior.best(score)[0][0]
+        for score, priors in zip(side.scores([side.state.residual]), side.priors, strict=True)
+        for prior in priors
+    ]
+    return max(0.0, *(float(evidence) for evidence in best))
 
 
 def _again(inside: Problem, fitted: Fit, family: Family, taught: _Taught) -> tuple[Fit, dict[str, float]]:

@@ -35,7 +35,7 @@ class SearchOptions:
     least_probability : `float`
         Probability of a class with which it is named.
     most_effects : `int`
-        Largest number of effects named together.
+        Largest number of effects tried together; three are told, and too many to be named (`outsiders_for_one`).
     refits : `int`
         Effects that are refitted in each round, best scores first; twice as many pairs.
     credit : `float`

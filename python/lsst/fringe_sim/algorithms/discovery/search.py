@@ -24,7 +24,7 @@ from .evaluations import OutOfTimeError, time_limit
 from .fit import Fit, fit_model
 from .forward import Exposures
 from .hidden_islands import hidden_island
-from .learning import learn
+from .learning import evidence_of_correction, learn
 from .next_frames import FrameForecast
 from .next_step import Ranking, flats_ranked, with_next_measurements
 from .options import SearchOptions
@@ -45,7 +45,6 @@ from .selection import IMPRECISION, Candidate, Hypothesis, Selector, chance_of
 from .set_search import SetSearch
 from .validation import (
     HeldOut,
-    degrees_of_freedom,
     disagreement_size,
     held_out_blocks,
     misfit_rms,
@@ -84,9 +83,6 @@ effect and a thickness that is wrong in places."""
 FEW_MENDED = 0.01
 """Part of the cells that may change their fringe order without moving where effects alone are by more than a fit that
 starts there finds."""
-
-MOST = 0.5
-"""Part of a disagreement that is most of it."""
 
 WITHIN_ACCURACY = (
     "model and data differ beyond noise, and by no more than the tables of the model may be wrong"
@@ -641,10 +637,11 @@ class _Search:
         verdict, accuracy = ("no_discrepancy" if within else "unexplained"), {**accuracy, "within": within}
         if within:
             reason = f"{WITHIN_ACCURACY}; {reason}"
+        alike = whole.null if within else self._alike(whole, hypothesis)
         description: dict[str, Any] = {
             "reason": reason,
             "too_poor": False,
-            "like": list(self._alike(whole, hypothesis)) if not within else [],
+            "like": list(alike.names),
             "partial": [
                 {"name": e.name, "probability": e.probability, "significance": e.significance,
                  "parameters": {k: [p.value, p.sigma] for k, p in e.parameters.items()}}
@@ -652,23 +649,39 @@ class _Search:
             ],
             **describe_residual(state, self.cells.geometry, self.prepared.index, self.cells.cell_px, channels),
         }  # fmt: skip
-        learned = {} if within else self._learned(whole, hypothesis)
+        learned = {} if within else self._learned(whole, alike)
         found = self._verdict(verdict, whole, hypothesis, chance, (), description, steps)
         return replace(found, learned=learned, accuracy=accuracy)
 
-    @staticmethod
-    def _alike(whole: Selector, found: Hypothesis) -> tuple[str, ...]:
-        """Effects of a set that is not the cause, and yet most of the disagreement."""
-        before, after = whole.null.fit.chi2, found.fit.chi2
-        beyond = before - degrees_of_freedom(whole.problem, whole.null.fit)
-        return found.names if found.names and before - after > MOST * beyond else ()
+    def _alike(self, whole: Selector, found: Hypothesis) -> Hypothesis:
+        """The effects of a set that are not the cause, and which no correction can replace.
+
+        Without each of them, the others with the best correction beside them have less log evidence, by at least as
+        much as an effect must bring.
+        """
+        teaches = self.prepared.rich and not self.cells_are_of_sky
+
+        def evidence(one: Hypothesis) -> float:
+            return one.log_evidence + (evidence_of_correction(whole.problem, one.fit) if teaches else 0.0)
+
+        try:
+            with time_limit(self.until):
+                reached = evidence(found) if found.names else 0.0
+                while found.names:
+                    smaller = [
+                        whole.hypothesis(tuple(n for n in found.names if n != name), None, found.fit)
+                        for name in found.names
+                    ]
+                    left, best = max(((evidence(one), one) for one in smaller), key=lambda pair: pair[0])
+                    if left < reached - self.options.least_evidence:
+                        break
+                    found, reached = best, left
+        except OutOfTimeError:
+            return whole.null
+        return found
 
     def _learned(self, whole: Selector, found: Hypothesis) -> dict[str, Any]:
-        """A correction, judged by cells that it has not seen; nothing where there is none.
-
-        It stands beside the effects of a set that is most of the disagreement, and of no other.
-        """
-        found = found if self._alike(whole, found) else whole.null
+        """A correction beside a set, judged by cells that it has not seen; nothing where there is none."""
         if not self.prepared.rich or self.cells_are_of_sky:
             return {}
         self.say("learning a correction from what is left")

@@ -477,7 +477,10 @@ class SetSearch:
         )
 
     def classified(self, chosen: Hypothesis, steps: list[Step]) -> tuple[Hypothesis, dict[str, EffectClass]]:
-        """Class of each effect of a set, and the set with a rival in the place of one that is clearly likelier."""
+        """Class of each effect of a set, with a rival in the place of one that is clearly likelier.
+
+        Members that bring nothing there are left out.
+        """
         classes = classes_of(self.selector, chosen, self.options.class_width)
         for _ in range(self.options.most_effects):
             best = max((group.best for group in classes.values()), key=lambda item: item.log_evidence)
@@ -488,6 +491,12 @@ class SetSearch:
                 break
             steps.append(self.step(chosen, likelier))
             chosen, classes = likelier, classes_of(self.selector, likelier, self.options.class_width)
+        # A rival may have led to a minimum in which a member brings less than an effect must.
+        if any(group.significance**2 < 2.0 * self.options.least_evidence for group in classes.values()):
+            smaller = self.pruned(chosen)
+            if smaller.names != chosen.names:
+                steps.append(self.step(chosen, smaller))
+                return self.classified(smaller, steps)
         return chosen, classes
 
 

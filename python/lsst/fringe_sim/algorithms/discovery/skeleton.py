@@ -89,13 +89,18 @@ def patterns_of(name: str, own: Mapping[str, float], side: int) -> tuple[list[in
     return nodes, effect.change_image(np.ones((len(nodes), side, side)), values, geometry) - 1.0
 
 
-def learned_files(verdict: Verdict) -> dict[str, str]:
-    """Texts by file name: an override with a correction, and the beginning of an effect; none without."""
+def learned_files(verdict: Verdict, detector: str | None = None) -> dict[str, str]:
+    """Texts by file name: an override with a correction, and the beginning of an effect; none without.
+
+    ``detector``: name of the sensor, for the override.
+    """
     if not verdict.has_learned:
         return {}
     beside, own = verdict.learned["beside"], {key: x for key, x in verdict.learned["own"].items() if x}
     told = f"{verdict.verdict}; learned from what no effect explains, not physics"
-    override = effects_override({**beside, **own}, verdict.setup, told, known=verdict.known)
+    override = effects_override(
+        {**beside, **own}, verdict.setup, told, known=verdict.known, detector=detector
+    )
     return {"learned.py": override, "learned_effect.py": effect_skeleton(verdict)}
 
 

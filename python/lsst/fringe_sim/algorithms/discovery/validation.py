@@ -219,17 +219,16 @@ def degrees_of_freedom(problem: Problem, fit: Fit) -> int:
 def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
     """Size of what a fit leaves beyond noise, as `Verdict.size` states it.
 
-    Noise that happens to be small gives no limit below that of mean noise: power-constrained limits of Cowan et al.
-    2011.
+    Noise of single exposures and noise that all of them share, the scatter of the response of the cells, are compared
+    with what is left of each: what all exposures share is lost in χ² where the response scatters. The limit takes
+    the sum for a multiple of one chi-square (Satterthwaite 1946, doi 10.2307/3002019). Noise that happens to be small
+    gives no limit below that of mean noise: power-constrained limits of Cowan et al. 2011.
     """
-    noise, degrees = problem.cells.noise_rms, degrees_of_freedom(problem, fit)
-    counts, most = (
-        noise * math.sqrt(max(chi2 / expected - 1.0, 0.0))
-        for chi2, expected in (
-            (fit.chi2, degrees),
-            (max(fit.chi2, float(degrees)), float(chdtri(degrees, CONFIDENCE))),
-        )
-    )
+    variance, chi2, freedom = np.array(_noise_and_misfit(problem, fit)).T
+    noise, left = float(variance.sum()), float((variance * chi2 / freedom).sum())
+    degrees = noise**2 / float((variance**2 / freedom).sum())
+    counts = math.sqrt(max(left - noise, 0.0))
+    most = math.sqrt(max(max(left, noise) * degrees / float(chdtri(degrees, CONFIDENCE)) - noise, 0.0))
     level, _ = problem.amplitudes(fit.levels)
     pattern = (problem.expected_of(fit) / level - 1.0)[:, problem.cells.seen]
     fringes = math.sqrt(float(pattern.var(axis=1).mean())) if pattern.size else 0.0
@@ -238,6 +237,24 @@ def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
         "of_fringes": counts / fringes if fringes > 0.0 else math.nan,
         "of_fringes_at_most": most / fringes if fringes > 0.0 else math.nan,
     }
+
+
+def _noise_and_misfit(problem: Problem, fit: Fit) -> list[tuple[float, float, float]]:
+    """Variance of a value by noise, χ² and degrees of freedom: of single exposures, and of what all of them share."""
+    cells, degrees = problem.cells, float(degrees_of_freedom(problem, fit))
+    if cells.response_scatter == 0.0:
+        return [(cells.noise_rms**2, fit.chi2, degrees)]
+    expected = problem.expected_of(fit)
+    whiten = problem.whitener(expected)
+    residual = whiten(np.where(cells.weight > 0.0, cells.value - expected, 0.0))
+    square = (whiten.direction**2).sum(axis=0)[cells.seen]
+    shared = float((((whiten.direction * residual).sum(axis=0)[cells.seen]) ** 2 / square).sum())
+    variance = float((1.0 / square).mean()) + cells.response_scatter**2
+    freedom = degrees * square.size / cells.n_values
+    return [
+        (cells.noise_rms**2 - variance, fit.chi2 - shared, degrees - freedom),
+        (variance, shared, freedom),
+    ]
 
 
 def _field_freedom(problem: Problem) -> int:

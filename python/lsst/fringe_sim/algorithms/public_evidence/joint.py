@@ -22,8 +22,6 @@ from ...model import FringeModel
 from .kinds import SHIFT_UM, Kind, PixelFlats
 from .models import LAB, models_with, without_bench
 
-__all__ = ["Axis", "JointFit", "Predictor", "parse_set"]
-
 FloatArray = NDArray[np.float64]
 
 MOST_PARAMETERS = 3
@@ -31,11 +29,8 @@ COARSE_NODES = (0, 11, 7, 5)
 """Values of each parameter that are computed, by the number of parameters; a second time where it matters."""
 
 FINE_NODES = (0, 61, 21, 9)
-RESOLVED = 2
-"""Times that the grid is made finer about the posterior; nothing is computed anew for it."""
-
-NEGLIGIBLE = 1e-5
-"""Posterior mass that a range of parameters may leave out, relative to its largest value."""
+RESOLVED = 2  # Times that the grid is made finer about the posterior; nothing is computed anew for it
+NEGLIGIBLE = 1e-5  # Posterior mass that a range of parameters may leave out, relative to its largest value
 
 
 @dataclass(frozen=True)

@@ -27,16 +27,6 @@ from ..single_pixel import published_pixel
 from ..sky_response import is_band
 from .models import LAB, Models
 
-__all__ = [
-    "SHIFT_UM",
-    "FlatContrast",
-    "Kind",
-    "PixelFlats",
-    "harmonics",
-    "public_kinds",
-    "sky_amplitude",
-]
-
 FloatArray = NDArray[np.float64]
 
 SHIFT_UM = np.linspace(-1.5, 1.5, 601)
@@ -67,16 +57,14 @@ CONTRAST_CALIBRATION = 0.05
 SHAPE_SIGMA = 0.03
 """Uncertainty of the second harmonic: fitted phases of the map cluster, which bends every fringe alike."""
 
-PHASE_SIGMA = 0.1
-"""Uncertainty of the phase of the map [rad], 5 nm of adhesive."""
+PHASE_SIGMA = 0.1  # Uncertainty of the phase of the map [rad], 5 nm of adhesive
 
 MAP_SIGMA_UM = 0.3
 """A walk may slip by an order, and the observable of the paper turns the fringe by half an order."""
 
 QE_NM = np.arange(880.0, 1061.0, 20.0)
 QE_SIGMA, QE_LEVEL = 0.03, 0.03
-QE_LINE_NM = 6.0
-"""Width of the line in which the efficiency is computed: the silicon makes no fringes in it."""
+QE_LINE_NM = 6.0  # Width of the line in which the efficiency is computed: the silicon makes no fringes in it
 
 LINE_SHIFT_NM, LEAST_SHARE = 0.02, 0.97
 SKY_NODES = {"monocam": 12, "hsc": 24, "lsst_e2v": 64}

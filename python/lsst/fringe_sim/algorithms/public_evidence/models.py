@@ -10,8 +10,6 @@ from ...effects import known_effects
 from ...instrument.setup import Setup
 from ...model import FringeModel
 
-__all__ = ["EVERY_SENSOR", "LAB", "Models", "models_with", "without_bench"]
-
 LAB = "ts8_e2v"
 
 

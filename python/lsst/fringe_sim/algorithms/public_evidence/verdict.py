@@ -17,19 +17,8 @@ from ...errors import InputError
 from ...notebook import do_nothing
 from ..discovery.options import SearchOptions
 from .joint import Axis, JointFit, Predictor, parse_set
-from .kinds import (
-    SHIFT_UM,
-    FlatPhase,
-    Kind,
-    PixelFlats,
-    PublishedMap,
-    harmonics,
-    public_kinds,
-    sky_amplitude,
-)
+from .kinds import SHIFT_UM, FlatPhase, Kind, PixelFlats, PublishedMap, harmonics, public_kinds, sky_amplitude
 from .models import LAB, Models, models_with, without_bench
-
-__all__ = ["DECIDING", "RIVALS", "Comparison", "KindRow", "Measurement", "compare"]
 
 FloatArray = NDArray[np.float64]
 

@@ -13,6 +13,8 @@ LARGEST_CELL_PX = 8
 """Cells beyond this would wash out the steep fringes of real sensors (9 nm per pixel)."""
 MOST_CELLS = 600_000
 """Bound on the memory of the order evidence: about 84 orders of 4 bytes for each cell."""
+_FEWEST_CELLS = 64
+"""Cells that are more than what is learned beside the thickness: a dozen numbers of each wavelength."""
 _STEEPEST_STRUCTURE = 1.0
 """Largest ``1 - cos`` of the phase across a cell, in the steepest tenth of the sensor: a quarter of a fringe."""
 _LARGEST_LOSS = 1.0
@@ -66,7 +68,7 @@ def choose_cell_size(data: Amplitudes) -> int:
     for size in (8, 4, 2):
         if size <= least:
             break
-        if size >= max(ny, nx):
+        if size >= max(ny, nx) or ny * nx < _FEWEST_CELLS * size**2:
             continue
         structure = _structure(strips, size, noise, signal)
         # The mean over a ramp of phase f is sin(f/2) / (f/2) of its middle: about 1 - (1 - cos f) / 12.

@@ -87,8 +87,8 @@ def rank_orders(
 
     def costs() -> dict[float, float]:
         """Improbability of all, each where cells err alike as far as those of the best do."""
-        shared = min(tried.values(), key=lambda fit: fit.chi2 + fit.prior).shared
-        return {shift: fit.chi2 / shared + fit.prior for shift, fit in tried.items()}
+        shared = min(tried.values(), key=lambda fit: fit.cost()).shared
+        return {shift: fit.cost(shared) for shift, fit in tried.items()}
 
     def clear(shift: float) -> bool:
         cost = costs()

@@ -25,7 +25,9 @@ _INDEPENDENT = 100
 """Independent places of a sensor at most, before the fringes are known: they hide light of their own scale."""
 
 
-def first_nuisances(cells: Cells, templates: FringeTemplates, free: Nuisances) -> NuisanceFit:
+def first_nuisances(
+    cells: Cells, templates: FringeTemplates, free: Nuisances, own: bool = True
+) -> NuisanceFit:
     """Light and contrast before any thickness is known: fringes average out over wavelengths and over the sensor.
 
     Parameters
@@ -36,6 +38,8 @@ def first_nuisances(cells: Cells, templates: FringeTemplates, free: Nuisances) -
         The model.
     free : `Nuisances`
         What is free.
+    own : `bool`, optional
+        Whether each wavelength has light of its own, which fringes of few orders are taken for.
     """
     wavelengths, width = templates.n_wavelengths, cells.value.shape[-1]
     seen = some_of(np.flatnonzero((cells.weight[..., :wavelengths] > 0).all(axis=-1)), _FIRST_CELLS)
@@ -50,9 +54,11 @@ def first_nuisances(cells: Cells, templates: FringeTemplates, free: Nuisances) -
     if pattern.shape[-1]:
         level = np.log1p(np.clip(value, -0.9, 10.0))
         shared = _ridge(pattern, level.mean(axis=1), light_widths(free, zones, pattern.shape[-1], True))
-        own = level - (pattern @ shared)[:, None]
-        alone = light_widths(free, zones, pattern.shape[-1], False)
-        coefficients = np.stack([shared + _ridge(pattern, part, alone) for part in own.T])
+        coefficients[:] = shared
+        if own:
+            rest = level - (pattern @ shared)[:, None]
+            alone = light_widths(free, zones, pattern.shape[-1], False)
+            coefficients += np.stack([_ridge(pattern, part, alone) for part in rest.T])
     rest = (1.0 + value) * np.exp(-pattern @ coefficients.T) - 1.0
     strength = templates.amplitude().std(axis=0)
     power = np.array(

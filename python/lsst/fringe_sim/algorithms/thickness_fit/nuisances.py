@@ -204,6 +204,10 @@ class NuisanceFit:
             overtones=np.zeros((wavelengths, OVERTONES)),
         )  # fmt: skip
 
+    def cost(self, shared: float = 1.0) -> float:
+        """Improbability of all that was found, where the cells err alike as far as ``shared`` says."""
+        return self.chi2 / shared + self.prior
+
     def light(self, cells: Cells, free: Nuisances) -> NDArray[np.float32]:
         """Light on all cells, less one, shape ``(n_wavelengths, ncy, ncx)``; no wavelengths if it is even."""
         if not np.any(self.coefficients):

@@ -22,7 +22,6 @@ Herráez, Burton, Lalor & Gdeisat 2002, Applied Optics 41, 7437 (phase unwrappin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,32 +31,13 @@ from ...compiled import kernel, subkernel
 from .cells import Cells
 from .evidence import IMPOSSIBLE, OrderEvidence
 
-__all__ = ["OrderSolution", "solve_orders"]
+__all__ = ["solve_orders"]
 
 SURE = 60.0
 """Chi-square difference between the best and the next order at which a region is sure of its order."""
 
 
-@dataclass(frozen=True, eq=False)
-class OrderSolution:
-    """The order of every cell.
-
-    Attributes
-    ----------
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        ``phase + order * m`` [µm]; NaN where a cell has no data.
-    region : `numpy.ndarray`, int32, shape ``(ncy, ncx)``
-        Number of the region, 0, 1, ... by size; -1 where a cell has no data.
-    region_evidence : `numpy.ndarray`, shape ``(n_regions, n_orders)``
-        Summed evidence of each region for shifts of -n ... n orders from the solution; 0 at the solution.
-    """
-
-    thickness_um: NDArray[np.float32]
-    region: NDArray[np.int32]
-    region_evidence: NDArray[np.float32]
-
-
-def solve_orders(cells: Cells, found: OrderEvidence, sure: float = SURE) -> OrderSolution:
+def solve_orders(cells: Cells, found: OrderEvidence, sure: float = SURE) -> NDArray[np.float32]:
     """Join cells into regions and give each region its absolute order.
 
     Parameters
@@ -71,7 +51,8 @@ def solve_orders(cells: Cells, found: OrderEvidence, sure: float = SURE) -> Orde
 
     Returns
     -------
-    solution : `OrderSolution`
+    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
+        ``phase + order * m`` [µm]; NaN where a cell has no data.
     """
     ny, nx = found.phase_um.shape
     rise_y = found.slope_y * np.diff(cells.y_edges).astype(np.float32)[:, None]
@@ -85,25 +66,8 @@ def solve_orders(cells: Cells, found: OrderEvidence, sure: float = SURE) -> Orde
     best = np.zeros(len(root), np.int64)
     best[roots] = np.argmin(evidence[roots], axis=1)
     order = best[root] + offset
-    thickness = np.where(valid, found.phase_um.ravel() + found.order_um * order, np.nan).astype(np.float32)
-    roots, member = np.unique(root[valid], return_inverse=True)
-    rank = np.argsort(-np.bincount(member, minlength=len(roots)), kind="stable")
-    number = np.empty(len(roots), np.int32)
-    number[rank] = np.arange(len(roots))
-    region = np.full(ny * nx, -1, np.int32)
-    region[valid] = number[member]
-    around = _centred(evidence[roots[rank]])
-    return OrderSolution(thickness.reshape(ny, nx), region.reshape(ny, nx), around)
-
-
-def _centred(evidence: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Evidence relative to the best order of each region, on shifts ``-(n-1) ... n-1``."""
-    count = evidence.shape[1]
-    out = np.full((len(evidence), 2 * count - 1), IMPOSSIBLE, np.float32)
-    best = np.argmin(evidence, axis=1)
-    for row, at in enumerate(best):
-        out[row, count - 1 - at : 2 * count - 1 - at] = evidence[row] - evidence[row, at]
-    return out
+    thickness = np.where(valid, found.phase_um.ravel() + found.order_um * order, np.nan)
+    return thickness.astype(np.float32).reshape(ny, nx)
 
 
 def _links(

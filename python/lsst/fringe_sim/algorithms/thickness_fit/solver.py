@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -74,6 +75,8 @@ class State:
     """Whether mean response and orders were found together, by a search that may have missed the true ones."""
     free: Nuisances = field(default_factory=Nuisances)
     margin: float = np.inf
+    rival: float = np.inf
+    """Improbability, above that of this one, of a solution of another order that the search came upon."""
     alike: float = 1.0
     """Variance of sums over cells relative to cells that err by themselves, the largest that was met on the way."""
     described: bool = False
@@ -96,23 +99,52 @@ class Solver:
         """Solve the orders, and again if the model turns out to be another than was thought."""
         if not self.free.any:
             return self._solve_held(cells, templates)
+        wide = True
         if np.isfinite(self.free.gain_accuracy):
-            described = self._described(cells, templates)
+            described, wide = self._described(cells, templates)
             if described is not None:
                 return described
-        nuisance = first_nuisances(cells, templates, self.free)
+        # Fringes of few orders look like light that each wavelength has of its own: both are tried.
+        starts = [
+            first_nuisances(cells, templates, self.free, own) for own in ((True,) if wide else (True, False))
+        ]
+        return self._likeliest(
+            state for start in starts for state in self._solve_from(start, cells, templates)
+        )
+
+    def _likeliest(self, states: Iterator[State]) -> State:
+        """The most probable of some solutions; the best of another order of the sensor is its rival."""
+        best, seen = next(states), []
+        seen.append((best.thickness_um, best.nuisance))
+        for state in states:  # one at a time: the evidence of all cells is large
+            seen.append((state.thickness_um, state.nuisance))
+            if state.nuisance.cost() <= best.nuisance.cost():
+                best = state
+        if not np.isfinite(best.nuisance.chi2):
+            return best
+        rivals = [
+            fit.cost(best.nuisance.shared) - best.nuisance.cost(best.nuisance.shared)
+            for thickness, fit in seen
+            if abs(np.nanmedian(thickness - best.thickness_um)) > _SAME_SHAPE * self.order_um
+        ]
+        return replace(best, rival=min(rivals, default=np.inf))
+
+    def _solve_from(self, nuisance: NuisanceFit, cells: Cells, templates: FringeTemplates) -> Iterator[State]:
+        """Orders and all that is free in turn, from a first light and contrast: every solution on the way."""
         fitted, alike = nuisance.applied_to(templates), 1.0
         for turn in range(_MOST_SOLUTIONS):
             even = subtract_offset(cells, nuisance.light(cells, self.free))
-            state = self._state(even, fitted, nuisance, "sensor", self.range_um, alike)
-            before, state = state, self._learn(state, ranked=turn == 0)
+            before = self._state(even, fitted, nuisance, "sensor", self.range_um, alike)
+            state = self._learn(before, ranked=turn == 0)
+            yield state
             if _agree(before, state):
                 break
             fitted, nuisance, alike = state.templates, state.nuisance, state.alike
-        return state
 
-    def _described(self, cells: Cells, templates: FringeTemplates) -> State | None:
-        """Solution with the model as it is, if that describes the flats; what is free then moves no order.
+    def _described(self, cells: Cells, templates: FringeTemplates) -> tuple[State | None, bool]:
+        """Solution with the model as it is, if that describes the flats, and whether the sensor has many orders.
+
+        What is free moves no order then.
 
         Light and contrast of a sensor of few orders cannot be told from its fringes: there they stay as they are.
         """
@@ -123,13 +155,13 @@ class Solver:
         if narrow:
             state = held._solve_held(cells, templates, probe)
             alone = cells_leave_only_noise(state.cells, state.templates, state.thickness_um)
-            return state if alone and self._leaves_only_noise(state) else None
+            return state if alone and self._leaves_only_noise(state) else None, False
         if not self._leaves_only_noise(held.adjust(replace(probe, normalisation="sensor"))):
-            return None
+            return None, True
         state = held._solve_held(cells, templates, probe)
         count = patterns_of_cells(cells, self.free, *np.zeros((2, 1), np.intp))[0].shape[-1]
         start = NuisanceFit.none(templates.n_wavelengths, count)
-        return replace(state, free=self.free, nuisance=start, described=True)
+        return replace(state, free=self.free, nuisance=start, described=True), True
 
     def _leaves_only_noise(self, state: State) -> bool:
         """Whether a solution leaves over nothing that neighbouring pixels share."""
@@ -167,7 +199,7 @@ class Solver:
         orders = self._open_orders(state.templates)
         if spans_orders(state.thickness_um, self.order_um, _SURELY_MORE * orders):
             return True
-        joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
+        joined = solve_orders(state.cells, state.found, sure=np.inf)
         return spans_orders(joined, self.order_um, orders)
 
     @staticmethod
@@ -187,7 +219,7 @@ class Solver:
         if spans_orders(state.thickness_um, self.order_um, _SURELY_MORE * orders):
             return False
         # Wrong orders make a sensor look thicker and thinner than it is; joined by phases alone it cannot jump.
-        joined = solve_orders(state.cells, state.found, sure=np.inf).thickness_um
+        joined = solve_orders(state.cells, state.found, sure=np.inf)
         return not all(
             spans_orders(thickness, self.order_um, orders) for thickness in (state.thickness_um, joined)
         )
@@ -212,7 +244,7 @@ class Solver:
         )  # fmt: skip
         # Evidence of a model that does not describe the flats is worth less, however many agree: they err alike.
         alike = max(alike, self._erring_alike(state)) if self.free.any else 1.0
-        thickness = solve_orders(cells, found, SURE * alike).thickness_um
+        thickness = solve_orders(cells, found, SURE * alike)
         return replace(state, thickness_um=thickness, alike=alike)
 
     def _erring_alike(self, state: State) -> float:
@@ -256,7 +288,7 @@ class Solver:
             for other in ranked[:_MOST_MEANS]:
                 tried = solved if other is best else self._with_mean_of(other, cells, first)
                 joined = solve_orders(tried.cells, tried.found, sure=np.inf)
-                for shape in (tried.thickness_um, joined.thickness_um):
+                for shape in (tried.thickness_um, joined):
                     if not _among(shape, shapes, self.order_um):
                         shapes.append(shape)
             if all(_among(shape, known, self.order_um) for shape in shapes):
@@ -298,7 +330,8 @@ class Solver:
         base = self.base or state.templates
         if ranked:
             found = rank_orders(sample, base, state.free, state.nuisance, self.order_um, state.range_um)
-            fit, shift, slip, margin = found.fit, found.shift, found.slip, found.margin
+            fit, shift, margin = found.fit, found.shift, min(found.margin, state.rival)
+            slip = 1.0 - (1.0 - found.slip) / (1.0 + (1.0 - found.slip) * np.exp(-0.5 * state.rival))
         else:
             fit, shift = learn(sample, base, state.free, state.nuisance)[1], 0.0
             slip, margin = state.common_slip, state.margin
