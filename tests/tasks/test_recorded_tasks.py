@@ -102,6 +102,29 @@ def test_the_forecast_of_a_sensor_and_a_frame_in_its_beams_are_as_recorded(
     recorded({"table": table, "stated": stated, "frame": frame, "reported": reported(caplog)})
 
 
+def test_a_map_of_a_part_is_forecast_in_the_place_of_that_part() -> None:
+    task = FringeForecastTask(
+        config=FringeForecastConfig(nights=1, cells=2, apertures_arcsec=[1.0], templates=1)
+    )
+    silent = wedge(560, 572)
+    whole, part = (
+        task.run(dataclasses.replace(silent, metadata={"DETSEC": section}), SENSOR).forecast
+        for section in (f"[1:{SENSOR.shape[1]},1:{SENSOR.shape[0]}]", "[573:2,561:2]")
+    )
+    stated = task.run(silent, SENSOR).forecast  # nothing says that it is less than the sensor
+    np.testing.assert_array_equal(stated["rms"], whole["rms"])
+    pixel_mm = 1e-3 * SENSOR.pixel_um
+    for name, size, centre, step, last in (
+        ("x", SENSOR.shape[1], SENSOR.x_mm, 572, np.array([0, 1, 0, 1])),
+        ("y", SENSOR.shape[0], SENSOR.y_mm, 560, np.array([0, 0, 1, 1])),
+    ):
+        for table, first, side in ((whole, 0.5, size), (part, step + 1.5, -step)):
+            place = first + side * (0.5 * last + 0.25) - 0.5 - 0.5 * size
+            np.testing.assert_allclose(table[name], centre + pixel_mm * place, atol=1e-9)
+    # A cell of the part has 286 pixels on a side in the place of 2000: fewer fringes are averaged, others are seen.
+    assert part.meta["field_radius"] > whole.meta["field_radius"]
+
+
 def test_templates_of_a_night_are_as_recorded(recorded: Record, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     y, x = np.mgrid[:20, :30]

@@ -23,7 +23,7 @@ from ..instrument.night import NightHistory
 from ..instrument.readout import electrons_to_microjansky, zero_point
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel
-from .field_response import SensorResponse
+from .field_response import SensorPlacement, SensorResponse
 from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
 from .sky_frame import component_electrons
 
@@ -240,8 +240,8 @@ def pattern_moments(
 ) -> PatternMoments:
     """Mean products of the fringe patterns of a sensor.
 
-    ``thickness_um`` (ny, nx): thickness, on pixels of any size that cover the sensor; NaN where it is not
-    known.
+    ``thickness_um`` (ny, nx): thickness, on pixels of any size that cover what is placed, the sensor or a part of it;
+    NaN where it is not known.
     """
     chosen = ForecastOptions() if options is None else options
     thickness = np.asarray(thickness_um)
@@ -328,7 +328,7 @@ def forecast_sensor(
     square = np.einsum("tc,ayxcd,td->ayx", relative, moments.product, relative) / len(sky)
     cell_left = np.sqrt(np.maximum(square, 0.0))
     typical = np.sqrt((noises**2).mean(axis=1))[:, None, None]
-    x_mm, y_mm = _cell_centres(detector, chosen.cells)
+    x_mm, y_mm = _cell_centres(detector, response.placement, level.pixel_scale_arcsec, chosen.cells)
     radius_deg = math.hypot(response.placement.field_x_deg, response.placement.field_y_deg)
     return SensorForecast(
         detector=detector.name,
@@ -365,7 +365,7 @@ def _cell_rms(moments: PatternMoments, vector: FloatArray, factors: FloatArray) 
 
 def _block_of(shape: tuple[int, ...], response: SensorResponse, options: ForecastOptions) -> int:
     """Pixels of the map along a side of a block."""
-    pixel_arcsec = 3600.0 * response.placement.width_deg / shape[1]
+    pixel_arcsec = 3600.0 * abs(response.placement.width_deg) / shape[1]
     block = max(1, round(_BLOCK_ARCSEC / pixel_arcsec))
     least = options.cells * round(max(options.apertures_arcsec))
     if min(shape) // block < least or pixel_arcsec > 1.5 * _BLOCK_ARCSEC:
@@ -399,12 +399,12 @@ def _cell_products(patterns: NDArray[Any], cells: int) -> FloatArray:
     return out
 
 
-def _cell_centres(detector: Detector, cells: int) -> tuple[FloatArray, FloatArray]:
-    turn = math.radians(detector.yaw_deg)
-    rows, columns = detector.shape
-    middle = (np.arange(cells) + 0.5) / cells - 0.5
-    along = 1e-3 * detector.pixel_um * columns * middle[None, :]
-    across = 1e-3 * detector.pixel_um * rows * middle[:, None]
-    x = detector.x_mm + math.cos(turn) * along - math.sin(turn) * across
-    y = detector.y_mm + math.sin(turn) * along + math.cos(turn) * across
-    return x, y
+def _cell_centres(
+    detector: Detector, placement: SensorPlacement, pixel_scale_arcsec: float, cells: int
+) -> tuple[FloatArray, FloatArray]:
+    """Places of the cells in the focal plane [mm]."""
+    column, row = np.meshgrid(np.arange(cells), np.arange(cells))
+    x, y = (start + along * column + across * row for start, along, across in placement.plane((cells, cells)))
+    whole = SensorPlacement.of(detector, pixel_scale_arcsec)
+    mm = 1e-3 * detector.pixel_um * 3600.0 / pixel_scale_arcsec
+    return detector.x_mm + mm * (x - whole.field_x_deg), detector.y_mm + mm * (y - whole.field_y_deg)

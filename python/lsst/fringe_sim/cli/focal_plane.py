@@ -31,10 +31,11 @@ from ..instrument.flat_spectrum import FlatSpectrum
 from ..instrument.night import NightHistory, random_nights
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel, Setup
+from ..products.sensor_section import SensorSection
 from ..products.thickness_map import thickness_span_um
 from ..report.focal_plane_page import write_focal_plane_page
 from .command import command, flag, option
-from .inputs import read_settings, read_thickness, sky_settings
+from .inputs import read_section, read_settings, read_thickness, sky_settings
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import effects_file_option, with_effects_from
 from .progress import progress
@@ -105,7 +106,7 @@ def focal_plane(
     settings = sky_settings(read_settings(effects_file) if effects_file else {})
     flat = None if flat_spectrum == "white" else FlatSpectrum.from_name(flat_spectrum)
     thickness = {
-        sensor.name: read_thickness(measured[sensor.name], Setup.from_name(SETUPS[sensor.vendor]), sensor)
+        sensor.name: _SensorLayer.read(measured[sensor.name], sensor)
         for sensor in chosen
         if sensor.name in measured
     }
@@ -122,7 +123,7 @@ def focal_plane(
             if not detectors:
                 continue
             model = FringeModel.from_setup(setup_name, _of_stack(settings, setup_name))
-            field = _field(model, sky, [thickness[d.name] for d in detectors if d.name in thickness])
+            field = _field(model, sky, [thickness[d.name].value_um for d in detectors if d.name in thickness])
             for detector in detectors:
                 tables.append(
                     _forecast(detector, model, sky, field, thickness.get(detector.name), observed, seed)
@@ -137,6 +138,19 @@ def focal_plane(
         click.echo(line)
     click.echo(str(folder))
     click.echo(str(folder / "report.html"))
+
+
+@dataclass(frozen=True)
+class _SensorLayer:
+    """Thickness of the varying layer of a sensor, and the part of the sensor that it shows; `None` for all of it."""
+
+    value_um: NDArray[np.float64]
+    section: SensorSection | None
+
+    @classmethod
+    def read(cls, path: Path, sensor: Detector) -> _SensorLayer:
+        value_um = read_thickness(path, Setup.from_name(SETUPS[sensor.vendor]), sensor)
+        return cls(value_um, read_section(path, sensor, (value_um.shape[0], value_um.shape[1])))
 
 
 def _chosen(names: Iterable[str]) -> list[Detector]:
@@ -202,7 +216,7 @@ def _forecast(
     model: FringeModel,
     sky: SkySpectrum,
     field: FieldResponse,
-    measured: NDArray[np.float64] | None,
+    measured: _SensorLayer | None,
     observed: NightHistory,
     seed: int,
 ) -> Table:
@@ -210,9 +224,10 @@ def _forecast(
     thickness = (
         stand_in_thickness(model.setup, detector, seed, shape).value
         if measured is None
-        else measured.astype(np.float32)
+        else measured.value_um.astype(np.float32)
     )
-    response = field.on(SensorPlacement.of(detector, model.setup.pixel_scale_arcsec))
+    section = None if measured is None else measured.section
+    response = field.on(SensorPlacement.of(detector, model.setup.pixel_scale_arcsec, section))
     light = float(field.relative_illumination(detector.field_radius_deg))
     level = SkyLevel.of(sky, model, detector.read_noise, light)
     forecast = forecast_sensor(

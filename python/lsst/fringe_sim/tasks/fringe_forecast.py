@@ -113,8 +113,10 @@ class FringeForecastTask(base.PipelineTask):
             No map where one is needed; a map of another layer, or fitted with other effects than those configured
             here; a telescope whose beams do not depend on the distance from the axis alone.
         """
-        known = self.config.map_of(thickness, detector).known_um()
-        model, sky, response = self.config.sky_model(detector, self.config.airmass, known).response()
+        layer = self.config.map_of(thickness, detector)
+        known = layer.known_um()
+        made = self.config.sky_model(detector, self.config.airmass, known, layer.metadata)
+        model, sky, response = made.response()
         if not isinstance(response, SensorResponse):
             raise InputError(
                 "telescope", model.setup.telescope, "one whose beams depend on the field radius alone"

@@ -191,14 +191,14 @@ class SkyModelConfig(FringeModelConfig):
         detector: Detector,
         airmass: float,
         thickness_um: NDArray[np.float32],
-        header: Mapping[str, Any] | None = None,
+        header: Mapping[str, Any],
     ) -> SkyModel:
         """What the response of a sensor depends on; the header of its map says which part of it the map shows."""
         rows, columns = thickness_um.shape
-        section = SensorSection.of_image(detector, (rows, columns), header or {})
+        section = SensorSection.of_image(detector, (rows, columns), header)
         choice = self.choice_of(detector)
         setup = Setup.from_name(choice.setup)
-        stated = (header or {}).get(LABORATORY_TEMPERATURE)
+        stated = header.get(LABORATORY_TEMPERATURE)
         return SkyModel(
             choice=(choice.setup, tuple(sorted(choice.applied_effects.items()))),
             placement=SensorPlacement.of(detector, setup.pixel_scale_arcsec, section),
