@@ -27,7 +27,8 @@ def imports(tree: ast.AST, inside: bool = False) -> Iterator[tuple[str, bool]]:
         if isinstance(node, ast.Import):
             yield from ((alias.name, inside) for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and not node.level:
-            yield str(node.module), inside
+            # A module without anything of its own gives modules: `from lsst.pipe import base`.
+            yield from ((f"{node.module}.{alias.name}", inside) for alias in node.names)
         types_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
         later = inside or types_only or isinstance(node, ast.FunctionDef)
         yield from imports(node, later)

@@ -107,7 +107,7 @@ def test_a_map_from_a_range_is_as_recorded(recorded: Record) -> None:
     values = [size * seen + 3e-3 * rng.standard_normal(layer.shape) + 1e-4 for size in (0.7, 1.0, 1.3, 0.9)]
     weights = [np.full(layer.shape, 3e-3**-2) for _ in values]
     values[1][20:24, 10:14], weights[1][20:24, 10:14] = np.nan, 0.0
-    recorded(map_from_range(values, weights, (13.0, 13.9), light, 0.3, model_accuracy=0.02))
+    recorded(map_from_range(values, weights, (13.0, 13.9), light, 0.3, order_error=0.02))
 
 
 @pytest.mark.slow

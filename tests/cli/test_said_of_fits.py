@@ -16,7 +16,7 @@ from small_pages import SIDE, WAVELENGTHS_NM, smooth_map, verdict
 from lsst.fringe_sim.algorithms import map_on_sky
 from lsst.fringe_sim.cli import discover, fit, fit_sky
 from lsst.fringe_sim.cli.main import run
-from lsst.fringe_sim.errors import UndeterminedError
+from lsst.fringe_sim.errors import InputError, UndeterminedError
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube
 from lsst.fringe_sim.products.thickness_map import ThicknessMap
@@ -61,7 +61,7 @@ def searched(folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> N
             {"order_probability": 0.4},
             "no map was found: the likeliest one has a probability of 0.4 among other orders and directions, and "
             "0.5 is asked for; the next leaves 0.2 of its fringes, and the model may be wrong by more "
-            "(--model-accuracy)",
+            "(--order-error)",
         ),
         ({"order_probability": fit_sky.LEAST_PROBABILITY}, "75 % of the pixels are known"),
         ({"model_error": fit_sky.LARGE_ERROR}, "no map was found: the likeliest one leaves "),
@@ -82,12 +82,16 @@ def test_a_map_from_the_sky_alone(
 
 
 def test_what_is_free_in_a_fit() -> None:
-    usual = fit._free(None, None, None, 0.5)
-    zoned = fit._free("halves", 3, "common", 0.5)
-    assert (zoned.zones, zoned.illumination_degree, zoned.gain_accuracy) == ("halves", 3, math.inf)
-    assert usual.gain_accuracy != math.inf
-    assert (usual.contrast, zoned.contrast) == ("wavelength", "common")
-    assert usual.illumination_degree != 3
+    assert fit._free(None, None, None, 0.5, usual=True) is None
+    curved = fit._free(None, 3, None, 0.5, usual=True)
+    zoned = fit._free("halves", None, "common", 0.5, usual=True)
+    assert (zoned.zones, zoned.gain_accuracy, zoned.contrast) == ("halves", math.inf, "common")
+    assert zoned.illumination_degree != 3
+    assert (curved.illumination_degree, curved.contrast) == (3, "wavelength")
+    assert curved.gain_accuracy != math.inf
+    assert curved.wavelength_accuracy_nm == 0.5
+    with pytest.raises(InputError, match="guo2022"):
+        fit._free(None, 3, None, 0.5, usual=False)
 
 
 def test_silicon_in_words() -> None:
