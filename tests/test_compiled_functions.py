@@ -104,6 +104,8 @@ def test_every_function_is_compiled_once() -> None:
         "    work()\n"
         "for item in gc.get_objects():\n"
         "    if isinstance(item, Dispatcher) and item.py_func.__module__.startswith('lsst.fringe_sim'):\n"
+        "        assert item.targetoptions['nogil'], item  # or threads would wait for each other\n"
+        "        assert item.targetoptions['error_model'] == 'numpy', item  # a division by 0 is no exception\n"
         "        print(item.py_func.__module__, item.py_func.__name__, len(item.overloads))\n"
     )
     shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout

@@ -116,6 +116,11 @@ def test_no_rings_where_there_are_none() -> None:
     wave = image + 2.0 * np.cos(2.0 * np.pi * (0.6 * y[:, np.newaxis] + 0.8 * x) / 200.0)
     assert find_rings(wave, used, y, x, middle) is None
     assert find_rings(np.ones_like(image), used, y, x, middle) is None
+    # Rings of less than 2.3 cells may be any other wave of the grid.
+    for cells, seen in ((2.15, False), (2.45, True)):
+        dense, *places = rings((30, 30), 40.0, (400.0, -200.0), cells * 40.0, 3.0)
+        found = find_rings(dense, *places)
+        assert (found is not None and found.period == pytest.approx(cells * 40.0, rel=0.02)) is seen
     bent, used, y, x, middle = rings((30, 30), 40.0, (300.0, 300.0), 200.0, 2.0)
     few = np.zeros_like(used)
     few.flat[:499] = True
