@@ -18,7 +18,7 @@ from lsst.fringe_sim.cli.observed import latest_date
 from lsst.fringe_sim.cli.sky import laboratory_contrast, map_header
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
-from lsst.fringe_sim.products.file_keywords import FILE_KEYWORDS, FILTER_NAMES, SENSOR_NAMES
+from lsst.fringe_sim.products.file_keywords import FILE_KEYWORDS, FILTER_NAMES, PLACE_NAMES, SENSOR_NAMES
 from lsst.fringe_sim.products.observed_files import observed_images
 from lsst.fringe_sim.products.sky_frame import CORRECTED_BY
 
@@ -190,7 +190,10 @@ VALUES: dict[tuple[str, str], tuple[int, tuple[Any, ...]]] = {
     ("flat of amplifiers", "RDNOISE"): (1, (9.0, -9.0)),
     ("flat of amplifiers", "SATURATE"): (1, (810.0,)),
     ("observed frame", "BUNIT"): (1, ("adu",)),
-    **{("observed frame", name): (1, ("S1",)) for name in (*SENSOR_NAMES, "EXTNAME", *FILTER_NAMES)},
+    **{
+        ("observed frame", name): (1, ("S1",))
+        for name in (*SENSOR_NAMES, "EXTNAME", *PLACE_NAMES, *FILTER_NAMES)
+    },
     **{("observed frame", name): (1, (True, "fringe.fits")) for name in CORRECTED_BY},
     ("observed frame", "DATE-OBS"): (1, ("2026-01-02T03:04:05",)),
     ("observed frame", "OBSDATE"): (0, ("2026-01-02T03:04:05",)),

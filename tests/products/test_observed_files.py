@@ -196,3 +196,16 @@ def test_the_sensor_is_named_by_the_most_telling_keyword():
     assert detector_of({"EXTNAME": "N4", "CCDNUM": 7}) == "N4"
     assert detector_of({"DETNAME": "R22_S11", "EXTNAME": "N4"}) == "R22_S11"
     assert detector_of({}) == ""
+
+
+def test_sensors_of_cameras_that_name_them_in_other_ways_are_not_one():
+    # Two quadrants of one CCD of ZTF, two sensors of HSC, and two of the LSST Camera.
+    assert [detector_of({"CCDID": 7, "QID": n + 1, "RCID": 24 + n}) for n in (0, 1)] == ["24", "25"]
+    assert [detector_of({"EXTNAME": "IMAGE", "DET-ID": n}) for n in (0, 50)] == ["0", "50"]
+    slots = [{"RAFTBAY": "R22", "CCDSLOT": slot} for slot in ("S11", "S12")]
+    assert list(map(detector_of, slots)) == ["R22_S11", "R22_S12"]
+
+
+def test_the_filter_of_hsc_is_read(tmp_path):
+    path = write(tmp_path / "CORR.fits", fits.ImageHDU(IMAGE, fits.Header({"FILTER01": "HSC-Y"})))
+    assert observed_images(path)[0].read().physical_filter == "HSC-Y"

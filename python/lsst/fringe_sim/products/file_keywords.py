@@ -24,10 +24,12 @@ class FileKeyword:
     what: str
 
 
-SENSOR_NAMES = ("DETNAME", "DETECTOR", "CCDNAME", "DETPOS", "CCDNUM", "CCDID")
-"""Keywords by which cameras name a sensor; the first that is stated counts."""
+SENSOR_NAMES = ("DETNAME", "DETECTOR", "CCDNAME", "DETPOS", "CCDNUM", "RCID", "CCDID", "DET-ID")
+"""Keywords by which cameras name a sensor, or the quadrant of one that is a file; the first that is stated counts."""
 
-FILTER_NAMES = ("FILTER", "FILTNAM", "FILTERID")  # Keywords of the filter; the first that is stated counts
+PLACE_NAMES = ("RAFTBAY", "CCDSLOT")  # Raft and slot, which name a sensor of LSST together
+
+FILTER_NAMES = ("FILTER", "FILTNAM", "FILTER01", "FILTERID")  # Of the filter; the first that is stated counts
 
 _MAP, _CUBE, _SKY, _ANY = "thickness map", "fringe cube", "sky frame", "any product"
 _PLAIN, _AMPLIFIERS, _OBSERVED = "plain flat", "flat of amplifiers", "observed frame"
@@ -86,7 +88,7 @@ _TABLE = (  # kind of file, keywords, readers, treatment, what
     (_OBSERVED, "BUNIT", "templates", USED, "one unit in all frames; a correction is in that of its frame"),
     (
         _OBSERVED,
-        " ".join((*SENSOR_NAMES, "EXTNAME")),
+        " ".join((*SENSOR_NAMES, "EXTNAME", *PLACE_NAMES)),
         _CORRECTION,
         USED,
         "the sensor, of which the templates are; each image of a file has its own",

@@ -22,7 +22,7 @@ from ..instrument.raw_header import header_value
 from ..resources import complete_fits, open_user_fits, refuse_damage
 from ._fits import write_summed
 from .afw_background import afw_background, is_afw_background
-from .file_keywords import FILTER_NAMES, SENSOR_NAMES, declared_names
+from .file_keywords import FILTER_NAMES, PLACE_NAMES, SENSOR_NAMES, declared_names
 from .image_archive import (
     IMAGE,
     address_again,
@@ -159,7 +159,8 @@ def observed_images(path: Path) -> list[ObservedImage]:
 
 def detector_of(header: Mapping[str, Any]) -> str:
     """Name of the sensor that a header states; empty if it states none."""
-    return _first_of(header, _DETECTORS)
+    place = filter(None, (_text(header, keyword) for keyword in PLACE_NAMES))
+    return _first_of(header, _DETECTORS) or "_".join(place)
 
 
 def write_images(
