@@ -315,7 +315,7 @@ def functions_of(path: Path) -> Iterator[Function]:
             names = {part.id if isinstance(part, ast.Name) else part.attr for part in used if _is_name(part)}
             unseen = any(UNSEEN.search(ast.unparse(one)) for one in node.decorator_list)
             yield Function(
-                path, node.name, node.lineno, node.end_lineno or node.lineno, frozenset(names), unseen
+                path, node.name, node.body[0].lineno, node.end_lineno or 0, frozenset(names), unseen
             )
 
 

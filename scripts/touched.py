@@ -145,18 +145,22 @@ class Touched:
         return data
 
     def lines(self, path: Path) -> dict[int, set[str]]:
-        """Tests that passed and execute a line, of each line of a file."""
+        """Tests that passed and execute a line, of each line of a file; all of the file if an import executes it."""
         users: dict[str, set[str]] = defaultdict(set)
         for test, made in self.fixtures.items():
             for name in (test, *made):
                 users[name].add(test)
         found: dict[int, set[str]] = defaultdict(set)
+        imported: set[int] = set()
         for measured in self.data.measured_files():
             if measured.endswith(f"/{path.as_posix()}"):
                 for line, contexts in self.data.contexts_by_lineno(measured).items():
-                    for context in contexts:
-                        found[line] |= users[context.strip("|")]
-        return found
+                    names = {context.strip("|") for context in contexts}
+                    found[line].update(*(users[name] for name in names))
+                    if "" in names:
+                        imported.add(line)
+        every = set().union(*found.values())
+        return {line: every if line in imported else tests for line, tests in found.items()}
 
     def in_order(self, tests: Iterable[str], most_seconds: float) -> list[str]:
         """The cheapest tests, as many as fit into a time together."""
