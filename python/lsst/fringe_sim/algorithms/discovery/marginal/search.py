@@ -107,41 +107,52 @@ class SetSearch:
         """Log evidence less the price of the effects."""
         return found.log_evidence - self.catalogue.price * len(found.effects)
 
-    def run(self, most: int) -> Hypothesis:
-        """The best set of so many effects at most."""
-        best, beam = self.null, [self.null]
-        for size in range(1, most + 1):
-            self._grow(beam[0])
-            if size > 1 and self._is_enough(beam[0]):
-                break
-            for parent in beam[1:]:
-                self._grow(parent, most=self.rules.refits // 2)
-            grown = self._of_size(size)
-            if not grown:
-                break
-            top = self._settled(grown[0]) if size > 1 else grown[0]
-            gained = top.log_evidence - self.null.log_evidence
-            self.say(f"best of {size}: {', '.join(top.effects)} (log evidence {gained:.1f})")
-            if not self._is_surely_better(top, best):
-                break
-            best = top
-            beam = self._of_size(size)[: self.rules.beam]
-        return best
+    def larger(self, best: Hypothesis) -> Hypothesis:
+        """The best set with one effect more, or the same where none is surely better."""
+        size = len(best.effects) + 1
+        beam = self._of_size(size - 1)[: self.rules.beam] if best.effects else [self.null]
+        self._grow(beam[0])
+        if best.effects and self._is_enough(beam[0]):
+            return best
+        for parent in beam[1:]:
+            self._grow(parent, most=self.rules.refits // 2)
+        grown = self._of_size(size)
+        if not grown:
+            return best
+        top = self._settled(grown[0]) if size > 1 else grown[0]
+        gained = top.log_evidence - self.null.log_evidence
+        self.say(f"best of {size}: {', '.join(top.effects)} (log evidence {gained:.1f})")
+        return top if self._is_surely_better(top, best) else best
+
+    def settled(self, size: int) -> Hypothesis:
+        """The best set of so many effects at most after members were left out and exchanged."""
+        if size == 1:
+            return self.larger(self.null)
+        best = self._settled(self._of_size(size)[0])
+        smaller = max(
+            (one for one in self.pool.values() if len(one.effects) < len(best.effects)), key=self.posterior
+        )
+        return best if self._is_surely_better(best, smaller) else smaller
 
     def on(self, null: Hypothesis) -> SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
         again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise)
         known = sorted(self.pool.values(), key=self.posterior, reverse=True)
-        least = self.rules.least_of_promise * (known[0].log_evidence - self.null.log_evidence)
-        for one in known[: 2 * self.rules.refits]:
-            if one.effects and one.log_evidence - self.null.log_evidence > least - self.rules.class_width:
+        top = known[0].log_evidence - self.null.log_evidence
+        # With one effect of several the noise is still that of a wrong model.
+        doubt = 1.0 - self.rules.least_of_promise if len(known[0].effects) < 2 else self.rules.imprecision
+        least = (1.0 - doubt) * top - self.rules.class_width
+        for number, one in enumerate(known):
+            if not one.effects:
+                continue
+            steps = {(frozenset(one.effects) - {name}, name) for name in one.effects}
+            if one.log_evidence - self.null.log_evidence <= least:
+                again._short |= steps
+            elif number < 2 * self.rules.refits:
                 at = one.point
                 start = null.point.problem.at(at.settings, at.levels, at.thickness_um)
                 again._keep(fit(one.effects, one.items, start))
-                if len(one.effects) == 1:
-                    again._added_before.add((frozenset(), one.effects[0]))
-            elif len(one.effects) == 1:
-                again._short.add((frozenset(), one.effects[0]))
+                again._added_before |= steps
         return again
 
     def _is_surely_better(self, larger: Hypothesis, smaller: Hypothesis) -> bool:

@@ -64,6 +64,7 @@ class _Judgement:
         wavelength = prepared.cells.wavelength_nm
         self.index = np.real(medium.index(wavelength, model.system.temperature_k))
         self.order_um = float(model.fringe_order_um(np.median(wavelength)))
+        self._judged_with: list[set[str]] = []
         self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
         self.catalogue = Catalogue.of(effects, prepared.problem.forward)
         self.sets = SetSearch(self.catalogue, prepared.null, rules, report, self._leaves_noise)
@@ -82,15 +83,7 @@ class _Judgement:
         null = self.prepared.null
         before = self._channels(null)
         self.report(f"chance that noise alone disagrees as much: {total_chance(before):.3g}")
-        best, judged = self.sets.run(1), [self.sets.null.effects]
-        while best.effects not in judged:
-            judged.append(best.effects)
-            self.report(f"noise and cells are judged again with {best.effects[0]}")
-            self.prepared = prepare_again(self.prepared, best)
-            self.sets = self.sets.on(self.prepared.null)
-            best = self.sets.run(1)
-        if len(judged) > 1:
-            best = self.sets.run(self.rules.most_effects)
+        best = self._best()
         if not best.effects:
             if total_chance(before) > self.rules.significance:
                 return self._told("no_discrepancy", null, before, (), {}, None)
@@ -110,6 +103,26 @@ class _Judgement:
         if reasons:
             return self._unexplained(best, before, reasons, named, unseen)
         return self._told("named", best, before, named, {}, unseen)
+
+    def _best(self) -> Hypothesis:
+        """The best set, found one effect at a time; noise and cells are judged with the best of every size."""
+        best = self.prepared.null
+        for _ in range(self.rules.most_effects):
+            size = len(best.effects)
+            best = self._judged_again(self.sets.larger(best))
+            if len(best.effects) <= size:
+                break
+        return best
+
+    def _judged_again(self, best: Hypothesis) -> Hypothesis:
+        """The best set once noise and slopes in the cells are those that it leaves itself."""
+        while best.effects and set(best.effects) not in self._judged_with:
+            self._judged_with.append(set(best.effects))
+            self.report(f"noise and cells are judged again with {', '.join(best.effects)}")
+            self.prepared = prepare_again(self.prepared, best)
+            self.sets = self.sets.on(self.prepared.null)
+            best = self.sets.settled(len(best.effects))
+        return best
 
     def _at_ends(self, best: Hypothesis) -> list[str]:
         """Parameters at an end of their range that nature does not have."""
