@@ -253,6 +253,11 @@ class Point:
         left = self.residual_cells - np.tensordot(step, columns.cells, axes=1)
         return np.asarray(self._back_solved(left)[1])
 
+    @property
+    def wanted_um(self) -> FloatArray:
+        """Change of the thickness of every cell to its best, all else as it is [µm]."""
+        return np.asarray(self._back_solved(self.residual_cells)[1])
+
     def projected(self, values: FloatArray) -> FloatArray:
         """Whitened values less what response and thickness of the cells make of them."""
         cells = self._back_solved(self._forward_solved(self._along(values)))

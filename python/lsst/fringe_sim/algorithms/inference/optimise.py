@@ -13,7 +13,7 @@ from ...errors import OutOfRangeError
 from .coordinates import SECANT, Coordinate, log_evidence_of_parameters
 from .marginal import Columns, Point, joined
 
-__all__ = ["Hypothesis", "effect_columns", "fit", "jumped", "relaxed"]
+__all__ = ["Hypothesis", "effect_columns", "fit", "in_best_orders", "jumped", "relaxed"]
 
 FloatArray = NDArray[np.float64]
 
@@ -25,6 +25,9 @@ MOST_JUMP_UM = 0.25
 
 STRIDE_UM, MOST_STRIDES = 0.05, 16
 """Typical length of a stride of the thickness [µm], and how many of them are walked at most."""
+
+SHIFTS = (0.0, -1.0 / 3.0, 1.0 / 3.0)
+"""Moves of the thickness from which that of a cell is sought anew [orders]."""
 
 RIDGE_SCALES = 10.0
 """Prior scales of the Gaussian that keeps parameters which the data do not see where they are."""
@@ -113,6 +116,26 @@ def jumped(point: Point, items: Sequence[Coordinate], values: Sequence[float]) -
         moved = np.clip(moved, -MOST_JUMP_UM, MOST_JUMP_UM)
         point = point.moved(point.levels, point.thickness_um + moved, settings)
     return relaxed(point, rounds=2)
+
+
+def in_best_orders(
+    point: Point, order_um: float, where: NDArray[np.bool_] | None = None, rounds: int = 4
+) -> Point:
+    """The thickness of every cell where it is best of all within half an order, at these levels.
+
+    ``where`` (N,): cells that may move; the others stay.
+    """
+    moves = np.ones(len(point.thickness_um)) if where is None else where.astype(float)
+    best, energy = point.thickness_um.copy(), point.cell_energy.copy()
+    for shift in SHIFTS:
+        own = point.moved(point.levels, point.thickness_um + shift * order_um * moves)
+        for number in range(rounds + 1):
+            better = own.cell_energy < energy
+            best[better], energy[better] = own.thickness_um[better], own.cell_energy[better]
+            if number < rounds:
+                step = np.clip(own.wanted_um, -MOST_STEP_UM, MOST_STEP_UM)
+                own = own.moved(own.levels, own.thickness_um + step * moves)
+    return point.moved(point.levels, best)
 
 
 def _typical_um(point: Point, moved_um: FloatArray) -> float:

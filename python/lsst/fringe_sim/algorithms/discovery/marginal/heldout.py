@@ -6,14 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...inference import Data, Hypothesis, Point, relaxed
+from ...inference import Data, Hypothesis, Point, in_best_orders, relaxed
 from ..continuation import continued
 from .preparation import Prepared
 
 __all__ = ["Unseen", "judge_unseen"]
-
-SHIFTS = (0.0, -1.0 / 3.0, 1.0 / 3.0)
-"""Moves of the thickness from which cells are fitted [orders]: that of cells held out is continued, not measured."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +45,5 @@ def _fitted(prepared: Prepared, found: Hypothesis, order_um: float) -> Point:
     data = Data(cells.value.reshape(shape[0], -1), cells.weight.reshape(shape[0], -1))
     start = continued(found.point.thickness_um.reshape(shape[1:]), prepared.cells.seen).ravel()
     problem = replace(found.point.problem, data=data, thickness_um=start)
-    points = [
-        relaxed(problem.at(found.point.settings, found.point.levels, start + shift * order_um), rounds=4)
-        for shift in SHIFTS
-    ]
-    best = np.argmin([point.cell_energy for point in points], axis=0)
-    thickness = np.choose(best, [point.thickness_um for point in points])
-    return relaxed(problem.at(found.point.settings, points[0].levels, thickness), rounds=6)
+    first = problem.at(found.point.settings, found.point.levels, start)
+    return relaxed(in_best_orders(relaxed(first, rounds=4), order_um), rounds=6)

@@ -19,6 +19,7 @@ from ...inference import (
     coordinates_of,
     effect_columns,
     fit,
+    in_best_orders,
     joined,
     jumped,
 )
@@ -54,7 +55,7 @@ class Catalogue:
             except InputError as error:
                 left_out[effect.name] = str(error)
                 continue
-            if effect.local:
+            if effect.local and type(effect).propose is Effect.propose:
                 left_out[effect.name] = (
                     "a place that no derivative leads to, and the new core has no starts for it yet"
                 )
@@ -274,7 +275,8 @@ class SetSearch:
                 if name in base.effects:
                     continue
                 effect = self.catalogue.effects[name]
-                one = _proposed(effect, items, base) if effect.search.sought else scorer.score(name, items)
+                sought = effect.search.sought or effect.local
+                one = _proposed(effect, items, base) if sought else scorer.score(name, items)
                 if one is not None:
                     found.append(one)
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
@@ -403,7 +405,7 @@ def _proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) -
     best = None
     for values in effect.propose(Residuals(np.where(weight > 0.0, left, 0.0), weight, geometry)):
         try:
-            start = jumped(point, items, [values[item.parameter] for item in items])
+            start = _begun(effect, items, values, point)
         except OutOfRangeError:
             continue
         if best is None or start.cost < best.cost:
@@ -414,3 +416,14 @@ def _proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) -
     change = point.projected(best.whitened(best.value) - point.whitened(point.value)).ravel()
     unit = change / max(float(np.linalg.norm(change)), 1e-300)
     return Scored(effect.name, point.cost - best.cost, len(items), step, unit, best)
+
+
+def _begun(effect: Effect, items: tuple[Coordinate, ...], values: dict[str, float], point: Point) -> Point:
+    """A proposal with the thickness that goes with it; that of an island may lie anywhere within an order."""
+    if not effect.local:
+        return jumped(point, items, [values[item.parameter] for item in items])
+    forward = point.problem.forward
+    settings = {**point.settings, **{item.key: item.clipped(values[item.parameter]) for item in items}}
+    order_um = float(forward.model.fringe_order_um(np.median(forward.geometry.wavelength_nm)))
+    there = effect.coverage(values, forward.geometry).ravel() > 0.0
+    return in_best_orders(point.moved(point.levels, point.thickness_um, settings), order_um, there)
