@@ -118,13 +118,12 @@ def jumped(point: Point, items: Sequence[Coordinate], values: Sequence[float]) -
     return relaxed(point, rounds=2)
 
 
-def in_best_orders(
-    point: Point, order_um: float, where: NDArray[np.bool_] | None = None, rounds: int = 4
-) -> Point:
+def in_best_orders(point: Point, where: NDArray[np.bool_] | None = None, rounds: int = 4) -> Point:
     """The thickness of every cell where it is best of all within half an order, at these levels.
 
     ``where`` (N,): cells that may move; the others stay.
     """
+    order_um = point.problem.forward.order_um
     moves = np.ones(len(point.thickness_um)) if where is None else where.astype(float)
     best, energy = point.thickness_um.copy(), point.cell_energy.copy()
     for shift in SHIFTS:
@@ -192,7 +191,9 @@ def _step(point: Point, items: Sequence[Coordinate], columns: Columns, informati
     matrix = information.copy()
     for row, item in enumerate(items, start=waves):
         precision = 0.0 if item.place else (RIDGE_SCALES * item.scale) ** -2.0
-        matrix[row, row] += precision + 1e-12 * information[row, row]
+        # A place at which nothing is may be anywhere.
+        nowhere = (item.high - item.low) ** -2.0 if item.place else 0.0
+        matrix[row, row] += precision + nowhere + 1e-12 * information[row, row]
         gradient[row] -= precision * (point.settings[item.key] - item.null)
     step: FloatArray = np.asarray(np.linalg.solve(matrix, gradient))
     free = np.ones(len(gradient), dtype=bool)

@@ -68,8 +68,7 @@ def prepare(
     size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
     prepared = _in_cells(cube, held, size, model, effects)
     while min(prepared.cells.shape[1:]) >= 2 * FEWEST_ROWS:
-        order = float(model.fringe_order_um(np.median(prepared.cells.wavelength_nm)))
-        turn = 2.0 * np.pi / order
+        turn = 2.0 * np.pi / prepared.problem.forward.order_um
         error = turn * _thickness_error_um(prepared.point)
         slope = turn * np.quantile(np.hypot(*prepared.problem.forward.shape.gradient), 0.95)
         if error < rules.phase_error or 2.0 * size * slope > rules.cell_phase:

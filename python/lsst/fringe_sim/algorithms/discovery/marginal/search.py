@@ -135,6 +135,26 @@ class SetSearch:
         )
         return best if self._is_surely_better(best, smaller) else smaller
 
+    def alike(self, best: Hypothesis) -> Hypothesis:
+        """The best set after others of its size were fitted from its thickness, as far as they may be of its class.
+
+        Some cells of weak fringes lie in another minimum for every set, which says nothing about the sets.
+        """
+        for one in self._of_size(len(best.effects))[: self.rules.refits]:
+            behind = self.posterior(best) - self.posterior(one)
+            if one is not best and behind < self.rules.refits * self.rules.class_width:
+                at = one.point.moved(one.point.levels, best.point.thickness_um)
+                self._keep(fit(one.effects, one.items, at))
+        return self._of_size(len(best.effects))[0]
+
+    def best_so_far(self) -> Hypothesis:
+        """The best set that is known, none larger than what is surely better."""
+        best = self.null
+        for size in range(1, self.rules.most_effects + 1):
+            for larger in self._of_size(size)[:1]:
+                best = larger if self._is_surely_better(larger, best) else best
+        return best
+
     def on(self, null: Hypothesis) -> SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
         again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise)
@@ -424,6 +444,5 @@ def _begun(effect: Effect, items: tuple[Coordinate, ...], values: dict[str, floa
         return jumped(point, items, [values[item.parameter] for item in items])
     forward = point.problem.forward
     settings = {**point.settings, **{item.key: item.clipped(values[item.parameter]) for item in items}}
-    order_um = float(forward.model.fringe_order_um(np.median(forward.geometry.wavelength_nm)))
     there = effect.coverage(values, forward.geometry).ravel() > 0.0
-    return in_best_orders(point.moved(point.levels, point.thickness_um, settings), order_um, there)
+    return in_best_orders(point.moved(point.levels, point.thickness_um, settings), there)
