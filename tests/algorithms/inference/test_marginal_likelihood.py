@@ -15,6 +15,7 @@ from lsst.fringe_sim.algorithms.inference import (
     coordinates_of,
     effect_columns,
     fit,
+    in_best_orders,
     jumped,
     relaxed,
 )
@@ -209,3 +210,16 @@ def test_thickness_follows_to_another_order() -> None:
     found = jumped(start, items, [0.3])
     assert np.abs(start.thickness_um - thickness).mean() > 0.2
     assert np.abs(found.thickness_um - thickness).max() < 1e-3
+
+
+def test_cells_find_the_best_of_an_order() -> None:
+    forward, thickness = forward_of()
+    value = forward.predict({}, thickness)[0]
+    problem = Problem(Data(value, np.full(value.shape, 1e-3**-2.0)), forward, thickness, 1e-5)
+    away = 0.4 * forward.order_um * np.where(np.arange(thickness.size) % 2, 1.0, -1.0)
+    point = problem.at({}, np.ones(len(WAVELENGTHS)), thickness + away)
+    assert np.abs(in_best_orders(point).thickness_um - thickness).max() < 1e-4
+    some = np.arange(thickness.size) < 30
+    only = in_best_orders(point, some).thickness_um
+    assert np.abs(only - thickness)[some].max() < 1e-4
+    assert np.array_equal(only[~some], point.thickness_um[~some])

@@ -31,6 +31,9 @@ __all__ = ["MarginalSearch"]
 
 FloatArray = NDArray[np.float64]
 
+MOST_JUDGED = 4
+"""How often noise and slopes are judged again with one effect; in most cases the second best is the best already."""
+
 _METRIC = "rms of data minus model, relative counts"
 
 
@@ -126,7 +129,9 @@ class MarginalSearch:
 
     def _judged_again(self, best: Hypothesis) -> Hypothesis:
         """The best set once noise and slopes in the cells are those that it leaves itself."""
-        while best.effects and set(best.effects) not in self._judged_with:
+        for _ in range(MOST_JUDGED if len(best.effects) == 1 else 1):
+            if not best.effects or set(best.effects) in self._judged_with:
+                break
             self._judged_with.append(set(best.effects))
             self.report(f"noise and cells are judged again with {', '.join(best.effects)}")
             prepared = prepare_again(self.prepared, best)
