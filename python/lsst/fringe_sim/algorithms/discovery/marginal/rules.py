@@ -28,6 +28,9 @@ class Rules:
         Probability of a class with which it is named, as in the present search.
     most_effects : `int`
         Largest set that is named, as in the present search.
+    most_judged : `int`
+        How often noise and slopes are judged again with one effect, as long as another one is the best; with more
+        effects they are judged once.
     significance : `float`
         Chance of noise of all critics together below which what is left is no noise, as in the present search.
     outsider_prior : `float`
@@ -60,6 +63,7 @@ class Rules:
     class_width: float = 5.0
     least_probability: float = 0.95
     most_effects: int = 3
+    most_judged: int = 4
     significance: float = 1e-3
     outsider_prior: float = 0.15
     heldout_fraction: float = 0.25

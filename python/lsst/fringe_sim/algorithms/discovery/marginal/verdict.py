@@ -31,9 +31,6 @@ __all__ = ["MarginalSearch"]
 
 FloatArray = NDArray[np.float64]
 
-MOST_JUDGED = 4
-"""How often noise and slopes are judged again with one effect; in most cases the second best is the best already."""
-
 _METRIC = "rms of data minus model, relative counts"
 
 
@@ -129,7 +126,7 @@ class MarginalSearch:
 
     def _judged_again(self, best: Hypothesis) -> Hypothesis:
         """The best set once noise and slopes in the cells are those that it leaves itself."""
-        for _ in range(MOST_JUDGED if len(best.effects) == 1 else 1):
+        for _ in range(self.rules.most_judged if len(best.effects) == 1 else 1):
             if not best.effects or set(best.effects) in self._judged_with:
                 break
             self._judged_with.append(set(best.effects))
