@@ -42,6 +42,7 @@ def test_the_new_core_says_that_it_was_stopped(monkeypatch: pytest.MonkeyPatch, 
     assert verdict.effects == ()
 
 
+@pytest.mark.slow
 def test_the_new_core_judges_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
     verdict = stopped(monkeypatch, "best of 1", 0.9 * BUDGET_S, "marginal")
     assert not verdict.complete
