@@ -15,7 +15,7 @@ BUDGET_S = 100.0
 CASE = draw_case("one", np.random.default_rng(31), size=(48, 64), only=["ghost_pedestal"])
 
 
-def stopped(monkeypatch: pytest.MonkeyPatch, line: str, at_s: float) -> Verdict:
+def stopped(monkeypatch: pytest.MonkeyPatch, line: str, at_s: float, core: str = "present") -> Verdict:
     """Verdict of a search whose clock stands still, and jumps once a line is said."""
     clock = {"now": 0.0}
     monkeypatch.setattr(evaluations.time, "monotonic", lambda: clock["now"])
@@ -24,7 +24,7 @@ def stopped(monkeypatch: pytest.MonkeyPatch, line: str, at_s: float) -> Verdict:
         if said.startswith(line):
             clock["now"] = at_s
 
-    options = SearchOptions(time_budget_s=BUDGET_S)
+    options = SearchOptions(time_budget_s=BUDGET_S, core=core)
     return discover(CASE.cube, CASE.setup, rng=np.random.default_rng(0), options=options, report=report)
 
 
@@ -33,6 +33,25 @@ def test_time_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (verdict.verdict, verdict.complete) == ("unexplained", False)
     assert verdict.effects == ()
     assert "stopped" in verdict.summary()
+
+
+@pytest.mark.parametrize("line", ["fitting the thickness", "chance that noise"])
+def test_the_new_core_says_that_it_was_stopped(monkeypatch: pytest.MonkeyPatch, line: str) -> None:
+    verdict = stopped(monkeypatch, line, 2 * BUDGET_S, "marginal")
+    assert (verdict.verdict, verdict.complete) == ("unexplained", False)
+    assert verdict.effects == ()
+
+
+@pytest.mark.slow
+def test_the_new_core_judges_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    verdict = stopped(monkeypatch, "best of 1", 0.9 * BUDGET_S, "marginal")
+    assert not verdict.complete
+    assert verdict.gap.heldout_after < verdict.gap.heldout_before
+    (found,) = verdict.effects
+    assert "ghost_pedestal" in {found.name, *found.ambiguous_with}
+    late = stopped(monkeypatch, "best of 1", 2 * BUDGET_S, "marginal")
+    assert (late.verdict, late.complete, late.effects) == ("unexplained", False, ())
+    assert any("not judged" in note for note in late.notes)
 
 
 @pytest.mark.slow

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,
@@ -16,6 +15,7 @@ from lsst.fringe_sim.algorithms.inference import (
     coordinates_of,
     effect_columns,
     fit,
+    in_best_orders,
     jumped,
     relaxed,
 )
@@ -56,25 +56,16 @@ def point_of(rng: np.random.Generator, settings: dict[str, float], response: flo
 
 
 @pytest.mark.rng("evidence of cells")
-@pytest.mark.parametrize("accuracy", [0.0, 0.01])
-def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator, accuracy: float) -> None:
+def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator) -> None:
     point = point_of(rng, {})
-    point = replace(point, problem=replace(point.problem, accuracy=accuracy))
     problem, waves, cells = point.problem, *point.value.shape
     columns = point.level_columns
     information, score = point.information(columns, columns), point.score(columns)
     ours = -point.linear_cost + 0.5 * score @ np.linalg.solve(information, score)
     ours -= 0.5 * np.linalg.slogdet(information)[1]
     # All levels, responses and thicknesses in one matrix.
-    wrong = 2 if accuracy else 0
-    dense = np.zeros((waves * cells, waves + 2 * cells + wrong))
+    dense = np.zeros((waves * cells, waves + 2 * cells))
     prior, pull = np.zeros(dense.shape[1]), np.zeros(dense.shape[1])
-    if accuracy:
-        fringes = point.value - point.value.mean(axis=1, keepdims=True)
-        fringes *= point.levels[:, np.newaxis] * np.sqrt(problem.data.weight)
-        colour = 2.0 * (WAVELENGTHS - WAVELENGTHS.mean()) / np.ptp(WAVELENGTHS)
-        dense[:, -2], dense[:, -1] = fringes.ravel(), (colour[:, np.newaxis] * fringes).ravel()
-        prior[-2:] = accuracy**-2
     for w in range(waves):
         for c in range(cells):
             row = w * cells + c
@@ -89,13 +80,10 @@ def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator, accur
     residual = point.residual.ravel()
     precision = dense.T @ dense + np.diag(prior)
     gradient = dense.T @ residual + pull
-    if accuracy:
-        gradient[-2:] -= point.accuracy_columns.log_det / accuracy
     energy = 0.5 * (residual @ residual + (away**2).sum() / problem.thickness_sigma_um**2)
     expected = -energy + 0.5 * gradient @ np.linalg.solve(precision, gradient)
     expected -= 0.5 * np.linalg.slogdet(precision)[1]
     expected -= cells * np.log(problem.response_sigma * problem.thickness_sigma_um)
-    expected -= wrong * np.log(accuracy or 1.0)
     assert ours == pytest.approx(expected, rel=1e-8)
 
 
@@ -176,6 +164,23 @@ def test_averages_in_cells_are_those_of_pixels(cell_px: int) -> None:
     assert wrong.std() < 1e-4
 
 
+def test_a_blur_over_some_pixels_is_that_of_pixels() -> None:
+    # The blur reaches over an eighth of an order, and is mirrored at the edges of the sensor.
+    forward, thickness = forward_of()
+    value = forward.predict({"charge_diffusion.sigma": 0.8}, thickness)[0]
+    parts = 9
+    place = (np.arange(parts * SIDE) + 0.5) / parts - 0.5
+    light = forward.model.system.flat_fields(WAVELENGTHS, 0.1)
+    fine = forward.model.respond(light, field(*np.meshgrid(place, place, indexing="ij")), WAVELENGTHS)
+    fine = gaussian_filter(fine, (0.0, 0.8 * parts, 0.8 * parts), mode="reflect")
+    exact = fine.reshape(len(WAVELENGTHS), SIDE, parts, SIDE, parts).mean(axis=(2, 4)).reshape(value.shape)
+    level = (value * exact).sum(axis=1, keepdims=True) / (exact**2).sum(axis=1, keepdims=True)
+    wrong = (value / level - exact) / exact.std(axis=1, keepdims=True)
+    middle = wrong.reshape(-1, SIDE, SIDE)[:, 3:-3, 3:-3]
+    assert wrong.std() < 0.03
+    assert middle.std() < 4e-3
+
+
 @pytest.mark.rng("scores of noise")
 def test_noise_of_the_thickness_imitates_no_contrast(rng: np.random.Generator) -> None:
     forward, thickness = forward_of()
@@ -205,3 +210,16 @@ def test_thickness_follows_to_another_order() -> None:
     found = jumped(start, items, [0.3])
     assert np.abs(start.thickness_um - thickness).mean() > 0.2
     assert np.abs(found.thickness_um - thickness).max() < 1e-3
+
+
+def test_cells_find_the_best_of_an_order() -> None:
+    forward, thickness = forward_of()
+    value = forward.predict({}, thickness)[0]
+    problem = Problem(Data(value, np.full(value.shape, 1e-3**-2.0)), forward, thickness, 1e-5)
+    away = 0.4 * forward.order_um * np.where(np.arange(thickness.size) % 2, 1.0, -1.0)
+    point = problem.at({}, np.ones(len(WAVELENGTHS)), thickness + away)
+    assert np.abs(in_best_orders(point).thickness_um - thickness).max() < 1e-4
+    some = np.arange(thickness.size) < 30
+    only = in_best_orders(point, some).thickness_um
+    assert np.abs(only - thickness)[some].max() < 1e-4
+    assert np.array_equal(only[~some], point.thickness_um[~some])

@@ -6,12 +6,17 @@ import math
 
 import numpy as np
 
-from .base import FloatArray, Parameter, SearchHints, Values
+from .base import FloatArray, Parameter, Residuals, SearchHints, Values
+from .disc_search import find_disc
 from .geometry import ImageGeometry
 from .stack import InsertedLayer
 
 LEAST_SLANT = 1e-3
 """Sides of the ramp that the rim of a disc has in a pixel [px], where it runs along the pixel's own side."""
+
+
+SIZES_PER_REPETITION = 12
+"""Gaps that are tried, up to one at which the fringes look nearly the same again."""
 
 
 class Void(InsertedLayer):
@@ -37,6 +42,18 @@ class Void(InsertedLayer):
         repeats_after={"thickness": 470.0},
         steps={"centre_x": 0.02, "centre_y": 0.02, "radius": 0.02},
     )
+
+    def propose(self, residuals: Residuals) -> tuple[dict[str, float], ...]:
+        """The disc in which most is left, with gaps of all sizes."""
+        disc = find_disc(residuals)
+        if disc is None:
+            return ()
+        row, column, radius = disc
+        one = self.search.repeats_after["thickness"] / SIZES_PER_REPETITION
+        return tuple(
+            {"thickness": number * one, "centre_x": column, "centre_y": row, "radius": radius}
+            for number in range(1, SIZES_PER_REPETITION + 1)
+        )
 
     def coverage(self, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Part of the area of every sample that lies on the island."""

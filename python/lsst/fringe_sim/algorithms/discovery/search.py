@@ -160,13 +160,14 @@ def search_exposures(
         if poor:
             return _no_answer(model, poor, cube)
         begun, budget = time.monotonic(), chosen.time_budget_s
-        search = None
+        search: _Search | MarginalSearch | None = None
         try:
             with time_limit(begun + (1.0 - FOR_JUDGEMENT) * budget):
                 if chosen.core == "marginal" and exposures is None and _suits_marginal(cube):
-                    from .marginal import search_marginal  # is made of parts of this package
+                    from .marginal import MarginalSearch  # is made of parts of this package
 
-                    return search_marginal(cube, model, effects, rng, chosen.most_cells, say)
+                    search = MarginalSearch(cube, model, effects, rng, chosen.most_cells, say)
+                    return search.run()
                 say("fitting the thickness with the unchanged model")
                 prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
                 search = _Search(cube, prepared, model, effects, chosen, rng, say)

@@ -4,7 +4,7 @@ from .cell_average import CellShape
 from .coordinates import Coordinate, coordinates_of
 from .forward import Forward
 from .marginal import Columns, Data, Point, Problem, joined
-from .optimise import Hypothesis, effect_columns, fit, jumped, relaxed
+from .optimise import Hypothesis, effect_columns, fit, in_best_orders, jumped, relaxed
 
 __all__ = [
     "CellShape",
@@ -18,6 +18,7 @@ __all__ = [
     "coordinates_of",
     "effect_columns",
     "fit",
+    "in_best_orders",
     "joined",
     "jumped",
     "relaxed",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,11 @@ class Forward:
     def waves(self) -> int:
         """Number of exposures."""
         return len(self.geometry.wavelength_nm)
+
+    @cached_property
+    def order_um(self) -> float:
+        """Thickness of one fringe order in the middle of the wavelengths [µm]."""
+        return float(self.model.fringe_order_um(np.median(self.geometry.wavelength_nm)))
 
     def effect_of(self, key: str) -> Effect:
         """The effect that a setting belongs to."""

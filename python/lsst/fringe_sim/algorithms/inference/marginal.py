@@ -41,9 +41,6 @@ class Problem:
     thickness_um: FloatArray  # (N,): the first thickness, about which that of a cell is Gaussian
     response_sigma: float  # prior of the response of a cell
     thickness_sigma_um: float = 1.0  # some fringe orders, which pulls no cell
-    accuracy: float = (
-        0.0  # prior of the part in which the model's contrast is wrong, and of its trend in wavelength
-    )
 
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""
@@ -169,40 +166,14 @@ class Point:
     @cached_property
     def cost(self) -> float:
         """Minus the log likelihood with the cells integrated, but for constants of the noise and of the data."""
-        return float(self.cell_energy.sum()) + self._mean_log_det + self._accuracy_cost
+        return float(self.cell_energy.sum()) + self._mean_log_det
 
     @property
     def linear_cost(self) -> float:
         """The same with the thickness of every cell at the best of the linear model, not where it is."""
         away = (self.thickness_um - self.problem.thickness_um) / self.problem.thickness_sigma_um
         energy = 0.5 * float((self.residual**2).sum() + (away**2).sum() - (self.residual_cells**2).sum())
-        return energy + self.log_det + self._accuracy_cost
-
-    # Accuracy of the model --------------------------------------------------------------------------------------
-
-    @cached_property
-    def accuracy_columns(self) -> Columns:
-        """Fringes stronger or weaker than the model's by the prior, alike and in proportion to wavelength."""
-        fringes = self.response - self.root * (self.levels * self.value.mean(axis=1))[:, np.newaxis]
-        wavelength = self.problem.forward.geometry.wavelength_nm
-        colour = (wavelength - wavelength.mean()) / max(float(np.ptp(wavelength)), 1e-9)
-        trend = np.stack([np.ones(len(colour)), 2.0 * colour])[..., np.newaxis] * self.problem.accuracy
-        # What noise makes of the thickness strengthens the fringes; the log determinant takes that back.
-        return self.columns(trend * fringes, trend * self.steep)
-
-    @cached_property
-    def _accuracy(self) -> tuple[FloatArray, FloatArray]:
-        """Precision of those two beside the cells, and their score."""
-        columns = self.accuracy_columns
-        score = self._raw_score(columns) - columns.log_det
-        return np.eye(2) + self._raw_information(columns, columns), score
-
-    @cached_property
-    def _accuracy_cost(self) -> float:
-        if self.problem.accuracy == 0.0:
-            return 0.0
-        matrix, score = self._accuracy
-        return 0.5 * float(np.linalg.slogdet(matrix)[1] - score @ np.linalg.solve(matrix, score))
+        return energy + self.log_det
 
     # Dense parameters -----------------------------------------------------------------------------------------
 
@@ -259,22 +230,14 @@ class Point:
         )
 
     def information(self, first: Columns, second: Columns) -> FloatArray:
-        """Fisher matrix of dense columns with cells and accuracy integrated."""
-        plain = self._raw_information(first, second)
-        if self.problem.accuracy == 0.0:
-            return plain
-        own = self.accuracy_columns
-        solved = np.linalg.solve(self._accuracy[0], self._raw_information(own, second))
-        return np.asarray(plain - self._raw_information(first, own) @ solved)
+        """Fisher matrix of dense columns with the cells integrated."""
+        whole = np.tensordot(first.value, second.value, axes=([1, 2], [1, 2]))
+        return np.asarray(whole - np.tensordot(first.cells, second.cells, axes=([1, 2], [1, 2])))
 
     def score(self, columns: Columns) -> FloatArray:
         """Derivative of the log likelihood with respect to dense parameters, without that of the determinant."""
-        plain = self._raw_score(columns)
-        if self.problem.accuracy == 0.0:
-            return plain
-        matrix, score = self._accuracy
-        across = self._raw_information(columns, self.accuracy_columns)
-        return np.asarray(plain - across @ np.linalg.solve(matrix, score))
+        whole = np.tensordot(columns.value, self.residual, axes=([1, 2], [0, 1]))
+        return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
 
     def unbiased_score(self, columns: Columns) -> FloatArray:
         """Derivative of the log likelihood, the thickness of every cell at its best, that is 0 on the average.
@@ -283,28 +246,17 @@ class Point:
         times the second derivative; a score that falls on many cells would take that for an effect.
         """
         left = 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
-
-        def plain(own: Columns) -> FloatArray:
-            return np.asarray(self._raw_score(own) + np.tensordot(own.value, left, axes=([1, 2], [0, 1])))
-
-        if self.problem.accuracy == 0.0:
-            return plain(columns)
-        own = self.accuracy_columns
-        across = self._raw_information(columns, own)
-        return np.asarray(plain(columns) - across @ np.linalg.solve(self._accuracy[0], plain(own)))
-
-    def _raw_information(self, first: Columns, second: Columns) -> FloatArray:
-        whole = np.tensordot(first.value, second.value, axes=([1, 2], [1, 2]))
-        return np.asarray(whole - np.tensordot(first.cells, second.cells, axes=([1, 2], [1, 2])))
-
-    def _raw_score(self, columns: Columns) -> FloatArray:
-        whole = np.tensordot(columns.value, self.residual, axes=([1, 2], [0, 1]))
-        return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
+        return np.asarray(self.score(columns) + np.tensordot(columns.value, left, axes=([1, 2], [0, 1])))
 
     def followed_um(self, step: FloatArray, columns: Columns) -> FloatArray:
         """Change of the thickness that goes with a step of dense parameters [µm]."""
         left = self.residual_cells - np.tensordot(step, columns.cells, axes=1)
         return np.asarray(self._back_solved(left)[1])
+
+    @property
+    def wanted_um(self) -> FloatArray:
+        """Change of the thickness of every cell to its best, all else as it is [µm]."""
+        return np.asarray(self._back_solved(self.residual_cells)[1])
 
     def projected(self, values: FloatArray) -> FloatArray:
         """Whitened values less what response and thickness of the cells make of them."""

@@ -1,5 +1,5 @@
 """The search on the core of `algorithms.inference`, behind ``SearchOptions(core="marginal")``."""
 
-from .verdict import search_marginal
+from .verdict import MarginalSearch
 
-__all__ = ["search_marginal"]
+__all__ = ["MarginalSearch"]

@@ -6,14 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...inference import Data, Hypothesis, Point, relaxed
+from ...inference import Data, Hypothesis, Point, in_best_orders, relaxed
 from ..continuation import continued
 from .preparation import Prepared
 
 __all__ = ["Unseen", "judge_unseen"]
-
-SHIFTS = (0.0, -1.0 / 3.0, 1.0 / 3.0)
-"""Moves of the thickness from which cells are fitted [orders]: that of cells held out is continued, not measured."""
 
 
 @dataclass(frozen=True)
@@ -30,28 +27,23 @@ class Unseen:
         return self.gain > 0.0
 
 
-def judge_unseen(prepared: Prepared, found: Hypothesis, order_um: float) -> Unseen | None:
+def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen | None:
     """Compare a set with the unchanged model on the part held out; nothing where there is none."""
     if not prepared.unseen.seen.any():
         return None
-    before, after = (_fitted(prepared, one, order_um) for one in (prepared.null, found))
+    before, after = (_fitted(prepared, one) for one in (prepared.null, found))
     noise = prepared.unseen.noise_rms
     number = max(float(before.noise_share[:, before.problem.data.seen].sum()), 1.0)
     rms = [noise * float(np.sqrt(2.0 * point.cell_energy.sum() / number)) for point in (before, after)]
     return Unseen(before.cost - after.cost, *rms)
 
 
-def _fitted(prepared: Prepared, found: Hypothesis, order_um: float) -> Point:
+def _fitted(prepared: Prepared, found: Hypothesis) -> Point:
     """The held out cells with the effects of a hypothesis as they are; levels and cells are their own."""
     cells = prepared.unseen
     shape = cells.shape
     data = Data(cells.value.reshape(shape[0], -1), cells.weight.reshape(shape[0], -1))
     start = continued(found.point.thickness_um.reshape(shape[1:]), prepared.cells.seen).ravel()
     problem = replace(found.point.problem, data=data, thickness_um=start)
-    points = [
-        relaxed(problem.at(found.point.settings, found.point.levels, start + shift * order_um), rounds=4)
-        for shift in SHIFTS
-    ]
-    best = np.argmin([point.cell_energy for point in points], axis=0)
-    thickness = np.choose(best, [point.thickness_um for point in points])
-    return relaxed(problem.at(found.point.settings, points[0].levels, thickness), rounds=6)
+    first = problem.at(found.point.settings, found.point.levels, start)
+    return relaxed(in_best_orders(relaxed(first, rounds=4)), rounds=6)

@@ -32,9 +32,6 @@ MARGIN_UM = 0.8
 FIRST_ERROR_UM = 0.004
 """Error of the first thickness [µm]: it is one of steps of 0.01."""
 
-ACCURACY = 1e-3
-"""Part in which the contrast of the model is believed to be wrong without any effect: assumed, not measured."""
-
 NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
 """Response scatter that is none, and what it is before it is measured (the prototype's)."""
 
@@ -71,8 +68,7 @@ def prepare(
     size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
     prepared = _in_cells(cube, held, size, model, effects)
     while min(prepared.cells.shape[1:]) >= 2 * FEWEST_ROWS:
-        order = float(model.fringe_order_um(np.median(prepared.cells.wavelength_nm)))
-        turn = 2.0 * np.pi / order
+        turn = 2.0 * np.pi / prepared.problem.forward.order_um
         error = turn * _thickness_error_um(prepared.point)
         slope = turn * np.quantile(np.hypot(*prepared.problem.forward.shape.gradient), 0.95)
         if error < rules.phase_error or 2.0 * size * slope > rules.cell_phase:
@@ -184,7 +180,7 @@ def _problem(
     if cells.centroid is not None:
         centroid = cells.cell_px * cells.centroid.reshape(2, cells.shape[0], -1)
     forward = Forward(model, effects, cells.geometry, shape, limits, centroid)
-    return Problem(_data(cells), forward, thickness_um.ravel(), FIRST_SCATTER, accuracy=ACCURACY)
+    return Problem(_data(cells), forward, thickness_um.ravel(), FIRST_SCATTER)
 
 
 def _thickness_error_um(point: Point) -> float:

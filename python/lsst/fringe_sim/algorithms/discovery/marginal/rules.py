@@ -28,6 +28,11 @@ class Rules:
         Probability of a class with which it is named, as in the present search.
     most_effects : `int`
         Largest set that is named, as in the present search.
+    most_judged : `int`
+        How often noise and slopes are judged again with one effect, as long as another one is the best; with more
+        effects they are judged once.
+    most_turns : `int`
+        Repeats of an effect by which a fit goes on, as long as each brings more.
     significance : `float`
         Chance of noise of all critics together below which what is left is no noise, as in the present search.
     outsider_prior : `float`
@@ -50,7 +55,7 @@ class Rules:
         Seen in the fits of four cases of the panel, where all but a few kept within it.
     sizes : `tuple` [`float`, ...]
         Departures, in prior scales, at which an effect of one parameter is tried where its linear step does not bring
-        what it promised, and to which its secants reach if it departs to one side.
+        what it promised, and to which its secants reach if it departs to one side or repeats.
     """
 
     refits: int = 6
@@ -60,6 +65,8 @@ class Rules:
     class_width: float = 5.0
     least_probability: float = 0.95
     most_effects: int = 3
+    most_judged: int = 4
+    most_turns: int = 4
     significance: float = 1e-3
     outsider_prior: float = 0.15
     heldout_fraction: float = 0.25

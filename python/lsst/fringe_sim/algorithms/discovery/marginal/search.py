@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ....effects import Effect, Residuals
+from ....effects import Effect
 from ....errors import InputError, OutOfRangeError
 from ...inference import (
-    Columns,
     Coordinate,
     Forward,
     Hypothesis,
@@ -22,16 +21,13 @@ from ...inference import (
     joined,
     jumped,
 )
-from ...inference.coordinates import SECANT
 from ...inference.marginal import Point
 from .rules import Rules
+from .scores import Scored, Scorer, proposed
 
-__all__ = ["Catalogue", "Scored", "SetSearch"]
+__all__ = ["Catalogue", "SetSearch"]
 
 FloatArray = NDArray[np.float64]
-
-WIDTHS = np.geomspace(0.03, 30.0, 13)
-"""Widths of the prior, in its scales, over which a score is the best: departures may be of any size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +50,7 @@ class Catalogue:
             except InputError as error:
                 left_out[effect.name] = str(error)
                 continue
-            if effect.local:
+            if effect.local and type(effect).propose is Effect.propose:
                 left_out[effect.name] = (
                     "a place that no derivative leads to, and the new core has no starts for it yet"
                 )
@@ -72,18 +68,6 @@ def _try(items: tuple[Coordinate, ...], forward: Forward) -> None:
     """Raise what an effect raises on these data."""
     middle = np.full(forward.shape.gradient.shape[1], 0.5 * sum(forward.range_um))
     forward.predict({item.key: item.null + item.difference(item.null) for item in items[:1]}, middle)
-
-
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """An effect that could be added, by one derivative."""
-
-    name: str
-    gain: float  # of log evidence
-    degrees: int
-    step: FloatArray  # linear step of its parameters from null
-    signature: FloatArray  # (W * N,): what that step does beside all that is free, of unit length
-    start: Point | None = None  # what the effect itself proposes
 
 
 @dataclass(eq=False)
@@ -107,41 +91,72 @@ class SetSearch:
         """Log evidence less the price of the effects."""
         return found.log_evidence - self.catalogue.price * len(found.effects)
 
-    def run(self, most: int) -> Hypothesis:
-        """The best set of so many effects at most."""
-        best, beam = self.null, [self.null]
-        for size in range(1, most + 1):
-            self._grow(beam[0])
-            if size > 1 and self._is_enough(beam[0]):
-                break
-            for parent in beam[1:]:
-                self._grow(parent, most=self.rules.refits // 2)
-            grown = self._of_size(size)
-            if not grown:
-                break
-            top = self._settled(grown[0]) if size > 1 else grown[0]
-            gained = top.log_evidence - self.null.log_evidence
-            self.say(f"best of {size}: {', '.join(top.effects)} (log evidence {gained:.1f})")
-            if not self._is_surely_better(top, best):
-                break
-            best = top
-            beam = self._of_size(size)[: self.rules.beam]
+    def larger(self, best: Hypothesis) -> Hypothesis:
+        """The best set with one effect more, or the same where none is surely better."""
+        size = len(best.effects) + 1
+        beam = self._of_size(size - 1)[: self.rules.beam] if best.effects else [self.null]
+        self._grow(beam[0])
+        if best.effects and self._is_enough(beam[0]):
+            return best
+        for parent in beam[1:]:
+            self._grow(parent, most=self.rules.refits // 2)
+        grown = self._of_size(size)
+        if not grown:
+            return best
+        top = self._settled(grown[0]) if size > 1 else grown[0]
+        gained = top.log_evidence - self.null.log_evidence
+        self.say(f"best of {size}: {', '.join(top.effects)} (log evidence {gained:.1f})")
+        return top if self._is_surely_better(top, best) else best
+
+    def settled(self, size: int) -> Hypothesis:
+        """The best set of so many effects at most after members were left out and exchanged."""
+        if size == 1:
+            return self.larger(self.null)
+        best = self._settled(self._of_size(size)[0])
+        smaller = max(
+            (one for one in self.pool.values() if len(one.effects) < len(best.effects)), key=self.posterior
+        )
+        return best if self._is_surely_better(best, smaller) else smaller
+
+    def alike(self, best: Hypothesis) -> Hypothesis:
+        """The best set after others of its size were fitted from its thickness, as far as they may be of its class.
+
+        Some cells of weak fringes lie in another minimum for every set, which says nothing about the sets.
+        """
+        for one in self._of_size(len(best.effects))[: self.rules.refits]:
+            behind = self.posterior(best) - self.posterior(one)
+            if one is not best and behind < self.rules.refits * self.rules.class_width:
+                at = one.point.moved(one.point.levels, best.point.thickness_um)
+                self._keep(fit(one.effects, one.items, at))
+        return self._of_size(len(best.effects))[0]
+
+    def best_so_far(self) -> Hypothesis:
+        """The best set that is known, none larger than what is surely better."""
+        best = self.null
+        for size in range(1, self.rules.most_effects + 1):
+            for larger in self._of_size(size)[:1]:
+                best = larger if self._is_surely_better(larger, best) else best
         return best
 
     def on(self, null: Hypothesis) -> SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
         again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise)
         known = sorted(self.pool.values(), key=self.posterior, reverse=True)
-        least = self.rules.least_of_promise * (known[0].log_evidence - self.null.log_evidence)
-        for one in known[: 2 * self.rules.refits]:
-            if one.effects and one.log_evidence - self.null.log_evidence > least - self.rules.class_width:
+        top = known[0].log_evidence - self.null.log_evidence
+        # With one effect of several the noise is still that of a wrong model.
+        doubt = 1.0 - self.rules.least_of_promise if len(known[0].effects) < 2 else self.rules.imprecision
+        least = (1.0 - doubt) * top - self.rules.class_width
+        for number, one in enumerate(known):
+            if not one.effects:
+                continue
+            steps = {(frozenset(one.effects) - {name}, name) for name in one.effects}
+            if one.log_evidence - self.null.log_evidence <= least:
+                again._short |= steps
+            elif number < 2 * self.rules.refits:
                 at = one.point
                 start = null.point.problem.at(at.settings, at.levels, at.thickness_um)
                 again._keep(fit(one.effects, one.items, start))
-                if len(one.effects) == 1:
-                    again._added_before.add((frozenset(), one.effects[0]))
-            elif len(one.effects) == 1:
-                again._short.add((frozenset(), one.effects[0]))
+                again._added_before |= steps
         return again
 
     def _is_surely_better(self, larger: Hypothesis, smaller: Hypothesis) -> bool:
@@ -257,13 +272,14 @@ class SetSearch:
             columns = point.level_columns
             if base.items:
                 columns = joined(columns, effect_columns(point, base.items))
-            scorer = _Scorer(point, columns, self.rules.sizes)
+            scorer = Scorer(point, columns, self.rules.sizes)
             found = []
             for name, items in self.catalogue.items.items():
                 if name in base.effects:
                     continue
                 effect = self.catalogue.effects[name]
-                one = _proposed(effect, items, base) if effect.search.sought else scorer.score(name, items)
+                sought = effect.search.sought or effect.local
+                one = proposed(effect, items, base) if sought else scorer.score(name, items)
                 if one is not None:
                     found.append(one)
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
@@ -299,16 +315,18 @@ class SetSearch:
             return found
         (item,) = items
         tried: list[FloatArray] = []
-        if item.repeat:
-            value = found.point.settings[item.key]
-            tried += [np.array([value + turn * item.repeat]) for turn in (-1.0, 1.0)]
         if not kept:
             sides = (item.side,) if item.side else (1.0, -1.0)
             tried += [np.array([item.null + s * x * item.scale]) for s in sides for x in self.rules.sizes]
-        other = self._best_start(base, items, tried)
-        if other is not None:
-            new = fit(names, every, other)
-            found = new if new.log_evidence > found.log_evidence else found
+        for _ in range(self.rules.most_turns if item.repeat else 1):
+            if item.repeat:
+                value = found.point.settings[item.key]
+                tried += [np.array([value + turn * item.repeat]) for turn in (-1.0, 1.0)]
+            other = self._best_start(base, items, tried)
+            new = found if other is None else fit(names, every, other)
+            if new.log_evidence <= found.log_evidence:
+                break
+            found, tried = new, []
         return found
 
     @staticmethod
@@ -329,77 +347,3 @@ class SetSearch:
             if start.cost < (base.point if best is None else best).cost:
                 best = start
         return best
-
-
-class _Scorer:
-    """Scores of effects beside what is free at a point."""
-
-    def __init__(self, point: Point, columns: Columns, sizes: Sequence[float]) -> None:
-        self.point, self.columns, self.sizes = point, columns, sizes
-        self.base = point.information(columns, columns)
-        self.gradient = point.score(columns) - columns.log_det
-
-    def score(self, name: str, items: tuple[Coordinate, ...]) -> Scored | None:
-        """What an effect promises by its derivatives; by the best of several secants where they may vanish."""
-        sizes = self.sizes if len(items) == 1 and items[0].side and not items[0].step else (SECANT,)
-        every = [self._with_secant(name, items, size) for size in sizes]
-        return max((one for one in every if one is not None), key=lambda one: one.gain, default=None)
-
-    def _with_secant(self, name: str, items: tuple[Coordinate, ...], secant: float) -> Scored | None:
-        try:
-            own = effect_columns(self.point, items, secant)
-        except OutOfRangeError:
-            return None
-        across = np.linalg.solve(self.base, self.point.information(self.columns, own))
-        matrix = self.point.information(own, own) - self.point.information(own, self.columns) @ across
-        gradient = self.point.score(own) - own.log_det - across.T @ self.gradient
-        scale = np.array([item.scale for item in items])
-        best, step, degrees = -math.inf, np.zeros(len(items)), 0
-        for highest in sorted({item.refinement for item in items}):
-            few = np.array([item.refinement <= highest for item in items])
-            gain, part = _best_gain(matrix[np.ix_(few, few)], gradient[few], scale[few])
-            if gain > best:
-                best, step = gain, np.zeros(len(items))
-                step[few] = part
-                degrees = int(few.sum())
-        if len(items) == 1 and items[0].side * step[0] < 0.0:
-            best, step = -1.0, -step
-        signature = np.tensordot(step, own.value - np.tensordot(across.T, self.columns.value, axes=1), axes=1)
-        flat = self.point.projected(signature).ravel()
-        return Scored(name, best, degrees, step, flat / max(float(np.linalg.norm(flat)), 1e-300))
-
-
-def _best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tuple[float, FloatArray]:
-    """Largest gain of log evidence over the width of the prior, and its step."""
-    best, step = -math.inf, scale * 0.0
-    for width in WIDTHS:
-        prior = np.diag((width * scale) ** -2.0)
-        part = np.linalg.solve(matrix + prior, gradient)
-        inflated = np.eye(len(scale)) + matrix * (width * scale) ** 2
-        gain = 0.5 * float(gradient @ part) - 0.5 * float(np.linalg.slogdet(inflated)[1])
-        if gain > best:
-            best, step = gain, np.asarray(part, dtype=float)
-    return best, step
-
-
-def _proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) -> Scored | None:
-    """What an effect that is sought proposes itself, or nothing."""
-    point = base.point
-    geometry = point.problem.forward.geometry
-    shape = (len(point.levels), *geometry.sample_shape)
-    left = (point.problem.data.value - point.value * point.levels[:, np.newaxis]).reshape(shape)
-    weight = point.problem.data.weight.reshape(shape)
-    best = None
-    for values in effect.propose(Residuals(np.where(weight > 0.0, left, 0.0), weight, geometry)):
-        try:
-            start = jumped(point, items, [values[item.parameter] for item in items])
-        except OutOfRangeError:
-            continue
-        if best is None or start.cost < best.cost:
-            best = start
-    if best is None:
-        return None
-    step = np.array([best.settings[item.key] - item.null for item in items])
-    change = point.projected(best.whitened(best.value) - point.whitened(point.value)).ravel()
-    unit = change / max(float(np.linalg.norm(change)), 1e-300)
-    return Scored(effect.name, point.cost - best.cost, len(items), step, unit, best)

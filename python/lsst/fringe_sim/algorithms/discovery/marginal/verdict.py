@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -18,52 +19,46 @@ from ...inference import Hypothesis
 from ..channels import Channel
 from ..classes import outsider_probability
 from ..describe import describe_residual, disagreement
+from ..evaluations import OutOfTimeError, time_limit
 from ..verdict import CONFIDENCE, Gap, NamedEffect, ParameterValue, Step, Verdict, probability_text
 from .critics import judge, state_of, total_chance
 from .heldout import Unseen, judge_unseen
-from .preparation import Prepared, prepare, prepare_again
+from .preparation import prepare, prepare_again
 from .rules import Rules
 from .search import Catalogue, SetSearch
 
-__all__ = ["search_marginal"]
+__all__ = ["MarginalSearch"]
 
 FloatArray = NDArray[np.float64]
 
 _METRIC = "rms of data minus model, relative counts"
 
 
-def search_marginal(
-    cube: FringeCube,
-    model: FringeModel,
-    effects: Sequence[Effect],
-    rng: np.random.Generator,
-    most_cells: int,
-    report: Callable[[str], None],
-) -> Verdict:
-    """Search flats by one log marginal likelihood; parameters and result are those of `discover`."""
-    rules = Rules()
-    report("fitting the thickness with the unchanged model")
-    prepared = prepare(cube, model, effects, most_cells, rules, rng)
-    return _Judgement(prepared, model, effects, rules, report).verdict()
+class MarginalSearch:
+    """One search of flats by one log marginal likelihood, and how its answer is put.
 
-
-class _Judgement:
-    """One search, and how its answer is put."""
+    Parameters are those of `discover`; thickness and noise are fitted with the unchanged model when it is made.
+    """
 
     def __init__(
         self,
-        prepared: Prepared,
+        cube: FringeCube,
         model: FringeModel,
         effects: Sequence[Effect],
-        rules: Rules,
+        rng: np.random.Generator,
+        most_cells: int,
         report: Callable[[str], None],
     ) -> None:
+        rules = Rules()
+        report("fitting the thickness with the unchanged model")
+        prepared = prepare(cube, model, effects, most_cells, rules, rng)
         self.prepared, self.model, self.rules, self.report = prepared, model, rules, report
         stack = model.system.stack
         medium = stack.layers[stack.position(model.system.varying)].medium
         wavelength = prepared.cells.wavelength_nm
         self.index = np.real(medium.index(wavelength, model.system.temperature_k))
-        self.order_um = float(model.fringe_order_um(np.median(wavelength)))
+        self.notes = ["searched by one likelihood (core marginal)"]
+        self._judged_with: list[set[str]] = []
         self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
         self.catalogue = Catalogue.of(effects, prepared.problem.forward)
         self.sets = SetSearch(self.catalogue, prepared.null, rules, report, self._leaves_noise)
@@ -77,26 +72,34 @@ class _Judgement:
             self._judged[key] = judge(*key, self.index, self.rules)
         return self._judged[key]
 
-    def verdict(self) -> Verdict:
+    def run(self) -> Verdict:
         """The answer."""
-        null = self.prepared.null
-        before = self._channels(null)
+        before = self._channels(self.prepared.null)
         self.report(f"chance that noise alone disagrees as much: {total_chance(before):.3g}")
-        best, judged = self.sets.run(1), [self.sets.null.effects]
-        while best.effects not in judged:
-            judged.append(best.effects)
-            self.report(f"noise and cells are judged again with {best.effects[0]}")
-            self.prepared = prepare_again(self.prepared, best)
-            self.sets = self.sets.on(self.prepared.null)
-            best = self.sets.run(1)
-        if len(judged) > 1:
-            best = self.sets.run(self.rules.most_effects)
-        if not best.effects:
-            if total_chance(before) > self.rules.significance:
-                return self._told("no_discrepancy", null, before, (), {}, None)
-            return self._unexplained(null, before, ["no effect of the catalogue explains it"], (), None)
-        after = self._channels(best)
-        unseen = judge_unseen(self.prepared, best, self.order_um)
+        best = self._best()
+        null, before = self.prepared.null, self._channels(self.prepared.null)
+        if best.effects:
+            return self._concluded(best)
+        if total_chance(before) > self.rules.significance:
+            return self._told("no_discrepancy", null, before, (), {}, None)
+        return self._unexplained(null, ["no effect of the catalogue explains it"], (), None)
+
+    def best_so_far(self, until: float) -> Verdict:
+        """Answer of a search that was stopped; the part held out is asked about it until an instant [s]."""
+        null, best = self.prepared.null, self.sets.best_so_far()
+        if best.effects:
+            try:
+                with time_limit(until):
+                    return replace(self._concluded(best), complete=False)
+            except OutOfTimeError:
+                self.notes.append(f"best so far, not judged on data held out: {', '.join(best.effects)}")
+        return replace(self._unexplained(null, ["the search was stopped"], (), None), complete=False)
+
+    def _concluded(self, best: Hypothesis) -> Verdict:
+        """Judgement of the set that was selected."""
+        best = self.sets.alike(best)
+        before, after = self._channels(self.prepared.null), self._channels(best)
+        unseen = judge_unseen(self.prepared, best)
         named, doubts = self._named(best, total_chance(after))
         reasons = []
         if total_chance(after) < self.rules.significance:
@@ -108,8 +111,30 @@ class _Judgement:
         if unseen is not None and not unseen.better:
             reasons.append("data held out are not predicted better")
         if reasons:
-            return self._unexplained(best, before, reasons, named, unseen)
+            return self._unexplained(best, reasons, named, unseen)
         return self._told("named", best, before, named, {}, unseen)
+
+    def _best(self) -> Hypothesis:
+        """The best set, found one effect at a time; noise and cells are judged with the best of every size."""
+        best = self.prepared.null
+        for _ in range(self.rules.most_effects):
+            size = len(best.effects)
+            best = self._judged_again(self.sets.larger(best))
+            if len(best.effects) <= size:
+                break
+        return best
+
+    def _judged_again(self, best: Hypothesis) -> Hypothesis:
+        """The best set once noise and slopes in the cells are those that it leaves itself."""
+        for _ in range(self.rules.most_judged if len(best.effects) == 1 else 1):
+            if not best.effects or set(best.effects) in self._judged_with:
+                break
+            self._judged_with.append(set(best.effects))
+            self.report(f"noise and cells are judged again with {', '.join(best.effects)}")
+            prepared = prepare_again(self.prepared, best)
+            self.sets, self.prepared = self.sets.on(prepared.null), prepared
+            best = self.sets.settled(len(best.effects))
+        return best
 
     def _at_ends(self, best: Hypothesis) -> list[str]:
         """Parameters at an end of their range that nature does not have."""
@@ -178,7 +203,6 @@ class _Judgement:
     def _unexplained(
         self,
         found: Hypothesis,
-        before: tuple[Channel, ...],
         reasons: Sequence[str],
         partial: Sequence[NamedEffect],
         unseen: Unseen | None,
@@ -196,6 +220,7 @@ class _Judgement:
             ],
             **describe_residual(state, cells.geometry, self.index, cells.cell_px, channels),
         }  # fmt: skip
+        before = self._channels(self.prepared.null)
         return self._told("unexplained", found, before, (), description, unseen)
 
     def _told(
@@ -216,8 +241,7 @@ class _Judgement:
             gained = found.log_evidence - null.log_evidence
             quiet = word == "named"
             steps = (Step(found.effects, gained, null.chi2 - found.chi2, first, last, quiet),)
-        notes = ["searched by one likelihood (core marginal)"]
-        notes += [f"{name} was left out: {why}" for name, why in self.catalogue.left_out.items()]
+        notes = self.notes + [f"{name} was left out: {why}" for name, why in self.catalogue.left_out.items()]
         scored = self.sets.scores(null)
         return Verdict(
             word, effects,

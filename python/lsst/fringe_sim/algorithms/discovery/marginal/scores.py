@@ -1,0 +1,126 @@
+"""What effects promise beside a set, before any is fitted: by derivatives, secants, or what they propose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....effects import Effect, Residuals
+from ....errors import OutOfRangeError
+from ...inference import Columns, Coordinate, Hypothesis, Point, effect_columns, in_best_orders, jumped
+from ...inference.coordinates import SECANT
+
+__all__ = ["Scored", "Scorer", "proposed"]
+
+FloatArray = NDArray[np.float64]
+
+WIDTHS = np.geomspace(0.03, 30.0, 13)
+"""Widths of the prior, in its scales, over which a score is the best: departures may be of any size."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """An effect that could be added, by one derivative."""
+
+    name: str
+    gain: float  # of log evidence
+    degrees: int
+    step: FloatArray  # linear step of its parameters from null
+    signature: FloatArray  # (W * N,): what that step does beside all that is free, of unit length
+    start: Point | None = None  # what the effect itself proposes
+
+
+class Scorer:
+    """Scores of effects beside what is free at a point."""
+
+    def __init__(self, point: Point, columns: Columns, sizes: Sequence[float]) -> None:
+        self.point, self.columns, self.sizes = point, columns, sizes
+        self.base = point.information(columns, columns)
+        self.gradient = point.score(columns) - columns.log_det
+
+    def score(self, name: str, items: tuple[Coordinate, ...]) -> Scored | None:
+        """What an effect promises by its derivatives; by the best of several secants where they may vanish."""
+        every = [self._with_secant(name, items, SECANT)]
+        if len(items) == 1 and items[0].side and not items[0].step:
+            every = [self._with_secant(name, items, size) for size in self.sizes]
+        elif len(items) == 1 and items[0].repeat:
+            every += [self._with_secant(name, far, SECANT) for far in self._repeated(items[0])]
+        return max((one for one in every if one is not None), key=lambda one: one.gain, default=None)
+
+    def _repeated(self, item: Coordinate) -> list[tuple[Coordinate]]:
+        """A parameter by secants over whole repeats, which see what does not repeat."""
+        turns = {max(round(size * item.scale / item.repeat), 1) for size in self.sizes}
+        return [(replace(item, step=turn * item.repeat),) for turn in sorted(turns)]
+
+    def _with_secant(self, name: str, items: tuple[Coordinate, ...], secant: float) -> Scored | None:
+        try:
+            own = effect_columns(self.point, items, secant)
+        except OutOfRangeError:
+            return None
+        across = np.linalg.solve(self.base, self.point.information(self.columns, own))
+        matrix = self.point.information(own, own) - self.point.information(own, self.columns) @ across
+        gradient = self.point.score(own) - own.log_det - across.T @ self.gradient
+        scale = np.array([item.scale for item in items])
+        best, step, degrees = -math.inf, np.zeros(len(items)), 0
+        for highest in sorted({item.refinement for item in items}):
+            few = np.array([item.refinement <= highest for item in items])
+            gain, part = _best_gain(matrix[np.ix_(few, few)], gradient[few], scale[few])
+            if gain > best:
+                best, step = gain, np.zeros(len(items))
+                step[few] = part
+                degrees = int(few.sum())
+        if len(items) == 1 and items[0].side * step[0] < 0.0:
+            best, step = -1.0, -step
+        signature = np.tensordot(step, own.value - np.tensordot(across.T, self.columns.value, axes=1), axes=1)
+        flat = self.point.projected(signature).ravel()
+        return Scored(name, best, degrees, step, flat / max(float(np.linalg.norm(flat)), 1e-300))
+
+
+def _best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tuple[float, FloatArray]:
+    """Largest gain of log evidence over the width of the prior, and its step."""
+    best, step = -math.inf, scale * 0.0
+    for width in WIDTHS:
+        prior = np.diag((width * scale) ** -2.0)
+        part = np.linalg.solve(matrix + prior, gradient)
+        inflated = np.eye(len(scale)) + matrix * (width * scale) ** 2
+        gain = 0.5 * float(gradient @ part) - 0.5 * float(np.linalg.slogdet(inflated)[1])
+        if gain > best:
+            best, step = gain, np.asarray(part, dtype=float)
+    return best, step
+
+
+def proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) -> Scored | None:
+    """What an effect that is sought proposes itself, or nothing."""
+    point = base.point
+    geometry = point.problem.forward.geometry
+    shape = (len(point.levels), *geometry.sample_shape)
+    left = (point.problem.data.value - point.value * point.levels[:, np.newaxis]).reshape(shape)
+    weight = point.problem.data.weight.reshape(shape)
+    best = None
+    for values in effect.propose(Residuals(np.where(weight > 0.0, left, 0.0), weight, geometry)):
+        try:
+            start = _begun(effect, items, values, point)
+        except OutOfRangeError:
+            continue
+        if best is None or start.cost < best.cost:
+            best = start
+    if best is None:
+        return None
+    step = np.array([best.settings[item.key] - item.null for item in items])
+    change = point.projected(best.whitened(best.value) - point.whitened(point.value)).ravel()
+    unit = change / max(float(np.linalg.norm(change)), 1e-300)
+    return Scored(effect.name, point.cost - best.cost, len(items), step, unit, best)
+
+
+def _begun(effect: Effect, items: tuple[Coordinate, ...], values: dict[str, float], point: Point) -> Point:
+    """A proposal with the thickness that goes with it; that of an island may lie anywhere within an order."""
+    if not effect.local:
+        return jumped(point, items, [values[item.parameter] for item in items])
+    forward = point.problem.forward
+    settings = {**point.settings, **{item.key: item.clipped(values[item.parameter]) for item in items}}
+    there = effect.coverage(values, forward.geometry).ravel() > 0.0
+    return in_best_orders(point.moved(point.levels, point.thickness_um, settings), there)
