@@ -41,8 +41,8 @@ BINNED_PX = (2, 2, 4)
 """Side of the squares of pixels in which objects of each width are sought."""
 
 NEIGHBOURHOOD_PX, CELLS_A_NEIGHBOURHOOD = 256, 8
-"""Side of the square around a place whose scatter an object has to exceed, the distance of the knots of the background,
-as which longer waves count; and the cells a side whose sums tell it."""
+"""Side of the square around a place whose scatter an object has to exceed, the distance of the knots of the
+background, as which longer waves count; and the cells a side whose sums tell it."""
 
 _ROWS = 128
 """Rows that are worked on at a time, which the memory of a processor holds."""
