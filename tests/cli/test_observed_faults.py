@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 from made_once import made_once
 from observed_night import observed_night
 
@@ -284,3 +285,18 @@ def test_an_undoing_that_cannot_be_right_is_refused(
     assert correct(made / "templates", tmp_path / "again", path, more=("--undo",)) == 1
     assert words in capsys.readouterr().out
     assert not list((tmp_path / "again").glob("*.fits"))
+
+
+def test_a_frame_of_which_the_templates_are_made_is_named(
+    made: Path, night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On its line, on the page and in the table; a frame with other noise is none of them."""
+    rewrite(night / NAME, lambda image: np.random.default_rng(3).poisson(image).astype(np.float32))
+    assert correct(made / "templates", tmp_path / "out", night / NAME, night / "visit_2.fits") == 0
+    other, own = [line for line in capsys.readouterr().out.splitlines() if line.startswith("visit_")]
+    words = "made of this frame itself"
+    assert words in own
+    assert words not in other
+    assert "templates of this frame itself" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    table = Table.read(tmp_path / "out" / "frames.ecsv")
+    assert list(table["of_own_templates"]) == [False, True]

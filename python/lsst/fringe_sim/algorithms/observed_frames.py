@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, named_units
 from ..notebook import do_nothing
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
+from ..products.fringe_templates import input_cards
 from ..products.same_light import refuse_equal_pixels
 from .correction.empirical import TemplateOptions, fit_templates
 from .correction.injection import InjectionOptions, inject_sources, injection_table
@@ -96,6 +97,7 @@ class CorrectedFrame:
             correlation,
             injected,
             self.frame.unit,
+            found.of_own_templates,
         )
 
     def _correlation(self, good: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -141,6 +143,8 @@ class FrameRecord:
         Bias and scatter of the fluxes of sources in a copy of the frame (`injection_table`).
     unit : `str`
         Unit of the frame and of the scales; may be empty.
+    of_own_templates : `bool`
+        Whether the templates were made of this frame itself, and have its noise.
     """
 
     name: str
@@ -153,6 +157,7 @@ class FrameRecord:
     correlation: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
     injected: Table | None = None
     unit: str = ""
+    of_own_templates: bool = False
 
 
 def make_templates(
@@ -195,7 +200,7 @@ def make_templates(
     chosen = options or TemplateOptions()
     if len(frames) < LEAST_FRAMES:
         raise InputError("frames for templates", len(frames), "three or more, of different places on the sky")
-    first = first_of_alike(frames, names, "frames for templates")
+    first, digests = first_of_alike(frames, names, "frames for templates")
     expected = [np.where(each.mask == 0, each.image, 0).astype(np.float32) for each in prior]
     found = fit_templates([partial(_loaded, frame) for frame in frames], chosen, expected, advance)
     unseen = found.coverage < chosen.least_frames
@@ -206,7 +211,12 @@ def make_templates(
         scores=found.scores,
         mask=np.where(unseen, mask_bits("NO_DATA"), 0).astype(np.int32),
         creation_datetime=creation_datetime,
-        metadata={**(metadata or {}), "NFRAMES": len(frames), "BGSPACE": float(chosen.spacing_px)},
+        metadata={
+            **(metadata or {}),
+            "NFRAMES": len(frames),
+            "BGSPACE": float(chosen.spacing_px),
+            **input_cards(digests),
+        },
         detector=first.detector,
         physical_filter=first.physical_filter,
     )
@@ -330,6 +340,7 @@ def summary_table(records: Sequence[FrameRecord]) -> Table:
         table[name] = [getattr(each.proof, name) for each in records]
     for row, name in ((1, "correlation_before"), (2, "correlation_after")):
         table[name] = [_largest(each.correlation[row]) for each in records]
+    table["of_own_templates"] = [each.of_own_templates for each in records]
     table["seen"] = [each.proof.seen for each in records]
     table["passed"] = [each.proof.passed for each in records]
     return table
@@ -360,8 +371,8 @@ def _block_means(image: NDArray[Any], good: NDArray[np.bool_], side: int) -> NDA
 
 def first_of_alike(
     frames: Sequence[Callable[[], ObservedFrame]], names: Sequence[str], purpose: str
-) -> ObservedFrame:
-    """The first frame, when all have been read and found to belong together, each being there once.
+) -> tuple[ObservedFrame, list[str]]:
+    """The first frame, when all have been found to belong together, each being there once; and digests of all.
 
     `InputError`: one is of another sensor, filter, unit or size, was corrected, or is there twice.
     """
@@ -373,8 +384,7 @@ def first_of_alike(
             _refuse_other(read, first)
             yield read.image
 
-    refuse_equal_pixels(purpose, images(), names)
-    return first
+    return first, refuse_equal_pixels(purpose, images(), names)
 
 
 def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

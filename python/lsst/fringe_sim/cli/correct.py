@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 EXIT_REFUSED = 1
 
+OWN_TEMPLATES = "the templates are made of this frame itself: what is left cannot be judged from it"
+
 OWN_CARD = re.compile(r"FRING(COR|TID|PRB|VER|S[CE]\d+)")
 """Keywords that a correction writes, and its undoing removes."""
 
@@ -228,6 +230,7 @@ def _describe(record: FrameRecord) -> str:
         f"{record.name}: {scales} (fringes at {clearest:.1f} σ); of the fringes "
         f"{_left(proof.part_left, proof.part_left_sigma)} left; structure beyond the noise "
         f"{proof.structure_before:.2f} before, {proof.structure_after:.2f} after"
+        + (f"; {OWN_TEMPLATES}" if record.of_own_templates else "")
     )
 
 

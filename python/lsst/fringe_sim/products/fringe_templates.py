@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +14,22 @@ from ..errors import FrameFormatError
 from .fits_product import DETECTOR, FILTER, MASK, Card, FitsProduct, Image
 from .fringe_frame import FringeFrame
 from .mask import mask_bits
+
+INPUT = re.compile(r"INPUT\d+")
+"""Keywords of templates with the digests of the frames that they were made of."""
+
+DIGITS = 16
+"""Digits of a digest that a keyword holds."""
+
+
+def input_cards(digests: Sequence[str]) -> dict[str, str]:
+    """Keywords of templates that name the frames that they were made of, by digests of their pixels."""
+    return {f"INPUT{number}": digest[:DIGITS] for number, digest in enumerate(digests)}
+
+
+def made_of(metadata: Mapping[str, Any], digest: str) -> bool:
+    """Whether the keywords of a template name a frame among those that it was made of."""
+    return any(INPUT.fullmatch(name) and value == digest[:DIGITS] for name, value in metadata.items())
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -119,7 +119,9 @@ def write_correction_report(
 def _verdict(record: FrameRecord) -> str:
     if not record.proof.passed:
         return f"refused: {record.proof.worst}"
-    return "corrected" if record.proof.seen else "left as it is"
+    if not record.proof.seen:
+        return "left as it is"
+    return "corrected by templates of this frame itself" if record.of_own_templates else "corrected"
 
 
 def _shown(records: Sequence[FrameRecord]) -> Table:
@@ -150,6 +152,7 @@ def _summary(records: Sequence[FrameRecord], refused: Sequence[str]) -> list[tup
     structure = [
         [getattr(each.proof, name) for each in corrected] for name in ("structure_before", "structure_after")
     ]
+    own = sum(each.of_own_templates for each in corrected)
     unit = next((each.unit for each in corrected if each.unit), "counts")
     rms = _median([each.proof.fringe_rms for each in corrected])
     seen = f"; {unseen} left as they are, for the fringes of the templates are not seen" if unseen else ""
@@ -157,6 +160,11 @@ def _summary(records: Sequence[FrameRecord], refused: Sequence[str]) -> list[tup
         ("result", f"{len(corrected)} of {len(records) + len(refused)} images corrected{seen}"),
         ("refused", f"{bad}; the pictures show the frames" if bad else "none"),
         ("part of the fringes that is left, median", f"{_median(left)} ± {_median(sigma)}" if left else ""),
+        *(
+            [("frames of which the templates are made", f"{own}: what is left cannot be judged from them")]
+            if own
+            else []
+        ),
         (
             "structure beyond the noise, over the noise, median",
             " → ".join(map(_median, structure)) if left else "",
