@@ -167,6 +167,17 @@ def test_templates_are_made_without_a_bad_frame_only_if_that_is_asked_for(
     assert "from 3 frames" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("spoil", [other_filter, one_value])
+def test_a_dry_run_refuses_frames_that_the_run_refuses(
+    night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], None]
+) -> None:
+    spoil(night)
+    assert templates(night, tmp_path / "out", "--dry-run") == 1
+    said = capsys.readouterr().err
+    assert templates(night, tmp_path / "out") == 1
+    assert capsys.readouterr().err == said
+
+
 def test_templates_of_an_image_without_light_are_refused(
     night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,6 +20,7 @@ from ..products import CORRECTED, FringeFrame, refuse_corrected
 from ..products.fringe_templates import made_of
 from ..products.same_light import pixels_digest
 from .correction.background import AMPLIFIERS_UNKNOWN, SPACING_PX, AmplifierGrid, BackgroundTerms
+from .correction.constant import without_constant_blocks
 from .correction.objects import ROUNDS, FrameFit, fit_frame
 from .correction.scales import ScaleFit, refuse_negative_sky, steady_weight
 from .sky_frame import SkyResponse
@@ -244,6 +245,7 @@ def correct_fringes(
     good = np.isfinite(exposure) & ~unknown
     if mask is not None:
         good &= _of_shape("mask", mask, shape) == 0
+    good = without_constant_blocks(exposure, good)
     weight = steady_weight(
         good, None if variance is None else _of_shape("variance", variance, shape), exposure
     )

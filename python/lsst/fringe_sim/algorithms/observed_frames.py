@@ -18,6 +18,7 @@ from ..notebook import do_nothing
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
 from ..products.fringe_templates import input_cards
 from ..products.same_light import refuse_equal_pixels
+from .correction.constant import without_constant_blocks
 from .correction.empirical import TemplateOptions, fit_templates
 from .correction.injection import InjectionOptions, inject_sources, injection_table
 from .correction.objects import masked_sums, square_sums
@@ -393,8 +394,8 @@ def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[NDArray[np.float32], ND
 
 
 def frame_weight(frame: ObservedFrame) -> NDArray[np.float32]:
-    """Inverse variance of the background of a frame, 0 in pixels that are masked or hold no number."""
-    good = (frame.mask == 0) & np.isfinite(frame.image)
+    """Inverse variance of the background of a frame, 0 where it is masked, no number, or has no noise."""
+    good = without_constant_blocks(frame.image, (frame.mask == 0) & np.isfinite(frame.image))
     weight = steady_weight(good, frame.variance, frame.image)
     refuse_negative_sky(frame.image, weight)
     return weight

@@ -67,6 +67,7 @@ def templates(
     expected = None if prior is None else TemplateFolder(prior)
     if dry_run:
         for name, images in sensors.items():
+            _check(images, background, expected, name)
             click.echo(f"would make templates of {name} from {len(images)} frames")
         return
     folder = out.prepare()
@@ -116,8 +117,23 @@ def _made(
     from ..model.provenance import software_cards
 
     date = latest_date([image.header() for image in images])
-    names = [f"{image.path}[{image.name}]" for image in images]
-    return make_templates(background.loaders(images), date, options, prior, software_cards(), advance, names)
+    loaders, names = background.loaders(images), _names(images)
+    return make_templates(loaders, date, options, prior, software_cards(), advance, names)
+
+
+def _names(images: list[ObservedImage]) -> list[str]:
+    return [f"{image.path}[{image.name}]" for image in images]
+
+
+def _check(
+    images: list[ObservedImage], background: Background, expected: TemplateFolder | None, name: str
+) -> None:
+    """Refuse what the making of templates of a sensor would refuse before its first fit."""
+    from ..algorithms.observed_frames import first_of_alike
+
+    if expected is not None:
+        expected.of(name)
+    first_of_alike(background.loaders(images), _names(images), "frames for templates")
 
 
 def _file_name(sensor: str) -> str:
