@@ -311,3 +311,30 @@ def test_a_frame_of_which_the_templates_are_made_is_named(
     assert "templates of this frame itself" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     table = Table.read(tmp_path / "out" / "frames.ecsv")
     assert list(table["of_own_templates"]) == [False, True]
+
+
+def without_sky(path: Path) -> None:
+    rewrite(path, lambda image: image - np.float32(np.median(image)))
+
+
+def test_templates_of_frames_without_their_sky_are_no_parts_of_it(
+    night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their rms is that of the fringes in the unit of the frames, and who subtracted the sky is asked for it."""
+    without_sky(night / NAME)
+    assert templates(night, tmp_path / "some") == 1
+    assert "frames without their sky is 1" in capsys.readouterr().err
+    for number in (0, 2, 3):
+        without_sky(night / f"visit_{number}.fits")
+    assert templates(night, tmp_path / "out") == 0
+    said = capsys.readouterr().out
+    assert "--background puts it back" in said
+    assert "%" not in said.partition(";")[0]
+    with fits.open(tmp_path / "out" / "templates_S11.fits") as hdus:
+        pattern, scores = hdus["PATTERNS"].data[0], hdus["SCORES"].data
+        assert not hdus[0].header["PERSKY"]
+    assert np.sqrt((scores**2).mean()) == pytest.approx(1.0, rel=0.01)
+    # Fringes of 2 % of 2000 electrons.
+    assert pattern.std() == pytest.approx(40.0 / np.sqrt(2.0), rel=0.2)
+    assert correct(tmp_path / "out", tmp_path / "corrected", night / NAME) == 0
+    assert "frames without a sky: 1 of 1" in capsys.readouterr().out

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from ..errors import InputError, named_units
 from ..notebook import do_nothing
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
-from ..products.fringe_templates import input_cards
+from ..products.fringe_templates import PER_SKY, input_cards
 from ..products.same_light import refuse_equal_pixels
 from .correction.constant import without_constant_blocks
 from .correction.empirical import TemplateOptions, fit_templates
 from .correction.injection import InjectionOptions, inject_sources, injection_table
 from .correction.objects import masked_sums, square_sums
 from .correction.quality import FrameProof, prove
-from .correction.scales import refuse_negative_sky, steady_weight
+from .correction.scales import refuse_negative_sky, sky_is_subtracted, steady_weight
 from .fringe_correction import CorrectionOptions, FringeCorrection, TemplateSet, correct_fringes
 from .image_correlation import LogBins, correlation_function
 
@@ -99,6 +99,7 @@ class CorrectedFrame:
             injected,
             self.frame.unit,
             found.of_own_templates,
+            sky_is_subtracted(float(np.median(fitted.background)), self._pixel_noise()),
         )
 
     def _correlation(self, good: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -117,9 +118,13 @@ class CorrectedFrame:
             correlation_function(np.nan_to_num(each - np.nanmean(each)), number, bins)
             for each in (before, after)
         ]
-        weight = fitted.fit.weight
-        variance = fitted.fit.chi2_per_pixel / float(np.median(weight[good]))
+        variance = self._pixel_noise() ** 2
         return np.stack([side * found[0].separation_px, *(each.xi / variance for each in found)])
+
+    def _pixel_noise(self) -> float:
+        """Standard deviation of a pixel."""
+        fit = self.correction.frame.fit
+        return math.sqrt(fit.chi2_per_pixel / float(np.median(fit.weight[fit.weight > 0])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +151,8 @@ class FrameRecord:
         Unit of the frame and of the scales; may be empty.
     of_own_templates : `bool`
         Whether the templates were made of this frame itself, and have its noise.
+    sky_subtracted : `bool`
+        Whether its sky is within the noise of a pixel of 0.
     """
 
     name: str
@@ -159,6 +166,7 @@ class FrameRecord:
     injected: Table | None = None
     unit: str = ""
     of_own_templates: bool = False
+    sky_subtracted: bool = False
 
 
 def make_templates(
@@ -216,6 +224,7 @@ def make_templates(
             **(metadata or {}),
             "NFRAMES": len(frames),
             "BGSPACE": float(chosen.spacing_px),
+            PER_SKY: found.per_sky,
             **input_cards(digests),
         },
         detector=first.detector,
@@ -323,9 +332,7 @@ def recover_sources(
         background = done.frame.background
         return image - background, np.asarray(done.image, dtype=np.float32) - background
 
-    fitted = corrected.correction.frame
-    used = fitted.fit.weight
-    noise = math.sqrt(fitted.fit.chi2_per_pixel / float(np.median(used[used > 0])))
+    fitted, noise = corrected.correction.frame, corrected._pixel_noise()
     free = fitted.sums.usable & ~fitted.objects
     measured = inject_sources(frame.image, free, noise, pixel_arcsec, both, sources)
     return injection_table(name, measured)

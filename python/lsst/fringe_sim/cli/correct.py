@@ -13,7 +13,7 @@ import click
 from ..errors import InputError
 from .bad_files import refuse_bad
 from .command import DRY_RUN, EXISTING, argument, command, flag, option
-from .observed import Background, TemplateFolder, background_options, images_of, stem_of, target_names
+from .observed import NO_SKY, Background, TemplateFolder, background_options, images_of, stem_of, target_names
 from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 
@@ -94,6 +94,9 @@ def correct(
     for line in [*map(str, unusable), *refused]:
         click.echo(line)
     if not undo:
+        bare = sum(record.sky_subtracted for record in done)
+        if bare:
+            click.echo(f"frames without a sky: {bare} of {len(done)} ({NO_SKY})")
         click.echo(str(target / "report.html"))
     if unusable or refused or not passed:
         raise click.exceptions.Exit(EXIT_REFUSED)

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files import same_file_key
 from .bad_files import refuse_bad
 from .command import DRY_RUN, EXISTING, argument, command, flag, option
-from .observed import Background, TemplateFolder, background_options, images_of, latest_date
+from .observed import NO_SKY, Background, TemplateFolder, background_options, images_of, latest_date
 from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 
@@ -142,7 +142,11 @@ def _file_name(sensor: str) -> str:
 
 def _describe(name: str, product: FringeTemplates) -> str:
     good = product.mask == 0
-    rms = ", ".join(f"{100.0 * float(each[good].std()):.4f} %" for each in product.patterns)
+    spread = [float(each[good].std()) for each in product.patterns]
+    if product.per_sky:
+        rms = ", ".join(f"{100.0 * each:.4f} %" for each in spread)
+    else:
+        rms = ", ".join(f"{each:.4g}" for each in spread) + f" in the unit of the frames ({NO_SKY})"
     return (
         f"{name or 'sensor'}: {len(product.patterns)} templates from {len(product.scores)} frames, rms {rms}; "
         f"{100.0 * float((~good).mean()):.2f} % of the pixels are seen by too few"
