@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from lsst.fringe_sim.algorithms.correction import BackgroundTerms, fit_scales
 from lsst.fringe_sim.algorithms.correction.quality import excess_structure, uniform_background_indicator
 from lsst.fringe_sim.algorithms.fringe_correction import TemplateSet
-from lsst.fringe_sim.algorithms.observed_frames import correct_frame
+from lsst.fringe_sim.algorithms.observed_frames import correct_frame, make_templates
 from lsst.fringe_sim.products import ObservedFrame
 
 SIDE, NOISE, APERTURE = 400, 3.0, 20
@@ -70,3 +73,44 @@ def test_what_is_left_of_the_fringes_is_told(rng, phase_error):
     )
     ratio = proof.fringes_left / proof.part_left if proof.part_left else 0.0
     assert ratio == pytest.approx(proof.structure_before, rel=0.3) or ratio == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.rng("what templates of observed frames leave is not stated too low")
+def test_what_templates_of_observed_frames_leave_is_not_stated_too_low(rng):
+    """Of forty frames that the templates do not know, at most two have more left than the limit of two errors."""
+    side = 256
+    y, x = np.mgrid[:side, :side] / 100.0
+    u, v = x - 1.0, y - 1.4
+    phase = 2.0 * np.pi * (2.1 * u + 1.3 * v + 1.1 * u * u - 0.8 * v * v + 0.6 * u * v)
+    patterns = np.array([np.cos(phase), np.cos(1.07 * phase + 0.8)])
+    background = BackgroundTerms((side, side))
+
+    def frame():
+        sky = rng.uniform(2200.0, 4200.0)
+        fringes = (
+            0.007 * sky * np.tensordot([rng.uniform(0.6, 1.4), rng.uniform(-0.3, 0.3)], patterns, axes=1)
+        )
+        image = rng.poisson(sky + fringes).astype(np.float32)
+        return ObservedFrame(image, np.zeros(image.shape, dtype=np.int32), unit="electron"), fringes
+
+    def beside_background(image):
+        even = np.ones(image.shape, dtype=np.float32)
+        fit = fit_scales(image, even, [], background, clip_sigma=np.inf)
+        return np.std(image - background.surface(fit.coefficient))
+
+    frames = [frame() for _ in range(50)]
+    made = make_templates(
+        [partial(lambda each: each, image) for image, _ in frames[:10]], "2026-01-01T00:00:00"
+    )
+    known, exceeding, parts = TemplateSet.of(made.frames()), 0, []
+    for image, fringes in frames[10:]:
+        done = correct_frame(image, known)
+        left = beside_background(fringes - done.fringes) / beside_background(fringes)
+        square = done.proof.part_left**2
+        error = (done.proof.part_left + done.proof.part_left_sigma) ** 2 - square
+        exceeding += left**2 > square + 2.0 * error
+        parts.append((left, done.proof.part_left))
+    assert exceeding <= 2
+    true, stated = np.median(parts, axis=0)
+    assert stated == pytest.approx(true, rel=0.3)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 from made_once import made_once
 from observed_night import observed_night
 
@@ -166,6 +167,17 @@ def test_templates_are_made_without_a_bad_frame_only_if_that_is_asked_for(
     assert "from 3 frames" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("spoil", [other_filter, one_value])
+def test_a_dry_run_refuses_frames_that_the_run_refuses(
+    night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], None]
+) -> None:
+    spoil(night)
+    assert templates(night, tmp_path / "out", "--dry-run") == 1
+    said = capsys.readouterr().err
+    assert templates(night, tmp_path / "out") == 1
+    assert capsys.readouterr().err == said
+
+
 def test_templates_of_an_image_without_light_are_refused(
     night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -284,3 +296,45 @@ def test_an_undoing_that_cannot_be_right_is_refused(
     assert correct(made / "templates", tmp_path / "again", path, more=("--undo",)) == 1
     assert words in capsys.readouterr().out
     assert not list((tmp_path / "again").glob("*.fits"))
+
+
+def test_a_frame_of_which_the_templates_are_made_is_named(
+    made: Path, night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On its line, on the page and in the table; a frame with other noise is none of them."""
+    rewrite(night / NAME, lambda image: np.random.default_rng(3).poisson(image).astype(np.float32))
+    assert correct(made / "templates", tmp_path / "out", night / NAME, night / "visit_2.fits") == 0
+    other, own = [line for line in capsys.readouterr().out.splitlines() if line.startswith("visit_")]
+    words = "made of this frame itself"
+    assert words in own
+    assert words not in other
+    assert "templates of this frame itself" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    table = Table.read(tmp_path / "out" / "frames.ecsv")
+    assert list(table["of_own_templates"]) == [False, True]
+
+
+def without_sky(path: Path) -> None:
+    rewrite(path, lambda image: image - np.float32(np.median(image)))
+
+
+def test_templates_of_frames_without_their_sky_are_no_parts_of_it(
+    night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their rms is that of the fringes in the unit of the frames, and who subtracted the sky is asked for it."""
+    without_sky(night / NAME)
+    assert templates(night, tmp_path / "some") == 1
+    assert "frames without their sky is 1" in capsys.readouterr().err
+    for number in (0, 2, 3):
+        without_sky(night / f"visit_{number}.fits")
+    assert templates(night, tmp_path / "out") == 0
+    said = capsys.readouterr().out
+    assert "--background puts it back" in said
+    assert "%" not in said.partition(";")[0]
+    with fits.open(tmp_path / "out" / "templates_S11.fits") as hdus:
+        pattern, scores = hdus["PATTERNS"].data[0], hdus["SCORES"].data
+        assert not hdus[0].header["PERSKY"]
+    assert np.sqrt((scores**2).mean()) == pytest.approx(1.0, rel=0.01)
+    # Fringes of 2 % of 2000 electrons.
+    assert pattern.std() == pytest.approx(40.0 / np.sqrt(2.0), rel=0.2)
+    assert correct(tmp_path / "out", tmp_path / "corrected", night / NAME) == 0
+    assert "frames without a sky: 1 of 1" in capsys.readouterr().out

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,7 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError, named_units, to_number
 from ..products import CORRECTED, FringeFrame, refuse_corrected
+from ..products.fringe_templates import made_of
+from ..products.same_light import pixels_digest
 from .correction.background import AMPLIFIERS_UNKNOWN, SPACING_PX, AmplifierGrid, BackgroundTerms
+from .correction.constant import without_constant_blocks
 from .correction.objects import ROUNDS, FrameFit, fit_frame
 from .correction.scales import ScaleFit, refuse_negative_sky, steady_weight
 from .sky_frame import SkyResponse
@@ -76,12 +79,15 @@ class TemplateSet:
         Pixels in which one of them has no value.
     identity : `str`
         Beginning of the SHA-256 of all their pixels that have a value.
+    metadata : `list` of mapping
+        Header keywords of each, as far as they have some.
     """
 
     patterns: list[NDArray[np.float32]]
     variances: list[NDArray[np.float32]]
     unknown: NDArray[np.bool_]
     identity: str
+    metadata: list[Mapping[str, Any]] = field(default_factory=list)
 
     @classmethod
     def of(cls, templates: Templates) -> TemplateSet:
@@ -108,7 +114,13 @@ class TemplateSet:
             patterns.append(np.where(missing, np.float32(0.0), image - np.float32(pedestal)))
             if isinstance(template, FringeFrame):
                 variances.append(np.where(missing, np.float32(0.0), template.variance.astype(np.float32)))
-        return cls(patterns, variances, unknown, digest.hexdigest()[:16])
+        cards = [template.metadata for template in templates if isinstance(template, FringeFrame)]  # type: ignore[union-attr]
+        return cls(patterns, variances, unknown, digest.hexdigest()[:16], cards)
+
+    def made_of(self, image: NDArray[Any]) -> bool:
+        """Whether they were made of this frame, among others."""
+        digest = pixels_digest(image) if self.metadata else ""
+        return any(made_of(each, digest) for each in self.metadata)
 
     def refuse_other_shape(self, shape: tuple[int, ...]) -> None:
         """Refuse an exposure of another size.
@@ -141,6 +153,8 @@ class FringeCorrection:
         Background, objects and residual.
     templates : `TemplateSet`
         The templates.
+    of_own_templates : `bool`
+        Whether the templates were made of this exposure, among others: what is left cannot be judged from it.
     """
 
     image: NDArray[Any]
@@ -149,6 +163,7 @@ class FringeCorrection:
     covariance: FloatArray
     frame: FrameFit
     templates: TemplateSet
+    of_own_templates: bool = False
 
     @property
     def template_id(self) -> str:
@@ -230,6 +245,7 @@ def correct_fringes(
     good = np.isfinite(exposure) & ~unknown
     if mask is not None:
         good &= _of_shape("mask", mask, shape) == 0
+    good = without_constant_blocks(exposure, good)
     weight = steady_weight(
         good, None if variance is None else _of_shape("variance", variance, shape), exposure
     )
@@ -238,7 +254,8 @@ def correct_fringes(
     rounds = ROUNDS if chosen.find_objects else 1
     frame = fit_frame(exposure, weight, known.patterns, background, rounds=rounds)
     corrected = _subtracted(exposure, known, frame.fit)
-    return FringeCorrection(corrected, unknown, frame.fit.scale, frame.fit.covariance, frame, known)
+    own = known.made_of(exposure)
+    return FringeCorrection(corrected, unknown, frame.fit.scale, frame.fit.covariance, frame, known, own)
 
 
 def undo_correction(image: ArrayLike, templates: Templates, header: Mapping[str, Any]) -> NDArray[Any]:

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from ..errors import InputError, named_units
 from ..notebook import do_nothing
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
+from ..products.fringe_templates import PER_SKY, input_cards
 from ..products.same_light import refuse_equal_pixels
+from .correction.constant import without_constant_blocks
 from .correction.empirical import TemplateOptions, fit_templates
 from .correction.injection import InjectionOptions, inject_sources, injection_table
 from .correction.objects import masked_sums, square_sums
 from .correction.quality import FrameProof, prove
-from .correction.scales import refuse_negative_sky, steady_weight
+from .correction.scales import refuse_negative_sky, sky_is_subtracted, steady_weight
 from .fringe_correction import CorrectionOptions, FringeCorrection, TemplateSet, correct_fringes
 from .image_correlation import LogBins, correlation_function
 
@@ -96,6 +98,8 @@ class CorrectedFrame:
             correlation,
             injected,
             self.frame.unit,
+            found.of_own_templates,
+            sky_is_subtracted(float(np.median(fitted.background)), self._pixel_noise()),
         )
 
     def _correlation(self, good: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -114,9 +118,13 @@ class CorrectedFrame:
             correlation_function(np.nan_to_num(each - np.nanmean(each)), number, bins)
             for each in (before, after)
         ]
-        weight = fitted.fit.weight
-        variance = fitted.fit.chi2_per_pixel / float(np.median(weight[good]))
+        variance = self._pixel_noise() ** 2
         return np.stack([side * found[0].separation_px, *(each.xi / variance for each in found)])
+
+    def _pixel_noise(self) -> float:
+        """Standard deviation of a pixel."""
+        fit = self.correction.frame.fit
+        return math.sqrt(fit.chi2_per_pixel / float(np.median(fit.weight[fit.weight > 0])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +149,10 @@ class FrameRecord:
         Bias and scatter of the fluxes of sources in a copy of the frame (`injection_table`).
     unit : `str`
         Unit of the frame and of the scales; may be empty.
+    of_own_templates : `bool`
+        Whether the templates were made of this frame itself, and have its noise.
+    sky_subtracted : `bool`
+        Whether its sky is within the noise of a pixel of 0.
     """
 
     name: str
@@ -153,6 +165,8 @@ class FrameRecord:
     correlation: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
     injected: Table | None = None
     unit: str = ""
+    of_own_templates: bool = False
+    sky_subtracted: bool = False
 
 
 def make_templates(
@@ -195,7 +209,7 @@ def make_templates(
     chosen = options or TemplateOptions()
     if len(frames) < LEAST_FRAMES:
         raise InputError("frames for templates", len(frames), "three or more, of different places on the sky")
-    first = first_of_alike(frames, names, "frames for templates")
+    first, digests = first_of_alike(frames, names, "frames for templates")
     expected = [np.where(each.mask == 0, each.image, 0).astype(np.float32) for each in prior]
     found = fit_templates([partial(_loaded, frame) for frame in frames], chosen, expected, advance)
     unseen = found.coverage < chosen.least_frames
@@ -206,7 +220,13 @@ def make_templates(
         scores=found.scores,
         mask=np.where(unseen, mask_bits("NO_DATA"), 0).astype(np.int32),
         creation_datetime=creation_datetime,
-        metadata={**(metadata or {}), "NFRAMES": len(frames), "BGSPACE": float(chosen.spacing_px)},
+        metadata={
+            **(metadata or {}),
+            "NFRAMES": len(frames),
+            "BGSPACE": float(chosen.spacing_px),
+            PER_SKY: found.per_sky,
+            **input_cards(digests),
+        },
         detector=first.detector,
         physical_filter=first.physical_filter,
     )
@@ -312,9 +332,7 @@ def recover_sources(
         background = done.frame.background
         return image - background, np.asarray(done.image, dtype=np.float32) - background
 
-    fitted = corrected.correction.frame
-    used = fitted.fit.weight
-    noise = math.sqrt(fitted.fit.chi2_per_pixel / float(np.median(used[used > 0])))
+    fitted, noise = corrected.correction.frame, corrected._pixel_noise()
     free = fitted.sums.usable & ~fitted.objects
     measured = inject_sources(frame.image, free, noise, pixel_arcsec, both, sources)
     return injection_table(name, measured)
@@ -330,6 +348,7 @@ def summary_table(records: Sequence[FrameRecord]) -> Table:
         table[name] = [getattr(each.proof, name) for each in records]
     for row, name in ((1, "correlation_before"), (2, "correlation_after")):
         table[name] = [_largest(each.correlation[row]) for each in records]
+    table["of_own_templates"] = [each.of_own_templates for each in records]
     table["seen"] = [each.proof.seen for each in records]
     table["passed"] = [each.proof.passed for each in records]
     return table
@@ -360,8 +379,8 @@ def _block_means(image: NDArray[Any], good: NDArray[np.bool_], side: int) -> NDA
 
 def first_of_alike(
     frames: Sequence[Callable[[], ObservedFrame]], names: Sequence[str], purpose: str
-) -> ObservedFrame:
-    """The first frame, when all have been read and found to belong together, each being there once.
+) -> tuple[ObservedFrame, list[str]]:
+    """The first frame, when all have been found to belong together, each being there once; and digests of all.
 
     `InputError`: one is of another sensor, filter, unit or size, was corrected, or is there twice.
     """
@@ -373,8 +392,7 @@ def first_of_alike(
             _refuse_other(read, first)
             yield read.image
 
-    refuse_equal_pixels(purpose, images(), names)
-    return first
+    return first, refuse_equal_pixels(purpose, images(), names)
 
 
 def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -383,8 +401,8 @@ def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[NDArray[np.float32], ND
 
 
 def frame_weight(frame: ObservedFrame) -> NDArray[np.float32]:
-    """Inverse variance of the background of a frame, 0 in pixels that are masked or hold no number."""
-    good = (frame.mask == 0) & np.isfinite(frame.image)
+    """Inverse variance of the background of a frame, 0 where it is masked, no number, or has no noise."""
+    good = without_constant_blocks(frame.image, (frame.mask == 0) & np.isfinite(frame.image))
     weight = steady_weight(good, frame.variance, frame.image)
     refuse_negative_sky(frame.image, weight)
     return weight

@@ -13,7 +13,7 @@ import click
 from ..errors import InputError
 from .bad_files import refuse_bad
 from .command import DRY_RUN, EXISTING, argument, command, flag, option
-from .observed import Background, TemplateFolder, background_options, images_of, stem_of, target_names
+from .observed import NO_SKY, Background, TemplateFolder, background_options, images_of, stem_of, target_names
 from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from ..report.page import Origin
 
 EXIT_REFUSED = 1
+
+OWN_TEMPLATES = "the templates are made of this frame itself: what is left cannot be judged from it"
 
 OWN_CARD = re.compile(r"FRING(COR|TID|PRB|VER|S[CE]\d+)")
 """Keywords that a correction writes, and its undoing removes."""
@@ -92,6 +94,9 @@ def correct(
     for line in [*map(str, unusable), *refused]:
         click.echo(line)
     if not undo:
+        bare = sum(record.sky_subtracted for record in done)
+        if bare:
+            click.echo(f"frames without a sky: {bare} of {len(done)} ({NO_SKY})")
         click.echo(str(target / "report.html"))
     if unusable or refused or not passed:
         raise click.exceptions.Exit(EXIT_REFUSED)
@@ -228,6 +233,7 @@ def _describe(record: FrameRecord) -> str:
         f"{record.name}: {scales} (fringes at {clearest:.1f} σ); of the fringes "
         f"{_left(proof.part_left, proof.part_left_sigma)} left; structure beyond the noise "
         f"{proof.structure_before:.2f} before, {proof.structure_after:.2f} after"
+        + (f"; {OWN_TEMPLATES}" if record.of_own_templates else "")
     )
 
 

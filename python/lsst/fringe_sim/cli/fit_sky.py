@@ -346,7 +346,7 @@ def _check_frames(
     from ..algorithms.observed_frames import first_of_alike
 
     names = [f"{image.path}[{image.name}]" for image in images]
-    first = first_of_alike(loaders, names, "frames of the sky")
+    first, _ = first_of_alike(loaders, names, "frames of the sky")
     if layer is not None and first.shape != layer.shape:
         raise InputError("shape of the frames", first.shape, f"{layer.shape}, that of the thickness map")
     if other_light(setup.filter_name, first.physical_filter, is_model=True):

@@ -28,6 +28,8 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
 
 SPACING_PX = 256.0
 
+NO_SKY = "their sky was subtracted, perhaps with part of the fringes; --background puts it back"
+
 
 @dataclass(frozen=True)
 class Background:

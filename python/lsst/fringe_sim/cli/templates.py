@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files import same_file_key
 from .bad_files import refuse_bad
 from .command import DRY_RUN, EXISTING, argument, command, flag, option
-from .observed import Background, TemplateFolder, background_options, images_of, latest_date
+from .observed import NO_SKY, Background, TemplateFolder, background_options, images_of, latest_date
 from .output import OutputFolder, origin_of, output_folder
 from .progress import progress
 
@@ -67,6 +67,7 @@ def templates(
     expected = None if prior is None else TemplateFolder(prior)
     if dry_run:
         for name, images in sensors.items():
+            _check(images, background, expected, name)
             click.echo(f"would make templates of {name} from {len(images)} frames")
         return
     folder = out.prepare()
@@ -116,8 +117,23 @@ def _made(
     from ..model.provenance import software_cards
 
     date = latest_date([image.header() for image in images])
-    names = [f"{image.path}[{image.name}]" for image in images]
-    return make_templates(background.loaders(images), date, options, prior, software_cards(), advance, names)
+    loaders, names = background.loaders(images), _names(images)
+    return make_templates(loaders, date, options, prior, software_cards(), advance, names)
+
+
+def _names(images: list[ObservedImage]) -> list[str]:
+    return [f"{image.path}[{image.name}]" for image in images]
+
+
+def _check(
+    images: list[ObservedImage], background: Background, expected: TemplateFolder | None, name: str
+) -> None:
+    """Refuse what the making of templates of a sensor would refuse before its first fit."""
+    from ..algorithms.observed_frames import first_of_alike
+
+    if expected is not None:
+        expected.of(name)
+    first_of_alike(background.loaders(images), _names(images), "frames for templates")
 
 
 def _file_name(sensor: str) -> str:
@@ -126,7 +142,11 @@ def _file_name(sensor: str) -> str:
 
 def _describe(name: str, product: FringeTemplates) -> str:
     good = product.mask == 0
-    rms = ", ".join(f"{100.0 * float(each[good].std()):.4f} %" for each in product.patterns)
+    spread = [float(each[good].std()) for each in product.patterns]
+    if product.per_sky:
+        rms = ", ".join(f"{100.0 * each:.4f} %" for each in spread)
+    else:
+        rms = ", ".join(f"{each:.4g}" for each in spread) + f" in the unit of the frames ({NO_SKY})"
     return (
         f"{name or 'sensor'}: {len(product.patterns)} templates from {len(product.scores)} frames, rms {rms}; "
         f"{100.0 * float((~good).mean()):.2f} % of the pixels are seen by too few"

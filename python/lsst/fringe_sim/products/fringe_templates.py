@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +14,25 @@ from ..errors import FrameFormatError
 from .fits_product import DETECTOR, FILTER, MASK, Card, FitsProduct, Image
 from .fringe_frame import FringeFrame
 from .mask import mask_bits
+
+PER_SKY = "PERSKY"
+"""Keyword of templates: whether they are parts of the sky; otherwise they are in the unit of the frames."""
+
+INPUT = re.compile(r"INPUT\d+")
+"""Keywords of templates with the digests of the frames that they were made of."""
+
+DIGITS = 16
+"""Digits of a digest that a keyword holds."""
+
+
+def input_cards(digests: Sequence[str]) -> dict[str, str]:
+    """Keywords of templates that name the frames that they were made of, by digests of their pixels."""
+    return {f"INPUT{number}": digest[:DIGITS] for number, digest in enumerate(digests)}
+
+
+def made_of(metadata: Mapping[str, Any], digest: str) -> bool:
+    """Whether the keywords of a template name a frame among those that it was made of."""
+    return any(INPUT.fullmatch(name) and value == digest[:DIGITS] for name, value in metadata.items())
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -26,7 +46,7 @@ class FringeTemplates(FitsProduct):
     coverage : `numpy.ndarray`, float32, shape ``(ny, nx)``
         Frames that see each pixel.
     patterns : `numpy.ndarray`, float32, shape ``(K, ny, nx)``
-        Templates, in fractions of the sky; every pixel a number.
+        Templates, in fractions of the sky, or in the unit of the frames (`per_sky`); every pixel a number.
     variance : `numpy.ndarray`, float32, shape ``(K, ny, nx)``
         Variance of their noise.
     scores : `numpy.ndarray`, float64, shape ``(N, K)``
@@ -56,7 +76,14 @@ class FringeTemplates(FitsProduct):
     detector: str = ""
     physical_filter: str = ""
 
+    @property
+    def per_sky(self) -> bool:
+        """Whether the frames had a sky, of which the patterns are parts."""
+        return bool(self.metadata.get(PER_SKY, True))
+
     def _picture(self) -> tuple[NDArray[Any], str, bool]:
+        if not self.per_sky:
+            return self.patterns[0], "first template [unit of the frames]", True
         return 100.0 * self.patterns[0], "first template [% of the sky]", True
 
     CARDS = (DETECTOR, FILTER, Card("creation_datetime", "CALIB_CREATION_DATETIME", "", kind=str))

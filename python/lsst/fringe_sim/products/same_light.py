@@ -20,17 +20,22 @@ def pixels_digest(image: NDArray[Any]) -> str:
     return hashlib.blake2b(np.ascontiguousarray(image, "<f4").tobytes(), digest_size=16).hexdigest()
 
 
-def refuse_equal_pixels(field: str, images: Iterable[NDArray[Any]], names: Sequence[str] = ()) -> None:
+def refuse_equal_pixels(field: str, images: Iterable[NDArray[Any]], names: Sequence[str] = ()) -> list[str]:
     """Refuse images of which two have equal pixels; images of one value have no light to tell.
+
+    Returns their digests.
 
     ``names``: what the message calls them, in place of their numbers.
     """
     seen: dict[str, int] = {}
+    digests = []
     for number, image in enumerate(images):
-        first = seen.setdefault(pixels_digest(image), number)
+        digests.append(pixels_digest(image))
+        first = seen.setdefault(digests[-1], number)
         if first != number and image.min() != image.max():
             pair = f"{names[first]} and {names[number]}" if names else f"{first} and {number}"
             raise InputError(field, f"equal pixels in {pair}", "each exposure once")
+    return digests
 
 
 def refuse_mixed_models(metadata: Sequence[Mapping[str, Any]]) -> None:

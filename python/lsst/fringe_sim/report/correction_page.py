@@ -57,6 +57,7 @@ class _Facts(NamedTuple):
     sigma: float  # median of a pixel of it
     masked: float  # part of the pixels
     size: str
+    per_sky: bool
 
 
 def _facts(name: str, product: FringeTemplates) -> _Facts:
@@ -64,7 +65,7 @@ def _facts(name: str, product: FringeTemplates) -> _Facts:
     rms, variance = float(product.patterns[0][good].std()), float(np.median(product.variance[0][good]))
     size = of_sensor(product.mask.shape, None)
     frames, count = product.scores.shape
-    return _Facts(name, count, frames, rms, math.sqrt(variance), float((~good).mean()), size)
+    return _Facts(name, count, frames, rms, math.sqrt(variance), float((~good).mean()), size, product.per_sky)
 
 
 def _summary_of_templates(facts: Sequence[_Facts]) -> list[tuple[str, str]]:
@@ -74,13 +75,15 @@ def _summary_of_templates(facts: Sequence[_Facts]) -> list[tuple[str, str]]:
         name: [getattr(each, name) for each in facts]
         for name in ("templates", "frames", "rms", "sigma", "masked")
     }
-    percent = {name: span_text(PERCENT * np.array(column[name])) for name in ("rms", "sigma", "masked")}
+    sky = all(each.per_sky for each in facts)
+    unit = "% of the sky" if sky else "in the unit of the frames, whose sky was subtracted"
+    text = {name: span_text((PERCENT if sky else 1.0) * np.array(column[name])) for name in ("rms", "sigma")}
     return [
         ("result", f"{span_text(column['templates'])} fringe templates of {who}"),
         ("frames", span_text(column["frames"])),
-        ("first template, rms", f"{percent['rms']} % of the sky"),
-        ("median σ of a pixel of it", f"{percent['sigma']} % of the sky"),
-        ("masked", f"{percent['masked']} % of the pixels"),
+        ("first template, rms", f"{text['rms']} {unit}"),
+        ("median σ of a pixel of it", f"{text['sigma']} {unit}"),
+        ("masked", f"{span_text(PERCENT * np.array(column['masked']))} % of the pixels"),
         ("part of the sensor", ", ".join(dict.fromkeys(each.size for each in facts))),
     ]
 
@@ -119,7 +122,9 @@ def write_correction_report(
 def _verdict(record: FrameRecord) -> str:
     if not record.proof.passed:
         return f"refused: {record.proof.worst}"
-    return "corrected" if record.proof.seen else "left as it is"
+    if not record.proof.seen:
+        return "left as it is"
+    return "corrected by templates of this frame itself" if record.of_own_templates else "corrected"
 
 
 def _shown(records: Sequence[FrameRecord]) -> Table:
@@ -150,6 +155,7 @@ def _summary(records: Sequence[FrameRecord], refused: Sequence[str]) -> list[tup
     structure = [
         [getattr(each.proof, name) for each in corrected] for name in ("structure_before", "structure_after")
     ]
+    own = sum(each.of_own_templates for each in corrected)
     unit = next((each.unit for each in corrected if each.unit), "counts")
     rms = _median([each.proof.fringe_rms for each in corrected])
     seen = f"; {unseen} left as they are, for the fringes of the templates are not seen" if unseen else ""
@@ -157,6 +163,11 @@ def _summary(records: Sequence[FrameRecord], refused: Sequence[str]) -> list[tup
         ("result", f"{len(corrected)} of {len(records) + len(refused)} images corrected{seen}"),
         ("refused", f"{bad}; the pictures show the frames" if bad else "none"),
         ("part of the fringes that is left, median", f"{_median(left)} ± {_median(sigma)}" if left else ""),
+        *(
+            [("frames of which the templates are made", f"{own}: what is left cannot be judged from them")]
+            if own
+            else []
+        ),
         (
             "structure beyond the noise, over the noise, median",
             " → ".join(map(_median, structure)) if left else "",
@@ -252,9 +263,9 @@ def _templates_figure(product: FringeTemplates) -> Figure:
         for number, axes in enumerate(shown[:count]):
             show_image(
                 axes,
-                PERCENT * product.patterns[number],
+                (PERCENT if product.per_sky else 1.0) * product.patterns[number],
                 mask=product.mask,
-                label="template [% of the sky]",
+                label="template [% of the sky]" if product.per_sky else "template [unit of the frames]",
                 title=f"template {number}",
                 diverging=True,
             )

@@ -131,6 +131,10 @@ class FringeCorrectionTask(base.PipelineTask):
             raise InputError("probability of the correction", float(f"{made.proof.probability:.4g}"), allowed)
         if not made.proof.seen:
             self.log.warning("%s: left as it is: the fringes of the templates are not seen", name)
+        if made.correction.of_own_templates:
+            self.log.warning(
+                "%s: the templates are made of this frame itself: its summary does not judge them", name
+            )
         self.log.info(
             "%s: structure beyond the noise %.2f before, %.2f after",
             *(name, made.proof.structure_before, made.proof.structure_after),

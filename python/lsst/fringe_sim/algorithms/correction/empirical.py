@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from ...notebook import do_nothing
 from .background import AMPLIFIERS_UNKNOWN, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .denoise import shrink_noise
 from .objects import fit_frame
+from .scales import refuse_part_without_sky, sky_is_subtracted
 from .sums import four_digits
 
 __all__ = ["ObservedTemplates", "TemplateOptions", "fit_templates"]
@@ -101,6 +103,8 @@ class ObservedTemplates:
     gain : `numpy.ndarray`
         What 0, 1, 2, … templates take of the squared pulls of frames that they were not made of, as far as they were
         tried; empty if their number was given.
+    per_sky : `bool`
+        Whether the frames have a sky, of which the templates are parts; or in the unit of the frames.
     """
 
     patterns: NDArray[np.float32]
@@ -108,6 +112,7 @@ class ObservedTemplates:
     coverage: NDArray[np.int32]
     scores: FloatArray
     gain: FloatArray
+    per_sky: bool = True
 
 
 def fit_templates(
@@ -133,7 +138,7 @@ def fit_templates(
     Raises
     ------
     InputError
-        Frames of different shapes.
+        Frames of different shapes, or some without their sky.
     UndeterminedError
         No template predicts frames that it was not made of.
 
@@ -149,14 +154,15 @@ def fit_templates(
     background = BackgroundTerms(shape, chosen.spacing_px, chosen.amplifiers)
     with _Stack(len(frames), shape) as stack:
         patterns: list[NDArray[np.float32]] = list(prior)
-        level = np.ones(len(frames))
+        level, bare = np.ones(len(frames)), np.zeros(len(frames), dtype=bool)
         found: _Decomposition | None = None
         gain = np.zeros(0)
         number = chosen.components or 1
         for turn in range(LEARNING_ROUNDS):
             for place, frame in enumerate(frames):
-                level[place] = stack.fill(place, frame, patterns, background)
+                level[place], bare[place] = stack.fill(place, frame, patterns, background)
                 advance()
+            refuse_part_without_sky(bare)
             if turn == LEARNING_ROUNDS - 1 and chosen.components is None:
                 gain = _held_out_gain(*stack.strips(prior), min(chosen.most, len(frames) // 3))
                 number = int(np.argmax(gain))
@@ -172,13 +178,14 @@ def fit_templates(
             patterns = list(found.patterns)
         coverage = stack.coverage()
     assert found is not None
-    unit = _per_sky(found.scores, level)
+    unit = _per_sky(found.scores, np.where(bare, 1.0, level))
     return ObservedTemplates(
         (found.patterns * unit[:, None, None]).astype(np.float32),
         (found.variance * unit[:, None, None] ** 2).astype(np.float32),
         coverage,
         found.scores / unit,
         gain,
+        not bare.any(),
     )
 
 
@@ -215,8 +222,8 @@ class _Stack:
         frame: Callable[[], tuple[NDArray[Any], NDArray[np.float32]]],
         patterns: Sequence[NDArray[np.float32]],
         background: BackgroundTerms,
-    ) -> float:
-        """Take the background off a frame, leave out its objects, and return the level of its sky."""
+    ) -> tuple[float, bool]:
+        """Take background and objects off a frame; the level of its sky, and whether that was subtracted before."""
         image, weight = frame()
         if image.shape != self.shape:
             raise InputError(f"shape of frame {place}", image.shape, f"{self.shape}, as of the first")
@@ -224,7 +231,8 @@ class _Stack:
         kept = np.where(made.objects, 0, made.fit.weight)
         self.weight[place] = kept / max(made.fit.chi2_per_pixel, 1e-30)
         self.values[place] = np.where(kept > 0, image - made.background, 0)
-        return float(np.median(made.background))
+        level, middle = (float(np.median(each)) for each in (made.background, self.weight[place][kept > 0]))
+        return level, sky_is_subtracted(level, 1.0 / math.sqrt(middle))
 
     def bands(self) -> list[slice]:
         rows = max(1, BAND_BYTES // (4 * self.frames * self.shape[1]))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, label
+from scipy.ndimage import gaussian_filter, label, uniform_filter
 
 from ...compiled import run_threaded
 from .background import BackgroundTerms
@@ -39,6 +39,10 @@ SAMPLE, LEAST_SAMPLE = 200_000, 1000
 
 BINNED_PX = (2, 2, 4)
 """Side of the squares of pixels in which objects of each width are sought."""
+
+NEIGHBOURHOOD_PX, CELLS_A_NEIGHBOURHOOD = 256, 8
+"""Side of the square around a place whose scatter an object has to exceed, the distance of the knots of the
+background, as which longer waves count; and the cells a side whose sums tell it."""
 
 _ROWS = 128
 """Rows that are worked on at a time, which the memory of a processor holds."""
@@ -180,8 +184,25 @@ def _above(
     # White noise is the least there is: few independent places do not tell less.
     effective = math.sqrt(width**2 + (binned**2 - 1) / 12.0)
     least = noise / (2.0 * math.sqrt(math.pi) * effective)
-    scatter = max(_scatter(smooth, seen), least) / np.sqrt(np.maximum(share, 0.25))
+    scatter = np.maximum(
+        max(_scatter(smooth, seen), least) / np.sqrt(np.maximum(share, 0.25)),
+        _scatter_around(smooth, seen, NEIGHBOURHOOD_PX // binned),
+    )
     return np.asarray(seen & (smooth > threshold * scatter))
+
+
+def _scatter_around(values: NDArray[np.float32], good: BoolArray, side: int) -> NDArray[np.float32]:
+    """Root mean square of the values below 0 in the neighbourhood of each: objects only add light, waves do not."""
+    cell = max(1, side // CELLS_A_NEIGHBOURHOOD)
+    below = good & (values < 0.0)
+    number = square_sums(below, cell)
+    total = square_sums(np.where(below, np.square(values), np.float32(0.0)), cell)
+    number, total = (
+        uniform_filter(each, CELLS_A_NEIGHBOURHOOD + 1, mode="constant") for each in (number, total)
+    )
+    scatter = np.sqrt(np.divide(total, number, out=np.zeros_like(total), where=number > 0.0))
+    wide = scatter.repeat(cell, axis=0).repeat(cell, axis=1)
+    return np.asarray(wide[: values.shape[0], : values.shape[1]])
 
 
 def masked_sums(values: NDArray[Any], good: BoolArray, side: int) -> NDArray[np.float32]:

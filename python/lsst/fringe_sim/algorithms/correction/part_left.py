@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +59,7 @@ def part_left(
     used: NDArray[np.bool_],
     fit: ScaleFit,
     information: NDArray[np.float64],
+    noise: Sequence[NDArray[Any]] = (),
 ) -> PartLeft:
     """Compare the residual with the fringes that were subtracted.
 
@@ -70,6 +73,8 @@ def part_left(
         Scales and their covariance.
     information : `numpy.ndarray`, shape ``(K, K)``
         Sums of products of the templates beside the background.
+    noise : sequence of `numpy.ndarray`, optional
+        Variance of the noise that the templates print into the frame, one of them each.
 
     Notes
     -----
@@ -77,7 +82,9 @@ def part_left(
     the same waves turned by 90 degrees is subtracted: noise, and the round images of faint objects, have as much of
     one as of the other. A map that is wrong moves fringes, and leaves waves of their length and direction. What
     the errors of the scales leave is no part of this power, because the fit has made the residual orthogonal to the
-    templates; it is added from the covariance of the scales.
+    templates; it is added from the covariance of the scales. The noise of the templates has no direction either,
+    and is added from their variance. Where noise was taken out of templates (`shrink_noise`), fringes of about the
+    same power went with it, of which nobody knows how much: the error of this term is as large as the term.
     """
     of_residual, of_fringes = _oriented_power(residual, fringes, used)
     total = float(of_fringes.sum())
@@ -88,7 +95,10 @@ def part_left(
     scatter = float(np.square(of_residual - square * of_fringes).sum()) * number / (number - 1)
     spread = fit.covariance @ information / float(fit.scale @ information @ fit.scale)
     from_scales = float(np.trace(spread)), 2.0 * float(np.trace(spread @ spread))
-    return PartLeft(square + from_scales[0], scatter / total**2 + from_scales[1])
+    printed = sum(float(each.mean(where=used, dtype=np.float64)) for each in noise)
+    printed /= float(fringes.var(where=used, dtype=np.float64))
+    variance = scatter / total**2 + from_scales[1] + printed**2
+    return PartLeft(square + from_scales[0] + printed, variance)
 
 
 def _oriented_power(residual: Window, fringes: Window, used: NDArray[np.bool_]) -> Sums:

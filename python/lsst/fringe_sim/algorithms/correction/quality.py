@@ -147,7 +147,7 @@ def prove(
         lambda: math.sqrt(apertures.power(fringes - np.float32(mean)) / noise) if noise > 0.0 else math.nan,
         lambda: [apertures.structure(each, noise) for each in (before, frame.residual)],
         lambda: [uniform_background_indicator(each, used) for each in (before, frame.residual)],
-        lambda: part_left(frame.residual, fringes, used, fit, frame.solution.schur),
+        lambda: part_left(frame.residual, fringes, used, fit, frame.solution.schur, allowed),
     )
     probability, worst = _corrected(found)
     return FrameProof(

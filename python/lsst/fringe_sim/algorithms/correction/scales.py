@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...errors import OutOfRangeError, UndeterminedError
+from ...errors import InputError, OutOfRangeError, UndeterminedError
 from .background import SMALLEST_BLOCK_PX, BackgroundTerms
 from .detection import log_evidence
 from .scatter import scale_covariance
@@ -21,8 +21,10 @@ __all__ = [
     "coefficient_of",
     "fit_scales",
     "refuse_negative_sky",
+    "refuse_part_without_sky",
     "scale_fit",
     "settle",
+    "sky_is_subtracted",
     "steady_weight",
 ]
 
@@ -259,6 +261,26 @@ def refuse_negative_sky(image: NDArray[Any], weight: NDArray[np.float32]) -> Non
     if level < -noise:
         allowed = f"positive, or subtracted: within the noise of a pixel ({noise:.3g}) of 0"
         raise OutOfRangeError("sky of the frame", four_digits(level), allowed)
+
+
+def sky_is_subtracted(level: float, noise: float) -> bool:
+    """Whether a level lies within the noise of a pixel of 0, so that nobody knows the sky."""
+    return abs(level) < noise
+
+
+def refuse_part_without_sky(subtracted: BoolArray) -> None:
+    """Refuse frames of which some have their sky and others do not: their templates have no common unit.
+
+    Raises
+    ------
+    InputError
+        Some do, and others do not.
+    """
+    if subtracted.any() and not subtracted.all():
+        number = int(np.count_nonzero(subtracted))
+        raise InputError(
+            "frames without their sky", number, "0, or all: --background puts back what was subtracted"
+        )
 
 
 def _cell_medians(some: NDArray[Any]) -> NDArray[Any]:
