@@ -94,21 +94,22 @@ def test_what_another_simulator_hides_is_named(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "places",
+    ("places", "seed"),
     [
-        9,
+        (9, 42),
+        (3, 42),
         pytest.param(
-            3,
+            *(3, 45),
             marks=pytest.mark.xfail(
                 strict=True,
-                reason="three places a side are not always recognised: of five draws two disagree (7e-4, 1e-38)",
+                reason="three places a side are not always recognised: of five draws one disagrees (1e-38)",
             ),
         ),
     ],
 )
-def test_nothing_is_found_in_another_simulators_plain_flats(places: int) -> None:
+def test_nothing_is_found_in_another_simulators_plain_flats(places: int, seed: int) -> None:
     """Pixels that average over three places by three see a ninth less of their area than real ones."""
-    cube = exposed(ForeignSensor(), np.random.default_rng(42), places)
+    cube = exposed(ForeignSensor(), np.random.default_rng(seed), places)
     assert discover(cube, "ts8_e2v", rng=np.random.default_rng(0)).verdict == "no_discrepancy"
 
 
