@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,21 +100,21 @@ class Solver:
         """Solve the orders, and again if the model turns out to be another than was thought."""
         if not self.free.any:
             return self._solve_held(cells, templates)
-        wide = True
+        narrow = None
         if np.isfinite(self.free.gain_accuracy):
-            described, wide = self._described(cells, templates)
+            described, narrow = self._described(cells, templates)
             if described is not None:
                 return described
         # Fringes of few orders look like light that each wavelength has of its own: both are tried.
         starts = [
-            first_nuisances(cells, templates, self.free, own) for own in ((True,) if wide else (True, False))
+            first_nuisances(cells, templates, self.free, own)
+            for own in ((True,) if narrow is None else (True, False))
         ]
-        return self._likeliest(
-            state for start in starts for state in self._solve_from(start, cells, templates)
-        )
+        solved = (state for start in starts for state in self._solve_from(start, cells, templates))
+        return self._likeliest(chain(solved, [] if narrow is None else [self._learn(narrow, ranked=True)]))
 
     def _likeliest(self, states: Iterator[State]) -> State:
-        """The most probable of some solutions; the best of another order of the sensor is its rival."""
+        """The most probable of some solutions; the best with another relief is its rival."""
         best, seen = next(states), []
         seen.append((best.thickness_um, best.nuisance))
         for state in states:  # one at a time: the evidence of all cells is large
@@ -125,9 +126,14 @@ class Solver:
         rivals = [
             fit.cost(best.nuisance.shared) - best.nuisance.cost(best.nuisance.shared)
             for thickness, fit in seen
-            if abs(np.nanmedian(thickness - best.thickness_um)) > _SAME_SHAPE * self.order_um
+            if self._is_other_relief(thickness - best.thickness_um)
         ]
         return replace(best, rival=min(rivals, default=np.inf))
+
+    def _is_other_relief(self, apart_um: NDArray[np.float32]) -> bool:
+        """Whether a difference of thickness is more than one of whole orders, which are ranked with all pixels."""
+        turns = np.rint(np.nanmedian(apart_um) / self.order_um)
+        return bool(np.nanmedian(np.abs(apart_um - turns * self.order_um)) > _SAME_SHAPE * self.order_um)
 
     def _solve_from(self, nuisance: NuisanceFit, cells: Cells, templates: FringeTemplates) -> Iterator[State]:
         """Orders and all that is free in turn, from a first light and contrast: every solution on the way."""
@@ -141,27 +147,27 @@ class Solver:
                 break
             fitted, nuisance, alike = state.templates, state.nuisance, state.alike
 
-    def _described(self, cells: Cells, templates: FringeTemplates) -> tuple[State | None, bool]:
-        """Solution with the model as it is, if that describes the flats, and whether the sensor has many orders.
+    def _described(self, cells: Cells, templates: FringeTemplates) -> tuple[State | None, State | None]:
+        """Solution with the model as it is, if that describes the flats, and in any case that of a narrow sensor.
 
-        What is free moves no order then.
+        What is free moves no order of the first; the second is one from which all that is free may be learned.
 
         Light and contrast of a sensor of few orders cannot be told from its fringes: there they stay as they are.
         """
         held = replace(self, free=Nuisances())
         nothing = NuisanceFit.none(templates.n_wavelengths)
         probe = held._state(cells, templates, nothing, "range", self.range_um)
-        narrow = held._mean_is_open(probe) or not held._is_wide(probe)
-        if narrow:
-            state = held._solve_held(cells, templates, probe)
-            alone = cells_leave_only_noise(state.cells, state.templates, state.thickness_um)
-            return state if alone and self._leaves_only_noise(state) else None, False
-        if not self._leaves_only_noise(held.adjust(replace(probe, normalisation="sensor"))):
-            return None, True
-        state = held._solve_held(cells, templates, probe)
         count = patterns_of_cells(cells, self.free, *np.zeros((2, 1), np.intp))[0].shape[-1]
         start = NuisanceFit.none(templates.n_wavelengths, count)
-        return replace(state, free=self.free, nuisance=start, described=True), True
+        if held._mean_is_open(probe) or not held._is_wide(probe):
+            state = held._solve_held(cells, templates, probe)
+            alone = cells_leave_only_noise(state.cells, state.templates, state.thickness_um)
+            free = replace(state, free=self.free, nuisance=start, normalisation="sensor")
+            return state if alone and self._leaves_only_noise(state) else None, free
+        if not self._leaves_only_noise(held.adjust(replace(probe, normalisation="sensor"))):
+            return None, None
+        state = held._solve_held(cells, templates, probe)
+        return replace(state, free=self.free, nuisance=start, described=True), None
 
     def _leaves_only_noise(self, state: State) -> bool:
         """Whether a solution leaves over nothing that neighbouring pixels share."""
