@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError, named_units, to_number
 from ..products import CORRECTED, FringeFrame, refuse_corrected
-from ..products.fringe_templates import made_of
+from ..products.fringe_templates import INPUT, made_of
 from ..products.same_light import pixels_digest
 from .correction.background import AMPLIFIERS_UNKNOWN, SPACING_PX, AmplifierGrid, BackgroundTerms
 from .correction.constant import without_constant_blocks
@@ -119,8 +119,9 @@ class TemplateSet:
 
     def made_of(self, image: NDArray[Any]) -> bool:
         """Whether they were made of this frame, among others."""
-        digest = pixels_digest(image) if self.metadata else ""
-        return any(made_of(each, digest) for each in self.metadata)
+        named = [cards for cards in self.metadata if any(map(INPUT.fullmatch, cards))]
+        digest = pixels_digest(image) if named else ""
+        return any(made_of(each, digest) for each in named)
 
     def refuse_other_shape(self, shape: tuple[int, ...]) -> None:
         """Refuse an exposure of another size.

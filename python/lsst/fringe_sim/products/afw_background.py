@@ -65,12 +65,12 @@ def _drawn(bins: Any, variance: Any) -> FloatArray:
     values = np.array(bins.data, dtype=float)
     shape = int(header["BKGD_HEIGHT"]), int(header["BKGD_WIDTH"])
     rows, columns = (_centres(side, number) for side, number in zip(shape, values.shape, strict=True))
-    style = _usable(int(header["INTERPSTYLE"]), values.shape, int(header["UNDERSAMPLESTYLE"]) == _REDUCE)
+    reduce = int(header["UNDERSAMPLESTYLE"]) == _REDUCE
+    style = _usable(int(header["INTERPSTYLE"]), values.shape, reduce)
     if int(header.get("APPROXSTYLE", -1)) == _CHEBYSHEV:
         weighted = bool(header.get("APPROXWEIGHTING", True))
         weight = 1.0 / np.array(variance.data, dtype=float) if weighted else np.ones(values.shape)
         return _polynomial(values, weight, (rows, columns), shape, int(header.get("APPROXORDERX", 1)))
-    reduce = int(header["UNDERSAMPLESTYLE"]) == _REDUCE
     along = np.full((shape[0], columns.size), np.nan)
     for column in range(columns.size):
         good = ~np.isnan(values[:, column])

@@ -43,18 +43,18 @@ class EffectDiscoveryConnections(base.PipelineTaskConnections, dimensions=SENSOR
         dimensions=SENSOR,
     )
     learned = Output(
-        doc="A correction that was learned from what no effect explains, as an override; nothing where none is "
+        "learnedOverride",
+        "ConfigOverride",
+        "A correction that was learned from what no effect explains, as an override; nothing where none is "
         "believed.",
-        name="learnedOverride",
-        storageClass="ConfigOverride",
-        dimensions=("instrument", "detector"),
+        dimensions=SENSOR,
     )
     learned_effect = Output(
-        doc="The beginning of an effect that does what was learned, for --effects-from; nothing where none is "
+        "learnedEffect",
+        "ConfigOverride",
+        "The beginning of an effect that does what was learned, for --effects-from; nothing where none is "
         "believed.",
-        name="learnedEffect",
-        storageClass="ConfigOverride",
-        dimensions=("instrument", "detector"),
+        dimensions=SENSOR,
     )
 
 

@@ -77,7 +77,7 @@ class State:
     free: Nuisances = field(default_factory=Nuisances)
     margin: float = np.inf
     rival: float = np.inf
-    """Improbability, above that of this one, of a solution of another order that the search came upon."""
+    """Improbability, above that of this one, of a solution with another relief that the search came upon."""
     alike: float = 1.0
     """Variance of sums over cells relative to cells that err by themselves, the largest that was met on the way."""
     described: bool = False
@@ -111,7 +111,8 @@ class Solver:
             for own in ((True,) if narrow is None else (True, False))
         ]
         solved = (state for start in starts for state in self._solve_from(start, cells, templates))
-        return self._likeliest(chain(solved, [] if narrow is None else [self._learn(narrow, ranked=True)]))
+        alone = (self._learn(state, ranked=True) for state in (narrow,) if state is not None)
+        return self._likeliest(chain(solved, alone))
 
     def _likeliest(self, states: Iterator[State]) -> State:
         """The most probable of some solutions; the best with another relief is its rival."""
