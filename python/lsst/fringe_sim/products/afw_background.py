@@ -16,8 +16,6 @@ from scipy.interpolate import CubicSpline
 
 from ..errors import FrameFormatError
 
-__all__ = ["afw_background", "is_afw_background"]
-
 FloatArray = NDArray[np.float64]
 
 CONSTANT, LINEAR, NATURAL, CUBIC, AKIMA = 0, 1, 2, 3, 5
@@ -26,14 +24,9 @@ CONSTANT, LINEAR, NATURAL, CUBIC, AKIMA = 0, 1, 2, 3, 5
 _LEAST_POINTS = {CONSTANT: 1, LINEAR: 2, NATURAL: 3, CUBIC: 3, AKIMA: 5}
 _OF_POINTS = (CONSTANT, CONSTANT, LINEAR, CUBIC, CUBIC)
 
-_REDUCE = 1
-"""Number of the ``UndersampleStyle`` that takes a simpler spline where there are too few bins."""
-
-_CHEBYSHEV = 0
-"""Number of ``ApproximateControl::Style``; -1 is none."""
-
-_PARTS = 3
-"""HDUs of a background: means of the bins, mask, variance."""
+_REDUCE = 1  # Number of the ``UndersampleStyle`` that takes a simpler spline where there are too few bins
+_CHEBYSHEV = 0  # Number of ``ApproximateControl::Style``; -1 is none
+_PARTS = 3  # HDUs of a background: means of the bins, mask, variance
 
 
 def is_afw_background(hdus: fits.HDUList) -> bool:

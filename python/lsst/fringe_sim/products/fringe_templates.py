@@ -18,11 +18,8 @@ from .mask import mask_bits
 PER_SKY = "PERSKY"
 """Keyword of templates: whether they are parts of the sky; otherwise they are in the unit of the frames."""
 
-INPUT = re.compile(r"INPUT\d+")
-"""Keywords of templates with the digests of the frames that they were made of."""
-
-DIGITS = 16
-"""Digits of a digest that a keyword holds."""
+INPUT = re.compile(r"INPUT\d+")  # Keywords of templates with the digests of the frames that they were made of
+DIGITS = 16  # Digits of a digest that a keyword holds
 
 
 def input_cards(digests: Sequence[str]) -> dict[str, str]:

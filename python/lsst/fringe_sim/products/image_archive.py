@@ -20,15 +20,6 @@ from numpy.typing import NDArray
 
 from ..errors import FrameFormatError, MissingPackageError
 
-__all__ = [
-    "address_again",
-    "archive_cards",
-    "archive_planes",
-    "archived_background",
-    "is_archive",
-    "origin_of",
-]
-
 IMAGE = "IMAGE"
 
 _TREE, _INDEX = "JSON", "INDEX"

@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["without_constant_blocks"]
-
 BoolArray = NDArray[np.bool_]
 
 BLOCK_PX = 16

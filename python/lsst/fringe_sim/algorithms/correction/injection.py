@@ -13,25 +13,12 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 
-__all__ = [
-    "QUANTITIES",
-    "InjectionOptions",
-    "Measured",
-    "Source",
-    "bias_columns",
-    "free_places",
-    "inject_sources",
-    "injection_table",
-    "stamp_side",
-]
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 POINT, EXTENDED = "point", "extended"
 
-STAMP_FWHM = 6.0
-"""Side of the images of sources, in widths of the image of a star."""
+STAMP_FWHM = 6.0  # Side of the images of sources, in widths of the image of a star
 
 QUANTITIES = ("", "e1_", "e2_", "size_")
 """What is measured, as columns of tables begin: the flux, two components of the ellipticity, the size."""

@@ -15,13 +15,10 @@ from ...errors import UndeterminedError
 from .background import CUBIC, BackgroundTerms
 from .levels import FREE_LEVELS, LevelSpread
 
-__all__ = ["FrameSums", "Solution", "four_digits"]
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-TERMS = CUBIC * CUBIC
-"""Products of cubics in a cell."""
+TERMS = CUBIC * CUBIC  # Products of cubics in a cell
 
 RIDGE = 1e-9
 """Part of its mean that is added to the diagonal of the background's normal matrix: rounding of sums in float64 is

@@ -15,8 +15,6 @@ from .learned_columns import over_wavelength
 from .selection import Selector, chance_of
 from .spots import spot_channel
 
-__all__ = ["ACCURACY_SOURCE", "MODEL_ACCURACY", "chance_within_accuracy"]
-
 FloatArray = NDArray[np.float64]
 
 MODEL_ACCURACY = 0.014

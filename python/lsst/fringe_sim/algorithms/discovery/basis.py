@@ -14,12 +14,9 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from ...compiled import kernel
 
-__all__ = ["CellBasis", "FieldBasis", "NormalMatrix", "SplineBasis"]
-
 FloatArray = NDArray[np.float64]
 
-RIDGE = 1e-8
-"""Smallest curvature relative to the largest; keeps coefficients without data where they are."""
+RIDGE = 1e-8  # Smallest curvature relative to the largest; keeps coefficients without data where they are
 
 STIFFNESS = 1e-6
 """Curvature along differences of neighbouring coefficients, over the largest, that continues a fitted field."""

@@ -16,12 +16,9 @@ from ...products.fringe_cube import FringeCube
 from ...products.mask import mask_bits
 from ..flat_prep_options import GAUSSIAN_MAD
 
-__all__ = ["CellData", "bin_cube", "finest_useful_cell", "spectral_order"]
-
 FloatArray = NDArray[np.float64]
 
-LEAST_FILLED = 0.75
-"""Smallest part of good pixels with which a cell is used."""
+LEAST_FILLED = 0.75  # Smallest part of good pixels with which a cell is used
 
 BAD_PLANES = mask_bits("BAD", "SAT", "INTRP", "CR", "EDGE", "SUSPECT", "NO_DATA")
 
@@ -191,8 +188,7 @@ def _centroid(good: NDArray[np.bool_], count: FloatArray, cell_px: int) -> Float
 KEPT_PATTERN = 0.88
 """Part of the pattern's variance that cells must keep: a quarter of a fringe in a cell, which the model follows."""
 
-FEWEST_CELLS = 400
-"""Cells that coarser ones must leave."""
+FEWEST_CELLS = 400  # Cells that coarser ones must leave
 
 
 def finest_useful_cell(cube: FringeCube, *, most_cells: int, largest: int = 64) -> int:

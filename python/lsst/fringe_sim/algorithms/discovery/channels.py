@@ -14,37 +14,19 @@ from scipy.special import chdtrc, fdtrc, gammaincinv
 from ...effects import AMPLIFIERS, ImageGeometry
 from .fit import Columns, Design, FullColumns, PlaneColumns, Whitener
 
-__all__ = [
-    "Channel",
-    "State",
-    "beside_thickness",
-    "chance_beyond",
-    "combined_probability",
-    "fringe_phase",
-    "in_looks",
-    "measure_channels",
-    "project_test",
-]
-
 FloatArray = NDArray[np.float64]
 
 HARMONICS = 3
-BANDS = 8
-"""Bands of spatial frequency in the test of texture."""
-
-SPATIAL_ORDER = 4
-"""Cosine patterns up to this order along both axes together."""
-
-MEDIAN_OF_SQUARE = 2.0 * float(gammaincinv(0.5, 0.5))
-"""Median of χ² of one degree of freedom."""
+BANDS = 8  # Bands of spatial frequency in the test of texture
+SPATIAL_ORDER = 4  # Cosine patterns up to this order along both axes together
+MEDIAN_OF_SQUARE = 2.0 * float(gammaincinv(0.5, 0.5))  # Median of χ² of one degree of freedom
 
 RANK_TOLERANCE = 1e-7
 
 NEAREST_ECHO = 4
 """Cells below which a moved copy of the image is no echo: diffusion and thickness do that as well."""
 
-LEAST_OVERLAP = 0.1
-"""Part of the image that a copy must share with the sensor."""
+LEAST_OVERLAP = 0.1  # Part of the image that a copy must share with the sensor
 
 
 @dataclass(frozen=True, eq=False)

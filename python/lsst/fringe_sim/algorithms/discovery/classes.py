@@ -10,8 +10,6 @@ from itertools import islice
 from .fit import Fit
 from .selection import MOST_OF_PROMISE, Hypothesis, Selector, similarity
 
-__all__ = ["EffectClass", "classes_in_all_data", "classes_of", "outsider_probability", "outsiders_for_one"]
-
 MIMICKED = 0.05
 """Part of the causes outside the catalogue that effects in it can mimic, however strong they are."""
 
@@ -29,8 +27,7 @@ MUCH_OF_IT = 0.9
 as many that shift the phase are looked for at other sizes and in other orders."""
 
 LEAST_PROMISE = 4.0
-ALIKE = 0.8
-"""Fall of χ² and cosine of signatures from which on a replacement is fitted."""
+ALIKE = 0.8  # Fall of χ² and cosine of signatures from which on a replacement is fitted
 
 AS_MUCH, AS_MUCH_TRIED = 0.8, 5
 """Part of what an effect brings that others must promise to be fitted however they look, and how many of them: the
@@ -39,8 +36,7 @@ signature of a size that goes through many fringes is not the derivative."""
 WIDTHS_BEHIND = 3.0
 """How far a rival may be behind in the part of the data that is searched and still be compared in all data."""
 
-CHI2_PER_PARAMETER = 6.0
-"""Fall of χ² that a further parameter must bring, for a fit to be as good as another."""
+CHI2_PER_PARAMETER = 6.0  # Fall of χ² that a further parameter must bring, for a fit to be as good as another
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "FEW_CELLS",
-    "SAMPLED_CELLS",
-    "chi2_with_free_fringes",
-    "chi2_with_free_levels",
-    "fringe_order_um",
-    "local_minima",
-    "sampled_part",
-]
-
 FloatArray = NDArray[np.float64]
 
 SAMPLED_CELLS, FEW_CELLS = 400, 150

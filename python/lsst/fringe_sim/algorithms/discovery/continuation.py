@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-__all__ = ["continued"]
-
 FloatArray = NDArray[np.float64]
 
 STIFFNESS, NO_WEIGHT = 1e-3, 1e-12

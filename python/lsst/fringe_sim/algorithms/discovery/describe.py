@@ -17,26 +17,15 @@ from ..flat_prep_options import GAUSSIAN_MAD
 from .channels import Channel, State, fringe_phase
 from .verdict import Where
 
-__all__ = ["describe_residual", "disagreement", "places_apart"]
-
 FloatArray = NDArray[np.float64]
 
 PHASE_BINS = 16
 
-FEWEST_ROWS = 16
-"""Rows and columns of cells from which on scales and places say something."""
-
-PLACE_CELLS = 1.5
-"""Standard deviation of the window through which places are looked for [cells]."""
-
-PLACE_SIGMA = 6.0
-"""Standard deviations by which a place fits worse than the rest of the sensor."""
-
-LARGEST_PLACES = 0.25
-"""Part of the sensor beyond which a misfit is no longer one of places."""
-
-MOST_PLACES = 5
-"""Places that are listed, the worst first."""
+FEWEST_ROWS = 16  # Rows and columns of cells from which on scales and places say something
+PLACE_CELLS = 1.5  # Standard deviation of the window through which places are looked for [cells]
+PLACE_SIGMA = 6.0  # Standard deviations by which a place fits worse than the rest of the sensor
+LARGEST_PLACES = 0.25  # Part of the sensor beyond which a misfit is no longer one of places
+MOST_PLACES = 5  # Places that are listed, the worst first
 
 
 def disagreement(

@@ -10,15 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-__all__ = ["Disc", "Discs"]
-
 FloatArray = NDArray[np.float64]
 
 SMALLEST_RADIUS, LARGEST_PART, RADIUS_RATIO = 2.0, 0.35, 1.2
 """Radii that are tried: the smallest [cells], the largest over the shorter side, and one over the one before."""
 
-LEAST_SEEN = 0.3
-"""Part of a disc that must lie on cells with data."""
+LEAST_SEEN = 0.3  # Part of a disc that must lie on cells with data
 
 Disc = tuple[float, float, float, float]
 """Fall of χ² that a disc promises, its row, column and radius [cells]."""

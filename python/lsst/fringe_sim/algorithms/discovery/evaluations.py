@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
-__all__ = ["EvaluationCount", "OutOfTimeError", "count_evaluations", "note_evaluation", "time_limit"]
-
 
 class OutOfTimeError(Exception):
     """The time that a caller gave is over."""

@@ -11,8 +11,6 @@ from scipy.special import logsumexp
 
 from .fit import Coordinate, Fit
 
-__all__ = ["log_evidence", "prior_cost"]
-
 FloatArray = NDArray[np.float64]
 
 WIDTHS = np.geomspace(1e-4, 30.0, 141)

@@ -19,36 +19,16 @@ from .cells import CellData
 from .comparison import chi2_with_free_levels
 from .forward import Forward, Prediction
 
-__all__ = [
-    "Columns",
-    "Coordinate",
-    "Design",
-    "Fit",
-    "FullColumns",
-    "PlaneColumns",
-    "Problem",
-    "Whitener",
-    "coordinate_derivative",
-    "coordinates_of",
-    "fit_model",
-    "linearise_at",
-    "solve_symmetric",
-]
-
 FloatArray = NDArray[np.float64]
 
 PRIOR_WIDTH = 3.0
 """Width of the weak Cauchy prior of a parameter in units of its prior scale: what is large is not drawn to null."""
 
-LARGEST_PHASE_STEP_UM = 0.06
-"""Largest step of the fringe phase, as a thickness: a fifth of a fringe order."""
-
-WIDE_BLUR = 0.5
-"""Rms radius of a blur [cells] from which on a cell sees the thickness beside it."""
+LARGEST_PHASE_STEP_UM = 0.06  # Largest step of the fringe phase, as a thickness: a fifth of a fringe order
+WIDE_BLUR = 0.5  # Rms radius of a blur [cells] from which on a cell sees the thickness beside it
 
 MOST_ITERATIONS = 25
-CONVERGED = 0.02
-"""Change of χ² at which a fit stops."""
+CONVERGED = 0.02  # Change of χ² at which a fit stops
 
 FAR_BEHIND = 100.0
 CATCHING_UP = 75.0

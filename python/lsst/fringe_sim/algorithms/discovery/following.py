@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from .comparison import FEW_CELLS, chi2_with_free_fringes, fringe_order_um, sampled_part
 from .fit import Problem
 
-__all__ = ["ThicknessFollower"]
-
 FloatArray = NDArray[np.float64]
 
 SHIFTS_PER_ORDER, ORDERS_TRIED = 10, 1.5

@@ -18,8 +18,6 @@ from .cells import CellData
 from .evaluations import note_evaluation
 from .slopes import Slopes
 
-__all__ = ["Exposures", "Forward", "Prediction"]
-
 FloatArray = NDArray[np.float64]
 Settings = Mapping[str, float]
 
@@ -32,32 +30,15 @@ TABLE_TOLERANCE = 1e-9
 LINE_STEP_NM = 0.1
 """Spacing of wavelength nodes [nm]: five per fringe of detection layer and support together."""
 
-MARGIN_UM = 0.45
-"""Thickness beyond the field that a table covers [µm]: a step of a fit may not leave it."""
-
-NO_DISTANCE_PX = 1e-12
-"""Distance between the centroids of a cell that is rounding."""
-
-MOST_TABLE_BYTES = 400e6
-"""Memory of the tables kept for reuse."""
-
-MOST_ROWS = 8
-"""Rows kept for each exposure while wavelengths are moved."""
-
-LEAST_SPREAD = 1e-12
-"""Variance of the thickness in a cell that is rounding [steps of the table squared]."""
-
-UNIFORM = 1.8
-"""Fourth moment of what is uniform, over the square of its second."""
-
-LEAST_PART = 1e-6
-"""Part of a cell that is rounding."""
-
-_LEAST_LOOKUPS = 20_000
-"""Cells times wavelengths that are worth a thread."""
-
-_BLOCK = 256
-"""Cells that a core interpolates at a time."""
+MARGIN_UM = 0.45  # Thickness beyond the field that a table covers [µm]: a step of a fit may not leave it
+NO_DISTANCE_PX = 1e-12  # Distance between the centroids of a cell that is rounding
+MOST_TABLE_BYTES = 400e6  # Memory of the tables kept for reuse
+MOST_ROWS = 8  # Rows kept for each exposure while wavelengths are moved
+LEAST_SPREAD = 1e-12  # Variance of the thickness in a cell that is rounding [steps of the table squared]
+UNIFORM = 1.8  # Fourth moment of what is uniform, over the square of its second
+LEAST_PART = 1e-6  # Part of a cell that is rounding
+_LEAST_LOOKUPS = 20_000  # Cells times wavelengths that are worth a thread
+_BLOCK = 256  # Cells that a core interpolates at a time
 
 FARTHEST_UM = 3.0
 """Thickness by which a field may leave the first range [µm]: ten fringe orders. What goes farther does not fit."""

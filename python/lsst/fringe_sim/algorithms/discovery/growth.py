@@ -12,32 +12,22 @@ from .basis import SplineBasis
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
 
-__all__ = ["Grown", "SmoothFit", "fitted_smooth", "grown_thickness"]
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 KNOTS, TURNS = (8.0, 6.0), 3
 """Spacings of the spline that is fitted [cells], and how often each is tried: one may succeed where another fails."""
 
-GAIN = 0.995
-"""Part of χ² to which a growth must lower it."""
-
-SIDE = 3
-"""Side of the area in which the misfit is averaged [cells]."""
-
-STEP, STEPS_ACROSS = 3, 32
-"""Cells that a round goes further, and rounds that cross a large sensor at least."""
+GAIN = 0.995  # Part of χ² to which a growth must lower it
+SIDE = 3  # Side of the area in which the misfit is averaged [cells]
+STEP, STEPS_ACROSS = 3, 32  # Cells that a round goes further, and rounds that cross a large sensor at least
 
 GOOD, BAD, FEW_BAD = 1.7, 3.0, 0.001
 """Misfit over that of the better cells, up to which the model fits and from which it does not; the part of the cells
 that may be so."""
 
-BETTER_PART = 0.3
-"""Quantile of the misfit that stands for cells where the model fits."""
-
-NO_DATA = 1e-9
-"""Part of the data of a cell and its neighbours that is nothing but rounding."""
+BETTER_PART = 0.3  # Quantile of the misfit that stands for cells where the model fits
+NO_DATA = 1e-9  # Part of the data of a cell and its neighbours that is nothing but rounding
 
 CONTINUED_SIGMA_UM = 0.03
 """How far the thickness may move from a continuation with the least curvature, where that is new [µm]."""

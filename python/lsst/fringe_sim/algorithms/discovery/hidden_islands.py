@@ -14,8 +14,6 @@ from .fit import Fit, Problem, fit_model
 from .preparation import Prepared, prepare_again, smoother
 from .selection import Hypothesis, Selector
 
-__all__ = ["HiddenIsland", "hidden_island"]
-
 FloatArray = NDArray[np.float64]
 
 LEAST_PROMISED, LEAST_EXPLAINED = 0.2, 0.9

@@ -20,17 +20,6 @@ from .discs import Disc, Discs
 from .fit import Coordinate, Fit, Problem
 from .thickness_steps import best_thickness_step
 
-__all__ = [
-    "ANOTHER_ORDER",
-    "IslandStart",
-    "followed_on_island",
-    "island_starts",
-    "mended_on_islands",
-    "placed_on_island",
-    "start_at_step",
-    "thickness_on_islands",
-]
-
 FloatArray = NDArray[np.float64]
 
 SIZES_TRIED = (0.01, 0.02, 0.04)
@@ -52,8 +41,7 @@ COMPARED_THICKNESSES = 120
 ISLAND_CELLS = 400
 """Shifts of the thickness in a fringe order, and the thicknesses or cells on which they are compared."""
 
-ANOTHER_ORDER = 0.5
-"""Fringe orders from which on a thickness is another one, to which no fit gets by itself."""
+ANOTHER_ORDER = 0.5  # Fringe orders from which on a thickness is another one, to which no fit gets by itself
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,25 +22,17 @@ from .fit import Design, Fit, Problem, Projected, fit_model, linearise_at
 from .learned_columns import Family, families, with_learned
 from .validation import FEWEST_ROWS, misfit_rms, thickness_starts
 
-__all__ = ["FALSE_ALARMS", "Learned", "Prior", "evidence_of_correction", "judging_cells", "learn"]
-
 FloatArray = NDArray[np.float64]
 
-FALSE_ALARMS = 0.01
-"""Chance with which noise alone may seem to teach something."""
+FALSE_ALARMS = 0.01  # Chance with which noise alone may seem to teach something
 
 DRAWS = 199
 """Draws of noise. The rank of the data among them is an exact chance for any number (Phipson & Smyth 2010, doi
 10.2202/1544-6115.1585); with this many, one draw that is as good is still an alarm of one in a hundred."""
 
-ROUNDS = 1
-"""Rounds in which a correction is learned again about itself."""
-
-AT_ONCE = 20
-"""Draws that are in memory together."""
-
-TILE = 2
-"""Side of the tiles of cells of which every other is judged by."""
+ROUNDS = 1  # Rounds in which a correction is learned again about itself
+AT_ONCE = 20  # Draws that are in memory together
+TILE = 2  # Side of the tiles of cells of which every other is judged by
 
 SIZES = np.geomspace(1e-5, 0.1, 17)
 """Rms of a parameter that are tried: from what averages over all cells hide to what is as large as fringes."""

@@ -31,8 +31,6 @@ from .fit import (
 from .forward import Exposures, Forward
 from .next_step import Values
 
-__all__ = ["FrameForecast", "laboratory_of"]
-
 FloatArray = NDArray[np.float64]
 
 

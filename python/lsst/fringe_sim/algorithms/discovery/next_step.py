@@ -14,13 +14,8 @@ from ..next_measurement import Measurement, RankedMeasurement, break_ambiguity, 
 from .cells import CellData
 from .verdict import NamedEffect
 
-__all__ = ["Ranking", "Values", "flats_ranked", "with_next_measurements"]
-
-MOST_RIVALS = 4
-"""Members of a class, likeliest first, that a measurement is asked to tell from the effect."""
-
-MANY_PX = 100
-"""Side of the part of a sensor that is recommended instead of a few pixels [px]."""
+MOST_RIVALS = 4  # Members of a class, likeliest first, that a measurement is asked to tell from the effect
+MANY_PX = 100  # Side of the part of a sensor that is recommended instead of a few pixels [px]
 
 Values = Mapping[str, Mapping[str, float]]
 Ranking = Callable[[NamedEffect, Values], tuple[RankedMeasurement, ...]]

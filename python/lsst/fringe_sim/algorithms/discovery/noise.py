@@ -11,23 +11,17 @@ from numpy.typing import NDArray
 from ..flat_prep_options import GAUSSIAN_MAD
 from .cells import CellData
 
-__all__ = ["NoiseEstimate", "estimate_noise", "map_variance_share", "noise_ratio", "scatter_of_pixels"]
-
 FloatArray = NDArray[np.float64]
 
 LEAST_TRIPLES = 60
 """Fewest second differences from which a noise level is taken; with fewer, the stated variance is believed."""
 
-STATED_UNCERTAINTY = 0.2
-"""Relative uncertainty of a stated noise level that cannot be checked."""
+STATED_UNCERTAINTY = 0.2  # Relative uncertainty of a stated noise level that cannot be checked
 
 CLIP_SIGMA = 5.0
 
-MOST_TAKEN = 0.9
-"""Part of the variance of the noise that a thickness may take up and still be told from it."""
-
-LEAST_OTHERS = 2
-"""Wavelengths besides one that tell errors of a thickness map from noise."""
+MOST_TAKEN = 0.9  # Part of the variance of the noise that a thickness may take up and still be told from it
+LEAST_OTHERS = 2  # Wavelengths besides one that tell errors of a thickness map from noise
 
 
 @dataclass(frozen=True, eq=False)

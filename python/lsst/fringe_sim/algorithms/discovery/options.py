@@ -9,10 +9,7 @@ from ...errors import OutOfRangeError, UnknownNameError, named_units
 from .accuracy import MODEL_ACCURACY
 from .selection import Hypothesis
 
-__all__ = ["CORES", "SearchOptions"]
-
-CORES = ("present", "marginal")
-"""Searches that there are."""
+CORES = ("present", "marginal")  # Searches that there are
 
 
 @named_units

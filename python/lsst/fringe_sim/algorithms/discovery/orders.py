@@ -18,8 +18,6 @@ from .comparison import (
 )
 from .fit import Coordinate, Fit, Problem, fit_model
 
-__all__ = ["fields_in_other_orders", "starts_in_other_orders"]
-
 FloatArray = NDArray[np.float64]
 
 SIZES_TRIED = (0.1, 0.15, 0.23, 0.35, *(0.5 * n for n in range(1, 21)))
@@ -28,8 +26,7 @@ SIZES_TRIED = (0.1, 0.15, 0.23, 0.35, *(0.5 * n for n in range(1, 21)))
 PARTS_BETWEEN = (0.5, 0.25)
 """Parts of the distance to the next size by which the best ones of all orders are changed, in turn."""
 
-ORDERS_MOVED, STEPS_PER_ORDER = 6, 12
-"""How far the field is moved [fringe orders], and the steps to an order."""
+ORDERS_MOVED, STEPS_PER_ORDER = 6, 12  # How far the field is moved [fringe orders], and the steps to an order
 
 PLACES_REFITTED, STEPS_ALONE, PLACES_KEPT = 8, 8, 2
 """Places from which the size of an effect is fitted alone, the steps of such a fit (a fifth of an order at most, from

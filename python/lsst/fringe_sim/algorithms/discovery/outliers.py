@@ -11,25 +11,17 @@ from scipy.ndimage import binary_dilation, median_filter
 
 from ..flat_prep_options import GAUSSIAN_MAD
 
-__all__ = ["spoiled_cells"]
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-OUTLIER_SIGMA = 6.0
-"""Robust standard deviations beyond which a cell is spoiled."""
-
-GROWTH_SIGMA = 3.0
-"""The same for what adjoins a spoiled cell."""
-
-MOST_OF_A_PLANE = 0.02
-"""Part of a plane beyond which outliers are a pattern of their own, and stay."""
+OUTLIER_SIGMA = 6.0  # Robust standard deviations beyond which a cell is spoiled
+GROWTH_SIGMA = 3.0  # The same for what adjoins a spoiled cell
+MOST_OF_A_PLANE = 0.02  # Part of a plane beyond which outliers are a pattern of their own, and stay
 
 MOST_PLANES = 0.3
 """Part of the exposures beyond which what is wrong with a cell is not an accident of one of them."""
 
-NEIGHBOURHOOD = 7
-"""Side of the area whose median is taken off [cells]; a track covers less than half of it."""
+NEIGHBOURHOOD = 7  # Side of the area whose median is taken off [cells]; a track covers less than half of it
 
 TILE = 24
 """Side of the tiles in which the spread is taken [cells]: misfit of the model may be larger in some places."""

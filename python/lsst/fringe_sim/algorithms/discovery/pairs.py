@@ -13,8 +13,6 @@ from ...errors import InputError
 from .fit import Fit, FullColumns
 from .selection import Hypothesis, Selector, bounded_minimum
 
-__all__ = ["PairCandidate", "fitted_pair", "likely_pairs"]
-
 FloatArray = NDArray[np.float64]
 
 

@@ -14,8 +14,6 @@ from ...model import FringeModel
 from .cells import CellData
 from .start import SEARCH_STEP_UM, order_steps, robust_surface, search_template
 
-__all__ = ["is_torn", "joined_planes"]
-
 FloatArray = NDArray[np.float64]
 
 TORN = 0.01
@@ -30,14 +28,9 @@ STEEPEST, SLOPES = 0.35, 17
 """Steepest plane [fringe orders per cell], and slopes along an axis that are tried."""
 
 ORDERS = 4.0
-STRIDE = 2
-"""Fringe orders about a smooth thickness that are tried, and steps of the search at a time."""
-
-ORDERS_MOVED = 6.0
-"""Fringe orders by which all joined planes together are moved at most."""
-
-SURFACE_SPACING = 8.0
-"""Knots of the smooth thickness [cells]."""
+STRIDE = 2  # Fringe orders about a smooth thickness that are tried, and steps of the search at a time
+ORDERS_MOVED = 6.0  # Fringe orders by which all joined planes together are moved at most
+SURFACE_SPACING = 8.0  # Knots of the smooth thickness [cells]
 
 
 def is_torn(thickness_um: FloatArray, seen: NDArray[np.bool_], order_um: float) -> bool:

@@ -27,19 +27,6 @@ from .outliers import spoiled_cells
 from .planes import is_torn, joined_planes
 from .start import mended_thickness, starting_thickness
 
-__all__ = [
-    "Prepared",
-    "check_setup",
-    "field_bases",
-    "headers_apart",
-    "is_judged_better",
-    "prepare",
-    "prepare_again",
-    "prepare_finer",
-    "smoother",
-    "why_too_poor",
-]
-
 FloatArray = NDArray[np.float64]
 
 SPACINGS = (8.0, 4.0, 2.0)
@@ -61,26 +48,19 @@ MUCH_EXPLAINED, NOISE_SIGMAS = 0.5, 5.0
 along a side; the part of the misfit beyond noise that they may leave, and the uncertainty of that noise [standard
 deviations]."""
 
-PIXEL_RMS = 1.0 / math.sqrt(12.0)
-"""Rms radius of a pixel's area along one axis [px]."""
+PIXEL_RMS = 1.0 / math.sqrt(12.0)  # Rms radius of a pixel's area along one axis [px]
 
 SAME_AREA = 0.5
 """Part by which the variance of a blur may differ from what few places lack of an area, to be taken for it."""
 
-AREA_LOSS = 9.0
-"""Rise of χ² for which pixels are taken to see their area instead of few places and a blur."""
-
-RIM_CELLS = 2
-"""Cells on both sides of the rim of a local effect that do not decide how fine the thickness is."""
-
-FEWEST_ROWS = 6
-"""Rows and columns of cells from which on noise and levels can be measured."""
+AREA_LOSS = 9.0  # Rise of χ² for which pixels are taken to see their area instead of few places and a blur
+RIM_CELLS = 2  # Cells on both sides of the rim of a local effect that do not decide how fine the thickness is
+FEWEST_ROWS = 6  # Rows and columns of cells from which on noise and levels can be measured
 
 FEWEST_OF_A_MEAN = 500
 """Pixels in fewer rows or columns than that from which on their mean is about that of a fringe."""
 
-ORDERS_TRIED = 6
-"""Fringe orders on both sides of the first one in which a few pixels are fitted."""
+ORDERS_TRIED = 6  # Fringe orders on both sides of the first one in which a few pixels are fitted
 
 STEPS_PER_ORDER = 12
 

@@ -55,8 +55,6 @@ from .validation import (
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
 from .verdict_words import chance_text
 
-__all__ = ["SearchOptions", "discover"]
-
 FloatArray = NDArray[np.float64]
 
 _METRIC = "rms of data minus model, relative counts"

@@ -33,8 +33,6 @@ from .orders import fields_in_other_orders, starts_in_other_orders
 from .spots import log_evidence_of_spots, spot_channel
 from .trends import FEWEST_DRAWS, trend_channel
 
-__all__ = ["Candidate", "Hypothesis", "Selector", "bounded_minimum", "chance_of", "similarity"]
-
 FloatArray = NDArray[np.float64]
 
 
@@ -75,14 +73,9 @@ which on it is looked for once more."""
 MOST_OF_PROMISE = 0.9
 """Part of the promised fall of χ² that a fit must bring, to be believed to be in the same valley as its base."""
 
-PLACES_REFITTED = 10
-"""Minima in size and thickness from which a few pixels are fitted."""
-
-LEAST_MOVE_UM = 0.005
-"""Move of the thickness that a fit finds by itself [µm]."""
-
-PLACES_TRIED = 4
-"""How often a local effect is placed anew, and fitted from there."""
+PLACES_REFITTED = 10  # Minima in size and thickness from which a few pixels are fitted
+LEAST_MOVE_UM = 0.005  # Move of the thickness that a fit finds by itself [µm]
+PLACES_TRIED = 4  # How often a local effect is placed anew, and fitted from there
 
 STEPS_PER_MINIMUM = 5
 MINIMA_REFITTED = 4

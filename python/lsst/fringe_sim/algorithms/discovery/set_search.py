@@ -13,20 +13,14 @@ from .selection import IMPRECISION, Candidate, Hypothesis, Selector, chance_of, 
 from .validation import misfit_rms
 from .verdict import Step
 
-__all__ = ["SetSearch"]
-
-SURELY = 1e-7
-"""Chance of noise below which an effect is added to a set that leaves nothing else to see."""
-
-WORTH_FITTING = 9.0
-"""Fall of χ² that an effect must promise to be fitted."""
+SURELY = 1e-7  # Chance of noise below which an effect is added to a set that leaves nothing else to see
+WORTH_FITTING = 9.0  # Fall of χ² that an effect must promise to be fitted
 
 MORE_THAN_PROMISED, PROMISE_KEPT = 3.0, 1.5
 """By how much a fit may bring more than its score promised: where all effects are asked whether they can explain what
 is left, and beside a set that leaves noise. Of 140 fits to flats with one and two effects the most was 1.18."""
 
-MUCH_LEFT = 0.05
-"""χ² above that of noise, over the number of values, that is surely no error of the noise."""
+MUCH_LEFT = 0.05  # χ² above that of noise, over the number of values, that is surely no error of the noise
 
 HARDLY_LESS = 0.5
 """Part of that excess which one effect must take off, or further ones promise, for sets of several to be tried."""

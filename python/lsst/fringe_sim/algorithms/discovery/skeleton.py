@@ -15,12 +15,9 @@ from ...model.effects_override import effects_override, ended
 if TYPE_CHECKING:
     from .verdict import Verdict
 
-__all__ = ["effect_skeleton", "learned_files", "patterns_of", "wave_form"]
-
 FloatArray = NDArray[np.float64]
 
-PHASES = 16
-"""Places in the fringe phase at which a wave form is written down."""
+PHASES = 16  # Places in the fringe phase at which a wave form is written down
 
 _ON_RESPONSE = ("response", "change_system(self, system, values)", "change_system(system, learned)")
 _ON_IMAGE = ("image", "change_image(self, image, values, geometry)", "change_image(image, learned, geometry)")

@@ -45,29 +45,17 @@ from .noise import scatter_of_pixels
 from .search import Report, SearchOptions, search_exposures
 from .verdict import Verdict
 
-__all__ = ["SKY_SEARCH", "SkyExposures", "discover_sky", "placement_in_frames"]
-
 FloatArray = NDArray[np.float64]
-Grid = tuple[float, float, int]
-"""First, step [µm] and number of thicknesses."""
-
-LINE_ANGLES = 40
-"""Angles of the beam for lines."""
-
-CONTINUUM_ANGLES = 8
-"""Angles for continua, whose fringes average out over wavelength."""
-
-CONTINUUM_STEP_NM = 0.2
-"""Spacing of the wavelengths that stand for a continuum [nm]."""
-
-FLAT_STEP_NM = 0.05
-"""Spacing of the wavelengths that stand for the light of flat fields [nm]."""
+Grid = tuple[float, float, int]  # First, step [µm] and number of thicknesses
+LINE_ANGLES = 40  # Angles of the beam for lines
+CONTINUUM_ANGLES = 8  # Angles for continua, whose fringes average out over wavelength
+CONTINUUM_STEP_NM = 0.2  # Spacing of the wavelengths that stand for a continuum [nm]
+FLAT_STEP_NM = 0.05  # Spacing of the wavelengths that stand for the light of flat fields [nm]
 
 RADII, FEW_RADII = 8, 3
 """Field radii at which the beams of a sensor are summed in full, and those for what an effect changes."""
 
-LINE_SHIFT_NM = 0.02
-"""Rms shift of the lines that are merged [nm]."""
+LINE_SHIFT_NM = 0.02  # Rms shift of the lines that are merged [nm]
 
 TOLERANCE = 1e-7
 """Error of the sums over harmonics, relative to the fringes of one line, 300 times those of all together."""
@@ -76,14 +64,12 @@ LEAST_SCATTER_E, COUNTED_E = 1.0, 100.0
 """Scatter of pixels that counted electrons have, whatever was averaged: whole numbers alone scatter by 0.3. And the
 level above which they scatter by ten times that [e⁻]."""
 
-AIRMASS_RANGE = 0.2
-"""Largest difference in airmass of frames that are searched together."""
+AIRMASS_RANGE = 0.2  # Largest difference in airmass of frames that are searched together
 
 SKY_SEARCH = SearchOptions(most_effects=2, refits=6, parents=2)
 """Fewer trials than for flats: each costs seconds, and one pattern does not tell three effects apart."""
 
-_KEPT = 16
-"""Sensors whose reductions are kept: parameters of the sky move while one of them stays."""
+_KEPT = 16  # Sensors whose reductions are kept: parameters of the sky move while one of them stays
 
 _NO_DATA = mask_bits("NO_DATA")
 

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 
-__all__ = ["Slopes"]
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
@@ -34,8 +32,7 @@ CURVED = (
 )
 """The same to fourth order, at the rim to second."""
 
-REACH = max(abs(step) for stencil in CURVED for step in stencil)
-"""Farthest neighbour of a cell."""
+REACH = max(abs(step) for stencil in CURVED for step in stencil)  # Farthest neighbour of a cell
 
 LARGEST_CORRECTION = 0.2
 """Part of the slope to the neighbours by which that to fourth order may differ: beyond it the field is no smooth one

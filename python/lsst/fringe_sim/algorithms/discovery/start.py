@@ -17,26 +17,12 @@ from .basis import SplineBasis
 from .cells import CellData
 from .comparison import chi2_with_free_fringes
 
-__all__ = [
-    "SEARCH_STEP_UM",
-    "mended_thickness",
-    "order_steps",
-    "robust_surface",
-    "search_template",
-    "starting_thickness",
-]
-
 FloatArray = NDArray[np.float64]
 
 SEARCH_STEP_UM = 0.01
-HALF_WINDOW_UM = 0.12
-"""Reach of the search around a neighbour's thickness [µm]; below half a fringe order."""
-
-CELLS_AT_ONCE = 256
-"""Cells that are worth a thread."""
-
-FEWEST_ROWS = 12
-"""Rows and columns of cells from which on they are looked at together."""
+HALF_WINDOW_UM = 0.12  # Reach of the search around a neighbour's thickness [µm]; below half a fringe order
+CELLS_AT_ONCE = 256  # Cells that are worth a thread
+FEWEST_ROWS = 12  # Rows and columns of cells from which on they are looked at together
 
 PATCH_ROUNDS = 6
 LARGEST_PATCH = 0.1

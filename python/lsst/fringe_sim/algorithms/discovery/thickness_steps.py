@@ -13,8 +13,6 @@ from .channels import State
 from .discs import Disc, Discs
 from .fit import Design
 
-__all__ = ["best_thickness_step"]
-
 FloatArray = NDArray[np.float64]
 
 SMALLEST_RADIUS, MIDDLES_PER_RADIUS = 2.8, 2.0
@@ -23,8 +21,7 @@ which it is computed what one does take up."""
 
 DISCS_AT_ONCE = 400
 
-LEAST_LEFT = 0.02
-"""Part of what a disc does that a smooth thickness must leave."""
+LEAST_LEFT = 0.02  # Part of what a disc does that a smooth thickness must leave
 
 
 def best_thickness_step(state: State) -> tuple[Disc, float]:

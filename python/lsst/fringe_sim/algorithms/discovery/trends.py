@@ -8,12 +8,9 @@ from scipy.special import fdtrc
 
 from .channels import Channel
 
-__all__ = ["FEWEST_DRAWS", "trend_channel"]
-
 FloatArray = NDArray[np.float64]
 
-ORDER = 3
-"""Order of the polynomial in wavelength that draws do not follow."""
+ORDER = 3  # Order of the polynomial in wavelength that draws do not follow
 
 FEWEST_DRAWS = 6
 

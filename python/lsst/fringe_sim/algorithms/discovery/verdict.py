@@ -21,18 +21,7 @@ from .verdict_words import accuracy_text, learned_text
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = [
-    "Gap",
-    "NamedEffect",
-    "ParameterValue",
-    "Step",
-    "Verdict",
-    "Where",
-    "probability_text",
-]
-
-MOST_CANDIDATES = 15
-"""Effects that a picture shows at most."""
+MOST_CANDIDATES = 15  # Effects that a picture shows at most
 
 _SIZES = ("of_counts", "of_fringes", "of_fringes_at_most")
 
