@@ -31,8 +31,6 @@ from lsst.fringe_sim.middleware.raw_ingest import ingest_raws
 from lsst.fringe_sim.middleware.repository import recover_repository
 from lsst.fringe_sim.mock.raw_frames import write_mock_flats
 
-__all__ = ["Chain", "Ended", "Undisturbed", "make_template", "thickness_um"]
-
 SEED_CONFIG = "resource://lsst.fringe_sim/configs/butler.yaml"
 PIPELINE = "resource://lsst.fringe_sim/pipelines/ts8/labFlats.yaml"
 SENSOR = "RTM-020_S01"

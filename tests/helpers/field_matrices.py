@@ -10,8 +10,6 @@ from scipy.interpolate import CubicSpline
 
 from lsst.fringe_sim.optics import get_medium
 
-__all__ = ["ForeignSensor", "Stain", "Window"]
-
 KELVIN = 183.15
 LINE_NM = 2.0
 """Full width of a Gaussian line [nm]."""

@@ -7,8 +7,6 @@ import numpy as np
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FlatExposures, FringeCube
 
-__all__ = ["TEN_NM", "relative_flats"]
-
 TEN_NM = np.arange(880.0, 991.0, 10.0)
 
 

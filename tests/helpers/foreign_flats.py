@@ -9,8 +9,6 @@ from field_matrices import KELVIN, LINE_NM, ForeignSensor
 
 from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
 
-__all__ = ["ForeignCharge", "exposed", "smooth_map"]
-
 WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 READ_NOISE_E = 6.0
 PLACES = 5

@@ -16,8 +16,6 @@ import numpy as np
 
 import lsst.fringe_sim
 
-__all__ = ["ForeignClutter", "ForeignFrame", "ForeignSky", "Media", "foreign_map", "foreign_night"]
-
 DATA = Path(lsst.fringe_sim.__file__).parent / "data"
 
 ABOVE = ((1.375, 0.1221), (2.10, 0.0441))

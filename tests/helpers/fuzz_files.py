@@ -10,8 +10,6 @@ from typing import Any
 from astropy.io import fits
 from hypothesis import strategies as st
 
-__all__ = ["alter_fits", "plain_header"]
-
 CARD, BLOCK = 80, 2880
 
 VALUES = st.one_of(

@@ -7,8 +7,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["HARD_MAPS"]
-
 FRINGE_ORDER_UM = 0.300
 """Thickness of one fringe order at 960 nm in an adhesive of index 1.6 [µm]."""
 

@@ -21,8 +21,6 @@ from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FlatExposures, FringeCube, ThicknessMap
 
-__all__ = ["CERTAIN", "ROWS", "Laboratory", "Result", "expected_margin", "fit_one", "judge", "make_flats"]
-
 TEN_NM = np.arange(880.0, 991.0, 10.0)
 ORDER_UM = 0.3
 GRID_UM = 0.002

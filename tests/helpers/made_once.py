@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["made_once"]
-
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """Folder that the first worker fills and that the others wait for; not to be changed."""

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["ObservedNight", "observed_night"]
-
 LEVEL = 2000.0
 
 

@@ -21,8 +21,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-__all__ = ["PostgresServer", "UnavailableError", "postgres_server"]
-
 PR_SET_PDEATHSIG = 1
 """Linux: a signal for a process whose parent has died."""
 

@@ -23,8 +23,6 @@ from astropy.io import fits
 from astropy.table import Table
 from PIL import Image
 
-__all__ = ["Record", "Words", "differences", "numbers_of"]
-
 RELATIVE, RELATIVE_ELSEWHERE = 1e-6, 1e-3
 """Part of a number by which it may differ. Other processors sum in another order, so that a pixel at a limit may fall
 on its other side."""

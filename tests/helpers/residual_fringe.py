@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
-__all__ = ["residual_fringe"]
-
 
 @dataclass(frozen=True)
 class Residual:

@@ -21,8 +21,6 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 from recorded_numbers import Words
 
-__all__ = ["drawn", "seen_of_page"]
-
 _TABLE = re.compile(r'download="([^"]+)\.ecsv" href="data:text/plain;base64,([^"]+)"')
 _UNREAD = re.compile(r'<div class="(?:all )?made">.*?</div>|<style>.*?</style>|"data:[^"]*"|<pre>.*?</pre>')
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 import pytest
 
-__all__ = ["Share", "group_of"]
-
 
 @dataclass(frozen=True)
 class Share:

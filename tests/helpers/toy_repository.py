@@ -12,8 +12,6 @@ from raw_frame_maker import write_raw
 
 from lsst.fringe_sim.middleware.raw_ingest import ingest_raws
 
-__all__ = ["PIPELINE", "SENSORS", "Invoke", "fill", "put_fringe"]
-
 Invoke = Callable[..., click.testing.Result]
 
 PIPELINE = Path(__file__).with_name("toy_pipeline.yaml")
