@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Column, Table, vstack
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray
 from ..effects import activate_effects, known_effects
 from ..effects.active import settings_of
 from ..errors import InputError
@@ -30,8 +31,6 @@ from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
 from .sky_frame import SkyQuadrature
 from .sky_response import tabulate_components, white_light
 from .thickness_stand_in import stand_in_thickness
-
-FloatArray = NDArray[np.float64]
 
 EDGE_DEG = 1.44  # Field radius that the paper calls the edge of the focal plane [deg]
 

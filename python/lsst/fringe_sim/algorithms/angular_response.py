@@ -7,8 +7,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.ray_bundle import reduce_beam
@@ -25,8 +26,6 @@ from .sky_response import (
     tabulate_components,
     white_light,
 )
-
-FloatArray = NDArray[np.float64]
 
 ANGLES = 192
 """Nodes in sin²θ for lines: 3e-5 of the peak-to-peak of an LSST sky frame at any radius (128 give 2e-3)."""

@@ -11,12 +11,11 @@ from astropy.table import Table
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform
 
+from ..array_types import FloatArray
 from ..errors import named_units
 from ..products import SkyFringe
 from .coadds import VisitPlaces, filled_pattern, patterns_left, placed_visits
 from .correction.injection import InjectionOptions, Source, bias_columns, free_places, stamp_side
-
-FloatArray = NDArray[np.float64]
 
 SINGLE = 8  # Single visits that are looked at; each has some dozens of sources of a kind and flux
 

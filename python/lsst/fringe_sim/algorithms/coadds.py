@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, spline_filter
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, named_units
 from ..products import SkyFringe
 from ..resources import read_user_table
-
-FloatArray = NDArray[np.float64]
 
 COUNTS = (1, 10, 100, 1000)  # Exposures in coadds that are looked at, besides the deepest
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import FloatArray
 from ..compiled import contiguous, kernel, run_shares
 from ..errors import InputError, OutOfRangeError
 from ..instrument.beam_field import BeamField
@@ -28,8 +29,6 @@ from .island_response import parts_of, response_with_islands
 from .sensor_placement import SensorPlacement
 from .sky_frame import is_band, sky_response
 from .sky_response import Response, component_factors
-
-FloatArray = NDArray[np.float64]
 
 RADIUS_STEP_DEG = 0.005
 """Spacing of the tabulated field radii. Where the pupil is vignetted, beyond 1.75 deg, the phase of the light from

@@ -25,13 +25,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, named_units
 from ..model import FringeModel
 from .flat_rivals import SEARCH_STRIDE, ChosenFlats, Curves, PlannedFlat, RankedFlat, Rivals
-
-FloatArray = NDArray[np.float64]
 
 FEWEST_FLATS = 4  # A fit of fewer wavelengths is flagged
 MOST_FLATS = 24

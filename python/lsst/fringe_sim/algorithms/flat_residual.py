@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..effects import ImageGeometry, apply_to_image
 from ..errors import InputError, named_units
 from ..model import FringeModel
@@ -25,8 +26,6 @@ __all__ = [
     "relative_flats",
     "residual_pair",
 ]
-
-FloatArray = NDArray[np.float64]
 
 
 @named_units
@@ -101,7 +100,7 @@ def flat_residual(
     cube: FringeCube,
     model: FringeModel,
     thickness_um: NDArray[np.floating],
-    contrast: NDArray[np.float64] | None = None,
+    contrast: FloatArray | None = None,
 ) -> NDArray[np.float32]:
     """Flats minus model at a given thickness, each plane over its mean.
 

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
+from ..array_types import FloatArray
 from ..errors import OutOfRangeError
 from ..model import FringeModel
-
-FloatArray = NDArray[np.float64]
 
 NODES_PER_ORDER = 24
 """Nodes in one order; between them cubic interpolation with exact slopes is good to 1e-5 of the swing."""

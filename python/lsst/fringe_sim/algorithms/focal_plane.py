@@ -16,6 +16,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
@@ -26,8 +27,6 @@ from ..model import FringeModel
 from .field_response import SensorPlacement, SensorResponse
 from .fringe_amplitudes import FringeAmplitudes, fringe_amplitudes
 from .sky_frame import component_electrons
-
-FloatArray = NDArray[np.float64]
 
 DES_CRITERION = 0.1
 """Residual fringe over shot noise, at scales up to 20 arcsec, that the Dark Energy Survey asks for."""

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from threadpoolctl import threadpool_limits
 
+from ..array_types import BoolArray, FloatArray
 from ..errors import InputError
 from ..products import SkyFringe
-
-FloatArray = NDArray[np.float64]
 
 TILE_BYTES = 8 * 2**20  # Memory of one tile of all frames
 
@@ -33,7 +32,7 @@ class FrameStack:
     frames: tuple[Any, ...]  # images of one shape, N of them, that can be sliced by rows
     # (ny, nx): pixels that are used. Those without a value in some frame are taken out as the frames are
     # read.
-    good: NDArray[np.bool_]
+    good: BoolArray
     offset: FloatArray  # (N,): what is subtracted from every frame
     unit: float  # what they are divided by
     # Variance of the noise of a pixel of a frame, in that unit; 0 where it is not known

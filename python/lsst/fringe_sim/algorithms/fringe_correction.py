@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import BoolArray, FloatArray
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError, named_units, to_number
 from ..products import CORRECTED, FringeFrame, refuse_corrected
@@ -34,8 +35,6 @@ __all__ = [
     "refuse_uncorrected",
     "undo_correction",
 ]
-
-FloatArray = NDArray[np.float64]
 
 Templates: TypeAlias = "TemplateSet | Sequence[FringeFrame] | ArrayLike"
 
@@ -85,7 +84,7 @@ class TemplateSet:
 
     patterns: list[NDArray[np.float32]]
     variances: list[NDArray[np.float32]]
-    unknown: NDArray[np.bool_]
+    unknown: BoolArray
     identity: str
     metadata: list[Mapping[str, Any]] = field(default_factory=list)
 
@@ -159,7 +158,7 @@ class FringeCorrection:
     """
 
     image: NDArray[Any]
-    uncorrected: NDArray[np.bool_]
+    uncorrected: BoolArray
     scale: FloatArray
     covariance: FloatArray
     frame: FrameFit
@@ -298,7 +297,7 @@ def refuse_uncorrected(header: Mapping[str, Any], source: str | None = None) -> 
         raise InputError(CORRECTED, None, "an exposure that was corrected by this package", source=source)
 
 
-def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
+def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) -> FloatArray:
     """Scales of all templates by a header of ours; 0 if they were not seen, and nothing was subtracted."""
     if header[CORRECTED] == 0:
         return np.zeros(len(patterns))
@@ -348,7 +347,7 @@ def component_patterns(thickness_um: ArrayLike, response: SkyResponse) -> NDArra
     return patterns
 
 
-def _pattern(template: FringeFrame | ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _pattern(template: FringeFrame | ArrayLike) -> tuple[NDArray[np.float32], BoolArray]:
     """A template, and where it has no value."""
     if isinstance(template, FringeFrame):
         return template.image, template.mask != 0

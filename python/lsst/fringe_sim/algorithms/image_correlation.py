@@ -14,9 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import affine_transform, spline_filter
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError
 
 __all__ = [
@@ -28,8 +29,6 @@ __all__ = [
     "correlation_function",
     "random_cutout",
 ]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,10 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, named_units
 from ..instrument.camera import Camera
 from ..instrument.night import AirglowField
@@ -28,8 +29,6 @@ from .sky_frame import sky_response
 from .thickness_stand_in import ThicknessField
 
 __all__ = ["CCDFringing", "SkyDirection"]
-
-FloatArray = NDArray[np.float64]
 
 SENSOR = "R22_S11"
 """All e2v sensors are of this shape."""

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import FloatArray
 from ..effects import ActiveEffect, ImageGeometry
 from ..model import FringeModel
 
 if TYPE_CHECKING:
     from .sky_response import FrameTable, Response
-
-FloatArray = NDArray[np.float64]
 
 
 def response_with_islands(model: FringeModel, respond: Callable[[FringeModel], Response]) -> Response:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import FloatArray, FloatImage
 from ..effects.at_telescope import ADHESIVE_PHASE_SIGMA, adhesive_change
 from ..errors import OutOfRangeError
 from ..model import FringeModel
@@ -19,9 +20,6 @@ from ..products import FringeFrame, mask_bits
 from .sky_response import FrameTable, Response
 
 __all__ = ["ADHESIVE_PHASE_SIGMA", "phase_change", "template_pair", "widened_um"]
-
-FloatArray = NDArray[np.float64]
-FloatImage = NDArray[np.float32]
 
 LARGEST_SIGMA = 2.0  # Bound of the effect `epoxy_temperature` [rad per 10 K]
 

@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtr, stdtr
 
+from ..array_types import BoolArray, FloatArray
 from ..deprecation import deprecated
 from ..errors import InputError, OutOfRangeError, UndeterminedError, named_units
 from ..products import ThicknessMap, mask_bits
@@ -17,8 +18,6 @@ from .night_levels import BAND_SIGMA
 from .range_cells import PARTS, FittedMap, Polynomial, RangeCells, Seed, across_degrees, down_degrees
 
 __all__ = ["MODEL_ACCURACY", "ORDER_ERROR", "RangeMap", "map_from_range"]
-
-FloatArray = NDArray[np.float64]
 
 STEPS_PER_ORDER = 12
 """Thicknesses in an order that planes are tried at."""
@@ -80,7 +79,7 @@ class RangeMap:
 
     thickness_um: FloatArray
     sigma_um: FloatArray
-    known: NDArray[np.bool_]
+    known: BoolArray
     order_probability: float
     apart: float
     strength: float
@@ -276,7 +275,7 @@ def _grown(problem: RangeCells, seed: Seed) -> FittedMap | None:
     return _followed(problem, start, near & (problem.weight > 0.0))
 
 
-def _followed(problem: RangeCells, start: FloatArray, used: NDArray[np.bool_]) -> FittedMap | None:
+def _followed(problem: RangeCells, start: FloatArray, used: BoolArray) -> FittedMap | None:
     """Fit cells, and then those that they tell."""
     coefficient = start
     limit = FOLLOWED_ORDERS * problem.order_um
@@ -308,7 +307,7 @@ def _widened(
     problem: RangeCells,
     covariance: FloatArray,
     thickness: FloatArray,
-    used: NDArray[np.bool_],
+    used: BoolArray,
     level: FloatArray,
 ) -> FloatArray:
     """Covariance with what the residuals of parts have in common (Liang & Zeger 1986, Biometrika 73, 13)."""
@@ -322,9 +321,7 @@ def _widened(
     return np.asarray(covariance + sandwich)
 
 
-def _step(
-    problem: RangeCells, coefficient: FloatArray, used: NDArray[np.bool_]
-) -> tuple[FloatArray, FloatArray]:
+def _step(problem: RangeCells, coefficient: FloatArray, used: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Step of Gauss and Newton, and covariance of the map; strength of the fringes and background are free."""
     terms, weight = problem.terms[used], problem.weight[used]
     thickness = terms @ coefficient
@@ -350,7 +347,7 @@ def _step(
 
 
 def _left(
-    problem: RangeCells, thickness: FloatArray | None, used: NDArray[np.bool_]
+    problem: RangeCells, thickness: FloatArray | None, used: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Squared pulls of all cells, and what some cells tell: the strength of the fringes, if any, and a background."""
     beside = _beside(problem, thickness)
@@ -385,7 +382,7 @@ def _other_orders(problem: RangeCells, first: FittedMap) -> list[FittedMap]:
     return [each for each in found if each is not None]
 
 
-def _seen(problem: RangeCells, best: FittedMap) -> NDArray[np.bool_]:
+def _seen(problem: RangeCells, best: FittedMap) -> BoolArray:
     """Cells of parts that are likelier with the fringes of a map than without them or with shifted ones."""
     part = problem.parts()
     without, _ = _left(problem, None, best.followed)

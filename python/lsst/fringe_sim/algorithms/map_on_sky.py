@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from ..array_types import FloatArray
 from ..errors import InputError, named_units
 from ..notebook import do_nothing
 from ..products import ObservedFrame, ThicknessMap, mask_bits
@@ -20,8 +21,6 @@ from .fringe_correction import CorrectionOptions
 from .observed_frames import frame_weight
 from .sky_response import FrameTable, Response
 from .sky_shift import MAP_SIGMA_ORDERS, SkyShift, fit_sky_shift
-
-FloatArray = NDArray[np.float64]
 
 LARGEST_STEP_RAD = 0.5
 """Change of phase from one end of a cell of pixels to the other in all but a twentieth of the cells: the mean of the

@@ -7,14 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..effects import Effect, ImageGeometry, Parameter, activate_effects, apply_to_image
 from ..errors import OutOfRangeError
 from ..model import FringeModel
 from .flat_series import FlatSeries
-
-FloatArray = NDArray[np.float64]
 
 Report = Callable[[str], None]
 

@@ -26,7 +26,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ..effects import Effect, known_effects
@@ -34,8 +33,6 @@ from ..errors import InputError, UnknownNameError, named_units
 from ..model import FringeModel
 from .flat_series import LEVEL_E, FlatSeries
 from .measurement_forecast import Forecast, Report, Sample, Tested
-
-FloatArray = NDArray[np.float64]
 
 HIGH_LEVEL_E = 80_000.0
 NARROW_FWHM_NM = 0.5

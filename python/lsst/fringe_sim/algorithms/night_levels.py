@@ -6,9 +6,9 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ..array_types import FloatArray
+
 Predictor = Callable[[FloatArray], FloatArray]
 
 BAND_SIGMA = 1.0

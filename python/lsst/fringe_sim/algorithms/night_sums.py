@@ -13,14 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..compiled import kernel, subkernel
 from .night_levels import background_terms
 from .sky_model_error import Envelope
 from .smooth_field import Splines
 
 __all__ = ["BACKGROUND", "NightSums", "Slopes"]
-
-FloatArray = NDArray[np.float64]
 
 PIECE_PX = 128
 """Pixels of a piece of a row."""

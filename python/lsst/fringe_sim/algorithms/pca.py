@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import BoolArray, FloatArray
 from ..errors import InputError, OutOfRangeError, named_units
 from ..model import ResponseTable
 from ..products import FringeComponents, FringeFrame, SkyFringe, mask_bits, refuse_corrected
@@ -35,8 +36,6 @@ __all__ = [
     "project",
     "significant_components",
 ]
-
-FloatArray = NDArray[np.float64]
 
 _ROUNDING = 1e-13
 """Share of the variance below which an eigenvalue is rounding of float32 frames."""
@@ -417,7 +416,7 @@ def _dot(one: FloatArray, two: FloatArray) -> float:
     return float(np.vdot(one, two))
 
 
-def _zero_mean(image: NDArray[np.float32], good: NDArray[np.bool_]) -> FloatArray:
+def _zero_mean(image: NDArray[np.float32], good: BoolArray) -> FloatArray:
     values = np.where(good, image, 0.0).astype(np.float64)
     return np.where(good, values - values.sum() / good.sum(), 0.0)
 

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import convolve
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError
 from ..instrument.sky import SpectralComponent
 from ..instrument.telescope import RayBundle
 from ..optics import LayerStack
-
-FloatArray = NDArray[np.float64]
 
 _DEPTHS = 256  # Equally probable depths that stand for the distribution of depth
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray
 from ..errors import InputError
 from .frame_stack import TILE_BYTES
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

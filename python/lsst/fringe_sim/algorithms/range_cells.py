@@ -11,7 +11,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from ..array_types import BoolArray, FloatArray
 
 DEGREE, BACKGROUND_DEGREE = 8, 1
 """Degrees of the polynomials of the map and, along either side, of a background beside the fringes."""
@@ -80,7 +80,7 @@ class FittedMap:
     covariance: FloatArray
     thickness_um: FloatArray
     residual2: FloatArray  # squared pulls of all cells
-    followed: NDArray[np.bool_]
+    followed: BoolArray
     level: FloatArray  # strength of the fringes, and the background
 
     @property

@@ -7,17 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, named_units
 from ..products import ObservedFrame
 from .fringe_correction import CorrectionOptions
 from .map_on_sky import fringes_alone
 
 __all__ = ["RangeForecast", "forecast_of_range", "frame_noise"]
-
-FloatArray = NDArray[np.float64]
 
 STEPS_PER_ORDER = 24
 """Thicknesses in one fringe order at which the sky is asked: 15 degrees of phase."""

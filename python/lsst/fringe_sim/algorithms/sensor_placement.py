@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray
 from ..instrument.detector import Detector
 from ..products import SensorSection
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

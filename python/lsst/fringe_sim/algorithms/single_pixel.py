@@ -8,15 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray
 from ..errors import InputError, named_units
 from ..model import FringeModel
 from ..resources import read_table
 
 __all__ = ["SinglePixelFit", "fit_single_pixel", "published_pixel"]
-
-FloatArray = NDArray[np.float64]
 
 GRID_STEP_UM = 0.002
 """Spacing of the searched thicknesses [µm]; 150 per fringe order."""

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import BoolArray
 from ..effects import ImageGeometry, apply_to_image
 from ..errors import InputError, OutOfRangeError, named_units
 from ..instrument.bandpass import Bandpass
@@ -37,8 +38,6 @@ __all__ = [
     "sky_response",
     "throughput_electrons",
 ]
-
-FloatArray = NDArray[np.float64]
 
 _BASELINE_HOUR = 19.0
 """Local time of hour 0 of a night [h]."""
@@ -257,7 +256,7 @@ def component_electrons(
 def _with_image_effects(
     model: FringeModel,
     image: NDArray[np.float32],
-    known: NDArray[np.bool_],
+    known: BoolArray,
     wavelength_nm: float,
     to_electrons: float,
 ) -> NDArray[np.float32]:
@@ -278,7 +277,7 @@ def _with_image_effects(
     return np.where(known, mean * changed, np.nan).astype(np.float32)
 
 
-def _spread(image: NDArray[np.float32], known: NDArray[np.bool_], kernel: ArrayLike) -> NDArray[np.float32]:
+def _spread(image: NDArray[np.float32], known: BoolArray, kernel: ArrayLike) -> NDArray[np.float32]:
     """Frame after photon migration; pixels that are not known take part with the mean of the others."""
     mean = np.float32(image.mean(dtype=np.float64, where=known))
     spread = spread_charge(np.where(known, image, mean), kernel)

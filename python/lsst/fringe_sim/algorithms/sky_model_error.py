@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import named_units
 
 __all__ = ["Envelope", "ModelError"]
-
-FloatArray = NDArray[np.float64]
 
 SPACING_ORDERS = 3.0
 """Distance of the thicknesses between which an error of the envelope changes [orders]: lines of a y band differ in

@@ -12,8 +12,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray, FloatImage
 from ..errors import InputError, OutOfRangeError
 from ..instrument.camera import Camera
 from ..instrument.sky import SkySpectrum
@@ -24,8 +25,6 @@ from .field_response import SensorPlacement, sensor_response
 from .laboratory_shift import widened_um
 from .sky_response import FrameTable, Response, bandpass_of
 
-FloatArray = NDArray[np.float64]
-FloatImage = NDArray[np.float32]
 Respond = Callable[[FringeModel, tuple[float, float], tuple[Response, ...]], Response]
 
 NODES_PER_ORDER = 10

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import FloatArray
 from ..effects import apply_to_sky
 from ..errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ..instrument.bandpass import Bandpass
@@ -18,8 +19,6 @@ from ..instrument.telescope import reduce_beam
 from ..model import FringeModel, ResponseTable, tabulate
 from ..optics import Beam, Illumination
 from ..optics.phase_response import PhaseResponse
-
-FloatArray = NDArray[np.float64]
 
 _ERROR_SAMPLES = 48  # Thicknesses at which the quadrature is compared with a finer one
 _BOUND_ANGLES = 6  # Angles that stand for a beam where no phases are involved

@@ -9,17 +9,16 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
+from ..array_types import FloatArray
 from ..errors import InputError, named_units
 from .correction.objects import square_sums
 from .night_levels import BAND_SIGMA, Predictor, background_terms, levels_of, thinned
 from .night_sums import BACKGROUND, NightSums, Slopes
 from .sky_model_error import SIZES, Envelope, ModelError
 from .smooth_field import Splines, Spread, nearest_coefficients, prior_covariance
-
-FloatArray = NDArray[np.float64]
 
 MAP_SIGMA_ORDERS = 0.15
 """What a map may be off by as a whole before the sky is seen [orders]: 1 rad of phase, as much as the adhesive may

@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
-FloatArray = NDArray[np.float64]
+from ..array_types import FloatArray
 
 NEGLIGIBLE_WEIGHT = 1e-4
 """Spreads of less weight are left out of an average; they change it by less than this of a standard deviation."""

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.detector import Detector
 from ..model import Setup
 from ..products import ThicknessMap
 from ..resources import read_yaml
-
-FloatArray = NDArray[np.float64]
 
 _PERIOD = 1.5  # Sides of the sensor after which the cosines of the field have no slope: beyond its edge
 

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from ..algorithms.discovery import Verdict
@@ -14,11 +13,10 @@ from ..algorithms.discovery.basis import CellBasis
 from ..algorithms.discovery.cells import CellData
 from ..algorithms.discovery.fit import Fit, Problem, coordinates_of, fit_model
 from ..algorithms.discovery.preparation import prepare
+from ..array_types import FloatArray
 from ..effects import EFFECTS
 from ..model import FringeModel
 from .sealed_cases import SealedCase
-
-FloatArray = NDArray[np.float64]
 
 ORDERS = (0.0, -1.0, 1.0)
 """Fringe orders by which the thickness is shifted for a fit that lacks an effect: it may be likelier there."""

@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError
 from ..files import table_text, write_together
-
-FloatArray = NDArray[np.float64]
 
 CASE_KINDS = ("none", "one", "two", "outsider")
 

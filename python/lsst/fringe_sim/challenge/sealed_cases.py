@@ -9,9 +9,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from ..array_types import FloatArray
 from ..errors import InputError, UnknownNameError
 from ..mock.hidden_effects import AmplifierState, HiddenEffect, validate_effects, with_hidden_optics
 from ..mock.optics import FlatFieldOptics
@@ -23,7 +23,6 @@ from ..products.fringe_cube import FlatExposures, FringeCube
 from ..products.mask import mask_bits
 from .result import CASE_KINDS
 
-FloatArray = NDArray[np.float64]
 Draw = Callable[[np.random.Generator], dict[str, float]]
 
 FULL_SPAN_PX = 96

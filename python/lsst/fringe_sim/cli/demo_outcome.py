@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..algorithms.discovery import Verdict
 from ..algorithms.night_levels import background_terms
+from ..array_types import FloatArray
 from ..challenge.demo_case import DemoCase, found_words, of_the_layers
 from ..effects import EFFECTS
 from ..products import SkyFringe, ThicknessMap
@@ -23,8 +24,6 @@ from ..report.page import Report
 from ..report.words import measured_text
 from ..style import figure, finite_range, show_image
 from .demo_truth import DemoTruth
-
-FloatArray = NDArray[np.float64]
 
 PERCENT, NM_PER_UM = 100.0, 1000.0
 
@@ -274,7 +273,7 @@ def _without_background(image: NDArray[np.floating]) -> FloatArray:
     return np.asarray(image - terms @ found)
 
 
-def _error_nm(found: ThicknessMap, true_um: NDArray[np.float64]) -> float:
+def _error_nm(found: ThicknessMap, true_um: FloatArray) -> float:
     return NM_PER_UM * float(np.median(np.abs(found.value - true_um)[found.mask == 0]))
 
 

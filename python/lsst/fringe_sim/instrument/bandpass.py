@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray
 from ..descriptions import described, is_file_name, read_description, read_table_of
 from ..errors import (
     InputError,
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
 __all__ = ["Atmosphere", "Bandpass", "bandpass_names"]
-
-FloatArray = NDArray[np.float64]
 
 _LEAST_DETECTOR = 1e-3
 """Below this quantum efficiency (times air) a throughput cannot be divided by it."""

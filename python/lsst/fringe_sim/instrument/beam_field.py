@@ -10,12 +10,11 @@ import batoid
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, ResourceError, named_units
 from ..optics import Beam
 from .ray_bundle import BEAM_NODES, QUANTILES, beam_of_quantiles, lagrange_weights, quantiles
 from .telescope import Telescope, TracedOptics, batoid_optic
-
-FloatArray = NDArray[np.float64]
 
 TRACED_RADII = 8
 """Field radii through which the rays of a `BeamField` are interpolated: errors of 2e-11 in sin²θ.

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import RegularGridInterpolator
 
+from ..array_types import FloatArray
 from ..errors import OutOfRangeError, named_units
 from ..resources import read_table
 from .oh_levels import SECOND_RADIATION_CM_K
-
-FloatArray = NDArray[np.float64]
 
 ARCSEC2_PER_SR = (180.0 * 3600.0 / math.pi) ** 2
 

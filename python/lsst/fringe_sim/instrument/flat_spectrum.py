@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, named_units, to_number
 from ..resources import read_user_table
 from .sky import SpectralComponent
 
 if TYPE_CHECKING:  # filters take time to import, and effects do without
     from .bandpass import Bandpass
-
-FloatArray = NDArray[np.float64]
 
 STEP_NM = 0.2  # Spacing of the wavelengths that stand for white light [nm]
 NODES = 160  # Least number of wavelengths that stand for the light of a lamp

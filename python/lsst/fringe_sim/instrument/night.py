@@ -7,16 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import RegularGridInterpolator
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, named_units
 from ..notebook import OneLine
 from ..resources import read_table
 
 __all__ = ["AirglowField", "NightHistory", "StochasticNight", "join_nights", "random_nights"]
-
-FloatArray = NDArray[np.float64]
 
 
 @named_units

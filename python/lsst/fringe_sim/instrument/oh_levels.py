@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import OutOfRangeError
 from ..resources import read_table
-
-FloatArray = NDArray[np.float64]
 
 SECOND_RADIATION_CM_K = 1.4387769  # hc/k [cm K]
 

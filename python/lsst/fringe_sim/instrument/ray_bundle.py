@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray
 from ..errors import OutOfRangeError
 from ..optics import Beam
-
-FloatArray = NDArray[np.float64]
 
 BEAM_NODES = 96
 """Angles in a beam.

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray
 from ..errors import named_units
 from .bandpass import Bandpass
 
 __all__ = ["electrons_to_microjansky", "magnitude_to_microjansky", "microjansky_to_magnitude", "zero_point"]
-
-FloatArray = NDArray[np.float64]
 
 AB_MICROJANSKY_ZERO_POINT = 23.9
 """AB magnitude of 1 µJy."""

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import BoolArray, FloatArray
 from ..errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ..notebook import OneLine
 from ..resources import read_table
@@ -37,8 +38,6 @@ __all__ = [
     "van_rhijn_factor",
     "zodiacal_light",
 ]
-
-FloatArray = NDArray[np.float64]
 
 AIRGLOW_HEIGHT_KM = 90.0
 EARTH_RADIUS_KM = 6371.0
@@ -407,7 +406,7 @@ def blend_components(components: Sequence[SpectralComponent], rms_shift_nm: floa
 
 def _merge_neighbours(
     wavelength: FloatArray, weight: FloatArray, owner: NDArray[np.int64], budget: float
-) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Agglomerate neighbours of one owner until the added variance would exceed the budget.
 
     Returns which nodes survive, and the wavelengths and weights in which the survivors hold what they absorbed.

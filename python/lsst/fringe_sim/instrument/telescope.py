@@ -16,8 +16,8 @@ from typing import Any
 
 import batoid
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..descriptions import is_file_name, read_description
 from ..errors import InputError, OutOfRangeError, ResourceError, UnknownNameError, named_units, printable_name
 from ..optics import Beam
@@ -34,8 +34,6 @@ __all__ = [
     "reduce_beam",
     "telescope_beam",
 ]
-
-FloatArray = NDArray[np.float64]
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 

@@ -7,15 +7,12 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import ComplexArray, FloatArray
 from ..compiled import kernel
 
 if TYPE_CHECKING:
     from .optics import Film, FlatFieldOptics
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 class Light(NamedTuple):

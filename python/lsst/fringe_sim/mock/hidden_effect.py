@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..effects import Parameter
 from ..effects.base import Described
 from .optics import FlatFieldOptics
 
-FloatArray = NDArray[np.float64]
 Values = Mapping[str, float]
 
 RIM_SQUARES, RIM_POINTS = 8, 8

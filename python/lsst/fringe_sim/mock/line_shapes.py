@@ -7,9 +7,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ..array_types import FloatArray
 
 LINE_STEP_NM = 0.03
 """Spacing of wavelength nodes [nm]: fifteen per fringe of detection layer and support together."""

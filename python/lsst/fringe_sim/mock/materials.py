@@ -9,15 +9,12 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
+from ..array_types import ComplexArray, FloatArray
 from ..descriptions import read_table_of
 from ..errors import OutOfRangeError, UnknownNameError
 from ..resources import read_table, read_user_yaml, read_yaml
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 GREEN_TEMPERATURE_K = 300.0
 

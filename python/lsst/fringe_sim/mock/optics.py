@@ -16,17 +16,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import ComplexArray, FloatArray
 from ..errors import ConvergenceError, OutOfRangeError, StackError, UnknownNameError
 from .film_fields import add_mode, light_in
 from .line_shapes import LINE_SHAPES, LINE_STEP_NM
 from .materials import material_index
 from .signal_table import SignalTable
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 
 DISPERSION_PIVOT_NM = 960.0  # Wavelength at which added dispersion leaves the index as it is [nm]
 SCALE_PIVOT_NM = 935.0  # Wavelength at which an error of the wavelength scale vanishes [nm]

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import BoolArray, FloatArray
 from ..descriptions import is_file_name, read_description, with_files_beside
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.camera import Amplifier, Camera, Detector
@@ -27,8 +28,6 @@ from .optics import Film, FlatFieldOptics
 from .raw_files import Clock, primary_header, with_raw_layout, write_frame
 from .readout import Readout
 from .sensor_signal import SensorSignal
-
-FloatArray = NDArray[np.float64]
 
 DEFAULT_LEVEL_E = 20_000.0
 DEFAULT_BIAS_FRAMES = 5
@@ -88,7 +87,7 @@ class MockTruth:
     amplifiers: tuple[AmplifierState, ...]
     response: NDArray[np.float32]
     excess_e: NDArray[np.float32]
-    defective: NDArray[np.bool_]
+    defective: BoolArray
 
     def light(self, wavelength_nm: float) -> FloatArray:
         """Light that becomes charge, relative to its mean over the sensor: fringes and illumination, no defects."""

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError
 from ..instrument.camera import Amplifier, Detector, RawSegment
 from .hidden_effects import AmplifierState, HiddenEffect
 
-FloatArray = NDArray[np.float64]
 ActiveEffects = Sequence[tuple[HiddenEffect, dict[str, float]]]
 
 ADC_MAXIMUM = 2**18 - 1  # Largest number of the 18-bit converters [ADU]

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from .hidden_effect import RIM_SQUARES
 from .hidden_effects import ActiveHiddenEffect, Island, added_silicon, hidden_islands
 from .optics import FlatFieldOptics
 from .silicon_tables import SiliconTables
 from .thickness import PixelArea
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,15 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from ..array_types import FloatArray
 from ..compiled import kernel
 from ..errors import ConvergenceError
 from .optics import RELATIVE_TOLERANCE, FlatFieldOptics
 from .signal_table import SignalTable
 
-FloatArray = NDArray[np.float64]
 Seen = Callable[..., FloatArray]
 
 PER_ORDER = 6

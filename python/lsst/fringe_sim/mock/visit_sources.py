@@ -12,12 +12,11 @@ import numpy as np
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 
+from ..array_types import BoolArray, ComplexArray, FloatArray
 from ..errors import InputError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
 from ..instrument.readout import zero_point
-
-FloatArray = NDArray[np.float64]
 
 MASK_PLANES = {"BAD": 0, "SAT": 1}  # Bits as Rubin's masks have them
 CENTRE_DEG = (150.1, 2.2)  # Right ascension and declination about which the visits point
@@ -103,7 +102,7 @@ class Scene:
     north: FloatArray
     magnitude: FloatArray
     radius_arcsec: FloatArray  # half-light radius; 0 of stars
-    shear: NDArray[np.complex128]
+    shear: ComplexArray
 
     @classmethod
     def draw(
@@ -301,7 +300,7 @@ def _add_cosmic_rays(
         np.add.at(charge, (rows[kept], columns[kept]), np.float32(total / steps))
 
 
-def _bleed(charge: NDArray[np.float32], full_well: float) -> NDArray[np.bool_]:
+def _bleed(charge: NDArray[np.float32], full_well: float) -> BoolArray:
     """Spread charge beyond the full well along columns; pixels that are full."""
     for column in np.flatnonzero((charge > full_well).any(axis=0)):
         values = charge[:, column]

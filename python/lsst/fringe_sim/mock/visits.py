@@ -17,6 +17,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..effects import known_effects
 from ..errors import InputError, OutOfRangeError
 from ..files import all_or_nothing
@@ -33,8 +34,6 @@ from .optics import FlatFieldOptics, heights_and_weights
 from .raw_frames import checked_thickness, films_of, parse_size, read_setup_file
 from .signal_table import SignalTable
 from .visit_sources import MASK_PLANES, Pointing, Scene, VisitConditions, VisitImage, expected_sources
-
-FloatArray = NDArray[np.float64]
 
 STEP_UM = 0.01
 """Spacing of the table over thickness [µm]: thirty points per fringe, between which a cubic is right to 1e-5."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import FloatArray
 from ..effects import (
     ActiveEffect,
     Effect,
@@ -31,8 +32,6 @@ from ..optics.phase_response import PhaseResponse
 from ..optics.system import OpticalSystem
 from .response_table import DEFAULT_TOLERANCE, ResponseTable, response_table, tabulate
 from .spectrum import StackSpectrum, spectrum_of
-
-FloatArray = NDArray[np.float64]
 
 LABORATORY_TEMPERATURE = "LABTEMP"
 """Keyword of the temperature of the sensor during the flats from which a thickness map was made [K]."""

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
+from ..array_types import FloatArray
 from ..compiled import contiguous, kernel, run_shares
 from ..errors import ConvergenceError, InputError, OutOfRangeError, named_units
 from ..notebook import OneLine
 from ..optics.illumination import Illumination
 from ..optics.system import OpticalSystem
 
-FloatArray = NDArray[np.float64]
 Sampler = Callable[[float, float, int], FloatArray]
 """``(start_um, step_um, count) -> response [W, count]`` on a uniform grid of thickness."""
 

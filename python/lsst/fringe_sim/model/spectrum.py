@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError, named_units
 from ..notebook import InNotebook, axes_or_new
 from ..optics.system import OpticalSystem
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["StackSpectrum", "spectrum_of"]
-
-FloatArray = NDArray[np.float64]
 
 
 @named_units

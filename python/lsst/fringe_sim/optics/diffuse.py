@@ -6,15 +6,14 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import ComplexArray, FloatArray
 from ..errors import named_units
 from .stack import LayerStack
 from .transfer_matrix import layer_absorption
 
 __all__ = ["DiffuseReturn"]
-
-FloatArray = NDArray[np.float64]
 
 NODES = 16
 """Nodes of Gauss's rule between two critical angles, where the integrand is smooth."""
@@ -120,7 +119,7 @@ def _rule(kinks: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _front(
     stack: LayerStack,
     detection: int,
-    index: NDArray[np.complex128],
+    index: ComplexArray,
     wavelength_nm: FloatArray,
     cosine: FloatArray,
 ) -> FloatArray:

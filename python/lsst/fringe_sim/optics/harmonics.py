@@ -27,9 +27,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..compiled import contiguous, kernel, processors, run_shares, run_threaded, subkernel
-
-FloatArray = NDArray[np.float64]
 
 ROUNDING = 2e-13  # Error of the sum on a grid that is not told to be less exact, relative to the fringes
 COARSEST = 1e-3  # Largest error that makes sense

@@ -7,8 +7,9 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, named_units
 
 __all__ = [
@@ -20,8 +21,6 @@ __all__ = [
     "SpectralProfile",
     "TriangularProfile",
 ]
-
-FloatArray = NDArray[np.float64]
 
 DEFAULT_STEP_NM = 0.05
 """Spacing of wavelength samples [nm]: eight per fringe of 265 µm of silicon, which the support can produce."""

@@ -13,8 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import ComplexArray, FloatArray
 from ..errors import InputError, OutOfRangeError, StackError, named_units
 
 __all__ = [
@@ -32,9 +33,6 @@ POLARIZATIONS = ("s", "p", "mixed")
 
 MOST_WAVELENGTHS = 1e12
 """In one layer; the rounding of a double then moves the phase by 2 pi 1e12 2.2e-16 = 1.4e-3 rad."""
-
-ComplexArray = NDArray[np.complex128]
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

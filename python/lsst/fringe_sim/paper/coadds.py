@@ -6,17 +6,15 @@ import math
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from ..algorithms.image_correlation import LogBins, coadd_correlation, correlation_function
 from ..algorithms.pca import fit_pca_from_thickness
+from ..array_types import FloatArray
 from ..instrument.night import NightHistory
 from .laboratory import MAP_RANGE_UM, RAFT
 from .section import Context, Curve, Graph, Section
 from .sky import RANGE_UM, lines_only
-
-FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
 SKY_E = 2717.0  # Electrons per pixel of the zenith sky in 30 s; decides the noise of an exposure

@@ -13,13 +13,12 @@ from scipy.ndimage import median_filter
 
 from ..algorithms.single_pixel import fit_single_pixel, published_pixel
 from ..algorithms.thickness_fit import fit_thickness
+from ..array_types import FloatArray
 from ..mock.raw_frames import setup_optics
 from ..mock.thickness import E2V_SHAPE
 from ..model import FringeModel
 from ..products import FlatExposures, FringeCube
 from .section import Context, Curve, Graph, Picture, Section, columns, missing
-
-FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
 LAB = "ts8_e2v"

@@ -6,7 +6,6 @@ import math
 
 import batoid
 import numpy as np
-from numpy.typing import NDArray
 
 from ..algorithms.fringe_amplitudes import fringe_amplitudes
 from ..algorithms.photon_migration import photon_migration
@@ -18,8 +17,6 @@ from ..model import FringeModel
 from ..optics import Beam, Illumination
 from ..resources import read_table
 from .section import Context, Curve, Graph, Section, columns, missing
-
-FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
 SECOND_RADIATION_CONSTANT = 1.4387769  # hc/k [cm K]

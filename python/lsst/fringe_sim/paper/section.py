@@ -11,6 +11,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError
 from ..instrument.setup import Setup
 from ..mock.thickness import E2V_SHAPE
@@ -18,8 +19,6 @@ from ..optics import LayerStack
 
 PAPER_SILICON, COLD_SILICON = "Si_green2008", "Si"
 """Tables of silicon: that of the paper, a law extrapolated to the cold, and what was measured there."""
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 
 from ..algorithms.fringe_amplitudes import fringe_amplitudes
 from ..algorithms.sky_frame import SkyResponse, sky_response, throughput_electrons
+from ..array_types import FloatArray
 from ..instrument.bandpass import Bandpass
 from ..instrument.readout import (
     electrons_to_microjansky,
@@ -26,8 +26,6 @@ from ..instrument.sky import EmissionLines, SkySpectrum
 from ..model import FringeModel, Setup
 from ..optics import Illumination
 from .section import Context, Curve, Graph, Picture, Section, columns, missing
-
-FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
 AIRMASS = 1.2

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
+from ..array_types import FloatArray
 from ..model import FringeModel
 from ..optics import Beam, LayerStack, Medium, get_medium
 from ..optics.illumination import SIGMA_PER_FWHM, GaussianProfile
 from ..optics.system import OpticalSystem
 from .section import Context, Curve, Graph, Section, columns, missing
-
-FloatArray = NDArray[np.float64]
 
 PERCENT = 100.0
 LAB_K = 183.0
@@ -60,7 +59,7 @@ def layers(context: Context) -> Section:
 
 def _absorption(
     stack: LayerStack, wavelength_nm: ArrayLike, fwhm_nm: float, extinction_scale: float = 1.0
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """1 − R − T of the stack of Table 1 with 14 µm of adhesive, as Figure 1 shows it."""
     if extinction_scale != 1.0:
         silicon = stack.layers[stack.position("detection")].medium.modified(extinction_scale=extinction_scale)

@@ -11,12 +11,10 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from ..array_types import FloatArray
 from ..errors import FrameFormatError
-
-FloatArray = NDArray[np.float64]
 
 CONSTANT, LINEAR, NATURAL, CUBIC, AKIMA = 0, 1, 2, 3, 5
 """Numbers of ``Interpolate::Style``; the periodic ones are not in use."""

@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import FrameFormatError, named_units
 from . import _fits as io
 from .fits_product import Extension
-
-FloatArray = NDArray[np.float64]
 
 FLAT_COLUMNS = (
     ("wavelength_nm", "nm"),

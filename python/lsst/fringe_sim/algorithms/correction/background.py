@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from ...array_types import FloatArray
 from ...compiled import run_threaded
 from ...errors import OutOfRangeError
 
 __all__ = ["AmplifierGrid", "BackgroundTerms"]
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 SPACING_PX = 256.0

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-BoolArray = NDArray[np.bool_]
+from ...array_types import BoolArray
 
 BLOCK_PX = 16
 """Side of the blocks that are looked at: half of the smallest amplifier of a sensor that is cut down to 64 px."""

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-__all__ = ["log_evidence"]
+from ...array_types import FloatArray
 
-FloatArray = NDArray[np.float64]
+__all__ = ["log_evidence"]
 
 
 def log_evidence(scale: FloatArray, covariance: FloatArray, blocks: int) -> float:

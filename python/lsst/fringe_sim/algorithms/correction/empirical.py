@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from ...errors import InputError, UndeterminedError
 from ...notebook import do_nothing
 from .background import AMPLIFIERS_UNKNOWN, SPACING_PX, AmplifierGrid, BackgroundTerms
@@ -20,8 +21,6 @@ from .scales import refuse_part_without_sky, sky_is_subtracted
 from .sums import four_digits
 
 __all__ = ["ObservedTemplates", "TemplateOptions", "fit_templates"]
-
-FloatArray = NDArray[np.float64]
 
 IN_MEMORY = 512 * 2**20
 """Bytes of frames beyond which they lie in a file, so that memory does not grow with their number."""
@@ -300,7 +299,7 @@ def _gram(patterns: NDArray[np.float32]) -> FloatArray:
 def _shrunk(
     patterns: NDArray[np.float32],
     variance: NDArray[np.float32],
-    known: NDArray[np.bool_],
+    known: BoolArray,
     prior: Sequence[NDArray[np.float32]],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     made, left = np.empty_like(patterns), np.empty_like(patterns)
@@ -341,7 +340,7 @@ def _first_scores(
 
 def _patterns_of(
     stack: _Stack, scores: FloatArray, chosen: NDArray[Any]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], BoolArray]:
     """Every pixel of the patterns from the frames that see it, its variance, and whether enough of them do."""
     number = scores.shape[1]
     patterns = np.zeros((number, *stack.shape), dtype=np.float32)

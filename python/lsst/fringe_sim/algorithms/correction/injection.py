@@ -11,10 +11,8 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from ...errors import InputError
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 POINT, EXTENDED = "point", "extended"
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-__all__ = ["FREE_LEVELS", "LevelSpread"]
+from ...array_types import FloatArray
 
-FloatArray = NDArray[np.float64]
+__all__ = ["FREE_LEVELS", "LevelSpread"]
 
 LEAST_MODE = 1e-9
 """Part of what the best known level says, below which one is a constant, which the smooth background has."""

@@ -12,15 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label, uniform_filter
 
+from ...array_types import BoolArray, FloatArray
 from ...compiled import run_threaded
 from .background import BackgroundTerms
 from .scales import ScaleFit, coefficient_of, rounding_of, scale_fit, settle
 from .sums import FrameSums, Solution
 
 __all__ = ["FrameFit", "find_objects", "fit_frame", "masked_sums", "square_sums"]
-
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
 
 SCALES_PX = (0.0, 1.5, 5.0)
 """Widths of the kernels with which objects are looked for [px]: single pixels, stars, halos and galaxies."""

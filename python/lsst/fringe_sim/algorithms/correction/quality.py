@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtr
 
+from ...array_types import BoolArray, FloatArray
 from ...compiled import processors, run_threaded
 from ...errors import InputError
 from .objects import FrameFit, find_objects, square_sums
@@ -20,8 +21,6 @@ from .scales import CLIP_SIGMA, rounding_of
 from .sums import FrameSums
 
 __all__ = ["FrameProof", "excess_structure", "prove", "uniform_background_indicator"]
-
-FloatArray = NDArray[np.float64]
 
 LEAST_PROBABILITY = 1e-3
 """Probability of a good template's statistic below which it is refused: one of a thousand good frames."""
@@ -219,7 +218,7 @@ def _plain_weight(
 class _Apertures:
     """Square apertures of 2, 4, 8, … px and the largest ones, over the good pixels of a frame."""
 
-    def __init__(self, good: NDArray[np.bool_], largest: int) -> None:
+    def __init__(self, good: BoolArray, largest: int) -> None:
         self.good, self.largest = good, largest
         self.shares: list[NDArray[np.float32]] = []
         share: NDArray[Any] = good
@@ -272,7 +271,7 @@ def _power(share: NDArray[Any], total: NDArray[Any], side: int) -> float:
     return squares / float(np.mean(1.0 / number, dtype=np.float64))
 
 
-def uniform_background_indicator(residual: NDArray[Any], good: NDArray[np.bool_]) -> float:
+def uniform_background_indicator(residual: NDArray[Any], good: BoolArray) -> float:
     """Scatter of the flux in empty apertures over what the noise of pixels lets expect (Medford et al. 2021).
 
     0.98 for white noise, more where the noise is correlated over an aperture.
@@ -333,7 +332,7 @@ def _overlapping(total: NDArray[Any], half: int) -> NDArray[np.float32]:
     return np.asarray(whole[1:, 1:] + whole[1:, :-1] + whole[:-1, 1:] + whole[:-1, :-1])
 
 
-def _pixel_variance(residual: NDArray[Any], good: NDArray[np.bool_]) -> float:
+def _pixel_variance(residual: NDArray[Any], good: BoolArray) -> float:
     step = max(1, len(good) // NOISE_ROWS)
     both = good[::step, 1:] & good[::step, :-1]
     if not both.any():
@@ -370,7 +369,7 @@ def _rises(
     return looks
 
 
-def _rms(values: NDArray[np.float32], good: NDArray[np.bool_]) -> float:
+def _rms(values: NDArray[np.float32], good: BoolArray) -> float:
     """Standard deviation of the good pixels."""
     kept, number = np.where(good, values, np.float32(0.0)), max(float(np.count_nonzero(good)), 1.0)
     mean = float(kept.sum(axis=1).sum(dtype=np.float64)) / number
@@ -420,7 +419,7 @@ def _disc(radius: float) -> FloatArray:
     return np.asarray(inside.reshape(side, 10, side, 10).mean(axis=(1, 3)))
 
 
-def _box_variance(values: NDArray[Any], good: NDArray[np.bool_]) -> FloatArray:
+def _box_variance(values: NDArray[Any], good: BoolArray) -> FloatArray:
     """Variance of the good pixels in boxes; that of all in boxes without many."""
     kept = np.where(good, values, 0.0)
     number, total, squares = (

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...array_types import BoolArray, FloatArray
 from ...errors import InputError, OutOfRangeError, UndeterminedError
 from .background import SMALLEST_BLOCK_PX, BackgroundTerms
 from .detection import log_evidence
@@ -27,9 +28,6 @@ __all__ = [
     "sky_is_subtracted",
     "steady_weight",
 ]
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 LEAST_BLOCKS = 25
 """Blocks with pixels below which the errors of the scales, which come from their scatter, mean nothing: with 25 an
@@ -200,9 +198,7 @@ def coefficient_of(sums: FrameSums, solution: Solution) -> FloatArray:
     return np.asarray(solution.coefficient + sums.level * sums.background.unity())
 
 
-def steady_weight(
-    good: NDArray[np.bool_], variance: NDArray[Any] | None, image: NDArray[Any]
-) -> NDArray[np.float32]:
+def steady_weight(good: BoolArray, variance: NDArray[Any] | None, image: NDArray[Any]) -> NDArray[np.float32]:
     """Inverse variance of the background: 0 in pixels that are not good, steady over cells elsewhere.
 
     A variance that follows the counts of its pixel would give low counts more weight than high ones.

@@ -7,11 +7,10 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.fft import irfft2, rfft2
 
+from ...array_types import FloatArray
 from .sums import RIDGE, FrameSums, Solution
 
 __all__ = ["scale_covariance"]
-
-FloatArray = NDArray[np.float64]
 
 LEAST_FREE = 1e-6
 """Part of the noise of a block that the fit leaves, below which rounding is all that is left."""

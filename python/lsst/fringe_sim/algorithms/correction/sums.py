@@ -10,13 +10,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from ...compiled import run_threaded
 from ...errors import UndeterminedError
 from .background import CUBIC, BackgroundTerms
 from .levels import FREE_LEVELS, LevelSpread
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 TERMS = CUBIC * CUBIC  # Products of cubics in a cell
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from ...array_types import FloatArray
 from ...errors import InputError
 from .channels import Channel, State, combined_probability, in_looks, measure_channels
 from .fit import Design, Fit, FullColumns, PlaneColumns, Problem
 from .learned_columns import over_wavelength
 from .selection import Selector, chance_of
 from .spots import spot_channel
-
-FloatArray = NDArray[np.float64]
 
 MODEL_ACCURACY = 0.014
 """Error of the fringes of the model at a wavelength, as a part of their amplitude and in radians of their phase.

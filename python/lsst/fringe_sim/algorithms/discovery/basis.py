@@ -12,9 +12,8 @@ from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from ...array_types import FloatArray
 from ...compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 RIDGE = 1e-8  # Smallest curvature relative to the largest; keeps coefficients without data where they are
 

@@ -10,13 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from ...effects import ImageGeometry
 from ...errors import InputError
 from ...products.fringe_cube import FringeCube
 from ...products.mask import mask_bits
 from ..flat_prep_options import GAUSSIAN_MAD
-
-FloatArray = NDArray[np.float64]
 
 LEAST_FILLED = 0.75  # Smallest part of good pixels with which a cell is used
 
@@ -58,7 +57,7 @@ class CellData:
         return int(np.count_nonzero(self.weight))
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> BoolArray:
         """Cells with data at some wavelength, shape ``(ny, nx)``."""
         return np.asarray((self.weight > 0).any(axis=0))
 
@@ -70,7 +69,7 @@ class CellData:
             return math.nan
         return float(np.sqrt((1.0 / self.weight[used]).mean() + self.response_scatter**2))
 
-    def restricted(self, keep: NDArray[np.bool_]) -> CellData:
+    def restricted(self, keep: BoolArray) -> CellData:
         """Same data with weight 0 where ``keep`` (broadcast to the values) is false."""
         return replace(self, weight=np.where(keep, self.weight, 0.0))
 
@@ -170,7 +169,7 @@ def bin_cube(
     return CellData(value, weight, geometry, cell_px, 0.0, known, sigma, moved)
 
 
-def _centroid(good: NDArray[np.bool_], count: FloatArray, cell_px: int) -> FloatArray:
+def _centroid(good: BoolArray, count: FloatArray, cell_px: int) -> FloatArray:
     """Mean place of the good pixels of each cell from its centre, ``(2, ny, nx)`` [cells]."""
     result = np.zeros((2, *count.shape))
     partial = (count > 0) & (count < cell_px**2)
@@ -266,7 +265,7 @@ class _Sums(NamedTuple):
         return value, weight
 
 
-def _pixels_of(cube: FringeCube, source: int) -> tuple[_Sums, NDArray[np.bool_], float]:
+def _pixels_of(cube: FringeCube, source: int) -> tuple[_Sums, BoolArray, float]:
     """Pixels of one plane as cells, which of them are good, and their mean."""
     image = np.array(cube.image[source], dtype=np.float64)
     variance = np.array(cube.variance[source], dtype=np.float64)

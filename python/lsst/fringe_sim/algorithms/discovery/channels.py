@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dctn, irfft2, next_fast_len, rfft2
 from scipy.special import chdtrc, fdtrc, gammaincinv
 
+from ...array_types import BoolArray, FloatArray
 from ...effects import AMPLIFIERS, ImageGeometry
 from .fit import Columns, Design, FullColumns, PlaneColumns, Whitener
-
-FloatArray = NDArray[np.float64]
 
 HARMONICS = 3
 BANDS = 8  # Bands of spatial frequency in the test of texture
@@ -261,7 +259,7 @@ def beside_thickness(state: State, whitened: FloatArray) -> FloatArray:
     return np.asarray(whitened - slope * along)
 
 
-def _is_far(shape: tuple[int, ...], nearest: int) -> NDArray[np.bool_]:
+def _is_far(shape: tuple[int, ...], nearest: int) -> BoolArray:
     """Shifts in the order of a Fourier transform that are at least so many cells long."""
     along = [np.minimum(np.arange(size), size - np.arange(size)) for size in shape]
     return np.hypot(along[0][:, None], along[1][None, :]) >= nearest

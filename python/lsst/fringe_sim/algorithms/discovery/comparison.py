@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ...array_types import FloatArray
 
 SAMPLED_CELLS, FEW_CELLS = 400, 150
 """Cells on which a start is followed, and on which many starts are compared; the best are fitted to all cells."""

@@ -5,17 +5,16 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-FloatArray = NDArray[np.float64]
+from ...array_types import BoolArray, FloatArray
 
 STIFFNESS, NO_WEIGHT = 1e-3, 1e-12
 """Weights of the curvature and of cells that are not known; those of the others are 1."""
 
 
-def continued(field: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
+def continued(field: FloatArray, known: BoolArray) -> FloatArray:
     """Continue a field from where it is known with the least sum of squares of its second derivatives.
 
     ``field`` (ny, nx): the field; its values elsewhere do not matter. ``known`` (ny, nx). Returns (ny, nx).

@@ -12,12 +12,11 @@ from scipy.fft import dctn
 from scipy.ndimage import gaussian_filter, label
 from scipy.special import chdtrc
 
+from ...array_types import BoolArray, FloatArray
 from ...effects import AMPLIFIERS, ImageGeometry
 from ..flat_prep_options import GAUSSIAN_MAD
 from .channels import Channel, State, fringe_phase
 from .verdict import Where
-
-FloatArray = NDArray[np.float64]
 
 PHASE_BINS = 16
 
@@ -115,7 +114,7 @@ def places_apart(residual: FloatArray, geometry: ImageGeometry) -> list[dict[str
     return sorted(rows, key=lambda row: -row["excess_share"])[:MOST_PLACES]
 
 
-def _pieces(marked: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+def _pieces(marked: BoolArray) -> list[BoolArray]:
     """Parts of an image that hang together."""
     number, found = label(marked)
     return [number == one for one in range(1, found + 1)]

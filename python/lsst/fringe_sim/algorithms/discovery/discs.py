@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-FloatArray = NDArray[np.float64]
+from ...array_types import BoolArray, ComplexArray, FloatArray
 
 SMALLEST_RADIUS, LARGEST_PART, RADIUS_RATIO = 2.0, 0.35, 1.2
 """Radii that are tried: the smallest [cells], the largest over the shorter side, and one over the one before."""
@@ -28,11 +27,11 @@ class Discs:
     shape: tuple[int, int]  # rows and columns of cells
     padded: tuple[int, int]  # the same with room for the largest disc
     radii: list[float]  # radii [cells]
-    transforms: list[NDArray[np.complex128]]  # Fourier transform of a disc of each radius
-    usable: list[NDArray[np.bool_]]  # cells about which enough of a disc of each radius has data
+    transforms: list[ComplexArray]  # Fourier transform of a disc of each radius
+    usable: list[BoolArray]  # cells about which enough of a disc of each radius has data
 
     @classmethod
-    def of(cls, seen: NDArray[np.bool_]) -> Discs:
+    def of(cls, seen: BoolArray) -> Discs:
         """Discs about the cells with and without data."""
         shape = (seen.shape[0], seen.shape[1])
         largest = LARGEST_PART * min(shape)

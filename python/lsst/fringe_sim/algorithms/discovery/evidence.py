@@ -6,12 +6,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from ...array_types import FloatArray
 from .fit import Coordinate, Fit
-
-FloatArray = NDArray[np.float64]
 
 WIDTHS = np.geomspace(1e-4, 30.0, 141)
 """Widths of the distribution of exchangeable parameters, in prior scales, over which the evidence is integrated."""

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from ...array_types import BoolArray, FloatArray
 from ...effects import Effect, Parameter
 from .basis import FieldBasis, NormalMatrix
 from .cells import CellData
 from .comparison import chi2_with_free_levels
 from .forward import Forward, Prediction
-
-FloatArray = NDArray[np.float64]
 
 PRIOR_WIDTH = 3.0
 """Width of the weak Cauchy prior of a parameter in units of its prior scale: what is large is not drawn to null."""
@@ -369,7 +368,7 @@ class Problem:
         """Same problem with other data on the same cells."""
         return replace(self, cells=cells)
 
-    def without_cells(self, out: NDArray[np.bool_]) -> Problem:
+    def without_cells(self, out: BoolArray) -> Problem:
         """Same problem without the data of some cells, of shape ``(ny, nx)``: their thickness is not known either."""
         cells = self.cells.restricted(~out)
         return replace(self, cells=cells, forward=self.forward.with_seen(cells.seen))

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from .comparison import FEW_CELLS, chi2_with_free_fringes, fringe_order_um, sampled_part
 from .fit import Problem
-
-FloatArray = NDArray[np.float64]
 
 SHIFTS_PER_ORDER, ORDERS_TRIED = 10, 1.5
 """Shifts that are compared before the first step, up to some fringe orders on either side.

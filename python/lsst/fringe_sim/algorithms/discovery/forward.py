@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from ...compiled import contiguous, kernel, run_shares, subkernel
 from ...effects import ActiveEffect, Effect, ImageGeometry, activate_effects, apply_to_image
 from ...model import FringeModel
@@ -18,7 +19,6 @@ from .cells import CellData
 from .evaluations import note_evaluation
 from .slopes import Slopes
 
-FloatArray = NDArray[np.float64]
 Settings = Mapping[str, float]
 
 TABLE_STEP_UM = 0.004
@@ -113,7 +113,7 @@ class Forward:
     centroid: FloatArray | None = None  # (2, W, ny, nx): see `CellData`
     # (ny, nx): cells with data; by default all. The thickness of others is not known, and slopes do not
     # lean on it.
-    seen: NDArray[np.bool_] | None = None
+    seen: BoolArray | None = None
     exposures: Exposures | None = None  # the light; monochromator flats by default
     # (ny, nx): variance of the thickness at which a cell is looked up about the true one [µm²]; by
     # default none
@@ -169,7 +169,7 @@ class Forward:
         """The same with pixels that see their area (0), or so many places on each side; tables are kept."""
         return self._with(places=places)
 
-    def with_seen(self, seen: NDArray[np.bool_]) -> Forward:
+    def with_seen(self, seen: BoolArray) -> Forward:
         """The same with data in fewer cells; tables are kept."""
         return self._with(seen=seen)
 
@@ -536,7 +536,7 @@ class Forward:
         (item,) = activate_effects(own, self.catalogue)
         return item.coverage(self.model.base_system, self.geometry)
 
-    def on_islands(self, settings: Settings) -> NDArray[np.bool_]:
+    def on_islands(self, settings: Settings) -> BoolArray:
         """Cells with a local effect, shape ``(ny, nx)``."""
         covered = np.zeros(self.geometry.sample_shape, dtype=bool)
         for part in self.island_parts(settings):

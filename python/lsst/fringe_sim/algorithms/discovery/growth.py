@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, label, uniform_filter
 
+from ...array_types import BoolArray, FloatArray
 from .basis import SplineBasis
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 KNOTS, TURNS = (8.0, 6.0), 3
 """Spacings of the spline that is fitted [cells], and how often each is tried: one may succeed where another fails."""

@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ...array_types import FloatArray
 from ...effects import Effect
 from .basis import CellBasis
 from .fit import Fit, Problem, fit_model
 from .preparation import Prepared, prepare_again, smoother
 from .selection import Hypothesis, Selector
-
-FloatArray = NDArray[np.float64]
 
 LEAST_PROMISED, LEAST_EXPLAINED = 0.2, 0.9
 """Part of what the fine thickness gains over a smooth one, beyond noise, that a local effect must promise and explain

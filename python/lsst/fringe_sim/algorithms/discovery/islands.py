@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.optimize import minimize
 
+from ...array_types import BoolArray, FloatArray
 from ..parabola import parabolic_minimum
 from .cells import CellData
 from .channels import State, beside_thickness
@@ -19,8 +20,6 @@ from .continuation import continued
 from .discs import Disc, Discs
 from .fit import Coordinate, Fit, Problem
 from .thickness_steps import best_thickness_step
-
-FloatArray = NDArray[np.float64]
 
 SIZES_TRIED = (0.01, 0.02, 0.04)
 SIZES_PER_REPETITION = 12
@@ -182,7 +181,7 @@ def placed_on_island(
 
 
 def thickness_on_islands(
-    problem: Problem, fit: Fit, thickness_um: FloatArray, held_out: NDArray[np.bool_]
+    problem: Problem, fit: Fit, thickness_um: FloatArray, held_out: BoolArray
 ) -> FloatArray:
     """Thickness of cells on islands that took no part in a fit, from those within half an order [µm].
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...array_types import FloatArray
 from ...effects import AMPLIFIERS, LEARNED, ImageGeometry
 from ...effects.learned import (
     LEARNED_HARMONICS,
@@ -21,8 +22,6 @@ from ...effects.learned import (
 )
 from .channels import State
 from .fit import Columns, Fit, PlaneColumns, Problem
-
-FloatArray = NDArray[np.float64]
 
 LENGTHS_NM = (1.0, 30.0, 100.0)
 """Correlation lengths over wavelength that are tried [nm]: none at all, some exposures, all of them."""

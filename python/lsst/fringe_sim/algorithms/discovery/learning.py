@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from .channels import State
 from .fit import Design, Fit, Problem, Projected, fit_model, linearise_at
 from .learned_columns import Family, families, with_learned
 from .validation import FEWEST_ROWS, misfit_rms, thickness_starts
-
-FloatArray = NDArray[np.float64]
 
 FALSE_ALARMS = 0.01  # Chance with which noise alone may seem to teach something
 
@@ -177,7 +176,7 @@ def _taught(
     )  # fmt: skip
 
 
-def judging_cells(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def judging_cells(shape: tuple[int, ...]) -> BoolArray:
     """Cells that are judged by: every other tile along both sides, ``(ny, nx)``; the others lie all around them.
 
     A pattern over the sensor can be told where it is seen near by, not in the middle of a block without data.
@@ -192,7 +191,7 @@ def learn(
     problem: Problem,
     null: Fit,
     best: Fit,
-    held_out: NDArray[np.bool_],
+    held_out: BoolArray,
     rng: np.random.Generator,
     least: float,
 ) -> Learned | None:
@@ -267,7 +266,7 @@ def _again(inside: Problem, fitted: Fit, family: Family, taught: _Taught) -> tup
     return fitted, dict(zip(family.keys, known.tolist(), strict=True))
 
 
-def _chi2_of(problem: Problem, fit: Fit, cells: NDArray[np.bool_]) -> float:
+def _chi2_of(problem: Problem, fit: Fit, cells: BoolArray) -> float:
     """χ² of some of the cells ``(ny, nx)``."""
     expected = problem.expected_of(fit)
     residual = problem.whitener(expected)(problem.cells.value - expected)
@@ -279,7 +278,7 @@ def _beyond(
     outside: Problem,
     null: Fit,
     fitted: Fit,
-    judged: NDArray[np.bool_],
+    judged: BoolArray,
     settings: dict[str, float],
 ) -> Fit:
     """Thickness and levels fitted to the cells held out, effects and correction as they were learned."""

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from ..flat_prep_options import GAUSSIAN_MAD
 from .cells import CellData
-
-FloatArray = NDArray[np.float64]
 
 LEAST_TRIPLES = 60
 """Fewest second differences from which a noise level is taken; with fewer, the stated variance is believed."""
@@ -91,7 +90,7 @@ def estimate_noise(cells: CellData, residual: FloatArray) -> NoiseEstimate:
     )
 
 
-def scatter_of_pixels(image: NDArray[np.floating], good: NDArray[np.bool_]) -> float:
+def scatter_of_pixels(image: NDArray[np.floating], good: BoolArray) -> float:
     """Standard deviation of what neighbouring pixels do not share, from the median of their second differences.
 
     ``image``, ``good`` (ny, nx). Infinite where too few pixels tell.
@@ -118,7 +117,7 @@ def _common_variance(difference: FloatArray, measured: FloatArray) -> float:
     return mean * float(measured.mean()) if mean > 5.0 * error and mean > 1e-3 else 0.0
 
 
-def _neighbour_correlation(difference: FloatArray, good: NDArray[np.bool_]) -> float:
+def _neighbour_correlation(difference: FloatArray, good: BoolArray) -> float:
     """Correlation of neighbours beyond the -2/3 that second differences of independent noise have."""
     both = good[:, :, 1:] & good[:, :, :-1]
     product = float((difference[:, :, 1:] * difference[:, :, :-1])[both].mean()) if both.any() else 0.0
@@ -133,9 +132,9 @@ def _second_difference(image: FloatArray) -> FloatArray:
     return both
 
 
-def _all_of_nine(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _all_of_nine(good: BoolArray) -> BoolArray:
     rows = good[:, :-2] & good[:, 1:-1] & good[:, 2:]
-    both: NDArray[np.bool_] = rows[:, :, :-2] & rows[:, :, 1:-1] & rows[:, :, 2:]
+    both: BoolArray = rows[:, :, :-2] & rows[:, :, 1:-1] & rows[:, :, 2:]
     return both
 
 

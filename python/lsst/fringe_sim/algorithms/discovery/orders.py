@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from .comparison import (
     FEW_CELLS,
     chi2_with_free_fringes,
@@ -17,8 +17,6 @@ from .comparison import (
     sampled_part,
 )
 from .fit import Coordinate, Fit, Problem, fit_model
-
-FloatArray = NDArray[np.float64]
 
 SIZES_TRIED = (0.1, 0.15, 0.23, 0.35, *(0.5 * n for n in range(1, 21)))
 """Departures, in prior scales, at which one that shifts the phase is: its misfit has a minimum for every fringe."""
@@ -240,7 +238,7 @@ def _shifts(problem: Problem, whole: FloatArray, order: float) -> FloatArray:
     return np.asarray(shifts[_is_possible(problem, whole, shifts)])
 
 
-def _is_possible(problem: Problem, whole: FloatArray, shifts: FloatArray) -> NDArray[np.bool_]:
+def _is_possible(problem: Problem, whole: FloatArray, shifts: FloatArray) -> BoolArray:
     least = whole.min() + np.minimum(shifts, shifts * whole.min() / whole.mean())
     possible = least > LEAST_THICKNESS_UM
     return np.asarray(possible & (np.abs(shifts) * np.sqrt(problem.field_prior) <= MOST_SIGMAS))

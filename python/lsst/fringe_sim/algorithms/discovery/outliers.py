@@ -6,13 +6,10 @@ import functools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, median_filter
 
+from ...array_types import BoolArray, FloatArray
 from ..flat_prep_options import GAUSSIAN_MAD
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 OUTLIER_SIGMA = 6.0  # Robust standard deviations beyond which a cell is spoiled
 GROWTH_SIGMA = 3.0  # The same for what adjoins a spoiled cell

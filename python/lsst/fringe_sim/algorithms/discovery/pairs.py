@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from ...errors import InputError
 from .fit import Fit, FullColumns
 from .selection import Hypothesis, Selector, bounded_minimum
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

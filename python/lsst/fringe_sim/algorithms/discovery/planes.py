@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
+from ...array_types import BoolArray, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from ...model import FringeModel
 from .cells import CellData
 from .start import SEARCH_STEP_UM, order_steps, robust_surface, search_template
-
-FloatArray = NDArray[np.float64]
 
 TORN = 0.01
 CLIFF = 0.5
@@ -33,7 +32,7 @@ ORDERS_MOVED = 6.0  # Fringe orders by which all joined planes together are move
 SURFACE_SPACING = 8.0  # Knots of the smooth thickness [cells]
 
 
-def is_torn(thickness_um: FloatArray, seen: NDArray[np.bool_], order_um: float) -> bool:
+def is_torn(thickness_um: FloatArray, seen: BoolArray, order_um: float) -> bool:
     """Whether there are cliffs of about a fringe order between many neighbouring cells.
 
     ``thickness_um`` (ny, nx). ``seen`` (ny, nx).

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import binary_dilation
 
+from ...array_types import BoolArray, FloatArray
 from ...effects import Effect
 from ...errors import InputError
 from ...model import FringeModel
@@ -26,8 +26,6 @@ from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_varian
 from .outliers import spoiled_cells
 from .planes import is_torn, joined_planes
 from .start import mended_thickness, starting_thickness
-
-FloatArray = NDArray[np.float64]
 
 SPACINGS = (8.0, 4.0, 2.0)
 MUCH_SMOOTHER = 0.5
@@ -365,7 +363,7 @@ def smoother(prepared: Prepared) -> Iterator[Prepared]:
         )
 
 
-def _rims(problem: Problem, settings: Mapping[str, float]) -> NDArray[np.bool_]:
+def _rims(problem: Problem, settings: Mapping[str, float]) -> BoolArray:
     """Cells at the rim of local effects: one that is a little off would ask for a thickness of each of them."""
     found = np.zeros(problem.cells.shape[1:], dtype=bool)
     for part in problem.forward.island_parts(settings):
@@ -738,9 +736,7 @@ def _without_spoiled(
     return *_choose_field(problem.with_cells(cells), start, settings), cells
 
 
-def _spoiled_of(
-    problem: Problem, fit: Fit, settings: Mapping[str, float]
-) -> tuple[Problem, Fit, NDArray[np.bool_]]:
+def _spoiled_of(problem: Problem, fit: Fit, settings: Mapping[str, float]) -> tuple[Problem, Fit, BoolArray]:
     """Cells that something spoiled in one exposure, and the fit without them."""
     spoiled = np.zeros(problem.cells.shape, dtype=bool)
     for _ in range(SPOILED_ROUNDS):

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from ...array_types import BoolArray, FloatArray
 from ...effects import Effect, known_effects
 from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
@@ -54,8 +54,6 @@ from .validation import (
 )
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
 from .verdict_words import chance_text
-
-FloatArray = NDArray[np.float64]
 
 _METRIC = "rms of data minus model, relative counts"
 
@@ -201,7 +199,7 @@ class _Reached:
     """How far a search has come."""
 
     prepared: Prepared
-    heldout: NDArray[np.bool_]
+    heldout: BoolArray
     whole: Selector
     chance: float
     sets: SetSearch | None = None

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from ...array_types import FloatArray
 from ...effects import Effect, Residuals
 from ...errors import InputError
 from .channels import Channel, State, chance_beyond, combined_probability, measure_channels
@@ -32,9 +32,6 @@ from .islands import IslandStart, followed_on_island, island_starts, placed_on_i
 from .orders import fields_in_other_orders, starts_in_other_orders
 from .spots import log_evidence_of_spots, spot_channel
 from .trends import FEWEST_DRAWS, trend_channel
-
-FloatArray = NDArray[np.float64]
-
 
 SCAN = (0.1, 0.3, 1.0, 3.0, 10.0)
 FIRST_SCAN = (0.3, 3.0)

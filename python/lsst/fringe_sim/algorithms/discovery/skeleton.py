@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from ...effects import LEARNED, ImageGeometry
 from ...effects.learned import LEARNED_HARMONICS, LEARNED_NODES_NM
 from ...model.effects_override import effects_override, ended
 
 if TYPE_CHECKING:
     from .verdict import Verdict
-
-FloatArray = NDArray[np.float64]
 
 PHASES = 16  # Places in the fringe phase at which a wave form is written down
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BarycentricInterpolator
 
+from ...array_types import FloatArray
 from ...effects import Effect, ImageGeometry, known_effects
 from ...errors import InputError, named_units
 from ...instrument.bandpass import Bandpass
@@ -45,7 +46,6 @@ from .noise import scatter_of_pixels
 from .search import Report, SearchOptions, search_exposures
 from .verdict import Verdict
 
-FloatArray = NDArray[np.float64]
 Grid = tuple[float, float, int]  # First, step [µm] and number of thicknesses
 LINE_ANGLES = 40  # Angles of the beam for lines
 CONTINUUM_ANGLES = 8  # Angles for continua, whose fringes average out over wavelength

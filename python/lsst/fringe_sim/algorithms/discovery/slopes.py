@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from ...array_types import BoolArray, FloatArray
 
 BESIDE = ({-1: -0.5, 1: 0.5}, {0: -1.0, 1: 1.0}, {0: 1.0, -1: -1.0})
 BEYOND = ({-2: -0.25, 2: 0.25}, {0: -0.5, 2: 0.5}, {0: 0.5, -2: -0.5})

@@ -7,14 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
+from ...array_types import FloatArray
 from .channels import Channel, State, beside_thickness
-
-FloatArray = NDArray[np.float64]
 
 RADII = (3.0, 4.5, 7.0, 10.0, 15.0)
 """Standard deviations of the spots that are looked for [cells]; larger ones are patterns of large scale."""

@@ -11,13 +11,12 @@ from scipy.ndimage import binary_closing, median, median_filter, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ...array_types import BoolArray, FloatArray
 from ...compiled import contiguous, kernel, run_shares, subkernel
 from ...model import FringeModel
 from .basis import SplineBasis
 from .cells import CellData
 from .comparison import chi2_with_free_fringes
-
-FloatArray = NDArray[np.float64]
 
 SEARCH_STEP_UM = 0.01
 HALF_WINDOW_UM = 0.12  # Reach of the search around a neighbour's thickness [µm]; below half a fringe order
@@ -370,7 +369,7 @@ def _mend_orders(
 
 
 def _mend_patches(
-    score: NDArray[np.float32], best: NDArray[np.int64], seen: NDArray[np.bool_], order: float
+    score: NDArray[np.float32], best: NDArray[np.int64], seen: BoolArray, order: float
 ) -> NDArray[np.int64]:
     """Take back small patches, single cells among them, that stand whole orders off what surrounds them.
 
@@ -407,7 +406,7 @@ def _mend_patches(
     return current
 
 
-def _without_gaps(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _without_gaps(seen: BoolArray) -> BoolArray:
     """Cells with data, and those in gaps between them of a few cells."""
     filled = binary_closing(np.pad(seen, WIDEST_GAP), iterations=WIDEST_GAP // 2)
     inner = slice(WIDEST_GAP, -WIDEST_GAP)
@@ -435,7 +434,7 @@ def _mend_by_surface(
 
 def _near_surface(
     score: NDArray[np.float32], current: NDArray[np.int64], cells: CellData, spacing: float, order: float
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.int64], BoolArray]:
     """Steps with those more than half an order from a smooth surface moved to their best less far from it; which."""
     surface = robust_surface(current.reshape(cells.shape[1:]).astype(float), cells.seen, spacing, order)
     middle = np.clip(np.rint(surface.ravel()).astype(np.int64), 0, score.shape[1] - 1)
@@ -444,7 +443,7 @@ def _near_surface(
     return np.where(away, _nearby_peak(score, middle, reach), current), away
 
 
-def robust_surface(field: FloatArray, seen: NDArray[np.bool_], spacing: float, order: float) -> FloatArray:
+def robust_surface(field: FloatArray, seen: BoolArray, spacing: float, order: float) -> FloatArray:
     """Spline through most cells of a field ``(ny, nx)``; those that lie orders away do not count."""
     basis = SplineBasis.of_grid((field.shape[0], field.shape[1]), spacing)
     weight = seen.astype(float)

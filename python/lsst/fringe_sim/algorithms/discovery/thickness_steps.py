@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse import csr_array
 
+from ...array_types import FloatArray
 from .channels import State
 from .discs import Disc, Discs
 from .fit import Design
-
-FloatArray = NDArray[np.float64]
 
 SMALLEST_RADIUS, MIDDLES_PER_RADIUS = 2.8, 2.0
 """Radius of the smallest disc of which no smooth thickness takes up all [cells]; how closely the middles lie for

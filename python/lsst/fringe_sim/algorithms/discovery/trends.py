@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from ...array_types import FloatArray
 from .channels import Channel
-
-FloatArray = NDArray[np.float64]
 
 ORDER = 3  # Order of the polynomial in wavelength that draws do not follow
 

@@ -6,17 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.special import chdtri
 
+from ...array_types import BoolArray, FloatArray
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
 from .islands import ANOTHER_ORDER, thickness_on_islands
 from .verdict import CONFIDENCE
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 BLOCKS_ACROSS = 8
 FEWEST_ROWS = 12

@@ -12,17 +12,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.special import gammainc, gammaln, logsumexp
 
+from ...array_types import FloatArray
 from ...effects import Effect, Parameter, known_effects
 from ...errors import InputError, UnknownNameError
 from ...model import FringeModel
 from .kinds import SHIFT_UM, Kind, PixelFlats
 from .models import LAB, models_with, without_bench
-
-FloatArray = NDArray[np.float64]
 
 MOST_PARAMETERS = 3
 COARSE_NODES = (0, 11, 7, 5)

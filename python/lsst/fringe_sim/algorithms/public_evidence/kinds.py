@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import ComplexArray, FloatArray
 from ...errors import InputError
 from ...instrument.bandpass import Bandpass
 from ...instrument.measured_thickness import e2v_321
@@ -26,8 +26,6 @@ from ...resources import read_table
 from ..single_pixel import published_pixel
 from ..sky_response import is_band
 from .models import LAB, Models
-
-FloatArray = NDArray[np.float64]
 
 SHIFT_UM = np.linspace(-1.5, 1.5, 601)
 """Shifts of the published map that are allowed [µm]: five fringe orders either way."""
@@ -360,9 +358,7 @@ def public_kinds() -> tuple[Kind, ...]:
     )
 
 
-def harmonics(
-    model: FringeModel, wavelength_nm: float
-) -> tuple[FloatArray, NDArray[np.complex128], NDArray[np.complex128]]:
+def harmonics(model: FringeModel, wavelength_nm: float) -> tuple[FloatArray, ComplexArray, ComplexArray]:
     """First and second harmonic of the fringe over its mean, at thicknesses from 14 to 22 µm."""
     order = float(model.fringe_order_um(wavelength_nm))
     layer = order * np.arange(np.ceil(14.0 / order), 22.0 / order, 4.0)

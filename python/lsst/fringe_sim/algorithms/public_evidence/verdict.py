@@ -10,17 +10,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from ...array_types import FloatArray
 from ...errors import InputError
 from ...notebook import do_nothing
 from ..discovery.options import SearchOptions
 from .joint import Axis, JointFit, Predictor, parse_set
 from .kinds import SHIFT_UM, FlatPhase, Kind, PixelFlats, PublishedMap, harmonics, public_kinds, sky_amplitude
 from .models import LAB, Models, models_with, without_bench
-
-FloatArray = NDArray[np.float64]
 
 CLASS_WIDTH = SearchOptions().class_width
 """Difference of the logarithms of evidence within which sets are one class, as in the search."""
