@@ -30,21 +30,13 @@ BACKGROUND = 6
 
 @dataclass(frozen=True, eq=False)
 class NightSums:
-    """Frames of a night, and what of their sums depends on no model.
+    """Frames of a night, and what of their sums depends on no model."""
 
-    Attributes
-    ----------
-    weight, weighted : `numpy.ndarray`, shape ``(ny, F, nx)``
-        Weights of the pixels, and these times the values.
-    squares : `numpy.ndarray`, shape ``(F,)``
-        Weighted sums of the squares of the values.
-    background : `numpy.ndarray`, shape ``(F, 6, 7)``
-        Products of the terms of the background with each other and with the values.
-    """
-
+    # weight, weighted: weights of the pixels, and these times the values, ``(ny, F, nx)``
     weight: FloatArray
     weighted: FloatArray
-    squares: FloatArray
+    squares: FloatArray  # weighted sums of the squares of the values, ``(F,)``
+    # products of the terms of the background with each other and with the values, ``(F, 6, 7)``
     background: FloatArray
 
     @classmethod

@@ -35,10 +35,8 @@ def is_afw_background(hdus: fits.HDUList) -> bool:
 def afw_background(hdus: fits.HDUList) -> FloatArray:
     """Sum of all backgrounds of a file, of the shape of the image that they were made of.
 
-    Raises
-    ------
-    FrameFormatError
-        Backgrounds of different images, a spline that is not known, or bins that are too few for it.
+    Raises `FrameFormatError`: backgrounds of different images, a spline that is not known, or bins that are too few
+    for it.
     """
     total: FloatArray | None = None
     for number in range(0, len(hdus), _PARTS):

@@ -80,21 +80,10 @@ def _bit(header: fits.Header, keyword: str) -> int:
 def archived_background(path: Path, origin: tuple[int, int] | None, shape: tuple[int, ...]) -> NDArray[Any]:
     """What was subtracted from an exposure of ``lsst.images``, drawn by that package.
 
-    Parameters
-    ----------
-    path : `pathlib.Path`
-        The exposure, a map of backgrounds, or one background.
-    origin : `tuple` [`int`, `int`] or `None`
-        Row and column of the sensor at which the image begins; `None` for those at which the background does.
-    shape : `tuple` [`int`, `int`]
-        Shape of the image.
-
-    Raises
-    ------
-    MissingPackageError
-        ``lsst.images`` is not installed.
-    FrameFormatError
-        Nothing was subtracted, or the background does not cover the image.
+    ``path``: the exposure, a map of backgrounds, or one background; ``origin``: row and column of the sensor at
+    which the image begins; `None` for those at which the background does; ``shape``: shape of the image. Raises
+    `MissingPackageError`: ``lsst.images`` is not installed. Raises `FrameFormatError`: nothing was subtracted, or
+    the background does not cover the image.
     """
     try:
         from lsst.images import Box

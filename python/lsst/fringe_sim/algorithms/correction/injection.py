@@ -152,10 +152,7 @@ def injection_table(name: str, measured: Sequence[Measured]) -> Table:
 def bias_columns(departures: Mapping[str, FloatArray]) -> dict[str, float]:
     """Bias with its error, and scatter, of all quantities of the sources that have them in all of several images.
 
-    Parameters
-    ----------
-    departures : mapping of `str` to `numpy.ndarray`, shape ``(4, N)``
-        Departures by the name of the image, which ends the names of the columns.
+    ``departures``: departures by the name of the image, which ends the names of the columns, ``(4, N)``.
     """
     known = np.logical_and.reduce([np.isfinite(each) for each in departures.values()])
     row = {}

@@ -31,14 +31,8 @@ class ThicknessFollower:
     Many effects shift the fringes first, as a change of thickness does, and weaken or tilt them second. With the
     thickness held, only the shift would be seen; a line in thickness takes it up but for what no thickness can do.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        Data and model; a sample of the cells is used.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness that is moved [µm].
-    index : `float`
-        Refractive index of the layer, for the fringe order.
+    ``thickness_um``: thickness that is moved [µm], ``(ny, nx)``; ``index``: refractive index of the layer, for the
+    fringe order.
     """
 
     def __init__(self, problem: Problem, thickness_um: FloatArray, index: float) -> None:

@@ -112,30 +112,14 @@ class Hypothesis:
 class Selector:
     """Fits and compares sets of effects on one problem.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        Data, model and nuisances.
-    catalogue : sequence of `Effect`
-        Effects that may be named.
-    null : `Fit`
-        Fit of the unchanged model.
-    index : `numpy.ndarray`, shape ``(W,)``
-        Refractive index of the varying layer, for the fringe phase.
-    generic : `bool`, optional
-        Whether there are enough cells for the tests without a catalogue.
-    first_field : `numpy.ndarray`, optional
-        Field from which the first effect is fitted; that of ``null`` by default, which a strong effect distorts.
-    shifts_um : sequence of `float`, optional
-        Moves of the first field [µm] among which every set of effects looks for its own best thickness: the order of
-        a few pixels is open.
-    guess : mapping, optional
-        Settings with which ``first_field`` was fitted: where to start with those effects, besides.
-    alike : `Selector`, optional
-        One of the same effects on as large cells, from which their coordinates are taken over.
-    singles : mapping, optional
-        Coordinates of effects that were fitted alone to the same data before: beside the unchanged model no other
-        sizes and places are looked for.
+    ``catalogue``: effects that may be named; ``index``: refractive index of the varying layer, for the fringe
+    phase, ``(W,)``; ``generic``: whether there are enough cells for the tests without a catalogue; ``first_field``:
+    field from which the first effect is fitted; that of ``null`` by default, which a strong effect distorts;
+    ``shifts_um``: moves of the first field [µm] among which every set of effects looks for its own best thickness:
+    the order of a few pixels is open; ``guess``: settings with which ``first_field`` was fitted: where to start
+    with those effects, besides; ``alike``: one of the same effects on as large cells, from which their coordinates
+    are taken over; ``singles``: coordinates of effects that were fitted alone to the same data before: beside the
+    unchanged model no other sizes and places are looked for.
     """
 
     def __init__(

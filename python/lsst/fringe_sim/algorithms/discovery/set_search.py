@@ -44,18 +44,9 @@ MOST_OF_MANY = 0.8
 class SetSearch:
     """Looks for the most credible set of effects.
 
-    Parameters
-    ----------
-    selector : `Selector`
-        Fits to the part of the data that is searched.
-    options : `SearchOptions`
-        Thresholds and sizes.
-    say : callable
-        Called with a line of text at every fit.
-    rescued : callable
-        Fits a set again from its fit to all data, where that leaves noise and the part does not.
-    order_open : `bool`, optional
-        Whether the fringe order is not known, so that scores in one of them say nothing.
+    ``say``: called with a line of text at every fit; ``rescued``: fits a set again from its fit to all data, where
+    that leaves noise and the part does not; ``order_open``: whether the fringe order is not known, so that scores
+    in one of them say nothing.
     """
 
     def __init__(

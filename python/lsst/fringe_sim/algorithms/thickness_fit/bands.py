@@ -27,19 +27,9 @@ def load_band(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Amplitudes and inverse variances of the rows from ``low`` to ``high``, light divided out.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    low, high : `int`
-        First row, and the one after the last; rows beyond the sensor are left out.
-    wavelengths : `slice`, optional
-        Which of them; all by default.
-
-    Returns
-    -------
-    amplitude, weight : `numpy.ndarray`, float32, shape ``(n_wavelengths, rows, columns and some more)``
-        Both 0 where a pixel cannot be used; the columns beyond those of the sensor hold nothing.
+    ``low, high``: first row, and the one after the last; rows beyond the sensor are left out; ``wavelengths``:
+    which of them; all by default. Both are 0 where a pixel cannot be used; the columns beyond those of the
+    sensor hold nothing, float32, ``(n_wavelengths, rows, columns and some more)``.
     """
     image, variance, bad = data.rows(low, high, wavelengths)
     variance, bad = core(variance), core(bad)

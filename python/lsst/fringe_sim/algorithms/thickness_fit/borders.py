@@ -39,27 +39,11 @@ def settle_borders(
 ) -> tuple[PixelFit, NDArray[np.float32]]:
     """Revise the pixels near steps.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        The model, normalised to the sensor.
-    pixels : `PixelFit`
-        What the pixels found by themselves; its arrays are revised in place.
-    rough : `numpy.ndarray`, bool, shape ``(ny, nx)``
-        Pixels that have more than one surface within reach.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    temper : `float`
-        Independent pixels per pixel: below 1 where the noise is correlated.
-
-    Returns
-    -------
-    pixels : `PixelFit`
-        The revised fit.
-    slip : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Probability that a pixel lies on another of the surfaces; 0 where there is only one.
+    ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``rough``: pixels that have
+    more than one surface within reach, bool, ``(ny, nx)``; ``order_um``: thickness of one fringe order [µm];
+    ``temper``: independent pixels per pixel: below 1 where the noise is correlated. Returns ``pixels``: the revised
+    fit; ``slip``: probability that a pixel lies on another of the surfaces; 0 where there is only one, float32,
+    ``(ny, nx)``.
     """
     slip = np.zeros(rough.shape, np.float32)
     rows, columns = np.nonzero(rough & (pixels.n_wavelengths > 0))

@@ -38,15 +38,7 @@ def choose_cell_size(data: Amplitudes) -> int:
     The structure function ``<(a(x + s) - a(x))²> / 2 var(a)`` of a fringe is ``1 - cos`` of its phase over the
     distance ``s``; it is taken in blocks, at the wavelengths with the clearest fringes, with the noise subtracted.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-
-    Returns
-    -------
-    size : `int`
-        1, 2, 4 or 8 px, or what keeps the number of cells below `MOST_CELLS`.
+    Returns 1, 2, 4 or 8 px, or what keeps the number of cells below `MOST_CELLS`.
     """
     _, ny, nx = data.shape
     least = int(np.ceil(np.sqrt(ny * nx / MOST_CELLS)))

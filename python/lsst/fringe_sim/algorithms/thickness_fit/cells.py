@@ -86,19 +86,8 @@ class Cells:
 def cell_edges(length: int, size: int, breaks: Sequence[int] = ()) -> NDArray[np.int64]:
     """Edges of cells of about ``size`` pixels, none of which crosses a break.
 
-    Parameters
-    ----------
-    length : `int`
-        Number of pixels.
-    size : `int`
-        Wanted size of a cell; none is larger.
-    breaks : sequence of `int`, optional
-        Pixels at which a new zone of the sensor begins.
-
-    Raises
-    ------
-    InputError
-        A break outside the sensor.
+    ``length``: number of pixels; ``size``: wanted size of a cell; none is larger; ``breaks``: pixels at which a new
+    zone of the sensor begins. Raises `InputError`: a break outside the sensor.
     """
     for value in breaks:
         if not 0 <= value <= length:
@@ -117,12 +106,8 @@ def effective_number(rows: float, columns: float, correlation_px: float) -> floa
     The correlation of two pixels a distance ``r`` apart is ``exp(-r² / 4 s²)``; the variance of the mean is
     the mean of the correlation over all pairs, which factors into rows and columns.
 
-    Parameters
-    ----------
-    rows, columns : `float`
-        Size of the block [px].
-    correlation_px : `float`
-        Standard deviation ``s`` of the kernel [px]; 0 for independent pixels.
+    ``rows, columns``: size of the block [px]; ``correlation_px``: standard deviation ``s`` of the kernel [px]; 0
+    for independent pixels.
     """
     return (
         rows * columns / (_pair_sum(round(rows), correlation_px) * _pair_sum(round(columns), correlation_px))
@@ -157,20 +142,8 @@ def average_cells(
 ) -> Cells:
     """Average a cube over cells.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    y_edges, x_edges : `numpy.ndarray`
-        From `cell_edges`.
-    largest_amplitude : array_like, shape ``(n_wavelengths,)``
-        Largest fringe amplitude that the model can show: how much curvature is still a fringe.
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
-
-    Returns
-    -------
-    cells : `Cells`
+    ``y_edges, x_edges``: from `cell_edges`; ``largest_amplitude``: largest fringe amplitude that the model can
+    show: how much curvature is still a fringe, ``(n_wavelengths,)``.
     """
     wavelengths = data.shape[0]
     shape = (len(y_edges) - 1, len(x_edges) - 1)
@@ -204,21 +177,9 @@ def compensate_slopes(
     direction; a slope that is taken from the two halves of a cell is too small by this and by the same loss over
     half a cell.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    slope_y, slope_x : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Slopes of the thickness as found from the halves [µm/px].
-    order_um : `float`
-        Thickness of one fringe order [µm].
-
-    Returns
-    -------
-    cells : `Cells`
-        With amplitudes divided by the loss, and weights to match.
-    slope_y, slope_x : `numpy.ndarray`
-        Corrected slopes.
+    ``slope_y, slope_x``: slopes of the thickness as found from the halves [µm/px], float32, ``(ncy, ncx)``;
+    ``order_um``: thickness of one fringe order [µm]. Returns ``cells``: the cells with amplitudes divided by
+    the loss, and weights to match; ``slope_y, slope_x``: corrected slopes.
     """
     turn_y = slope_y * np.diff(cells.y_edges)[:, None] / order_um
     turn_x = slope_x * np.diff(cells.x_edges)[None, :] / order_um
@@ -244,12 +205,7 @@ def compensate_slopes(
 def sample_pixels(data: Amplitudes, most: int = 200_000) -> Cells:
     """Cells of one pixel each, on a regular grid over the sensor.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    most : `int`, optional
-        Bound on the number of pixels taken.
+    ``most``: bound on the number of pixels taken.
     """
     wavelengths, ny, nx = data.shape
     stride = max(1, int(np.ceil(np.sqrt(ny * nx / most))))

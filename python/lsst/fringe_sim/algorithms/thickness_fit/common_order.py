@@ -23,24 +23,12 @@ _INSIDE = 0.99
 
 @dataclass(frozen=True, eq=False)
 class CommonOrder:
-    """Order of a whole sensor, all nuisances being free.
+    """Order of a whole sensor, all nuisances being free."""
 
-    Attributes
-    ----------
-    shift : `float`
-        Orders by which the thickness is to be moved.
-    fit : `NuisanceFit`
-        Nuisances there.
-    margin : `float`
-        Chi-square by which the next best order is worse, model error allowed for.
-    slip : `float`
-        Probability that the order is another.
-    """
-
-    shift: float
-    fit: NuisanceFit
-    margin: float
-    slip: float
+    shift: float  # orders by which the thickness is to be moved
+    fit: NuisanceFit  # nuisances there
+    margin: float  # chi-square by which the next best order is worse, model error allowed for
+    slip: float  # probability that the order is another
 
 
 def rank_orders(
@@ -53,20 +41,7 @@ def rank_orders(
 ) -> CommonOrder:
     """Compare the orders of a whole sensor: each with the light, contrast and wavelengths that it needs.
 
-    Parameters
-    ----------
-    cells : `LearningCells`
-        Cells with their thickness.
-    base : `FringeTemplates`
-        The model.
-    free : `Nuisances`
-        What is free.
-    start : `NuisanceFit`
-        Nuisances at the present order.
-    order_um : `float`
-        Thickness of one order [µm].
-    range_um : `tuple` [`float`, `float`]
-        Thicknesses that are possible [µm].
+    ``order_um``: thickness of one order [µm]; ``range_um``: thicknesses that are possible [µm].
     """
     thickness, here = learn(cells, base, free, start)
     if not np.isfinite(

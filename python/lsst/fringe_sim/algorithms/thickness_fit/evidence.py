@@ -48,33 +48,22 @@ _MARGIN_ORDERS = 3
 
 @dataclass(frozen=True, eq=False)
 class OrderEvidence:
-    """What each cell says about its own thickness.
+    """What each cell says about its own thickness."""
 
-    Attributes
-    ----------
-    phase_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Thickness of the best template moved by whole orders into the first order of the range [µm];
-        NaN where a cell has no data.
-    slope_y, slope_x : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Slope of the thickness inside the cells, mean of 3 by 3 cells; the same for every order [µm/px].
-    best_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Thickness of the best template by itself [µm].
-    chi2 : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Its chi-square.
-    evidence : `numpy.ndarray`, float32, shape ``(ncy, ncx, n_orders)``
-        Chi-square of each order ``phase + m * order`` above that of the best, scaled down where the best
-        itself fits badly and where the noise of neighbouring cells is correlated; at most `EVIDENCE_CAP`.
-    order_um : `float`
-        Thickness of one order [µm].
-    """
-
+    # thickness of the best template moved by whole orders into the first order of the range [µm]; NaN where a cell
+    # has no data, float32, ``(ncy, ncx)``
     phase_um: NDArray[np.float32]
+    # slope_y, slope_x: slope of the thickness inside the cells, mean of 3 by 3 cells; the same for every order
+    # [µm/px], float32, ``(ncy, ncx)``
     slope_y: NDArray[np.float32]
     slope_x: NDArray[np.float32]
-    best_um: NDArray[np.float32]
-    chi2: NDArray[np.float32]
+    best_um: NDArray[np.float32]  # thickness of the best template by itself [µm], float32, ``(ncy, ncx)``
+    chi2: NDArray[np.float32]  # its chi-square, float32, ``(ncy, ncx)``
+    # chi-square of each order ``phase + m * order`` above that of the best, scaled down where the best itself fits
+    # badly and where the noise of neighbouring cells is correlated; at most `EVIDENCE_CAP`, float32,
+    # ``(ncy, ncx, n_orders)``
     evidence: NDArray[np.float32]
-    order_um: float
+    order_um: float  # thickness of one order [µm]
 
 
 def order_evidence(
@@ -88,20 +77,8 @@ def order_evidence(
 ) -> OrderEvidence:
     """Compare every cell with templates over the whole range.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    templates : `FringeTemplates`
-        The model; its grid must contain the range.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    range_um : `tuple` [`float`, `float`]
-        Thicknesses that are possible [µm].
-    temper : `float`, optional
-        Independent cells per cell: below 1 where the noise of neighbouring cells is correlated.
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
+    ``order_um``: thickness of one fringe order [µm]; ``range_um``: thicknesses that are possible [µm]; ``temper``:
+    independent cells per cell: below 1 where the noise of neighbouring cells is correlated.
     """
     low = max(round((range_um[0] - templates.start_um) / templates.step_um), 0)
     high = min(round((range_um[1] - templates.start_um) / templates.step_um), len(templates.response) - 1)
@@ -373,16 +350,7 @@ def refine_cells(
 ) -> NDArray[np.float32]:
     """Least chi-square of every cell near a given thickness; NaN stays NaN.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    templates : `FringeTemplates`
-        The model.
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Where to begin [µm].
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
+    ``thickness_um``: where to begin [µm], float32, ``(ncy, ncx)``.
     """
     table = templates.table()
     out = np.full(cells.shape, np.nan, np.float32)

@@ -30,16 +30,7 @@ def first_nuisances(
 ) -> NuisanceFit:
     """Light and contrast before any thickness is known: fringes average out over wavelengths and over the sensor.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    templates : `FringeTemplates`
-        The model.
-    free : `Nuisances`
-        What is free.
-    own : `bool`, optional
-        Whether each wavelength has light of its own, which fringes of few orders are taken for.
+    ``own``: whether each wavelength has light of its own, which fringes of few orders are taken for.
     """
     wavelengths, width = templates.n_wavelengths, cells.value.shape[-1]
     seen = some_of(np.flatnonzero((cells.weight[..., :wavelengths] > 0).all(axis=-1)), _FIRST_CELLS)

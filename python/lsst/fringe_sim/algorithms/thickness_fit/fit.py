@@ -184,17 +184,9 @@ def fit_thickness(
 def amplitudes_from_cube(cube: FringeCube, noise_correlation_px: float | None = None) -> Amplitudes:
     """Fringe amplitudes of a cube: counts over their mean over the sensor, less one.
 
-    Parameters
-    ----------
-    cube : `FringeCube`
-        Flats; a cube in electrons is divided by the mean of its good pixels, a relative one is left as it is.
-    noise_correlation_px : `float`, optional
-        See `fit_thickness`.
-
-    Raises
-    ------
-    InputError
-        A wavelength without a good pixel, or with a mean that is not positive.
+    ``cube``: flats; a cube in electrons is divided by the mean of its good pixels, a relative one is left as it is;
+    ``noise_correlation_px``: see `fit_thickness`. Raises `InputError`: a wavelength without a good pixel, or with a
+    mean that is not positive.
     """
     if noise_correlation_px is None:
         noise_correlation_px = float(cube.metadata.get("SMOOTHPX") or 0.0)
@@ -289,10 +281,7 @@ def _turn_beside(
 def with_observable(model: FringeModel, observable: str) -> FringeModel:
     """The model with another observable.
 
-    Raises
-    ------
-    UnknownNameError
-        There is no such observable.
+    Raises `UnknownNameError`: there is no such observable.
     """
     if observable not in OBSERVABLES:
         raise UnknownNameError("observable", observable, OBSERVABLES)

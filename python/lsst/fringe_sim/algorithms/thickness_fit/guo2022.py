@@ -31,31 +31,11 @@ def walk_fit(
 ) -> PixelFit:
     """Fit every pixel by the walk of the paper.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        Model on a uniform grid; its step is the resolution of the result.
-    start_pixel : `tuple` [`int`, `int`]
-        Row and column of the first pixel. If it is masked, the next good one along the walk takes its place.
-    range_um : `tuple` [`float`, `float`]
-        Range of the first search [µm].
-    window_um : `float`, optional
-        Full width of the later searches [µm]: one fringe order.
-    threads : `int`, optional
-        With 2 or more the forward and the backward walk run at the same time; the result is the same.
-
-    Returns
-    -------
-    fit : `PixelFit`
-
-    Raises
-    ------
-    InputError
-        The start pixel lies outside the sensor, or no pixel is good.
-    OutOfRangeError
-        The search range reaches beyond the templates.
+    ``templates``: model on a uniform grid; its step is the resolution of the result; ``start_pixel``: row and
+    column of the first pixel. If it is masked, the next good one along the walk takes its place; ``range_um``:
+    range of the first search [µm]; ``window_um``: full width of the later searches [µm]: one fringe order. Raises
+    `InputError`: the start pixel lies outside the sensor, or no pixel is good. Raises `OutOfRangeError`: the search
+    range reaches beyond the templates.
     """
     _, ny, nx = data.shape
     row, column = start_pixel

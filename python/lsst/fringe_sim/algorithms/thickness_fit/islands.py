@@ -46,19 +46,7 @@ def fit_islands(fitted: ThicknessMap, cube: FringeCube, model: FringeModel) -> T
     then looked for near the middle of its neighbours, within a few fringe orders and again within half of one. Pixels
     of the rim see both optics.
 
-    Parameters
-    ----------
-    fitted : `ThicknessMap`
-        The first fit.
-    cube : `FringeCube`
-        The flats.
-    model : `FringeModel`
-        The model, with its local effects.
-
-    Returns
-    -------
-    fitted : `ThicknessMap`
-        The same map where no effect is local.
+    Returns the same map where no effect is local.
     """
     geometry = ImageGeometry.of_pixels((fitted.value.shape[0], fitted.value.shape[1]), cube.wavelength_nm)
     for item, inside in model.islands:

@@ -43,24 +43,12 @@ _LEAST_IN_MEAN = 20_000
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Adhesive of every pixel, and silicon of the sensor.
+    """Adhesive of every pixel, and silicon of the sensor."""
 
-    Attributes
-    ----------
-    pixels : `PixelFit`
-        The adhesive. Its uncertainty contains that of the silicon.
-    slip : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Probability that the order of a pixel is wrong.
-    silicon : `SiliconFit`
-        The silicon. If it is not decided, its fringes counted as noise of the flats.
-    found : `GlobalFit`
-        The fit in which the orders of the adhesive were solved.
-    """
-
-    pixels: PixelFit
-    slip: NDArray[np.float32]
-    silicon: SiliconFit
-    found: GlobalFit
+    pixels: PixelFit  # the adhesive. Its uncertainty contains that of the silicon
+    slip: NDArray[np.float32]  # probability that the order of a pixel is wrong, float32, ``(ny, nx)``
+    silicon: SiliconFit  # the silicon. If it is not decided, its fringes counted as noise of the flats
+    found: GlobalFit  # the fit in which the orders of the adhesive were solved
 
 
 def joint_fit(
@@ -76,25 +64,9 @@ def joint_fit(
 ) -> JointFit:
     """Fit adhesive and silicon.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        Grid of the adhesive; its response is replaced.
-    model : `SiliconModel`
-        The model, at any silicon.
-    search : `SiliconSearch`
-        What of the silicon is free.
-    range_um : `tuple` [`float`, `float`]
-        Thicknesses of the adhesive that are possible [µm].
-    cell_px : `int`, optional
-        Size of the cells on which orders are solved [px].
-    nuisances : `Nuisances`, optional
-        What is learned where the model does not fit; the silicon is then left as it is, as the fringes that would
-        tell it lose contrast too.
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
+    ``range_um``: thicknesses of the adhesive that are possible [µm]; ``cell_px``: size of the cells on which orders
+    are solved [px]; ``nuisances``: what is learned where the model does not fit; the silicon is then left as it is,
+    as the fringes that would tell it lose contrast too.
     """
     free, blurred = silicon_free(data, templates, model)
     found = global_fit(free, blurred, range_um=range_um, cell_px=cell_px, threads=threads)

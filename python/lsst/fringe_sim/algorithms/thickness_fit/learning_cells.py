@@ -65,18 +65,8 @@ def sample_blocks(
     Cells are steep: their averages lose contrast and overtones. A block is only as large as its noise asks for, as
     the contrast of what is mostly noise would be taken for too high.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    surface : `CellSurface`
-        Thickness of the cells.
-    free : `Nuisances`
-        What is free.
-    phase_sigma : `float`
-        Standard uncertainty of the phase of a single pixel [rad].
-    order_um : `float`
-        Thickness of one order [µm].
+    ``phase_sigma``: standard uncertainty of the phase of a single pixel [rad]; ``order_um``: thickness of one order
+    [µm].
     """
     _, ny, nx = data.shape
     phase_sigma = np.nan_to_num(phase_sigma, nan=np.inf)  # no phase at all: blocks as large as they may be

@@ -21,21 +21,12 @@ __all__ = ["LoneSurfaces", "settle_lone_surfaces"]
 
 @dataclass(frozen=True, eq=False)
 class LoneSurfaces:
-    """Order of the lone surfaces.
+    """Order of the lone surfaces."""
 
-    Attributes
-    ----------
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Thickness of all cells; only those of lone surfaces may have changed.
-    surface : `numpy.ndarray` of `int`, shape ``(n,)``
-        Numbers of the lone surfaces.
-    slip : `numpy.ndarray`, shape ``(n,)``
-        Probability that their order is wrong.
-    """
-
+    # thickness of all cells; only those of lone surfaces may have changed, float32, ``(ncy, ncx)``
     thickness_um: NDArray[np.float32]
-    surface: NDArray[np.intp]
-    slip: NDArray[np.float64]
+    surface: NDArray[np.intp]  # numbers of the lone surfaces, ``(n,)``
+    slip: NDArray[np.float64]  # probability that their order is wrong, ``(n,)``
 
 
 def settle_lone_surfaces(
@@ -53,28 +44,12 @@ def settle_lone_surfaces(
 ) -> LoneSurfaces:
     """Give every lone surface the order that all its cells together prefer.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    templates : `FringeTemplates`
-        The model, normalised to the sensor.
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Thickness so far [µm]; NaN where a cell has no data.
-    segment : `numpy.ndarray`, int32, shape ``(ncy, ncx)``
-        Number of the surface each cell lies on; -1 where a cell has no data.
-    independence : `numpy.ndarray`, shape ``(n_segments,)``
-        How much more independent the cells of each surface are than ``temper`` says.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    range_um : `tuple` [`float`, `float`]
-        Thicknesses that are possible [µm].
-    temper : `float`
-        Independent cells per cell, as for `order_evidence`.
-    most_cells : `int`
-        Largest surface that is looked at; larger ones have cells enough.
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
+    ``thickness_um``: thickness so far [µm]; NaN where a cell has no data, float32, ``(ncy, ncx)``; ``segment``:
+    number of the surface each cell lies on; -1 where a cell has no data, int32, ``(ncy, ncx)``; ``independence``:
+    how much more independent the cells of each surface are than ``temper`` says, ``(n_segments,)``; ``order_um``:
+    thickness of one fringe order [µm]; ``range_um``: thicknesses that are possible [µm]; ``temper``: independent
+    cells per cell, as for `order_evidence`; ``most_cells``: largest surface that is looked at; larger ones have
+    cells enough.
     """
     surface = np.flatnonzero(_are_lone(segment) & (np.bincount(segment[segment >= 0]) <= most_cells))
     member = np.flatnonzero(np.isin(segment, surface))

@@ -34,21 +34,8 @@ def normalise_to_cells(
     A wrong mean response shifts each thickness by a little that depends on its phase, and so bends the very
     distribution from which the mean response is taken; a few rounds straighten it.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    templates : `FringeTemplates`
-        The model as it is normalised so far.
-    thickness_um : `numpy.ndarray`, shape ``(ncy, ncx)``
-        Thickness of the cells to within a fraction of an order [µm]; NaN where there is none.
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-    templates : `FringeTemplates`
+    ``thickness_um``: thickness of the cells to within a fraction of an order [µm]; NaN where there is none,
+    ``(ncy, ncx)``. Returns the thickness, float32, and the templates.
     """
     thickness, fitted = thickness_um, templates.normalised_to(thickness_um)
     for _ in range(_MOST_ROUNDS):

@@ -93,14 +93,8 @@ def shared_variances(rest: FloatArray, thickness_um: NDArray[np.floating], order
 
     Cells beside each other may err alike, and those of the same phase of the fringes.
 
-    Parameters
-    ----------
-    rest : `numpy.ndarray`, shape ``(n_cells, n_wavelengths)``
-        What cells leave over, in standard deviations.
-    thickness_um : `numpy.ndarray`, shape ``(n_cells,)``
-        Their thickness [µm], neighbours one after the other.
-    order_um : `float`
-        Thickness of a fringe [µm].
+    ``rest``: what cells leave over, in standard deviations, ``(n_cells, n_wavelengths)``; ``thickness_um``: their
+    thickness [µm], neighbours one after the other, ``(n_cells,)``; ``order_um``: thickness of a fringe [µm].
     """
     sizes = [1]
     while _FEWEST_BATCHES * 2 * sizes[-1] <= len(rest):

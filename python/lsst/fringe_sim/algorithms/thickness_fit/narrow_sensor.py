@@ -58,33 +58,15 @@ _OWN_MEAN = 0.1
 
 @dataclass(frozen=True, eq=False)
 class NarrowSensor:
-    """What a sensor of few orders says about its common thickness.
+    """What a sensor of few orders says about its common thickness."""
 
-    Attributes
-    ----------
-    templates : `FringeTemplates`
-        The model with the mean response of the best solution.
-    range_um : `tuple` [`float`, `float`]
-        Least and largest thickness of the solution [µm].
-    slip : `float`
-        Probability that another solution is true.
-    sigma_um : `float`
-        Uncertainty of the mean thickness of the sensor [µm].
-    chi2 : `float`
-        Chi-square of this solution, summed over the cells that were asked.
-    cell : `numpy.ndarray` of `int`, shape ``(n,)``
-        Which cells were asked, counted row by row.
-    cell_um : `numpy.ndarray`, shape ``(n,)``
-        Their thickness [µm].
-    """
-
-    templates: FringeTemplates
-    range_um: tuple[float, float]
-    slip: float
-    sigma_um: float
-    chi2: float
-    cell: NDArray[np.intp]
-    cell_um: FloatArray
+    templates: FringeTemplates  # the model with the mean response of the best solution
+    range_um: tuple[float, float]  # least and largest thickness of the solution [µm]
+    slip: float  # probability that another solution is true
+    sigma_um: float  # uncertainty of the mean thickness of the sensor [µm]
+    chi2: float  # chi-square of this solution, summed over the cells that were asked
+    cell: NDArray[np.intp]  # which cells were asked, counted row by row, ``(n,)``
+    cell_um: FloatArray  # their thickness [µm], ``(n,)``
 
     def agrees_with(self, thickness_um: NDArray[np.float32], order_um: float) -> bool:
         """Whether a map has the same orders where cells were asked, but for a few of them."""
@@ -93,15 +75,7 @@ class NarrowSensor:
 
 
 def is_own_mean(cells: Cells, templates: FringeTemplates) -> bool:
-    """Whether the flats are over their mean over these very cells, not over a larger sensor they were cut from.
-
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    templates : `FringeTemplates`
-        The model.
-    """
+    """Whether the flats are over their mean over these very cells, not over a larger sensor they were cut from."""
     wavelengths = templates.n_wavelengths
     weight = cells.weight[..., :wavelengths] > 0.0
     number = weight.sum(axis=(0, 1))
@@ -123,25 +97,11 @@ def settle_narrow_sensor(
 ) -> list[NarrowSensor]:
     """Find the common thickness of a sensor together with its mean response; the best solutions, best first.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    templates : `FringeTemplates`
-        The model, with any mean response.
-    ideas_um : sequence of `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Ideas of the thickness [µm], of which the shape is used; NaN where a cell has no data. The shape that is
-        true within half an order everywhere must be among them, or the result may be wrong.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    range_um : `tuple` [`float`, `float`]
-        Possible thicknesses [µm].
-    temper : `float`
-        Independent cells per cell, as for `order_evidence`.
-    earlier : sequence of `NarrowSensor`, optional
-        Solutions from other ideas, which compete with the new ones.
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
+    ``ideas_um``: ideas of the thickness [µm], of which the shape is used; NaN where a cell has no data. The shape
+    that is true within half an order everywhere must be among them, or the result may be wrong, float32,
+    ``(ncy, ncx)``; ``order_um``: thickness of one fringe order [µm]; ``range_um``: possible thicknesses [µm];
+    ``temper``: independent cells per cell, as for `order_evidence`; ``earlier``: solutions from other ideas, which
+    compete with the new ones.
     """
     sample, shapes_um, middles_um = _Sample.of(cells, ideas_um, templates.n_wavelengths, _MOST_CELLS)
     stride = max(shapes_um.shape[1] // _FEW_CELLS, 1)

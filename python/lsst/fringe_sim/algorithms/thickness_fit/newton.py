@@ -102,21 +102,10 @@ def newton_block(table, place, value, weight, count, steps, longest, information
 def gauss_newton(table, place, value, weight, item, steps, longest):  # type: ignore[no-untyped-def]
     """Least chi-square near a place of the table.
 
-    Parameters
-    ----------
-    table, value, weight, item
-        As for `score`.
-    place : `float`
-        Where to begin.
-    steps : `int`
-        Largest number of steps, at least 3; a second step below half a per cent of an order ends the search.
-    longest : `float`
-        Longest single step, in steps of the table.
-
-    Returns
-    -------
-    place, information, chi2 : `float`
-        Where it ended, information there, and chi-square after the last (quadratic) step.
+    ``table, value, weight, item``: as for `score`; ``place``: where to begin; ``steps``: largest number of steps,
+    at least 3; a second step below half a per cent of an order ends the search; ``longest``: longest single step,
+    in steps of the table. Returns where it ended, information there, and chi-square after the last (quadratic)
+    step.
     """
     top = table.shape[0] - 1.0
     limit = np.float32(longest)

@@ -40,19 +40,8 @@ SURE = 60.0
 def solve_orders(cells: Cells, found: OrderEvidence, sure: float = SURE) -> NDArray[np.float32]:
     """Join cells into regions and give each region its absolute order.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        The cells; only their edges are used.
-    found : `OrderEvidence`
-        From `order_evidence`.
-    sure : `float`, optional
-        Regions that are surer of their order than this chi-square difference stay apart where they disagree.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        ``phase + order * m`` [µm]; NaN where a cell has no data.
+    ``sure``: regions that are surer of their order than this chi-square difference stay apart where they disagree.
+    Returns ``phase + order * m`` [µm]; NaN where a cell has no data, float32, ``(ncy, ncx)``.
     """
     ny, nx = found.phase_um.shape
     rise_y = found.slope_y * np.diff(cells.y_edges).astype(np.float32)[:, None]

@@ -35,49 +35,35 @@ _BLOCK = 32
 
 @dataclass(frozen=True, eq=False)
 class PixelFit:
-    """Result for every pixel; NaN (and 0 wavelengths) where there was nothing to fit.
+    """Result for every pixel; NaN (and 0 wavelengths) where there was nothing to fit."""
 
-    Attributes
-    ----------
-    value, sigma : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Thickness and its standard uncertainty [µm].
-    chi2 : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Reduced chi-square.
-    n_wavelengths : `numpy.ndarray`, int32, shape ``(ny, nx)``
-        Number of wavelengths used.
-    """
-
+    # value, sigma: thickness and its standard uncertainty [µm], float32, ``(ny, nx)``
     value: NDArray[np.float32]
     sigma: NDArray[np.float32]
-    chi2: NDArray[np.float32]
-    n_wavelengths: NDArray[np.int32]
+    chi2: NDArray[np.float32]  # reduced chi-square, float32, ``(ny, nx)``
+    n_wavelengths: NDArray[np.int32]  # number of wavelengths used, int32, ``(ny, nx)``
 
 
 @dataclass(frozen=True, eq=False)
 class CellSurface:
-    """Thickness and slope of every cell, and where cells lie on one surface.
+    """Thickness and slope of every cell, and where cells lie on one surface."""
 
-    Attributes
-    ----------
-    thickness_um, slope_y, slope_x : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Thickness at the centre [µm] and its slopes [µm/px]; finite everywhere.
-    y_centre, x_centre : `numpy.ndarray`
-        Centres of the cells [px].
-    smooth : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
-        Whether a cell and its eight neighbours lie on one surface.
-    known : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
-        Whether a cell has data; the thickness of the others is borrowed, and no evidence for a surface.
-    sigma_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Standard uncertainty of the thickness from the noise of the flats [µm]; infinite where it is not known.
-    """
-
+    # thickness_um, slope_y, slope_x: thickness at the centre [µm] and its slopes [µm/px]; finite everywhere,
+    # float32, ``(ncy, ncx)``
     thickness_um: NDArray[np.float32]
     slope_y: NDArray[np.float32]
     slope_x: NDArray[np.float32]
+    # y_centre, x_centre: centres of the cells [px]
     y_centre: NDArray[np.float64]
     x_centre: NDArray[np.float64]
-    smooth: NDArray[np.bool_]
+    smooth: NDArray[
+        np.bool_
+    ]  # whether a cell and its eight neighbours lie on one surface, bool, ``(ncy, ncx)``
+    # whether a cell has data; the thickness of the others is borrowed, and no evidence for a surface, bool,
+    # ``(ncy, ncx)``
     known: NDArray[np.bool_]
+    # standard uncertainty of the thickness from the noise of the flats [µm]; infinite where it is not known,
+    # float32, ``(ncy, ncx)``
     sigma_um: NDArray[np.float32]
 
     @classmethod
@@ -130,13 +116,6 @@ def calm_surface(surface: CellSurface, threads: int = 2) -> CellSurface:
 
     Only a place to begin: a cell that noise has put on a false minimum, a fraction of an order away, must not
     take its pixels there.
-
-    Parameters
-    ----------
-    surface : `CellSurface`
-        Cells as they were solved.
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
     """
     out = surface.thickness_um.copy()
 
@@ -188,18 +167,7 @@ def fit_pixels(
 ) -> PixelFit:
     """Refine every pixel.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        The model, normalised to the sensor.
-    surface : `CellSurface`
-        Where to begin.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
+    ``order_um``: thickness of one fringe order [µm].
     """
     _, ny, nx = data.shape
     value, sigma, chi2 = (np.empty((ny, nx), np.float32) for _ in range(3))

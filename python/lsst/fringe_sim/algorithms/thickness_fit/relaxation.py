@@ -42,23 +42,17 @@ _MOST_ROUNDS = 6
 
 @dataclass(frozen=True, eq=False)
 class SettledCells:
-    """Cells with their final order.
+    """Cells with their final order."""
 
-    Attributes
-    ----------
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Thickness of each cell [µm]; NaN where a cell has no data.
-    segment : `numpy.ndarray`, int32, shape ``(ncy, ncx)``
-        Number of the connected surface each cell lies on, 0, 1, ... by size; -1 where a cell has no data.
-    segment_slip : `numpy.ndarray`, shape ``(n_segments,)``
-        Probability that a whole surface has the wrong order.
-    cell_slip : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Probability that a cell has another order than its surface suggests.
-    """
-
+    # thickness of each cell [µm]; NaN where a cell has no data, float32, ``(ncy, ncx)``
     thickness_um: NDArray[np.float32]
+    # number of the connected surface each cell lies on, 0, 1, ... by size; -1 where a cell has no data, int32,
+    # ``(ncy, ncx)``
     segment: NDArray[np.int32]
-    segment_slip: NDArray[np.float64]
+    segment_slip: NDArray[
+        np.float64
+    ]  # probability that a whole surface has the wrong order, ``(n_segments,)``
+    # probability that a cell has another order than its surface suggests, float32, ``(ncy, ncx)``
     cell_slip: NDArray[np.float32]
 
 
@@ -78,28 +72,10 @@ def settle_orders(
 ) -> SettledCells:
     """Revise the orders of all cells.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    templates : `FringeTemplates`
-        The model, normalised to the sensor.
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Thickness so far [µm]; NaN where a cell has no data.
-    slope_y, slope_x : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Slopes of the thickness [µm/px].
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    found : `OrderEvidence`
-        What the cells said at first, over the whole range.
-    range_um : `tuple` [`float`, `float`]
-        Thicknesses that are possible [µm].
-    temper : `float`, optional
-        Independent cells per cell, as for `order_evidence`.
-    correlation_px : `float`, optional
-        Standard deviation of the kernel that correlates the noise [px].
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
+    ``thickness_um``: thickness so far [µm]; NaN where a cell has no data, float32, ``(ncy, ncx)``;
+    ``slope_y, slope_x``: slopes of the thickness [µm/px], float32, ``(ncy, ncx)``; ``order_um``: thickness of one
+    fringe order [µm]; ``range_um``: thicknesses that are possible [µm]; ``temper``: independent cells per cell, as
+    for `order_evidence`; ``correlation_px``: standard deviation of the kernel that correlates the noise [px].
     """
     thickness = thickness_um.copy()
     rise_y = slope_y * np.diff(cells.y_edges).astype(np.float32)[:, None]

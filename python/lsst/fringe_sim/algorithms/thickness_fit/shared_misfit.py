@@ -37,16 +37,8 @@ def doubt_from_shared_misfit(
     The misfit of one pixel in the direction of another order is then as good as that of all: an excess of ``d`` in
     the chi-square of a pixel at another order counts as ``d`` over the shared misfit per degree of freedom.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        The model as it was normalised in the end.
-    thickness_um : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Thickness of every pixel [µm].
-    order_um : `float`
-        Thickness of one fringe order [µm].
+    ``thickness_um``: thickness of every pixel [µm], float32, ``(ny, nx)``; ``order_um``: thickness of one fringe
+    order [µm].
     """
     apart = 1 + int(np.ceil(_APART * data.noise_correlation_px))
     ny, nx = thickness_um.shape
@@ -84,15 +76,6 @@ def leaves_only_noise(data: Amplitudes, templates: FringeTemplates, surface: Cel
     """Whether what a model leaves over in neighbouring pixels has nothing in common.
 
     The median over pairs of pixels is not moved by some that have a wrong order.
-
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        The model, normalised to the sensor.
-    surface : `CellSurface`
-        Where the pixels begin.
     """
     apart = 1 + int(np.ceil(_APART * data.noise_correlation_px))
     _, ny, nx = data.shape

@@ -71,27 +71,17 @@ _CAP = 25.0
 class SiliconSearch:
     """What of the silicon is free.
 
-    Parameters
-    ----------
-    degree : `int`, optional
-        0 for one thickness of the whole sensor, 1 for a plane, 2 for a paraboloid.
-    span_um : `float`, optional
-        How far the mean may lie from the thickness in the model, on both sides [µm].
-    tilt_um : `float`, optional
-        Largest difference between middle and edge of the sensor, for a degree above 0 [µm].
-    slip_limit : `float`, optional
-        The silicon is held fixed if its order would be wrong with a larger probability.
-
-    Raises
-    ------
-    OutOfRangeError
-        A degree beyond 2, or a length or probability that is not positive.
+    Raises `OutOfRangeError`: a degree beyond 2, or a length or probability that is not positive.
     """
 
-    degree: int = 0
-    span_um: float = 1.0
-    tilt_um: float = 0.2
-    slip_limit: float = 0.01
+    degree: int = 0  # 0 for one thickness of the whole sensor, 1 for a plane, 2 for a paraboloid
+    span_um: float = 1.0  # how far the mean may lie from the thickness in the model, on both sides [µm]
+    tilt_um: float = (
+        0.2  # largest difference between middle and edge of the sensor, for a degree above 0 [µm]
+    )
+    slip_limit: float = (
+        0.01  # the silicon is held fixed if its order would be wrong with a larger probability
+    )
 
     def __post_init__(self) -> None:
         if self.degree not in (0, 1, 2):
@@ -114,58 +104,30 @@ class SiliconSearch:
 
 @dataclass(frozen=True, eq=False)
 class SiliconForecast:
-    """What the flats can tell about the silicon.
+    """What the flats can tell about the silicon."""
 
-    Attributes
-    ----------
-    sigma_um : `float`
-        Largest uncertainty of the thickness of the silicon on the sensor, from its fringes alone [µm].
-    slip_probability : `float`
-        Probability that its order is wrong.
-    order_um : `float`
-        Thickness of one fringe order of the silicon [µm].
-    fringe : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Half peak to peak of its fringes in each flat, as a fraction of the level.
-    decided : `bool`
-        Whether the flats decide.
-    reason : `str`
-        Why, or why not.
-    """
-
-    sigma_um: float
-    slip_probability: float
-    order_um: float
+    sigma_um: float  # largest uncertainty of the thickness of the silicon on the sensor, from its fringes alone [µm]
+    slip_probability: float  # probability that its order is wrong
+    order_um: float  # thickness of one fringe order of the silicon [µm]
+    # half peak to peak of its fringes in each flat, as a fraction of the level, ``(n_wavelengths,)``
     fringe: FloatArray
-    decided: bool
-    reason: str
+    decided: bool  # whether the flats decide
+    reason: str  # why, or why not
 
 
 @dataclass(frozen=True, eq=False)
 class SiliconFit:
-    """Thickness of the silicon over a sensor.
+    """Thickness of the silicon over a sensor."""
 
-    Attributes
-    ----------
-    search : `SiliconSearch`
-        What was free.
-    coefficients : `numpy.ndarray`, shape ``(n_terms,)``
-        Of the terms of `SiliconSearch.terms`, relative to the thickness in the model [µm]; zeros if not decided.
-    covariance : `numpy.ndarray`, shape ``(n_terms, n_terms)``
-        Their covariance [µm²], larger by the misfit of the flats if that is above one.
-    chi2 : `float`
-        Chi-square per degree of freedom of the pixels that were asked.
-    slip_probability : `float`
-        Probability that another order of the silicon is the right one.
-    forecast : `SiliconForecast`
-        What was to be expected.
-    """
-
-    search: SiliconSearch
+    search: SiliconSearch  # what was free
+    # of the terms of `SiliconSearch.terms`, relative to the thickness in the model [µm]; zeros if not decided,
+    # ``(n_terms,)``
     coefficients: FloatArray
+    # their covariance [µm²], larger by the misfit of the flats if that is above one, ``(n_terms, n_terms)``
     covariance: FloatArray
-    chi2: float
-    slip_probability: float
-    forecast: SiliconForecast
+    chi2: float  # chi-square per degree of freedom of the pixels that were asked
+    slip_probability: float  # probability that another order of the silicon is the right one
+    forecast: SiliconForecast  # what was to be expected
 
     @property
     def decided(self) -> bool:
@@ -201,12 +163,7 @@ class SiliconFit:
 def silicon_map(fitted: ThicknessMap, model: FringeModel) -> ThicknessMap | None:
     """Thickness of the silicon on the pixels of a map that was fitted together with it; `None` if it was not decided.
 
-    Parameters
-    ----------
-    fitted : `ThicknessMap`
-        Map of the other layer, with the keywords of `SiliconFit.cards`.
-    model : `FringeModel`
-        The model of that fit.
+    ``fitted``: map of the other layer, with the keywords of `SiliconFit.cards`.
     """
     header = fitted.metadata
     if not header.get("SIFIT"):
@@ -241,26 +198,17 @@ def silicon_map(fitted: ThicknessMap, model: FringeModel) -> ThicknessMap | None
 
 @dataclass(frozen=True, eq=False)
 class SiliconTables:
-    """Response against the adhesive for several thicknesses of the silicon.
+    """Response against the adhesive for several thicknesses of the silicon."""
 
-    Attributes
-    ----------
-    response : `numpy.ndarray`, float32, shape ``(n_silicon, n_thickness, padded wavelengths)``
-        Response; 0 in the padding.
-    silicon_start_um, silicon_step_um : `float`
-        First silicon, relative to that of the model, and spacing [µm].
-    start_um, step_um : `float`
-        First thickness of the adhesive and spacing [µm].
-    wavelengths : `int`
-        Number of wavelengths, without padding.
-    """
-
+    # response; 0 in the padding, float32, ``(n_silicon, n_thickness, padded wavelengths)``
     response: NDArray[np.float32]
+    # silicon_start_um, silicon_step_um: first silicon, relative to that of the model, and spacing [µm]
     silicon_start_um: float
     silicon_step_um: float
+    # start_um, step_um: first thickness of the adhesive and spacing [µm]
     start_um: float
     step_um: float
-    wavelengths: int
+    wavelengths: int  # number of wavelengths, without padding
 
     def at(
         self, silicon_um: FloatArray, thickness_um: FloatArray
@@ -311,20 +259,12 @@ class _Solution:
 class SiliconModel:
     """The response of the flats of a cube, each with its own width of the line, for any silicon.
 
-    Parameters
-    ----------
-    model : `FringeModel`
-        The model.
-    wavelength_nm, bandwidth_nm : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Wavelengths and widths of the lines [nm]. A width as in the set-up, or 0, is that of the model.
-
-    Raises
-    ------
-    InputError
-        The layer that varies is the silicon itself.
+    Raises `InputError`: the layer that varies is the silicon itself.
     """
 
-    model: FringeModel
+    model: FringeModel  # the model
+    # wavelength_nm, bandwidth_nm: wavelengths and widths of the lines [nm]. A width as in the set-up, or 0, is that
+    # of the model, ``(n_wavelengths,)``
     wavelength_nm: FloatArray
     bandwidth_nm: FloatArray
 
@@ -383,15 +323,6 @@ def silicon_free(
     """Flats and model for a first fit that does not know the silicon.
 
     The model is averaged over one order of the silicon, and what its fringes do to a flat counts as noise.
-
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        Grid of the model.
-    model : `SiliconModel`
-        The model, at any silicon.
     """
     flats = model
     shifts = flats.order_um * (np.arange(_SCAN_PER_ORDER) + 0.5 - 0.5 * _SCAN_PER_ORDER) / _SCAN_PER_ORDER
@@ -419,24 +350,10 @@ def find_silicon(
 ) -> SiliconFit:
     """Fit the thickness of the silicon beside that of the adhesive.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    thickness_um : `numpy.ndarray`, shape ``(ny, nx)``
-        Thickness of the adhesive from a first fit, right to a quarter of an order [µm]; NaN where a pixel is not to
-        be asked.
-    model : `SiliconModel`
-        The model, at any silicon; its own is where the search begins.
-    search : `SiliconSearch`
-        What is free.
-    order_um : `float`
-        Thickness of one fringe order of the adhesive [µm].
-
-    Returns
-    -------
-    found : `SiliconFit`
-        Not `SiliconFit.decided` where the flats cannot tell.
+    ``thickness_um``: thickness of the adhesive from a first fit, right to a quarter of an order [µm]; NaN where a
+    pixel is not to be asked, ``(ny, nx)``; ``model``: the model, at any silicon; its own is where the search
+    begins; ``order_um``: thickness of one fringe order of the adhesive [µm]. The result is not
+    `SiliconFit.decided` where the flats cannot tell.
     """
     sample = _sample(data, thickness_um, search)
     forecast = _forecast(model, sample, search, order_um)

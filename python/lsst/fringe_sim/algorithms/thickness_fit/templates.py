@@ -288,18 +288,8 @@ def arc_length_nodes(amplitude: FloatArray, weight: ArrayLike, nodes: int) -> ND
     Uniform thickness steps crowd where the curve turns slowly and leap where it turns fast (the sharp side
     of an Airy fringe), and a leap can step over an order.
 
-    Parameters
-    ----------
-    amplitude : `numpy.ndarray`, shape ``(n_thickness, n_wavelengths)``
-        The curve.
-    weight : array_like, shape ``(n_wavelengths,)``
-        Inverse variance of the data: distances are counted in standard deviations.
-    nodes : `int`
-        Number of rows wanted.
-
-    Returns
-    -------
-    rows : `numpy.ndarray` of `int`, ascending, first and last row included
+    ``amplitude``: the curve, ``(n_thickness, n_wavelengths)``; ``weight``: inverse variance of the data: distances
+    are counted in standard deviations, ``(n_wavelengths,)``; ``nodes``: number of rows wanted.
     """
     step = np.sqrt((np.diff(amplitude, axis=0) ** 2) @ np.asarray(weight, dtype=float))
     # A floor keeps the thickness steps bounded where nothing changes.

@@ -59,23 +59,9 @@ def lone_slip_probability(
 ) -> NDArray[np.float32]:
     """Probability that the order of a pixel is wrong, on its own amplitudes alone.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        The model.
-    thickness_um : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Fitted thickness [µm].
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
-
-    Returns
-    -------
-    probability : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        With a flat prior over four orders on both sides; 1 where there is no thickness.
+    ``thickness_um``: fitted thickness [µm], float32, ``(ny, nx)``; ``order_um``: thickness of one fringe order
+    [µm]. Returns it for a flat prior over four orders on both sides; 1 where there is no thickness, float32,
+    ``(ny, nx)``.
     """
     out = np.ones(thickness_um.shape, np.float32)
     table = templates.table()

@@ -27,32 +27,20 @@ _WIDTHS, _PLACES, _ZOOMS = 25, 101, 3
 
 @dataclass(frozen=True)
 class CommonError:
-    """What all wavelengths are off by, given how far they are off relative to each other.
+    """What all wavelengths are off by, given how far they are off relative to each other."""
 
-    Attributes
-    ----------
-    mean_nm, sigma_nm : `float`
-        What is to be added to all offsets, and its standard uncertainty [nm].
-    cost : `float`
-        Twice the negative logarithm of the probability of the relative offsets.
-    """
-
+    # mean_nm, sigma_nm: what is to be added to all offsets, and its standard uncertainty [nm]
     mean_nm: float
     sigma_nm: float
-    cost: float
+    cost: float  # twice the negative logarithm of the probability of the relative offsets
 
 
 def common_error(shift_nm: FloatArray, along: FloatArray, accuracy_nm: float) -> CommonError:
     """Common error of the wavelengths, summed over it and over the width of their distribution.
 
-    Parameters
-    ----------
-    shift_nm : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Offsets that fit the flats [nm].
-    along : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        What may be added to them without any effect on the flats.
-    accuracy_nm : `float`
-        Stated standard deviation of the wavelengths about their labels [nm].
+    ``shift_nm``: offsets that fit the flats [nm], ``(n_wavelengths,)``; ``along``: what may be added to them
+    without any effect on the flats, ``(n_wavelengths,)``; ``accuracy_nm``: stated standard deviation of the
+    wavelengths about their labels [nm].
     """
     widths = np.geomspace(*_range_of_widths(accuracy_nm), _WIDTHS)
     roots = -shift_nm / along

@@ -33,29 +33,9 @@ def settle_weak_pixels(
 ) -> tuple[PixelFit, NDArray[np.bool_]]:
     """Give pixels that do not tell their thickness by themselves the surface of the cells as a prior.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        The model, normalised to the sensor.
-    surface : `CellSurface`
-        The cells as they were solved.
-    cells : `Cells`
-        Their mean amplitudes.
-    pixels : `PixelFit`
-        What the pixels found by themselves; its arrays are revised in place.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
-
-    Returns
-    -------
-    pixels : `PixelFit`
-        The revised fit.
-    leaning : `numpy.ndarray`, bool, shape ``(ny, nx)``
-        Pixels that have a surface as their prior.
+    ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``order_um``: thickness of one
+    fringe order [µm]. Returns ``pixels``: the revised fit; ``leaning``: pixels that have a surface as their prior,
+    bool, ``(ny, nx)``.
     """
     typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
     weak = _weak(templates, pixels, widest_parabola(templates, typical, order_um))
