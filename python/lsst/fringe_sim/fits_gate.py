@@ -66,19 +66,9 @@ def check_axes(stream: IO[bytes], source: str) -> None:
     negative size it looks for the next header further in front, again and again. A file of a few megabytes,
     compressed or with holes, may stand for any number of bytes.
 
-    Parameters
-    ----------
-    stream : binary file
-        The file, compressed or not. It is read, and stands at its beginning afterwards.
-    source : `str`
-        Its name.
-
-    Raises
-    ------
-    FrameFormatError
-        There is such a header, or the file stands for far more than it is.
-    OSError, EOFError
-        The file cannot be read, or cannot be decompressed.
+    ``stream``: the file, compressed or not. It is read, and stands at its beginning afterwards; ``source``: its
+    name. Raises `FrameFormatError`: there is such a header, or the file stands for far more than it is. Raises
+    `OSError, EOFError`: the file cannot be read, or cannot be decompressed.
     """
     most = _most_bytes(stream, source)
     stream.seek(0)

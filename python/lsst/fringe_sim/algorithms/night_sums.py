@@ -75,19 +75,13 @@ class NightSums:
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """Sums with the change of the fringes of every frame with a shift.
+    """Sums with the change of the fringes of every frame with a shift."""
 
-    Attributes
-    ----------
-    total, gradient : `numpy.ndarray`, shape ``(ny, nx)``
-        Sums over frames of weight times the square of the change, and times change and residual.
-    cross : `numpy.ndarray`, shape ``(F, P, splines)``
-        Products of weight, change and terms with the splines.
-    """
-
+    # total, gradient: sums over frames of weight times the square of the change, and times change and residual,
+    # ``(ny, nx)``
     total: FloatArray
     gradient: FloatArray
-    cross: FloatArray
+    cross: FloatArray  # products of weight, change and terms with the splines, ``(F, P, splines)``
 
     @classmethod
     def of(

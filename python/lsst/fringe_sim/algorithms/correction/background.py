@@ -174,35 +174,18 @@ class BackgroundTerms:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One side of an image, cut where a span of the splines, an amplifier or a block ends.
+    """One side of an image, cut where a span of the splines, an amplifier or a block ends."""
 
-    Attributes
-    ----------
-    splines : `numpy.ndarray`, shape ``(side, spans + 3)``
-        Cubic B-splines at the centres of the pixels.
-    pixel_part : `numpy.ndarray` of `int`, shape ``(side,)``
-        Amplifier of each pixel.
-    edges : `numpy.ndarray` of `int`, shape ``(N + 1,)``
-        First pixels of the N pieces, and the length of the side.
-    basis : `list` of `numpy.ndarray`, shape ``(pixels, 7)``
-        Orthonormal polynomials of rising degree over the pixels of each piece; 0 for those beyond its pixels.
-    product : `numpy.ndarray`, shape ``(N, 4, 4, 7)``
-        Products of two of the first four polynomials, as sums of all.
-    cubic : `numpy.ndarray`, shape ``(N, 4, 4)``
-        Coefficients of the four splines of a piece.
-    one : `numpy.ndarray`, shape ``(N, 4)``
-        Coefficients of the constant 1.
-    span, part, half, block : `numpy.ndarray` of `int`, shape ``(N,)``
-        First spline, amplifier, half of an amplifier, and block of each piece.
-    """
-
-    splines: FloatArray
-    pixel_part: IntArray
-    edges: IntArray
+    splines: FloatArray  # cubic B-splines at the centres of the pixels, ``(side, spans + 3)``
+    pixel_part: IntArray  # amplifier of each pixel, ``(side,)``
+    edges: IntArray  # first pixels of the N pieces, and the length of the side, ``(N + 1,)``
+    # orthonormal polynomials of rising degree over the pixels of each piece; 0 for those beyond its pixels,
+    # ``(pixels, 7)``
     basis: list[FloatArray]
-    product: FloatArray
-    cubic: FloatArray
-    one: FloatArray
+    product: FloatArray  # products of two of the first four polynomials, as sums of all, ``(N, 4, 4, 7)``
+    cubic: FloatArray  # coefficients of the four splines of a piece, ``(N, 4, 4)``
+    one: FloatArray  # coefficients of the constant 1, ``(N, 4)``
+    # span, part, half, block: first spline, amplifier, half of an amplifier, and block of each piece, ``(N,)``
     span: IntArray
     part: IntArray
     half: IntArray

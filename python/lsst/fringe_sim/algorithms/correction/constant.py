@@ -19,17 +19,9 @@ LEAST_PROBABILITY = 1e-3
 def without_constant_blocks(image: NDArray[np.generic], good: BoolArray) -> BoolArray:
     """Good pixels that have noise.
 
-    Parameters
-    ----------
-    image : `numpy.ndarray`, shape ``(ny, nx)``
-        The frame.
-    good : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
-        Pixels that may be used.
-
-    Notes
-    -----
-    Rounded pixels may be equal to their neighbours by chance. How often is told by the blocks that are not constant;
-    a frame without any such block has no noise that could be missed.
+    ``image``: the frame, ``(ny, nx)``; ``good``: pixels that may be used, ``(ny, nx)``. Rounded pixels may be equal
+    to their neighbours by chance. How often is told by the blocks that are not constant; a frame without any such
+    block has no noise that could be missed.
     """
     ny, nx = (size // BLOCK_PX for size in image.shape)
     whole = image[: ny * BLOCK_PX, : nx * BLOCK_PX].reshape(ny, BLOCK_PX, nx, BLOCK_PX)

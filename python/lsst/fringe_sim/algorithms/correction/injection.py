@@ -24,46 +24,29 @@ QUANTITIES = ("", "e1_", "e2_", "size_")
 
 @dataclass(frozen=True)
 class InjectionOptions:
-    """Which sources are drawn, and how they are measured.
+    """Which sources are drawn, and how they are measured."""
 
-    Attributes
-    ----------
-    fwhm_arcsec : `float`
-        Width of the image of a star [arcsec].
-    half_light_arcsec : `float`
-        Half-light radius of the exponential discs that stand for galaxies [arcsec].
-    signal_to_noise : `tuple` [`float`, ...]
-        Fluxes, over the noise of the sky in the aperture.
-    number : `int`
-        Most sources of each kind and flux.
-    seed : `int`
-        Of the places.
-    """
-
-    fwhm_arcsec: float = 0.8
+    fwhm_arcsec: float = 0.8  # width of the image of a star [arcsec]
+    # half-light radius of the exponential discs that stand for galaxies [arcsec]
     half_light_arcsec: float = 0.5
-    signal_to_noise: tuple[float, ...] = (10.0, 30.0, 100.0)
-    number: int = 200
-    seed: int = 1
+    signal_to_noise: tuple[float, ...] = (
+        10.0,
+        30.0,
+        100.0,
+    )  # fluxes, over the noise of the sky in the aperture
+    number: int = 200  # most sources of each kind and flux
+    seed: int = 1  # of the places
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Sources of one kind and flux in one frame.
+    """Sources of one kind and flux in one frame."""
 
-    Attributes
-    ----------
-    kind : `str`
-        ``point`` or ``extended``.
-    flux : `float`
-        What each has, in the unit of the frame.
-    before, after : `numpy.ndarray`, shape ``(4, N)``
-        Departures from what the source has, in the frame with its fringes and without: of the flux as a part of it,
-        of the two components of the ellipticity, of the size as a part of it. NaN where no shape is found.
-    """
-
-    kind: str
-    flux: float
+    kind: str  # ``point`` or ``extended``
+    flux: float  # what each has, in the unit of the frame
+    # before, after: departures from what the source has, in the frame with its fringes and without: of the flux as
+    # a part of it, of the two components of the ellipticity, of the size as a part of it. NaN where no shape is
+    # found, ``(4, N)``
     before: FloatArray
     after: FloatArray
 
@@ -78,33 +61,14 @@ def inject_sources(
 ) -> list[Measured]:
     """Draw sources into a copy of a frame, correct it anew, and measure them.
 
-    Parameters
-    ----------
-    image : `numpy.ndarray`, shape ``(ny, nx)``
-        The frame with its fringes, which stays as it is.
-    free : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
-        Good pixels without objects.
-    noise : `float`
-        Standard deviation of a pixel.
-    pixel_arcsec : `float`
-        Size of a pixel [arcsec].
-    correct : callable
-        ``image -> (before, after)``: the frame less its smooth background, with and without fringes.
-    options : `InjectionOptions`, optional
-        Sources.
-
-    Raises
-    ------
-    InputError
-        No place where a source would be alone.
-
-    Notes
-    -----
-    Fluxes are sums over a circle whose radius is the width of a star, less the mean of a ring around it, over the
-    part of the flux that the same measurement finds of the source without noise. Shapes are adaptive moments (``hsm``
-    of GalSim; Hirata & Seljak 2003, MNRAS 343, 459, doi 10.1046/j.1365-8711.2003.06683.x) of the image less the same
-    mean, compared with those of the source without noise. Noise of the sources themselves is not added: what
-    scatters is the sky and its fringes.
+    ``image``: the frame with its fringes, which stays as it is, ``(ny, nx)``; ``free``: good pixels without
+    objects, ``(ny, nx)``; ``noise``: standard deviation of a pixel; ``pixel_arcsec``: size of a pixel [arcsec];
+    ``correct``: ``image -> (before, after)``: the frame less its smooth background, with and without fringes.
+    Raises `InputError`: no place where a source would be alone. Fluxes are sums over a circle whose radius is the
+    width of a star, less the mean of a ring around it, over the part of the flux that the same measurement finds of
+    the source without noise. Shapes are adaptive moments (``hsm`` of GalSim; Hirata & Seljak 2003, MNRAS 343, 459,
+    doi 10.1046/j.1365-8711.2003.06683.x) of the image less the same mean, compared with those of the source without
+    noise. Noise of the sources themselves is not added: what scatters is the sky and its fringes.
     """
     chosen = options or InjectionOptions()
     sources = Source.of_all(chosen, pixel_arcsec)
@@ -168,18 +132,10 @@ def bias_columns(departures: Mapping[str, FloatArray]) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A kind of source: its image of flux 1, and what is found of it without noise.
+    """A kind of source: its image of flux 1, and what is found of it without noise."""
 
-    Attributes
-    ----------
-    kind : `str`
-        ``point`` or ``extended``.
-    stamp : `numpy.ndarray`, shape ``(S, S)``
-        Image in the middle of a square.
-    """
-
-    kind: str
-    stamp: FloatArray
+    kind: str  # ``point`` or ``extended``
+    stamp: FloatArray  # image in the middle of a square, ``(S, S)``
     _aperture: _Aperture
     _seen: FloatArray  # part of the flux in the aperture, two components of the ellipticity, size [px]
 

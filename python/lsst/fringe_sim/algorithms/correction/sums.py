@@ -31,24 +31,12 @@ FEW = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Least-squares solution.
+    """Least-squares solution."""
 
-    Attributes
-    ----------
-    scale : `numpy.ndarray`, shape ``(K,)``
-        Scales of the templates.
-    coefficient : `numpy.ndarray`, shape ``(P,)``
-        Coefficients of the background.
-    schur : `numpy.ndarray`, shape ``(K, K)``
-        Normal matrix of the scales with the background eliminated.
-    leakage : `numpy.ndarray`, shape ``(P, K)``
-        Background that each template resembles.
-    """
-
-    scale: FloatArray
-    coefficient: FloatArray
-    schur: FloatArray
-    leakage: FloatArray
+    scale: FloatArray  # scales of the templates, ``(K,)``
+    coefficient: FloatArray  # coefficients of the background, ``(P,)``
+    schur: FloatArray  # normal matrix of the scales with the background eliminated, ``(K, K)``
+    leakage: FloatArray  # background that each template resembles, ``(P, K)``
 
 
 class FrameSums:
@@ -57,16 +45,8 @@ class FrameSums:
     One pass over the pixels makes them. When few pixels come or go, only those are added or taken away; parts of the
     frame, errors and what is left of a fit need no pixels at all.
 
-    Parameters
-    ----------
-    image : `numpy.ndarray`, shape ``(ny, nx)``
-        The frame.
-    weight : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Inverse variance; 0 where a pixel is never used.
-    patterns : sequence of `numpy.ndarray`, K of shape ``(ny, nx)``
-        Templates; numbers wherever the weight is not 0.
-    background : `BackgroundTerms`
-        Terms beside them.
+    ``image``: the frame, ``(ny, nx)``; ``weight``: inverse variance; 0 where a pixel is never used, float32,
+    ``(ny, nx)``; ``patterns``: templates; numbers wherever the weight is not 0, ``(K, ny, nx)``.
     """
 
     def __init__(
@@ -97,10 +77,7 @@ class FrameSums:
     def solve(self, cells: BoolArray | None = None, *, templates: bool = True) -> Solution:
         """Least-squares solution from all cells or some, with the templates or without.
 
-        Raises
-        ------
-        UndeterminedError
-            Templates that the background or other templates can stand for.
+        Raises `UndeterminedError`: templates that the background or other templates can stand for.
         """
         matrix = self.matrix if cells is None else self.matrix * cells[..., None, None]
         number = len(self.patterns) if templates else 0

@@ -501,37 +501,18 @@ def _against_field(
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of a fit.
+    """Result of a fit."""
 
-    Attributes
-    ----------
-    settings : `dict`
-        Effects by ``name.parameter``, those held fixed included.
-    coordinates : `tuple` [`Coordinate`, ...]
-        The free ones.
-    position : `numpy.ndarray`
-        Values of the coordinates.
-    levels : `numpy.ndarray`, shape ``(L,)``
-        Coefficients of the levels.
-    field : `numpy.ndarray`, shape ``(M,)``
-        Coefficients of the thickness.
-    chi2 : `float`
-        Whitened sum of squares, and that of the field against a map that is known.
-    information : `numpy.ndarray`
-        Curvature in the free coordinates, nuisances profiled out, without prior.
-    spread : `numpy.ndarray`
-        Rms distance of other minima that the data allow, by coordinate.
-    """
-
-    settings: dict[str, float]
-    coordinates: tuple[Coordinate, ...]
-    position: FloatArray
-    levels: FloatArray
-    field: FloatArray
-    chi2: float
-    information: FloatArray
+    settings: dict[str, float]  # effects by ``name.parameter``, those held fixed included
+    coordinates: tuple[Coordinate, ...]  # the free ones
+    position: FloatArray  # values of the coordinates
+    levels: FloatArray  # coefficients of the levels, ``(L,)``
+    field: FloatArray  # coefficients of the thickness, ``(M,)``
+    chi2: float  # whitened sum of squares, and that of the field against a map that is known
+    information: FloatArray  # curvature in the free coordinates, nuisances profiled out, without prior
     iterations: int = 0
     converged: bool = True
+    # rms distance of other minima that the data allow, by coordinate
     spread: FloatArray = dataclass_field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:

@@ -41,10 +41,8 @@ there, but in wrong fringe orders."""
 class Slopes:
     """Change of a field from cell to cell, from neighbours that are seen.
 
-    Parameters
-    ----------
-    seen : `numpy.ndarray` of `bool`, shape ``(ny, nx)``
-        Cells where the field is known; slopes of others, and of those farther than three from the next, are 0.
+    ``seen``: cells where the field is known; slopes of others, and of those farther than three from the next, are
+    0, ``(ny, nx)``.
     """
 
     def __init__(self, seen: BoolArray) -> None:

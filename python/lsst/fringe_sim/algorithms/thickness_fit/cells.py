@@ -43,22 +43,17 @@ _LEAST_FILLED = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Mean amplitude of every cell.
+    """Mean amplitude of every cell."""
 
-    Attributes
-    ----------
-    value, weight : `numpy.ndarray`, float32, shape ``(ncy, ncx, padded wavelengths)``
-        Mean amplitude and its inverse variance; weight 0 where there is none.
-    rise_y, rise_x : `numpy.ndarray`, float32, shape of ``value``
-        Slope of the amplitude inside the cell along rows and columns [1/px], from its two halves.
-    y_edges, x_edges : `numpy.ndarray` of `int`
-        First row (column) of each cell, and the end of the last.
-    """
-
+    # value, weight: mean amplitude and its inverse variance; weight 0 where there is none, float32,
+    # ``(ncy, ncx, padded wavelengths)``
     value: NDArray[np.float32]
     weight: NDArray[np.float32]
+    # rise_y, rise_x: slope of the amplitude inside the cell along rows and columns [1/px], from its two halves,
+    # float32
     rise_y: NDArray[np.float32]
     rise_x: NDArray[np.float32]
+    # y_edges, x_edges: first row (column) of each cell, and the end of the last
     y_edges: NDArray[np.int64]
     x_edges: NDArray[np.int64]
 

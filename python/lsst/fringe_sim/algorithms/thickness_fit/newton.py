@@ -39,21 +39,10 @@ def _score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
 def score(table, place, value, weight, item):  # type: ignore[no-untyped-def]
     """Score, information and chi-square at one place of the table, in units of its step.
 
-    Parameters
-    ----------
-    table : float32, shape ``(n_thickness, padded wavelengths)``
-        Template amplitudes.
-    place : `float`
-        Thickness in steps of the table; between 0 and ``n_thickness - 1``.
-    value, weight : float32, shape ``(n, padded wavelengths)``
-        Amplitudes and inverse variances; weight 0 where there is none.
-    item : `int`
-        Which row of them.
-
-    Returns
-    -------
-    score, information, chi2 : `float`
-        ``sum w g r``, ``sum w g²`` and ``sum w r²`` with the residual ``r`` and the slope ``g``.
+    ``table``: template amplitudes, ``(n_thickness, padded wavelengths)``; ``place``: thickness in steps of the
+    table; between 0 and ``n_thickness - 1``; ``value, weight``: amplitudes and inverse variances; weight 0 where
+    there is none, ``(n, padded wavelengths)``; ``item``: which row of them. Returns ``sum w g r``, ``sum w g²`` and
+    ``sum w r²`` with the residual ``r`` and the slope ``g``.
     """
     return _score(table, place, value, weight, item)
 

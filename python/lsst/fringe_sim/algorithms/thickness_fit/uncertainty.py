@@ -24,17 +24,8 @@ def slip_probability(found: GlobalFit, out: NDArray[np.float32] | None = None) -
     Either the whole surface is off, on the summed evidence of its cells; or its cell is, against the neighbours;
     or, near a step, the pixel lies on the other side of it.
 
-    Parameters
-    ----------
-    found : `GlobalFit`
-        Result of the global fit.
-    out : `numpy.ndarray`, float32, shape ``(ny, nx)``, optional
-        Where to write; may be ``found.border_slip``, which is then lost.
-
-    Returns
-    -------
-    probability : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        1 where a cell has no data.
+    ``out``: where to write; may be ``found.border_slip``, which is then lost, float32, ``(ny, nx)``. Returns 1
+    where a cell has no data, float32, ``(ny, nx)``.
     """
     settled = found.settled
     by_segment = np.append(settled.segment_slip, 1.0)[settled.segment]
