@@ -223,8 +223,7 @@ def to_number(field: str, value: Any, allowed: str = "a number", *, source: str 
         raise OutOfRangeError(field, sign, f"{allowed} below 1.8e308", source=source) from None
 
 
-TRUTHS = ("bool", "bool_")
-"""Types of Python and numpy that are no numbers, though both count them as 0 and 1."""
+TRUTHS = ("bool", "bool_")  # Types of Python and numpy that are no numbers, though both count them as 0 and 1
 
 
 def is_masked(value: Any) -> bool:

@@ -42,24 +42,19 @@ __all__ = [
 Image = NDArray[np.float32]
 Mask = NDArray[np.int32]
 
-ADC_MAXIMUM = 2**18 - 1
-"""Largest number of the 18-bit converters [ADU]; a pixel there has lost its value."""
-
-MINIMUM_SIGNAL = 5.0
-"""Least median signal of a flat, in units of its read noise."""
+ADC_MAXIMUM = 2**18 - 1  # Largest number of the 18-bit converters [ADU]; a pixel there has lost its value
+MINIMUM_SIGNAL = 5.0  # Least median signal of a flat, in units of its read noise
 
 AMPLIFIER_LEVELS = (0.1, 2.0)
 """Signal of an amplifier relative to the median of its sensor outside which it is not used: dead, or hot. Gains and
 illumination of amplifiers differ by tens of per cent."""
 
-SATURATED_AMPLIFIER = 0.5
-"""An amplifier with more than this part of its pixels saturated is not used."""
+SATURATED_AMPLIFIER = 0.5  # An amplifier with more than this part of its pixels saturated is not used
 
 SHOULDER = 2.0
 """Pixels above so many times the median of their amplifier belong to the saturated ones that they touch."""
 
-BESIDE_SATURATED_PX = 2
-"""Pixels around a saturated one that are masked with it."""
+BESIDE_SATURATED_PX = 2  # Pixels around a saturated one that are masked with it
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,7 @@ __all__ = ["FringeAmplitudes", "fringe_amplitudes"]
 
 _PERCENTILES = (1.0, 99.0)
 
-_BLOCK = 16_384
-"""Values that are summed at a time."""
+_BLOCK = 16_384  # Values that are summed at a time
 
 
 @dataclass(frozen=True)

@@ -38,11 +38,8 @@ __all__ = [
 
 Templates: TypeAlias = "TemplateSet | Sequence[FringeFrame] | ArrayLike"
 
-_ROWS = 128
-"""Rows that are worked on at a time, which the memory of a processor holds."""
-
-TEMPLATE_ID = "FRINGTID"
-"""Keyword of a corrected exposure: which templates were subtracted."""
+_ROWS = 128  # Rows that are worked on at a time, which the memory of a processor holds
+TEMPLATE_ID = "FRINGTID"  # Keyword of a corrected exposure: which templates were subtracted
 
 
 @dataclass(frozen=True)

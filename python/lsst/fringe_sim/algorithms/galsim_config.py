@@ -29,9 +29,7 @@ from .thickness_stand_in import stand_in_thickness
 
 __all__ = ["FringedSkyBuilder"]
 
-FRINGES = "fringes"
-"""Field of the image that holds what is said of them."""
-
+FRINGES = "fringes"  # Field of the image that holds what is said of them
 REQUIRED = {"detector": str}
 OPTIONAL = {"setup": str, "thickness": str, "airmass": float}
 

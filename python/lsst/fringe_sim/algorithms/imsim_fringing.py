@@ -30,8 +30,7 @@ from .thickness_stand_in import ThicknessField
 
 __all__ = ["CCDFringing", "SkyDirection"]
 
-SENSOR = "R22_S11"
-"""All e2v sensors are of this shape."""
+SENSOR = "R22_S11"  # All e2v sensors are of this shape
 
 
 class _Angle(Protocol):

@@ -19,8 +19,7 @@ from .range_cells import PARTS, FittedMap, Polynomial, RangeCells, Seed, across_
 
 __all__ = ["MODEL_ACCURACY", "ORDER_ERROR", "RangeMap", "map_from_range"]
 
-STEPS_PER_ORDER = 12
-"""Thicknesses in an order that planes are tried at."""
+STEPS_PER_ORDER = 12  # Thicknesses in an order that planes are tried at
 
 CELL_ORDERS = 0.3
 """What a layer of mean slope may change over a cell [orders]: its mean has 0.86 of the fringes of its middle."""
@@ -38,8 +37,7 @@ CENTRES = (-0.5, 0.0, 0.5)
 ROUNDS, STEPS, FINISHED_ORDERS = 20, 3, 1e-3
 """Most rounds in which cells are added, steps in each, and the change at which they end [orders]."""
 
-COMPARED_PARTS = 8
-"""Parts along a side by which maps are compared."""
+COMPARED_PARTS = 8  # Parts along a side by which maps are compared
 
 ORDER_ERROR = 0.17
 """What the fringes of an independent simulator have beyond those of the model, over the fringes, along the difference

@@ -21,11 +21,8 @@ from .smooth_field import Splines
 
 __all__ = ["BACKGROUND", "NightSums", "Slopes"]
 
-PIECE_PX = 128
-"""Pixels of a piece of a row."""
-
-BACKGROUND = 6
-"""Terms of a background of second degree, in the order of `background_terms`."""
+PIECE_PX = 128  # Pixels of a piece of a row
+BACKGROUND = 6  # Terms of a background of second degree, in the order of `background_terms`
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,8 +39,7 @@ __all__ = [
     "summary_table",
 ]
 
-LEAST_FRAMES = 3
-"""Two frames cannot tell what they share from what either has alone."""
+LEAST_FRAMES = 3  # Two frames cannot tell what they share from what either has alone
 
 APERTURE_ARCSEC = 20.0
 """Scale up to which fringes are judged: that of the criterion of the Dark Energy Survey."""
@@ -51,8 +50,7 @@ PICTURE_PX = 128
 SQUARES_IN_APERTURE = 12
 """Squares over which pixels are averaged for the correlation function, in its largest separation."""
 
-LARGEST_PART = 8
-"""The largest aperture is at most this part of a side: there must be several of them."""
+LARGEST_PART = 8  # The largest aperture is at most this part of a side: there must be several of them
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,14 +37,9 @@ __all__ = [
     "significant_components",
 ]
 
-_ROUNDING = 1e-13
-"""Share of the variance below which an eigenvalue is rounding of float32 frames."""
-
-_HISTOGRAM_BINS = 32_768
-"""Of thickness, over the range of the response; the error falls with their square."""
-
-_BLOCK = 65_536
-"""Pixels that are counted at a time."""
+_ROUNDING = 1e-13  # Share of the variance below which an eigenvalue is rounding of float32 frames
+_HISTOGRAM_BINS = 32_768  # Of thickness, over the range of the response; the error falls with their square
+_BLOCK = 65_536  # Pixels that are counted at a time
 
 
 def fit_pca(

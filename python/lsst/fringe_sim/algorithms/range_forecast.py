@@ -18,14 +18,12 @@ from .map_on_sky import fringes_alone
 
 __all__ = ["RangeForecast", "forecast_of_range", "frame_noise"]
 
-STEPS_PER_ORDER = 24
-"""Thicknesses in one fringe order at which the sky is asked: 15 degrees of phase."""
+STEPS_PER_ORDER = 24  # Thicknesses in one fringe order at which the sky is asked: 15 degrees of phase
 
 PLANE_ORDERS = 0.125
 """What a layer may depart from a plane over a part of the sensor [orders]: 45 degrees of phase."""
 
-CHANCE = 0.01
-"""Probability of a wrong answer with the frames that are stated."""
+CHANCE = 0.01  # Probability of a wrong answer with the frames that are stated
 
 
 @named_units

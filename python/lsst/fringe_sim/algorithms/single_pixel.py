@@ -17,8 +17,7 @@ from ..resources import read_table
 
 __all__ = ["SinglePixelFit", "fit_single_pixel", "published_pixel"]
 
-GRID_STEP_UM = 0.002
-"""Spacing of the searched thicknesses [µm]; 150 per fringe order."""
+GRID_STEP_UM = 0.002  # Spacing of the searched thicknesses [µm]; 150 per fringe order
 
 
 @named_units

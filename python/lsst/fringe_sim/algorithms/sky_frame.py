@@ -39,8 +39,7 @@ __all__ = [
     "throughput_electrons",
 ]
 
-_BASELINE_HOUR = 19.0
-"""Local time of hour 0 of a night [h]."""
+_BASELINE_HOUR = 19.0  # Local time of hour 0 of a night [h]
 
 
 @named_units

@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Atmosphere", "Bandpass", "bandpass_names"]
 
-_LEAST_DETECTOR = 1e-3
-"""Below this quantum efficiency (times air) a throughput cannot be divided by it."""
+_LEAST_DETECTOR = 1e-3  # Below this quantum efficiency (times air) a throughput cannot be divided by it
 
 
 @named_units

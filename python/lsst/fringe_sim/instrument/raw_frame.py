@@ -39,8 +39,7 @@ __all__ = [
     "read_raw_metadata",
 ]
 
-MOST_SHOWN = 12
-"""Keywords that a note names."""
+MOST_SHOWN = 12  # Keywords that a note names
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -50,8 +50,7 @@ OBSERVATION_TYPES: Mapping[str, str] = {
 WITHOUT_LIGHT = frozenset({"bias", "dark"})
 """Observation types whose ``MONOWL`` is left over from another exposure."""
 
-WAVELENGTH_RANGE_NM = (200.0, 1300.0)
-"""Wavelengths to which a silicon CCD and its monochromator can be set."""
+WAVELENGTH_RANGE_NM = (200.0, 1300.0)  # Wavelengths to which a silicon CCD and its monochromator can be set
 
 TEMPERATURE_RANGE_C = (NO_READING_C, 60.0)
 """Temperatures that a CCD can have while it is read; a value in kelvin falls outside."""

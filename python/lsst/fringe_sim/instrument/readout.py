@@ -13,9 +13,7 @@ from .bandpass import Bandpass
 
 __all__ = ["electrons_to_microjansky", "magnitude_to_microjansky", "microjansky_to_magnitude", "zero_point"]
 
-AB_MICROJANSKY_ZERO_POINT = 23.9
-"""AB magnitude of 1 µJy."""
-
+AB_MICROJANSKY_ZERO_POINT = 23.9  # AB magnitude of 1 µJy
 _PLANCK_J_S = 6.62607015e-34
 
 

@@ -32,11 +32,8 @@ _PROFILES = {"gaussian": GaussianProfile, "triangular": TriangularProfile}
 _BEAM_KEYS = {"collimated": set[str](), "cone": {"f_number", "obscuration"}, "telescope": {"telescope"}}
 
 
-SAME_WAVELENGTH_NM = 1.0
-"""A flat within this distance of a usual wavelength counts as taken there."""
-
-LONGEST_EXPOSURE_S = 1e6
-"""Exposures of the sky up to this are simulated [s]."""
+SAME_WAVELENGTH_NM = 1.0  # A flat within this distance of a usual wavelength counts as taken there
+LONGEST_EXPOSURE_S = 1e6  # Exposures of the sky up to this are simulated [s]
 
 WAVELENGTH_ACCURACY_NM = 0.5
 """Accuracy of a monochromator where the set-up states none [nm]; an assumption, of the order of what makers state."""

@@ -42,14 +42,12 @@ __all__ = [
 AIRGLOW_HEIGHT_KM = 90.0
 EARTH_RADIUS_KM = 6371.0
 
-OH_NM = (880.0, 1110.0)
-"""Wavelengths between which the list of OH lines is complete [nm]."""
+OH_NM = (880.0, 1110.0)  # Wavelengths between which the list of OH lines is complete [nm]
 
 MOST_WITHOUT_LINES = 1e-3
 """Part of the light of a white source that a bandpass may let through outside `OH_NM`; of the y band it is 2e-5."""
 
-LINES_NM = (300.0, 3000.0)
-"""Where the air glows in lines; the same lines in Å or µm lie outside."""
+LINES_NM = (300.0, 3000.0)  # Where the air glows in lines; the same lines in Å or µm lie outside
 
 CONTINUUM_STEP_NM = 0.1
 """Spacing of continuum nodes [nm]: the fringe of 365 µm of silicon (HSC and its support) has 0.35 nm."""

@@ -79,8 +79,7 @@ class StackSpectrum(InNotebook):
         return drawn
 
 
-NEGLIGIBLE = 1e-3
-"""A line that nobody would see in a picture from 0 to 1."""
+NEGLIGIBLE = 1e-3  # A line that nobody would see in a picture from 0 to 1
 
 
 @named_units

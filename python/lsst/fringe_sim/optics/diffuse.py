@@ -15,8 +15,7 @@ from .transfer_matrix import layer_absorption
 
 __all__ = ["DiffuseReturn"]
 
-NODES = 16
-"""Nodes of Gauss's rule between two critical angles, where the integrand is smooth."""
+NODES = 16  # Nodes of Gauss's rule between two critical angles, where the integrand is smooth
 
 STEP_NM = 1.0
 """Spacing of the wavelengths between which the absorbed part is interpolated; tables of silicon have 5 nm."""

@@ -21,18 +21,14 @@ IntArray = NDArray[np.int64]
 SPACING_PX = 256.0
 """Distance between the knots of the surface [px]: what is smaller than it is left to the fringes."""
 
-CUBIC = 4
-"""Coefficients of a cubic."""
-
-PRODUCT = 7
-"""Coefficients of the product of two cubics."""
+CUBIC = 4  # Coefficients of a cubic
+PRODUCT = 7  # Coefficients of the product of two cubics
 
 MOST_BLOCKS_A_SIDE, SMALLEST_BLOCK_PX = 16, 4
 """Blocks are as large as correlated noise reaches, and enough of them to know a scatter to 5 %: 16 a side
 where the image is large enough, 4 pixels a side where it is not."""
 
-_ROWS = 32
-"""Rows of a surface that are made at a time: few enough that a processor's own memory holds them."""
+_ROWS = 32  # Rows of a surface that are made at a time: few enough that a processor's own memory holds them
 
 
 @dataclass(frozen=True)

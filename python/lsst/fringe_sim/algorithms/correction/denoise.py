@@ -18,8 +18,7 @@ THRESHOLD = 3.0
 """Power over that of the noise, averaged over 3 x 3 waves, below which all is noise. Of pure noise 1.8 % of
 the standard deviation pass; what is left of noise and of fringes together is the same from 2.5 to 3.5."""
 
-FILLINGS = 4
-"""Times that pixels without a value get the one that the others let expect."""
+FILLINGS = 4  # Times that pixels without a value get the one that the others let expect
 
 
 def shrink_noise(

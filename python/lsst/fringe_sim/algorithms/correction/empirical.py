@@ -25,35 +25,27 @@ __all__ = ["ObservedTemplates", "TemplateOptions", "fit_templates"]
 IN_MEMORY = 512 * 2**20
 """Bytes of frames beyond which they lie in a file, so that memory does not grow with their number."""
 
-BAND_BYTES = 64 * 2**20
-"""Bytes of all frames that are worked on at a time."""
-
-LEARNING_ROUNDS = 3
-"""Times that background and objects are found anew with the fringes known so far."""
+BAND_BYTES = 64 * 2**20  # Bytes of all frames that are worked on at a time
+LEARNING_ROUNDS = 3  # Times that background and objects are found anew with the fringes known so far
 
 STEPS, SETTLED = 6, 1e-4
 """Most alternations between scores and patterns, each a weighted least-squares solution given the other, and the
 change of the projection on the scores below which they end."""
 
-LEARNING_STEPS = 2
-"""Alternations in all learning rounds but the last."""
+LEARNING_STEPS = 2  # Alternations in all learning rounds but the last
 
 MOST_VARIANCE = 20.0
 """Variance of a pixel of a pattern over the usual one beyond which the frames that see it do not decide it."""
 
-ROUNDING = 1e-6
-"""Part of a sum in single precision below which a difference from it is rounding."""
-
-ROWS = 64
-"""Rows that are converted to float64 at a time."""
+ROUNDING = 1e-6  # Part of a sum in single precision below which a difference from it is rounding
+ROWS = 64  # Rows that are converted to float64 at a time
 
 JUDGED_ROWS, STRIPS = 256, 2
 """Rows of a strip of the sensor, and the number of strips that tell the number of templates where the frames do not
 fit into memory: a template that a frame holds with a hundredth of the noise of a pixel has a scale of ten
 standard deviations in a million pixels."""
 
-FOLDS = 4
-"""Groups of frames, each of which is left out in turn."""
+FOLDS = 4  # Groups of frames, each of which is left out in turn
 
 CHECK_PX = 16
 """Side of the squares of a chequerboard: scores from the white ones predict the black ones, and the other way

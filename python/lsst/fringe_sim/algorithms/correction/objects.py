@@ -29,21 +29,18 @@ THRESHOLDS = (5.0, 4.0, 4.0)
 LEAST_GROWTH_PX, GROWTH = 3.0, 0.5
 """An object is masked as far as 3 px and half the square root of its area around what is above the threshold."""
 
-UNCHANGED = 1e-3
-"""Part of the pixels of which no fit takes notice, below which objects count as the same."""
+UNCHANGED = 1e-3  # Part of the pixels of which no fit takes notice, below which objects count as the same
 
 SAMPLE, LEAST_SAMPLE = 200_000, 1000
 """Pixels that tell a scatter to 0.2 %, and those below which all are asked."""
 
-BINNED_PX = (2, 2, 4)
-"""Side of the squares of pixels in which objects of each width are sought."""
+BINNED_PX = (2, 2, 4)  # Side of the squares of pixels in which objects of each width are sought
 
 NEIGHBOURHOOD_PX, CELLS_A_NEIGHBOURHOOD = 256, 8
 """Side of the square around a place whose scatter an object has to exceed, the distance of the knots of the
 background, as which longer waves count; and the cells a side whose sums tell it."""
 
-_ROWS = 128
-"""Rows that are worked on at a time, which the memory of a processor holds."""
+_ROWS = 128  # Rows that are worked on at a time, which the memory of a processor holds
 
 ROUNDS = 4
 """Rounds of fit and detection; fringes and background are those of pixels without the objects found so far."""

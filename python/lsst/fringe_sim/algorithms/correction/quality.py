@@ -25,14 +25,9 @@ __all__ = ["FrameProof", "excess_structure", "prove", "uniform_background_indica
 LEAST_PROBABILITY = 1e-3
 """Probability of a good template's statistic below which it is refused: one of a thousand good frames."""
 
-JUDGED_TOGETHER = 2
-"""Blocks a side over which products are added before their scatter is taken."""
-
-LEAST_SHARE = 0.5
-"""Part of an aperture that must be good."""
-
-LEAST_OVERLAPPING = 4
-"""Half the side of the smallest apertures that overlap [px]."""
+JUDGED_TOGETHER = 2  # Blocks a side over which products are added before their scatter is taken
+LEAST_SHARE = 0.5  # Part of an aperture that must be good
+LEAST_OVERLAPPING = 4  # Half the side of the smallest apertures that overlap [px]
 
 UBI_RADIUS_PX, UBI_BOX_PX, UBI_STEP_PX = 2.0, 10, 4
 """Radius of the apertures, side of the boxes of the local noise, distance of the apertures from each other, which
@@ -41,11 +36,8 @@ hardly overlap."""
 NOISE_ROWS = 512
 """Rows whose differences of neighbours tell the noise of a pixel to 0.1 % where a row has a thousand pixels."""
 
-ROWS = 128
-"""Rows that are worked on at a time, which the memory of a processor holds."""
-
-NOISE_SAMPLE = 200_000
-"""Pixels that tell a scatter to 0.2 %."""
+ROWS = 128  # Rows that are worked on at a time, which the memory of a processor holds
+NOISE_SAMPLE = 200_000  # Pixels that tell a scatter to 0.2 %
 
 
 @dataclass(frozen=True)

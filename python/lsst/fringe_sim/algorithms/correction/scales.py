@@ -37,8 +37,7 @@ ROUNDS, UNCHANGED = 6, 2e-4
 """Most rounds of clipping, and the part of the pixels below which it ends: Gaussian noise has 6e-5 beyond
 four standard deviations."""
 
-CLIP_SIGMA = 4.0
-"""Standard deviations beyond which a pixel is left out."""
+CLIP_SIGMA = 4.0  # Standard deviations beyond which a pixel is left out
 
 ROUGH_SIGMA = 5.0
 """Standard deviations from the median of its cell beyond which a pixel is left out of the first fit, which
@@ -47,15 +46,13 @@ stars would spoil."""
 LARGEST_NOISE = 1e15
 """Noise of a pixel, and one over it, whose square and its products with pixels are numbers in single precision."""
 
-SAMPLE = 200_000
-"""Pixels that tell a scatter to 0.2 %."""
+SAMPLE = 200_000  # Pixels that tell a scatter to 0.2 %
 
 CELL_PX, CELL_STEP = 64, 4
 """Side of the cells in which the variance is averaged, so that no pixel is weighed by its own noise, and the
 distance of the pixels that tell it."""
 
-_ROWS = 256
-"""Rows that are worked on at a time."""
+_ROWS = 256  # Rows that are worked on at a time
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,13 +20,11 @@ from .templates import FringeTemplates
 
 __all__ = ["settle_borders"]
 
-_PRICE = 2.0
-"""Chi-square that a break of half an order or more between two neighbouring pixels costs."""
+_PRICE = 2.0  # Chi-square that a break of half an order or more between two neighbouring pixels costs
 _SWEEPS = 6
 _SAME_SURFACE = 0.25
 _MOST_SURFACES = 6
-_MOST_JUDGED = 20_000
-"""Pixels that show how far all are off."""
+_MOST_JUDGED = 20_000  # Pixels that show how far all are off
 
 
 def settle_borders(

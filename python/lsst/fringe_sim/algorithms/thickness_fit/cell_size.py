@@ -9,10 +9,8 @@ from .amplitudes import Amplitudes
 
 __all__ = ["choose_cell_size"]
 
-LARGEST_CELL_PX = 8
-"""Cells beyond this would wash out the steep fringes of real sensors (9 nm per pixel)."""
-MOST_CELLS = 600_000
-"""Bound on the memory of the order evidence: about 84 orders of 4 bytes for each cell."""
+LARGEST_CELL_PX = 8  # Cells beyond this would wash out the steep fringes of real sensors (9 nm per pixel)
+MOST_CELLS = 600_000  # Bound on the memory of the order evidence: about 84 orders of 4 bytes for each cell
 _FEWEST_CELLS = 64
 """Cells that are more than what is learned beside the thickness: a dozen numbers of each wavelength."""
 _STEEPEST_STRUCTURE = 1.0
@@ -22,14 +20,10 @@ _LARGEST_LOSS = 1.0
 
 Slopes inside the cells make up for most of it; beyond this, cells of some phases take the wrong order all the same.
 """
-_NINTH_DECILE = 1.28
-"""Of a normal distribution, in standard deviations."""
-_CLEAREST = 4
-"""Wavelengths from which the size of the cells is chosen."""
-_SAMPLE = 1000
-"""Squares from which their median is taken."""
-_CUT_NOISE = 0.902
-"""Mean of the squares of normal deviates that are cut at eight times their median."""
+_NINTH_DECILE = 1.28  # Of a normal distribution, in standard deviations
+_CLEAREST = 4  # Wavelengths from which the size of the cells is chosen
+_SAMPLE = 1000  # Squares from which their median is taken
+_CUT_NOISE = 0.902  # Mean of the squares of normal deviates that are cut at eight times their median
 
 
 def choose_cell_size(data: Amplitudes) -> int:

@@ -31,14 +31,10 @@ __all__ = [
     "sample_pixels",
 ]
 
-_SPIKE_SIGMA = 6.0
-"""A row or column of a cell this many standard deviations off its neighbours is thrown out."""
-_FINEST_PERIOD_PX = 24.0
-"""Shortest fringe whose curvature is not mistaken for a spike [px]."""
-_LEAST_CONTRAST = 0.4
-"""Smallest share of the contrast that a steep cell is taken to keep."""
-_LEAST_FILLED = 0.2
-"""Smallest fraction of good pixels with which a cell counts at a wavelength."""
+_SPIKE_SIGMA = 6.0  # A row or column of a cell this many standard deviations off its neighbours is thrown out
+_FINEST_PERIOD_PX = 24.0  # Shortest fringe whose curvature is not mistaken for a spike [px]
+_LEAST_CONTRAST = 0.4  # Smallest share of the contrast that a steep cell is taken to keep
+_LEAST_FILLED = 0.2  # Smallest fraction of good pixels with which a cell counts at a wavelength
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,9 @@ from .templates import FringeTemplates
 __all__ = ["CommonOrder", "rank_orders"]
 
 _MOST_ORDERS = 8
-_CLEAR = 100.0
-"""Chi-square difference beyond which the orders behind one need not be asked."""
+_CLEAR = 100.0  # Chi-square difference beyond which the orders behind one need not be asked
 _ROUNDS_ELSEWHERE = 6
-_INSIDE = 0.99
-"""Share of a sensor that must lie in the range of thicknesses."""
+_INSIDE = 0.99  # Share of a sensor that must lie in the range of thicknesses
 
 
 @dataclass(frozen=True, eq=False)

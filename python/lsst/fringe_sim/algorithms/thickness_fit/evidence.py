@@ -32,18 +32,13 @@ NODES_PER_ORDER = 16
 """Templates in one fringe order: the least chi-square from a parabola is then good to 2e-4 of its swing."""
 EVIDENCE_CAP = 30.0
 """Largest chi-square difference that one cell may claim, so that no single cell decides alone."""
-MISFIT = 3.0
-"""Cells whose chi-square is this many times the median lose their say on the order."""
-IMPOSSIBLE = 1.0e6
-"""Chi-square given to an order outside the thickness range."""
+MISFIT = 3.0  # Cells whose chi-square is this many times the median lose their say on the order
+IMPOSSIBLE = 1.0e6  # Chi-square given to an order outside the thickness range
 _POLISHED = 64
 """Most minima of a cell that are refined on the full table before they are compared: few wavelengths have many."""
-_POLISH_SHARE = 0.01
-"""Minima are refined while they lie within this share of the chi-square of a wrong phase."""
-_STRIDE = 4
-"""One cell in so many, in both directions, is compared with the whole range first."""
-_MARGIN_ORDERS = 3
-"""Orders that the others look beyond what the first cells showed to be needed."""
+_POLISH_SHARE = 0.01  # Minima are refined while they lie within this share of the chi-square of a wrong phase
+_STRIDE = 4  # One cell in so many, in both directions, is compared with the whole range first
+_MARGIN_ORDERS = 3  # Orders that the others look beyond what the first cells showed to be needed
 
 
 @dataclass(frozen=True, eq=False)

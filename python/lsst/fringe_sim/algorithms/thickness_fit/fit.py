@@ -40,8 +40,7 @@ FEWEST_WAVELENGTHS = 4
 _TURNING_NM = 0.1
 """Step of the derivative in wavelength: a fringe of the thickest layer then turns by less than 0.1 rad."""
 _TURNING_STRIDE = 10
-_ROWS = 64
-"""Rows that are flagged at a time by one thread."""
+_ROWS = 64  # Rows that are flagged at a time by one thread
 
 
 @named_units

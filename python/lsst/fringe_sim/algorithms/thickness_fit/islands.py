@@ -22,20 +22,14 @@ FloatArray = NDArray[np.float64]
 WIDE = 1.6
 """Fringe orders on both sides in which pixels are looked for at first; strong voids break the first fit."""
 
-NEIGHBOURS = 3
-"""Rows and columns on both sides of a pixel whose median is where it is looked for."""
+NEIGHBOURS = 3  # Rows and columns on both sides of a pixel whose median is where it is looked for
 
 STEPS_PER_ORDER = 60
 """Thicknesses in a fringe order at which pixels are compared; a parabola through three of them does the rest."""
 
-RING_PX = 12
-"""Pixels around an island that tell the thickness with which it begins."""
-
-SAMPLED = 20_000
-"""Pixels outside that tell the levels of the flats."""
-
-_PIXELS = 2048
-"""Pixels that are compared at a time."""
+RING_PX = 12  # Pixels around an island that tell the thickness with which it begins
+SAMPLED = 20_000  # Pixels outside that tell the levels of the flats
+_PIXELS = 2048  # Pixels that are compared at a time
 
 
 def fit_islands(fitted: ThicknessMap, cube: FringeCube, model: FringeModel) -> ThicknessMap:

@@ -34,10 +34,8 @@ FloatArray = NDArray[np.float64]
 
 _STEPS = 3
 _LONGEST = 0.1
-_SURE = 0.01
-"""Probability of a wrong order below which a pixel of the first fit is believed."""
-_MEAN_STRIDE = 4
-"""Every so many pixels of a row and a column enter the mean response."""
+_SURE = 0.01  # Probability of a wrong order below which a pixel of the first fit is believed
+_MEAN_STRIDE = 4  # Every so many pixels of a row and a column enter the mean response
 _LEAST_IN_MEAN = 20_000
 
 

@@ -20,8 +20,7 @@ FloatArray = NDArray[np.float64]
 _MOST_CELLS = 3_000
 _MOST_BLOCKS = 6_000
 _LARGEST_BLOCK = 6
-_LEAST_KEPT = 0.7
-"""Share of its contrast that a block must keep."""
+_LEAST_KEPT = 0.7  # Share of its contrast that a block must keep
 _PHASE_SIGMA = 0.1
 """Uncertainty of the phase of a block [rad] at which its noise raises the contrast by half a per cent."""
 

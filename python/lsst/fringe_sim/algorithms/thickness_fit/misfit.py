@@ -24,10 +24,8 @@ FloatArray = NDArray[np.float64]
 
 _TAILS = np.geomspace(2.0, 1024.0, 10)
 """Degrees of freedom that are tried; the likelihood changes little from one to the next."""
-_ROUNDS = 25
-"""Steps of the scale towards the most probable one."""
-_FEWEST_BATCHES = 16
-"""Batches whose means tell their variance to a tenth, at a dozen wavelengths."""
+_ROUNDS = 25  # Steps of the scale towards the most probable one
+_FEWEST_BATCHES = 16  # Batches whose means tell their variance to a tenth, at a dozen wavelengths
 
 
 @dataclass(frozen=True)

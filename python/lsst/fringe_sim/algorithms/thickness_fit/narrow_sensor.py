@@ -31,10 +31,8 @@ __all__ = ["NarrowSensor", "is_own_mean", "settle_narrow_sensor"]
 
 FloatArray = NDArray[np.float64]
 
-_MOST_CELLS = 600
-"""Cells that are asked; more would only add certainty."""
-_FEW_CELLS = 120
-"""Cells with which all starts are compared; only the best of these go on with more."""
+_MOST_CELLS = 600  # Cells that are asked; more would only add certainty
+_FEW_CELLS = 120  # Cells with which all starts are compared; only the best of these go on with more
 _STARTS_PER_ORDER = 12
 _FIRST_ROUNDS = 8
 _KEPT = 120
@@ -46,12 +44,9 @@ _LONGEST_STEP_UM = 0.02
 _SIDES = (0.0, -0.125, 0.125, -0.25, 0.25, -0.375, 0.375)
 """Orders from its thickness at which a cell is looked for again."""
 _SIDE_ROUNDS = 3
-_SIDE_MOVE = 0.05
-"""Orders by which a cell must move before that is more than what the steps left over."""
-_SAME_SOLUTION = 0.25
-"""Solutions whose common thickness agrees within this many orders are one."""
-_FEW_ASTRAY = 0.01
-"""Share of cells that may have another order before two maps are told apart."""
+_SIDE_MOVE = 0.05  # Orders by which a cell must move before that is more than what the steps left over
+_SAME_SOLUTION = 0.25  # Solutions whose common thickness agrees within this many orders are one
+_FEW_ASTRAY = 0.01  # Share of cells that may have another order before two maps are told apart
 _OWN_MEAN = 0.1
 """Mean amplitude, in rms amplitudes of the model, up to which flats have been divided by their own mean."""
 

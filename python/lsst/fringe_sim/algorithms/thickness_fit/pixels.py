@@ -22,10 +22,8 @@ from .templates import FringeTemplates
 
 __all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels"]
 
-_STEPS = 5
-"""Most Gauss-Newton steps; two are usual."""
-_LONGEST_STEP = 0.1
-"""Longest Gauss-Newton step, in fringe orders."""
+_STEPS = 5  # Most Gauss-Newton steps; two are usual
+_LONGEST_STEP = 0.1  # Longest Gauss-Newton step, in fringe orders
 SAME_SURFACE = 0.25
 """Cells whose thickness agrees within this many orders, slopes allowed for, lie on one surface."""
 LONE_CELL_PENALTY = 12.0

@@ -29,15 +29,13 @@ __all__ = [
 _CHANGE = 0.25
 """Relative change of the information within three standard deviations up to which the likelihood is a parabola: its
 uncertainty is then good to a tenth."""
-REACH = 0.5
-"""Orders on both sides over which a pixel may lie: the cells decide between orders."""
+REACH = 0.5  # Orders on both sides over which a pixel may lie: the cells decide between orders
 NODES = 65
 _CROWD = 4.0
 """Nodes lie as the hyperbolic sine of equal steps, the last of which is this: for an adhesive 0.7 nm apart at the
 surface, 19 nm at the ends, where nothing is narrower than the uncertainty of a pixel."""
 _STEPS = np.linspace(-_CROWD, _CROWD, NODES)
-AWAY = np.sinh(_STEPS) / np.sinh(_CROWD)
-"""Places of the nodes in units of the reach."""
+AWAY = np.sinh(_STEPS) / np.sinh(_CROWD)  # Places of the nodes in units of the reach
 SHARE = np.cosh(_STEPS) / np.cosh(_STEPS).sum()
 _ROUNDS = 30
 """Steps of expectation and maximisation for the share of pixels that lie apart, then good to a few per cent."""

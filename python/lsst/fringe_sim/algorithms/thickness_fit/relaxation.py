@@ -24,16 +24,11 @@ from .templates import FringeTemplates
 
 __all__ = ["SettledCells", "settle_orders"]
 
-SHIFTS = 3
-"""Orders above and below that are tried in one round."""
-BREAK_PRICE = 8.0
-"""Chi-square that a break of half an order or more between two neighbouring cells costs."""
-SAME_SURFACE = 0.25
-"""Cells that agree within this many orders, slopes allowed for, lie on one surface."""
-_LARGEST_MENDED = 400
-"""Largest surface, in cells, that is moved onto the one around it, whatever the jump."""
-_MOST_JUDGED = 20_000
-"""Cells that show how far all are off."""
+SHIFTS = 3  # Orders above and below that are tried in one round
+BREAK_PRICE = 8.0  # Chi-square that a break of half an order or more between two neighbouring cells costs
+SAME_SURFACE = 0.25  # Cells that agree within this many orders, slopes allowed for, lie on one surface
+_LARGEST_MENDED = 400  # Largest surface, in cells, that is moved onto the one around it, whatever the jump
+_MOST_JUDGED = 20_000  # Cells that show how far all are off
 _LARGEST_BLOCK = 64
 _BOLD_BLOCK = 8
 _SWEEPS = 3

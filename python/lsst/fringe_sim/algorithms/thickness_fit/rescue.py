@@ -22,16 +22,13 @@ from .templates import FringeTemplates
 
 __all__ = ["SUSPECT_PROBABILITY", "chi2_limits", "rescue_pixels", "typical_misfit"]
 
-SUSPECT_PROBABILITY = 1e-7
-"""A pixel whose chi-square is that improbable is not believed."""
-_FEWEST_TO_SPARE = 6
-"""A wavelength is left out only of so many or more."""
+SUSPECT_PROBABILITY = 1e-7  # A pixel whose chi-square is that improbable is not believed
+_FEWEST_TO_SPARE = 6  # A wavelength is left out only of so many or more
 _COMPACT = 0.5
 """Fraction of its 5 by 5 neighbours that fit badly too, from which a pixel may lie in a void: columns have less."""
 _NEIGHBOURS = 25
 _MOST_SEARCHED = 200_000
-_SAMPLE = 400_000
-"""Pixels from which the typical misfit is taken."""
+_SAMPLE = 400_000  # Pixels from which the typical misfit is taken
 
 
 def chi2_limits(most: int) -> NDArray[np.float32]:

@@ -21,8 +21,7 @@ __all__ = ["cells_leave_only_noise", "doubt_from_shared_misfit", "leaves_only_no
 
 _MOST_PIXELS = 4000
 _MOST_PAIRS = 40_000
-_SHIFTS = (-3, -2, -1, 1, 2, 3)
-"""Orders from the solution with which the shared misfit is compared."""
+_SHIFTS = (-3, -2, -1, 1, 2, 3)  # Orders from the solution with which the shared misfit is compared
 _NOISE_SIGMA = 3.0
 """Standard deviations of its own uncertainty by which the shared misfit is believed to be smaller."""
 _APART = 4.0

@@ -63,8 +63,7 @@ _RESOLVED = 1.0 / 12.0
 """Uncertainty of the silicon, in its orders, below which its fringes are said to be seen."""
 _RIVALS = (-3, -2, -1, 1, 2, 3)
 _TILTS = 13
-_CAP = 25.0
-"""Largest chi-square per wavelength of a pixel in the scan: one bad pixel must not decide."""
+_CAP = 25.0  # Largest chi-square per wavelength of a pixel in the scan: one bad pixel must not decide
 
 
 @dataclass(frozen=True)

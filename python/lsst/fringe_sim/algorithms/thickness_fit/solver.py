@@ -28,11 +28,9 @@ from .templates import FringeTemplates
 
 __all__ = ["Solver", "State", "surface_of"]
 
-_MODEL_CHANGE = 0.15
-"""Change of the model, in rms fringe amplitudes, at which the orders are solved again."""
+_MODEL_CHANGE = 0.15  # Change of the model, in rms fringe amplitudes, at which the orders are solved again
 _MOST_SOLUTIONS = 3
-_MOST_COMPARED = 20_000
-"""Cells that show how far cells err alike."""
+_MOST_COMPARED = 20_000  # Cells that show how far cells err alike
 _FEWEST_TO_SETTLE = 4
 """Wavelengths from which on the mean response of a narrow sensor is sought together with its order."""
 _OPEN_ORDERS = 0.5
@@ -43,18 +41,13 @@ order turns the fringes at one end of the band against those at the other by the
 """
 _SURELY_MORE = 4.0
 """Times that many orders with which a sensor holds enough of them even if a good part is wrong."""
-_MOST_MEANS = 4
-"""Solutions of a narrow sensor whose mean response is tried on all cells."""
-_MOST_SHAPES = 4
-"""Rounds of mean response and orders of a narrow sensor."""
+_MOST_MEANS = 4  # Solutions of a narrow sensor whose mean response is tried on all cells
+_MOST_SHAPES = 4  # Rounds of mean response and orders of a narrow sensor
 _RIVAL = 2.0
 """Solutions of so many times the least chi-square are still looked at: cells astray cost the true one as much."""
-_SAME_SHAPE = 0.25
-"""Reliefs that agree within this many orders everywhere are one."""
-_WORTHWHILE = 0.01
-"""Relative gain of chi-square for which another round is worth its time."""
-_NARROW_MARGIN = 3.0
-"""Orders beyond what a narrow sensor showed in a sample that its other cells may have."""
+_SAME_SHAPE = 0.25  # Reliefs that agree within this many orders everywhere are one
+_WORTHWHILE = 0.01  # Relative gain of chi-square for which another round is worth its time
+_NARROW_MARGIN = 3.0  # Orders beyond what a narrow sensor showed in a sample that its other cells may have
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,7 @@ __all__ = ["FringeTemplates", "arc_length_nodes"]
 
 FloatArray = NDArray[np.float64]
 
-LANES = 8
-"""Wavelength axes are padded to a multiple of this, so that inner loops fill the vector registers."""
+LANES = 8  # Wavelength axes are padded to a multiple of this, so that inner loops fill the vector registers
 
 
 @dataclass(frozen=True, eq=False)

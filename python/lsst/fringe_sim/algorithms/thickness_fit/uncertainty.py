@@ -14,8 +14,7 @@ from .templates import FringeTemplates
 
 __all__ = ["lone_slip_probability", "slip_probability"]
 
-_SHIFTS = 4
-"""Orders on both sides that a lone pixel is compared with."""
+_SHIFTS = 4  # Orders on both sides that a lone pixel is compared with
 
 
 def slip_probability(found: GlobalFit, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:

@@ -17,10 +17,8 @@ __all__ = ["CommonError", "common_error", "shift_precision", "spread_of_waveleng
 
 FloatArray = NDArray[np.float64]
 
-_LEAST_SHIFT_NM = 0.02
-"""Least standard deviation of the wavelengths: that of a calibrated monochromator."""
-_TAIL = 6.0
-"""Degrees of freedom of Student's distribution: now and then a wavelength is far off."""
+_LEAST_SHIFT_NM = 0.02  # Least standard deviation of the wavelengths: that of a calibrated monochromator
+_TAIL = 6.0  # Degrees of freedom of Student's distribution: now and then a wavelength is far off
 _WIDTHS, _PLACES, _ZOOMS = 25, 101, 3
 """Steps of the sums over width and common error; a width is known to about a fifth, three steps of it."""
 

@@ -17,8 +17,7 @@ from .templates import FringeTemplates
 
 __all__ = ["settle_weak_pixels"]
 
-_MOST_ASKED = 8192
-"""Pixels that show how many lie apart from their surface."""
+_MOST_ASKED = 8192  # Pixels that show how many lie apart from their surface
 
 
 def settle_weak_pixels(
