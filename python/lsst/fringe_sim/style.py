@@ -134,8 +134,7 @@ def show_image(
         thin, cmap=cmap, vmin=low, vmax=high, extent=(-0.5, nx - 0.5, -0.5, ny - 0.5), aspect="equal"
     )
     axes.set_title(title, y=TITLE_PLACE)
-    axes.set_xlabel("column [px]")
-    axes.set_ylabel("row [px]")
+    axes.set(xlabel="column [px]", ylabel="row [px]")
     if colorbar:
         color_bar(axes, drawn, label)
     return drawn

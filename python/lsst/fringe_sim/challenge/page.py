@@ -88,8 +88,7 @@ def confusion_figure(result: ChallengeResult) -> Figure:
                 axes.text(column, row, f"{number:.0f}", ha="center", va="center", color=ink, fontsize=8)
         axes.set_xticks(range(len(columns)), columns, rotation=90)
         axes.set_yticks(range(len(rows)), rows)
-        axes.set_xlabel("verdict, or likeliest member of the named class")
-        axes.set_ylabel("hidden")
+        axes.set(xlabel="verdict, or likeliest member of the named class", ylabel="hidden")
         return made
 
 
@@ -108,8 +107,7 @@ def accuracy_figure(result: ChallengeResult) -> Figure:
         right = [case for case in single if case.right_class and np.isfinite(case.shrinkage)]
         gap.semilogx([max(c.signal_to_noise, 1.0) for c in right], [c.shrinkage for c in right], ".", ms=5)
         gap.axhline(WANTED_SHRINKAGE, color=LINES[1], lw=1.0, label=f"wanted: {WANTED_SHRINKAGE}")
-        gap.set_ylim(0.0, 2.0)
-        gap.set_xlabel("signal to noise [1]")
+        gap.set(ylim=(0.0, 2.0), xlabel="signal to noise [1]")
         gap.set_ylabel("fall of held-out variance over the oracle's [1]")
         gap.legend(loc="lower right")
         return made
@@ -124,9 +122,7 @@ def _draw_accuracy(axes: Axes, table: Table) -> None:
     for k, row in enumerate(table):
         axes.text(k, 1.01, f"{row['cases']}", ha="center", va="bottom", fontsize=8)
     axes.set_xticks(place, labels)
-    axes.set_ylim(0.0, 1.12)
-    axes.set_xlabel("signal to noise [1]")
-    axes.set_ylabel("part of the cases (number above)")
+    axes.set(ylim=(0.0, 1.12), xlabel="signal to noise [1]", ylabel="part of the cases (number above)")
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.92), frameon=True)
 
 
@@ -141,8 +137,7 @@ def pulls_figure(result: ChallengeResult) -> Figure:
             2.0 * np.pi
         )
         axes.plot(fine, pulls.size * (edges[1] - edges[0]) * normal, color=LINES[1], label="normal")
-        axes.set_xlabel("(found − true) / σ [1]")
-        axes.set_ylabel("parameters")
+        axes.set(xlabel="(found − true) / σ [1]", ylabel="parameters")
         axes.legend()
         return made
 
@@ -164,9 +159,7 @@ def calibration_figure(result: ChallengeResult) -> Figure:
                 textcoords="offset points",
                 fontsize=8,
             )
-        axes.set_xlim(0.0, 1.03)
-        axes.set_ylim(0.0, 1.1)
-        axes.set_xlabel("stated probability of the names [1]")
+        axes.set(xlim=(0.0, 1.03), ylim=(0.0, 1.1), xlabel="stated probability of the names [1]")
         axes.set_ylabel("part that is right [1]")
         axes.legend(loc="upper left")
         return made

@@ -94,8 +94,7 @@ def gap_figure(verdict: Verdict) -> Figure:
             right.plot(range(len(values)), [PERCENT * value for value in values], "o-", color=LINES[0])
             right.axhline(PERCENT * gap.noise_floor, color="black", ls="--", lw=1)
             right.set_xticks(range(len(values)), [label.replace(" + ", "\n+ ") for label in labels])
-            right.set_xlim(-0.4, len(values) - 0.6)
-            right.set_ylabel("rms of data − model [%]")
+            right.set(xlim=(-0.4, len(values) - 0.6), ylabel="rms of data − model [%]")
             right.set_title("step by step, on the data of the selection")
         return made
 
@@ -114,17 +113,13 @@ def _draw_colour(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
         [row["wavelength_nm"] for row in rows], [PERCENT * row["variance_beyond_noise"] for row in rows], "o-"
     )
     axes.axhline(0.0, color="0.6", lw=0.8)
-    axes.set_xlabel("wavelength [nm]")
-    axes.set_ylabel("variance beyond noise [% of the noise]")
-    axes.set_title("by wavelength")
+    axes.set(xlabel="wavelength [nm]", ylabel="variance beyond noise [% of the noise]", title="by wavelength")
 
 
 def _draw_scales(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
     axes.semilogx([row["scale_px"] for row in rows], [row["power"] for row in rows], "o-")
     axes.axhline(1.0, color="black", ls="--", lw=1, label="noise")
-    axes.set_xlabel("spatial scale [px]")
-    axes.set_ylabel("power over that of noise [1]")
-    axes.set_title("by scale")
+    axes.set(xlabel="spatial scale [px]", ylabel="power over that of noise [1]", title="by scale")
     axes.legend()
 
 
@@ -139,10 +134,8 @@ def _draw_wavelengths(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
     highest = max((row["chi2"] / row["degrees"] for row in rows), default=1.0)
     if highest > LARGEST_LINEAR:
         axes.set_yscale("symlog", linthresh=1.0)
-    axes.set_ylim(0.0, max(1.2, 1.25 * highest))
-    axes.set_xlabel("wavelength [nm]")
-    axes.set_ylabel("χ² of the fringe pattern / degrees [1]")
-    axes.set_title("by wavelength")
+    axes.set(ylim=(0.0, max(1.2, 1.25 * highest)), xlabel="wavelength [nm]")
+    axes.set(ylabel="χ² of the fringe pattern / degrees [1]", title="by wavelength")
     axes.legend(fontsize=7, loc="upper left", frameon=True)
 
 
@@ -157,9 +150,7 @@ def _draw_phase(axes: Axes, rows: Sequence[Mapping[str, float]]) -> None:
         color=LINES[0],
     )
     axes.axhline(0.0, color="0.6", lw=0.8)
-    axes.set_xlim(0.0, 1.0)
-    axes.set_xlabel("thickness over one fringe order [1]")
-    axes.set_ylabel("mean of data − model [%]")
+    axes.set(xlim=(0.0, 1.0), xlabel="thickness over one fringe order [1]", ylabel="mean of data − model [%]")
     axes.set_title("by fringe phase, all wavelengths")
 
 
@@ -199,8 +190,7 @@ def _draw_tests(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     if max(-math.log10(value) for value in [*chance, 1.0]) > LARGEST_LINEAR:
         axes.set_xscale("symlog", linthresh=3.0)
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("−log₁₀ of the chance (dashed: 10⁻³) [1]")
-    axes.set_title("tests, each on its own")
+    axes.set(xlabel="−log₁₀ of the chance (dashed: 10⁻³) [1]", title="tests, each on its own")
 
 
 def _step(values: Sequence[float]) -> float:

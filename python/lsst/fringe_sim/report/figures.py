@@ -278,8 +278,7 @@ def components_figure(components: FringeComponents) -> Figure:
             scree.semilogy(np.arange(1, len(ratio) + 1), PERCENT * ratio, "o-")
             scree.yaxis.set_minor_formatter(NullFormatter())
             scree.xaxis.set_major_locator(MaxNLocator(integer=True))
-            scree.set_xlabel("component")
-            scree.set_title("share of the variance [%]")
+            scree.set(xlabel="component", title="share of the variance [%]")
         return made
 
 
@@ -304,11 +303,9 @@ def coadds_figure(found: Coadds) -> Figure:
         for axis in axes:
             axis.set_ylim(min(lows), LEGEND_ROOM * max(highs))
         side = found.square_px[-1]
-        axes[0].set_title(f"means of {side} × {side} px")
-        axes[0].set_xlabel("exposures in the coadd")
+        axes[0].set(title=f"means of {side} × {side} px", xlabel="exposures in the coadd")
         axes[0].set_ylabel("rms [% of the sky]")
-        axes[1].set_title(f"{found.counts[-1]} exposures")
-        axes[1].set_xlabel("side of the square that is averaged [px]")
+        axes[1].set(title=f"{found.counts[-1]} exposures", xlabel="side of the square that is averaged [px]")
         axes[1].set_ylabel("rms [% of the sky]")
         axes[1].legend(fontsize=8)
         return made
@@ -327,8 +324,7 @@ def template_figure(template: FringeFrame) -> Figure:
         )
         row = template.image.shape[0] // 2
         right.plot(PERCENT * template.image[row], lw=0.8)
-        right.set_xlabel("column [px]")
-        right.set_title(f"row {row}: sky / mean − 1 [%]")
+        right.set(xlabel="column [px]", title=f"row {row}: sky / mean − 1 [%]")
         return made
 
 
@@ -353,15 +349,12 @@ def single_pixel_figure(
                 label=f"{name}: {fit.thickness_um:.2f} µm, rms {PERCENT * fit.rms:.2f} %",
             )
             right.plot(fit.searched_um, PERCENT * fit.searched_rms, lw=0.7, color=color)
-        left.set_xlabel("wavelength [nm]")
-        left.set_ylabel("fringe amplitude [%]")
+        left.set(xlabel="wavelength [nm]", ylabel="fringe amplitude [%]")
         low, high = left.get_ylim()
         left.set_ylim(low, high + PIXEL_ROOM * (high - low))
         left.legend(fontsize=7, loc="upper left")
         left.set_title("pixel (2100, 2100) of E2V-CCD250-321")
-        right.set_xlabel("adhesive thickness [µm]")
-        right.set_ylabel("rms misfit [%]")
-        right.set_yscale("log")
+        right.set(xlabel="adhesive thickness [µm]", ylabel="rms misfit [%]", yscale="log")
         right.set_title("misfit at every thickness")
         return made
 

@@ -153,8 +153,7 @@ def _draw_radius(axes: Axes, sensors: Table) -> None:
     axes.semilogy(
         [0.0, 1.44], [0.14, 0.04], "x", ms=9, mew=2, color="black", label="Guo et al. 2022, lines alone"
     )
-    axes.set_xlabel("distance of the sensor from the axis [deg]")
-    axes.set_ylabel("fringe rms of the sensor [%]")
+    axes.set(xlabel="distance of the sensor from the axis [deg]", ylabel="fringe rms of the sensor [%]")
     axes.set_title("strength over field radius")
     axes.yaxis.set_major_formatter(PLAIN)
     axes.yaxis.set_minor_formatter(PLAIN)
@@ -182,9 +181,7 @@ def _draw_cells(panel: Axes, cells: Table, column: str, norm: Normalize, cmap: s
         image = values[chosen].reshape(side, side)
         drawn = panel.imshow(image, extent=extent, norm=norm, cmap=cmap, aspect="equal")
     reach = 1.05 * max(np.abs(x).max(), np.abs(y).max())
-    panel.set_xlim(-reach, reach)
-    panel.set_ylim(-reach, reach)
-    panel.set_xlabel("x in the focal plane [mm]")
+    panel.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x in the focal plane [mm]")
     panel.set_ylabel("y in the focal plane [mm]")
     if drawn is None:
         raise InputError("cells of the focal plane", 0, "one sensor or more")

@@ -33,8 +33,7 @@ def learned_figure(learned: Mapping[str, Any]) -> Figure:
             (axes,) = panels(made, 1, 1)
             edges = (-0.5 / PHASES, 1.0 - 0.5 / PHASES, nodes[0] - 5.0, nodes[-1] + 5.0)
             _show(axes, shape, "wave form", extent=edges)
-            axes.set_xlabel("fringe phase [fringes]")
-            axes.set_ylabel("wavelength [nm]")
+            axes.set(xlabel="fringe phase [fringes]", ylabel="wavelength [nm]")
             return made
     nodes, patterns = patterns_of(learned["name"], learned["own"], SIDE)
     nodes, patterns = nodes[:MOST_EXPOSURES], patterns[:MOST_EXPOSURES]

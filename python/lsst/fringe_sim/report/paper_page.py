@@ -116,9 +116,7 @@ def _draw_graph(axes: Axes, graph: Graph) -> None:
         if graph.logarithmic:
             y = np.where(y > graph.lowest, y, np.nan)
         axes.plot(curve.x, y, style, label=curve.label, **thick)
-    axes.set_title(graph.title)
-    axes.set_xlabel(graph.xlabel)
-    axes.set_ylabel(graph.ylabel)
+    axes.set(title=graph.title, xlabel=graph.xlabel, ylabel=graph.ylabel)
     if graph.logarithmic:
         axes.set_yscale("log")
     if len(graph.curves) > 1:
