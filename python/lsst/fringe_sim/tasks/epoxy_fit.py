@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from lsst.pex.config import ChoiceField, Field, ListField, RangeField
 from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Output
-from lsst.utils.logging import getLogger
 
 from ..algorithms import fit_thickness
 from ..algorithms.flat_conditions import model_of_flats
@@ -24,12 +23,16 @@ from ..instrument.detector import Detector
 from ..model import LABORATORY_TEMPERATURE, Setup
 from ..products import FringeCube, FringeFlat, ThicknessMap, describe_mask
 from .model_config import FringeModelConfig
-from .quantum import SENSOR, common_header, data_id_of, flats_input, sensor_of, unusable
-
-_LOG = getLogger(__name__)
+from .quantum import SENSOR, OrderedConnections, common_header, data_id_of, flats_input, sensor_of, unusable
 
 
-class EpoxyFitConnections(base.PipelineTaskConnections, dimensions=SENSOR):
+def _by_wavelength(ref: Any) -> tuple[str, int]:
+    # The ingest writes the wavelength with a fixed number of digits, so the texts sort like the numbers.
+    exposure = ref.dataId.records["exposure"]
+    return exposure.target_name or "", exposure.id
+
+
+class EpoxyFitConnections(OrderedConnections, dimensions=SENSOR):
     """The flats of a sensor in, its thickness map out."""
 
     flats = flats_input()
@@ -47,25 +50,11 @@ class EpoxyFitConnections(base.PipelineTaskConnections, dimensions=SENSOR):
         dimensions=SENSOR,
     )
 
+    ORDERED = ("flats", _by_wavelength)
+
     def __init__(self, *, config: EpoxyFitConfig | None = None) -> None:
         if config is not None and config.silicon == "fixed":
             del self.silicon
-
-    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
-        """Put the flats in the order of their wavelengths."""
-        connection, refs = inputs["flats"]
-        if not refs:
-            raise base.NoWorkFound(label, "flats", connection)
-        ordered = sorted(refs, key=_wavelength_order)
-        inputs["flats"] = (connection, ordered)
-        super().adjustQuantum(inputs, outputs, label, data_id)
-        return {"flats": (connection, ordered)}, {}
-
-
-def _wavelength_order(ref: Any) -> tuple[str, int]:
-    # The ingest writes the wavelength with a fixed number of digits, so the texts sort like the numbers.
-    exposure = ref.dataId.records["exposure"]
-    return exposure.target_name or "", exposure.id
 
 
 class EpoxyFitConfig(FringeModelConfig, base.PipelineTaskConfig, pipelineConnections=EpoxyFitConnections):

@@ -12,10 +12,10 @@ from lsst.pipe import base
 from lsst.pipe.base.connectionTypes import Input, Output
 
 from ..algorithms.focal_plane import summary_table
-from .quantum import SENSOR, common_header, put_in_order, unusable
+from .quantum import SENSOR, OrderedConnections, common_header, unusable
 
 
-class FocalPlaneSummaryConnections(base.PipelineTaskConnections, dimensions=("instrument",)):
+class FocalPlaneSummaryConnections(OrderedConnections, dimensions=("instrument",)):
     """Forecasts of sensors in, one table out."""
 
     forecasts = Input(
@@ -23,11 +23,7 @@ class FocalPlaneSummaryConnections(base.PipelineTaskConnections, dimensions=("in
     )
     summary = Output("focalPlaneForecast", "AstropyTable", "One row per sensor.", dimensions=("instrument",))
 
-    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
-        """Put the sensors in the order of their numbers."""
-        ordered = put_in_order(inputs, "forecasts", lambda ref: ref.dataId["detector"])
-        super().adjustQuantum(inputs, outputs, label, data_id)
-        return ordered, {}
+    ORDERED = ("forecasts", lambda ref: ref.dataId["detector"])
 
 
 class FocalPlaneSummaryConfig(base.PipelineTaskConfig, pipelineConnections=FocalPlaneSummaryConnections):

@@ -19,16 +19,17 @@ from ..products.same_light import refuse_equal_pixels, refuse_mixed_models
 from .quantum import (
     SENSOR_EXPOSURE,
     SENSOR_FILTER,
+    OrderedConnections,
+    by_exposure,
     common_header,
     data_id_of,
-    put_in_order,
     run_datetime,
     sensor_of,
     unusable,
 )
 
 
-class FringePcaConnections(base.PipelineTaskConnections, dimensions=SENSOR_FILTER):
+class FringePcaConnections(OrderedConnections, dimensions=SENSOR_FILTER):
     """The sky frames of a sensor in a filter in, one template and all components out."""
 
     frames = Input(
@@ -37,8 +38,9 @@ class FringePcaConnections(base.PipelineTaskConnections, dimensions=SENSOR_FILTE
         "Sky frames of the sensor in this filter.",
         dimensions=SENSOR_EXPOSURE,
         multiple=True,
-        minimum=2,
+        minimum=2,  # one alone has no components
     )
+    ORDERED = ("frames", by_exposure)
     fringe = Output(
         "fringe",
         "FringeFrame",
@@ -56,12 +58,6 @@ class FringePcaConnections(base.PipelineTaskConnections, dimensions=SENSOR_FILTE
     def __init__(self, *, config: FringePcaConfig | None = None) -> None:
         if config is not None:
             self.fringe = dataclasses.replace(self.fringe, storageClass=config.fringeStorageClass)
-
-    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
-        """Put the frames in the order of time; one alone has no components."""
-        ordered = put_in_order(inputs, "frames", lambda ref: ref.dataId["exposure"])
-        super().adjustQuantum(inputs, outputs, label, data_id)
-        return ordered, {}
 
 
 class FringePcaConfig(base.PipelineTaskConfig, pipelineConnections=FringePcaConnections):

@@ -17,9 +17,10 @@ from ..products import ObservedFrame
 from .quantum import (
     SENSOR_EXPOSURE,
     SENSOR_FILTER,
+    OrderedConnections,
+    by_exposure,
     common_header,
     data_id_of,
-    put_in_order,
     run_datetime,
     sensor_of,
     unusable,
@@ -28,7 +29,7 @@ from .quantum import (
 LEAST_FRAMES = 3
 
 
-class ObservedFringeConnections(base.PipelineTaskConnections, dimensions=SENSOR_FILTER):
+class ObservedFringeConnections(OrderedConnections, dimensions=SENSOR_FILTER):
     """The frames of a sensor in a filter in, its templates out."""
 
     frames = Input(
@@ -47,12 +48,7 @@ class ObservedFringeConnections(base.PipelineTaskConnections, dimensions=SENSOR_
         dimensions=SENSOR_FILTER,
         isCalibration=True,
     )
-
-    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
-        """Put the frames in the order of time; two have no template."""
-        ordered = put_in_order(inputs, "frames", lambda ref: ref.dataId["exposure"])
-        super().adjustQuantum(inputs, outputs, label, data_id)
-        return ordered, {}
+    ORDERED = ("frames", by_exposure)
 
 
 class BackgroundConfig(Config):

@@ -8,7 +8,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import Config
@@ -23,12 +23,13 @@ __all__ = [
     "SENSOR",
     "SENSOR_EXPOSURE",
     "SENSOR_FILTER",
+    "OrderedConnections",
     "UnusableDataError",
+    "by_exposure",
     "common_header",
     "config_digest",
     "data_id_of",
     "flats_input",
-    "put_in_order",
     "run_datetime",
     "sensor_of",
     "unusable",
@@ -92,11 +93,23 @@ def data_id_of(butlerQC: base.QuantumContext) -> DataCoordinate:
     return data_id
 
 
-def put_in_order(inputs: Any, name: str, key: Callable[[Any], Any]) -> dict[str, Any]:
-    """Sort the references of an input for `adjustQuantum`, which returns what this returns."""
-    connection, refs = inputs[name]
-    inputs[name] = (connection, sorted(refs, key=key))
-    return {name: inputs[name]}
+class OrderedConnections(base.PipelineTaskConnections, dimensions=()):
+    """Connections of which one input has its references in order."""
+
+    ORDERED: ClassVar[tuple[str, Callable[[Any], Any]]]  # name of that input, and what it is sorted by
+
+    def adjustQuantum(self, inputs: Any, outputs: Any, label: str, data_id: Any) -> tuple[dict, dict]:
+        """Put the references in order."""
+        name, key = self.ORDERED
+        connection, refs = inputs[name]
+        inputs[name] = (connection, sorted(refs, key=key))
+        super().adjustQuantum(inputs, outputs, label, data_id)
+        return {name: inputs[name]}, {}
+
+
+def by_exposure(ref: Any) -> int:
+    """Number of the exposure of a dataset: the order of time."""
+    return int(ref.dataId["exposure"])
 
 
 def common_header(config: Config) -> dict[str, Any]:
