@@ -25,8 +25,7 @@ from lsst.fringe_sim.products import FlatExposures, FringeCube, mask_bits
 HALF_ORDER_UM = 0.15
 SHAPE = (160, 180)
 NOISE = 0.002
-SPAN_UM = 1.2
-"""Four orders in 160 pixels: 7 nm per pixel, near the steepest of real sensors (9 nm)."""
+SPAN_UM = 1.2  # Four orders in 160 pixels: 7 nm per pixel, near the steepest of real sensors (9 nm)
 
 
 @pytest.fixture(scope="module")

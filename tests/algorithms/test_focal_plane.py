@@ -34,8 +34,7 @@ from lsst.fringe_sim.model import FringeModel
 DETECTOR = Camera.from_name("lsstCam").detector("R22_S12")
 PLACE = SensorPlacement.of(DETECTOR, 0.2)
 OPTIONS = ForecastOptions(cells=4)
-SHAPE = (801, 820)
-"""One pixel per arcsecond."""
+SHAPE = (801, 820)  # One pixel per arcsecond
 
 
 @pytest.fixture(scope="module")

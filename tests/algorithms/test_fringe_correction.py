@@ -345,8 +345,7 @@ def test_residual_against_shot_noise():
 # The chain: templates from one night, exposures of another.
 
 
-CELL = 4
-"""Every fourth pixel stands for a cell of 16 with the light of 16, so that the whole sensor is small."""
+CELL = 4  # Every fourth pixel stands for a cell of 16 with the light of 16, so that the whole sensor is small
 
 
 @pytest.fixture(scope="module")

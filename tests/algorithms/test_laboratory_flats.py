@@ -16,8 +16,7 @@ from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube, ThicknessMap
 
-SHAPE = (160, 192)
-"""Amplifiers of 80 by 24 pixels."""
+SHAPE = (160, 192)  # Amplifiers of 80 by 24 pixels
 
 
 @pytest.fixture(scope="module")

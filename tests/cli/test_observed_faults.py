@@ -16,8 +16,7 @@ from observed_night import observed_night
 
 from lsst.fringe_sim.cli.main import run
 
-NAME = "visit_1.fits"
-"""The frame that is spoiled."""
+NAME = "visit_1.fits"  # The frame that is spoiled
 
 
 @pytest.fixture(scope="module")

@@ -64,8 +64,7 @@ from lsst.fringe_sim.optics import Layer, LayerStack, get_medium, layer_absorpti
 from lsst.fringe_sim.products.observed_files import observed_images, write_images
 from lsst.fringe_sim.resources import resource_path
 
-LONGEST_S = 20.0
-"""Processor time that one case may take; most take milliseconds."""
+LONGEST_S = 20.0  # Processor time that one case may take; most take milliseconds
 
 MOST_BYTES = 1 << 30
 """Memory that one case may need beyond what the process had; the files have less than a megabyte."""
@@ -349,8 +348,7 @@ def _honest(image: Any, mask: Any) -> None:
 
 FINITE = st.floats(width=32, allow_nan=True, allow_infinity=True)
 
-RANGE_UM = (12.5, 13.5)
-"""Where a thickness is looked for: two fringe orders, so that a case costs little."""
+RANGE_UM = (12.5, 13.5)  # Where a thickness is looked for: two fringe orders, so that a case costs little
 
 
 def cube(data: st.DataObject, folder: Path) -> None:
@@ -428,8 +426,7 @@ def _numbers(low: float, high: float) -> st.SearchStrategy[float]:
     return st.one_of(sensible, sensible, sensible, sensible, odd)
 
 
-LARGE = 10**400
-"""An integer that no float can hold."""
+LARGE = 10**400  # An integer that no float can hold
 
 
 def _near(value: float) -> st.SearchStrategy[float]:
@@ -768,8 +765,7 @@ def keep(target: str, folder: Path) -> None:
             shutil.copy(path, CORPUS / target / f"{path.stem}-{digest}{path.suffix}")
 
 
-ROUND = 10 * sum(TARGETS.values())
-"""Cases between two looks at the clock."""
+ROUND = 10 * sum(TARGETS.values())  # Cases between two looks at the clock
 
 
 @functools.cache

@@ -27,14 +27,9 @@ from fault_chain import OUT, QUANTA, Chain, Ended, make_template
 DONE = re.compile(r"Executed (\d+) quanta successfully, 0 failed and 0 remain")
 NOTHING_LEFT = "QuantumGraph contains no quanta"
 
-FILES = 30
-"""Files that a run writes, about."""
-
-WHOLE = 4
-"""One chain of so many is the whole one."""
-
-IN_A_ROW = 4
-"""Most kills before a chain is left in peace."""
+FILES = 30  # Files that a run writes, about
+WHOLE = 4  # One chain of so many is the whole one
+IN_A_ROW = 4  # Most kills before a chain is left in peace
 
 
 @dataclass(frozen=True)

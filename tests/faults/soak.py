@@ -33,9 +33,7 @@ from lsst.fringe_sim.middleware import LsstCamFringe
 from lsst.fringe_sim.middleware.night import NightPlan, define_night, parse_hours
 
 PIPELINE = "resource://lsst.fringe_sim/pipelines/lsstCam/skyFringe.yaml"
-RAFT, FIRST = "R22", 90
-"""A raft and its first detector."""
-
+RAFT, FIRST = "R22", 90  # A raft and its first detector
 DATE = datetime.date(2026, 1, 15)
 SHAPE = (80, 72)
 PRODUCTS = ("skyFringe", "fringe", "fringeComponents")

@@ -10,12 +10,8 @@ from pathlib import Path
 import pytest
 
 SECONDS = 60
-LEAST = 250
-"""Cases: one round. A minute of processor time is good for a thousand and more."""
-
-
-QUICK = 300
-"""Cases in every quick run."""
+LEAST = 250  # Cases: one round. A minute of processor time is good for a thousand and more.
+QUICK = 300  # Cases in every quick run
 
 
 def fuzz(*arguments: object) -> int:

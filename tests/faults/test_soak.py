@@ -12,8 +12,7 @@ from soak import growth, soak
 
 pytestmark = [pytest.mark.middleware, pytest.mark.slow]
 
-MOST_GROWTH_BYTES = 4 << 20
-"""A night; one kept frame would be less, the arrays of a response more."""
+MOST_GROWTH_BYTES = 4 << 20  # A night; one kept frame would be less, the arrays of a response more
 
 
 def test_nights_in_one_process(tmp_path: Path) -> None:

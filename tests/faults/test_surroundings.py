@@ -28,8 +28,7 @@ from lsst.fringe_sim.products.mask import mask_bits
 pytestmark = pytest.mark.slow
 
 WAVELENGTHS_NM = np.arange(880.0, 1000.0, 10.0)
-PAGES = {"report.html"}
-"""Pages state the time of their making."""
+PAGES = {"report.html"}  # Pages state the time of their making
 
 
 def field_um(rows: int, columns: int) -> np.ndarray:
@@ -184,8 +183,7 @@ def test_two_hundred_wavelengths() -> None:
     assert 0.5 < np.std(pull) < 2.0
 
 
-MOST_GROWTH_BYTES = 2 << 20
-"""In each run: the arrays of a run here are larger."""
+MOST_GROWTH_BYTES = 2 << 20  # In each run: the arrays of a run here are larger
 
 
 @pytest.mark.parametrize("name", ["sky", "fit"])

@@ -11,8 +11,7 @@ from scipy.interpolate import CubicSpline
 from lsst.fringe_sim.optics import get_medium
 
 KELVIN = 183.15
-LINE_NM = 2.0
-"""Full width of a Gaussian line [nm]."""
+LINE_NM = 2.0  # Full width of a Gaussian line [nm]
 
 LAYERS = (
     ("MgF2", 0.1221),

@@ -11,8 +11,7 @@ from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
 
 WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 READ_NOISE_E = 6.0
-PLACES = 5
-"""Places along a side of a pixel."""
+PLACES = 5  # Places along a side of a pixel
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ import lsst.fringe_sim
 
 DATA = Path(lsst.fringe_sim.__file__).parent / "data"
 
-ABOVE = ((1.375, 0.1221), (2.10, 0.0441))
-"""Index and thickness [µm] of the coating, from the light on."""
+ABOVE = ((1.375, 0.1221), (2.10, 0.0441))  # Index and thickness [µm] of the coating, from the light on
 BELOW = ((1.451, 0.1), (None, 0.3), (1.451, 1.0))
 """Oxide, gates (of silicon) and insulation between detection layer and adhesive."""
 EPOXY, SUPPORT_UM, SUBSTRATE = 1.6, 165.0, 1.99
@@ -28,12 +27,8 @@ RAYS, FEW_RAYS = 32, 8
 """Nodes over the square of the sine of the angle: for lines, in whose light the phase turns by 56 rad over the pupil,
 and for light whose fringes average out over the wavelength."""
 
-STEP_UM = 0.004
-"""Grid of the adhesive, over which waves are summed: 75 points per fringe."""
-
-FAINTEST = 1e-3
-"""Lines fainter than so much of the brightest are left out."""
-
+STEP_UM = 0.004  # Grid of the adhesive, over which waves are summed: 75 points per fringe
+FAINTEST = 1e-3  # Lines fainter than so much of the brightest are left out
 CONTINUUM = "continuum"
 
 

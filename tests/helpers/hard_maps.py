@@ -7,9 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-FRINGE_ORDER_UM = 0.300
-"""Thickness of one fringe order at 960 nm in an adhesive of index 1.6 [µm]."""
-
+FRINGE_ORDER_UM = 0.300  # Thickness of one fringe order at 960 nm in an adhesive of index 1.6 [µm]
 Shape = tuple[int, int]
 Map = NDArray[np.float64]
 

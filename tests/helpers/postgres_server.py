@@ -21,8 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-PR_SET_PDEATHSIG = 1
-"""Linux: a signal for a process whose parent has died."""
+PR_SET_PDEATHSIG = 1  # Linux: a signal for a process whose parent has died
 
 SETTINGS = {
     "listen_addresses": "",

@@ -16,8 +16,7 @@ from astropy.io import fits
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Amplifier, Camera, Detector
 
-PRESCAN, SERIAL, PARALLEL = 1000, 2000, 3000
-"""Values of the pixels outside the imaging sections."""
+PRESCAN, SERIAL, PARALLEL = 1000, 2000, 3000  # Values of the pixels outside the imaging sections
 
 TS8_HEADER: dict[str, Any] = {
     "TSTAND": "TS8",

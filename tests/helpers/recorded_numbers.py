@@ -27,9 +27,7 @@ RELATIVE, RELATIVE_ELSEWHERE = 1e-6, 1e-3
 """Part of a number by which it may differ. Other processors sum in another order, so that a pixel at a limit may fall
 on its other side."""
 
-GREY, GREY_ELSEWHERE = 2.0, 8.0
-"""Of 255: letters are drawn otherwise by other versions of the fonts."""
-
+GREY, GREY_ELSEWHERE = 2.0, 8.0  # Of 255: letters are drawn otherwise by other versions of the fonts
 PROCESSOR = llvmlite.binding.get_host_cpu_name()
 
 Leaf = float | str | list[float] | list[str]

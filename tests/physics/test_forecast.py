@@ -16,9 +16,7 @@ from lsst.fringe_sim.instrument.measured_thickness import e2v_321
 from lsst.fringe_sim.optics import get_medium
 from lsst.fringe_sim.resources import read_table
 
-RAYS = 144
-"""Equal parts of the light over the angles of a beam, each at its mean square of the sine."""
-
+RAYS = 144  # Equal parts of the light over the angles of a beam, each at its mean square of the sine
 FAINTEST = 1e-3
 
 

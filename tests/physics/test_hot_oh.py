@@ -14,8 +14,7 @@ from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.instrument.sky import EmissionLines, SkySpectrum
 from lsst.fringe_sim.resources import read_table
 
-HC_K = 1.4387769
-"""hc/k [cm K]."""
+HC_K = 1.4387769  # hc/k [cm K]
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,7 @@ from lsst.fringe_sim.algorithms.public_evidence.joint import JointFit, Predictor
 from lsst.fringe_sim.algorithms.public_evidence.kinds import FlatContrast, PixelFlats, PublishedMap
 
 LINE_NM = 2.0
-SHIFT_UM = np.arange(-300, 301) / 200.0
-"""Shifts of the map, five orders either way, all as likely."""
+SHIFT_UM = np.arange(-300, 301) / 200.0  # Shifts of the map, five orders either way, all as likely
 
 PHOTON_NOISE, UNEVEN = 7e-4, 0.03
 """Of the pixel's amplitudes: noise, and width of a free offset and of a free slope, at either end of the flats."""

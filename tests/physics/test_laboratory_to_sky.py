@@ -17,9 +17,7 @@ from lsst.fringe_sim.model import LABORATORY_TEMPERATURE, FringeModel
 from lsst.fringe_sim.optics import Beam
 
 PHASE = "epoxy_temperature.phase_per_10k"
-NORMAL_UM = 14.0
-"""Adhesive of the stack, to which the phase belongs."""
-
+NORMAL_UM = 14.0  # Adhesive of the stack, to which the phase belongs
 SPAN = (14.0, 19.0)
 MAP_UM = np.linspace(14.2, 18.8, 64 * 64).reshape(64, 64)
 DATE = "2026-01-15T00:00:00"

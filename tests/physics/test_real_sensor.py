@@ -7,8 +7,7 @@ import pytest
 from foreign_sky import DATA, ForeignSky
 from scipy.optimize import curve_fit
 
-LINE_NM = np.linspace(-2.4, 2.4, 25)
-"""Offsets within a line of 2 nm; its fringes of silicon are 1.2 nm apart."""
+LINE_NM = np.linspace(-2.4, 2.4, 25)  # Offsets within a line of 2 nm; its fringes of silicon are 1.2 nm apart
 LINE = np.exp(-4.0 * np.log(2.0) * (LINE_NM / 2.0) ** 2)
 
 

@@ -13,9 +13,7 @@ from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.optics import LayerStack, layer_absorption
 
 WAVE_NM = np.arange(900.0, 1100.0, 1.0)
-PER_PIXEL = 32.40 * 0.2**2 * 30.0
-"""Square metres, square arcseconds and seconds of a pixel."""
-
+PER_PIXEL = 32.40 * 0.2**2 * 30.0  # Square metres, square arcseconds and seconds of a pixel
 MEAN_ANGLE = np.deg2rad(19.46)
 
 

@@ -15,10 +15,8 @@ from lsst.fringe_sim.tasks.fringe_pca import FringePcaConnections
 ROWS, COLUMNS = 20, 30
 CREATED = "2026-11-21T03:43:40"
 Y, X = np.mgrid[:ROWS, :COLUMNS]
-MAIN = 2e-3 * np.sin(X / 3.0)
-"""Pattern of the lines."""
-SIDE = 3e-4 * np.cos(Y / 2.0)
-"""Pattern of a band that varies on its own."""
+MAIN = 2e-3 * np.sin(X / 3.0)  # Pattern of the lines
+SIDE = 3e-4 * np.cos(Y / 2.0)  # Pattern of a band that varies on its own
 FAINT = 1e-7 * np.sin((X + Y) / 2.0)
 
 

@@ -19,8 +19,7 @@ from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
 
 SHAPE = (72, 84)
-NOISE = 15.0
-"""Noise over that of the flats: single cells tell their order no more."""
+NOISE = 15.0  # Noise over that of the flats: single cells tell their order no more
 
 
 def weak(seed: int) -> tuple[FringeModel, CellData, np.ndarray]:
