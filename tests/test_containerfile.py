@@ -1,7 +1,5 @@
 """The image is made from all that the wheel needs, with pinned versions that are there."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is deprecated works as before, and says since when, until when, and what takes its place."""
 
-from __future__ import annotations
-
 import inspect
 import warnings
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The documentation builds without a warning, its examples run, and what it names exists."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import os

@@ -1,7 +1,5 @@
 """Errors say the field, the value and what is allowed, and survive the trip between processes."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import pickle

@@ -1,7 +1,5 @@
 """Headers of files from outside are followed exactly: what stands in data is no header, and what follows is one."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io

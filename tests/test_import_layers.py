@@ -1,7 +1,5 @@
 """Who may import whom: the table of doc/architecture.md, enforced by parsing the imports."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shipped tables: provenance, units, refusal of what is not there."""
 
-from __future__ import annotations
-
 import importlib.resources
 
 import pytest

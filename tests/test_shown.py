@@ -1,7 +1,5 @@
 """What objects say of themselves at the prompt and in ``help()``: short lines, without addresses of the memory."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re

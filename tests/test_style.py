@@ -1,7 +1,5 @@
 """Pictures hold the numbers that they show: blocks, colours, places, pieces."""
 
-from __future__ import annotations
-
 import io
 import warnings
 

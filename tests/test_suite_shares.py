@@ -1,7 +1,5 @@
 """The shares of the slow suite: each test in exactly one of them."""
 
-from __future__ import annotations
-
 import argparse
 
 import pytest

@@ -1,7 +1,5 @@
 """Quantities of astropy are converted or refused wherever a documented function takes a number with a unit."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re

@@ -1,7 +1,5 @@
 """Levels of amplifiers in a thickness fit: where the camera of the set-up has them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Sources in single visits and coadds: laws that hold whatever the fringes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import spline_filter

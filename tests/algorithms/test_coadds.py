@@ -1,7 +1,5 @@
 """Fringes left in coadds of visits: laws that hold whatever the pattern, and tables of visits from outside."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fringes too dense for pixels are named as such: nobody is sent to look for a hidden effect."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sensors of few orders in few wavelengths: mean response, relief and order hang together."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from flat_cubes import TEN_NM, relative_flats

@@ -1,7 +1,5 @@
 """What real flats have: steps, illumination, another contrast, gaps, unequal noise, thin and thick adhesive."""
 
-from __future__ import annotations
-
 import warnings
 from contextlib import suppress
 from dataclasses import replace

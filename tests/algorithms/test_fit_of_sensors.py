@@ -1,7 +1,5 @@
 """Thickness fits of whole sensors: hard maps, real maps, noise, missing data, and the walk of the paper beside it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

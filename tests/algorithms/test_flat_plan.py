@@ -1,7 +1,5 @@
 """Forecasts of flats: against brute force, against fits of noisy pixels, and what they recommend."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import norm

@@ -1,7 +1,5 @@
 """Preparation of flats: the mock's truth comes back, masks lie where the trouble is, the noise is what is stated."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

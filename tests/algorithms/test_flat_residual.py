@@ -1,7 +1,5 @@
 """Flats minus model: noise where the model is right, the effect where it is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

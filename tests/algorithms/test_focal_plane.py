@@ -1,7 +1,5 @@
 """Forecasts from moments of patterns, against frames that are really made and corrected."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from recorded_numbers import Record

@@ -1,7 +1,5 @@
 """Amplitudes of frames against numpy's own statistics."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Fringe correction of simulated exposures, with sources, and its measure of success."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from product_makers import sky

@@ -1,7 +1,5 @@
 """Fringes in images that GalSim draws from a configuration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

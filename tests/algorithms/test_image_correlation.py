@@ -1,7 +1,5 @@
 """Correlation functions against TreeCorr, and the laws of coadding."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import treecorr

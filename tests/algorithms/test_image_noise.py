@@ -1,7 +1,5 @@
 """Photon and read noise: distributions, moments, seeds, threads."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """Fringe maps for imSim: its calls, our physics."""
 
-from __future__ import annotations
-
 import inspect
 
 import galsim

@@ -1,7 +1,5 @@
 """Sources in copies of frames, whose fluxes are known."""
 
-from __future__ import annotations
-
 import galsim
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Silicon and adhesive fitted together, where flats with a narrow line allow it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A thickness map from frames of the sky and a range of the thickness alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Masked smoothing against brute force, and its noise against Monte Carlo."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Sensors of few fringe orders, whose mean response depends on the very thickness that is looked for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from flat_cubes import relative_flats

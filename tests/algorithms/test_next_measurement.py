@@ -1,7 +1,5 @@
 """Forecasts of further measurements against exact derivatives, real fits and published numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

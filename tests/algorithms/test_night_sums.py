@@ -1,7 +1,5 @@
 """Sums over the pixels of a night in pieces of rows are those of whole images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Thirty visits of nine sensors at reduced size: fringes left, errors of scales, photometry; nothing is named."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From one wavelength to two hundred, and adhesives beyond the usual range."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from flat_cubes import TEN_NM, relative_flats

@@ -1,7 +1,5 @@
 """Templates from observed frames, and what they leave in frames that they were not made of."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

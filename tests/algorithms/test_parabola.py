@@ -1,7 +1,5 @@
 """Minimum of sampled curves."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lsst.fringe_sim.algorithms.parabola import parabolic_minimum

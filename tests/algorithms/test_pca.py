@@ -1,7 +1,5 @@
 """Principal components against scikit-learn, and the templates against their purpose."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

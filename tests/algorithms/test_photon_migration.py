@@ -1,7 +1,5 @@
 """Walk of photons in silicon: geometry, statistics and conservation."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """All public data together: likelihoods against direct integrals, and what each kind of data says by itself."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

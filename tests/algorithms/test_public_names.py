@@ -1,7 +1,5 @@
 """What `lsst.fringe_sim.algorithms` offers is callable, however often and in whatever order it is asked for."""
 
-from __future__ import annotations
-
 import pytest
 
 from lsst.fringe_sim import algorithms

@@ -1,7 +1,5 @@
 """Frames that would tell a map from a range, where the answer follows by hand or by trial."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A defect is masked itself: it does not move what the rest of the sensor is judged by."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Thickness fits in which the silicon varies: sensors whose adhesive shows no fringes, or is hidden."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fit of one pixel, and the one public set of laboratory numbers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Sky frames against a direct sum over lines and angles, and against laws."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

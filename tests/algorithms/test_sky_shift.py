@@ -1,7 +1,5 @@
 """A map that is wrong by a smooth error is moved to where the frames of a night are; one that is right stays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

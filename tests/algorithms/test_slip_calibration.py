@@ -1,7 +1,5 @@
 """Of the pixels that are said to slip with some probability, that share does."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Random fields in place of thickness maps that nobody has measured."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Wavelengths that are off their labels: the common error, to which only the labels testify."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from laboratory_flats import TEN_NM

@@ -1,7 +1,5 @@
 """Pixels that do not tell their thickness by themselves lean on the cells around them, as far as the flats allow."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The foreign sensor in limits that are known without it, and beside the package's optics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

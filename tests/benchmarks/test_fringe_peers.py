@@ -1,7 +1,5 @@
 """The peers of the fringe correction, and the configuration with which the algorithm of ip_isr works."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.fringe_peers import aperture_scale

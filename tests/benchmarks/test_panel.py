@@ -1,7 +1,5 @@
 """The panel: its list, its judgement, its comparison, and twelve of its cases beside the frozen baseline."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

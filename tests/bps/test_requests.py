@@ -1,7 +1,5 @@
 """What the shipped site files ask a cluster for, beside what was measured, and the plan of a whole focal plane."""
 
-from __future__ import annotations
-
 import datetime
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A workflow of which one job is killed, and restarted: by the real commands of bps, with Parsl."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Sealed cases and how answers to them are judged."""
 
-from __future__ import annotations
-
 import secrets
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The page of a challenge."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from lsst.fringe_sim.challenge.page import confusion_figure, write_challenge_report

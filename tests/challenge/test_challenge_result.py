@@ -1,7 +1,5 @@
 """Tables of a challenge from results made by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

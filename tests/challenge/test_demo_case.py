@@ -1,7 +1,5 @@
 """What the demo hides, and how its search is judged."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

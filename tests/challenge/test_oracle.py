@@ -1,7 +1,5 @@
 """How clearly effects are seen in sealed cases."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

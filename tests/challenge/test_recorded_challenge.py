@@ -1,7 +1,5 @@
 """Records of what a challenge draws and writes, for edits that are not meant to change it; how it judges."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

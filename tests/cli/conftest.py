@@ -1,7 +1,5 @@
 """Raw frames that several tests of the commands look at."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

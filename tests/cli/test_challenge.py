@@ -1,7 +1,5 @@
 """``fringe-sim challenge``: cases are kept as they come."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """``fringe-sim templates`` and ``fringe-sim correct`` on files of a small night."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Headers that a FITS library stumbles over, or never comes back from, found by ``tests/faults/fuzz.py``."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import lzma

@@ -1,7 +1,5 @@
 """``fringe-sim demo``: the whole chain with the real programs, once, and what it leaves."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

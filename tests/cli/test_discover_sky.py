@@ -1,7 +1,5 @@
 """``fringe-sim discover`` with the set-up of a telescope."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``fringe-sim evidence``: what it would compare, what it refuses, and the whole of it on two effects."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """``fringe-sim mock-flats`` and ``fringe-sim fit``: the truth comes back, bad input is one clear line."""
 
-from __future__ import annotations
-
 import base64
 import re
 import shutil

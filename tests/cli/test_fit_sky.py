@@ -1,7 +1,5 @@
 """A map against a night of frames, by the command: noisy frames of a sensor whose map is off, and is not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

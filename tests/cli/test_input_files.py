@@ -1,7 +1,5 @@
 """The files that a command was given stand in what it writes."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which frames of a folder are used is said; a sensor goes with a set-up of its vendor, and gains with its place."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A map of another sensor of the same vendor is said, or refused where two maps have to be of one sensor."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

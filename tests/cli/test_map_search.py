@@ -1,7 +1,5 @@
 """A map from a range of the thickness alone, by the command."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``python -m lsst.fringe_sim``."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """One run in a folder, one writer at a time, and nothing cleared but what a run of this program left."""
 
-from __future__ import annotations
-
 import fcntl
 import subprocess
 import sys

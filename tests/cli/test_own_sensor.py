@@ -1,7 +1,5 @@
 """The tutorial on sensors of one's own: every command of it runs, outside the package, and ends as the page says."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """``fringe-sim plan-flats``."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``fringe-sim provenance``: what a product says of its making."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

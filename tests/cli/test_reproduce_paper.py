@@ -1,7 +1,5 @@
 """``fringe-sim reproduce-paper``: page, table, notices; the numbers themselves where the curves are at hand."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What commands say and write around their long work, which is replaced by results made by hand."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The same light twice counts once, or is refused; so are frames of two models together."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What would be taken for something else without a word: keys twice, folders that are read and written, odd maps."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``fringe-sim sky``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

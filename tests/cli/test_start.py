@@ -1,7 +1,5 @@
 """What a command imports before it has anything to do: nothing that takes longer than a person waits for help."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

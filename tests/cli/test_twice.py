@@ -1,7 +1,5 @@
 """Every command that writes, run twice: the second time changes nothing."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Callable

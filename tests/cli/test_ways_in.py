@@ -1,7 +1,5 @@
 """One gate for every file from outside: what it is, how large it is, what it would write; refused in one sentence."""
 
-from __future__ import annotations
-
 import ast
 import bz2
 import gzip

@@ -1,7 +1,5 @@
 """Tilted and widened beams."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Effects of the charge: crosstalk, brighter-fatter, and more than can be counted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Illumination that changes with wavelength, wherever it is even."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

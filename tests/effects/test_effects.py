@@ -1,7 +1,5 @@
 """One contract for all effects of the catalogue."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Corrections that were learned: what they do, where they go, and that nobody looks for them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Silicon that is thicker on one side, against the model and against a simulator of its own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from field_matrices import DETECTION, LINE_NM, ForeignSensor

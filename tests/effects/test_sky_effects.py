@@ -1,7 +1,5 @@
 """Effects on the night sky: what changes, what stays, and who sees it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

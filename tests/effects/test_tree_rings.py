@@ -1,7 +1,5 @@
 """Rings of the silicon: the pattern, and how it is found in what a model leaves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

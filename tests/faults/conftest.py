@@ -1,7 +1,5 @@
 """A repository made once, and what an undisturbed run makes of it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -10,8 +10,6 @@ that fails goes there, reduced, and stays. A case fails if it raises anything bu
 the program, makes a map or a flat with good pixels that are no numbers, or light out of nothing.
 """
 
-from __future__ import annotations
-
 import argparse
 import collections
 import contextlib

@@ -6,8 +6,6 @@ prints one line for each kill and a summary at the end. A fault of the package e
 drawn anew unless one is given, and printed.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import secrets

@@ -5,8 +5,6 @@
 simulates eleven hours of nine sensors ten times, at reduced size, and prints a line for each night.
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime
 import gc

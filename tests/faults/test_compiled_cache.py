@@ -1,7 +1,5 @@
 """What numba keeps of compiled functions: on a full disk, in a folder that cannot be written, and damaged."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """What can happen to a run: afterwards nothing is half there, nothing earlier has changed, the rest can be made."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import os

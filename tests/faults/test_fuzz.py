@@ -1,7 +1,5 @@
 """New spoiled files and settings in every run of the tests; as many as the processor makes of its time."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The same chain with its registry in PostgreSQL, on a server that the tests start themselves."""
 
-from __future__ import annotations
-
 import itertools
 import secrets
 import sys

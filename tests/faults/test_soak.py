@@ -1,7 +1,5 @@
 """The same night over and over, short; the long one is ``python tests/faults/soak.py``."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Commands in odd surroundings: no temporary files, other locales, any number of threads, one wavelength."""
 
-from __future__ import annotations
-
 import functools
 import gc
 import os

@@ -4,8 +4,6 @@ What must hold after every fault is asked here: every visible dataset can be rea
 what comes out in the end is what an undisturbed run makes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

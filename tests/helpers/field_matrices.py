@@ -1,7 +1,5 @@
 """Flats of a sensor from matrices of the fields; nothing but the tables of the media is shared with the package."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 

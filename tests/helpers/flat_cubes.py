@@ -1,7 +1,5 @@
 """Flats of a known thickness map, as the fit takes them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lsst.fringe_sim.model import FringeModel

@@ -1,7 +1,5 @@
 """Exposures of the foreign sensor: its map, its charge and its noise; no code is shared with the mock."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ Lines are those of the ESO sky model (Hanuschik 2003, Cosby 2006, Rousselot 2000
 filter is an analytic curve.
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """FITS files that are spoiled on purpose: cards, bytes, lengths."""
 
-from __future__ import annotations
-
 import tempfile
 from io import BytesIO
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Maps of thickness [µm] that a fit must master."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

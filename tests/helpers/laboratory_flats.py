@@ -4,8 +4,6 @@ The optics are those of `field_matrices`, which share nothing with the package b
 `benchmarks/laboratory.py` prints a table of them.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from typing import Any

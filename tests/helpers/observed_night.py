@@ -1,7 +1,5 @@
 """A night of small frames with one fringe pattern, stars, slopes and amplifier steps, quickly made."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

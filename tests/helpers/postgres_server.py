@@ -4,8 +4,6 @@ The server refuses to be run by root. Under root it is run by the user `postgres
 distribution brings along; under any other user by that user.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import glob

@@ -1,7 +1,5 @@
 """Makers of valid products, so that each test spoils or varies one thing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

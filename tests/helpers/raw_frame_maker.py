@@ -4,8 +4,6 @@ Independent of the reader: it follows `Amplifier` (position and flips from the s
 ``DATASEC``, ``DETSEC`` and ``DETSIZE`` with the y sense that real files have.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Sealed cases of recorded challenges."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

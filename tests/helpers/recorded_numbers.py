@@ -5,8 +5,6 @@ that was not meant to change a result is noticed. ``pytest --record-numbers TEST
 anew, in `tests/records`.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import io

@@ -1,7 +1,5 @@
 """What templates leave of a frame without noise, beside the shot noise of its sky."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

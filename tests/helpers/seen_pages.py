@@ -1,7 +1,5 @@
 """What a reader sees of pages: their words, the tables that can be saved, and all that is drawn in their figures."""
 
-from __future__ import annotations
-
 import base64
 import re
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """A night sky of few lines, and frames of one with photon noise, for searches."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

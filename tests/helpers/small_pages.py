@@ -1,7 +1,5 @@
 """Every page of the package, of small made-up results."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

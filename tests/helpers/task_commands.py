@@ -1,7 +1,5 @@
 """What the tests of the tasks share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

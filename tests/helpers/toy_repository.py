@@ -1,7 +1,5 @@
 """A small repository for the tests of the middleware: two sensors, one task."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 

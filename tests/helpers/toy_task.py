@@ -1,7 +1,5 @@
 """A small task on the package's own storage classes: what the header of a raw frame says, as JSON."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Bandpasses against speclite and against the tables they come from."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import speclite.filters

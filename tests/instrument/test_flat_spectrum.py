@@ -1,7 +1,5 @@
 """Light of flat fields, and the fringes that it prints into frames of the sky."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Headers that contradict themselves or the instrument are refused; times and numbers are those of obs_lsst."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ Headers are those of real frames; each keyword is given another value, and what 
 compared.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import sys

@@ -1,7 +1,5 @@
 """Variation through a night and over the field."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A set-up whose camera, stack, media, bandpass and telescope are files of one's own, in any folder."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Photometric units."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A record of set-ups, cameras, skies and telescopes, for edits that are not meant to change them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from recorded_numbers import Record

@@ -1,7 +1,5 @@
 """Night sky against molecular physics, published levels and independent formulae."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

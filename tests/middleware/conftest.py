@@ -1,7 +1,5 @@
 """Repositories for tests, copied from one that is made once."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

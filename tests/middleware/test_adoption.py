@@ -1,7 +1,5 @@
 """One sensor, two data ids: what was measured on the stand is found in the camera by the serial number."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

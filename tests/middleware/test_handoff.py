@@ -1,7 +1,5 @@
 """Certified fringe frames, and their way into a repository that does not know this package."""
 
-from __future__ import annotations
-
 import re
 import sys
 import types

@@ -1,7 +1,5 @@
 """The middleware under a real pipeline, in this process."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A repository whose last writer was killed in the middle of a transaction."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

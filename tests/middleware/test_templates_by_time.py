@@ -1,7 +1,5 @@
 """Certified templates meet the exposures of the time for which they are valid."""
 
-from __future__ import annotations
-
 import datetime
 
 import pytest

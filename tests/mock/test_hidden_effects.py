@@ -1,7 +1,5 @@
 """Hidden effects: identity at null, and a visible change away from it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

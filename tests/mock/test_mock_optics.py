@@ -1,7 +1,5 @@
 """The mock's own thin-film optics against tmm, and against brute force (against the model: tests/effects)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

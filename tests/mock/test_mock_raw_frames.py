@@ -1,7 +1,5 @@
 """Raw frames of the mock: layout, statistics, determinism, and that they keep their secret."""
 
-from __future__ import annotations
-
 import datetime
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Thickness maps: the measured one and random ones."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Visits: the right fringes, the catalogue's photometry, charge that is conserved, and no truth in the files."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import numpy as np

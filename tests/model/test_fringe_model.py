@@ -1,7 +1,5 @@
 """The fringe model: response, grids, derivative, quadrature, and the laws it must obey."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from astropy import units

@@ -1,7 +1,5 @@
 """Everything that the model of a sensor says of itself, against other ways to compute it, and as recorded."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import re

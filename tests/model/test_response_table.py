@@ -1,7 +1,5 @@
 """Tables: the stated error bounds the true one, frames do not depend on threads, bad input is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from recorded_numbers import Record

@@ -1,7 +1,5 @@
 """Set-ups: all shipped ones load, and a bad description is refused by the key at fault."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where light ends in a stack."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Loss of coherence against independent references: tmm.inc_tmm, refnx, and averaging by brute force."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Quadratures: normalised, and exact on what they claim."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

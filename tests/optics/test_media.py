@@ -1,7 +1,5 @@
 """Media: exact at the nodes, silent nowhere outside, temperature laws of silicon."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from astropy.table import Table

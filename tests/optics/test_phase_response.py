@@ -1,7 +1,5 @@
 """The closed form and its harmonic series against the transfer matrix, and against each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

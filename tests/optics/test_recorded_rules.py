@@ -1,7 +1,5 @@
 """What rules leave out, as recorded: errors of coarse sums, numbers of nodes, bounds; no exact result shows it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from recorded_numbers import Record

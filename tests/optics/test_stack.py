@@ -1,7 +1,5 @@
 """Stacks: the shipped ones are complete, impossible ones are refused."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The wavelengths that a monochromator delivers."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

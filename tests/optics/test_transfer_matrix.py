@@ -1,7 +1,5 @@
 """`layer_absorption` against the package tmm, against arbitrary precision, and against the laws of energy."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Table 2 of the paper: every cell from one function."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from astropy.table import Table

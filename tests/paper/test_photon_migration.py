@@ -1,7 +1,5 @@
 """Figure 11: how far photons walk in the silicon, in the centre of the field and near its edge."""
 
-from __future__ import annotations
-
 import pytest
 
 from lsst.fringe_sim.algorithms.photon_migration import photon_migration

@@ -1,7 +1,5 @@
 """The table of published numbers, and how a recomputed one is judged."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Amplitudes on the sky: sections 5.1 to 5.3, Figures 12 to 14 and Table 2 of the paper."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Silicon in the cold: the measured tables, read here line by line, against what set-ups and effects make of them."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Diffuse return at the gate side against photons followed one by one, and against the measured efficiency."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The bandpass moves with the angles at the filter: by how much over the field, and what the fringes make of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import batoid

@@ -3,8 +3,6 @@
 Waves, sums, rays and the temperature of silicon are own lines; tables of media, lines, optics and the map are shared.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import batoid

@@ -1,7 +1,5 @@
 """The sky that shares no code with the package: energy, noise, and the size of its fringes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from foreign_sky import CONTINUUM, ForeignClutter, ForeignSky, foreign_map, foreign_night

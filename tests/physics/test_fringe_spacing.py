@@ -1,7 +1,5 @@
 """Laws of interference: spacing of fringes in wavelength and in thickness, and what a bandwidth leaves of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import find_peaks

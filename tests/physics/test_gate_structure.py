@@ -1,7 +1,5 @@
 """Gates that overlap in a part of a pixel, against own lines, and what tells them from other layers there."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tmm

@@ -1,7 +1,5 @@
 """Cold and hot OH against a direct calculation: two Boltzmann distributions fitted here to tabulated populations."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

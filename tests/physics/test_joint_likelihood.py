@@ -3,8 +3,6 @@
 Only numbers are shared: the tables of the media, the measured values, and the uncertainties that are stated of them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the adhesive and the silicon do between the temperatures of laboratory and sky, against own lines."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

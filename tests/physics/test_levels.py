@@ -1,7 +1,5 @@
 """Zero points, areas and quantum efficiencies, each against its own few lines."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import numpy as np

@@ -7,8 +7,6 @@ while the phase of its silicon fringes is that of Green's n. The printed table, 
 per bandpass (2e-4) are too small to explain it. The difference is thus a table of k, not the optics.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

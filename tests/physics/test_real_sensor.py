@@ -1,7 +1,5 @@
 """Measured flats of the real sensor against waves that share no code with the package: contrast and what it lacks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from foreign_sky import DATA, ForeignSky

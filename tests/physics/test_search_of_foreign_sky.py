@@ -1,7 +1,5 @@
 """The search on frames of a sky that shares no code, no lines and no constants with the model that it corrects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

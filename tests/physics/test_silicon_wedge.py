@@ -1,7 +1,5 @@
 """Silicon that is thicker on one side, in flats whose line shows its own fringes: the mock against own lines."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from field_matrices import DETECTION, ForeignSensor

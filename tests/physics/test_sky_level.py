@@ -3,8 +3,6 @@
 The levels of doc/guide/physics.md are those of this module.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A sky whose pixels have silicon and adhesive of their own, against a transfer matrix for each of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Products on disk: the same bit for bit, whole or absent, in the published layout, and never read when spoilt."""
 
-from __future__ import annotations
-
 import dataclasses
 import struct
 import tempfile

@@ -1,7 +1,5 @@
 """Exposures of the package ``lsst.images``, written and read back by that package itself (Python 3.12 or later)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

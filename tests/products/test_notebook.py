@@ -1,7 +1,5 @@
 """What products show of themselves in a notebook."""
 
-from __future__ import annotations
-
 import matplotlib
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """An observed frame whose parts do not belong together is refused, and not read as another one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

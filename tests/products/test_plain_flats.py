@@ -1,7 +1,5 @@
 """Flats of a sensor without a layout of its own: one image in one file."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Images of a whole sensor, and of a part of it: the same pixel has the same coordinates in both."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from astropy.io import fits

@@ -1,7 +1,5 @@
 """World coordinates of sensor images, read back by astropy's own WCS."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from astropy.io import fits

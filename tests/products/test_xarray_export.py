@@ -1,7 +1,5 @@
 """Products as data sets of xarray: the same numbers, with names and units."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 

@@ -1,7 +1,5 @@
 """What pages show, for records of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The page of a search: every kind of verdict is told, with its evidence, and nothing is fetched."""
 
-from __future__ import annotations
-
 import base64
 import math
 import re

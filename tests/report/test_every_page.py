@@ -1,7 +1,5 @@
 """What all pages have in common: a summary first, links that lead somewhere, and room on a telephone."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """Pages in a real browser: no complaint, nothing fetched, readable on a desk and in a hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

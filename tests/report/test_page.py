@@ -1,7 +1,5 @@
 """The report page: self-contained, readable, its tables downloadable."""
 
-from __future__ import annotations
-
 import base64
 import re
 from html.parser import HTMLParser

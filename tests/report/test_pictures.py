@@ -1,7 +1,5 @@
 """What the pictures of pages show, and do not."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

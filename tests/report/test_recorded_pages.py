@@ -1,7 +1,5 @@
 """Pages of made-up results in which nothing is left out: words, tables and figures are as recorded."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

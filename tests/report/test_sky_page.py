@@ -1,7 +1,5 @@
 """The page of simulated sky frames."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A repository with raw frames of small sensors, made once, and the real commands that work on it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -5,8 +5,6 @@ their connections, as read in lsst/ip_isr d2a69bf, lsst/pipe_tasks 5b638a4, lsst
 a5ef3ba.
 """
 
-from __future__ import annotations
-
 import sys
 import types
 from functools import partial

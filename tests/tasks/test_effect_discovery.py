@@ -1,7 +1,5 @@
 """The chain closed: effects hidden in raw flats, found, and put into fit and sky by the override that is stored."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The tasks that make templates of observed frames and correct them: alone, and by the real programs."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import shutil

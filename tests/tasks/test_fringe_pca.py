@@ -1,7 +1,5 @@
 """The template task without a repository."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

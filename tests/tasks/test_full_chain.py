@@ -1,7 +1,5 @@
 """From raw flats to certified templates in one graph of one camera."""
 
-from __future__ import annotations
-
 import datetime
 import shutil
 from pathlib import Path

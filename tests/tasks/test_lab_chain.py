@@ -1,7 +1,5 @@
 """From raw files to thickness maps with the real commands on a real repository."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import os

@@ -1,7 +1,5 @@
 """The laboratory tasks without a repository."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import datetime

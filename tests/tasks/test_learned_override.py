@@ -1,7 +1,5 @@
 """A search that runs as a Task stores the correction that the command writes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Overrides of single rafts and sensors through the real commands: a wrong name stops before a graph is built."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

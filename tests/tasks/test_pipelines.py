@@ -1,7 +1,5 @@
 """Pipelines build without a repository, and refuse tasks that do not fit together."""
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """An effect hidden in frames of the sky, found by the real programs and put back by the override that is stored."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import shutil

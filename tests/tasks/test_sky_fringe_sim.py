@@ -1,7 +1,5 @@
 """The tasks that make a sky of a map, or its templates, without a repository."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

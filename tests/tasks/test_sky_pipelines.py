@@ -1,7 +1,5 @@
 """The sky pipelines of every camera, run by the real programs on small sensors."""
 
-from __future__ import annotations
-
 import datetime
 import shutil
 from pathlib import Path

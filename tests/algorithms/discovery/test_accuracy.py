@@ -1,7 +1,5 @@
 """A disagreement that the tables of the model may make is said to be within its accuracy; no other is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

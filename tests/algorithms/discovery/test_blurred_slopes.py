@@ -1,7 +1,5 @@
 """Where light is carried from cell to cell, a cell sees how the thickness changes around it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

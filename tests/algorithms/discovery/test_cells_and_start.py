@@ -1,7 +1,5 @@
 """Noise of cells, fringe orders of the first thickness, and neighbouring minima."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Effects are one class if all data, not only the part that was searched, cannot tell them apart."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

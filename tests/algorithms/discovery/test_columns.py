@@ -1,7 +1,5 @@
 """Derivatives that concern one wavelength, against the same ones written out with all their zeros."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Quick comparison of models with data, beside least squares plane by plane."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import nnls

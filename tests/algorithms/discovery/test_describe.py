@@ -1,7 +1,5 @@
 """Places that fit worse than the rest of a sensor, in residuals made by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

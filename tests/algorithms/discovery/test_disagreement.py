@@ -1,7 +1,5 @@
 """How large a disagreement is said to be."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

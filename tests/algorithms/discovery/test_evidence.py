@@ -1,7 +1,5 @@
 """Evidence of sets of effects."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Field of the thickness: how fine it is made, and that it stays in its fringe orders."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Fits say how well they know an effect, and what is large is not drawn to null."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Thickness that follows an effect at a finite size, and effects that are found because it does."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

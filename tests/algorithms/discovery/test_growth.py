@@ -1,7 +1,5 @@
 """Thickness that grows from where a blurred model fits, and fields that are continued."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

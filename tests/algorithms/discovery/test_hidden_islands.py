@@ -1,7 +1,5 @@
 """Islands that a thickness has taken up, and thicknesses that step like islands."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

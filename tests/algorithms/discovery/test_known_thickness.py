@@ -1,7 +1,5 @@
 """Thickness maps that are known only so well, or better than they state."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

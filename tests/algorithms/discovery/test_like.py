@@ -1,7 +1,5 @@
 """What a cause outside the catalogue is like: effects that no correction replaces."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

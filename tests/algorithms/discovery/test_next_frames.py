@@ -1,7 +1,5 @@
 """What would tell apart effects that frames of the sky leave in one class, against fits to noiseless data."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

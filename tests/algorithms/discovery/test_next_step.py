@@ -1,7 +1,5 @@
 """Which flats to take next, beside flats of many pixels and of one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Effects with which the thickness settles in the wrong fringe order are found in the right one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

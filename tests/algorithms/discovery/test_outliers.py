@@ -1,7 +1,5 @@
 """Cells that something spoiled in one exposure."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

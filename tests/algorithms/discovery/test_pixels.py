@@ -1,7 +1,5 @@
 """Pixels are areas: they average the fringes over themselves, unless the data are sharper than that."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates

@@ -1,7 +1,5 @@
 """Thickness from planes on the fringes of many cells at once."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A thickness rough from pixel to pixel has a value for every cell, and each follows the noise of its cell."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from flat_cubes import relative_flats

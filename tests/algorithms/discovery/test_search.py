@@ -1,7 +1,5 @@
 """The search on a few sealed cases and what it refuses; `python -m benchmarks panel` judges how well it does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

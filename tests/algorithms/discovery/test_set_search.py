@@ -1,7 +1,5 @@
 """How sets of effects grow, with fits that are made up."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The search on frames of the night sky: light as fast as a search needs, null and hidden effects, bad input."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

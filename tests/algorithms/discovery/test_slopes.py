@@ -1,7 +1,5 @@
 """Slopes of a field known at cells."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

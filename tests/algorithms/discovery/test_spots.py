@@ -1,7 +1,5 @@
 """Round spots: how often noise makes one, what a few are worth, and gains that are fitted to them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

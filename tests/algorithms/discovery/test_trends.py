@@ -1,7 +1,5 @@
 """Errors of single exposures are draws, unless they follow a curve in wavelength."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A search on a sensor that lacks the layer of the local effect."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
