@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from ...errors import OutOfRangeError
 from .coordinates import SECANT, Coordinate, log_evidence_of_parameters
 from .marginal import Columns, Point, joined
 
-__all__ = ["Hypothesis", "effect_columns", "fit", "in_best_orders", "jumped", "relaxed"]
+__all__ = ["Hypothesis", "effect_columns", "fit", "in_best_orders", "jumped", "relaxed", "with_free_contrast"]
 
 FloatArray = NDArray[np.float64]
 
@@ -22,6 +22,9 @@ MOST_STEP_UM = 0.05
 
 MOST_JUMP_UM = 0.25
 """The same of a finite change of an effect, whose thickness may have to follow by most of an order."""
+
+LEAST_LEFT = 0.3
+"""Part of the contrast that a step leaves at least."""
 
 STRIDE_UM, MOST_STRIDES = 0.05, 16
 """Typical length of a stride of the thickness [µm], and how many of them are walked at most."""
@@ -91,6 +94,36 @@ def relaxed(point: Point, rounds: int = 3, tolerance: float = 0.02) -> Point:
     return point
 
 
+def with_free_contrast(point: Point, rounds: int = 8, tolerance: float = 0.02) -> Point:
+    """Levels, thickness and the contrast of the fringes at the best for these effects.
+
+    The contrast is part of the model of the point that is returned. Where fringes are weaker than the model has them, a
+    thickness that is fitted with its contrast goes to where the model has the weakest ones.
+    """
+    for _ in range(rounds):
+        forward = point.problem.forward
+        fringes = point.whitened((point.value - 1.0) / forward.contrast)
+        own = point.columns(fringes[np.newaxis], point.steep[np.newaxis] / forward.contrast)
+        columns = joined(point.level_columns, own)
+        gradient = point.score(columns) - columns.log_det
+        step = np.linalg.solve(point.information(columns, columns), gradient)
+        moved = np.clip(point.followed_um(step, columns), -MOST_STEP_UM, MOST_STEP_UM)
+        for part in SHRINK:
+            contrast = max(forward.contrast + part * float(step[-1]), LEAST_LEFT * forward.contrast)
+            problem = replace(point.problem, forward=replace(forward, contrast=contrast))
+            new = problem.at(
+                point.settings, point.levels + part * step[:-1], point.thickness_um + part * moved
+            )
+            if new.cost < point.cost:
+                break
+        else:
+            return point
+        gain, point = point.cost - new.cost, new
+        if gain < tolerance:
+            break
+    return point
+
+
 def jumped(point: Point, items: Sequence[Coordinate], values: Sequence[float]) -> Point:
     """Another value of some parameters, with the thickness that goes with it, and relaxed.
 
@@ -124,10 +157,20 @@ def in_best_orders(point: Point, where: NDArray[np.bool_] | None = None, rounds:
     ``where`` (N,): cells that may move; the others stay.
     """
     order_um = point.problem.forward.order_um
+    return _in_best_minima(point, [point.thickness_um + shift * order_um for shift in SHIFTS], where, rounds)
+
+
+def _in_best_minima(
+    point: Point,
+    starts: Sequence[FloatArray],
+    where: NDArray[np.bool_] | None = None,
+    rounds: int = 4,
+) -> Point:
+    """The thickness of every cell at the best to which these lead, each ``(N,)`` [µm], or where it is."""
     moves = np.ones(len(point.thickness_um)) if where is None else where.astype(float)
     best, energy = point.thickness_um.copy(), point.cell_energy.copy()
-    for shift in SHIFTS:
-        own = point.moved(point.levels, point.thickness_um + shift * order_um * moves)
+    for start in starts:
+        own = point.moved(point.levels, point.thickness_um + (start - point.thickness_um) * moves)
         for number in range(rounds + 1):
             better = own.cell_energy < energy
             best[better], energy[better] = own.thickness_um[better], own.cell_energy[better]
@@ -150,23 +193,31 @@ def fit(
     rounds: int = 12,
     tolerance: float = 0.03,
 ) -> Hypothesis:
-    """The best parameters, levels and thickness from a start, by steps that lower the cost."""
-    point = _started(items, start)
-    for number in range(rounds + 1):
+    """The best parameters, levels and thickness from a start, by steps that lower the cost.
+
+    Cells may go back to the first thickness: on the way from other effects some are left in other minima.
+    """
+    point = _walked(items, _started(items, start), rounds, tolerance)
+    back = _in_best_minima(point, [point.problem.thickness_um])
+    if point.cost - back.cost > tolerance:
+        point = _walked(items, back, rounds, tolerance)
+    return _hypothesis(effects, items, point)
+
+
+def _walked(items: Sequence[Coordinate], point: Point, rounds: int, tolerance: float) -> Point:
+    """The same without that."""
+    for _ in range(rounds):
         columns = point.level_columns
         if items:
             columns = joined(columns, effect_columns(point, items))
-        information = point.information(columns, columns)
-        if number == rounds:
-            break
-        step = _step(point, items, columns, information)
+        step = _step(point, items, columns, point.information(columns, columns))
         new = _best_of_parts(point, items, step, point.followed_um(step, columns))
         if new is None:
             break
         gain, point = _target(point, items) - _target(new, items), new
         if gain < tolerance:
             break
-    return _hypothesis(effects, items, point)
+    return point
 
 
 def _started(items: Sequence[Coordinate], start: Point) -> Point:

@@ -12,11 +12,11 @@ from ....effects import Effect
 from ....model import FringeModel
 from ....products.fringe_cube import FringeCube
 from ....products.mask import mask_bits
-from ...inference import CellShape, Data, Forward, Hypothesis, Point, Problem, fit, relaxed
+from ...inference import CellShape, Data, Forward, Hypothesis, Point, Problem, fit, relaxed, with_free_contrast
 from ..cells import CellData, bin_cube, finest_useful_cell
 from ..continuation import continued
 from ..outliers import spoiled_cells
-from ..start import starting_thickness
+from ..start import robust_surface, starting_thickness
 from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
 from .noise import measured_noise, neighbour_scatter
 from .rules import Rules
@@ -32,6 +32,12 @@ MARGIN_UM = 0.8
 FIRST_ERROR_UM = 0.004
 """Error of the first thickness [µm]: it is one of steps of 0.01."""
 
+SURFACE_CELLS = 8.0
+"""Distance of the knots of the surface whose slope limits the size of cells [cells]."""
+
+KNOWN_UM = 1e-6
+"""Error of a thickness that is known [µm]."""
+
 NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
 """Response scatter that is none, and what it is before it is measured (the prototype's)."""
 
@@ -45,6 +51,7 @@ class Prepared:
     problem: Problem
     null: Hypothesis
     noise_factor: FloatArray  # (W,): measured over stated standard deviation
+    free: Point  # the unchanged model with the contrast of the data
 
     @property
     def point(self) -> Point:
@@ -67,15 +74,52 @@ def prepare(
     held = _held_out(cube.shape[1:], rules.heldout_fraction, rng)
     size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
     prepared = _in_cells(cube, held, size, model, effects)
-    while min(prepared.cells.shape[1:]) >= 2 * FEWEST_ROWS:
-        turn = 2.0 * np.pi / prepared.problem.forward.order_um
-        error = turn * _thickness_error_um(prepared.point)
-        slope = turn * np.quantile(np.hypot(*prepared.problem.forward.shape.gradient), 0.95)
-        if error < rules.phase_error or 2.0 * size * slope > rules.cell_phase:
+    turn = 2.0 * np.pi / prepared.problem.forward.order_um
+    while (
+        turn * _thickness_error_um(prepared.free) > rules.phase_error
+        and min(prepared.cells.shape[1:]) >= 2 * FEWEST_ROWS
+    ):
+        larger = _in_cells(cube, held, 2 * prepared.cells.cell_px, model, effects)
+        across = turn * _steepest_um(larger) * larger.cells.cell_px
+        if across > rules.cell_phase or not _is_likelier(larger, prepared):
             break
-        size *= 2
-        prepared = _in_cells(cube, held, size, model, effects)
+        prepared = larger
     return prepared
+
+
+def _is_likelier(larger: Prepared, smaller: Prepared) -> bool:
+    """Whether values in small cells are likelier with the thickness of larger ones of twice the side."""
+    coarse, fine = larger.free, smaller.free
+    thickness, shape, inside = _in_quarters(larger, smaller)
+    forward = replace(fine.problem.forward, shape=shape)
+    known = replace(fine.problem, forward=forward, thickness_um=thickness, thickness_sigma_um=KNOWN_UM)
+    point = with_free_contrast(known.at({}, fine.levels, thickness))
+    used = inside & fine.problem.data.seen
+    seen = coarse.problem.data.seen
+    priors = np.log(coarse.thickness_sigma_um / coarse.problem.thickness_sigma_um)[seen]
+    gained = point.cell_evidence[used].sum() + priors.sum() - fine.cell_evidence[used].sum()
+    return bool(gained > 0.0)
+
+
+def _in_quarters(larger: Prepared, smaller: Prepared) -> tuple[FloatArray, CellShape, BoolArray]:
+    """Thickness of larger cells in smaller ones of half the side, its shape there, and which of those have it."""
+    own, size = larger.free.problem.forward.shape, smaller.cells.cell_px
+    rows, columns = larger.cells.shape[1:]
+    target = smaller.cells.shape[1:]
+    more = [(0, full - 2 * part) for full, part in zip(target, (rows, columns), strict=True)]
+
+    def spread(values: FloatArray) -> FloatArray:
+        whole = np.kron(values.reshape(rows, columns), np.ones((2, 2)))
+        return np.pad(whole, more, mode="edge").ravel()
+
+    y, x = (np.where(place % 2, 0.5, -0.5).ravel() * size for place in np.indices(target))
+    down, along = (spread(part) for part in own.gradient)
+    yy, yx, xx = hessian = np.stack([spread(part) for part in own.hessian])
+    thickness = spread(larger.free.thickness_um) + down * y + along * x
+    thickness += 0.5 * (yy * y**2 + 2.0 * yx * y * x + xx * x**2)
+    gradient = np.stack([down + yy * y + yx * x, along + yx * y + xx * x])
+    inside = np.pad(np.kron(larger.cells.seen, np.ones((2, 2), dtype=bool)), more).ravel()
+    return thickness, CellShape(gradient, hessian, size, own.area), inside
 
 
 def _held_out(shape: tuple[int, ...], fraction: float, rng: np.random.Generator) -> BoolArray:
@@ -103,20 +147,44 @@ def _in_cells(
     )
     first = continued(starting_thickness(model, cells), cells.seen)
     problem = _problem(cells, model, effects, first)
-    point = relaxed(problem.at({}, np.ones(cells.shape[0]), problem.thickness_um), rounds=8)
+    # The first thickness does not believe in the contrast of the model; it stays until that of the data is known.
+    known = replace(problem, thickness_sigma_um=KNOWN_UM)
+    point = with_free_contrast(known.at({}, np.ones(cells.shape[0]), problem.thickness_um))
+    problem = replace(problem, forward=point.problem.forward)
+    point = with_free_contrast(problem.at({}, point.levels, problem.thickness_um))
     factor = np.ones(cells.shape[0])
     for _ in range(2):
         spoiled = spoiled_cells(_left(point, cells), cells.weight > 0.0)
         cells, noise, problem = _judged(cells.restricted(~spoiled), point)
         factor = factor * noise
-        point = relaxed(problem.at({}, point.levels, problem.thickness_um), rounds=4)
+        point = with_free_contrast(problem.at({}, point.levels, problem.thickness_um), rounds=4)
     unseen = unseen.scaled_noise(factor, cells.response_scatter)
-    return Prepared(cells, unseen, problem, fit((), (), point), factor)
+    problem = _as_modelled(problem)
+    null = fit((), (), problem.at({}, point.levels, point.thickness_um))
+    return Prepared(cells, unseen, problem, null, factor, point)
+
+
+def _as_modelled(problem: Problem) -> Problem:
+    """A problem with the contrast of the model."""
+    return replace(problem, forward=replace(problem.forward, contrast=1.0))
+
+
+def _steepest_um(prepared: Prepared) -> float:
+    """Change of the thickness where it is steep but for a twentieth of the cells [µm/px].
+
+    Of the surface through most cells, as some may lie in other orders.
+    """
+    cells, problem = prepared.cells, prepared.problem
+    field = problem.thickness_um.reshape(cells.shape[1:])
+    surface = robust_surface(field, cells.seen, SURFACE_CELLS, problem.forward.order_um)
+    return float(np.quantile(np.hypot(*np.gradient(surface, cells.cell_px)), 0.95))
 
 
 def prepare_again(prepared: Prepared, found: Hypothesis) -> Prepared:
     """Noise, and what the thickness does within cells, as judged with effects in the model."""
-    cells, noise, problem = _judged(prepared.cells, found.point)
+    point = with_free_contrast(found.point)
+    cells, noise, problem = _judged(prepared.cells, point)
+    problem = _as_modelled(problem)
     null = problem.at({}, prepared.point.levels, prepared.point.thickness_um)
     return replace(
         prepared,
@@ -125,6 +193,7 @@ def prepare_again(prepared: Prepared, found: Hypothesis) -> Prepared:
         problem=problem,
         null=fit((), (), relaxed(null, rounds=4)),
         noise_factor=prepared.noise_factor * noise,
+        free=point,
     )
 
 

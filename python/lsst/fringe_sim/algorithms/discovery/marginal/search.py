@@ -240,14 +240,23 @@ class SetSearch:
         for group in groups:
             names = {one.name for one in group}
             if alike & names or missing in names:
+                kept = self._kept(base, group)
                 for one in group:
-                    if one.name != missing and self._may_lead(base, one):
+                    if one.name != missing and self._may_lead(base, one, kept):
                         self._added(base, one)
 
-    def _may_lead(self, base: Hypothesis, one: Scored) -> bool:
+    def _kept(self, base: Hypothesis, group: Sequence[Scored]) -> float:
+        """How many times what derivatives promise an effect of a group of twins has brought, 1 at least."""
+        sets = [(one, self.pool.get(frozenset((*base.effects, one.name)))) for one in group if one.gain > 0.0]
+        brought = [
+            (own.log_evidence - base.log_evidence) / one.gain for one, own in sets if own is not None
+        ]
+        return max([1.0, *brought])
+
+    def _may_lead(self, base: Hypothesis, one: Scored, kept: float = 1.0) -> bool:
         """Whether a set with one effect more comes near the best, if derivatives promise all but a part."""
         best = max(self.posterior(known) for known in self.pool.values())
-        hoped = self.posterior(base) + one.gain / self.rules.least_of_promise - self.catalogue.price
+        hoped = self.posterior(base) + kept * one.gain / self.rules.least_of_promise - self.catalogue.price
         return hoped > best - self.rules.class_width
 
     def _groups(self, scored: Sequence[Scored]) -> list[list[Scored]]:
