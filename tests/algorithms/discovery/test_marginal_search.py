@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
-from lsst.fringe_sim.algorithms.discovery.marginal.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.effects import known_effects
 from lsst.fringe_sim.errors import UnknownNameError
@@ -20,9 +20,9 @@ SIDE = 32
 ELECTRONS = 20_000.0
 
 
-def cube_of(rng: np.random.Generator, effects: dict[str, float]) -> FringeCube:
+def cube_of(rng: np.random.Generator, effects: dict[str, float], side: int = SIDE) -> FringeCube:
     """Flats of a small sensor with photon noise; the optics are the package's own."""
-    y, x = np.mgrid[:SIDE, :SIDE] / SIDE
+    y, x = np.mgrid[:side, :side] / SIDE
     thickness = 15.0 + 0.5 * x + 0.3 * y**2 - 0.2 * x * y
     model = FringeModel.from_setup("ts8_e2v", effects)
     light = model.system.flat_fields(WAVELENGTHS, 0.1)
@@ -88,6 +88,24 @@ def test_selection_does_not_see_the_part_held_out(rng: np.random.Generator) -> N
     second = prepared(replace(cube, image=planted.astype(np.float32)))
     assert np.array_equal(first.null.point.thickness_um, second.null.point.thickness_um)
     assert first.null.log_evidence == second.null.log_evidence
+
+
+@pytest.mark.rng("weak fringes")
+def test_cells_suit_a_contrast_that_is_not_known(rng: np.random.Generator) -> None:
+    model = FringeModel.from_setup("ts8_e2v")
+    effects = [effect for effect in known_effects(None) if not effect.sky_only]
+
+    def prepared(contrast: float) -> Prepared:
+        cube = cube_of(rng, {"contrast_loss.factor": contrast}, 64)
+        return prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+
+    plain, weak = prepared(1.0), prepared(0.1)
+    assert plain.cells.cell_px == 1
+    assert weak.cells.cell_px > 1
+    for own, contrast in ((plain, 1.0), (weak, 0.1)):
+        assert own.free.problem.forward.contrast == pytest.approx(contrast, rel=0.05)
+        assert own.noise_factor == pytest.approx(1.0, abs=0.1)
+        assert own.problem.forward.contrast == 1.0  # what is searched believes the model
 
 
 def test_another_core_is_refused() -> None:

@@ -12,7 +12,17 @@ from ....effects import Effect
 from ....model import FringeModel
 from ....products.fringe_cube import FringeCube
 from ....products.mask import mask_bits
-from ...inference import CellShape, Data, Forward, Hypothesis, Point, Problem, fit, relaxed, with_free_contrast
+from ...inference import (
+    CellShape,
+    Data,
+    Forward,
+    Hypothesis,
+    Point,
+    Problem,
+    fit,
+    in_whole_orders,
+    with_free_contrast,
+)
 from ..cells import CellData, bin_cube, finest_useful_cell
 from ..continuation import continued
 from ..outliers import spoiled_cells
@@ -73,52 +83,53 @@ def prepare(
     """
     held = _held_out(cube.shape[1:], rules.heldout_fraction, rng)
     size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
-    prepared = _in_cells(cube, held, size, model, effects)
+    prepared = _in_cells(cube, held, size, model, effects, rules)
     turn = 2.0 * np.pi / prepared.problem.forward.order_um
-    while (
-        turn * _thickness_error_um(prepared.free) > rules.phase_error
-        and min(prepared.cells.shape[1:]) >= 2 * FEWEST_ROWS
-    ):
-        larger = _in_cells(cube, held, 2 * prepared.cells.cell_px, model, effects)
-        across = turn * _steepest_um(larger) * larger.cells.cell_px
-        if across > rules.cell_phase or not _is_likelier(larger, prepared):
+    # Smaller ones than are needed may be in wrong orders, and tell nothing of larger ones.
+    while turn * _thickness_error_um(prepared.free) > rules.phase_error:
+        size *= 2
+        if min(cube.shape[1:]) // size < FEWEST_ROWS:
             break
-        prepared = larger
+        larger = _in_cells(cube, held, size, model, effects, rules)
+        across = turn * _steepest_um(larger) * size
+        if across < rules.cell_phase and _is_likelier(larger, prepared):
+            prepared = larger
     return prepared
 
 
 def _is_likelier(larger: Prepared, smaller: Prepared) -> bool:
-    """Whether values in small cells are likelier with the thickness of larger ones of twice the side."""
+    """Whether values in small cells are likelier with the thickness of larger ones, which are made of them."""
     coarse, fine = larger.free, smaller.free
-    thickness, shape, inside = _in_quarters(larger, smaller)
+    thickness, shape, inside = _in_parts(larger, smaller)
     forward = replace(fine.problem.forward, shape=shape)
     known = replace(fine.problem, forward=forward, thickness_um=thickness, thickness_sigma_um=KNOWN_UM)
     point = with_free_contrast(known.at({}, fine.levels, thickness))
-    used = inside & fine.problem.data.seen
-    seen = coarse.problem.data.seen
+    used, seen = inside & fine.problem.data.seen, coarse.problem.data.seen
     priors = np.log(coarse.thickness_sigma_um / coarse.problem.thickness_sigma_um)[seen]
     gained = point.cell_evidence[used].sum() + priors.sum() - fine.cell_evidence[used].sum()
     return bool(gained > 0.0)
 
 
-def _in_quarters(larger: Prepared, smaller: Prepared) -> tuple[FloatArray, CellShape, BoolArray]:
-    """Thickness of larger cells in smaller ones of half the side, its shape there, and which of those have it."""
+def _in_parts(larger: Prepared, smaller: Prepared) -> tuple[FloatArray, CellShape, BoolArray]:
+    """Thickness of larger cells in the smaller ones, its shape there, and which of those lie in one with data."""
     own, size = larger.free.problem.forward.shape, smaller.cells.cell_px
+    parts = larger.cells.cell_px // size
     rows, columns = larger.cells.shape[1:]
     target = smaller.cells.shape[1:]
-    more = [(0, full - 2 * part) for full, part in zip(target, (rows, columns), strict=True)]
+    more = [(0, full - parts * part) for full, part in zip(target, (rows, columns), strict=True)]
 
     def spread(values: FloatArray) -> FloatArray:
-        whole = np.kron(values.reshape(rows, columns), np.ones((2, 2)))
+        whole = np.kron(values.reshape(rows, columns), np.ones((parts, parts)))
         return np.pad(whole, more, mode="edge").ravel()
 
-    y, x = (np.where(place % 2, 0.5, -0.5).ravel() * size for place in np.indices(target))
+    y, x = (size * (place % parts - 0.5 * (parts - 1)).ravel() for place in np.indices(target))
     down, along = (spread(part) for part in own.gradient)
     yy, yx, xx = hessian = np.stack([spread(part) for part in own.hessian])
     thickness = spread(larger.free.thickness_um) + down * y + along * x
     thickness += 0.5 * (yy * y**2 + 2.0 * yx * y * x + xx * x**2)
     gradient = np.stack([down + yy * y + yx * x, along + yx * y + xx * x])
-    inside = np.pad(np.kron(larger.cells.seen, np.ones((2, 2), dtype=bool)), more).ravel()
+    inside = spread(larger.cells.seen.astype(float)) > 0.0
+    inside &= np.pad(np.ones((parts * rows, parts * columns), dtype=bool), more).ravel()
     return thickness, CellShape(gradient, hessian, size, own.area), inside
 
 
@@ -138,7 +149,7 @@ def _masked(cube: FringeCube, out: BoolArray) -> FringeCube:
 
 
 def _in_cells(
-    cube: FringeCube, held: BoolArray, size: int, model: FringeModel, effects: Sequence[Effect]
+    cube: FringeCube, held: BoolArray, size: int, model: FringeModel, effects: Sequence[Effect], rules: Rules
 ) -> Prepared:
     """The same in cells of so many pixels."""
     cells = bin_cube(_masked(cube, held), size)
@@ -152,6 +163,7 @@ def _in_cells(
     point = with_free_contrast(known.at({}, np.ones(cells.shape[0]), problem.thickness_um))
     problem = replace(problem, forward=point.problem.forward)
     point = with_free_contrast(problem.at({}, point.levels, problem.thickness_um))
+    point = in_whole_orders(point, rules.class_width)
     factor = np.ones(cells.shape[0])
     for _ in range(2):
         spoiled = spoiled_cells(_left(point, cells), cells.weight > 0.0)
@@ -160,7 +172,7 @@ def _in_cells(
         point = with_free_contrast(problem.at({}, point.levels, problem.thickness_um), rounds=4)
     unseen = unseen.scaled_noise(factor, cells.response_scatter)
     problem = _as_modelled(problem)
-    null = fit((), (), problem.at({}, point.levels, point.thickness_um))
+    null = fit((), (), problem.at({}, point.levels, point.thickness_um), aim=point.cost)
     return Prepared(cells, unseen, problem, null, factor, point)
 
 
@@ -184,14 +196,15 @@ def prepare_again(prepared: Prepared, found: Hypothesis) -> Prepared:
     """Noise, and what the thickness does within cells, as judged with effects in the model."""
     point = with_free_contrast(found.point)
     cells, noise, problem = _judged(prepared.cells, point)
-    problem = _as_modelled(problem)
+    # Every fit may return to the first thickness, whatever has been fitted since.
+    problem = replace(_as_modelled(problem), thickness_um=prepared.problem.thickness_um)
     null = problem.at({}, prepared.point.levels, prepared.point.thickness_um)
     return replace(
         prepared,
         cells=cells,
         unseen=prepared.unseen.scaled_noise(noise, cells.response_scatter),
         problem=problem,
-        null=fit((), (), relaxed(null, rounds=4)),
+        null=fit((), (), null, aim=point.cost),
         noise_factor=prepared.noise_factor * noise,
         free=point,
     )
