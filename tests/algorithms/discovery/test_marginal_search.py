@@ -20,13 +20,19 @@ SIDE = 32
 ELECTRONS = 20_000.0
 
 
-def cube_of(rng: np.random.Generator, effects: dict[str, float], side: int = SIDE) -> FringeCube:
-    """Flats of a small sensor with photon noise; the optics are the package's own."""
-    y, x = np.mgrid[:side, :side] / SIDE
+def cube_of(
+    rng: np.random.Generator, effects: dict[str, float], side: int = SIDE, places: int = 1
+) -> FringeCube:
+    """Flats of a small sensor with photon noise; the optics are the package's own.
+
+    Pixels see so many by so many places of their area.
+    """
+    y, x = (np.mgrid[: side * places, : side * places] + 0.5 - 0.5 * places) / (SIDE * places)
     thickness = 15.0 + 0.5 * x + 0.3 * y**2 - 0.2 * x * y
     model = FringeModel.from_setup("ts8_e2v", effects)
     light = model.system.flat_fields(WAVELENGTHS, 0.1)
     flats = model.respond(light, thickness, WAVELENGTHS)
+    flats = flats.reshape(8, side, places, side, places).mean(axis=(2, 4))
     flats *= ELECTRONS / flats.mean(axis=(1, 2), keepdims=True)
     image = rng.poisson(flats).astype(np.float32)
     setup = model.setup
@@ -106,6 +112,17 @@ def test_cells_suit_a_contrast_that_is_not_known(rng: np.random.Generator) -> No
         assert own.free.problem.forward.contrast == pytest.approx(contrast, rel=0.05)
         assert own.noise_factor == pytest.approx(1.0, abs=0.1)
         assert own.problem.forward.contrast == 1.0  # what is searched believes the model
+
+
+@pytest.mark.rng("pixels")
+@pytest.mark.parametrize("places", [1, 3])
+def test_pixels_see_a_point_or_their_area_by_the_likelihood(places: int, rng: np.random.Generator) -> None:
+    cube = cube_of(rng, {"contrast_loss.factor": 0.8}, 64, places)
+    effects = [effect for effect in known_effects(None) if not effect.sky_only]
+    model = FringeModel.from_setup("ts8_e2v")
+    found = prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+    assert found.problem.forward.shape.area == (places > 1)
+    assert found.free.problem.forward.contrast == pytest.approx(0.8, abs=0.01)
 
 
 def test_another_core_is_refused() -> None:

@@ -170,10 +170,20 @@ def _in_cells(
         cells, noise, problem = _judged(cells.restricted(~spoiled), point)
         factor = factor * noise
         point = with_free_contrast(problem.at({}, point.levels, problem.thickness_um), rounds=4)
+        point = _with_likelier_pixels(point, rules)
     unseen = unseen.scaled_noise(factor, cells.response_scatter)
-    problem = _as_modelled(problem)
+    problem = _as_modelled(point.problem)
     null = fit((), (), problem.at({}, point.levels, point.thickness_um), aim=point.cost)
     return Prepared(cells, unseen, problem, null, factor, point)
+
+
+def _with_likelier_pixels(point: Point, rules: Rules) -> Point:
+    """The same where pixels see the point in their middle instead of all of their area, or the reverse, if likelier."""
+    forward = point.problem.forward
+    shape = replace(forward.shape, area=not forward.shape.area)
+    problem = replace(point.problem, forward=replace(forward, shape=shape))
+    other = with_free_contrast(problem.at(point.settings, point.levels, point.thickness_um), rounds=4)
+    return other if point.cost - other.cost > rules.class_width else point
 
 
 def _as_modelled(problem: Problem) -> Problem:
@@ -192,9 +202,9 @@ def _steepest_um(prepared: Prepared) -> float:
     return float(np.quantile(np.hypot(*np.gradient(surface, cells.cell_px)), 0.95))
 
 
-def prepare_again(prepared: Prepared, found: Hypothesis) -> Prepared:
-    """Noise, and what the thickness does within cells, as judged with effects in the model."""
-    point = with_free_contrast(found.point)
+def prepare_again(prepared: Prepared, found: Hypothesis, rules: Rules) -> Prepared:
+    """Noise, and what pixels see and the thickness does within cells, as judged with effects in the model."""
+    point = _with_likelier_pixels(with_free_contrast(found.point), rules)
     cells, noise, problem = _judged(prepared.cells, point)
     # Every fit may return to the first thickness, whatever has been fitted since.
     problem = replace(_as_modelled(problem), thickness_um=prepared.problem.thickness_um)
@@ -225,7 +235,8 @@ def _judged(cells: CellData, point: Point) -> tuple[CellData, FloatArray, Proble
     # A wrong model errs in the thickness by more than noise does, and slopes that follow the errors blur fringes.
     error = max(_thickness_error_um(point), neighbour_scatter(thickness, cells.seen, 0.0))
     # Tables stay; they reach farther than the thickness moves.
-    forward = replace(old, shape=CellShape.of_field(thickness, cells.cell_px, error), geometry=geometry)
+    shape = CellShape.of_field(thickness, cells.cell_px, error, area=old.shape.area)
+    forward = replace(old, shape=shape, geometry=geometry)
     problem = replace(
         point.problem,
         data=_data(cells),

@@ -131,7 +131,7 @@ class MarginalSearch:
                 break
             self._judged_with.append(set(best.effects))
             self.report(f"noise and cells are judged again with {', '.join(best.effects)}")
-            prepared = prepare_again(self.prepared, best)
+            prepared = prepare_again(self.prepared, best, self.rules)
             self.sets, self.prepared = self.sets.on(prepared.null), prepared
             best = self.sets.settled(len(best.effects))
         return best
